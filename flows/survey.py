@@ -19,11 +19,11 @@ from flows.settings.parameters import SurveySettings
 from flows.tasks.captures import capture_pass, plan_capture
 from flows.tasks.open_survey import JUDGED, OpenSurvey, RunRef
 from flows.tasks.stages.accuracy import evaluate
-from flows.tasks.stages.attention import attend
+from flows.tasks.stages.attention import score
 from flows.tasks.stages.effects import choose_effects
-from flows.tasks.stages.maps import draw_map
+from flows.tasks.stages.maps import segment
 from flows.tasks.stages.on_ground import ground
-from flows.tasks.stages.placement import cut_patches, locate, rectify, register_coarse, register_fine
+from flows.tasks.stages.placement import extract_patches, locate, rectify, register_coarse, register_fine
 from flows.tasks.stages.raster import average_raster, take_patches
 from storage.archive.keys import StageRef
 
@@ -63,8 +63,8 @@ def draw_class_map(plan: OpenSurvey) -> None:
     """Run the stages from the first pass to the class map; their stores are the products of the plan."""
     if plan.is_map:  # the scene's own pixels: nothing is captured
         mosaic = average_raster(plan)
-        request = attend(plan, mosaic)
-        class_map = draw_map(plan, mosaic, take_patches(plan, request))
+        request = score(plan, mosaic)
+        class_map = segment(plan, mosaic, take_patches(plan, request))
     else:
         mosaic, class_map = _draw_captured(plan)
     if plan.on_the_ground:
@@ -76,14 +76,14 @@ def _draw_captured(plan: OpenSurvey) -> tuple[StageRef, StageRef]:
     effects = choose_effects(plan)
     raw = capture_pass(plan, "coarse", effects)
     seams = register_coarse(plan, raw) if plan.registers else None
-    lookup = locate(plan, raw, seams)
-    mosaic = rectify(plan, raw, lookup, seams)
-    request = attend(plan, mosaic)
+    geolocation = locate(plan, raw, seams)
+    mosaic = rectify(plan, raw, geolocation, seams)
+    request = score(plan, mosaic)
     if not plan.uniform:  # go back for what the plan requests
         raw = capture_pass(plan, "fine", request, effects)
         seams = register_fine(plan, raw, mosaic) if plan.registers else None
-    patches = cut_patches(plan, request, raw, seams)
-    class_map = draw_map(plan, mosaic, patches)
+    patches = extract_patches(plan, request, raw, seams)
+    class_map = segment(plan, mosaic, patches)
     return mosaic, class_map
 
 

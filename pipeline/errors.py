@@ -62,7 +62,7 @@ class BudgetError(PipelineError, ValueError):
 
 
 class NoScanPaidFor(BudgetError):  # noqa: N818 - said of scans
-    """No plain scan that some weights read costs as little; others may read fewer lines."""
+    """No uniform scan that some weights read costs as little; others may read fewer lines."""
 
 
 class SceneError(PipelineError, ValueError):

@@ -66,7 +66,7 @@ MOST_EDGE = 0.1  # of a picture's edge that is one value: by chance it is less
 
 
 def edge_fill(edge: NDArray[Any]) -> tuple[float, float] | None:
-    """The value that a picture's edge may be filled with, and its share of the edge; None where nothing suggests one.
+    """The value that a picture's edge may be filled with, and its fraction of the edge; None where nothing suggests one.
 
     ``edge`` is (pixel, band), NaN where nothing is known. Taken is the commonest value that all bands of a pixel have,
     where it is 0 or less, the most that its kind of whole numbers holds, or no reading.
@@ -75,8 +75,8 @@ def edge_fill(edge: NDArray[Any]) -> tuple[float, float] | None:
     if not alike.size:
         return None
     values, counts = np.unique(alike, return_counts=True)
-    value, share = values[counts.argmax()], float(counts.max()) / len(edge)
+    value, fraction = values[counts.argmax()], float(counts.max()) / len(edge)
     ends = edge.dtype.kind in "iu" and value == np.iinfo(edge.dtype).max
-    if share < MOST_EDGE or not (value <= 0 or ends or value > MOST_VALUE):
+    if fraction < MOST_EDGE or not (value <= 0 or ends or value > MOST_VALUE):
         return None
-    return float(value), share
+    return float(value), fraction

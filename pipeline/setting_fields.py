@@ -40,7 +40,7 @@ def stated(
 assumed = partial(stated, source="assumed")  # nobody has confirmed the default on a unit
 
 
-def number_words(low: float, high: float, unit: str = "", *, endless: bool = False) -> str:
+def format_number(low: float, high: float, unit: str = "", *, endless: bool = False) -> str:
     """What a number may be, for a message."""
     words = f"a number from {low:g} to {high:g}" if math.isfinite(high) else f"a number of at least {low:g}"
     return words + (f" {unit}" if unit else "") + (" or inf" if endless else "")
@@ -60,7 +60,7 @@ def misfits(part: Any) -> Iterator[tuple[str, str]]:
             continue
         endless = item.default in (None, math.inf)
         if isinstance(value, bool) or not low <= value <= high or (math.isinf(value) and not endless):
-            words = number_words(low, high, item.metadata["json_schema_extra"]["unit"], endless=endless)
+            words = format_number(low, high, item.metadata["json_schema_extra"]["unit"], endless=endless)
             yield item.name, f"must be {words}, got {value!r}"
 
 

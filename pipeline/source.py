@@ -30,19 +30,19 @@ class Line:
 
 @dataclass(frozen=True)
 class References:
-    """Dark and white frames of one sweep's binning, (sample, band) float32 DN, and the panel's value per band.
+    """Dark and white frames of one sweep's binning, (sample, band) float32 DN, and the white reference's value per band.
 
-    A sample's scene value is ``(raw - dark) / (white - dark) * panel``, over ``flat`` where there is one, over the
+    A sample's scene value is ``(raw - dark) / (white - dark) * white_reference``, over ``flat`` where there is one, over the
     mirror's throughput where ``by_mirror`` says that the light falls off with its tilt. ``bad`` elements of the
     detector are not to be believed.
     """
 
     dark: NDArray[np.float32]
     white: NDArray[np.float32]
-    panel: NDArray[np.float32]
+    white_reference: NDArray[np.float32]
     bad: NDArray[np.bool_] | None = None  # (sample, band)
     flat: NDArray[np.float32] | None = None  # (sample, band) relative response left over by the white frame
-    by_mirror: bool = False  # white was taken at rest; away from it the mirror passes another share of the light
+    by_mirror: bool = False  # white was taken at rest; away from it the mirror passes another fraction of the light
 
 
 class Source(Protocol):

@@ -90,7 +90,7 @@ class NoRunError(ArchiveError, KeyError):
 class OpenedRun:
     """One published run. Arrays are read when they are used; see `OpenedArchive` for how to come by one.
 
-    What lies on the scene's own grid (class map, confidence, mosaic, beliefs) has the scene's CRS where it had one, and
+    What lies on the scene's own grid (class map, confidence, mosaic, class probabilities) has the scene's CRS where it had one, and
     directions seen from the rig [rad] where it had none. A run with a ``[pose]`` has a ``ground_map`` besides.
     """
 
@@ -146,7 +146,7 @@ class OpenedRun:
 
     @property
     def mosaic(self) -> xarray.DataArray:
-        """(y, x, band) float32 values of the coarse look, NaN where nothing was seen; indexed by ``wavelength`` too."""
+        """(y, x, band) float32 values of the coarse pass, NaN where nothing was seen; indexed by ``wavelength`` too."""
         return self.dataset("mosaic")["values"]
 
     @property
@@ -156,14 +156,14 @@ class OpenedRun:
 
     @property
     def attention(self) -> xarray.Dataset:
-        """Worth (``score``) and order (``rank``, -1 not looked at) of every seat, (seat_y, seat_x)."""
+        """Worth (``score``) and order (``rank``, -1 not looked at) of every patch, (seat_y, seat_x)."""
         return self.dataset("attention")
 
     @property
     def ground_map(self) -> xarray.Dataset:
         """All on the map, where the survey had a ``[pose]``; its CRS in ``spatial_ref``.
 
-        ``classes``, ``confidence`` and ``picture``; ``age`` [days], and of a later visit ``changed`` (share of the
+        ``classes``, ``confidence`` and ``picture``; ``age`` [days], and of a later visit ``changed`` (fraction of the
         patch) and ``changed_from`` (class before, 255 where it is the same).
         """
         return self.dataset("ground_map")
@@ -180,7 +180,7 @@ class OpenedRun:
         return tuple(name for name, where in self.receipt["products"].items() if where.endswith(".zarr"))
 
     def dataset(self, product: str) -> xarray.Dataset:
-        """Open all arrays of a product, such as ``belief`` or ``lookup``.
+        """Open all arrays of a product, such as ``probabilities`` or ``geolocation``.
 
         Raises IncompleteStoreError: this run has left no such product, or it is damaged.
         """

@@ -50,7 +50,7 @@ USUAL = {"engine": "plain"}  # a server of Prefect's is started where it is aske
 TOKENS = ("dim", "layers", "heads", "mlp_ratio")
 MADE_HERE = ("dataset", "choices", "tokens", "settings", "command", "camera")  # of requests
 FILES = ("weights",)
-LISTS = (*FILES, "shares", "policies", "frames")
+LISTS = (*FILES, "fractions", "policies", "frames")
 OF_ONE_SCENE = ("labels", "bands", "wavelengths", "train_mask", "mask_classes")
 
 
@@ -64,7 +64,7 @@ def survey(settings: Asked = None, *, progress: Told | None = None, quiet: bool 
     settings
         A settings file (TOML), or its content as a dictionary. Keywords win over it.
     progress
-        Called as ``progress(stage, done, total)`` whenever a stage has come further; ``done / total`` is its share.
+        Called as ``progress(stage, done, total)`` whenever a stage has come further; ``done / total`` is its fraction.
     quiet
         False prints on stderr what the command would.
     flags
@@ -106,7 +106,7 @@ def evaluate(dataset: str | Path | OpenedRun, *, progress: Told | None = None, *
     progress
         As for `survey`.
     flags
-        Those of `spectralzoom evaluate`, lists as Python's: ``shares=[0.1, 0.2]``, ``out="judged"``.
+        Those of `spectralzoom evaluate`, lists as Python's: ``fractions=[0.1, 0.2]``, ``out="judged"``.
 
     Returns
     -------

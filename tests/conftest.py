@@ -27,14 +27,16 @@ from models.network.spectral import Normalisation, SpectralBasis
 from models.weights.files import Weights, save_weights, with_record
 from storage.readers.labels import default_colour
 from tests.object_server import bucket, machine, s3_server  # noqa: F401 - fixtures
-from tests.remembered_work import WORKED_OUT, remember, with_effects, without_effects
+from tests.prior_work import WORKED_OUT, remember, with_effects, without_effects
 
 RGB_NM = (640.0, 550.0, 460.0)
 CLASSES = ("class_0", "class_1", "class_2")  # as a label file of the numbers 0..2 names them
 
 WeightsMaker = Callable[..., Path]
 Survey = Callable[..., Published]
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # for what tests start; workers that share cores lose most of their time
+os.environ.setdefault(
+    "OMP_NUM_THREADS", "1"
+)  # for what tests start; workers that fraction cores lose most of their time
 torch.set_num_threads(1)
 law_settings.register_profile("anew", deadline=None, max_examples=40)  # a loaded machine is no broken law
 law_settings.register_profile("settled", law_settings.get_profile("anew"), derandomize=True)  # a change alone breaks it
@@ -82,12 +84,12 @@ def patchy_scene(shape: tuple[int, int], bands: int, seed: int) -> tuple[NDArray
 
 
 @pytest.fixture(scope="session", autouse=True)
-def remembered_work(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+def prior_work(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """What surveys of one scene and rig have in common is worked out once for all workers of a session."""
     base = tmp_path_factory.getbasetemp()
     shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
     with pytest.MonkeyPatch.context() as patch:
-        remember(shared / "remembered", patch.setattr)
+        remember(shared / "prior_map", patch.setattr)
         yield
 
 

@@ -107,7 +107,7 @@ def gc(
             raw_too=raw_too,
             made_again=versions_made_again() if patches_too else {},
             dry_run=dry_run,
-            progress=lambda removal, share: bars.show("gc", share, removal.uri),
+            progress=lambda removal, fraction: bars.show("gc", fraction, removal.uri),
         )
     content = {
         "archive": opened.name,
@@ -127,7 +127,7 @@ def run_verify(
     """Read an archive again; with ``remake`` have what is broken made anew by ``rerun`` (settings in, a run out)."""
     opened = open_archive(archive, create=False, write=remake)
     with StageProgress(console, {"verify": "reading again"}) as bars:
-        findings = verify_archive(opened, lambda uri, share: bars.show("verify", share, uri))
+        findings = verify_archive(opened, lambda uri, fraction: bars.show("verify", fraction, uri))
         bars.show("verify", 1.0, ended=True)
     bad = [finding for finding in findings if finding.problem is not None]
     content = verdict(opened, findings)
@@ -395,14 +395,14 @@ def _show_changes(content: dict[str, Any], console: Console) -> None:
 
 
 def _branch(node: Mapping[str, Any], parent: Tree | None) -> Tree:
-    words = _node_words(node)
+    words = _format_node(node)
     tree = Tree(words) if parent is None else parent.add(words)
     for given in node["inputs"]:
         _branch(given, tree)
     return tree
 
 
-def _node_words(node: Mapping[str, Any]) -> str:
+def _format_node(node: Mapping[str, Any]) -> str:
     if "stage" not in node:
         return f"[bold red]{escape(node['uri'])} {escape(node['problem'])}[/]"
     name = f"[bold]{escape(node['stage'])}[/] {escape(node['key'][:SHORT_KEY])}"

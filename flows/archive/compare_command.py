@@ -17,7 +17,7 @@ from flows.publish.receipt import areas_on_ground
 from flows.publish.receipt_table import COST_LABELS
 from flows.settings.survey_settings import BUILT_IN_SCENES
 from flows.tasks.scores import score_of
-from flows.terminal.figures import area_words, format_count, format_percent, format_points, known_number
+from flows.terminal.figures import format_area, format_count, format_percent, format_points, known_number
 from flows.terminal.processes import DONE
 from flows.terminal.progress import put_out
 from pipeline.errors import ArchiveError, SceneError, ShapeError
@@ -69,7 +69,11 @@ def compare(archive: ArchiveName, old: str, new: str, *, out: OutFolder = None, 
     content = _comparison(runs, maps)
     name = f"compare-{runs[0].folder.name}-{runs[1].folder.name}.png"
     with written_aside(folder, [name]) as aside:
-        titles = (content["a"]["run"], content["b"]["run"], f"{format_percent(content['differing']['share'])} differ")
+        titles = (
+            content["a"]["run"],
+            content["b"]["run"],
+            f"{format_percent(content['differing']['fraction'])} differ",
+        )
         panels.draw_difference(aside / name, maps, titles)
     content["picture"] = str(folder / name)
     put_out(content, show_comparison, as_json=as_json)
@@ -154,9 +158,14 @@ def _comparison(runs: tuple[Run, Run], maps: list[ClassMap]) -> dict[str, Any]:
     return {
         **{side: {"run": run.folder.name, **one} for side, run, one in zip("ab", runs, sides, strict=True)},
         "classes": _classes(runs, joint, names),
-        "differing": {"pixels": differing, "share": differing / old.size},
+        "differing": {"pixels": differing, "fraction": differing / old.size},
         "largest": [
-            {"from": names[i], "to": names[j], "pixels": int(changed[i, j]), "share": float(changed[i, j] / old.size)}
+            {
+                "from": names[i],
+                "to": names[j],
+                "pixels": int(changed[i, j]),
+                "fraction": float(changed[i, j] / old.size),
+            }
             for i, j in pairs
         ],
         "settings": _changes(*asked),
@@ -174,7 +183,7 @@ def _classes(runs: tuple[Run, Run], joint: NDArray[np.int64], names: list[str]) 
         both, pixels = int(joint[number, number]), [int(joint[number].sum()), int(joint[:, number].sum())]
         if either := sum(pixels) - both:
             row: dict[str, Any] = {"name": name, "pixels": pixels, "iou": both / either}
-            row["share"] = [count / int(joint.sum()) for count in pixels]
+            row["fraction"] = [count / int(joint.sum()) for count in pixels]
             if len(hectares) == 2 and number < len(names) - 1:
                 row["ha"] = [float(area.get(name, 0.0)) for area in hectares]
             found.append(row)
@@ -212,11 +221,11 @@ def show_comparison(content: dict[str, Any], console: Console) -> None:
     console.print(table)
     table = _table("class", "px in A", "px in B", "in A", "in B", "IoU of A and B")
     for row in content["classes"]:
-        cells = [*map(area_words, row["ha"])] if "ha" in row else [*map(format_count, row["pixels"])]
-        table.add_row(escape(row["name"]), *cells, *map(format_percent, row["share"]), format_points(row["iou"]))
+        cells = [*map(format_area, row["ha"])] if "ha" in row else [*map(format_count, row["pixels"])]
+        table.add_row(escape(row["name"]), *cells, *map(format_percent, row["fraction"]), format_points(row["iou"]))
     console.print(table)
-    told = content["differing"]
-    console.print(f"{format_count(told['pixels'])} px, {format_percent(told['share'])} differ")
+    figures = content["differing"]
+    console.print(f"{format_count(figures['pixels'])} px, {format_percent(figures['fraction'])} differ")
     for row in content["largest"]:
         console.print(escape(f"  {row['from']} to {row['to']}: {format_count(row['pixels'])} px"), soft_wrap=True)
     console.print(escape(f"  {content['picture']}"), soft_wrap=True)

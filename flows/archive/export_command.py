@@ -17,8 +17,8 @@ from flows.archive.export_layers import (
     ExportedRun,
     Layer,
     map_layers,
-    memory_layers,
     open_exported,
+    prior_map_layers,
     seen_rows,
     write_layer_style,
 )
@@ -55,7 +55,7 @@ from storage.export.stac_items import (
 from storage.remote.opening import open_archive
 
 COLLECTION_TEXT = (
-    "Surveys exported from the archive {}: a coarse look at a whole field, a fine look where it changes the map. Where "
+    "Surveys exported from the archive {}: a coarse pass at a whole field, a fine look where it changes the map. Where "
     "no survey says where it was, the extent is the whole earth."
 )
 ENVI_NUMBERS = "application/octet-stream"
@@ -122,7 +122,7 @@ def run_export(
     surveys = opened.archive.root.name
     collection_id = clean_id(surveys, "surveys")
     choice = check_zones(opened, choice)
-    layers = [*map_layers(opened), *memory_layers(opened), *spectral_layers(opened, choice)]
+    layers = [*map_layers(opened), *prior_map_layers(opened), *spectral_layers(opened, choice)]
     export = Export(opened, out)
     try:
         with ExitStack() as stack:
@@ -251,7 +251,7 @@ def name_stores(export: Export) -> None:
     stores: dict[str, tuple[str, dict[str, Any]]] = {
         "mosaic": ("Coarse mosaic", {**places["mosaic"], **bands}),
         "class_map": ("Class map and confidence on the camera's grid", places["class_map"]),
-        "attention": ("Score and rank of the seats", nowhere),
+        "attention": ("Score and rank of the patches", nowhere),
         "patches": ("Fine patches", nowhere),
     }
     if run.geobox is not None and run.map_product == "ground_map":

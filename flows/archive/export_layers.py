@@ -32,7 +32,7 @@ from storage.export.stac_items import classes
 Rows = Iterator[tuple[int, NDArray[Any]]]
 RGB = ("red", "green", "blue")
 LATEST = "latest"
-BELIEF, GROUND = "belief", "ground_map"
+PROBABILITIES, GROUND = "class_probabilities", "ground_map"
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class Layer:
 
 
 def map_layers(run: ExportedRun) -> list[Layer]:
-    """Class map, confidence, attention (on its seats) and picture: on the map where there is one, else on angles."""
+    """Class map, confidence, attention (on its patches) and picture: on the map where there is one, else on angles."""
     product = run.map_product
     about = open_image(run.path(product), "classes").about
     colours = np.array(about.get("class_colours", ()), np.uint8).reshape(-1, 3)
@@ -129,12 +129,12 @@ def map_layers(run: ExportedRun) -> list[Layer]:
     drawn = image_layer(run, product, "classes", ("class",), nodata=UNLABELLED, legend=legend)
     sure = image_layer(run, product, "confidence", ("confidence",), nodata=np.nan)
     seen = _picture(run) if product == "class_map" else image_layer(run, product, "picture", RGB, nodata=0)
-    score = seat_layer(run, "attention", "score", ("score",))
+    score = patch_layer(run, "attention", "score", ("score",))
     return [
         Layer("class_map", "Class map", ("data",), *drawn, fields=classes(legend)),
         Layer("confidence", "Probability of the class given", ("data", "confidence"), *sure, "1"),
-        Layer("attention", "Worth of a fine look, by seat", ("data",), *score, "1"),
-        Layer("rgb", "Picture of the coarse look", ("visual", "overview"), *seen),
+        Layer("attention", "Worth of a fine look, by patch", ("data",), *score, "1"),
+        Layer("rgb", "Picture of the coarse pass", ("visual", "overview"), *seen),
     ]
 
 
@@ -176,10 +176,10 @@ def image_layer(
     return image, stored.rows
 
 
-def seat_layer(
+def patch_layer(
     run: ExportedRun, product: str, array: str, bands: tuple[str, ...]
 ) -> tuple[CogImage, Callable[[], Rows]]:
-    """A figure of each seat, on the grid of the scene that their size in pixels gives."""
+    """A figure of each patch, on the grid of the scene that their size in pixels gives."""
     stored, drawn = open_image(run.path(product), array), run.store("class_map")
     assert drawn is not None
     patch = int(run.archive.manifest(drawn)["params"]["grid"]["patch"])
@@ -191,7 +191,7 @@ def seat_layer(
     on_angles = Place.on_angles(replace(scene, factor=patch), shape)
     place = on_angles if geobox is None else Place.on_map(zoomed_out(geobox, patch, shape))
     policy = {"policy": str(stored.about.get("policy", ""))} if product == "attention" else {}
-    tags = {**layer_tags(run, product, place), **policy, "seat_px": str(patch)}
+    tags = {**layer_tags(run, product, place), **policy, "patch_px": str(patch)}
     return CogImage(shape, stored.dtype.name, place, bands, np.nan, tags=tags), stored.rows
 
 
@@ -220,19 +220,19 @@ def seen_rows(run: ExportedRun) -> Iterator[tuple[int, NDArray[np.bool_]]]:
         yield first, (numbers != UNLABELLED) | (picture.max(axis=2) > 0)
 
 
-def memory_layers(run: ExportedRun) -> list[Layer]:
+def prior_map_layers(run: ExportedRun) -> list[Layer]:
     """Days since each pixel was looked at; of a run that goes on from another what changed, and from which class.
 
     On the map where there is a pose. A run that believes nothing, of an earlier version, has none of them.
     """
     layers = []
     if (product := _product_with(run, "age")) is not None:
-        seen = _ages(run) if product == BELIEF else image_layer(run, product, "age", ("age",), nodata=np.nan)
+        seen = _ages(run) if product == PROBABILITIES else image_layer(run, product, "age", ("age",), nodata=np.nan)
         layers.append(Layer("age", "Days since the pixel was looked at", ("data",), *seen, "days"))
     if (product := _product_with(run, "changed")) is not None:
-        title = "Share of the patch's pixels with another class than remembered"
-        if product == BELIEF:
-            changed = seat_layer(run, BELIEF, "changed", ("changed",))
+        title = "Fraction of the patch's pixels with another class than remembered"
+        if product == PROBABILITIES:
+            changed = patch_layer(run, PROBABILITIES, "changed", ("changed",))
         else:
             changed = image_layer(run, product, "changed", ("changed",), nodata=np.nan)
         layers.append(Layer("changed", title, ("data",), *changed, "1"))
@@ -246,13 +246,13 @@ def memory_layers(run: ExportedRun) -> list[Layer]:
 
 def _product_with(run: ExportedRun, array: str) -> str | None:
     """The store of which an image is taken: the map on the ground, else what is believed; None where neither has it."""
-    products = (name for name in (GROUND, BELIEF) if run.store(name) is not None)
+    products = (name for name in (GROUND, PROBABILITIES) if run.store(name) is not None)
     return next((name for name in products if array in open_group(run.path(name))), None)
 
 
 def _ages(run: ExportedRun) -> tuple[CogImage, Callable[[], Rows]]:
     """Ages of the field's own pixels, unpacked: few readers of GeoTIFF know of scales."""
-    image, packed = image_layer(run, BELIEF, "age", ("age",), nodata=np.nan)
+    image, packed = image_layer(run, PROBABILITIES, "age", ("age",), nodata=np.nan)
     return replace(image, dtype="float32"), lambda: ((first, unpacked_days(rows)) for first, rows in packed())
 
 

@@ -23,10 +23,10 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.ground.map_grid import GroundGrid, grid_of_map, image_at, map_blocks
 from pipeline.ground.view import GroundView, RigPose
-from pipeline.products.areas import ShareEstimate, probable_shares, stratified_shares
+from pipeline.products.areas import FractionEstimate, probable_fractions, stratified_fractions
 from pipeline.products.indices import SpectralIndex, index_values, pick_bands, white_level
 from storage.archive.whole_files import write_whole
-from storage.arrays.class_maps import BeliefStore
+from storage.arrays.class_maps import ProbabilityStore
 from storage.arrays.georeference import load_geobox
 from storage.arrays.ground_maps import load_bands, open_image
 from storage.arrays.layout import grid_of, read_array
@@ -38,11 +38,11 @@ COLUMNS = (
     "class",
     "pixels",
     "hectares",
-    "share",
+    "fraction",
     "mean_confidence",
-    "estimated_share",
+    "estimated_fraction",
     "estimated_hectares",
-    "standard_error_share",
+    "standard_error_fraction",
     "standard_error_hectares",
     "estimated_from",
 )
@@ -62,18 +62,18 @@ def write_areas(run: ExportedRun, path: Path) -> None:
     if "ground" in run.receipt:
         areas = run.receipt["ground"]["areas_ha"]
         hectares = np.array([areas.get(name, 0.0) for name in names], np.float64)
-    share = pixels / max(pixels.sum(), 1) if hectares is None else hectares / (hectares.sum() or 1.0)
-    estimate, source = _estimate(run, share)
+    fraction = pixels / max(pixels.sum(), 1) if hectares is None else hectares / (hectares.sum() or 1.0)
+    estimate, source = _estimate(run, fraction)
     total = np.nan if hectares is None else hectares.sum()
     own = np.full(len(names), np.nan) if hectares is None else hectares
-    figures = (own, share, confidence, estimate.shares, estimate.shares * total, estimate.errors)
+    figures = (own, fraction, confidence, estimate.fractions, estimate.fractions * total, estimate.errors)
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(COLUMNS)
     for number, (name, count) in enumerate(zip(names, pixels.tolist(), strict=True)):
         own_figures = [figure[number] for figure in (*figures, estimate.errors * total)]
-        told = [f"{value:.{DIGITS}g}" if np.isfinite(value) else "" for value in own_figures]
-        table.writerow([name, count, *told, source])
+        cells = [f"{value:.{DIGITS}g}" if np.isfinite(value) else "" for value in own_figures]
+        table.writerow([name, count, *cells, source])
     write_whole(path, text.getvalue())
 
 
@@ -90,20 +90,20 @@ def _counted(path: Path, count: int) -> tuple[NDArray[np.int64], NDArray[np.floa
     return pixels[:count], np.where(sure_pixels > 0, sums / np.maximum(sure_pixels, 1), np.nan)[:count]
 
 
-def _estimate(run: ExportedRun, share: NDArray[np.float64]) -> tuple[ShareEstimate, str]:
+def _estimate(run: ExportedRun, fraction: NDArray[np.float64]) -> tuple[FractionEstimate, str]:
     """Shares with their errors: by the confusion matrix of the receipt where there is one, else by probabilities."""
     confusion = run.receipt.get("accuracy", {}).get("confusion")
     if confusion is not None:
-        return stratified_shares(share, confusion), "labels"
-    if run.store("belief") is None:
-        unknown = np.full(len(share), np.nan)
-        return ShareEstimate(unknown, unknown), ""
-    return probable_shares(_probabilities(run, len(share)), len(share)), "probabilities"
+        return stratified_fractions(fraction, confusion), "labels"
+    if run.store("class_probabilities") is None:
+        unknown = np.full(len(fraction), np.nan)
+        return FractionEstimate(unknown, unknown), ""
+    return probable_fractions(_probabilities(run, len(fraction)), len(fraction)), "probabilities"
 
 
 def _probabilities(run: ExportedRun, count: int) -> Iterator[NDArray[np.float32]]:
     """What is believed of the pixels with a class, (y, x, class); of those called unknown that they are, for sure."""
-    store = BeliefStore(run.path("belief"))
+    store = ProbabilityStore(run.path("class_probabilities"))
     for first, drawn in open_image(run.path("class_map"), "classes").rows():
         values = np.exp(store.read(slice(first, first + len(drawn)))[0])
         known = values.shape[-1]
@@ -213,7 +213,7 @@ class RasterView:
     @property
     def words(self) -> str:
         """How much of the image is the raster's own pixels."""
-        kept, every = 0 if self.patches is None else len(self.patches.seats), len(self.grid.valid_seats())
+        kept, every = 0 if self.patches is None else len(self.patches.patch_index), len(self.grid.valid_patches())
         s = self.grid.factor
         if kept == every:
             return "Pixels of the raster"
@@ -222,15 +222,17 @@ class RasterView:
     def rows(self, bands: Sequence[int]) -> Rows:
         """Values (row, x, band) of some bands with the number of the first row, from the top down."""
         grid, chosen = self.grid, list(bands)
-        p, s, (_, across) = grid.patch, grid.factor, grid.seat_shape
+        p, s, (_, across) = grid.patch, grid.factor, grid.patch_shape
         means = open_image(self.run.path("mosaic"), "values")
-        seats = np.empty(0, np.int64) if self.patches is None else self.patches.seats
+        patch_index = np.empty(0, np.int64) if self.patches is None else self.patches.patch_index
         for first in range(0, grid.height, p * s):  # rows that hold whole patches and whole means
             coarse = read_array(means.group, "values", slice(first // s, first // s + p))[..., chosen]
             rows = np.repeat(np.repeat(coarse, s, axis=0), s, axis=1)[: grid.height - first, : grid.width].copy()
-            entries = np.flatnonzero(seats // across // s == first // (p * s))
+            entries = np.flatnonzero(patch_index // across // s == first // (p * s))
             if self.patches is not None and len(entries):
-                for patch, (y, x) in zip(self.patches.pick(entries), grid.seat_origin(seats[entries]), strict=True):
+                for patch, (y, x) in zip(
+                    self.patches.pick(entries), grid.patch_origin(patch_index[entries]), strict=True
+                ):
                     place = rows[y - first : y - first + p, x : x + p]
                     place[...] = patch[: place.shape[0], : place.shape[1], chosen]
             yield first, rows
@@ -281,15 +283,15 @@ def _reflectance(view: MosaicView | RasterView, white: float) -> Layer:
         view.place,
         tuple(f"{centre:.1f} nm" for centre in wave.tolist()),
         np.nan,
-        tags={**layer_tags(view.run, "mosaic", view.place), "values": _words(white), "pixels": view.words},
+        tags={**layer_tags(view.run, "mosaic", view.place), "values": _format_value(white), "pixels": view.words},
         wavelength_nm=wave.tolist(),
         fwhm_nm=None if width is None else width.tolist(),
     )
-    title = f"{view.words}, {len(wave)} bands: {_words(white)}"
+    title = f"{view.words}, {len(wave)} bands: {_format_value(white)}"
     return Layer("reflectance", title, ("data", "reflectance"), image, lambda: view.rows(range(len(wave))), "1")
 
 
-def _words(white: float) -> str:
+def _format_value(white: float) -> str:
     return "reflectance, 0 to 1" if white == 1.0 else "values of the scene, not reflectance"
 
 

@@ -35,7 +35,7 @@ from storage.export.map_files import (
     STYLE,
     Entry,
     TaskGrid,
-    TaskWords,
+    TaskText,
     ramp_colour,
     write_geojson,
     write_geopackage,
@@ -169,7 +169,7 @@ def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, cho
         place = plane(x, y)
         return heading.to_axes(place[..., 0], place[..., 1])
 
-    grid, found = _dosed(raster, doses, asked.least_share, (asked.cell_m, asked.cell_m), along_heading)
+    grid, found = _dosed(raster, doses, asked.least_fraction, (asked.cell_m, asked.cell_m), along_heading)
     seen = np.isfinite(found)
     row, column = np.nonzero(seen)
     columns = {"dose": found[seen], "unit": [asked.unit.name] * len(row), "row": row, "col": column}
@@ -184,9 +184,9 @@ def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, cho
     yield _styled(path, "dose", shown)
     step = tuple(round(asked.cell_m / metres, DEGREE_DIGITS) for metres in degree_m(raster.geobox))
     degrees = to_degrees(raster.geobox)
-    grid, found = _dosed(raster, doses, asked.least_share, (step[0], step[1]), degrees)
+    grid, found = _dosed(raster, doses, asked.least_fraction, (step[0], step[1]), degrees)
     known = int((raster.classes != UNLABELLED).sum())
-    told = TaskWords(
+    about = TaskText(
         run.receipt["survey"],
         run.receipt["survey"],
         words,
@@ -196,7 +196,7 @@ def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, cho
     task = TaskGrid(*grid.corner, *grid.step, found, asked.unit)
     for key, path, kind in zip(
         ("task_data", "task_grid"),
-        write_task_data(folder, task, told),
+        write_task_data(folder, task, about),
         ("application/xml", "application/octet-stream"),
         strict=True,
     ):
@@ -206,7 +206,7 @@ def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, cho
 
 
 def _dosed(
-    raster: ClassRaster, doses: dict[int, float], least_share: float, step: tuple[float, float], to_axes: ToAxes
+    raster: ClassRaster, doses: dict[int, float], least_fraction: float, step: tuple[float, float], to_axes: ToAxes
 ) -> tuple[CellGrid, NDArray[np.float64]]:
     """Cells around all that has a class, and their doses."""
     known = raster.classes != UNLABELLED
@@ -219,11 +219,11 @@ def _dosed(
     around = np.concatenate([*(edge[columns[0] : columns[-1] + 1] for edge in edges), sides.reshape(-1, 2)])
     grid = CellGrid.around(around, step)
     counts = count_classes(grid, raster.classes, raster.transform, to_axes, len(raster.legend.names))
-    return grid, dose_cells(counts, doses, least_share)
+    return grid, dose_cells(counts, doses, least_fraction)
 
 
 def row_heading(run: ExportedRun) -> float:
-    """Heading of the crop rows on the map, 0 to 180 degrees clockwise from north, as the coarse look shows them.
+    """Heading of the crop rows on the map, 0 to 180 degrees clockwise from north, as the coarse pass shows them.
 
     Raises SettingsError: no rows are seen.
     """

@@ -20,10 +20,10 @@ from rich.markup import escape
 from flows.archive.stale_runs import called
 from flows.cli.app import ArchiveName, AsJson, OutFile, check_outside, stderr
 from flows.publish.receipt import areas_on_ground
-from flows.publish.receipt_table import days_words
+from flows.publish.receipt_table import format_days
 from flows.settings.survey_settings import BUILT_IN_SCENES
 from flows.tasks.scores import score_of
-from flows.terminal.figures import DASH, area_words, counted, format_percent, format_seconds, known_number
+from flows.terminal.figures import DASH, counted, format_area, format_percent, format_seconds, known_number
 from flows.terminal.processes import DONE
 from flows.terminal.progress import print_json
 from pipeline.errors import ArchiveError, SettingsError, visible
@@ -33,7 +33,7 @@ from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run
 from storage.archive.whole_files import write_whole
-from storage.arrays.class_maps import BeliefStore, ClassMap, load_class_map
+from storage.arrays.class_maps import ClassMap, ProbabilityStore, load_class_map
 from storage.remote.opening import open_archive
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ MOST_ROWS = 1000  # of the table; older ones are counted
 MOST_VISITS = 24  # that a page shows: the newest
 MOST_PX = 400  # of a visit's picture
 MOST_CLASSES = 128  # that are told apart, the last of them standing for none
-CHANGED_SHARE = 0.25  # of a patch's pixels, from which it is said to have changed
+CHANGED_FRACTION = 0.25  # of a patch's pixels, from which it is said to have changed
 PALE = 0.8  # of what did not change
 SAVINGS = {"capture_s": "time at the camera", "lines": "lines", "bytes_stored": "stored data", "multiply_adds": "model"}
 SCORES = {"miou": "mIoU", "overall_accuracy": "overall"}
@@ -122,7 +122,9 @@ def read_histories(archive: Archive, field: str | None = None) -> list[FieldHist
         raise ArchiveError(f"no field of {archive.name} is called {field!r}; {hint}")
     found = []
     for name in names if field is None else [field]:
-        own = sorted((run for run in catalogue.runs if called(run) == name), key=lambda run: str(look_of(run) or ""))
+        own = sorted(
+            (run for run in catalogue.runs if called(run) == name), key=lambda run: str(time_of_visit(run) or "")
+        )
         maps = {run.uri: shown for run in own if (shown := _map_of(archive, catalogue, run)) is not None}
         rows = [_row(run, maps.get(run.uri)) for run in own]
         mapped = [(run, row) for run, row in zip(own, rows, strict=True) if run.uri in maps][-MOST_VISITS:]
@@ -159,12 +161,12 @@ def _row(run: Run, shown: ClassMap | None) -> Row:
         "run": run.uri,
         "created": run.created,
         "visit": run.settings.get("visit"),
-        "looked": None if (at := look_of(run)) is None else at.isoformat().replace("+00:00", "Z"),
+        "looked": None if (at := time_of_visit(run)) is None else at.isoformat().replace("+00:00", "Z"),
         "capture_seconds": {name: known_number(entries["capture_s"].get(name)) for name in ("done", "full")},
         **score_of(run.receipt),
         "savings": {name: known_number(entry.get("ratio")) for name, entry in entries.items()},
         "areas": areas,
-        "unit": "share" if hectares is None else "ha",
+        "unit": "fraction" if hectares is None else "ha",
         "problem": run.problem,
     }
 
@@ -177,7 +179,7 @@ def read_moment(value: object) -> datetime | None:
     return None
 
 
-def look_of(run: Run) -> datetime | None:
+def time_of_visit(run: Run) -> datetime | None:
     """Return the moment that a run's visit is called by, else the day that its farm was drawn on.
 
     Of others when they began, or were published. The day is of the year in which the run was published. None where
@@ -201,14 +203,14 @@ def _visit(archive: Archive, run: Run, row: Row, shown: ClassMap) -> dict[str, s
     thin = slice(None, None, -(-max(shown.classes.shape) // MOST_PX))
     palette = pictures.palette_bytes(shown.names[: MOST_CLASSES - 1], shown.colours[: MOST_CLASSES - 1])[:MOST_CLASSES]
     numbers, changes = np.minimum(shown.classes[thin, thin], MOST_CLASSES - 1), ""
-    address = run.products.get("belief")
+    address = run.products.get("class_probabilities")
     with suppress(OSError, LookupError, ValueError):
-        store = None if address is None else BeliefStore(archive.locate(address))
+        store = None if address is None else ProbabilityStore(archive.locate(address))
         changed = None if store is None else store.changed()
         if store is not None and changed is not None:
-            seats = (changed >= CHANGED_SHARE).repeat(store.patch_px, axis=0).repeat(store.patch_px, axis=1)
+            patch_index = (changed >= CHANGED_FRACTION).repeat(store.patch_px, axis=0).repeat(store.patch_px, axis=1)
             pale = np.rint(255 * PALE + (1 - PALE) * palette).astype(np.uint8)
-            kept = seats[: shown.classes.shape[0], : shown.classes.shape[1]][thin, thin]
+            kept = patch_index[: shown.classes.shape[0], : shown.classes.shape[1]][thin, thin]
             table = np.concatenate([palette, pale])
             changes = pictures.png_address(numbers + np.where(kept, 0, MOST_CLASSES).astype(np.uint8), table)
     when = _short(str(row["looked"] or row["created"]))
@@ -218,11 +220,11 @@ def _visit(archive: Archive, run: Run, row: Row, shown: ClassMap) -> dict[str, s
         "when": when,
         "map": pictures.png_address(numbers, palette),
         "changes": changes,
-        "words": _words(run.receipt),
+        "words": _format_row(run.receipt),
     }
 
 
-def _words(receipt: Mapping[str, Any]) -> str:
+def _format_row(receipt: Mapping[str, Any]) -> str:
     """Seconds spent, and what became of the prior map."""
     capture, memory = (receipt.get("savings") or {}).get("capture_s") or {}, receipt.get("memory")
     seconds = known_number(capture.get("done"))
@@ -231,8 +233,8 @@ def _words(receipt: Mapping[str, Any]) -> str:
         return ", ".join([*parts, "a first look"])
     if memory.get("put_aside"):
         return ", ".join([*parts, f"its prior map put aside ({memory['put_aside']})"])
-    share = memory["changed_px"] / memory["compared_px"] if memory.get("compared_px") else 0.0
-    return ", ".join([*parts, f"goes on from {days_words(memory['days'])}", f"{format_percent(share)} changed"])
+    fraction = memory["changed_px"] / memory["compared_px"] if memory.get("compared_px") else 0.0
+    return ", ".join([*parts, f"goes on from {format_days(memory['days'])}", f"{format_percent(fraction)} changed"])
 
 
 def render_history(history: FieldHistory, runs_at: str) -> str:
@@ -246,12 +248,12 @@ def render_history(history: FieldHistory, runs_at: str) -> str:
 
     colours = {name.replace("_", " "): colour for name, colour in history.colours.items()}
     charts: list[tuple[str, Points, bool]] = []
-    for unit, title in (("share", "Share of the map of each class"), ("ha", "Hectares of each class")):
+    for unit, title in (("fraction", "Fraction of the map of each class"), ("ha", "Hectares of each class")):
         own = [(at, row["areas"]) for at, row in dated if row["unit"] == unit]
         names = dict.fromkeys(name for _, areas in own for name, area in areas.items() if area)
         areas = {name.replace("_", " "): [(at, one[name]) for at, one in own if name in one] for name in names}
-        charts.append((title, areas, unit == "share"))
-    charts.append(("Share of everything", series(SAVINGS, "savings"), True))
+        charts.append((title, areas, unit == "fraction"))
+    charts.append(("Fraction of everything", series(SAVINGS, "savings"), True))
     charts.append(("Score against the truth", series(SCORES), True))
     return pages.render_page(
         "history.html",
@@ -268,7 +270,7 @@ def render_history(history: FieldHistory, runs_at: str) -> str:
 
 def _drawn(charts: Sequence[tuple[str, Points, bool]], colours: Mapping[str, str]) -> Iterator[tuple[str, str]]:
     """Draw each chart that has a point: its title, and the data address of a PNG; same points, same bytes."""
-    for title, series, is_share in charts:
+    for title, series, is_fraction in charts:
         known = {
             name: sorted((at, value) for at, value in points if abs(value) < _MOST_VALUE)
             for name, points in series.items()
@@ -282,7 +284,7 @@ def _drawn(charts: Sequence[tuple[str, Points, bool]], colours: Mapping[str, str
                 label = visible(name).replace("$", r"\$")
                 axes.plot(*zip(*points, strict=True), marker="o", markersize=4, label=label, color=colours.get(name))
         axes.set_ylim(bottom=0)
-        if is_share:
+        if is_fraction:
             axes.yaxis.set_major_formatter(lambda value, _: f"{100 * value:.3g} %")
         axes.grid(color=panels.GRID)
         axes.tick_params(axis="x", labelrotation=20)
@@ -314,7 +316,7 @@ def render_index(histories: Sequence[FieldHistory], archive: str, names: Mapping
 
 def _shown(row: Row, runs_at: str) -> dict[str, Any]:
     largest = sorted(row["areas"].items(), key=lambda item: -item[1])[:3]
-    show = area_words if row["unit"] == "ha" else format_percent
+    show = format_area if row["unit"] == "ha" else format_percent
     name = quote(str(row["run"]).removeprefix("runs/"), errors="surrogateescape")
     return {
         "looked": _short(str(row.get("looked") or "")) or DASH,

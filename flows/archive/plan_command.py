@@ -22,7 +22,7 @@ from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
 from flows.tasks.open_survey import JUDGED, STAGES, OpenSurvey
 from flows.tasks.run import SurveyRun, open_run
-from flows.tasks.scan_choice import ScanChoice, as_told
+from flows.tasks.scan_choice import ScanChoice, as_figures
 from flows.tasks.stage import Stage, Wanted
 from flows.tasks.stages.accuracy import evaluate
 from flows.tasks.stages.attention import load_plan
@@ -32,7 +32,7 @@ from flows.terminal.progress import put_out
 from pipeline.errors import IncompleteStoreError, PipelineError
 from pipeline.lazy import deferred
 from pipeline.planning.fine_pass import FinePlan
-from pipeline.planning.plain_scans import scan_words
+from pipeline.planning.uniform_scans import format_scan
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, plain, store_at
 from storage.archive.lineage import Catalogue, Change, changes_between
@@ -105,7 +105,9 @@ class Forecast:
     refused: str | None = None
     scans: ScanChoice = field(default_factory=ScanChoice)
     figures: Mapping[str, Any] = field(default_factory=dict)  # see `flows.publish.findings`
-    kept: Mapping[str, Any] | None = None  # of a plain scan that is kept and read in part: at most, as receipts tell it
+    kept: Mapping[str, Any] | None = (
+        None  # of a uniform scan that is kept and read in part: at most, as receipts tell it
+    )
 
 
 def forecast(settings: Settings, preview: Path | None = None) -> Forecast:
@@ -123,13 +125,13 @@ def forecast(settings: Settings, preview: Path | None = None) -> Forecast:
         survey_flow.draw_class_map(planner)
         if run.scene.labelled and run.settings.accuracy:
             evaluate(planner, *planner.products.there(*JUDGED))
-        fine = _planned_fine(planner.products["attend"])
+        fine = _planned_fine(planner.products["score"])
         figures = field_figures(run, fine)
         if preview is not None:
             shown = plan_preview.PlanPicture(run, fine, _last_map(run, catalogue), figure_lines(figures))
             with refusals(preview.parent, "write the preview"):
                 plan_preview.draw_preview(preview, shown)
-    kept = None if run.budget is None else run.budget.told(run.budget.most_seats)
+    kept = None if run.budget is None else run.budget.figures(run.budget.most_patches)
     return Forecast(planner.rows, run.refused, run.scans, figures, kept)
 
 
@@ -166,7 +168,7 @@ class Planner(OpenSurvey):
     def __call__(self, stage: str, /, *inputs: StageRef) -> StageRef:
         """Note what would become of a stage, and return where its store would be."""
         try:
-            row, ref = self._look(STAGES[stage], STAGES[stage].wants(self.run, *inputs))
+            row, ref = self._forecast(STAGES[stage], STAGES[stage].wants(self.run, *inputs))
         except (PipelineError, OSError) as error:  # what is there cannot be used: the survey would stop here
             why = f"waits for {error}" if isinstance(error, _WaitsError) else str(error)
             row = StageForecast(stage, "blocked", None, why)
@@ -175,7 +177,7 @@ class Planner(OpenSurvey):
         self.products[stage] = ref
         return ref
 
-    def _look(self, stage: Stage, wanted: Wanted) -> tuple[StageForecast, StageRef]:
+    def _forecast(self, stage: Stage, wanted: Wanted) -> tuple[StageForecast, StageRef]:
         key = stage.key(wanted)
         found = stage.find(self.run.archive, wanted)
         if found is not None:
@@ -204,16 +206,16 @@ class Planner(OpenSurvey):
             return ("nothing stored yet of this scene" if stored else "nothing stored yet"), ()
         known = replace(self.catalogue, stores=self.catalogue.stores | self._planned)
         found = tuple(change for change in changes_between(known, before, store) if change.kind != "library")
-        return _in_words(found, store.ref.stage), found
+        return _format_summary(found, store.ref.stage), found
 
     def _is_of_scene(self, store: Store) -> bool:
-        """Whether a store is of the run's scene, or of none: a lookup is of a path."""
+        """Whether a store is of the run's scene, or of none: a geolocation grid is of a path."""
         below = [store.ref.uri, *self.catalogue.ancestors([store.ref.uri])]
         stores = (self.catalogue.stores[uri] for uri in below if uri in self.catalogue.stores)
         return {str(one.params["scene"]) for one in stores if "scene" in one.params} <= {self.run.scene.key}
 
 
-def _in_words(changes: Sequence[Change], stage: str) -> str:
+def _format_summary(changes: Sequence[Change], stage: str) -> str:
     """The first thing that differs where it began, and how many more."""
     causes = [change for change in changes if change.kind != "input"] or list(changes)
     if not causes:
@@ -256,14 +258,14 @@ def plan_content(settings: Settings, preview: Path | None = None) -> dict[str, A
 
 
 def scans_content(scans: ScanChoice) -> dict[str, Any]:
-    """Plain scans of this field by the weights' record: the best for their seconds, and what is or would be taken."""
+    """Uniform scans of this field by the weights' record: the best for their seconds, and what is or would be taken."""
     best = scans.frontier
     last = max(len(best) - 1, 1)
     shown = sorted({round(number * last / (MOST_SCANS - 1)) for number in range(MOST_SCANS)}) if best else []
     return {
-        "taken": as_told(scans.chosen),
-        "reference": as_told(scans.reference),
-        "frontier": [as_told(best[number]) for number in shown if number < len(best)],
+        "taken": as_figures(scans.chosen),
+        "reference": as_figures(scans.reference),
+        "frontier": [as_figures(best[number]) for number in shown if number < len(best)],
     }
 
 
@@ -279,7 +281,7 @@ def show_plan(content: dict[str, Any], console: Console) -> None:
     for line in figure_lines(content["field"]):
         console.print(escape(line), soft_wrap=True)
     if "kept" in content:
-        console.print(escape(kept_words(content["kept"])), soft_wrap=True)
+        console.print(escape(format_kept(content["kept"])), soft_wrap=True)
     made = (
         f"{content['to_make']} stages to make" if content["to_make"] else "everything is stored: it would be published"
     )
@@ -297,8 +299,8 @@ def figure_lines(figures: Mapping[str, Any]) -> list[str]:
     ((_, ground),) = finding_rows({"field": figures})
     size = "" if figures["view_deg"] is None else f"{' x '.join(map(format_count, figures['size_px']))} px, "
     lines = [f"field: {size}{ground}"]
-    if figures["kept_share"] is not None:
-        lines.append(f"zones: {format_percent(figures['kept_share'])} of the field is kept to")
+    if figures["kept_fraction"] is not None:
+        lines.append(f"zones: {format_percent(figures['kept_fraction'])} of the field is kept to")
     if figures["ground_pixel_m"] is None:
         lines.append("no metres are known: a [pose], or a georeferenced scene, gives them and hectares an hour")
     camera, count = figures["camera_s"], figures["lines"]
@@ -314,18 +316,18 @@ def figure_lines(figures: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def kept_words(kept: Mapping[str, Any]) -> str:
-    """How much of a plain scan the budgets pay for at most."""
+def format_kept(kept: Mapping[str, Any]) -> str:
+    """How much of a uniform scan the budgets pay for at most."""
     read, stored = (kept[name]["done"] / kept[name]["everything"] for name in ("multiply_adds", "bytes"))
     return (
-        f"detail: at most {kept['seats']} of {kept['of_seats']} seats, for {format_percent(read)} of the multiply-adds "
+        f"detail: at most {kept['patches']} of {kept['of_patches']} patches, for {format_percent(read)} of the multiply-adds "
         f"of reading everything and {format_percent(stored)} of the bytes of keeping it"
     )
 
 
 def _show_scans(scans: dict[str, Any], console: Console) -> None:
-    """Print what plain scans of the field cost, and what the weights' record expects of them."""
-    title = "One plain scan of the field, by the weights' record"
+    """Print what uniform scans of the field cost, and what the weights' record expects of them."""
+    title = "One uniform scan of the field, by the weights' record"
     table = Table(title=title, title_justify="left", header_style="dim", box=SIMPLE_HEAD, collapse_padding=True)
     for name in ("scan", "", "seconds", "raw data", "mIoU, about"):
         table.add_column(name, justify="left" if name in ("scan", "") else "right", no_wrap=True)
@@ -337,5 +339,5 @@ def _show_scans(scans: dict[str, Any], console: Console) -> None:
         spread = "" if scan["expected_spread"] is None else f" ± {format_points(scan['expected_spread'])}"
         expected = f"{format_points(scan['expected_miou'])}{spread}"
         figures = f"{seconds:.1f}", format_bytes(scan["bytes_raw"]), expected
-        table.add_row(scan_words(scan["step"], scan["exposure_ms"]), said, *figures)
+        table.add_row(format_scan(scan["step"], scan["exposure_ms"]), said, *figures)
     console.print(table)

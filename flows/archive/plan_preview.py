@@ -115,13 +115,13 @@ def _point_to_rig(axes: Axes, low: NDArray[np.float64], high: NDArray[np.float64
     """An arrow at the field's border to a rig that stands far beyond it."""
     (x, y), size = ((low + high) / 2).tolist(), float((high - low).max())
     away = float(np.hypot(x, y))
-    begin, end = ((x * (1 - share * size / away), y * (1 - share * size / away)) for share in (0.25, 0.42))
+    begin, end = ((x * (1 - fraction * size / away), y * (1 - fraction * size / away)) for fraction in (0.25, 0.42))
     axes.annotate("", end, begin, arrowprops={"arrowstyle": "-|>", "color": "black"}, zorder=6)
     axes.annotate(f"rig, {away:.3g} m", end, (6, 0), textcoords="offset points", size=10, zorder=6)
 
 
 def _draw_plan(axes: Axes, shown: PlanPicture, onto: Any) -> None:
-    """Sweeps and zones, brought from pixels onto the panel."""
+    """Sweeps and zones, brought from pixels onto the white reference."""
     run, camera = shown.run, shown.run.camera
     rows, columns = run.zones.place.shape
     field = shapely.box(0, 0, columns, rows)

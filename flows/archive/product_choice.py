@@ -40,8 +40,8 @@ class ProductFlags:
     heading: Annotated[
         str, Parameter(help="Along which its cells lie, clockwise from north [deg], or `rows`: along the crop rows.")
     ] = "0"
-    least_share: Annotated[
-        float, Parameter(help="A cell gets the dose of a class of which it has more than this share, 0 to 1.")
+    least_fraction: Annotated[
+        float, Parameter(help="A cell gets the dose of a class of which it has more than this fraction, 0 to 1.")
     ] = 0.0
     least_area: Annotated[
         float, Parameter(help="Regions below it go to their neighbour, in polygons and prescription [m2].")
@@ -65,7 +65,7 @@ class Prescription:
     unit: DoseUnit
     cell_m: float
     heading: float | None  # degrees clockwise from north; None along the crop rows, whatever that is in a run
-    least_share: float
+    least_fraction: float
 
 
 @dataclass(frozen=True)
@@ -105,13 +105,13 @@ def _prescription(flags: ProductFlags, doses: Mapping[str, float]) -> Prescripti
         raise SettingsError(f"--dose-unit expects {' or '.join(UNITS)}, got {flags.dose_unit!r}")
     if not 0 < flags.cell < float("inf"):
         raise SettingsError(f"--cell expects metres above 0, got {flags.cell:g}")
-    if not 0 <= flags.least_share < 1:
-        raise SettingsError(f"--least-share expects a share from 0 to below 1, got {flags.least_share:g}")
+    if not 0 <= flags.least_fraction < 1:
+        raise SettingsError(f"--least-share expects a fraction from 0 to below 1, got {flags.least_fraction:g}")
     try:
         heading = None if flags.heading == ROWS else float(flags.heading) % 360
     except ValueError:
         raise SettingsError(f"--heading expects degrees from north, or {ROWS}, got {flags.heading!r}") from None
-    return Prescription(doses, UNITS[flags.dose_unit], flags.cell, heading, flags.least_share)
+    return Prescription(doses, UNITS[flags.dose_unit], flags.cell, heading, flags.least_fraction)
 
 
 def by_class(text: str | None, flag: str, example: str) -> dict[str, float]:

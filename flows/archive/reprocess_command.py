@@ -39,7 +39,7 @@ from flows.tasks.run import SurveyRun, open_run
 from flows.tasks.scene import for_rig
 from flows.tasks.scores import score_of
 from flows.tasks.stages.accuracy import evaluate
-from flows.tasks.stages.placement import cut_patches
+from flows.tasks.stages.placement import extract_patches
 from flows.tasks.stages.raster import take_patches
 from flows.terminal.figures import counted, format_points, format_seconds
 from flows.terminal.processes import DONE, FAILED, PARTLY
@@ -50,7 +50,7 @@ from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run, read_run
-from storage.parallel.crew import THREADS, Crew
+from storage.parallel.pool import THREADS, WorkerPool
 from storage.remote.opening import open_archive
 
 Survey = Callable[[Settings, Console], Path]  # settings in, the folder of the published run out
@@ -84,7 +84,7 @@ def reprocess(
     dry_run
         Only say what would run.
     """
-    request = ReprocessRequest(archive, since, field, failed, weights, dry_run, Crew(scheduler, workers))
+    request = ReprocessRequest(archive, since, field, failed, weights, dry_run, WorkerPool(scheduler, workers))
     return run_reprocess(request, stderr, as_json=as_json)
 
 
@@ -98,7 +98,7 @@ class ReprocessRequest:
     failed: bool = False  # only where the newest run is damaged or lacks stores
     weights: Path | None = None
     dry_run: bool = False
-    crew: Crew = THREADS  # who makes blocks; what the old runs were made by need not be there
+    pool: WorkerPool = THREADS  # who makes blocks; what the old runs were made by need not be there
 
 
 def run_reprocess(
@@ -123,14 +123,14 @@ def reprocess_fields(request: ReprocessRequest, console: Console, survey: Survey
     wanted = _chosen(catalogue, request)
     rows: list[dict[str, Any]] = []
     renewed = renewals(catalogue)
-    with request.crew.open():  # one start of its workers for all fields
+    with request.pool.open():  # one start of its workers for all fields
         for number, generation in enumerate(wanted, 1):
-            told = f"{number} of {len(wanted)}: {generation.field} ({generation.run.folder.name})"
-            console.print(f"[bold]reprocess {escape(told)}[/]", soft_wrap=True)
+            summary = f"{number} of {len(wanted)}: {generation.field} ({generation.run.folder.name})"
+            console.print(f"[bold]reprocess {escape(summary)}[/]", soft_wrap=True)
             rows.append(_again(catalogue, generation, request, console, survey or _survey, renewed))
             if rows[-1]["new"] is not None:
                 renewed[generation.run.folder.name] = rows[-1]["new"]
-            console.print(escape(_words(rows[-1])), soft_wrap=True)
+            console.print(escape(_format_row(rows[-1])), soft_wrap=True)
     return {"archive": opened.name, "dry_run": request.dry_run, "fields": rows}
 
 
@@ -182,13 +182,13 @@ def _again(
     }
     try:
         settings = asked_again(run, str(request.archive), request.weights)
-        settings = replace(settings, scheduler=request.crew.scheduler, workers=request.crew.workers)
+        settings = replace(settings, scheduler=request.pool.scheduler, workers=request.pool.workers)
         prior = renewed_prior(settings.prior, renewed)
         if prior == settings.prior and is_current(catalogue, run, settings):
             same = {"state": "skipped", "message": "is as it would become"}
             return row | same | _scores(run.receipt, "after")
         settings = from_raw_cubes(catalogue, run, replace(settings, prior=prior))
-        settings = replace(settings, scheduler=request.crew.scheduler, workers=request.crew.workers)
+        settings = replace(settings, scheduler=request.pool.scheduler, workers=request.pool.workers)
         if request.dry_run:
             return row | {"state": "would run"}
         folder = survey(settings, console)
@@ -212,7 +212,7 @@ def _scores(receipt: Mapping[str, Any], when: str) -> dict[str, float | None]:
     return {f"{name}_{when}": score for name, score in score_of(receipt).items()}
 
 
-def _words(row: Mapping[str, Any]) -> str:
+def _format_row(row: Mapping[str, Any]) -> str:
     words = f"{row['field']} ({row['old']}) {row['state']}"
     if row["state"] == "ran":
         words += f": {row['new']}, {format_seconds(row['seconds'])}"
@@ -226,10 +226,10 @@ def _words(row: Mapping[str, Any]) -> str:
 def _show(content: Mapping[str, Any], console: Console) -> None:
     rows = content["fields"]
     counts = {state: sum(row["state"] == state for row in rows) for state in STATES}
-    told = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
+    summary = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
     lines = [
-        *map(_words, rows),
-        f"{counted(len(rows), 'field')}: {told}" if rows else "no field matches: nothing to do",
+        *map(_format_row, rows),
+        f"{counted(len(rows), 'field')}: {summary}" if rows else "no field matches: nothing to do",
     ]
     for line in lines:
         console.print(escape(line), soft_wrap=True)
@@ -280,10 +280,10 @@ def run_judge(
         with draft:
             made = survey.products
             if catalogue.stores[made.patches.uri].cleared and survey.is_map:
-                take_patches(survey, made["attend"])
+                take_patches(survey, made["score"])
             elif catalogue.stores[made.patches.uri].cleared:
                 last = "coarse" if survey.uniform else "fine"
-                cut_patches(survey, made["attend"], *made.there(f"capture_{last}", f"register_{last}"))
+                extract_patches(survey, made["score"], *made.there(f"capture_{last}", f"register_{last}"))
             published = extend_with_accuracy(survey, draft, evaluate(survey, *made.there(*JUDGED)))
     show_published(published, settings.out, console)
     return published.receipt
@@ -297,8 +297,8 @@ def _places_none(settings: Settings) -> bool:
 def _needed(survey: OpenSurvey) -> tuple[str, ...]:
     """Return the stages by whose stores a map is judged."""
     if survey.is_map:
-        return ("average_raster", "take_patches", "draw_map", "attend")
-    return ("rectify", "cut_patches", "draw_map", "choose_effects", "attend")
+        return ("average_raster", "take_patches", "segment", "score")
+    return ("rectify", "extract_patches", "segment", "choose_effects", "score")
 
 
 def _store(catalogue: Catalogue, archive: Archive, what: str, key: str) -> StageRef:
@@ -321,7 +321,7 @@ def _check_same(catalogue: Catalogue, found: Run, products: Products, run: Surve
         raise SceneError(
             f"the scene {run.settings.scene} is another than {found.uri} looked at; put that one back, or survey again"
         )
-    if run.weights_key != catalogue.stores[products["draw_map"].uri].params.get("weights"):
+    if run.weights_key != catalogue.stores[products["segment"].uri].params.get("weights"):
         raise WeightsError(
             f"the weights {run.settings.weights or 'that come with SpectralZoom'} are others than the map of"
             f" {found.uri} was drawn with; put those back, or reprocess with these"

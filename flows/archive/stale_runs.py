@@ -57,12 +57,12 @@ def newest_runs(catalogue: Catalogue) -> list[Generation]:
 
 def renewals(catalogue: Catalogue) -> dict[str, str]:
     """For every run that was made again the newest of the same look, by their names."""
-    looks: dict[str, list[str]] = {}
+    scan_passes: dict[str, list[str]] = {}
     for run in catalogue.runs:
         if run.settings:
             light = _light_of(_recorded_run(catalogue, run))
-            looks.setdefault(canonical_json([called(run), light]), []).append(run.folder.name)
-    return {earlier: names[-1] for names in looks.values() for earlier in names[:-1]}
+            scan_passes.setdefault(canonical_json([called(run), light]), []).append(run.folder.name)
+    return {earlier: names[-1] for names in scan_passes.values() for earlier in names[:-1]}
 
 
 def renewed_prior(prior: str, renewed: Mapping[str, str]) -> str:

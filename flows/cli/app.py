@@ -58,7 +58,7 @@ def build_app(*, listed: bool) -> App:
     app = App(
         name="spectralzoom",
         version=lambda: importlib.metadata.version("spectralzoom"),
-        help="Survey a field: the best map for the seconds, by one scan or by a second look where it changes the map.",
+        help="Survey a field: the best map for the seconds, by one scan or by a second pass where it changes the map.",
         suppress_keyboard_interrupt=False,  # main says what an interrupted survey leaves
     )
     rig = App(name="rig", help="Check a rig before a survey, or emulate one to try surveys on.")

@@ -10,7 +10,7 @@ import traceback
 from cyclopts import CycloptsError, UnknownOptionError
 
 from flows.cli.app import GOES_ON, VERBS, build_app, removed, say, stderr
-from flows.terminal.processes import TERMINATED, Terminated, place_caches, refusal_words, terminable
+from flows.terminal.processes import TERMINATED, Terminated, format_refusal, place_caches, terminable
 from pipeline.errors import PipelineError, SettingsError
 
 INTERRUPTED = 130
@@ -45,7 +45,7 @@ def _run(arguments: list[str]) -> int:
     except BrokenPipeError:
         return 1
     except Exception as error:
-        if (refused := refusal_words(error)) is not None:
+        if (refused := format_refusal(error)) is not None:
             say(refused)
             return 1
         say(f"{type(error).__name__}: {error}; this is a defect of SpectralZoom: please report {_keep_traceback()}")

@@ -13,15 +13,15 @@ from cyclopts import Parameter
 from flows.archive.reprocess_command import run_judge
 from flows.cli.app import AsJson, OutFile, OutFolder, parse_numbers, parse_wholes, split_list, stderr
 from flows.evaluate.command import run_evaluate
-from flows.evaluate.frames import SHARES, USUAL, EvaluateRequest
+from flows.evaluate.frames import FRACTIONS, USUAL, EvaluateRequest
 from flows.terminal.progress import print_json
 from flows.tradeoff.command import run_tradeoff
-from flows.training.familiarity import FamiliarRequest, run_measure_familiar
-from flows.training.remember import JUDGED_LANDS, LANDS, MemoryRequest, run_remember
+from flows.training.fit_ood import OodRequest, run_measure_ood
 from flows.training.train import asked_command, run_train, usual_crop
 from flows.training.train_scenes import TrainRequest
+from flows.training.train_temporal import JUDGED_LANDS, LANDS, TemporalRequest, run_remember
 from models.network.machine import PROCESSOR, Device
-from models.training.memory import MemoryTraining
+from models.training.temporal import TemporalTraining
 from models.training.train import TrainingSettings
 from pipeline.errors import SettingsError
 
@@ -70,7 +70,7 @@ def train(
     positions: Literal["2d", "paper"] = "2d",
     init: Path | None = None,
     remember: Path | None = None,
-    familiar: Path | None = None,
+    ood_detector: Path | None = None,
     dim: int = 128,
     layers: int = 4,
     heads: int = 4,
@@ -145,7 +145,7 @@ def train(
         enough.
     darkest_ms
         Shortest exposure that the weights are to read: crops are shown with exposures from here to 100 ms, and lines 1,
-        2 or 4 px apart; where scenes are kept for validation the file then has a record of plain scans on them, by
+        2 or 4 px apart; where scenes are kept for validation the file then has a record of uniform scans on them, by
         which `survey --seconds` plans.
     device
         Where the network computes: `cpu`, `cuda`, `mps`, or `auto`, the first of the last two that torch can use here,
@@ -164,9 +164,9 @@ def train(
     """
 
     if remember is not None:
-        how = MemoryTraining(minutes, steps, seed)
+        how = TemporalTraining(minutes, steps, seed)
         lands, judged = LANDS if scenes is None else scenes, JUDGED_LANDS if validation is None else validation
-        asked = MemoryRequest(dataset, remember, out, lands, judged, settings=how, command=asked_command())
+        asked = TemporalRequest(dataset, remember, out, lands, judged, settings=how, command=asked_command())
         record = run_remember(asked, stderr)
         if as_json:
             print_json(record)
@@ -178,8 +178,8 @@ def train(
         "train_mask": train_mask,
         "mask_classes": parse_wholes(mask_classes, "--mask-classes"),
     }
-    if familiar is not None:
-        known = run_measure_familiar(FamiliarRequest(dataset, familiar, out, choices, asked_command()), stderr)
+    if ood_detector is not None:
+        known = run_measure_ood(OodRequest(dataset, ood_detector, out, choices, asked_command()), stderr)
         if as_json:
             print_json(known)
         return 0
@@ -214,7 +214,7 @@ def evaluate(
     *,
     weights: Annotated[tuple[Path, ...], Parameter(negative="")] = (),
     out: OutFolder = None,
-    shares: str | None = None,
+    fractions: str | None = None,
     policies: str | None = None,
     frames: str | None = None,
     scenes: int | None = None,
@@ -247,10 +247,10 @@ def evaluate(
     out
         Folder for evaluation.json and its plot, evaluation.png.
     shares
-        Shares of the seats (patches to look at finely) to try, with commas; 0.05,0.1,0.15,0.2,0.35 by default. No seat
-        (none) and every seat (all) are always tried.
+        Shares of the patches (patches to look at finely) to try, with commas; 0.05,0.1,0.15,0.2,0.35 by default. No patch
+        (none) and every patch (all) are always tried.
     policies
-        Ways to choose the seats, with commas; gain,entropy,sobel,random by default. The oracle, which chooses by the
+        Ways to choose the patches, with commas; gain,entropy,sobel,random by default. The oracle, which chooses by the
         labels, is always there.
     frames
         Names of the frames to judge on, with commas; all by default.
@@ -272,7 +272,7 @@ def evaluate(
         Where the networks of WEIGHTS compute: `cpu`, `cuda`, `mps`, or `auto`, the first of the last two that torch can
         use here, else the processor.
     controls
-        For a run: also judge other placements of the same number of seats; as its survey was asked for by default.
+        For a run: also judge other placements of the same number of patches; as its survey was asked for by default.
     """
     flags = {name: value for name, value in locals().items() if name not in ("dataset", "run")}
     address = _run_address(dataset, run, given=bool(weights))
@@ -285,12 +285,12 @@ def evaluate(
         "bands": parse_wholes(bands, "--bands"),
         "wavelengths": parse_numbers(wavelengths, "--wavelengths"),
     }
-    given = parse_numbers(shares, "--shares")
+    given = parse_numbers(fractions, "--shares")
     request = EvaluateRequest(
         dataset,
         weights,
         out,
-        SHARES if given is None else tuple(given),
+        FRACTIONS if given is None else tuple(given),
         split_list(policies) or USUAL,
         split_list(frames),
         scenes,

@@ -18,8 +18,8 @@ from flows.evaluate.frames import (
     Candidate,
     EvaluateRequest,
     Show,
+    capture_passes,
     checked_request,
-    look_at,
     open_candidates,
     open_frames,
     scene_of,
@@ -76,7 +76,7 @@ def evaluate_weights(request: EvaluateRequest, show: Show = lambda what, done, w
         with writing(request.out):
             request.out.mkdir(parents=True, exist_ok=True)  # before minutes are spent on what cannot be kept
     jobs = sort_frames(request, data, candidates, show)
-    trial = Trial(request.shares, request.policies, request.seed, request.rig)
+    trial = Trial(request.fractions, request.policies, request.seed, request.rig)
     runs = _judged(request, data, candidates, jobs.frames, trial, show)
     names = [*jobs.frames, *jobs.left_out]
     asked = {**asdict(trial), "draws": request.draws, "level": LEVEL}
@@ -131,8 +131,8 @@ def _judged(
             ) -> Record:
                 if index not in loaded:
                     loaded[index] = load_weights(one.path).on(device)
-                look = look_at(scene, name, loaded[index], one.camera, request.seed)
-                return judge_frame(trial, look, loaded[index], one.camera)
+                scan_pass = capture_passes(scene, name, loaded[index], one.camera, request.seed)
+                return judge_frame(trial, scan_pass, loaded[index], one.camera)
 
             # the farm's labels follow from its key and are not drawn for this
             labels = None if data.files is None or scene.labels is None else zlib.crc32(scene.labels.tobytes())

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from flows.tasks.scene import check_labels, judged_labels
 from flows.training.data import TrainingData, farm_test_data, only_class, open_training_data
-from flows.training.look import observe_scene
+from flows.training.observed_scenes import observe_scene
 from models.evaluation.metrics import DRAWS
 from models.network.machine import PROCESSOR
 from models.network.spectral import patches_of
 from models.policies.policies import NETWORK_POLICIES, POLICIES
-from models.reading.inference import Glance, glance_of_columns
+from models.reading.inference import CoarsePrediction, coarse_prediction_of_columns
 from models.training.examples import normalised
 from models.weights.files import Description, Weights, content_key, describe_weights
 from pipeline.errors import PipelineError, SceneError, SettingsError, WeightsError
@@ -32,7 +32,7 @@ from pipeline.geometry.scan import CostModel
 from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
 from pipeline.simulator.scenes.scene import RasterScene
 
-SHARES = (0.05, 0.10, 0.15, 0.20, 0.35)
+FRACTIONS = (0.05, 0.10, 0.15, 0.20, 0.35)
 JUDGED = tuple(name for name in POLICIES if name not in ("mask", *NETWORK_POLICIES))  # these need a file of one's own
 USUAL = ("gain", "entropy", "sobel", "random")
 COST = CostModel()
@@ -45,7 +45,7 @@ class EvaluateRequest:
     dataset: str
     weights: tuple[Path, ...]
     out: Path | None = None
-    shares: tuple[float, ...] = SHARES
+    fractions: tuple[float, ...] = FRACTIONS
     policies: tuple[str, ...] = USUAL
     frames: tuple[str, ...] = ()  # all, without one
     scenes: int | None = None  # of the built-in farm
@@ -58,9 +58,9 @@ class EvaluateRequest:
 
 def checked_request(request: EvaluateRequest) -> EvaluateRequest:
     """Put shares in order, drop what is there anyway, and refuse what cannot be judged (SettingsError, its flag)."""
-    for share in request.shares:
-        if not 0 <= share <= 1:
-            raise SettingsError(f"--shares are shares of the seats from 0 to 1 (0.1 is 10 %), got {share:g}")
+    for fraction in request.fractions:
+        if not 0 <= fraction <= 1:
+            raise SettingsError(f"--shares are fractions of the patches from 0 to 1 (0.1 is 10 %), got {fraction:g}")
     for policy in request.policies:
         if policy not in JUDGED and policy != "oracle":
             raise SettingsError(
@@ -69,9 +69,9 @@ def checked_request(request: EvaluateRequest) -> EvaluateRequest:
     for flag, value, least in (("--seed", request.seed, 0), ("--draws", request.draws, 1)):
         if value < least:
             raise SettingsError(f"{flag} must be at least {least}, got {value}")
-    shares = tuple(sorted({share for share in request.shares if 0 < share < 1}))
+    fractions = tuple(sorted({fraction for fraction in request.fractions if 0 < fraction < 1}))
     policies = tuple(dict.fromkeys(name for name in request.policies if name != "oracle"))
-    return replace(request, shares=shares, policies=policies)
+    return replace(request, fractions=fractions, policies=policies)
 
 
 FARM_TEST_SCENES = 4
@@ -131,11 +131,11 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Look:
+class ScenePasses:
     """One frame in the spectral features of certain weights, with their coarse prediction."""
 
     name: str
-    seen: Glance
+    seen: CoarsePrediction
     fine: NDArray[np.float32]  # (patch, p, p, column) normalised, every patch of the padded grid
     labels: NDArray[np.uint8]  # (y, x) in the weights' classes
     bands: int
@@ -185,7 +185,7 @@ def open_frames(
     return TrainingData(data.law, names, (), (), data.camera, data.files, data.notes)
 
 
-def look_at(scene: RasterScene, name: str, weights: Weights, camera: LineCamera, seed: int) -> Look:
+def capture_passes(scene: RasterScene, name: str, weights: Weights, camera: LineCamera, seed: int) -> ScenePasses:
     """Look at a frame with the camera of the training; the noise follows from the seed and the frame's name."""
     config = weights.config
     grid = SceneGrid(*scene.shape, config.patch, config.factor)
@@ -195,9 +195,9 @@ def look_at(scene: RasterScene, name: str, weights: Weights, camera: LineCamera,
     example = normalised(observed, weights.normalisation, reached)
     labels = judged_labels(scene, Description(config, weights.basis, weights.class_names, weights.record))
     assert labels is not None  # sort_frames
-    seen = glance_of_columns(weights, np.ascontiguousarray(example.coarse, np.float32), grid)
+    seen = coarse_prediction_of_columns(weights, np.ascontiguousarray(example.coarse, np.float32), grid)
     fine = patches_of(example.fine, config.patch).astype(np.float32)
-    return Look(name, seen, fine, labels, len(scene.wavelength_nm))
+    return ScenePasses(name, seen, fine, labels, len(scene.wavelength_nm))
 
 
 Show = Callable[[str, float, str], None]

@@ -1,8 +1,8 @@
 """One frame judged by one set of weights, and the figures of many: means over seeds, intervals over frames and seeds.
 
-A record holds plain lists and numbers: counts of labels and map by every policy at each share of the patches and by
+A record holds plain lists and numbers: counts of labels and map by every policy at each fraction of the patches and by
 plans of lines, which add up over frames, and what each map costs. Weights of frames left out in turn have no frame in
-common: together they are one seed of the training, judged on all of their frames. Weights that share a frame are
+common: together they are one seed of the training, judged on all of their frames. Weights that fraction a frame are
 different seeds.
 """
 
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.evaluate.frames import COST, Look
+from flows.evaluate.frames import COST, ScenePasses
 from models.evaluation.metrics import (
     average_accuracy,
     confusion,
@@ -29,17 +29,17 @@ from models.evaluation.metrics import (
 )
 from models.evaluation.placement import RANDOM_DRAWS, captured_gain, gain_sums, oracle_gain
 from models.network.sizes import multiply_adds
-from models.policies.policies import score_multiply_adds, score_seats
+from models.policies.policies import score_multiply_adds, score_patches
 from models.reading.inference import segment
 from models.weights.files import Weights
 from pipeline.errors import BudgetError, PoseError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Axis
 from pipeline.planning.coverage import cheapest_full, coarse_sweeps
-from pipeline.planning.fine_pass import plan_fine, price_of_seats
+from pipeline.planning.fine_pass import plan_fine, price_of_patches
 from pipeline.planning.line_blocks import WIDTHS, line_blocks, most_shown
 from pipeline.planning.prices import BYTES_PER_SAMPLE, check_budget, count_lines
-from pipeline.planning.selection import frame_seats
+from pipeline.planning.selection import frame_patches
 
 ORACLE = "oracle"
 ENDS = ("none", "all")  # no patch, every patch
@@ -47,8 +47,8 @@ BUDGETS = (0.35, 0.4, 0.5, 0.65, 0.8)  # of the full scan's seconds, coarse pass
 PLANNED = ("gain", "entropy")
 UNIFORM, RANDOM = "uniform lines", "random lines"
 Record = dict[str, Any]
-Seats = NDArray[np.intp]
-Spend = Callable[[float], tuple[Seats, float, int]]  # seconds of the fine pass -> patches, seconds, lines
+PatchIndex = NDArray[np.intp]
+Spend = Callable[[float], tuple[PatchIndex, float, int]]  # seconds of the fine pass -> patches, seconds, lines
 
 
 @dataclass(frozen=True)
@@ -58,121 +58,132 @@ class Trial:
     The oracle chooses by the labels.
     """
 
-    shares: tuple[float, ...]  # of the valid patches, above 0 and below 1
+    fractions: tuple[float, ...]  # of the valid patches, above 0 and below 1
     policies: tuple[str, ...]
     seed: int = 0
     rig: bool = True  # also plans of lines at equal seconds
 
 
-def judge_frame(trial: Trial, look: Look, weights: Weights, camera: LineCamera) -> Record:
+def judge_frame(trial: Trial, scan_pass: ScenePasses, weights: Weights, camera: LineCamera) -> Record:
     """Judge the map of every row, with its costs."""
-    grid = look.seen.grid
-    gain = oracle_gain(weights, look.seen, look.fine, look.labels)
-    seconds = _seconds_of_patches(look, camera)
+    grid = scan_pass.seen.grid
+    gain = oracle_gain(weights, scan_pass.seen, scan_pass.fine, scan_pass.labels)
+    seconds = _seconds_of_patches(scan_pass, camera)
     rows = []
-    for policy, draw, share, seats in _placed(trial, look, gain):
-        samples = float(np.prod(grid.coarse_shape)) + float(grid.valid_share().ravel()[seats].sum() * grid.patch**2)
+    for policy, draw, fraction, patch_index in _placed(trial, scan_pass, gain):
+        samples = float(np.prod(grid.coarse_shape)) + float(
+            grid.valid_fraction().ravel()[patch_index].sum() * grid.patch**2
+        )
         scored = 0 if policy in (*ENDS, ORACLE) else score_multiply_adds(policy, weights.config, grid)
-        bought, best = gain_sums(gain, seats, grid.valid_seats())
+        bought, best = gain_sums(gain, patch_index, grid.valid_patches())
         row = {
-            **{"policy": policy, "draw": draw, "share": share, "seats": len(seats), "gain": bought, "best_gain": best},
-            **{"counts": _counts(look, weights, seats), "samples": samples},
-            "bytes": samples * look.bands * BYTES_PER_SAMPLE,
-            "multiply_adds": multiply_adds(weights.config, grid, len(seats), look.bands, score=scored).total,
+            **{
+                "policy": policy,
+                "draw": draw,
+                "fraction": fraction,
+                "patches": len(patch_index),
+                "gain": bought,
+                "best_gain": best,
+            },
+            **{"counts": _counts(scan_pass, weights, patch_index), "samples": samples},
+            "bytes": samples * scan_pass.bands * BYTES_PER_SAMPLE,
+            "multiply_adds": multiply_adds(weights.config, grid, len(patch_index), scan_pass.bands, score=scored).total,
         }
-        rows.append(row | seconds(policy, seats))
-    plans = _judged_plans(trial, look, weights, camera) if trial.rig else []
-    return {"frame": look.name, "shape": [grid.height, grid.width], "rows": rows, "plans": plans}
+        rows.append(row | seconds(policy, patch_index))
+    plans = _judged_plans(trial, scan_pass, weights, camera) if trial.rig else []
+    return {"frame": scan_pass.name, "shape": [grid.height, grid.width], "rows": rows, "plans": plans}
 
 
-def _placed(trial: Trial, look: Look, gain: NDArray[np.float64]) -> Iterator[tuple[str, int, float, Seats]]:
+def _placed(
+    trial: Trial, scan_pass: ScenePasses, gain: NDArray[np.float64]
+) -> Iterator[tuple[str, int, float, PatchIndex]]:
     """Give (policy, draw, share, patches) of each row; chance is drawn several times."""
-    allowed = look.seen.grid.valid_share().ravel() > 0
+    allowed = scan_pass.seen.grid.valid_fraction().ravel() > 0
     yield "none", 0, 0.0, np.empty(0, np.intp)
     yield "all", 0, 1.0, np.flatnonzero(allowed)
     for policy in (*trial.policies, ORACLE):
         for draw in range(RANDOM_DRAWS if policy == "random" else 1):
             seed = trial.seed + 1000 * (draw + 1)
-            scores = gain if policy == ORACLE else score_seats(policy, look.seen, seed=seed)
-            for share in trial.shares:
-                yield policy, draw, share, frame_seats(scores, share, allowed).seats
+            scores = gain if policy == ORACLE else score_patches(policy, scan_pass.seen, seed=seed)
+            for fraction in trial.fractions:
+                yield policy, draw, fraction, frame_patches(scores, fraction, allowed).patch_index
 
 
-def _counts(look: Look, weights: Weights, seats: Seats) -> list[list[int]]:
-    drawn = segment(weights, look.seen, look.fine[seats], seats).classes
-    counts: list[list[int]] = confusion(look.labels, drawn, weights.config.classes).tolist()
+def _counts(scan_pass: ScenePasses, weights: Weights, patch_index: PatchIndex) -> list[list[int]]:
+    drawn = segment(weights, scan_pass.seen, scan_pass.fine[patch_index], patch_index).classes
+    counts: list[list[int]] = confusion(scan_pass.labels, drawn, weights.config.classes).tolist()
     return counts
 
 
-def _seconds_of_patches(look: Look, camera: LineCamera) -> Callable[[str, Seats], Record]:
+def _seconds_of_patches(scan_pass: ScenePasses, camera: LineCamera) -> Callable[[str, PatchIndex], Record]:
     """Price patches by the cost model: coarse pass and runs of lines, or the full scan where that is cheaper.
 
     All patches are the full scan alone. None of each figure where the field is beyond the mirror's range.
     """
-    grid = look.seen.grid
+    grid = scan_pass.seen.grid
     try:
         along, _, full_s = cheapest_full(grid, camera, COST)
         coarse_s = COST.seconds(coarse_sweeps(grid, camera, along), camera)
     except PoseError:
-        return lambda policy, seats: {"capture_s": None, "full_s": None}
+        return lambda policy, patch_index: {"capture_s": None, "full_s": None}
 
-    def priced(policy: str, seats: Seats) -> Record:
+    def priced(policy: str, patch_index: PatchIndex) -> Record:
         seconds = full_s if policy == "all" else coarse_s
-        if policy != "all" and len(seats):
-            seconds += price_of_seats(grid, camera, COST, along, seats).least[1]
+        if policy != "all" and len(patch_index):
+            seconds += price_of_patches(grid, camera, COST, along, patch_index).least[1]
         return {"capture_s": seconds, "full_s": full_s}
 
     return priced
 
 
-def _judged_plans(trial: Trial, look: Look, weights: Weights, camera: LineCamera) -> list[Record]:
+def _judged_plans(trial: Trial, scan_pass: ScenePasses, weights: Weights, camera: LineCamera) -> list[Record]:
     """Judge plans of lines at each budget that pays; none where the field is beyond the mirror's range."""
-    grid, rows = look.seen.grid, []
+    grid, rows = scan_pass.seen.grid, []
     try:
         along, full, full_s = cheapest_full(grid, camera, COST)
         coarse = coarse_sweeps(grid, camera, along)
     except PoseError:
         return []
     coarse_s = COST.seconds(coarse, camera)
-    spends = _plans(look, camera, along, trial.seed)
+    spends = _plans(scan_pass, camera, along, trial.seed)
     for budget in BUDGETS:
         try:
             fine_s = check_budget(budget, coarse_s, full_s)
         except BudgetError:
             continue
         for plan, draw, spend in spends:
-            seats, seconds, lines = spend(fine_s)
-            row = {"policy": plan, "draw": draw, "share": budget, "seats": len(seats)}
+            patch_index, seconds, lines = spend(fine_s)
+            row = {"policy": plan, "draw": draw, "fraction": budget, "patches": len(patch_index)}
             row |= {"capture_s": coarse_s + seconds, "full_s": full_s}
             row |= {"lines": count_lines(coarse) + lines, "full_lines": count_lines(full)}
-            rows.append(row | {"counts": _counts(look, weights, seats)})
+            rows.append(row | {"counts": _counts(scan_pass, weights, patch_index)})
     return rows
 
 
-def _plans(look: Look, camera: LineCamera, along: Axis, seed: int) -> list[tuple[str, int, Spend]]:
+def _plans(scan_pass: ScenePasses, camera: LineCamera, along: Axis, seed: int) -> list[tuple[str, int, Spend]]:
     """Give our plans and two without a model: lines that lie evenly, and lines by chance, several times."""
-    grid = look.seen.grid
+    grid = scan_pass.seen.grid
     options = [line_blocks(grid, camera, COST, along, rows) for rows in WIDTHS]
 
     def ours(policy: str) -> Spend:
-        scores = score_seats(policy, look.seen, seed=seed)
+        scores = score_patches(policy, scan_pass.seen, seed=seed)
 
-        def spend(seconds: float) -> tuple[Seats, float, int]:
+        def spend(seconds: float) -> tuple[PatchIndex, float, int]:
             plan = plan_fine(grid, camera, COST, along, scores, budget_s=seconds)
-            return plan.seats, plan.seconds, plan.lines
+            return plan.patch_index, plan.seconds, plan.lines
 
         return spend
 
     def without_a_model(draw: int | None) -> Spend:
         """Give what shows the most of lines that lie evenly, or by chance where a draw is numbered."""
 
-        def spend(seconds: float) -> tuple[Seats, float, int]:
+        def spend(seconds: float) -> tuple[PatchIndex, float, int]:
             if draw is None:
                 lines = most_shown(options, lambda blocks: blocks.evenly(seconds))
             else:
                 seeds = [seed, 0xB10C, draw]
                 lines = most_shown(options, lambda blocks: blocks.at_random(seconds, np.random.default_rng(seeds)))
-            return lines.seats, COST.seconds(lines.sweeps, camera), count_lines(lines.sweeps)
+            return lines.patch_index, COST.seconds(lines.sweeps, camera), count_lines(lines.sweeps)
 
         return spend
 
@@ -182,7 +193,7 @@ def _plans(look: Look, camera: LineCamera, along: Axis, seed: int) -> list[tuple
 
 
 Runs = Sequence[Sequence[Record]]  # of each weights, or of each seed, the records of its frames
-COSTS = ("seats", "samples", "bytes", "multiply_adds", "capture_s", "full_s", "lines", "full_lines")
+COSTS = ("patches", "samples", "bytes", "multiply_adds", "capture_s", "full_s", "lines", "full_lines")
 
 
 @dataclass(frozen=True)
@@ -190,7 +201,7 @@ class Row:
     """One policy at one share over all frames; a run is one seed with one draw. Zeros where a run has no frame."""
 
     policy: str
-    share: float
+    fraction: float
     counts: NDArray[np.int64]  # (run, frame, class, class)
     of_seed: NDArray[np.intp]  # (run,)
     parts: list[Record]  # rows of the records
@@ -223,7 +234,7 @@ def seeds_of(runs: Runs) -> list[list[int]]:
     return [members for _, members in seeds]
 
 
-def collect_row(seeds: Runs, policy: str, share: float, kind: str = "rows") -> Row | None:
+def collect_row(seeds: Runs, policy: str, fraction: float, kind: str = "rows") -> Row | None:
     """Gather the counts of one row, or of one of the ``plans``, from the records of all seeds; None without any."""
     order = sorted({record["frame"] for records in seeds for record in records})
     found = [
@@ -231,7 +242,7 @@ def collect_row(seeds: Runs, policy: str, share: float, kind: str = "rows") -> R
         for number, records in enumerate(seeds)
         for record in records
         for row in record[kind]
-        if (row["policy"], row["share"]) == (policy, share)
+        if (row["policy"], row["fraction"]) == (policy, fraction)
     ]
     if not found:
         return None
@@ -240,7 +251,7 @@ def collect_row(seeds: Runs, policy: str, share: float, kind: str = "rows") -> R
     counts = np.zeros((len(seeds) * draws, len(order), classes, classes), np.int64)
     for number, at, row in found:
         counts[number * draws + row["draw"], at] = row["counts"]
-    return Row(policy, share, counts, np.repeat(np.arange(len(seeds)), draws), [row for _, _, row in found])
+    return Row(policy, fraction, counts, np.repeat(np.arange(len(seeds)), draws), [row for _, _, row in found])
 
 
 def difference(row: Row, other: Row | None, trial: Trial, draws: int) -> Record | None:
@@ -261,19 +272,24 @@ def summarise(runs: Runs, class_names: Sequence[str], trial: Trial, draws: int) 
     ``runs`` are of each weights the records of `judge_frame`, ``draws`` those of the bootstrap.
     """
     seeds = [[record for number in members for record in runs[number]] for members in seeds_of(runs)]
-    shared = [(policy, share) for policy in (*trial.policies, ORACLE) for share in trial.shares]
+    shared = [(policy, fraction) for policy in (*trial.policies, ORACLE) for fraction in trial.fractions]
     keys = [("none", 0.0), *shared, ("all", 1.0)]
     rows = {key: row for key in keys if (row := collect_row(seeds, *key)) is not None}
     whole, none = rows["all", 1.0], rows["none", 0.0]
     ends = [_mean(row.over_runs(mean_iou)) for row in (none, whole)]
     support = whole.counts.sum(axis=3).max(axis=0).sum(axis=0)  # labelled pixels of each class, each frame once
     table = []
-    for (policy, share), row in rows.items():
-        figures = {"policy": policy, "share": share, "uses_labels": policy == ORACLE, **_accuracy(row, class_names)}
+    for (policy, fraction), row in rows.items():
+        figures = {
+            "policy": policy,
+            "fraction": fraction,
+            "uses_labels": policy == ORACLE,
+            **_accuracy(row, class_names),
+        }
         figures["gap_closed"] = None if policy in ENDS else gap_closed(figures["miou"], *ends)
         figures["captured_gain"] = captured_gain(*(sum(p[name] for p in row.parts) for name in ("gain", "best_gain")))
         figures["against_all"] = difference(row, whole, trial, draws)
-        figures["against_random"] = difference(row, rows.get(("random", share)), trial, draws)
+        figures["against_random"] = difference(row, rows.get(("random", fraction)), trial, draws)
         table.append(figures | {"cost": _cost(row, whole)})
     named = dict(zip(class_names, support.tolist(), strict=True))
     return {"rows": table, "support": named, "rig": _plan_figures(seeds, class_names, trial, draws)}
@@ -317,7 +333,7 @@ def _accuracy(row: Row, class_names: Sequence[str]) -> Record:
 
 
 def _cost(row: Row, whole: Row) -> Record:
-    """Give what a frame takes in the mean, of each cost, and its share of that of every patch."""
+    """Give what a frame takes in the mean, of each cost, and its fraction of that of every patch."""
     found = {}
     for name in COSTS:
         done, full = (_mean_or_none([one.get(name) for one in some.parts]) for some in (row, whole))

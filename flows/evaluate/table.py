@@ -22,12 +22,12 @@ from flows.terminal.figures import (
     format_seconds,
 )
 
-SHOWN_SHARE = 0.10  # of the patches, or the nearest one tried: what is shown where one share has to do
+SHOWN_FRACTION = 0.10  # of the patches, or the nearest one tried: what is shown where one share has to do
 CAPTION = (
-    "K: share of the valid patches, each free of the others. mIoU over the counts of all frames, mean over the classes "
-    "of the labels; overall: share of pixels that are right; ± the spread of seeds, else of random draws. [ ] 95 % of "
+    "K: fraction of the valid patches, each free of the others. mIoU over the counts of all frames, mean over the classes "
+    "of the labels; overall: fraction of pixels that are right; ± the spread of seeds, else of random draws. [ ] 95 % of "
     "{draws} draws: paired bootstrap over frames, and over seeds where there are several. * uses labels. captured: the "
-    "chosen patches' share of the gain of the oracle's. Data before compression; multiply-adds in closed form; seconds "
+    "chosen patches' fraction of the gain of the oracle's. Data before compression; multiply-adds in closed form; seconds "
     "by the cost model, coarse pass included, by runs of lines or the full scan where that is cheaper."
 )
 
@@ -58,7 +58,7 @@ def _accuracy(content: dict[str, Any]) -> Table:
     for row in content["rows"]:
         table.add_row(
             f"{row['policy']}{'*' if row['uses_labels'] else ''}",
-            format_percent(row["share"]),
+            format_percent(row["fraction"]),
             _miou(row),
             format_points(row["pixel_accuracy"]),
             format_points(row["average_accuracy"]),
@@ -78,7 +78,7 @@ def _costs(content: dict[str, Any]) -> Table:
         cost = row["cost"]
         table.add_row(
             row["policy"],
-            format_percent(row["share"]),
+            format_percent(row["fraction"]),
             format_bytes(cost["bytes"]["done"]),
             format_percent(cost["bytes"]["ratio"]),
             format_count(cost["multiply_adds"]["done"]),
@@ -94,7 +94,7 @@ def _miou(row: dict[str, Any]) -> str:
 
 
 def _seconds(cost: dict[str, Any]) -> tuple[str, str]:
-    """Seconds of capture and their share of the full scan's; unknown beyond the mirror's range."""
+    """Seconds of capture and their fraction of the full scan's; unknown beyond the mirror's range."""
     if "capture_s" not in cost:
         return DASH, DASH
     done, full = cost["capture_s"]["done"], cost["full_s"]["done"]
@@ -122,9 +122,9 @@ def _rig(content: dict[str, Any]) -> Table:
 def _classes(content: dict[str, Any]) -> Table:
     shown = [row for row in content["rows"] if row["policy"] in ENDS]
     first = [row for row in content["rows"] if row["policy"] == content["rows"][1]["policy"]]
-    nearest = min(first, key=lambda row: abs(row["share"] - SHOWN_SHARE))
+    nearest = min(first, key=lambda row: abs(row["fraction"] - SHOWN_FRACTION))
     shown = [shown[0], *([] if nearest in shown else [nearest]), *shown[1:]]
-    heads = (f"{row['policy']} {format_percent(row['share'])}" for row in shown)
+    heads = (f"{row['policy']} {format_percent(row['fraction'])}" for row in shown)
     table = _table("class", "labelled px", *heads, title="IoU by class")
     for name, support in content["support"].items():
         cells = []

@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from flows.terminal.figures import DASH, format_seconds
-from pipeline.simulator.selection.choice import UNIT_WORDS
+from pipeline.simulator.selection.choice import UNIT_NAMES
 
 WIDE = 100  # characters, from which words fit into the table
 COLOURS = {"on": "green", "off": "dim"}
@@ -32,16 +32,16 @@ def print_effects(effects: Iterable[Row], total: Row, console: Console) -> None:
         figure = name in ("left out", "error", "measured", "CPU")
         table.add_column(name, justify="right" if figure else "left", no_wrap=name != "why", overflow="fold")
     for row in there:
-        table.add_row(*_figures(row, total), *([escape(_words(row))] if wide else []))
+        table.add_row(*_figures(row, total), *([escape(_format_row(row))] if wide else []))
     console.print(table)
-    console.print(escape(_KEY.format(unit=UNIT_WORDS[total["unit"]])), style="dim")
+    console.print(escape(_KEY.format(unit=UNIT_NAMES[total["unit"]])), style="dim")
     if not wide and not total.get("unweighed"):
         for row in there:
-            console.print(f"[bold]{escape(row['name'])}[/]: {escape(_words(row))}")
+            console.print(f"[bold]{escape(row['name'])}[/]: {escape(_format_row(row))}")
     absent = [f"{row['name']} ({row['magnitude']})" for row in rows if row["reason"] == "absent"]
     if absent:
         console.print(f"[bold]Not there[/]: {escape(', '.join(absent))}.")
-    for sentence in total_words(total):
+    for sentence in format_total(total):
         console.print(escape(sentence))
 
 
@@ -60,7 +60,7 @@ def _figures(row: Row, total: Row) -> list[str]:
     ]
 
 
-def _words(row: Row) -> str:
+def _format_row(row: Row) -> str:
     """How large an effect is, and why it is nevertheless there or left out where its figures do not tell."""
     said = {
         "exact": "",
@@ -84,9 +84,9 @@ def format_change(value: float | None, *, endless: bool = False) -> str:
     return f"{value:.2g}"
 
 
-def total_words(total: Mapping[str, Any]) -> Sequence[str]:
+def format_total(total: Mapping[str, Any]) -> Sequence[str]:
     """What was asked for and what is left out, against the tolerance, and the seconds that this saves."""
-    unit, count = UNIT_WORDS[total["unit"]], total["on"] + total["off"]
+    unit, count = UNIT_NAMES[total["unit"]], total["on"] + total["off"]
     tolerance = "any number of" if total["tolerance"] is None else f"{total['tolerance']:g}"
     words = [f"{total['on']} of {count} effects are computed (asked: {total['asked']}, tolerance {tolerance} {unit})."]
     if total["bound"] is None:

@@ -17,16 +17,16 @@ from PIL import Image
 from flows.publish.panels import UNLABELLED_COLOUR, class_palette
 from flows.publish.quicklook import QuicklookData, colours_of
 from flows.publish.receipt import Receipt
-from flows.publish.receipt_table import days_words
-from flows.tasks.memory import Prior
+from flows.publish.receipt_table import format_days
 from flows.tasks.open_survey import Products
+from flows.tasks.prior_maps import Prior
 from flows.tasks.run import SurveyRun
 from flows.terminal.figures import counted, format_percent, format_seconds
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.geometry.scan import Sweep, exposing
 from pipeline.planning.fine_pass import FinePlan
 from storage.archive.keys import StageRef
-from storage.arrays.class_maps import BeliefStore
+from storage.arrays.class_maps import ProbabilityStore
 from storage.arrays.layout import open_group, read_array
 from storage.arrays.quicklooks import choose_bands
 
@@ -63,17 +63,17 @@ class FieldMap:
 
 
 @dataclass(frozen=True)
-class RememberedField:
+class PriorMapField:
     """What a map that goes on from an earlier run has of it."""
 
     run: str
     days: float  # between that capture and this one
     classes: Bytes  # (y, x) of that run's map, by the numbers of today's; 255 for those that today has not
-    changed: NDArray[np.float32]  # (patch_y, patch_x) shares of pixels of another class
+    changed: NDArray[np.float32]  # (patch_y, patch_x) fractions of pixels of another class
     age_days: NDArray[np.float32]  # (y, x) since a pixel was captured, NaN where it never was
 
 
-def remembered(prior: Prior | None, drawn: StageRef, receipt: Receipt) -> RememberedField | None:
+def prior_map(prior: Prior | None, drawn: StageRef, receipt: Receipt) -> PriorMapField | None:
     """Return what the prior map shows; None where a map goes on from no other run, or put it aside.
 
     ``drawn`` is the store of the class map and of the class probabilities.
@@ -85,53 +85,64 @@ def remembered(prior: Prior | None, drawn: StageRef, receipt: Receipt) -> Rememb
     for number, earlier in enumerate(prior.classes):
         if earlier >= 0:
             names[earlier] = number
-    belief = BeliefStore(drawn.path / "belief.zarr")
-    changed = belief.changed()
+    probabilities = ProbabilityStore(drawn.path / "class_probabilities.zarr")
+    changed = probabilities.changed()
     assert changed is not None
-    before = read_array(open_group(prior.belief.path / "class_map.zarr"), "classes")
-    return RememberedField(prior.run, prior.days, names[before], changed, belief.age())
+    before = read_array(open_group(prior.probabilities.path / "class_map.zarr"), "classes")
+    return PriorMapField(prior.run, prior.days, names[before], changed, probabilities.age())
 
 
 def field_map(
-    run: SurveyRun, products: Products, plan: FinePlan, glance: QuicklookData, before: RememberedField | None
+    run: SurveyRun, products: Products, plan: FinePlan, coarse_prediction: QuicklookData, before: PriorMapField | None
 ) -> FieldMap:
-    """Gather the layers of a run; ``glance`` is what its quicklook shows."""
-    height, width = glance.class_map.shape
+    """Gather the layers of a run; ``coarse_prediction`` is what its quicklook shows."""
+    height, width = coarse_prediction.class_map.shape
     thin = slice(None, None, -(-max(height, width) // MOST_PX))
-    palette = palette_bytes(glance.class_names, glance.class_colours)
+    palette = palette_bytes(coarse_prediction.class_names, coarse_prediction.class_colours)
 
     def classes(image: NDArray[np.integer]) -> str:
         return png_address(image[thin, thin].astype(np.uint8), palette)
 
-    title = choose_bands(glance.wavelength_nm)[1].capitalize()
-    colours = np.rint(255 * colours_of(glance, glance.rectified)).astype(np.uint8)
+    title = choose_bands(coarse_prediction.wavelength_nm)[1].capitalize()
+    colours = np.rint(255 * colours_of(coarse_prediction, coarse_prediction.rectified)).astype(np.uint8)
     layers = [MapLayer(title, jpeg_address(colours[thin, thin]), shown=True)]
-    layers.append(MapLayer("Class map", classes(glance.class_map), shown=True))
-    if glance.confidence is not None:
-        layers.append(MapLayer("Confidence, dark 0 to bright 1", _ramp_address(glance.confidence[thin, thin], 1.0)))
-    if glance.truth is not None:
-        layers.append(MapLayer("Truth", classes(glance.truth)))
+    layers.append(MapLayer("Class map", classes(coarse_prediction.class_map), shown=True))
+    if coarse_prediction.confidence is not None:
+        layers.append(
+            MapLayer("Confidence, dark 0 to bright 1", _ramp_address(coarse_prediction.confidence[thin, thin], 1.0))
+        )
+    if coarse_prediction.truth is not None:
+        layers.append(MapLayer("Truth", classes(coarse_prediction.truth)))
     if before is not None:
-        layers.append(MapLayer(f"Before: {days_words(before.days)}", classes(before.classes)))
+        layers.append(MapLayer(f"Before: {format_days(before.days)}", classes(before.classes)))
         oldest = float(np.nanmax(before.age_days)) if np.isfinite(before.age_days).any() else 0.0
         ages = _ramp_address(before.age_days[thin, thin], oldest)
         layers.append(MapLayer(f"Days since it was captured, 0 to {oldest:.2g}", ages, opacity=0.8))
-        table = np.array([(*CHANGED_RGB, round(255 * share / LEVELS)) for share in range(LEVELS + 1)], np.uint8)
-        shares = np.rint(LEVELS * np.clip(np.nan_to_num(before.changed), 0, 1)).astype(np.uint8)
-        layers.append(MapLayer("Changed since", png_address(_on_field(run, shares)[thin, thin], table), opacity=0.8))
+        table = np.array([(*CHANGED_RGB, round(255 * fraction / LEVELS)) for fraction in range(LEVELS + 1)], np.uint8)
+        fractions = np.rint(LEVELS * np.clip(np.nan_to_num(before.changed), 0, 1)).astype(np.uint8)
+        layers.append(MapLayer("Changed since", png_address(_on_field(run, fractions)[thin, thin], table), opacity=0.8))
     if not run.plan.plain:
-        seats = np.zeros(run.grid.seat_shape, np.uint8)
-        seats.ravel()[plan.seats] = 1
+        patch_index = np.zeros(run.grid.patch_shape, np.uint8)
+        patch_index.ravel()[plan.patch_index] = 1
         table = np.array([(0, 0, 0, 0), (*PATCH_RGB, 255)], np.uint8)
-        layers.append(MapLayer("Looked at twice", png_address(_on_field(run, seats)[thin, thin], table), opacity=0.6))
+        layers.append(
+            MapLayer("Looked at twice", png_address(_on_field(run, patch_index)[thin, thin], table), opacity=0.6)
+        )
     if sweeps := _sweep_boxes(run, products, plan):
         layers.append(MapLayer("Sweeps, in their order", boxes=sweeps))
-    counts = np.bincount(glance.class_map.ravel(), minlength=256) / max(glance.class_map.size, 1)
-    covered = [*counts[: len(glance.class_names)].tolist(), float(counts[len(glance.class_names) :].sum())]
+    counts = np.bincount(coarse_prediction.class_map.ravel(), minlength=256) / max(coarse_prediction.class_map.size, 1)
+    covered = [
+        *counts[: len(coarse_prediction.class_names)].tolist(),
+        float(counts[len(coarse_prediction.class_names) :].sum()),
+    ]
     rows = [
-        {"name": name.replace("_", " "), "share": format_percent(share), "colour": "#" + bytes(colour.tolist()).hex()}
-        for name, share, colour in zip((*glance.class_names, "no class"), covered, palette, strict=False)
-        if share
+        {
+            "name": name.replace("_", " "),
+            "fraction": format_percent(fraction),
+            "colour": "#" + bytes(colour.tolist()).hex(),
+        }
+        for name, fraction, colour in zip((*coarse_prediction.class_names, "no class"), covered, palette, strict=False)
+        if fraction
     ]
     return FieldMap((width, height), layers, rows)
 
@@ -181,12 +192,12 @@ def _sweep_boxes(run: SurveyRun, products: Products, plan: FinePlan) -> list[tup
     passes = (("capture_coarse", run.plan.coarse), ("capture_fine", plan.sweeps))
     taken = [(sweep, products[stage].path / f"{sweep.name}.zarr") for stage, sweeps in passes for sweep in sweeps]
     return [
-        (block_of(sweep, run), f"{number} of {len(taken)}: {_sweep_words(run, sweep, path)}")
+        (block_of(sweep, run), f"{number} of {len(taken)}: {_format_sweep(run, sweep, path)}")
         for number, (sweep, path) in enumerate(taken, 1)
     ]
 
 
-def _sweep_words(run: SurveyRun, sweep: Sweep, path: Path) -> str:
+def _format_sweep(run: SurveyRun, sweep: Sweep, path: Path) -> str:
     """Return which sweep it was, its lines, and how long they took by their own times."""
     group, exposure = open_group(path), exposing(run.camera, sweep).exposure_ms
     times, started = read_array(group, "time"), group.attrs.get("started")
@@ -199,7 +210,7 @@ def _sweep_words(run: SurveyRun, sweep: Sweep, path: Path) -> str:
 def block_of(sweep: Sweep, run: SurveyRun) -> tuple[int, int, int, int]:
     """Return rows and columns (y0, y1, x0, x1) that a sweep's line centres and samples span, cut to the scene."""
     size = (run.grid.width, run.grid.height) if sweep.along == "x" else (run.grid.height, run.grid.width)
-    across = np.array([-0.5, 0.5]) * run.camera.samples + sweep.strip_px + size[0] / 2
+    across = np.array([-0.5, 0.5]) * run.camera.samples + sweep.swath_px + size[0] / 2
     scan = np.array([0, sweep.lines * sweep.step]) + sweep.start_px + size[1] / 2 - 0.5
     x0, x1 = np.clip(np.rint(across), 0, size[0]).astype(int).tolist()
     y0, y1 = np.clip(np.rint(scan), 0, size[1]).astype(int).tolist()

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.publish.receipt_table import FOREIGN
-from flows.settings.values import LOOK_WHOLE
-from flows.tasks.memory import told_of_memory
+from flows.settings.values import EXTENT_WHOLE
+from flows.tasks.prior_maps import prior_map_figures
 from flows.tasks.run import SurveyRun
-from flows.tasks.stages.maps import strange_pixels
+from flows.tasks.stages.maps import out_of_range_pixels
 from models.evaluation.expected_scores import expected_counts
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, FieldScale, areas_by_number
@@ -23,12 +23,12 @@ from pipeline.ground.georeference import class_areas_m2, crs_name, pixel_side_m
 from pipeline.ground.zones import figures_of_plots
 from pipeline.planning.fine_pass import FinePlan
 from storage.archive.keys import StageRef
-from storage.arrays.class_maps import BeliefStore, ClassMap
+from storage.arrays.class_maps import ClassMap, ProbabilityStore
 from storage.arrays.ground_maps import GroundMap
 
 OLDER_DAYS = (1, 7, 30)  # since a look, of which the hectares are told
 PLOTS_FILE = "plots.csv"
-STRIP_ROWS = 256  # of a belief that are read at a time
+STRIP_ROWS = 256  # of a class probabilities that are read at a time
 
 
 def field_figures(run: SurveyRun, fine: FinePlan | None) -> dict[str, Any]:
@@ -58,7 +58,7 @@ def field_figures(run: SurveyRun, fine: FinePlan | None) -> dict[str, Any]:
         "footprint_m": None if footprint is None else {"width": footprint.width_m, "depth": footprint.depth_m},
         "footprint_east_north_m": None if footprint is None else footprint.outline_m.tolist(),
         "hectares": kept.hectares,
-        "kept_share": None if run.zones.kept is None else float(run.zones.kept.kept.mean()),
+        "kept_fraction": None if run.zones.kept is None else float(run.zones.kept.kept.mean()),
         "camera_s": camera_s if captured else None,
         "fine_planned": fine is not None or run.plan.plain,
         "lines": lines if captured else None,
@@ -77,16 +77,18 @@ def _kept(run: SurveyRun, scale: FieldScale) -> FieldScale:
     return FieldScale(scale.shape, scale.view_deg, scale.pixel_m, float(np.nansum(areas[run.zones.kept.kept])))
 
 
-def find_ground(run: SurveyRun, posed: GroundMap | None, found: ClassMap, belief: BeliefStore) -> dict[str, Any]:
+def find_ground(
+    run: SurveyRun, posed: GroundMap | None, found: ClassMap, probabilities: ProbabilityStore
+) -> dict[str, Any]:
     """``ground``: grid, hectares of each class, what changed and what is old. Empty where nobody says where it lies."""
-    told = placed_findings(run, found) if posed is None else posed_findings(posed)
-    if told is None:
+    figures = placed_findings(run, found) if posed is None else posed_findings(posed)
+    if figures is None:
         return {}
     place, drawn = run.zones.place, found.classes != UNLABELLED
-    told |= {"older_ha": older_hectares(place, np.where(drawn, belief.age(), np.nan))}
-    if (old_class := belief.old_class()) is not None:
-        told |= {"changes_ha": changed_hectares(place, old_class, found)}
-    return {"ground": told}
+    figures |= {"older_ha": older_hectares(place, np.where(drawn, probabilities.age(), np.nan))}
+    if (old_class := probabilities.old_class()) is not None:
+        figures |= {"changes_ha": changed_hectares(place, old_class, found)}
+    return {"ground": figures}
 
 
 def posed_findings(drawn: GroundMap) -> dict[str, Any]:
@@ -162,13 +164,13 @@ def _ground_m2(run: SurveyRun, kept: NDArray[np.bool_]) -> float | None:
 
 def plots_csv(plots: Sequence[Mapping[str, Any]]) -> str:
     """Every figure of every plot, a row each; empty where nothing is known."""
-    names = list(plots[0]["shares"]) if plots else []
+    names = list(plots[0]["fractions"]) if plots else []
     head = ["plot", "pixels", "mapped_pixels", "area_m2", "confidence"]
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow([*head, *(f"share_{name}" for name in names)])
     for plot in plots:
-        cells = [*(plot[name] for name in head), *(plot["shares"][name] for name in names)]
+        cells = [*(plot[name] for name in head), *(plot["fractions"][name] for name in names)]
         table.writerow(["" if cell is None else cell for cell in cells])
     return text.getvalue()
 
@@ -176,39 +178,39 @@ def plots_csv(plots: Sequence[Mapping[str, Any]]) -> str:
 def find_map(run: SurveyRun, ref: StageRef, drawn: ClassMap) -> dict[str, Any]:
     """Findings of a map in the stage ``ref``: ``unknown``, ``pixels`` and ``expected``, each where there is one."""
     found: dict[str, Any] = {}
-    unclassed, share = drawn.classes == UNLABELLED, 0.0
-    if (rate := run.settings.unknown_rate) is not None and run.familiar is not None:
+    unclassed, fraction = drawn.classes == UNLABELLED, 0.0
+    if (rate := run.settings.unknown_rate) is not None and run.ood_detector is not None:
         count = int(np.count_nonzero(drawn.classes == run.described.config.classes))
         told_pixels = int(np.count_nonzero(~unclassed))
-        share = count / told_pixels if told_pixels else 0.0
-        found["unknown"] = {"pixels": count, "share": share, "rate": rate}
+        fraction = count / told_pixels if told_pixels else 0.0
+        found["unknown"] = {"pixels": count, "fraction": fraction, "rate": rate}
     if run.zones.left_out is not None:
         unclassed &= ~run.zones.left_out
     pixels = {
         "scene_without_a_value": run.scene.filled_px,
         "coarse_px_no_reading": 0,
         "fine_px_no_reading": 0,
-        **{f"{name}_no_reading": count for name, count in strange_pixels(ref).items()},
+        **{f"{name}_no_reading": count for name, count in out_of_range_pixels(ref).items()},
         "map_without_a_class": int(np.count_nonzero(unclassed)),
     }
     if any(pixels.values()):
         found["pixels"] = pixels
-    expected = None if share > FOREIGN else _expected(run, ref)
+    expected = None if fraction > FOREIGN else _expected(run, ref)
     return found if expected is None else found | {"expected": expected}
 
 
 def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
     """What the map is likely to score by what it says of itself; None where nobody knows how such comes true.
 
-    That is known of maps of plain scans that are read whole, without a memory.
+    That is known of maps of uniform scans that are read whole, without a memory.
     """
     settings, step = run.settings, run.settings.scan_step
-    memory = told_of_memory(ref.path)
+    memory = prior_map_figures(ref.path)
     remembers = memory is not None and memory["put_aside"] is None
-    if run.map_scores is None or step is None or settings.look != LOOK_WHOLE or run.budget is not None or remembers:
+    if run.map_scores is None or step is None or settings.extent != EXTENT_WHOLE or run.budget is not None or remembers:
         return None
     names = run.described.class_names
-    counts = expected_counts(_strips(BeliefStore(ref.path / "belief.zarr")), len(names))
+    counts = expected_counts(_strips(ProbabilityStore(ref.path / "class_probabilities.zarr")), len(names))
     score = run.map_scores.expected(counts, step, settings.scan_exposure_ms or run.camera.exposure_ms)
     if score is None or not np.isfinite(score.miou):
         return None
@@ -216,6 +218,6 @@ def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
     return {"miou": score.miou, "error": score.error, "per_class_iou": of_classes}
 
 
-def _strips(belief: BeliefStore) -> Iterator[NDArray[np.float32]]:
-    for top in range(0, belief.shape[0], STRIP_ROWS):
-        yield belief.read(slice(top, min(top + STRIP_ROWS, belief.shape[0])))[0]
+def _strips(probabilities: ProbabilityStore) -> Iterator[NDArray[np.float32]]:
+    for top in range(0, probabilities.shape[0], STRIP_ROWS):
+        yield probabilities.read(slice(top, min(top + STRIP_ROWS, probabilities.shape[0])))[0]

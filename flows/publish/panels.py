@@ -1,4 +1,4 @@
-"""What pictures of a map are made of: palettes, outlines of seats, scale bars; and the map on the ground."""
+"""What pictures of a map are made of: palettes, outlines of patches, scale bars; and the map on the ground."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from flows.terminal.figures import area_words
+from flows.terminal.figures import format_area
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.class_maps import ClassMap
 from storage.arrays.ground_maps import GroundMap
@@ -93,7 +93,7 @@ def class_rgb(classes: NDArray[np.integer], palette: NDArray[np.float32]) -> NDA
 
 
 def outline(chosen: NDArray[np.bool_], patch_px: int, shape: tuple[int, int]) -> list[list[tuple[float, float]]]:
-    """Border of a set of seats as line segments ((x, y), (x, y)) in scene px, clipped to the scene's (y, x) size."""
+    """Border of a set of patches as line segments ((x, y), (x, y)) in scene px, clipped to the scene's (y, x) size."""
     padded = np.pad(chosen, 1)
     limit = np.array([shape[1], shape[0]], np.float64)
     segments = []
@@ -156,7 +156,7 @@ def draw_ground(found: GroundMap) -> bytes:
             facecolor=found.legend.colours[number] / 255,
             edgecolor="0.4",
             linewidth=0.5,
-            label=f"{name.replace('_', ' ')}  {area_words(found.areas.get(name, {}).get('ha', 0.0))}",
+            label=f"{name.replace('_', ' ')}  {format_area(found.areas.get(name, {}).get('ha', 0.0))}",
         )
         for number, name in enumerate(found.legend.names)
         if number in present

@@ -146,7 +146,7 @@ def savings_rows(receipt: Receipt) -> list[dict[str, str]]:
             "cost": row["label"],
             "this survey": row["done"],
             "everything": row["full"],
-            "share": format_percent(row["ratio"]),
+            "fraction": format_percent(row["ratio"]),
         }
         for row in cost_rows(receipt["savings"])
     ]

@@ -1,4 +1,4 @@
-"""The quicklook, a survey at a glance as one PNG: raw lines and field, where it looked twice, class map, truth."""
+"""The quicklook, a survey at a glance as one PNG: raw lines and field, where it captured again, class map, truth."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ Box = tuple[int, int, int, int]
 
 @dataclass(frozen=True)
 class QuicklookData:
-    """What the four panels show, as plain arrays. Pixels are scene pixels; seats are numbered row by row."""
+    """What the four panels show, as plain arrays. Pixels are scene pixels; patches are numbered row by row."""
 
     survey: str
     seed: int
     about: str  # how it was looked at
-    policy: str | None  # that chose the seats; None of a plain scan of which all are read
+    policy: str | None  # that chose the patches; None of a uniform scan of which all are read
     raw: tuple[NDArray[np.generic], ...]  # sweeps as they came, calibrated, (line, sample, band) each, by strip
     raw_lines: int  # captured in them; a large sweep shows every n-th
     rectified: NDArray[np.floating]  # (y, x, band), NaN where nothing was captured
     wavelength_nm: NDArray[np.floating]  # (band,) of raw and rectified
-    score: NDArray[np.floating]  # (row, column) of the padded grid's seats; NaN or -inf without a score
+    score: NDArray[np.floating]  # (row, column) of the padded grid's patches; NaN or -inf without a score
     patch_px: int
-    seats: NDArray[np.integer]  # asked for, in order of rank
+    patch_index: NDArray[np.integer]  # asked for, in order of rank
     blocks: tuple[Box, ...]  # captured in detail: (y0, y1, x0, x1), half open [px]
     class_map: NDArray[np.integer]  # (y, x), 255 unlabelled
     class_names: tuple[str, ...]
@@ -48,7 +48,7 @@ class QuicklookData:
     confidence: NDArray[np.floating] | None = None  # (y, x) 0..1, shown where there is no truth
     along: Axis = "x"  # of the scene along which the raw lines lie
     note: str = ""  # at the end of the title line, such as the accuracy
-    scan: bool = False  # a plain scan, which looked nowhere twice
+    scan: bool = False  # a uniform scan, which looked nowhere twice
     raster: bool = False  # no lines were taken: ``raw`` is the image of its coarse means
 
 
@@ -60,7 +60,7 @@ def draw_quicklook(path: str | Path, panels: QuicklookData) -> None:
 
 _STYLE: Any = {**STYLE, "axes.titlesize": 14, "axes.titleweight": "bold", "axes.titlelocation": "left"}
 _DPI = 100
-_SEAT_COLOUR = "#7df9ff"
+_PATCH_COLOUR = "#7df9ff"
 _BLOCK: dict[str, Any] = {"facecolor": "none", "edgecolor": "white", "linewidth": 1.2, "linestyle": (0, (4, 2))}
 _FLAT, _TALL = 0.3, 2.0  # height over width beyond which the panels are stacked, or stand abreast
 
@@ -123,9 +123,9 @@ def colours_of(data: QuicklookData, image: NDArray[np.generic]) -> NDArray[np.fl
 
 
 def _draw_attention(axes: Axes, data: QuicklookData) -> None:
-    """Panel 2: the score of every seat over the field in grey, seats asked for and blocks captured outlined.
+    """Panel 2: the score of every patch over the field in grey, patches asked for and blocks captured outlined.
 
-    Of a plain scan, which looked nowhere twice, the confidence of the map.
+    Of a uniform scan, which looked nowhere twice, the confidence of the map.
     """
     if data.policy is None:
         return _draw_confidence(axes, data.confidence, "2  Confidence")
@@ -145,16 +145,16 @@ def _draw_attention(axes: Axes, data: QuicklookData) -> None:
     for y0, y1, x0, x1 in data.blocks:
         axes.add_patch(Rectangle((x0 - 0.5, y0 - 0.5), x1 - x0, y1 - y0, **_BLOCK))
     chosen = np.zeros(rows * columns, bool)
-    chosen[np.asarray(data.seats, np.intp)] = True
+    chosen[np.asarray(data.patch_index, np.intp)] = True
     segments = outline(chosen.reshape(rows, columns), data.patch_px, (height, width))
-    for colour, thickness in (("black", 2.0), (_SEAT_COLOUR, 1.0)):
+    for colour, thickness in (("black", 2.0), (_PATCH_COLOUR, 1.0)):
         axes.add_collection(LineCollection(segments, colors=colour, linewidths=thickness, capstyle="projecting"))
     _frame(axes, (height, width))
     _heat_key(heat, ("low", "high"))
-    words = f"{len(data.seats)} seats chosen by {data.policy} (cyan)"
+    words = f"{len(data.patch_index)} patches chosen by {data.policy} (cyan)"
     if data.scan:
         return _caption(axes, "2  What is kept in detail", words)
-    return _caption(axes, "2  Where it looked twice", f"{words}; captured in detail (dashed)")
+    return _caption(axes, "2  Where it captured again", f"{words}; captured in detail (dashed)")
 
 
 def _score_range(score: NDArray[np.floating]) -> tuple[NDArray[np.float64], float, float]:
@@ -205,10 +205,10 @@ def _draw_confidence(axes: Axes, confidence: NDArray[np.floating] | None, title:
 def _draw_legend(figure: Figure, data: QuicklookData, columns: int) -> None:
     palette = _palette(data)
     counts = np.bincount(data.class_map.ravel(), minlength=256)[: len(data.class_names)]
-    shares = counts / max(int(counts.sum()), 1)
+    fractions = counts / max(int(counts.sum()), 1)
     marks = [Patch(facecolor=tuple(colour), edgecolor="#555555", linewidth=0.6) for colour in palette]
-    words = ["< 0.1 %" if 0 < share < 0.001 else f"{100 * share:.1f} %" for share in shares]
-    names = [f"{name.replace('_', ' ')}  {share}" for name, share in zip(data.class_names, words, strict=True)]
+    words = ["< 0.1 %" if 0 < fraction < 0.001 else f"{100 * fraction:.1f} %" for fraction in fractions]
+    names = [f"{name.replace('_', ' ')}  {fraction}" for name, fraction in zip(data.class_names, words, strict=True)]
     others = [data.class_map] if data.truth is None else [data.class_map, data.truth]
     if any((image == UNLABELLED).any() for image in others):
         marks.append(Patch(facecolor=UNLABELLED_COLOUR, edgecolor="#555555", linewidth=0.6))

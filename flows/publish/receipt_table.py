@@ -12,10 +12,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from flows.publish.receipt import Receipt, is_pending
-from flows.tasks.scores import worst_class_words
+from flows.tasks.scores import format_worst_class
 from flows.terminal.figures import (
-    area_words,
     counted,
+    format_area,
     format_bytes,
     format_count,
     format_metres,
@@ -25,7 +25,7 @@ from flows.terminal.figures import (
     three_digits,
 )
 from pipeline.ground.field_places import M2_PER_HECTARE, SECONDS_PER_HOUR
-from pipeline.planning.plain_scans import scan_words
+from pipeline.planning.uniform_scans import format_scan
 
 COST_LABELS = {
     "capture_s": ("time at the camera", format_seconds),
@@ -38,7 +38,7 @@ COST_LABELS = {
 }
 MOST_CHANGES = 4  # in words
 LEADING = 3  # classes of a plot in words
-FOREIGN = 0.2  # share of a map that is unknown from which on its weights are the wrong ones
+FOREIGN = 0.2  # fraction of a map that is unknown from which on its weights are the wrong ones
 
 
 def cost_rows(savings: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -59,23 +59,23 @@ def print_table(receipt: Receipt, console: Console) -> None:
         table.add_row(row["label"], row["done"], row["full"], format_percent(row["ratio"]))
     console.print(table)
     for name, words in finding_rows({name: receipt[name] for name in ("memory", "unknown") if name in receipt}):
-        if name != "unknown" or receipt["unknown"]["share"] > FOREIGN:
+        if name != "unknown" or receipt["unknown"]["fraction"] > FOREIGN:
             console.print(escape(f"{name} {words}"))
 
 
 def headline(receipt: Receipt, captured_again: float | None = None) -> str:
     """Return the run in a few sentences for a farmer, plain text: how long, how good, and where it is worst.
 
-    ``captured_again`` is the share of the field that was captured in detail, 0..1; None leaves it out.
+    ``captured_again`` is the fraction of the field that was captured in detail, 0..1; None leaves it out.
     """
     savings, scan = receipt["savings"], receipt.get("plan", {}).get("kind") in ("scan", "raster")
     words = []
     if captured_again == 0:
         words.append(
-            "The camera looked twice at nothing: no run of fine lines fits into the time left, or is worth it."
+            "The camera captured again at nothing: no run of fine lines fits into the time left, or is worth it."
         )
     elif captured_again is not None:
-        words.append(f"The camera looked twice at {format_percent(captured_again)} of the field.")
+        words.append(f"The camera captured again at {format_percent(captured_again)} of the field.")
     if (capture := savings.get("capture_s")) is None:
         read, stored = (format_percent(savings[name]["ratio"]) for name in ("multiply_adds", "bytes_stored"))
         words.append(
@@ -93,7 +93,7 @@ def headline(receipt: Receipt, captured_again: float | None = None) -> str:
     if (accuracy := receipt.get("accuracy")) is not None:
         alone = scan and "kept" not in receipt  # everything is read
         others = (
-            {} if alone else {"the coarse look alone gives": accuracy["none"], "detail everywhere": accuracy["all"]}
+            {} if alone else {"the coarse pass alone gives": accuracy["none"], "detail everywhere": accuracy["all"]}
         )
         beside = [f"{name} {format_points(one['miou'])}" for name, one in others.items() if one["miou"] is not None]
         right = format_points(accuracy.get("overall_accuracy"))
@@ -101,7 +101,7 @@ def headline(receipt: Receipt, captured_again: float | None = None) -> str:
             f"The map scores {format_points(accuracy['miou'])} of 100 against the truth ({right} % of its pixels are "
             f"right){'; ' if beside else ''}{', '.join(beside)}."
         )
-        words.append(worst_class_words(accuracy, alone=alone))
+        words.append(format_worst_class(accuracy, alone=alone))
     return " ".join(filter(None, words))
 
 
@@ -116,7 +116,7 @@ def finding_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
         *(
             (f"pointing, {name}", words)
             for name, one in found.get("pointing", {}).items()
-            if isinstance(one, Mapping) and (words := _pointing_words(one))
+            if isinstance(one, Mapping) and (words := _format_pointing(one))
         ),
         *(
             (
@@ -132,7 +132,7 @@ def finding_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [(label, words) for label, words in rows if words]
 
 
-def _field_words(field: Mapping[str, Any], _: object) -> str:
+def _format_field(field: Mapping[str, Any], _: object) -> str:
     if field["view_deg"] is None:
         size = " x ".join(map(format_count, field["size_px"])) + " px"
     else:
@@ -140,7 +140,7 @@ def _field_words(field: Mapping[str, Any], _: object) -> str:
     if field["ground_pixel_m"] is None:
         return size
     away = "" if field["range_m"] is None else f", {format_metres(field['range_m']['median'])} away in the middle"
-    ground = f"{size}{away}: {area_words(field['hectares'])} at {format_metres(field['ground_pixel_m'])} a pixel"
+    ground = f"{size}{away}: {format_area(field['hectares'])} at {format_metres(field['ground_pixel_m'])} a pixel"
     pace = field["hectares_per_hour"]
     if pace is None:  # a raster took no time
         return ground
@@ -149,20 +149,20 @@ def _field_words(field: Mapping[str, Any], _: object) -> str:
     )
 
 
-def _plan_words(plan: Mapping[str, Any], _: object) -> str:
+def _format_plan(plan: Mapping[str, Any], _: object) -> str:
     parts = [plan["reason"] if plan["kind"] in ("full", "scan", "raster") else f"{plan['lines']} fine lines"]
     if plan["out_of_reach"]:
-        parts.append(f"{plan['out_of_reach']} places worth a second look lie beyond the mirror's range")
+        parts.append(f"{plan['out_of_reach']} places worth a second pass lie beyond the mirror's range")
     if plan.get("spared_s"):
-        share = f" ({format_percent(plan['spared_share'])} of the full scan's)" if plan["spared_share"] else ""
+        fraction = f" ({format_percent(plan['spared_fraction'])} of the full scan's)" if plan["spared_fraction"] else ""
         parts.append(
-            f"the threshold of {plan['threshold']:g} a second left {plan['spared_s']:.1f} s{share} unspent: no further "
+            f"the threshold of {plan['threshold']:g} a second left {plan['spared_s']:.1f} s{fraction} unspent: no further "
             "run of lines pays"
         )
     return "; ".join(filter(None, parts))
 
 
-def _recording_words(recording: Mapping[str, Any], _: object) -> str:
+def _format_recording(recording: Mapping[str, Any], _: object) -> str:
     done_s, full_s = recording["passes_s"], recording["full_scan_s"]
     own = "the recorded scan" if recording["full_scan_is"] == "recorded" else "a scan of every line"
     saved = f", {format_percent(1 - done_s / full_s)} less" if 0 < done_s < full_s else ""
@@ -173,21 +173,21 @@ def _recording_words(recording: Mapping[str, Any], _: object) -> str:
     )
 
 
-def _look_words(look: Mapping[str, Any], _: object) -> str:
-    rest = "the rest is as before" if look["remembers"] else "of the rest nothing is known"
-    text = f"lines {look['lines']}, {format_percent(look['share'])} of the field; {rest}"
-    if "expected_gain" in look:
-        text += f"; about {format_percent(look['expected_wrong'])} of the prior map was expected to be wrong there"
-    if look.get("due_left"):
-        text += f"; {format_count(look['due_left'])} of {format_count(look['due'])} places that were due had to wait"
+def _format_extent(scan_pass: Mapping[str, Any], _: object) -> str:
+    rest = "the rest is as before" if scan_pass["remembers"] else "of the rest nothing is known"
+    text = f"lines {scan_pass['lines']}, {format_percent(scan_pass['fraction'])} of the field; {rest}"
+    if "expected_gain" in scan_pass:
+        text += f"; about {format_percent(scan_pass['expected_wrong'])} of the prior map was expected to be wrong there"
+    if scan_pass.get("due_left"):
+        text += f"; {format_count(scan_pass['due_left'])} of {format_count(scan_pass['due'])} places that were due had to wait"
     return text
 
 
-def _kept_words(kept: Mapping[str, Any], found: Mapping[str, Any]) -> str:
+def _format_kept(kept: Mapping[str, Any], found: Mapping[str, Any]) -> str:
     read, stored = (kept[name]["done"] / kept[name]["everything"] for name in ("multiply_adds", "bytes"))
-    share = kept["seats"] / kept["of_seats"] if kept["of_seats"] else 0.0
+    fraction = kept["patches"] / kept["of_patches"] if kept["of_patches"] else 0.0
     text = (
-        f"{format_percent(share)} of the patches, for {format_percent(read)} of the multiply-adds of reading everything"
+        f"{format_percent(fraction)} of the patches, for {format_percent(read)} of the multiply-adds of reading everything"
         f" and {format_percent(stored)} of the bytes of keeping it"
     )
     accuracy = found.get("accuracy") or {}
@@ -195,34 +195,34 @@ def _kept_words(kept: Mapping[str, Any], found: Mapping[str, Any]) -> str:
     return text if every is None else f"{text}; everything read scores {format_points(every)}"
 
 
-def _memory_words(memory: Mapping[str, Any], _: object) -> str:
-    since, shift = f"{memory['run']}, {days_words(memory['days'])}", float(np.hypot(*memory["shift_px"]))
+def _format_prior_map(memory: Mapping[str, Any], _: object) -> str:
+    since, shift = f"{memory['run']}, {format_days(memory['days'])}", float(np.hypot(*memory["shift_px"]))
     if memory["put_aside"] == "turned":
         return f"{since}: put aside, the rig was turned since by {abs(memory['turned_deg']):.1f} degrees"
     alike = "nothing" if memory["agreement"] is None else format_percent(memory["agreement"])
     if memory["put_aside"]:
         return f"{since}: put aside, today's capture agrees with {alike} of it: another field, or a rig that was moved"
-    share = format_percent(memory["changed_px"] / memory["compared_px"]) if memory["compared_px"] else "nothing"
+    fraction = format_percent(memory["changed_px"] / memory["compared_px"]) if memory["compared_px"] else "nothing"
     most = ", ".join(f"{_spaced(old)} to {_spaced(new)}" for _, old, new in memory["changes"][:MOST_CHANGES])
     beside = f", which lay {shift:.0f} px beside it" if shift else ""
-    return f"{since}{beside}: today's capture agrees with {alike} of it, {share} changed{': ' if most else ''}{most}"
+    return f"{since}{beside}: today's capture agrees with {alike} of it, {fraction} changed{': ' if most else ''}{most}"
 
 
-def days_words(days: float) -> str:
+def format_days(days: float) -> str:
     """Return how long ago a capture was."""
     if days < 1:
         return f"{24 * days:.1f} hours earlier"
     return f"{days:.1f} days earlier" if days < 10 else f"{days:.0f} days earlier"
 
 
-def _unknown_words(unknown: Mapping[str, Any], found: Mapping[str, Any]) -> str:
+def _format_unknown(unknown: Mapping[str, Any], found: Mapping[str, Any]) -> str:
     text = (
-        f"{format_percent(unknown['share'])} of the map is unknown, unlike all that the weights were trained on; of"
+        f"{format_percent(unknown['fraction'])} of the map is unknown, unlike all that the weights were trained on; of"
         f" what they know it would be about {format_percent(unknown['rate'])}"
     )
     if pixels := (found.get("accuracy") or {}).get("unknown_px"):
         text += f"; {format_count(pixels)} such pixels have a label and count as wrong"
-    if unknown["share"] > FOREIGN:
+    if unknown["fraction"] > FOREIGN:
         text += (
             ". These weights do not know this field: train some on labelled scenes of it (spectralzoom train DATASET), "
             "or leave the class out with --unknown off"
@@ -230,36 +230,36 @@ def _unknown_words(unknown: Mapping[str, Any], found: Mapping[str, Any]) -> str:
     return text
 
 
-def _scans_words(scans: Mapping[str, Mapping[str, Any]], found: Mapping[str, Any]) -> str:
+def _format_scans(scans: Mapping[str, Mapping[str, Any]], found: Mapping[str, Any]) -> str:
     own = "this one, read whole" if "kept" in found else "this one"
     titles = {"taken": own, "best_in_time": "best in the same seconds", "reference": "nearly as good as any"}
     return "; ".join(
-        f"{title}: {scan_words(one['step'], one['exposure_ms'])}, {one['seconds']:.1f} s, about "
+        f"{title}: {format_scan(one['step'], one['exposure_ms'])}, {one['seconds']:.1f} s, about "
         f"{format_points(one['expected_miou'])} ± {format_points(one.get('expected_spread'))}"
         for name, title in titles.items()
         if (one := scans.get(name)) is not None
     )
 
 
-def _zones_words(zones: Mapping[str, Any], _: object) -> str:
-    ground = "" if zones["kept_m2"] is None else f", {area_words(zones['kept_m2'] / M2_PER_HECTARE)}"
+def _format_zones(zones: Mapping[str, Any], _: object) -> str:
+    ground = "" if zones["kept_m2"] is None else f", {format_area(zones['kept_m2'] / M2_PER_HECTARE)}"
     no_go = f"; no-go zones touch {format_count(zones['no_go_px'])} px" if zones["no_go_px"] else ""
-    share = format_percent(zones["kept_px"] / zones["field_px"])
-    return f"{format_count(zones['kept_px'])} px, {share} of the field{ground}{no_go}; of the rest no map is drawn"
+    fraction = format_percent(zones["kept_px"] / zones["field_px"])
+    return f"{format_count(zones['kept_px'])} px, {fraction} of the field{ground}{no_go}; of the rest no map is drawn"
 
 
-def _ground_words(ground: Mapping[str, Any], _: object) -> str:
-    areas = ", ".join(f"{_spaced(name)} {area_words(area)}" for name, area in ground["areas_ha"].items() if area)
+def _format_ground(ground: Mapping[str, Any], _: object) -> str:
+    areas = ", ".join(f"{_spaced(name)} {format_area(area)}" for name, area in ground["areas_ha"].items() if area)
     words = [f"{ground['crs']}, {ground['resolution_m']:.4g} m a pixel: {areas}"]
     if changes := ground.get("changes_ha"):
-        told = [f"{_spaced(old)} to {_spaced(new)} {area_words(area)}" for area, old, new in changes[:MOST_CHANGES]]
-        words.append(f"{area_words(sum(area for area, _, _ in changes))} changed: {', '.join(told)}")
+        largest = [f"{_spaced(old)} to {_spaced(new)} {format_area(area)}" for area, old, new in changes[:MOST_CHANGES]]
+        words.append(f"{format_area(sum(area for area, _, _ in changes))} changed: {', '.join(largest)}")
     older = [(int(days), area) for days, area in ground.get("older_ha", {}).items() if area]
-    words += [f"{area_words(area)} last captured more than {counted(days, 'day')} ago" for days, area in older]
+    words += [f"{format_area(area)} last captured more than {counted(days, 'day')} ago" for days, area in older]
     return "; ".join(words)
 
 
-def _pointing_words(one: Mapping[str, Any]) -> str:
+def _format_pointing(one: Mapping[str, Any]) -> str:
     put = [float(np.hypot(*offset)) for sweep, offset in one["sweeps"].items() if sweep not in one["not_found"]]
     parts = []
     if len(one["sweeps"]) == 1 and one["held"] in one["sweeps"]:
@@ -274,24 +274,24 @@ def _pointing_words(one: Mapping[str, Any]) -> str:
     if one["too_narrow"]:
         parts.append(f"{counted(len(one['too_narrow']), 'overlap')} too narrow to compare")
     if one.get("partly_seen"):
-        parts.append(f"{counted(one['partly_seen'], 'chosen place')} not seen whole, mapped there by the coarse look")
+        parts.append(f"{counted(one['partly_seen'], 'chosen place')} not seen whole, mapped there by the coarse pass")
     return "; ".join(parts)
 
 
 def plot_rows(plots: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     """Return the table of plots in words: name, ground, leading classes, confidence."""
 
-    def leading(shares: Mapping[str, float | None]) -> str:
-        known = sorted(((share, name) for name, share in shares.items() if share), key=lambda one: -one[0])
-        return ", ".join(f"{_spaced(name)} {format_percent(share)}" for share, name in known[:LEADING])
+    def leading(fractions: Mapping[str, float | None]) -> str:
+        known = sorted(((fraction, name) for name, fraction in fractions.items() if fraction), key=lambda one: -one[0])
+        return ", ".join(f"{_spaced(name)} {format_percent(fraction)}" for fraction, name in known[:LEADING])
 
     return [
         {
             "plot": plot["plot"],
             "area": f"{format_count(plot['pixels'])} px"
             if plot["area_m2"] is None
-            else area_words(plot["area_m2"] / M2_PER_HECTARE),
-            "classes": leading(plot["shares"]) if plot["mapped_pixels"] else "not mapped",
+            else format_area(plot["area_m2"] / M2_PER_HECTARE),
+            "classes": leading(plot["fractions"]) if plot["mapped_pixels"] else "not mapped",
             "confidence": format_percent(plot["confidence"]),
         }
         for plot in plots
@@ -303,19 +303,19 @@ def _spaced(name: str) -> str:
 
 
 _ROWS: Sequence[tuple[str, str, Any]] = (
-    ("field", "field", _field_words),
-    ("plan", "plan", _plan_words),
-    ("recording", "recording", _recording_words),
-    ("look", "captured", _look_words),
-    ("kept", "kept in detail", _kept_words),
-    ("memory", "goes on from", _memory_words),
-    ("unknown", "unknown", _unknown_words),
+    ("field", "field", _format_field),
+    ("plan", "plan", _format_plan),
+    ("recording", "recording", _format_recording),
+    ("extent", "captured", _format_extent),
+    ("kept", "kept in detail", _format_kept),
+    ("memory", "goes on from", _format_prior_map),
+    ("unknown", "unknown", _format_unknown),
     (
         "expected",
         "expected score",
         lambda one, _: f"about {format_points(one['miou'])} ± {format_points(one['error'])}, with no label asked",
     ),
-    ("scans", "uniform scans", _scans_words),
-    ("zones", "zones", _zones_words),
-    ("ground", "on the ground", _ground_words),
+    ("scans", "uniform scans", _format_scans),
+    ("zones", "zones", _format_zones),
+    ("ground", "on the ground", _format_ground),
 )

@@ -18,11 +18,11 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from jinja2.utils import htmlsafe_json_dumps
 from markupsafe import Markup
 
-from flows.publish.effects_table import format_change, total_words
+from flows.publish.effects_table import format_change, format_total
 from flows.publish.field_map import FieldMap
 from flows.publish.receipt import Receipt
 from flows.publish.receipt_table import cost_rows, finding_rows, headline, plot_rows
-from flows.tasks.scores import false_class_words
+from flows.tasks.scores import format_false_classes
 from flows.terminal.figures import format_bytes, format_percent, format_points, format_seconds
 from pipeline.errors import visible
 
@@ -95,16 +95,16 @@ def _environment(*, markdown: bool) -> Environment:
 
 def _data(content: object) -> Markup:
     """Content for the scripts of a page, as JSON in which nothing ends a tag; its words are `visible` ones."""
-    return htmlsafe_json_dumps(_visible_words(content), separators=(",", ":"))
+    return htmlsafe_json_dumps(_format_visible(content), separators=(",", ":"))
 
 
-def _visible_words(content: Any) -> Any:
+def _format_visible(content: Any) -> Any:
     if isinstance(content, str):
         return visible(content)
     if isinstance(content, Mapping):
-        return {visible(name): _visible_words(item) for name, item in content.items()}
+        return {visible(name): _format_visible(item) for name, item in content.items()}
     if isinstance(content, list | tuple):
-        return [_visible_words(item) for item in content]
+        return [_format_visible(item) for item in content]
     return content
 
 
@@ -133,12 +133,14 @@ def render_report(
 ) -> str:
     """The page as text, ``pictures`` below the quicklook; the same receipt, pictures and map give the same bytes.
 
-    ``captured_again`` is the share of the field captured in detail, 0..1, for the first sentence; None leaves it out.
+    ``captured_again`` is the fraction of the field captured in detail, 0..1, for the first sentence; None leaves it out.
     ``field`` is the map to move in, above all pictures; None leaves it out, with all scripts.
     """
     shown = [Picture(quicklook_png, "The survey at a glance."), *pictures]
     split: Mapping[str, Any] = receipt["savings"]["multiply_adds"]
-    parts = [name for name in ("glance", "score", "encode", "decode") if split["done"] and split[name] is not None]
+    parts = [
+        name for name in ("coarse_prediction", "score", "encode", "decode") if split["done"] and split[name] is not None
+    ]
     total, accuracy = receipt.get("effects_total"), receipt.get("accuracy")
     return render_page(
         "report.html",
@@ -152,12 +154,12 @@ def render_report(
         leaflet=LEAFLET,
         pictures=[{"data": base64.b64encode(one.png).decode("ascii"), "caption": one.caption} for one in shown],
         costs=cost_rows(receipt["savings"]),
-        shares={name: split[name] / split["done"] for name in parts},
+        fractions={name: split[name] / split["done"] for name in parts},
         findings=finding_rows(receipt),
         plots=plot_rows(receipt.get("plots", [])),
         accuracy=accuracy,
-        false_classes="" if accuracy is None else false_class_words(accuracy),
-        total_words="" if total is None else " ".join(total_words(total)),
+        false_classes="" if accuracy is None else format_false_classes(accuracy),
+        format_total="" if total is None else " ".join(format_total(total)),
         details={
             "Settings": {
                 f"{name}.{key}" if key else name: item

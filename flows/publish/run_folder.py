@@ -15,38 +15,38 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.publish.field_map import block_of, field_map, remembered
+from flows.publish.field_map import block_of, field_map, prior_map
 from flows.publish.findings import PLOTS_FILE, field_figures, find_ground, find_map, find_zones, plots_csv
 from flows.publish.panels import draw_ground
 from flows.publish.quicklook import QuicklookData, draw_quicklook
 from flows.publish.receipt import AccuracyIs, Receipt, build_receipt, check_receipt, with_accuracy
 from flows.publish.report import Picture, render_report
 from flows.settings.load import anchor_paths
-from flows.settings.values import LOOK_WHOLE
+from flows.settings.values import EXTENT_WHOLE
 from flows.tasks.extent import work_done, work_of_map
-from flows.tasks.memory import told_of_memory
 from flows.tasks.open_survey import STAGES, OpenSurvey, Products
+from flows.tasks.patch_budget import BYTES_A_VALUE
+from flows.tasks.prior_maps import prior_map_figures
 from flows.tasks.run import SurveyRun, now
-from flows.tasks.scan_choice import as_told
-from flows.tasks.seat_budget import BYTES_A_VALUE
+from flows.tasks.scan_choice import as_figures
 from flows.tasks.stages.accuracy import load_accuracy
 from flows.tasks.stages.attention import load_plan
 from flows.tasks.stages.capture import captured
 from flows.tasks.stages.effects import load_manifest
 from flows.tasks.stages.on_ground import STORE
-from flows.tasks.stages.placement import SEATS_AT_ONCE, line_facts, load_registration, seen_shares
+from flows.tasks.stages.placement import PATCHES_AT_ONCE, line_facts, load_registration, seen_fractions
 from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.errors import IncompleteStoreError
 from pipeline.planning.coverage import on_scene
 from pipeline.planning.fine_pass import FinePlan
-from pipeline.planning.plain_scans import scan_words
 from pipeline.planning.prices import SavingEntry, capture_savings
+from pipeline.planning.uniform_scans import format_scan
 from pipeline.rectify.calibrate import of_bands, reflectance
 from storage.archive.keys import StageRef
 from storage.archive.records import read_run
 from storage.archive.run_folders import RunDraft
 from storage.archive.whole_files import to_json
-from storage.arrays.class_maps import BeliefStore, load_class_map
+from storage.arrays.class_maps import ProbabilityStore, load_class_map
 from storage.arrays.cubes import RawCube
 from storage.arrays.ground_maps import load_ground_map, open_image
 from storage.arrays.mosaics import load_attention, open_patches
@@ -61,13 +61,13 @@ class Published:
 
     receipt: Receipt
     folder: Path
-    captured_again: float | None  # None of a uniform scan; share of the field's seats captured in detail
+    captured_again: float | None  # None of a uniform scan; fraction of the field's patches captured in detail
 
 
 def publish_run(survey: OpenSurvey) -> Published:
     """Write receipt.json, quicklook.png and report.html into a run folder and publish it as a whole."""
     run, products = survey.run, survey.products
-    plan = load_plan(products["attend"])
+    plan = load_plan(products["score"])
     with run.archive.new_run(run.name) as draft:
         receipt = make_receipt(survey, plan, f"runs/{draft.id}")
         return _publish(run, draft, products, plan, receipt)
@@ -91,7 +91,7 @@ def extend_with_accuracy(survey: OpenSurvey, draft: RunDraft, accuracy: StageRef
         settings={name: asked[name] for name in names},
         judged=now(),
     )
-    return _publish(run, draft, products, load_plan(products["attend"]), receipt)
+    return _publish(run, draft, products, load_plan(products["score"]), receipt)
 
 
 def load_receipt(folder: Path) -> Receipt:
@@ -103,16 +103,18 @@ def load_receipt(folder: Path) -> Receipt:
 
 
 def _publish(run: SurveyRun, draft: RunDraft, products: Products, plan: FinePlan, receipt: Receipt) -> Published:
-    again = None if run.plan.plain else float(seen_shares(run, products.patches).sum()) / len(run.grid.valid_seats())
-    glance = quicklook_data(run, products, plan, receipt)
-    draw_quicklook(draft.folder / "quicklook.png", glance)
+    again = (
+        None if run.plan.plain else float(seen_fractions(run, products.patches).sum()) / len(run.grid.valid_patches())
+    )
+    coarse_prediction = quicklook_data(run, products, plan, receipt)
+    draw_quicklook(draft.folder / "quicklook.png", coarse_prediction)
     draft.write_file("receipt.json", to_json(receipt))
     if "plots" in receipt:
         draft.write_file(PLOTS_FILE, plots_csv(receipt["plots"]))
     picture = (draft.folder / "quicklook.png").read_bytes()
     maps = (load_ground_map(ref.path / STORE) for ref in products.there("ground"))
     pictures = [Picture(draw_ground(drawn), "The map on the ground, north up.") for drawn in maps]
-    field = field_map(run, products, plan, glance, remembered(run.prior, products["draw_map"], receipt))
+    field = field_map(run, products, plan, coarse_prediction, prior_map(run.prior, products["segment"], receipt))
     page = render_report(receipt, picture, pictures, captured_again=again, field=field)
     (draft.folder / "report.html").write_text(page, encoding="utf-8")
     rests_on = run.archive.manifest_hashes(products.values())
@@ -185,18 +187,18 @@ def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, An
 def _bytes_saved(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, Any]:
     """Stored bytes of a raster's means and patches beside those of all its patches, which would pack as these do."""
     means, detail = (run.archive.stored_bytes(ref) for ref in (products.mosaic, products.patches))
-    valid, kept, bands = len(run.grid.valid_seats()), len(plan.seats), len(run.scene.wavelength_nm)
+    valid, kept, bands = len(run.grid.valid_patches()), len(plan.patch_index), len(run.scene.wavelength_nm)
     every = detail * valid / kept if kept else valid * run.grid.patch**2 * bands * BYTES_A_VALUE
     return SavingEntry(means + detail, round(means + every), "predicted").as_dict()
 
 
 def _model_savings(run: SurveyRun, plan: FinePlan) -> dict[str, Any]:
     """Tokens and multiply-adds of the map beside those of reading every patch."""
-    did, scan = work_done(run, plan.seats), work_of_map(run, run.grid.valid_seats())
-    config, valid = run.weights.config, len(run.grid.valid_seats())
+    did, scan = work_done(run, plan.patch_index), work_of_map(run, run.grid.valid_patches())
+    config, valid = run.weights.config, len(run.grid.valid_patches())
     cells, each = int(np.prod(run.grid.padded_shape)) // (config.patch * config.factor) ** 2, config.token_side**2
     return {
-        "tokens": SavingEntry(each * (cells + len(plan.seats)), each * (cells + valid), "predicted").as_dict(),
+        "tokens": SavingEntry(each * (cells + len(plan.patch_index)), each * (cells + valid), "predicted").as_dict(),
         "multiply_adds": {**SavingEntry(did.total, scan.total, "predicted").as_dict(), **asdict(did)},
     }
 
@@ -215,8 +217,8 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
     chosen = list(bands)
     image = open_image(products.mosaic.path / "mosaic.zarr", "values")
     coarse = np.concatenate([values[..., chosen] for _, values in image.rows()])
-    attention = load_attention(products["attend"].path / "attention.zarr")
-    found = load_class_map(products["draw_map"].path / "class_map.zarr")
+    attention = load_attention(products["score"].path / "attention.zarr")
+    found = load_class_map(products["segment"].path / "class_map.zarr")
     order = np.argsort(attention.rank.ravel(), kind="stable")
     accuracy = receipt.get("accuracy")
     moment = run.settings.moment  # of a farm that grows
@@ -224,11 +226,11 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
     if accuracy is not None and accuracy["miou"] is not None:
         notes.append(f"mIoU {100 * accuracy['miou']:.1f} %")
     sweeps = [cube for ref in products.there("capture_coarse") for cube in captured(ref)]  # of a raster none
-    strips = sorted(sweeps, key=lambda cube: cube.sweep.strip_px)  # as they lie there
+    strips = sorted(sweeps, key=lambda cube: cube.sweep.swath_px)  # as they lie there
     return QuicklookData(
         survey=run.name,
         seed=run.settings.seed,
-        about=_asked_words(run),
+        about=_format_asked(run),
         policy=None if run.plan.plain and run.budget is None else run.settings.policy,
         scan=run.plan.plain,
         raster=run.raster is not None,
@@ -238,7 +240,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
         wavelength_nm=run.scene.wavelength_nm[chosen],
         score=attention.score,
         patch_px=run.grid.patch,
-        seats=order[attention.rank.ravel()[order] >= 0],
+        patch_index=order[attention.rank.ravel()[order] >= 0],
         blocks=tuple(block_of(sweep, run) for sweep in plan.sweeps),
         class_map=found.classes,
         class_names=found.names,
@@ -250,12 +252,12 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
     )
 
 
-def _asked_words(run: SurveyRun) -> str:
+def _format_asked(run: SurveyRun) -> str:
     """How the field was looked at, in a few words."""
     if run.raster is not None:
         return "raster, taken as it is"
     if run.plan.plain:
-        return scan_words(run.settings.scan_step or 1, run.settings.scan_exposure_ms or run.camera.exposure_ms)
+        return format_scan(run.settings.scan_step or 1, run.settings.scan_exposure_ms or run.camera.exposure_ms)
     return f"budget {run.settings.budget:g}   ·   policy {run.settings.policy}"
 
 
@@ -280,67 +282,71 @@ def _both_scales(
     s, p = run.grid.factor, run.grid.patch
     canvas = np.repeat(np.repeat(coarse, s, axis=0), s, axis=1)[: run.grid.height, : run.grid.width].copy()
     store = open_patches(products.patches.path / "patches.zarr")
-    for first in range(0, len(store.seats), SEATS_AT_ONCE):
-        values = store.read(first, first + SEATS_AT_ONCE)[..., bands]
-        for patch, (y, x) in zip(values, run.grid.seat_origin(store.seats[first : first + len(values)]), strict=True):
+    for first in range(0, len(store.patch_index), PATCHES_AT_ONCE):
+        values = store.read(first, first + PATCHES_AT_ONCE)[..., bands]
+        for patch, (y, x) in zip(
+            values, run.grid.patch_origin(store.patch_index[first : first + len(values)]), strict=True
+        ):
             place = canvas[y : y + p, x : x + p]
             place[...] = patch[: place.shape[0], : place.shape[1]]
     return canvas
 
 
 def scans_told(run: SurveyRun, seconds: float) -> dict[str, Any]:
-    """Plain scans by the weights' record: the one taken, the best in as many seconds, and the cheapest good one.
+    """Uniform scans by the weights' record: the one taken, the best in as many seconds, and the cheapest good one.
 
     Empty where the weights have no record.
     """
     scans = run.scans
-    told = {"taken": scans.chosen, "best_in_time": scans.best_within(seconds), "reference": scans.reference}
-    return {name: as_told(scan) for name, scan in told.items() if scan is not None}
+    figures = {"taken": scans.chosen, "best_in_time": scans.best_within(seconds), "reference": scans.reference}
+    return {name: as_figures(scan) for name, scan in figures.items() if scan is not None}
 
 
 def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     """``plan``, and what not every survey has: see `flows.publish.receipt.FINDINGS`."""
-    plan = load_plan(products["attend"])
-    told: dict[str, Any] = {
+    plan = load_plan(products["score"])
+    figures: dict[str, Any] = {
         "kind": plan.kind,
         "reason": plan.reason,
         "lines": plan.lines,
         "seconds": plan.seconds,
-        "score_share": plan.worth / plan.wanted_worth if plan.wanted_worth else None,
-        "score_per_second": plan.worth_per_second,
+        "score_fraction": plan.expected_gain / plan.wanted_gain if plan.wanted_gain else None,
+        "score_per_second": plan.gain_per_second,
         "full_seconds": plan.full_seconds,
         "out_of_reach": plan.out_of_reach,
     }
     if plan.threshold is not None:  # what it left, and the score that was not worth more seconds
-        told |= {
+        figures |= {
             "threshold": plan.threshold,
             "spared_s": plan.spared_s,
-            "spared_share": None if plan.spared_s is None else plan.spared_s / run.plan.full_s,
-            "spared_score": plan.wanted_worth - plan.worth,
+            "spared_fraction": None if plan.spared_s is None else plan.spared_s / run.plan.full_s,
+            "spared_score": plan.wanted_gain - plan.expected_gain,
         }
-    found: dict[str, Any] = {"field": field_figures(run, plan), "plan": told}
+    found: dict[str, Any] = {"field": field_figures(run, plan), "plan": figures}
     if run.recorded is not None:
         found["recording"] = _recording(run, run.recorded, plan)
     if run.budget is not None:
-        found["kept"] = run.budget.told(plan.seats) | {"stored_bytes": _stored_detail(run, products)}
-    if (memory := told_of_memory(products["draw_map"].path)) is not None:
+        found["kept"] = run.budget.figures(plan.patch_index) | {"stored_bytes": _stored_detail(run, products)}
+    if (memory := prior_map_figures(products["segment"].path)) is not None:
         found["memory"] = memory
-    if run.settings.look != LOOK_WHOLE:
-        asked = run.grid.valid_share().ravel() > 0 if run.zones.shown is None else run.zones.shown
-        expected = {} if run.look is None else asdict(run.look)
+    if run.settings.extent != EXTENT_WHOLE:
+        asked = run.grid.valid_fraction().ravel() > 0 if run.zones.shown is None else run.zones.shown
+        expected = {} if run.extent is None else asdict(run.extent)
         remembers = memory is not None and memory["put_aside"] is None
-        share = len(plan.seats) / np.count_nonzero(asked)
-        found["look"] = {"lines": run.settings.look, "share": share, "remembers": remembers, **expected}
+        fraction = len(plan.patch_index) / np.count_nonzero(asked)
+        found["extent"] = {"lines": run.settings.extent, "fraction": fraction, "remembers": remembers, **expected}
     passes = {"coarse": products.get("register_coarse"), "fine": products.get("register_fine")}
     pointing = {name: _pointing(ref) for name, ref in passes.items() if ref is not None}
     if "fine" in pointing:
-        pointing["fine"]["partly_seen"] = int(np.count_nonzero(seen_shares(run, products.patches) < 1))
+        pointing["fine"]["partly_seen"] = int(np.count_nonzero(seen_fractions(run, products.patches) < 1))
     if pointing:
         found["pointing"] = {"prior_px": run.settings.pointing_px, **pointing}
-    class_map = products["draw_map"]
+    class_map = products["segment"]
     drawn = load_class_map(class_map.path / "class_map.zarr")
     posed = next((load_ground_map(ref.path / STORE) for ref in products.there("ground")), None)
-    found |= find_ground(run, posed, drawn, BeliefStore(class_map.path / "belief.zarr")) | find_zones(run, drawn)
+    found |= find_ground(run, posed, drawn, ProbabilityStore(class_map.path / "class_probabilities.zarr")) | find_zones(
+        run, drawn
+    )
     found |= find_map(run, class_map, drawn)
     lines = {} if run.raster is not None else line_facts(products.mosaic)
     troubled = {name: facts for name, facts in lines.items() if any(facts.values())}

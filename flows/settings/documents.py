@@ -27,15 +27,15 @@ def flag_help(one: Declared) -> str:
 
 def about(one: Declared, *, choices: bool = True) -> str:
     """The line of help of a setting, with its unit, its choices, and whether its default is assumed."""
-    unit = f" [{one.told['unit']}]" if one.told["unit"] else ""
+    unit = f" [{one.about['unit']}]" if one.about["unit"] else ""
     words = f" ({one.listed})" if one.choices and choices else ""
-    source = f"; {one.told['source']}" if one.told["source"] else ""
+    source = f"; {one.about['source']}" if one.about["source"] else ""
     return f"{one.item.metadata['description']}{unit}{words}{source}"
 
 
 def shown(one: Declared) -> str:
     """A setting's default, or an example of it, as TOML writes it."""
-    default, example = one.item.default, one.told["example"]
+    default, example = one.item.default, one.about["example"]
     value = default if example is None else example
     if isinstance(value, bool):
         return str(value).lower()

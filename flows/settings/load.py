@@ -23,21 +23,21 @@ from flows.settings.survey_settings import (
     OF_RECORDINGS,
     OF_TWO_PASSES,
     PATHS,
-    PLAIN,
     RASTER,
     RECORDED,
     RIG,
     RIG_FIELD,
     SPARING,
+    UNIFORM,
     MapChoice,
     Settings,
     source_of,
 )
-from flows.settings.values import LOOK_PART, LOOK_WHOLE, parse_moment, parse_text, to_whole, unit_guess
+from flows.settings.values import EXTENT_PART, EXTENT_WHOLE, parse_moment, parse_text, to_whole, unit_guess
 from models.network.sizes import TRAINED_VGG_FROM, VGG_FROM
 from pipeline.errors import BudgetError, PoseError, SettingsError
 from pipeline.rig.device_settings import MOST_PAIRS
-from pipeline.setting_fields import number_words, span_of
+from pipeline.setting_fields import format_number, span_of
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, REMOVED_LAW
 from storage.archive.staging import read_toml
 from storage.readers.recorded_runs import find_recorded_run
@@ -51,9 +51,9 @@ class Declared:
     kind: Any  # its type, None left out
 
     @property
-    def told(self) -> dict[str, Any]:
-        told: dict[str, Any] = self.item.metadata["json_schema_extra"]
-        return told
+    def about(self) -> dict[str, Any]:
+        about: dict[str, Any] = self.item.metadata["json_schema_extra"]
+        return about
 
     @property
     def choices(self) -> tuple[str, ...]:
@@ -70,7 +70,7 @@ class Declared:
             return f"one of {self.listed}"
         low, high = span_of(self.item)
         if self.kind is float:
-            return number_words(low, high, self.told["unit"], endless=self.item.default == math.inf)
+            return format_number(low, high, self.about["unit"], endless=self.item.default == math.inf)
         words = {int: f"a whole number from {low} to {high}", bool: "true or false", str: "text that is not empty"}
         return words.get(self.kind, "")
 
@@ -106,8 +106,8 @@ class Declared:
         if isinstance(cause, ValueError):  # of its own parser
             joint = ": " if isinstance(cause, SettingsError) else " "
             raise (BudgetError if isinstance(cause, BudgetError) else SettingsError)(f"{place}{joint}{cause}")
-        hint = unit_guess(value, *span_of(self.item), self.told["unit"]) if self.kind is float else ""
-        why = f"; {self.told['why']}" if self.told["why"] else ""
+        hint = unit_guess(value, *span_of(self.item), self.about["unit"]) if self.kind is float else ""
+        why = f"; {self.about['why']}" if self.about["why"] else ""
         raise SettingsError(f"{place} must be {self.expected}{';' if self.choices else ','} got {value!r}{hint}{why}")
 
 
@@ -131,8 +131,20 @@ TABLES = {
 }
 
 
-OF_THE_PLAN = (*PLAIN, *OF_TWO_PASSES, *SPARING, "scan_exposure_ms", "look")
-OF_THE_RUN = ("camera", "cost", "rig", "pose", "map", "zones", "kernel", "pointing_px", "seed", "weights", "unknown")
+OF_THE_PLAN = (*UNIFORM, *OF_TWO_PASSES, *SPARING, "scan_exposure_ms", "extent")
+OF_THE_RUN = (
+    "camera",
+    "cost",
+    "rig",
+    "pose",
+    "map",
+    "zones",
+    "resampling",
+    "pointing_px",
+    "seed",
+    "weights",
+    "unknown",
+)
 BUILT_IN_WEIGHTS = "farm"
 
 
@@ -150,8 +162,8 @@ def usual_of_recording(table: Mapping[str, object]) -> dict[str, Any]:
     found = find_recorded_run(str(table["sweeps"]))
     if found is not None:
         run, shape = found
-        uniform = any(run.settings.get(name) is not None for name in PLAIN)
-        another_plan = asked if uniform else asked & set(PLAIN)
+        uniform = any(run.settings.get(name) is not None for name in UNIFORM)
+        another_plan = asked if uniform else asked & set(UNIFORM)
         names = OF_THE_RUN if another_plan else (*OF_THE_RUN, *OF_THE_PLAN)
         usual |= {name: run.settings[name] for name in names if run.settings.get(name) is not None}
         usual |= {"name": str(run.receipt.get("survey") or run.folder.name)}
@@ -240,7 +252,7 @@ def _camera_of_a_map(table: Mapping[str, object], origin: Mapping[str, str]) -> 
 
 def _usual_policy(table: Mapping[str, object]) -> dict[str, object]:
     """Where multiply-adds are short, the policy whose scores take hardly any; a least gain needs scores in nat."""
-    short = table.get("compute") is not None and table.get("least_gain") is None
+    short = table.get("macs") is not None and table.get("least_gain") is None
     return {"policy": CHEAP_POLICY} if short and table.get("policy") is None else {}
 
 
@@ -316,20 +328,20 @@ def anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:
 
 
 def _contradictions(given: set[str], origin: Mapping[str, str]) -> Iterator[str]:
-    """Settings of a plain scan beside some of a survey in two passes, or those that choose it beside it itself."""
-    plain = [place_of(key, origin.get(key)) for key in PLAIN if key in given]
+    """Settings of a uniform scan beside some of a survey in two passes, or those that choose it beside it itself."""
+    plain = [place_of(key, origin.get(key)) for key in UNIFORM if key in given]
     chosen = OF_CHOOSING if given & set(SPARING) else ()
     passes = [place_of(key, origin.get(key)) for key in OF_TWO_PASSES if key in given and key not in chosen]
     if plain and passes:
         yield (
-            f"{plain[0]} asks for one plain scan of the field, and {passes[0]} is for a survey that looks twice; leave "
+            f"{plain[0]} asks for one uniform scan of the field, and {passes[0]} is for a survey that captures again; leave "
             "one of them out"
         )
     by_hand = [place_of(key, origin.get(key)) for key in ("scan_step", "scan_exposure_ms", "scan") if key in given]
     if by_hand and given & {"seconds", "bytes_raw", "goal"}:
         yield f"{plain[0]} leaves the choice of the scan to the weights' record, {by_hand[0]} makes it: leave one out"
     if "scan_exposure_ms" in given and "scan_step" not in given:
-        yield f"{by_hand[0]} is for a plain scan: give --scan-step too (1 for every line), or --coarse-exposure-ms"
+        yield f"{by_hand[0]} is for a uniform scan: give --scan-step too (1 for every line), or --coarse-exposure-ms"
 
 
 CHEAP_POLICY = "sobel"  # of the coarse image alone: gain would have the network read it twice
@@ -343,7 +355,7 @@ def _wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
     yield from _scene_wrongs(settings, origin)
     yield from _rig_wrongs(settings)
     yield from _recorded_wrongs(settings, origin)
-    yield from _look_wrongs(settings, origin)
+    yield from _extent_errors(settings, origin)
     yield from _sparing_wrongs(settings, origin)
 
 
@@ -427,43 +439,43 @@ def _recorded_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[
         )
     if settings.bands is not None:
         yield f"{place_of('bands', origin.get('bands'))} is for scenes: all bands of a recording are read; leave it out"
-    if settings.look == LOOK_PART:
+    if settings.extent == EXTENT_PART:
         yield (
-            f"{place_of('look', origin.get('look'))} = 'part' chooses lines and exposures for a camera that looks "
+            f"{place_of('extent', origin.get('extent'))} = 'part' chooses lines and exposures for a camera that looks "
             "again, and a recording has those that were taken; leave it out"
         )
 
 
-def _look_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
-    if settings.look == LOOK_PART and settings.seconds is None:
-        place = place_of("look", origin.get("look"))
+def _extent_errors(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
+    if settings.extent == EXTENT_PART and settings.seconds is None:
+        place = place_of("extent", origin.get("extent"))
         yield f"{place} = 'part' looks where the seconds are worth most: give --seconds too"
-    if settings.look not in (LOOK_WHOLE, LOOK_PART) and settings.scan_step is None:
-        yield f"{place_of('look', origin.get('look'))} names lines of a plain scan: give its --scan-step too"
-    if settings.look != LOOK_WHOLE and settings.pointing_px:
+    if settings.extent not in (EXTENT_WHOLE, EXTENT_PART) and settings.scan_step is None:
+        yield f"{place_of('extent', origin.get('extent'))} names lines of a uniform scan: give its --scan-step too"
+    if settings.extent != EXTENT_WHOLE and settings.pointing_px:
         yield (
-            f"{place_of('look', origin.get('look'))}: a mirror that may look beside the plan (pointing_px = "
+            f"{place_of('extent', origin.get('extent'))}: a mirror that may look beside the plan (pointing_px = "
             f"{settings.pointing_px:g}) ties its sweeps by what they share, so that none is left out; leave it out"
         )
-    if settings.doubt is not None and settings.look == LOOK_WHOLE:
-        place = place_of("doubt", origin.get("doubt"))
-        yield f"{place} says how sure a memory may be so that nothing is looked at: give --look part too"
-    if settings.refresh is not None and settings.look == LOOK_WHOLE:
-        place = place_of("refresh", origin.get("refresh"))
-        yield f"{place} says how old a place may become of which a visit looks at a part: give --look part too"
+    if settings.skip_below_error is not None and settings.extent == EXTENT_WHOLE:
+        place = place_of("skip_below_error", origin.get("skip_below_error"))
+        yield f"{place} says how sure a memory may be so that nothing is looked at: give --extent part too"
+    if settings.max_age is not None and settings.extent == EXTENT_WHOLE:
+        place = place_of("max_age", origin.get("max_age"))
+        yield f"{place} says how old a place may become of which a visit looks at a part: give --extent part too"
 
 
 def _sparing_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
-    """Budgets of seats where none are chosen: in two passes seconds buy them, and of a part all is read."""
+    """Budgets of patches where none are chosen: in two passes seconds buy them, and of a part all is read."""
     given = [place_of(name, origin.get(name)) for name in SPARING if getattr(settings, name) is not None]
     if given and not settings.plain:
         yield (
-            f"{given[0]} is for a raster or a plain scan, of which a part is kept and read in detail: give --seconds or"
+            f"{given[0]} is for a raster or a uniform scan, of which a part is kept and read in detail: give --seconds or"
             " --scan-step too; what a survey in two passes looks at in detail, its --budget says"
         )
-    if given and settings.look != LOOK_WHOLE:
-        place = place_of("look", origin.get("look"))
-        yield f"{given[0]} chooses among the seats of a whole field, and {place} looks at a part: leave one of them out"
+    if given and settings.extent != EXTENT_WHOLE:
+        place = place_of("extent", origin.get("extent"))
+        yield f"{given[0]} chooses among the patches of a whole field, and {place} looks at a part: leave one of them out"
     if settings.least_gain is not None and settings.policy not in IN_NAT:
         place = place_of("least_gain", origin.get("least_gain"))
         yield (

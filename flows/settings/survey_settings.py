@@ -20,10 +20,10 @@ from flows.settings.values import (
     Bytes,
     BytesKept,
     Compute,
-    Doubt,
     Effects,
+    ExpectedError,
+    Extent,
     Goal,
-    Look,
     Memory,
     Name,
     Refresh,
@@ -37,7 +37,7 @@ from flows.settings.values import (
 )
 from models.network.machine import PROCESSOR, Device
 from models.policies.policies import Policy
-from models.reading.familiar import RATE
+from models.reading.ood import RATE
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel
 from pipeline.ground.view import RigPose
@@ -46,16 +46,16 @@ from pipeline.rig.device_settings import SurveyRig
 from pipeline.setting_fields import stated
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
 from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES, FARM_SHAPE, USUAL_DAY, USUAL_HOUR
-from storage.parallel.crew import Crew
+from storage.parallel.pool import WorkerPool
 
 BUILT_IN_SCENES = FARM_NAMES
 USUAL_SIZE = f"{FARM_SHAPE[1]}x{FARM_SHAPE[0]}"
 RIG_FIELD = "field"  # the scene of which only the rig, or a recording, knows more than size and bands
 OF_THE_MACHINE = ("scheduler", "workers", "device")  # what of that day need not be there today
-OF_A_PART = ("refresh", "doubt")  # of what a field that is remembered is looked at by
+OF_A_PART = ("max_age", "skip_below_error")  # of what a field that is remembered is looked at by
 OF_RECORDINGS = ("sweeps", "pointing", "dark", "white", "scan")
-PLAIN = ("seconds", "bytes_raw", "goal", "scan_step", "scan")  # settings of which one asks for a plain scan
-SPARING = ("compute", "bytes_kept", "least_gain")  # by which a plain scan is kept and read in detail in part
+UNIFORM = ("seconds", "bytes_raw", "goal", "scan_step", "scan")  # settings of which one asks for a uniform scan
+SPARING = ("macs", "bytes_kept", "least_gain")  # by which a uniform scan is kept and read in detail in part
 OF_TWO_PASSES = ("budget", "coarse_exposure_ms", "policy", "threshold", "mask", "vgg")  # and of which none may
 OF_CHOOSING = ("policy", "mask", "vgg")  # but for these where a part of the scan is chosen
 PATHS = (
@@ -66,8 +66,8 @@ AUTO, SIM, RIG, RASTER = "auto", "sim", "rig", "raster"  # where pixels come fro
 RECORDED = "recorded"  # likewise, and the uniform scan that takes a recording's own lines
 # of a camera alone: tables, and settings beside them
 OF_A_CAMERA = (
-    *("camera", "optics", "mirror", "detector", "air", "sky", "cost", "rig", *PLAIN, "scan_exposure_ms"),
-    *("coarse_exposure_ms", "budget", "threshold", "effects", "tol", "kernel", "pointing_px", "look", *OF_A_PART),
+    *("camera", "optics", "mirror", "detector", "air", "sky", "cost", "rig", *UNIFORM, "scan_exposure_ms"),
+    *("coarse_exposure_ms", "budget", "threshold", "effects", "tol", "resampling", "pointing_px", "extent", *OF_A_PART),
 )
 OF_A_VIEW = ("camera.pitch_um", "camera.focal_length_mm")  # how large a pixel is seen, which a [pose] asks for
 ALL_OF_IT = "leave it out to keep and read all of the scan"
@@ -140,21 +140,21 @@ class Settings:
         "What of the field is remembered: latest (what its newest run left), the name of a run, or none; auto is latest"
         " for surveys that are served, else none",
     )
-    look: Look = stated(
+    extent: Extent = stated(
         "whole",
-        "What a plain scan looks at: whole (the field), part (with --seconds, of a field that is remembered: the lines "
+        "What a uniform scan looks at: whole (the field), part (with --seconds, of a field that is remembered: the lines "
         "that promise most there), or lines by hand, as a receipt tells them: 0:12-310,1:0-40",
     )
-    refresh: Refresh | None = stated(
+    max_age: Refresh | None = stated(
         None,
-        "With --look part: how old what is remembered of any place may become, such as 14d or 36h; what would be older "
+        "With --extent part: how old what is remembered of any place may become, such as 14d or 36h; what would be older "
         "is looked at before all else",
         "d",
         example="14d",
     )
-    doubt: Doubt | None = stated(
+    skip_below_error: ExpectedError | None = stated(
         None,
-        "With --look part: look at nothing, and leave the map as it is, where less than this share of what is "
+        "With --extent part: look at nothing, and leave the map as it is, where less than this fraction of what is "
         "remembered is expected to be wrong, and nothing is too old",
         example="2%",
     )
@@ -204,7 +204,7 @@ class Settings:
     )
     seconds: float | None = stated(
         None,
-        "One plain scan in the place of two passes: of those that end in so many of the camera's seconds, the one whose"
+        "One uniform scan in the place of two passes: of those that end in so many of the camera's seconds, the one whose"
         " map is likely to score most by the weights' record",
         "s",
         0.1,
@@ -215,17 +215,17 @@ class Settings:
     bytes_raw: Bytes | None = stated(None, "The same with no more raw data than this", example="2GiB", why=INSTEAD)
     goal: Goal | None = stated(
         None,
-        "One plain scan: the cheapest whose map is likely to have this mIoU in percent, or IoU of classes: 92,weed=70",
+        "One uniform scan: the cheapest whose map is likely to have this mIoU in percent, or IoU of classes: 92,weed=70",
         example="92",
         why=INSTEAD,
     )
     scan_step: int | None = stated(
-        None, "One plain scan with lines so far apart, chosen by hand", "px", 1, 8, example=2, why=INSTEAD
+        None, "One uniform scan with lines so far apart, chosen by hand", "px", 1, 8, example=2, why=INSTEAD
     )
     scan_exposure_ms: float | None = stated(
         None, "Exposure of that scan's lines; by default the camera's", "ms", 0.5, 10_000, example=25.0, why=INSTEAD
     )
-    compute: Compute | None = stated(
+    macs: Compute | None = stated(
         None,
         "Of a uniform scan or a raster read in detail what promises most for so much of the multiply-adds of reading "
         "everything, 25%, or for so many, 4e9; the rest is read from its coarse means",
@@ -241,7 +241,7 @@ class Settings:
     )
     least_gain: float | None = stated(
         None,
-        "Of a uniform scan or a raster keep and read in detail only seats that promise at least so much, for the "
+        "Of a uniform scan or a raster keep and read in detail only patches that promise at least so much, for the "
         "policies gain and entropy",
         "nat per px",
         0,
@@ -252,8 +252,8 @@ class Settings:
     coarse_exposure_ms: float | None = stated(
         None, "Exposure of a coarse line; by default the camera's", "ms", 0.5, 10_000, example=25.0
     )
-    policy: Policy = stated("gain", "Where to look twice")
-    mask: str | None = stated(None, "Image of where to look twice, for the policy mask", example="mask.png")
+    policy: Policy = stated("gain", "Where to capture again")
+    mask: str | None = stated(None, "Image of where to capture again, for the policy mask", example="mask.png")
     vgg: str | None = stated(None, "Weights of VGG19, for the policies vgg-static and vgg-trained", example="vgg19.pth")
     weights: str | None = stated(
         None,
@@ -263,11 +263,11 @@ class Settings:
     unknown: Unknown = stated(
         "auto",
         "Pixels unlike all that the weights were trained on get the class unknown: auto (where the weights know "
-        "what is familiar to them, at 0.1%), off, or the share of known pixels that may be called unknown: 0.5%",
+        "what is familiar to them, at 0.1%), off, or the fraction of known pixels that may be called unknown: 0.5%",
     )
     threshold: float | None = stated(
         None,
-        "Least gain (per px, summed over seats) in a second of the fine pass, the receipt's score_per_second; for the "
+        "Least gain (per px, summed over patches) in a second of the fine pass, the receipt's score_per_second; for the "
         "policies gain and entropy",
         "nat per second",
         0,
@@ -289,7 +289,7 @@ class Settings:
     accuracy: bool = stated(
         True, "Judge the published map by the labels; without it, `evaluate ARCHIVE RUN` does so later"
     )
-    controls: bool = stated(True, "Also judge other placements of the same number of seats (needs labels)")
+    controls: bool = stated(True, "Also judge other placements of the same number of patches (needs labels)")
     engine: Literal["prefect", "plain"] = stated("prefect", "Who runs the stages; plain where no server can start")
     memory: Memory = stated(4 * 1024**3, "How much the work on tiles and regions of the field may take", example="4GiB")
     scheduler: Scheduler = stated(
@@ -309,7 +309,7 @@ class Settings:
         "Where the network computes; auto is cuda or mps where torch can use one here, else the processor. A map of "
         "another device is another store: it may differ by rounding",
     )
-    kernel: Kernel = stated("catmull-rom", "How lines are read between samples; nearest mixes no spectra")
+    resampling: Kernel = stated("catmull-rom", "How lines are read between samples; nearest mixes no spectra")
     pointing_px: float = stated(
         0.0, "How far off the mirror may point; above 0 sweeps overlap, seams are registered", "px", 0, 300
     )
@@ -353,7 +353,7 @@ class Settings:
     @property
     def plain(self) -> bool:
         """Whether all of the field is there at once, scanned or as a raster, in the place of two passes."""
-        return self.is_map or any(getattr(self, name) is not None for name in PLAIN)
+        return self.is_map or any(getattr(self, name) is not None for name in UNIFORM)
 
     @property
     def is_map(self) -> bool:
@@ -362,18 +362,18 @@ class Settings:
 
     @property
     def sparing(self) -> bool:
-        """Whether a part of a plain scan alone is kept and read in detail."""
+        """Whether a part of a uniform scan alone is kept and read in detail."""
         return any(getattr(self, name) is not None for name in SPARING)
 
     @property
     def unknown_rate(self) -> float | None:
-        """Share of known pixels that may be called unknown; None where none is to be."""
+        """Fraction of known pixels that may be called unknown; None where none is to be."""
         usual = {UNKNOWN_AUTO: RATE, UNKNOWN_OFF: None}
         return usual[self.unknown] if self.unknown in usual else float(self.unknown.removesuffix("%")) / 100
 
     @property
-    def crew(self) -> Crew:
-        return Crew(self.scheduler, self.workers)
+    def pool(self) -> WorkerPool:
+        return WorkerPool(self.scheduler, self.workers)
 
     @property
     def shape(self) -> tuple[int, int] | None:

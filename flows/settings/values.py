@@ -15,15 +15,15 @@ from typing import Annotated
 from pydantic import ByteSize, PlainValidator, TypeAdapter, ValidationError
 
 from pipeline.errors import BudgetError
-from pipeline.planning.part_looks import LineRun
-from pipeline.planning.plain_scans import MIOU
-from pipeline.setting_fields import number_words, numbers_of
+from pipeline.planning.partial_scans import LineRun
+from pipeline.planning.uniform_scans import MIOU
+from pipeline.setting_fields import format_number, numbers_of
 from pipeline.simulator.effects.probe import Unit
 from pipeline.simulator.effects.registry import BY_NAME
 from pipeline.simulator.scenes.farm.farm_scene import refuse_removed
 from pipeline.simulator.selection.choice import named_effects
 from storage.archive.staging import is_name
-from storage.parallel.crew import Crew
+from storage.parallel.pool import WorkerPool
 
 LEAST_MEMORY = 256 * 1024**2
 _BYTES = TypeAdapter(ByteSize)
@@ -69,13 +69,13 @@ def parse_name(value: object) -> str:
 
 
 def parse_budget(value: object) -> float:
-    """A share of the full scan's seconds above 0 and at most 1; raises BudgetError."""
+    """A fraction of the full scan's seconds above 0 and at most 1; raises BudgetError."""
     number = _to_float(value)
     if number is None or not 0 < number <= 1:
         percent = _to_float(value.removesuffix("%")) if isinstance(value, str) else number
-        told = percent is not None and 1 < percent <= 100
-        hint = f"; for {percent:g} % write {percent / 100:g}" if told and percent is not None else ""
-        raise BudgetError(f"must be a share of the full scan's seconds, above 0 and at most 1, got {value!r}{hint}")
+        is_percent = percent is not None and 1 < percent <= 100
+        hint = f"; for {percent:g} % write {percent / 100:g}" if is_percent and percent is not None else ""
+        raise BudgetError(f"must be a fraction of the full scan's seconds, above 0 and at most 1, got {value!r}{hint}")
     return number
 
 
@@ -91,38 +91,38 @@ def parse_bytes(value: object) -> int:
 
 
 def parse_compute(value: object) -> str:
-    """A share of what reading everything takes, such as 25%, or a number of multiply-adds such as 4e9."""
+    """A fraction of what reading everything takes, such as 25%, or a number of multiply-adds such as 4e9."""
     percent = _parse_percent(value)
     number = None if isinstance(value, str) and value.strip().endswith("%") else _to_float(value)
     if percent is None and (number is None or not number >= 1):
         hint = f"; for {100 * number:g} % write {100 * number:g}%" if number is not None and 0 < number < 1 else ""
         raise BudgetError(
-            "must be a share of the multiply-adds of reading everything, above 0% and at most 100%, such as 25%, or a "
+            "must be a fraction of the multiply-adds of reading everything, above 0% and at most 100%, such as 25%, or a "
             f"number of them such as 4e9; got {value!r}{hint}"
         )
     return percent or f"{number!r}"
 
 
 def parse_bytes_kept(value: object) -> str:
-    """A share of the bytes of keeping everything, such as 40%, or bytes, before compression, such as 500MB."""
+    """A fraction of the bytes of keeping everything, such as 40%, or bytes, before compression, such as 500MB."""
     try:
         return _parse_percent(value) or str(parse_bytes(value))
     except ValueError:
         raise BudgetError(
-            "must be a share of the bytes of keeping everything, above 0% and at most 100%, such as 40%, or bytes with "
+            "must be a fraction of the bytes of keeping everything, above 0% and at most 100%, such as 40%, or bytes with "
             f"a unit such as 500MB; got {value!r}"
         ) from None
 
 
 def _parse_percent(value: object) -> str | None:
-    """Text such as 25% of a share above 0 and at most all; None of anything else."""
+    """Text such as 25% of a fraction above 0 and at most all; None of anything else."""
     text = value.strip() if isinstance(value, str) else ""
     percent = _to_float(text.removesuffix("%")) if text.endswith("%") else None
     return f"{percent!r}%".replace(".0%", "%") if percent is not None and 0 < percent <= 100 else None
 
 
 def limit_of(text: str | None, whole: float) -> float:
-    """The number that a limit comes to: that share of the whole, or what it says itself; no end where it is None."""
+    """The number that a limit comes to: that fraction of the whole, or what it says itself; no end where it is None."""
     if text is None:
         return math.inf
     return float(text.removesuffix("%")) / 100 * whole if text.endswith("%") else float(text)
@@ -138,7 +138,7 @@ def parse_memory(value: object) -> int:
 
 def parse_scheduler(value: object) -> str:
     """``threads``, ``processes``, or the address of a dask scheduler."""
-    return Crew(parse_text(value)).scheduler
+    return WorkerPool(parse_text(value)).scheduler
 
 
 def parse_size(value: object) -> tuple[int, int]:
@@ -234,7 +234,7 @@ def parse_wavelengths(value: object) -> tuple[float, ...]:
     for item, wave in zip(_items(value), waves, strict=True):
         if wave is None or not low <= wave <= high:
             raise ValueError(
-                f"must each be {number_words(low, high, 'nm')}, got {item!r}{unit_guess(wave, low, high, 'nm')}"
+                f"must each be {format_number(low, high, 'nm')}, got {item!r}{unit_guess(wave, low, high, 'nm')}"
             )
     return tuple(wave for wave in waves if wave is not None)
 
@@ -281,16 +281,16 @@ def parse_scene(value: object) -> str:
     return value
 
 
-LOOK_WHOLE, LOOK_PART = "whole", "part"
+EXTENT_WHOLE, EXTENT_PART = "whole", "part"
 
 
-def parse_look(value: object) -> str:
+def parse_extent(value: object) -> str:
     """``whole``, ``part``, or runs of lines of the scan's sweeps, such as 0:12-310,1:0-40."""
     word = str(value).strip().lower()
-    return word if word in (LOOK_WHOLE, LOOK_PART) else look_words(parse_look_runs(word))
+    return word if word in (EXTENT_WHOLE, EXTENT_PART) else format_extent(parse_extent_runs(word))
 
 
-def parse_look_runs(text: str) -> tuple[LineRun, ...]:
+def parse_extent_runs(text: str) -> tuple[LineRun, ...]:
     """Runs of lines, each the number of a sweep, its first line and the one after its last."""
     found = [re.fullmatch(r"(\d{1,6}):(\d{1,9})-(\d{1,9})", part.strip()) for part in text.split(",")]
     runs = [(int(one[1]), int(one[2]), int(one[3])) for one in found if one is not None]
@@ -302,8 +302,8 @@ def parse_look_runs(text: str) -> tuple[LineRun, ...]:
     return tuple(runs)
 
 
-def look_words(runs: Iterable[LineRun]) -> str:
-    """Runs of lines as one text; see `parse_look_runs`."""
+def format_extent(runs: Iterable[LineRun]) -> str:
+    """Runs of lines as one text; see `parse_extent_runs`."""
     return ",".join(f"{sweep}:{first}-{stop}" for sweep, first, stop in runs)
 
 
@@ -327,32 +327,32 @@ LEAST_UNKNOWN, MOST_UNKNOWN = 0.05, 5.0  # percent
 
 
 def parse_unknown(value: object) -> str:
-    """``auto``, ``off``, or the share of known pixels that may be called unknown, such as 0.5%."""
+    """``auto``, ``off``, or the fraction of known pixels that may be called unknown, such as 0.5%."""
     word = str(value).strip().lower()
     if word in (UNKNOWN_AUTO, UNKNOWN_OFF):
         return word
     percent = _to_float(word.removesuffix("%")) if word.endswith("%") else None
     if percent is None or not LEAST_UNKNOWN <= percent <= MOST_UNKNOWN:
         raise ValueError(
-            f"must be auto, off, or the share of known pixels that may be called unknown, {LEAST_UNKNOWN:g}% to"
+            f"must be auto, off, or the fraction of known pixels that may be called unknown, {LEAST_UNKNOWN:g}% to"
             f" {MOST_UNKNOWN:g}%, such as 0.5%; got {value!r}"
         )
     return f"{percent:g}%"
 
 
-LEAST_DOUBT, MOST_DOUBT = 0.001, 0.5
+LEAST_EXPECTED_ERROR, MOST_EXPECTED_ERROR = 0.001, 0.5
 
 
-def parse_doubt(value: object) -> float:
-    """Share of what is remembered, from a number or text such as 2%."""
+def parse_expected_error(value: object) -> float:
+    """Fraction of what is remembered, from a number or text such as 2%."""
     word = str(value).strip()
     number = None if isinstance(value, bool) else _to_float(word.removesuffix("%"))
-    share = None if number is None else number / 100 if word.endswith("%") else number
-    if share is None or not LEAST_DOUBT <= share <= MOST_DOUBT:
+    fraction = None if number is None else number / 100 if word.endswith("%") else number
+    if fraction is None or not LEAST_EXPECTED_ERROR <= fraction <= MOST_EXPECTED_ERROR:
         raise ValueError(
-            f"must be {LEAST_DOUBT:.1%} to {MOST_DOUBT:.0%} of what is remembered, such as 2%; got {value!r}"
+            f"must be {LEAST_EXPECTED_ERROR:.1%} to {MOST_EXPECTED_ERROR:.0%} of what is remembered, such as 2%; got {value!r}"
         )
-    return share
+    return fraction
 
 
 Name = Annotated[str, PlainValidator(parse_name)]
@@ -368,7 +368,7 @@ Scheduler = Annotated[str, PlainValidator(parse_scheduler)]
 Size = Annotated[tuple[int, int], PlainValidator(parse_size)]
 Effects = Annotated[str, PlainValidator(parse_effects)]
 Bands = Annotated[tuple[int, ...], PlainValidator(parse_bands)]
-Look = Annotated[str, PlainValidator(parse_look)]
+Extent = Annotated[str, PlainValidator(parse_extent)]
 Refresh = Annotated[float, PlainValidator(parse_refresh)]
-Doubt = Annotated[float, PlainValidator(parse_doubt)]
+ExpectedError = Annotated[float, PlainValidator(parse_expected_error)]
 Wavelengths = Annotated[tuple[float, ...], PlainValidator(parse_wavelengths)]

@@ -30,7 +30,7 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
 from pipeline.lazy import deferred
 from pipeline.simulator.scenes.scene import RasterScene
-from pipeline.simulator.selection.choice import UNIT_WORDS
+from pipeline.simulator.selection.choice import UNIT_NAMES
 from storage.archive.keys import StageRef
 from storage.readers.scene_files import load_scene_file
 from storage.remote.opening import open_archive
@@ -208,7 +208,7 @@ def _print(record: Mapping[str, Any], console: Console) -> None:
 
 
 def _print_comparison(found: Comparison, picture: Path, console: Console) -> None:
-    unit = UNIT_WORDS[found.unit]
+    unit = UNIT_NAMES[found.unit]
     which = "all" if found.lines == found.of_lines else f"{found.lines} of the {found.of_lines}"
     bound = "there is no bound" if found.bound is None else f"the bound is {found.bound:.2g}"
     console.print(

@@ -26,12 +26,12 @@ from pipeline.simulator.effects.probe import Unit, stored_mean, unit_at
 from pipeline.simulator.effects.registry import BY_NAME
 from pipeline.simulator.readout import dark_frame, read_out
 from pipeline.simulator.render import expected_light
-from pipeline.simulator.selection.choice import UNIT_WORDS
+from pipeline.simulator.selection.choice import UNIT_NAMES
 from pipeline.simulator.selection.verification import (
     contrast_about,
     misplaced_electrons,
+    misplaced_fraction,
     misplaced_in_tails,
-    misplaced_share,
 )
 from pipeline.simulator.simulated import BLOCK_LINES, SimulatedSource, sweep_starts
 from storage.archive.keys import StageRef
@@ -40,7 +40,7 @@ from storage.arrays.quicklooks import choose_bands
 MOST_S = 60.0  # of processor time for both ways together; beyond, not all lines are compared
 VIEW_PX = 160  # of the camera, along the line and along the scan
 
-Light = NDArray[np.float32]
+Radiance = NDArray[np.float32]
 Raw = NDArray[np.uint16]
 
 
@@ -58,8 +58,8 @@ class ViewPlace:
 class View:
     """Some lines and samples as both ways show them, about the place where they differ most."""
 
-    exact: Light  # (line, binned sample, 3) over the white panel
-    chosen: Light  # the same
+    exact: Radiance  # (line, binned sample, 3) over the white reference
+    chosen: Radiance  # the same
     change: NDArray[np.float64]  # (line, binned sample), the band that differs most, in the unit of the tolerance
     bands: str  # which three, in words
     lines: range
@@ -83,7 +83,7 @@ class Comparison:
     measured: float  # greatest change of expected light
     rms: float
     place: ViewPlace  # of the greatest
-    raw_unequal: float  # share of raw numbers that differ where light alone does: noise and digits as chosen
+    raw_unequal: float  # fraction of raw numbers that differ where light alone does: noise and digits as chosen
     raw_most_dn: int
     left_out: tuple[str, ...]  # of what the rig has
     cheaper: tuple[str, ...]  # name and variant
@@ -154,7 +154,7 @@ def compare_with_everything(
     if found.bound is not None and sums.unexplained > found.bound:
         place = found.place
         raise BoundError(
-            f"against everything on, light differs by {found.measured:.3g} {UNIT_WORDS[found.unit]} at sweep "
+            f"against everything on, light differs by {found.measured:.3g} {UNIT_NAMES[found.unit]} at sweep "
             f"{place.sweep}, line {place.line}, sample {place.sample}, band {place.band}, above the bound of "
             f"{found.bound:.3g}; simulate with --tol 0 or --effects all, and please report it with the rig's settings"
         )
@@ -186,7 +186,7 @@ def _count(blocks: Sequence[tuple[Sweep, range]]) -> int:
     return sum(len(lines) for _, lines in blocks)
 
 
-def _taken(source: SimulatedSource, block: SweepBlock) -> tuple[Light, Light, Raw, float]:
+def _taken(source: SimulatedSource, block: SweepBlock) -> tuple[Radiance, Radiance, Raw, float]:
     """A block one way: expected electrons without and with those of the dark, raw numbers, seconds of the processor."""
     began = time.process_time()
     light = expected_light(source.scene, block, source.choice)
@@ -237,9 +237,9 @@ class _Ways:
         if change.max() > self.bound:  # what of it arithmetic may have made
             block = self.exact.block(sweep, lines)
             ways = dict(self.exact.choice.effects), dict(self.chosen.choice.effects)
-            share, render = misplaced_share(block, *ways), partial(expected_light, self.exact.scene)
+            fraction, render = misplaced_fraction(block, *ways), partial(expected_light, self.exact.scene)
             contrast = contrast_about(block, render)
-            misplaced = misplaced_electrons(both.exact, stored_mean(contrast, sweep.binning), share)
+            misplaced = misplaced_electrons(both.exact, stored_mean(contrast, sweep.binning), fraction)
             change -= misplaced / self._unit(both, sweep)
             if change.max() > self.bound:
                 change -= stored_mean(misplaced_in_tails(block, *ways, render), sweep.binning) / self._unit(both, sweep)
@@ -300,7 +300,7 @@ def _view(run: CaptureRun, ways: _Ways, sweep: Sweep, place: ViewPlace) -> View:
         change = ways.change(both, sweep)[:, samples.start : samples.stop]
         strongest = np.abs(change).argmax(axis=2)[..., None]
         changes.append(np.take_along_axis(change, strongest, axis=2)[..., 0])
-    white = np.maximum(run.scene.panel_electrons[list(bands)] / camera.electrons_per_dn, np.float32(1e-6))
+    white = np.maximum(run.scene.white_reference_electrons[list(bands)] / camera.electrons_per_dn, np.float32(1e-6))
     dark = np.float32(binning * camera.dark_dn)
     shown = [(np.concatenate(kept).astype(np.float32) - dark) / (binning * white) for kept in (exact, chosen)]
     return View(shown[0], shown[1], np.concatenate(changes), words, lines, of_camera, sweep)

@@ -211,7 +211,7 @@ def _tell(request: EmulateRequest, served: ServedRig, console: Console, *, as_js
 
 
 def _rig_table(served: ServedRig, rig: SurveyRig) -> dict[str, object]:
-    panel = served.rig.camera.view.source.scene.panel
+    white_reference = served.rig.camera.view.source.scene.white_reference
     mounted = ("mirror_axes", "mirror_clocking_deg", "mirror_offset_x", "mirror_offset_y")
     return {
         "port": served.port,
@@ -219,7 +219,7 @@ def _rig_table(served: ServedRig, rig: SurveyRig) -> dict[str, object]:
         "control_port": served.camera_port,
         "file_port": served.file_port,
         "pulses": served.rig.camera.wired,
-        "panel": round(float(panel.mean()), 6),
+        "white_reference": round(float(white_reference.mean()), 6),
         "provenance": "emulated",
         **{name: getattr(rig, name) for name in mounted if rig.mounting != STRAIGHT},
     }
@@ -227,10 +227,10 @@ def _rig_table(served: ServedRig, rig: SurveyRig) -> dict[str, object]:
 
 def _tables_changed(settings: Settings) -> dict[str, dict[str, object]]:
     """What of the emulated rig is not usual, by table: a survey of it has to know the same camera."""
-    told, usual = settings.to_dict(), Settings().to_dict()
+    asked, usual = settings.to_dict(), Settings().to_dict()
     found = {}
     for name in EMULATED:
-        own, other = (cast("dict[str, object]", one[name]) for one in (told, usual))
+        own, other = (cast("dict[str, object]", one[name]) for one in (asked, usual))
         if own != other:
             found[name] = {key: value for key, value in own.items() if value != other[key] and value is not None}
     return found

@@ -1,1 +1,1 @@
-"""The survey: its context, its stages from a coarse look to a class map, and the engines that run them."""
+"""The survey: its context, its stages from a coarse pass to a class map, and the engines that run them."""

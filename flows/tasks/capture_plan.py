@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.settings.survey_settings import RECORDED, Settings
-from flows.settings.values import LOOK_WHOLE, parse_look_runs
+from flows.settings.values import EXTENT_WHOLE, parse_extent_runs
 from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, Sweep
-from pipeline.planning.coverage import cheapest_full, coarse_sweeps, plain_sweeps, sweeps_over, with_margin
-from pipeline.planning.part_looks import sweeps_of_runs
+from pipeline.planning.coverage import cheapest_full, coarse_sweeps, sweeps_over, uniform_sweeps, with_margin
+from pipeline.planning.partial_scans import sweeps_of_runs
 from pipeline.planning.prices import check_budget
 from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX
 
@@ -23,7 +23,7 @@ from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX
 class CapturePlan:
     """What every survey of this field has in common: orientation, coarse and full sweeps, and their seconds.
 
-    Of a plain scan ``coarse`` are the sweeps of that, and there is nothing to go back for.
+    Of a uniform scan ``coarse`` are the sweeps of that, and there is nothing to go back for.
     """
 
     along: Axis
@@ -49,7 +49,7 @@ def plan_capture(
 
     Either pass overlaps by what its own registration needs. Its map lies as the sweep that is held does, which another
     may lie beside by twice the mirror's error: so much earlier sweeps begin, and later they end. Lines show the
-    ``shown`` (seat,) seats, all of them where it is None. Of a recording they are ``recorded`` ones. Raises
+    ``shown`` (patch,) patches, all of them where it is None. Of a recording they are ``recorded`` ones. Raises
     SettingsError: the mirror may be so far off that overlaps take whole lines; BudgetError: the budget does not pay for
     the coarse pass; PoseError: the field is beyond the mirror's range; NotRecordedError: a line was never taken.
     """
@@ -64,9 +64,9 @@ def plan_capture(
 def lay_out_sweeps(
     settings: Settings, grid: SceneGrid, shown: NDArray[np.bool_] | None = None, recorded: RecordedPasses | None = None
 ) -> tuple[Axis, list[Sweep], list[Sweep]]:
-    """Give the axis that lines lie along, the coarse sweeps or those of a plain scan, and those of the full scan.
+    """Give the axis that lines lie along, the coarse sweeps or those of a uniform scan, and those of the full scan.
 
-    Lines that show none of the ``shown`` (seat,) seats are left out, but for a mirror that may look beside the plan:
+    Lines that show none of the ``shown`` (patch,) patches are left out, but for a mirror that may look beside the plan:
     its sweeps are tied together by what they share. Of the looks those lines are left that the settings name. Of a
     recording they are ``recorded`` lines. Raises SettingsError: the mirror may be so far off that overlaps take whole
     lines, or lines are named that the scan does not have; PoseError: the field is beyond the mirror's range;
@@ -82,18 +82,18 @@ def lay_out_sweeps(
     if settings.scan_step is not None:
         step, overlap = settings.scan_step, _overlap(settings, settings.scan_step)
         exposure_ms = settings.scan_exposure_ms
-        looks = plain_sweeps(grid, camera, along, step=step, exposure_ms=exposure_ms, overlap_px=overlap)
+        scan_passes = uniform_sweeps(grid, camera, along, step=step, exposure_ms=exposure_ms, overlap_px=overlap)
     else:
         overlap, exposure_ms = _overlap(settings, grid.factor), settings.coarse_exposure_ms
-        looks = coarse_sweeps(grid, camera, along, overlap_px=overlap, exposure_ms=exposure_ms)
-    looks = cut(looks)
-    if settings.look != LOOK_WHOLE:
-        looks = sweeps_of_runs(looks, parse_look_runs(settings.look))
-    looks, full = with_margin(looks, camera, apart), with_margin(full, camera, apart)
+        scan_passes = coarse_sweeps(grid, camera, along, overlap_px=overlap, exposure_ms=exposure_ms)
+    scan_passes = cut(scan_passes)
+    if settings.extent != EXTENT_WHOLE:
+        scan_passes = sweeps_of_runs(scan_passes, parse_extent_runs(settings.extent))
+    scan_passes, full = with_margin(scan_passes, camera, apart), with_margin(full, camera, apart)
     if recorded is None:
-        return along, looks, full
+        return along, scan_passes, full
     own = settings.scan == RECORDED
-    return along, recorded.uniform_scan() if own else recorded.first_pass(looks), recorded.full_scan(full)
+    return along, recorded.uniform_scan() if own else recorded.first_pass(scan_passes), recorded.full_scan(full)
 
 
 def _overlap(settings: Settings, step: int) -> float:

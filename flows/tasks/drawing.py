@@ -14,21 +14,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.tasks.field_memory import FieldMemory
-from flows.tasks.field_work import FieldWork, WeightsFile, look_at, seat_columns
-from models.reading.familiar import Familiar
-from models.reading.inference import CoarseLook, segment
+from flows.tasks.field_prior_map import FieldPriorMap
+from flows.tasks.field_work import FieldWork, WeightsFile, coarse_region, patch_features
+from models.reading.inference import CoarsePass, segment
+from models.reading.ood import OodDetector
+from models.reading.prior_map import Observation, TemporalAgreement, changed_from, compare, first_probabilities, fuse
 from models.reading.regions import Region
-from models.reading.remembered import Looked, MemoryAgreement, changed_from, compare, first_belief, recall
 from pipeline.geometry.grid import UNLABELLED
-from storage.arrays.class_maps import write_belief_tile, write_changes_tile, write_class_tile
+from storage.arrays.class_maps import write_changes_tile, write_class_tile, write_probabilities_tile
 from storage.arrays.layout import read_array
 from storage.arrays.mosaics import PatchStore, open_patches
 from storage.arrays.tile_work import let_tiles_go
-from storage.parallel.crew import run_blocks
+from storage.parallel.pool import run_blocks
 
-ENOUGH_SEEN = 0.5  # of a seat at the edge of a look at a part, so that what it shows is read
-Strange = tuple[int, int]  # coarse pixels, and fine ones, with a value that is no reading
+ENOUGH_SEEN = 0.5  # of a patch at the edge of a look at a part, so that what it shows is read
+OutOfRange = tuple[int, int]  # coarse pixels, and fine ones, with a value that is no reading
 
 
 @dataclass(frozen=True)
@@ -39,10 +39,10 @@ class Drawing:
     mosaic: Path
     patches: Path
     out: Path  # of the class map
-    belief: Path
-    light: float  # exposure of a line that is read in detail, as a share of the reference
+    probabilities: Path
+    light: float  # exposure of a line that is read in detail, as a fraction of the reference
     step: int  # pixels from such a line to the next
-    memory: FieldMemory | None = None  # what is remembered of the field
+    memory: FieldPriorMap | None = None  # what is remembered of the field
     left_out: Path | None = None  # (y, x) pixels of which zones have no map drawn
     unknown: UnknownRule | None = None  # which pixels are called unknown
     part: bool = False  # of the field was looked at: of the rest today's look says nothing
@@ -51,40 +51,49 @@ class Drawing:
         """Read what was seen of the region coarsely and finely, and store the part of the map that is kept."""
         let_tiles_go()
         weights, store = self.weights.load(), open_patches(self.patches)
-        seen = look_at(weights, self.mosaic, region)
-        strange = np.zeros(region.grid.seat_shape, np.int64)
-        seats, columns = seat_columns(weights, store, store.wavelength_nm, seen, region, strange=strange.ravel())
-        drawn, shown = segment(weights, seen, columns, seats, every_class=True), self._shown(region, store, seats)
+        seen = coarse_region(weights, self.mosaic, region)
+        out_of_range = np.zeros(region.grid.patch_shape, np.int64)
+        patch_index, columns = patch_features(
+            weights, store, store.wavelength_nm, seen, region, out_of_range=out_of_range.ravel()
+        )
+        drawn, shown = (
+            segment(weights, seen, columns, patch_index, every_class=True),
+            self._shown(region, store, patch_index),
+        )
         assert drawn.log_probability is not None
         unknown = None
         if self.unknown is not None:
-            familiar, bands = self.weights.load_familiar(), len(store.wavelength_nm)
-            unknown = self.unknown.pixels(familiar, seen, columns, seats, bands) & (drawn.classes != UNLABELLED)
+            ood_detector, bands = self.weights.load_ood(), len(store.wavelength_nm)
+            unknown = self.unknown.pixels(ood_detector, seen, columns, patch_index, bands) & (
+                drawn.classes != UNLABELLED
+            )
             unknown &= shown | (not self.part)
             drawn.log_probability[unknown] = np.nan  # of what these pixels show the classes say nothing
         del columns  # a memory takes their room
-        looked = self._looked(self._within_zones(region, drawn.log_probability), shown, seen)
+        observation = self._observation(self._within_zones(region, drawn.log_probability), shown, seen)
         classes, confidence = drawn.classes, drawn.confidence
         comparison, old = None, None
         if self.memory is None:
-            after = first_belief(looked)
+            after = first_probabilities(observation)
             if self.part:
                 classes, confidence = after.classes()
         else:
-            remembered = self.memory.of(region, weights)
-            after = recall(remembered, looked, self.weights.load_reader())
+            prior_map = self.memory.of(region, weights)
+            after = fuse(prior_map, observation, self.weights.load_reader())
             classes, confidence = after.classes()
-            comparison = compare(remembered, looked, after, region.kept_here)
-            old = changed_from(remembered, after)
+            comparison = compare(prior_map, observation, after, region.kept_here)
+            old = changed_from(prior_map, after)
         if self.unknown is not None and unknown is not None:
             classes[unknown], confidence[unknown] = self.unknown.number, np.nan
         origin = region.kept.top, region.kept.left
         if old is not None:
-            write_changes_tile(self.belief, origin, region.crop(old))
+            write_changes_tile(self.probabilities, origin, region.crop(old))
         write_class_tile(self.out, origin, region.crop(classes), region.crop(confidence))
-        write_belief_tile(self.belief, origin, *map(region.crop, (after.log_probability, after.age_days, after.light)))
-        coarse = 0 if seen.strange is None else int(np.count_nonzero(region.crop_coarse(seen.strange)))
-        return Drawn((coarse, int(region.crop_seats(strange).sum())), comparison)
+        write_probabilities_tile(
+            self.probabilities, origin, *map(region.crop, (after.log_probability, after.age_days, after.light))
+        )
+        coarse = 0 if seen.out_of_range is None else int(np.count_nonzero(region.crop_coarse(seen.out_of_range)))
+        return Drawn((coarse, int(region.crop_patches(out_of_range).sum())), comparison)
 
     def _within_zones(self, region: Region, log_probability: NDArray[np.float32]) -> NDArray[np.float32]:
         """Today's look, (y, x, class), with nothing said of pixels that zones leave out: a memory of them stays."""
@@ -93,26 +102,28 @@ class Drawing:
         away = np.load(self.left_out, mmap_mode="r")[region.read.rows, region.read.columns]
         return np.where(away[..., None], np.float32(np.nan), log_probability)
 
-    def _looked(self, log_probability: NDArray[np.float32], shown: NDArray[np.bool_], seen: CoarseLook) -> Looked:
+    def _observation(
+        self, log_probability: NDArray[np.float32], shown: NDArray[np.bool_], seen: CoarsePass
+    ) -> Observation:
         if self.part:
             log_probability = np.where(shown[..., None], log_probability, np.float32(np.nan))
-        return Looked(log_probability, shown, seen.seen_columns, self.light, self.step)
+        return Observation(log_probability, shown, seen.seen_columns, self.light, self.step)
 
-    def _shown(self, region: Region, store: PatchStore, seats: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def _shown(self, region: Region, store: PatchStore, patch_index: NDArray[np.int64]) -> NDArray[np.bool_]:
         """(y, x) pixels of a region that were looked at in detail.
 
-        Of a look at a part only what lines reached, in seats of which they reached enough: what is filled in beside
+        Of a look at a part only what lines reached, in patches of which they reached enough: what is filled in beside
         the part is no look, and would stand where something better is remembered.
         """
         grid, p = region.grid, region.grid.patch
-        detailed = np.zeros((int(np.prod(grid.seat_shape)), p, p), np.bool_)
-        detailed[seats] = True
+        detailed = np.zeros((int(np.prod(grid.patch_shape)), p, p), np.bool_)
+        detailed[patch_index] = True
         if self.part:
-            numbers = region.numbers_here(store.seats)
+            numbers = region.numbers_here(store.patch_index)
             here = np.flatnonzero(numbers >= 0)
             reached = read_array(store.group, "valid")[here]
             detailed[numbers[here]] &= reached & (reached.mean(axis=(1, 2), keepdims=True) >= ENOUGH_SEEN)
-        rows, columns = grid.seat_shape
+        rows, columns = grid.patch_shape
         pixels = detailed.reshape(rows, columns, p, p).swapaxes(1, 2).reshape(rows * p, columns * p)
         return np.ascontiguousarray(pixels[: grid.height, : grid.width])
 
@@ -123,23 +134,28 @@ class UnknownRule:
 
     number: int  # of the class, after those of the weights
     rate: float  # of known pixels that may be
-    light: float  # of a line that is read in detail, as a share of the reference
+    light: float  # of a line that is read in detail, as a fraction of the reference
     coarse_light: float  # of a coarse line
     step: int
 
     def pixels(
-        self, familiar: Familiar, seen: CoarseLook, patches: NDArray[np.float32], seats: NDArray[np.int64], bands: int
+        self,
+        ood_detector: OodDetector,
+        seen: CoarsePass,
+        patches: NDArray[np.float32],
+        patch_index: NDArray[np.int64],
+        bands: int,
     ) -> NDArray[np.bool_]:
-        """Unknown pixels of a region's scene, (y, x): by its patches, and by the coarse look beside them."""
+        """Unknown pixels of a region's scene, (y, x): by its patches, and by the coarse pass beside them."""
         grid, p = seen.grid, seen.grid.patch
         found = np.zeros(grid.padded_shape, np.bool_)
-        if len(seats) < len(grid.valid_seats()):
-            coarse = familiar.unknown(
+        if len(patch_index) < len(grid.valid_patches()):
+            coarse = ood_detector.unknown(
                 seen.columns, rate=self.rate, light=self.coarse_light, step=None, bands=bands, factor=grid.factor
             )
             found[...] = np.repeat(np.repeat(coarse, grid.factor, axis=0), grid.factor, axis=1)
-        fine = familiar.unknown(patches, rate=self.rate, light=self.light, step=self.step, bands=bands)
-        for patch, (y, x) in zip(fine, grid.seat_origin(seats), strict=True):
+        fine = ood_detector.unknown(patches, rate=self.rate, light=self.light, step=self.step, bands=bands)
+        for patch, (y, x) in zip(fine, grid.patch_origin(patch_index), strict=True):
             found[y : y + p, x : x + p] = patch
         return found[: grid.height, : grid.width]
 
@@ -148,29 +164,29 @@ class UnknownRule:
 class Drawn:
     """What a worker says of a region that it drew."""
 
-    strange: Strange
-    comparison: MemoryAgreement | None  # with what was remembered
+    out_of_range: OutOfRange
+    comparison: TemporalAgreement | None  # with what was remembered
 
 
 @dataclass(frozen=True)
 class DrawnField:
     """What was found while a map was drawn."""
 
-    strange: Strange
-    comparison: MemoryAgreement | None  # with what was remembered; None of a field's first look
+    out_of_range: OutOfRange
+    comparison: TemporalAgreement | None  # with what was remembered; None of a field's first look
 
 
 def draw_field(field: FieldWork, work: Drawing, report: Callable[[float], None]) -> DrawnField:
-    """Draw class map and belief into the stores that were created for them; count pixels that were left out.
+    """Draw class map and class probabilities into the stores that were created for them; count pixels that were left out.
 
     These are the coarse pixels, and the fine ones, with a value that the weights take for no reading. Raises
     SettingsError: not even one region at a time fits the memory.
     """
     store = open_patches(work.patches)
-    crew = field.crew_for(store.seats, len(store.wavelength_nm))
-    remembered = () if work.memory is None else (work.memory.belief, work.memory.mosaic)
-    paths = (work.mosaic, work.patches, work.out, work.belief, *remembered)
-    parts: list[Drawn] = run_blocks(work, field.regions, crew, report=report, paths=paths)
-    strange = sum(part.strange[0] for part in parts), sum(part.strange[1] for part in parts)
+    pool = field.pool_for(store.patch_index, len(store.wavelength_nm))
+    prior_map = () if work.memory is None else (work.memory.probabilities, work.memory.mosaic)
+    paths = (work.mosaic, work.patches, work.out, work.probabilities, *prior_map)
+    parts: list[Drawn] = run_blocks(work, field.regions, pool, report=report, paths=paths)
+    out_of_range = sum(part.out_of_range[0] for part in parts), sum(part.out_of_range[1] for part in parts)
     compared = [part.comparison for part in parts if part.comparison is not None]
-    return DrawnField(strange, reduce(add, compared) if compared else None)
+    return DrawnField(out_of_range, reduce(add, compared) if compared else None)

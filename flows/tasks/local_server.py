@@ -57,7 +57,7 @@ OF_SCHEDULES = (  # services that a single survey does not use
     *("PAUSE_EXPIRATIONS", "REPOSSESSOR", "SCHEDULER", "TRIGGERS"),
 )
 QUIET = {  # nothing outside this machine is asked; the terminal is left to the survey, run logs go to the server
-    "DO_NOT_TRACK": "1",
+    "DO_NOT_SCAN_PATH": "1",
     "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
     "PREFECT_SERVER_UI_V2_ENABLED": "false",
     "PREFECT_SERVER_UI_SHOW_PROMOTIONAL_CONTENT": "false",

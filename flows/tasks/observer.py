@@ -30,7 +30,7 @@ class Observer:
     note: Callable[[str], None] = lambda words: None  # what was assumed, and what the user should know
     say: Callable[[str], None] = lambda words: None  # what a device is at, while no line comes
     log: Callable[[str], None] = lambda words: None  # one line for each stage that ended
-    progress: Callable[[str, float], None] = lambda title, share: None  # how far (0..1) the survey is, and at what
+    progress: Callable[[str, float], None] = lambda title, fraction: None  # how far (0..1) the survey is, and at what
 
 
 _terminal: ContextVar[Observer | None] = ContextVar("observer", default=None)
@@ -77,12 +77,12 @@ class _ProgressPage:
         self._artifact: Any = None
         self._last = -PROGRESS_EVERY_S
 
-    def show(self, title: str, share: float) -> None:
+    def show(self, title: str, fraction: float) -> None:
         """Bring the run's progress artifact up to date, or create it; a server that is gone stops no survey."""
         now = time.monotonic()
-        if now - self._last < PROGRESS_EVERY_S and share < 1:
+        if now - self._last < PROGRESS_EVERY_S and fraction < 1:
             return
-        self._last, percent = now, round(100 * share, 1)
+        self._last, percent = now, round(100 * fraction, 1)
         with suppress(Exception):
             if self._artifact is None:
                 self._artifact = prefect_artifacts.create_progress_artifact(percent, description=title)

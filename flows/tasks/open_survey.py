@@ -16,12 +16,12 @@ from flows.tasks.rig_lock import rig_to_oneself
 from flows.tasks.run import SurveyRun, now
 from flows.tasks.stage import Stage
 from flows.tasks.stages.accuracy import evaluate
-from flows.tasks.stages.attention import attend
+from flows.tasks.stages.attention import score
 from flows.tasks.stages.capture import capture_coarse, capture_fine
 from flows.tasks.stages.effects import choose_effects
-from flows.tasks.stages.maps import draw_map
+from flows.tasks.stages.maps import segment
 from flows.tasks.stages.on_ground import ground
-from flows.tasks.stages.placement import cut_patches, locate, rectify, register_coarse, register_fine
+from flows.tasks.stages.placement import extract_patches, locate, rectify, register_coarse, register_fine
 from flows.tasks.stages.raster import average_raster, take_patches
 from pipeline.lazy import deferred
 from storage.archive.keys import StageRef
@@ -34,11 +34,11 @@ else:
 
 RIG_LIMIT = "rig"  # Prefect's global concurrency limit, where the server has one of that name
 OF_THE_SURVEY = (
-    *(choose_effects, capture_coarse, register_coarse, locate, rectify, average_raster, attend),
-    *(capture_fine, register_fine, cut_patches, take_patches, draw_map, ground, evaluate),
+    *(choose_effects, capture_coarse, register_coarse, locate, rectify, average_raster, score),
+    *(capture_fine, register_fine, extract_patches, take_patches, segment, ground, evaluate),
 )
-COARSE, DETAIL = ("rectify", "average_raster"), ("cut_patches", "take_patches")  # of a capture, of a raster
-JUDGED = (*COARSE, *DETAIL, "draw_map", "choose_effects", "register_coarse")  # whose stores `evaluate` takes
+COARSE, DETAIL = ("rectify", "average_raster"), ("extract_patches", "take_patches")  # of a capture, of a raster
+JUDGED = (*COARSE, *DETAIL, "segment", "choose_effects", "register_coarse")  # whose stores `evaluate` takes
 STAGES: dict[str, Stage] = {one.name: one for one in OF_THE_SURVEY}
 TITLES = {"plan": "scene, weights and plan", **{name: one.title for name, one in STAGES.items()}}
 
@@ -135,7 +135,7 @@ class OpenSurvey:
                     held.enter_context(prefect_concurrency.concurrency(RIG_LIMIT, occupy=1, lease_duration=60))
                 held.enter_context(rig_to_oneself(self.run.settings.rig.port, f"a survey of {self.run.name}"))
             held.enter_context(self.run.archive.in_use())
-            held.enter_context(self.run.settings.crew.open())
+            held.enter_context(self.run.settings.pool.open())
             yield
 
     def __call__(self, stage: str, /, *inputs: StageRef) -> StageRef:

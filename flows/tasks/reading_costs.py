@@ -1,4 +1,4 @@
-"""Multiply-adds of reading a field: of its map with fine patches at some seats, and of the scores of its seats."""
+"""Multiply-adds of reading a field: of its map with fine patches at some patches, and of the scores of its patches."""
 
 from __future__ import annotations
 
@@ -30,25 +30,25 @@ class ReadingCosts:
     def _regions(self) -> list[Region]:
         return plan_regions(self.grid, SHARD)
 
-    def of_map(self, seats: NDArray[np.integer]) -> MultiplyAdds:
-        """Count the map drawn with fine patches at these seats of the field."""
-        counts = [int(np.count_nonzero(region.numbers_here(seats) >= 0)) for region in self._regions]
+    def of_map(self, patch_index: NDArray[np.integer]) -> MultiplyAdds:
+        """Count the map drawn with fine patches at these patches of the field."""
+        counts = [int(np.count_nonzero(region.numbers_here(patch_index) >= 0)) for region in self._regions]
         parts = [
             astuple(multiply_adds(self.config, region.grid, count, self.bands))
             for region, count in zip(self._regions, counts, strict=True)
         ]
         return MultiplyAdds(*(sum(part) for part in zip(*parts, strict=True)))
 
-    def with_scores(self, seats: NDArray[np.integer], policy: str) -> MultiplyAdds:
-        """Count the same and what the policy takes to score all seats.
+    def with_scores(self, patch_index: NDArray[np.integer], policy: str) -> MultiplyAdds:
+        """Count the same and what the policy takes to score all patches.
 
-        Stages keep nothing of the model for each other, so that each reads the coarse look anew: ``glance`` holds what
+        Stages keep nothing of the model for each other, so that each reads the coarse pass anew: ``coarse_prediction`` holds what
         map and scores took for it.
         """
-        drawn = self.of_map(seats)
-        looks = 2 if policy in GLANCING_POLICIES else 1
+        drawn = self.of_map(patch_index)
+        scan_passes = 2 if policy in GLANCING_POLICIES else 1
         scored = [whole_field(self.grid)] if policy in IMAGE_POLICIES else self._regions
         score = sum(
             score_multiply_adds(policy, self.config, region.grid, channels=self.vgg_channels) for region in scored
         )
-        return replace(drawn, glance=looks * drawn.glance, score=score)
+        return replace(drawn, coarse_prediction=scan_passes * drawn.coarse_prediction, score=score)

@@ -18,7 +18,7 @@ from pipeline.capture.straight_scans import covered_field
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.lazy import Once
-from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
 from pipeline.source import Source
 from storage.archive.keys import stage_key
 from storage.readers.recordings import RecordedWith, Recording, open_recording
@@ -72,12 +72,12 @@ class OpenedRecording:
             key=f"{RECORDED}/{stage_key(RECORDED, 1, self.field.content, [])}/{width}x{height}",
             raster=SceneRaster.of(np.zeros((height, width, 1), np.float32), None if found is None else found.index),
             light=Once.of(
-                SceneLight(
+                SceneRadiance(
                     np.zeros((1, len(wavelength_nm)), np.float32),
-                    np.full(len(wavelength_nm), self.settings.camera.full_well_e, np.float32),
+                    np.full(len(wavelength_nm), self.settings.camera.full_full_well_e, np.float32),
                 )
             ),
-            panel=self.recording.sweeps[0].references.panel,
+            white_reference=self.recording.sweeps[0].references.white_reference,
             wavelength_nm=wavelength_nm,
             fwhm_nm=self.recording.fwhm_nm,
             class_names=() if found is None else found.names,
@@ -97,7 +97,7 @@ def open_recorded(settings: Settings) -> OpenedRecording:
         dark=None if settings.dark is None else Path(settings.dark),
         white=None if settings.white is None else Path(settings.white),
         wavelengths=settings.wavelengths,
-        panel=settings.rig.panel,
+        white_reference=settings.rig.white_reference,
         mounting=settings.rig.mounting,
     )
     recording = open_recording(str(settings.sweeps), settings.camera, given)

@@ -52,8 +52,8 @@ class RigLock:
             if isinstance(self.place, Path):
                 return self.place.read_text().strip() or "another process"
             below = rf" @{re.escape(self.place)}/(.+)$"  # the words below a name that is held
-            told: list[str] = re.findall(below, _NAMES.read_text(errors="replace"), re.MULTILINE)
-            return told[0]
+            names: list[str] = re.findall(below, _NAMES.read_text(errors="replace"), re.MULTILINE)
+            return names[0]
         return "another process"
 
 

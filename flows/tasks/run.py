@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.settings.survey_settings import RECORDED, RIG, Settings
-from flows.settings.values import LOOK_PART
+from flows.settings.values import EXTENT_PART
 from flows.tasks.capture_plan import CapturePlan, plan_capture
-from flows.tasks.look_choice import LookChoice, choose_look
-from flows.tasks.memory import AUTO, NONE, Prior, find_prior
+from flows.tasks.extent_choice import ExtentChoice, choose_extent
+from flows.tasks.patch_budget import PatchBudget
+from flows.tasks.prior_maps import AUTO, NONE, Prior, find_prior
 from flows.tasks.reading_costs import ReadingCosts
 from flows.tasks.recorded_field import OpenedRecording, open_recorded
-from flows.tasks.scan_choice import ScanChoice, choose_plain_scan
+from flows.tasks.scan_choice import ScanChoice, choose_uniform_scan
 from flows.tasks.scene import (
     FieldSource,
     SimulatedField,
@@ -33,14 +34,13 @@ from flows.tasks.scene import (
     open_map,
     open_scene,
 )
-from flows.tasks.seat_budget import SeatBudget
 from flows.tasks.survey_model import SurveyModel, beyond_training, vgg_file, weights_offered
 from flows.tasks.zones import SurveyZones, open_zones, place_of_field
 from models.evaluation.expected_scores import MapScores
 from models.network.machine import PROCESSOR, choose_device
 from models.policies.vgg_file import VggFile
 from models.weights.files import Description, Weights
-from models.weights.parts import FamiliarPart, ReaderPart
+from models.weights.parts import OodPart, ReaderPart
 from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.errors import NoScanPaidFor, SettingsError
 from pipeline.geometry.camera import LineCamera
@@ -77,7 +77,7 @@ def check_memory(settings: Settings, source: SimulatedSource, grid: SceneGrid, p
     rows, columns = image_spec(("y", "x"), pixels.shape, "<f4").shard or pixels.shape
     tiles = plan_tiles(placed, settings.camera, pixels, (rows, columns))
     work = MosaicWork(placed, settings.camera, pixels, finer=finer)
-    tile_budget(work, tiles, (rows, columns), memory=settings.memory, crew=replace(settings.crew, workers=1))
+    tile_budget(work, tiles, (rows, columns), memory=settings.memory, pool=replace(settings.pool, workers=1))
 
 
 class _PlannedSweep(SimulatedSweep):
@@ -87,7 +87,7 @@ class _PlannedSweep(SimulatedSweep):
     def references(self) -> References:
         """Frames of a detector without a fault, as the simulated one is."""
         white = np.ones((self.source.camera.samples // self.sweep.binning, len(self.source.wavelength_nm)), np.float32)
-        return References(dark=np.zeros_like(white), white=white, panel=white[0])
+        return References(dark=np.zeros_like(white), white=white, white_reference=white[0])
 
 
 Report = Callable[[float], None]  # how far a stage is, 0..1
@@ -141,10 +141,10 @@ class SurveyRun(CaptureRun):
     zones: SurveyZones  # what the survey keeps to, and plots
     recorded: RecordedPasses | None = None  # the recording whose lines the passes take
     raster: RasterPixels | None = None  # the pixels of a scene that is a map already: nothing is captured of it
-    budget: SeatBudget | None = None  # of seats of a plain scan, where a part of them alone is kept and read
-    look: LookChoice | None = None  # the part of a remembered field that is looked at, where one was chosen
-    prior: Prior | None = None  # the run whose belief is gone on from
-    familiar: FamiliarPart | None = None  # what is familiar to the weights, where pixels may be called unknown
+    budget: PatchBudget | None = None  # of patches of a uniform scan, where a part of them alone is kept and read
+    extent: ExtentChoice | None = None  # the part of a remembered field that is looked at, where one was chosen
+    prior: Prior | None = None  # the run whose class probabilities is gone on from
+    ood_detector: OodPart | None = None  # what is familiar to the weights, where pixels may be called unknown
     notes: tuple[str, ...] = ()
     refused: str | None = None  # why this machine would refuse the survey; it is planned nevertheless
 
@@ -166,7 +166,7 @@ class SurveyRun(CaptureRun):
     @property
     def map_scores(self) -> MapScores | None:
         """How what maps expect of themselves came true, where that was measured."""
-        return None if self.described.familiar is None else self.described.familiar.map_scores
+        return None if self.described.ood_detector is None else self.described.ood_detector.map_scores
 
     @property
     def device(self) -> str:
@@ -185,7 +185,7 @@ class SurveyRun(CaptureRun):
 
     @property
     def controls(self) -> bool:
-        """Whether other placements of seats are judged too; a plain scan that is read whole places none."""
+        """Whether other placements of patches are judged too; a uniform scan that is read whole places none."""
         return self.settings.controls and (self.chooses or self.raster is not None)
 
     @cached_property
@@ -247,25 +247,25 @@ def _run_by(
     grid = SceneGrid(*scene.shape, described.config.patch, described.config.factor)
     zones = open_zones(settings, place_of_field(settings, scene), grid)
     outside = beyond_training(settings, scene, described, model.trained_on, path)
-    familiar = model.asked_familiar(settings)
+    ood_detector = model.asked_ood(settings)
     name, found = settings.name or Path(scene.name).stem, None
     if planning:  # what a look would be, were there one
-        settings = replace(settings, doubt=None)
-    if settings.look == LOOK_PART:  # what is remembered says where to look: nothing else is asked for so early
+        settings = replace(settings, skip_below_error=None)
+    if settings.extent == EXTENT_PART:  # what is remembered says where to look: nothing else is asked for so early
         archive = open_archive(settings.out) if archive is None and is_archive(settings.out) else archive
         found = (None, ()) if archive is None else find_prior(archive, settings, name, grid, described.class_names)
     prior = None if found is None else found[0]
-    settings, look, look_notes = choose_look(settings, prior, described, path, grid, zones.shown)
+    settings, extent, extent_notes = choose_extent(settings, prior, described, path, grid, zones.shown)
     plan, scans, raster = CapturePlan.of_map(), ScanChoice(), None
     passes, bands = None if recorded is None else recorded.passes, len(scene.wavelength_nm)
     if pixels is None:
-        settings, scans = choose_plain_scan(settings, described, path, grid, bands, zones.shown, passes)
+        settings, scans = choose_uniform_scan(settings, described, path, grid, bands, zones.shown, passes)
         plan = plan_capture(settings, grid, zones.shown, passes)
     else:
         raster = RasterPixels(pixels.read, pixels.missing, bands, grid)
     channels = 3 if model.vgg is None else model.vgg.channels
     costs = ReadingCosts(described.config, grid, bands, channels)
-    budget = SeatBudget.asked(settings, costs, None if zones.shares is None else zones.shares > 0)
+    budget = PatchBudget.asked(settings, costs, None if zones.fractions is None else zones.fractions > 0)
     simulated, planned = make_source(scene, settings), (*plan.coarse, *plan.full)
     source = field_source(scene, settings, simulated, planned) if recorded is None else recorded.field
     if raster is None:
@@ -276,7 +276,7 @@ def _run_by(
     prior, prior_notes = found or find_prior(archive, settings, name, grid, described.class_names)
     if settings.prior != AUTO:  # what is meant when it is asked for again
         settings = replace(settings, prior=NONE if prior is None else prior.run)
-    said = (*notes, *zones.notes, *prior_notes, *look_notes, *model.notes(planning=planning), *outside, *label_notes)
+    said = (*notes, *zones.notes, *prior_notes, *extent_notes, *model.notes(planning=planning), *outside, *label_notes)
     return SurveyRun(
         settings=settings,
         archive=archive,
@@ -293,9 +293,9 @@ def _run_by(
         zones=zones,
         raster=raster,
         budget=budget,
-        look=look,
+        extent=extent,
         prior=prior,
-        familiar=familiar,
+        ood_detector=ood_detector,
         notes=said,
         refused=refused,
     )

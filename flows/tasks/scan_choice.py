@@ -1,4 +1,4 @@
-"""The plain scan of a survey: which one the weights' record promises most of, and what its neighbours would give."""
+"""The uniform scan of a survey: which one the weights' record promises most of, and what its neighbours would give."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.settings.survey_settings import Settings
-from flows.settings.values import LOOK_WHOLE, parse_goals
+from flows.settings.values import EXTENT_WHOLE, parse_goals
 from flows.tasks.capture_plan import lay_out_sweeps
 from models.weights.files import Description
 from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.errors import BudgetError, NotRecordedError, SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
-from pipeline.planning.plain_scans import (
+from pipeline.planning.uniform_scans import (
     MIOU,
-    PlainScan,
     ScanLimits,
-    ScanRecord,
+    ScanPerformance,
+    UniformScan,
     choose_scan,
     frontier,
-    plain_scans,
     priced_scan,
     reference_scan,
+    uniform_scans,
 )
 
 
@@ -36,10 +36,10 @@ from pipeline.planning.plain_scans import (
 class ScanChoice:
     """The scan that a survey takes, if it takes a plain one, and those that the weights' record tells of."""
 
-    offered: tuple[PlainScan, ...] = ()  # none without a record
-    chosen: PlainScan | None = None  # None of a survey in two passes, and of what the record does not tell of
+    offered: tuple[UniformScan, ...] = ()  # none without a record
+    chosen: UniformScan | None = None  # None of a survey in two passes, and of what the record does not tell of
 
-    def best_within(self, seconds: float) -> PlainScan | None:
+    def best_within(self, seconds: float) -> UniformScan | None:
         """The scan that is likely to score most in so many seconds; None where there is none."""
         try:
             return choose_scan(self.offered, ScanLimits(seconds)) if self.offered else None
@@ -47,17 +47,17 @@ class ScanChoice:
             return None
 
     @property
-    def reference(self) -> PlainScan | None:
+    def reference(self) -> UniformScan | None:
         """The cheapest scan that is nearly as good as the best; None without a record."""
         return reference_scan(self.offered) if self.offered else None
 
     @property
-    def frontier(self) -> list[PlainScan]:
+    def frontier(self) -> list[UniformScan]:
         """Scans than which none is as cheap and better, by ascending seconds."""
         return frontier(self.offered)
 
 
-def choose_plain_scan(
+def choose_uniform_scan(
     settings: Settings,
     weights: Description,
     path: Path,
@@ -66,9 +66,9 @@ def choose_plain_scan(
     shown: NDArray[np.bool_] | None = None,
     recorded: RecordedPasses | None = None,
 ) -> tuple[Settings, ScanChoice]:
-    """Settings with step and exposure of the plain scan that is asked for, and the choice that there was.
+    """Settings with step and exposure of the uniform scan that is asked for, and the choice that there was.
 
-    Lines show the ``shown`` (seat,) seats, all of them where it is None. Of a ``recorded`` field the scans are those
+    Lines show the ``shown`` (patch,) patches, all of them where it is None. Of a ``recorded`` field the scans are those
     that its lines serve, as they were exposed. What was chosen once stands in the settings,
     and is kept when an archive is read again with other weights. Raises WeightsError: the choice is left to weights
     without a record of scans; BudgetError: no scan costs as little, or reaches the goals; SettingsError: a goal of a
@@ -79,21 +79,21 @@ def choose_plain_scan(
     if content is None:
         if settings.scan_step is None and settings.plain:
             raise WeightsError(
-                f"the weights {path.name} have no record of plain scans, by which one would be chosen: give the scan "
+                f"the weights {path.name} have no record of uniform scans, by which one would be chosen: give the scan "
                 "with --scan-step and --scan-exposure-ms, or train weights with --darkest-ms 3, some scenes kept for"
                 " validation"
             )
         return settings, ScanChoice()
-    record = ScanRecord.read(content)
+    record = ScanPerformance.read(content)
     goals = {} if settings.goal is None else parse_goals(settings.goal)
     for name in goals:
         if name not in record.scores:
             known = ", ".join(one for one in record.scores if one != MIOU)
             raise SettingsError(f"--goal {name}={100 * goals[name]:g}: the weights tell apart {known}")
-    camera, cost, whole = settings.camera, settings.cost, replace(settings, look=LOOK_WHOLE)
+    camera, cost, whole = settings.camera, settings.cost, replace(settings, extent=EXTENT_WHOLE)
     sweeps = _scans_of_steps(record, whole, grid, shown, recorded)
     taken_ms = None if recorded is None else [camera.exposure_ms]
-    scans = plain_scans(record, sweeps, camera, cost, bands, seconds=settings.seconds, exposures_ms=taken_ms)
+    scans = uniform_scans(record, sweeps, camera, cost, bands, seconds=settings.seconds, exposures_ms=taken_ms)
     chosen, exposure_ms = None, settings.scan_exposure_ms or camera.exposure_ms
     if settings != whole:  # of a part of a field the record says nothing
         chosen = None
@@ -111,7 +111,7 @@ def choose_plain_scan(
 
 
 def _scans_of_steps(
-    record: ScanRecord,
+    record: ScanPerformance,
     settings: Settings,
     grid: SceneGrid,
     shown: NDArray[np.bool_] | None,
@@ -126,10 +126,10 @@ def _scans_of_steps(
     return found
 
 
-def as_told(scan: PlainScan | None) -> dict[str, Any] | None:
+def as_figures(scan: UniformScan | None) -> dict[str, Any] | None:
     """A scan as receipts tell it, with its expected mIoU alone."""
     if scan is None:
         return None
-    told: Mapping[str, Any] = asdict(scan)
+    fields: Mapping[str, Any] = asdict(scan)
     figures = {"expected_miou": scan.expected[MIOU], "expected_spread": scan.spread}
-    return {name: value for name, value in told.items() if name not in ("expected", "spread")} | figures
+    return {name: value for name, value in fields.items() if name not in ("expected", "spread")} | figures

@@ -21,7 +21,7 @@ from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import Once
 from pipeline.simulator.effects.effect import Effect
 from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, farm_scene, law_of_key
-from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Source
 from storage.readers.cube_sources import machine_bytes
@@ -89,8 +89,8 @@ def open_map(settings: Settings, known: Sequence[str] | None = None) -> tuple[Op
         name=file.name,
         key=file.light_hash,
         raster=SceneRaster.of(np.broadcast_to(np.float32(0), (*file.shape, 1)), labels),
-        light=Once.of(SceneLight(np.zeros((1, bands), np.float32), np.ones(bands, np.float32))),
-        panel=np.ones(bands, np.float32),
+        light=Once.of(SceneRadiance(np.zeros((1, bands), np.float32), np.ones(bands, np.float32))),
+        white_reference=np.ones(bands, np.float32),
         wavelength_nm=file.wavelength_nm,
         fwhm_nm=file.fwhm_nm,
         class_names=file.class_names,
@@ -108,11 +108,11 @@ Facts = TypeVar("Facts", bound=SceneFacts)
 
 def _judged_by_known(file: Facts, known: Sequence[str] | None) -> Facts:
     """Leave labels out that were found by their name and have a class beside the ``known`` ones."""
-    strange = [name for name in file.class_names if known is not None and name not in known]
-    if not (file.labels_found and strange):
+    out_of_range = [name for name in file.class_names if known is not None and name not in known]
+    if not (file.labels_found and out_of_range):
         return file
-    told = f"of the class {strange[0]!r}, which the weights do not know: name its classes in a scene.toml to judge"
-    return file.without_labels(f"the labels beside the scene are left out: they are {told} by them")
+    hint = f"of the class {out_of_range[0]!r}, which the weights do not know: name its classes in a scene.toml to judge"
+    return file.without_labels(f"the labels beside the scene are left out: they are {hint} by them")
 
 
 def _placed_once(scene: RasterScene, notes: tuple[str, ...], settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
@@ -148,9 +148,11 @@ def _field_before_rig(settings: Settings) -> RasterScene:
         key=f"{RIG_FIELD}/{settings.name or ''}/{width}x{height}",
         raster=SceneRaster.of(nothing),
         light=Once.of(
-            SceneLight(np.zeros((1, bands), np.float32), np.full(bands, settings.camera.full_well_e, np.float32))
+            SceneRadiance(
+                np.zeros((1, bands), np.float32), np.full(bands, settings.camera.full_full_well_e, np.float32)
+            )
         ),
-        panel=np.full(bands, settings.rig.panel, np.float32),
+        white_reference=np.full(bands, settings.rig.white_reference, np.float32),
         wavelength_nm=np.array(settings.wavelengths, np.float64),
     )
 
@@ -194,8 +196,8 @@ def _some_bands(scene: RasterScene, bands: tuple[int, ...]) -> RasterScene:
     return replace(
         scene,
         key=f"{scene.key}/only={','.join(map(str, bands))}",
-        light=Once(lambda: SceneLight(scene.electrons[:, chosen], scene.panel_electrons[chosen])),
-        panel=scene.panel[chosen],
+        light=Once(lambda: SceneRadiance(scene.electrons[:, chosen], scene.white_reference_electrons[chosen])),
+        white_reference=scene.white_reference[chosen],
         wavelength_nm=scene.wavelength_nm[chosen],
         fwhm_nm=None if scene.fwhm_nm is None else scene.fwhm_nm[chosen],
     )
@@ -215,14 +217,14 @@ def check_labels(scene: RasterScene, weights: Description) -> tuple[str, ...]:
     missing = [name for name in scene.class_names if name not in weights.class_names]
     if missing:
         known = ", ".join(weights.class_names)
-        told = "use weights for these"
+        hint = "use weights for these"
         if (found := re.fullmatch(r"class_(\d+)|colour_([0-9a-f]{6})", missing[0])) is not None:  # nobody named it
             value = found[1] or list(bytes.fromhex(found[2]))
-            told += (
+            hint += (
                 ", or say which class each value of the label file is, in a table [classes] of the scene.toml beside "
                 f"the scene's file: {weights.class_names[0]} = {value}"
             )
-        raise SceneError(f"the labels have the class {missing[0]!r}, the weights know {known}; {told}")
+        raise SceneError(f"the labels have the class {missing[0]!r}, the weights know {known}; {hint}")
     law, learnt = law_of_key(scene.key), law_of_key(str(weights.record.get("data")))
     if None not in (law, learnt) and law != learnt:
         return (f"the weights were trained on {learnt}, the scene is of {law}: expect a poorer map",)

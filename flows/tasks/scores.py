@@ -49,7 +49,7 @@ def worst_class(accuracy: Mapping[str, Any]) -> WorstClass | None:
     return WorstClass(name, none.get(name), known[name], every.get(name))
 
 
-def worst_class_words(accuracy: Mapping[str, Any], *, alone: bool = False) -> str:
+def format_worst_class(accuracy: Mapping[str, Any], *, alone: bool = False) -> str:
     """The worst class in a sentence, ``alone`` without what other looks give; empty where there is none."""
     worst = worst_class(accuracy)
     if worst is None:
@@ -59,17 +59,17 @@ def worst_class_words(accuracy: Mapping[str, Any], *, alone: bool = False) -> st
         return f"Its worst class is {name} with {format_points(worst.this)}."
     full = "" if worst.all is None else f", detail everywhere {format_points(worst.all)}"
     return (
-        f"Its worst class is {name} with {format_points(worst.this)}: the coarse look alone "
+        f"Its worst class is {name} with {format_points(worst.this)}: the coarse pass alone "
         f"gives {format_points(worst.none)}{full}."
     )
 
 
-def false_class_words(accuracy: Mapping[str, Any]) -> str:
+def format_false_classes(accuracy: Mapping[str, Any]) -> str:
     """Classes that a map shows and the truth lacks, with their pixels; empty where there are none."""
-    told = []
+    parts = []
     for name, one in judged_maps(accuracy).items():
         false = one.get("false_classes") or {}
         if false:
             pixels = ", ".join(f"{kind.replace('_', ' ')} {format_count(count)} px" for kind, count in false.items())
-            told.append(f"{name} {pixels}")
-    return f"Shown although the truth has none: {'; '.join(told)}." if told else ""
+            parts.append(f"{name} {pixels}")
+    return f"Shown although the truth has none: {'; '.join(parts)}." if parts else ""

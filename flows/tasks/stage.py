@@ -4,7 +4,7 @@ A stage says which store it wants; the archive makes the key, finds the store, o
 stage. The record is made where the function is, in a module of `flows.tasks.stages`:
 
     @stage("rectify", "mosaic", MOSAIC)
-    def rectify(run, raw, lookup): ...
+    def rectify(run, raw, geolocation grid): ...
 
 The order of the stages stands in `flows.survey`, which calls them with the opened survey and with the stores that
 they are made of.

@@ -14,8 +14,8 @@ from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from flows.settings.values import UNKNOWN_AUTO, UNKNOWN_OFF
 from models.network.machine import choose_device
 from models.policies.vgg_file import VggFile
-from models.weights.files import Description, Weights, describe_weights, load_familiar, load_reader, load_weights
-from models.weights.parts import TRAINED_ON, FamiliarPart, TrainedOn
+from models.weights.files import Description, Weights, describe_weights, load_ood, load_reader, load_weights
+from models.weights.parts import TRAINED_ON, OodPart, TrainedOn
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.ground.map_grid import median_footprint_m
@@ -25,7 +25,7 @@ from pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
 from pipeline.simulator.scenes.farm.seasons import sun_over_farm
 from pipeline.simulator.scenes.scene import RasterScene
 
-PLAIN_STEPS = (1, 2)  # pixels from line to line of what the weights for plain scans read
+UNIFORM_STEPS = (1, 2)  # pixels from line to line of what the weights for uniform scans read
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,8 @@ class SurveyModel:
             load()
             if described.reader is not None:
                 load_reader(path)
-            if described.familiar is not None and settings.unknown != UNKNOWN_OFF:
-                load_familiar(path)
+            if described.ood_detector is not None and settings.unknown != UNKNOWN_OFF:
+                load_ood(path)
             if model.vgg is not None:
                 model.vgg.saliency(load())  # refuses one that does not go with the weights
         return model
@@ -76,16 +76,16 @@ class SurveyModel:
         """What the weights were trained on, by their record or what is familiar to them; None where neither tells."""
         if TRAINED_ON in self.described.record:
             return TrainedOn.read(self.described.record[TRAINED_ON])
-        return None if self.described.familiar is None else self.described.familiar.trained_on
+        return None if self.described.ood_detector is None else self.described.ood_detector.trained_on
 
-    def asked_familiar(self, settings: Settings) -> FamiliarPart | None:
+    def asked_ood(self, settings: Settings) -> OodPart | None:
         """What is familiar, where pixels may be called unknown; WeightsError where it is asked and nobody knows it."""
-        if settings.unknown not in (UNKNOWN_AUTO, UNKNOWN_OFF) and self.described.familiar is None:
+        if settings.unknown not in (UNKNOWN_AUTO, UNKNOWN_OFF) and self.described.ood_detector is None:
             raise WeightsError(
                 f"--unknown {settings.unknown}: nobody measured what is familiar to {self.path.name}; do so with: "
                 f"spectralzoom train DATASET --familiar {self.path} -o {self.path}, or leave --unknown out"
             )
-        return None if settings.unknown == UNKNOWN_OFF else self.described.familiar
+        return None if settings.unknown == UNKNOWN_OFF else self.described.ood_detector
 
 
 def weights_path(settings: Settings) -> Path:
@@ -111,14 +111,14 @@ def weights_offered(settings: Settings) -> tuple[Path, ...]:
         return (two_passes,)
     if settings.scan_step is None:
         return plain, two_passes
-    return (plain,) if settings.scan_step in PLAIN_STEPS else (two_passes,)
+    return (plain,) if settings.scan_step in UNIFORM_STEPS else (two_passes,)
 
 
 def shipped_weights(*, plain: bool = False) -> Path:
     """The weights that come with the house: those that ``plain`` scans are read with, or those for two passes.
 
     The coarse pixels of the first are 2 px wide, which leaves less to be read in detail, but lines farther apart than
-    that no coarse look is made of; those of the other are 4 px wide, so that a coarse pass has few lines.
+    that no coarse pass is made of; those of the other are 4 px wide, so that a coarse pass has few lines.
     """
     name = "farm-scan.safetensors" if plain else "farm.safetensors"
     return Path(str(resources.files("models") / "shipped" / name))

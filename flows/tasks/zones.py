@@ -45,13 +45,13 @@ class SurveyZones:
 
     @cached_property
     def shown(self) -> NDArray[np.bool_] | None:
-        """(seat,) that lines have to show; None for all."""
-        return None if self.kept is None else self.kept.shown_seats(self.grid)
+        """(patch,) that lines have to show; None for all."""
+        return None if self.kept is None else self.kept.shown_patches(self.grid)
 
     @cached_property
-    def shares(self) -> NDArray[np.float64] | None:
-        """(seat,) share of what a fine look at each seat is worth; None: all of it."""
-        return None if self.kept is None else self.kept.seat_shares(self.grid)
+    def fractions(self) -> NDArray[np.float64] | None:
+        """(patch,) fraction of what a fine look at each patch is worth; None: all of it."""
+        return None if self.kept is None else self.kept.patch_fractions(self.grid)
 
     @cached_property
     def left_out(self) -> NDArray[np.bool_] | None:
@@ -94,8 +94,8 @@ def open_zones(settings: Settings, place: FieldPlace, grid: SceneGrid) -> Survey
         shapes = {name: on_field(one, found.crs, place) for name, one in found.shapes.items()}
         if all(one.is_empty for one in shapes.values()):
             if needed:
-                raise ZoneError(_beside_words(found, place))
-            notes.append(_beside_words(found, place))
+                raise ZoneError(_format_beside(found, place))
+            notes.append(_format_beside(found, place))
         return shapes
 
     area = None if files.area is None else tuple(placed(files.area).values())
@@ -105,7 +105,7 @@ def open_zones(settings: Settings, place: FieldPlace, grid: SceneGrid) -> Survey
     if inside is not None and not inside.any():
         raise ZoneError(
             f"the area of {files.area} holds no pixel's centre: it is smaller than a pixel of this field"
-            f"{_pixel_words(place)}; give a larger one, or leave it out"
+            f"{_format_pixels(place)}; give a larger one, or leave it out"
         )
     kept = field_zones(inside, None if no_go is None else pixels_inside(no_go, shape, touched=True))
     if kept is not None and not kept.kept.any():
@@ -132,7 +132,7 @@ def _read(source: str, place: FieldPlace, notes: list[str], named_by: str | None
     return found
 
 
-def _beside_words(found: ZoneFile, place: FieldPlace) -> str:
+def _format_beside(found: ZoneFile, place: FieldPlace) -> str:
     """Where polygons and field lie, of which none lies on it."""
     if found.crs is None or place.crs is None:
         unit, here, there = "px", _bounds(found), place.outline.bounds
@@ -166,7 +166,7 @@ def _extent(found: ZoneFile) -> tuple[float, float, float, float]:
     return west, south, east, north
 
 
-def _pixel_words(place: FieldPlace) -> str:
+def _format_pixels(place: FieldPlace) -> str:
     """How large a pixel is, where somebody knows."""
     rows, columns = place.shape
     middle = place.pixel_areas_m2(slice(rows // 2, rows // 2 + 1), slice(columns // 2, columns // 2 + 1))

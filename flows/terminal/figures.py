@@ -50,14 +50,14 @@ def three_digits(value: float) -> str:
     return format_count(round(value, 2 - math.floor(math.log10(abs(value)))))
 
 
-def format_percent(share: float | None) -> str:
-    """A share as percent without decimals, one decimal below 10 %."""
-    if not _known(share):
+def format_percent(fraction: float | None) -> str:
+    """A fraction as percent without decimals, one decimal below 10 %."""
+    if not _known(fraction):
         return DASH
-    return f"{100 * share:.1f} %" if abs(share) < 0.0995 else f"{100 * share:.0f} %"
+    return f"{100 * fraction:.1f} %" if abs(fraction) < 0.0995 else f"{100 * fraction:.0f} %"
 
 
-def area_words(hectares: float) -> str:
+def format_area(hectares: float) -> str:
     """An area in hectares, small ones in square metres."""
     return f"{hectares:.3g} ha" if hectares >= LEAST_HECTARES else f"{hectares * 1e4:.3g} m²"
 

@@ -1,4 +1,4 @@
-"""The measure of each stage: kernel, tolerance of effects, plan, share of patches, codec.
+"""The measure of each stage: kernel, tolerance of effects, plan, fraction of patches, codec.
 
 `tests/benchmarks` measures plans and kernels with the same scenes and readers.
 """
@@ -13,23 +13,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.settings.load import CHEAP_POLICY
+from flows.tasks.patch_budget import PatchBudget
 from flows.tasks.reading_costs import ReadingCosts
-from flows.tasks.seat_budget import SeatBudget
-from flows.tasks.stages.accuracy import columns_of_all_seats
-from flows.tasks.survey_model import PLAIN_STEPS, shipped_weights
+from flows.tasks.stages.accuracy import columns_of_all_patches
+from flows.tasks.survey_model import UNIFORM_STEPS, shipped_weights
 from flows.tradeoff.entries import Setting, Tradeoff
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.machine import keep_freed_memory
 from models.network.sizes import multiply_adds
-from models.policies.policies import score_seats
+from models.policies.policies import score_patches
 from models.reading.inference import (
-    CoarseLook,
+    CoarsePass,
+    CoarsePrediction,
     DrawnMap,
-    Glance,
-    glance,
-    glance_of_columns,
-    look_coarsely,
-    read_glance,
+    coarse_prediction,
+    coarse_prediction_of_columns,
+    read_coarse_pass,
+    read_coarse_prediction,
     segment,
 )
 from models.weights.files import Weights, load_weights
@@ -37,11 +37,11 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, CostModel, Sweep
-from pipeline.planning.coverage import cheapest_full, coarse_sweeps, full_sweeps, plain_sweeps
+from pipeline.planning.coverage import cheapest_full, coarse_sweeps, full_sweeps, uniform_sweeps
 from pipeline.planning.fine_pass import plan_fine
-from pipeline.planning.plain_scans import scan_words
 from pipeline.planning.prices import raw_bytes
-from pipeline.planning.selection import frame_seats
+from pipeline.planning.selection import frame_patches
+from pipeline.planning.uniform_scans import format_scan
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.region import mosaic_rows
 from pipeline.rectify.resample import resample
@@ -104,7 +104,7 @@ class Scattered:
 
 
 def scatter_points(seed: int) -> Scattered:
-    """Draw point samples of waves, and points at least 2 px inside, in the order of lines as a lookup gives them."""
+    """Draw point samples of waves, and points at least 2 px inside, in the order of lines as a geolocation grid gives them."""
     waves, rng = draw_waves(seed, BANDS, PERIODS_PX), np.random.default_rng([seed, 1])
     grid = np.argwhere(np.ones((SIDE, SIDE), bool)).astype(np.float64)
     samples = waves.at(grid).astype(np.float32).reshape(SIDE, SIDE, BANDS)
@@ -115,14 +115,14 @@ def scatter_points(seed: int) -> Scattered:
 
 def noise_level(camera: LineCamera) -> tuple[str, float]:
     """Return a tenth of the noise over the scene's standard deviation."""
-    electrons = camera.full_well_e / 2
+    electrons = camera.full_full_well_e / 2
     noise = float(np.sqrt(electrons + camera.read_noise_e**2))
     return "0.1 σ of noise", 0.1 * noise / (CONTRAST * electrons)  # noqa: RUF001
 
 
 RECTIFY = Tradeoff(
     stage="rectify",
-    knob="kernel",
+    knob="resampling",
     error="rmse / standard deviation",
     unit="px*band",
     reference=f"waves of {PERIODS_PX[0]:g} to {PERIODS_PX[1]:g} px, evaluated at the output pixels",
@@ -212,19 +212,21 @@ SIMULATE = Tradeoff(
 # survey: uniform scans and two passes, by the camera's seconds
 
 SURVEY_SHAPE = (384, 512)
-SCANS = {scan_words(step, ms): (step, ms) for step in (1, 2, 4) for ms in (100.0, 50.0, 25.0, 12.0, 6.0)}
+SCANS = {format_scan(step, ms): (step, ms) for step in (1, 2, 4) for ms in (100.0, 50.0, 25.0, 12.0, 6.0)}
 BUDGETS = {f"two passes, budget {budget:g}": budget for budget in (0.8, 0.65, 0.5, 0.4)}
 PART_OF = (1, 25.0)  # step and exposure [ms] of the scan of which parts are read in detail
-PARTS = {f"{scan_words(*PART_OF)} in part, {share} of the multiply-adds": share for share in ("50%", "35%", "25%")}
+PARTS = {
+    f"{format_scan(*PART_OF)} in part, {fraction} of the multiply-adds": fraction for fraction in ("50%", "35%", "25%")
+}
 
 
 @dataclass(frozen=True)
-class PlannedLook:
-    """The coarse look of a plan, its patches with their spectral features, and its cost."""
+class PlannedPass:
+    """The coarse pass of a plan, its patches with their spectral features, and its cost."""
 
-    seen: Glance
-    seats: NDArray[np.intp]
-    columns: Values  # (seat, p, p, column)
+    seen: CoarsePrediction
+    patch_index: NDArray[np.intp]
+    columns: Values  # (patch, p, p, column)
     seconds: float
     bytes_raw: int
     weights: Weights  # that read it
@@ -236,43 +238,48 @@ class PlannedField:
 
     labels: NDArray[np.uint8]
     bands: int
-    looks: Mapping[Setting, PlannedLook]
+    scan_passes: Mapping[Setting, PlannedPass]
 
     def read(self, plan: Setting) -> DrawnMap:
         """Return the class map of a plan."""
-        look = self.looks[plan]
-        return segment(look.weights, look.seen, look.columns, look.seats)
+        scan_pass = self.scan_passes[plan]
+        return segment(scan_pass.weights, scan_pass.seen, scan_pass.columns, scan_pass.patch_index)
 
     def miss(self, plan: Setting, drawn: DrawnMap) -> float:
         """Return 1 - mIoU of a map."""
-        return 1 - mean_iou(confusion(self.labels, drawn.classes, self.looks[plan].weights.config.classes))
+        return 1 - mean_iou(confusion(self.labels, drawn.classes, self.scan_passes[plan].weights.config.classes))
 
     def billion_multiply_adds(self, plan: Setting, _drawn: DrawnMap) -> float:
         """Return the multiply-adds of the network for a plan, in billions."""
-        look = self.looks[plan]
-        return multiply_adds(look.weights.config, look.seen.grid, len(look.seats), self.bands).total / 1e9
+        scan_pass = self.scan_passes[plan]
+        return (
+            multiply_adds(scan_pass.weights.config, scan_pass.seen.grid, len(scan_pass.patch_index), self.bands).total
+            / 1e9
+        )
 
 
-def plain_look(
+def uniform_pass(
     weights: Weights, source: SimulatedSource, sweeps: list[Sweep], grid: SceneGrid, cost: CostModel
-) -> PlannedLook:
-    """Read a uniform scan whole; its coarse look are the means of its own pixels, on a field of whole cells."""
-    columns = columns_of_all_seats(source, sweeps, grid, weights, memory=MEMORY, kernel="catmull-rom")
-    down, across = grid.seat_shape
+) -> PlannedPass:
+    """Read a uniform scan whole; its coarse pass are the means of its own pixels, on a field of whole cells."""
+    columns = columns_of_all_patches(source, sweeps, grid, weights, memory=MEMORY, kernel="catmull-rom")
+    down, across = grid.patch_shape
     p, s, camera = grid.patch, grid.factor, source.camera
     cells = columns.reshape(down, across, p // s, s, p // s, s, -1).mean(axis=(3, 5), dtype=np.float32)
     small = cells.swapaxes(1, 2).reshape(down * p // s, across * p // s, -1)
-    seats, size = grid.valid_seats(), raw_bytes(sweeps, camera, len(source.wavelength_nm))
+    patch_index, size = grid.valid_patches(), raw_bytes(sweeps, camera, len(source.wavelength_nm))
     seconds = cost.seconds(sweeps, camera)
-    return PlannedLook(glance_of_columns(weights, small, grid), seats, columns[seats], seconds, size, weights)
+    return PlannedPass(
+        coarse_prediction_of_columns(weights, small, grid), patch_index, columns[patch_index], seconds, size, weights
+    )
 
 
-def part_of(look: PlannedLook, bands: int, compute: str) -> PlannedLook:
-    """Return the same scan with the patches alone that edges promise most of, for a share of the multiply-adds."""
-    costs = ReadingCosts(look.weights.config, look.seen.grid, bands)
-    budget = SeatBudget(costs, look.seats, CHEAP_POLICY, compute)
-    kept = np.sort(budget.choose(score_seats(CHEAP_POLICY, look.seen)))
-    return replace(look, seats=kept, columns=look.columns[np.searchsorted(look.seats, kept)])
+def part_of(scan_pass: PlannedPass, bands: int, compute: str) -> PlannedPass:
+    """Return the same scan with the patches alone that edges promise most of, for a fraction of the multiply-adds."""
+    costs = ReadingCosts(scan_pass.weights.config, scan_pass.seen.grid, bands)
+    budget = PatchBudget(costs, scan_pass.patch_index, CHEAP_POLICY, compute)
+    kept = np.sort(budget.choose(score_patches(CHEAP_POLICY, scan_pass.seen)))
+    return replace(scan_pass, patch_index=kept, columns=scan_pass.columns[np.searchsorted(scan_pass.patch_index, kept)])
 
 
 def coarse_mosaic(source: SimulatedSource, coarse: list[Sweep], grid: SceneGrid) -> Values:
@@ -289,24 +296,24 @@ def plan_every_way(seed: int) -> PlannedField:
     grid, finer = (SceneGrid(*SURVEY_SHAPE, read.config.patch, read.config.factor) for read in (weights, of_scans))
     source, bands = SimulatedSource(scene, Rig(camera), seed), len(scene.wavelength_nm)
     along, full, full_s = cheapest_full(grid, camera, cost)
-    looks: dict[Setting, PlannedLook] = {}
+    scan_passes: dict[Setting, PlannedPass] = {}
     for words, (step, exposure_ms) in SCANS.items():
-        read_with, on = (of_scans, finer) if step in PLAIN_STEPS else (weights, grid)
-        sweeps = plain_sweeps(on, camera, along, step=step, exposure_ms=exposure_ms)
-        looks[words] = plain_look(read_with, source, sweeps, on, cost)
-    whole = looks[scan_words(*PART_OF)]
-    looks |= {words: part_of(whole, bands, share) for words, share in PARTS.items()}
+        read_with, on = (of_scans, finer) if step in UNIFORM_STEPS else (weights, grid)
+        sweeps = uniform_sweeps(on, camera, along, step=step, exposure_ms=exposure_ms)
+        scan_passes[words] = uniform_pass(read_with, source, sweeps, on, cost)
+    whole = scan_passes[format_scan(*PART_OF)]
+    scan_passes |= {words: part_of(whole, bands, fraction) for words, fraction in PARTS.items()}
     coarse = coarse_sweeps(grid, camera, along)
-    sweeps = plain_sweeps(grid, camera, along, step=1, exposure_ms=camera.exposure_ms)
-    every = plain_look(weights, source, sweeps, grid, cost)
-    seen = glance(weights, coarse_mosaic(source, coarse, grid), scene.wavelength_nm, grid)
-    coarse_s, scores = cost.seconds(coarse, camera), score_seats("gain", seen)
+    sweeps = uniform_sweeps(grid, camera, along, step=1, exposure_ms=camera.exposure_ms)
+    every = uniform_pass(weights, source, sweeps, grid, cost)
+    seen = coarse_prediction(weights, coarse_mosaic(source, coarse, grid), scene.wavelength_nm, grid)
+    coarse_s, scores = cost.seconds(coarse, camera), score_patches("gain", seen)
     for words, budget in BUDGETS.items():
         plan = plan_fine(grid, camera, cost, along, scores, budget_s=budget * full_s - coarse_s, full=full)
-        columns = every.columns[np.searchsorted(every.seats, plan.seats)]
+        columns = every.columns[np.searchsorted(every.patch_index, plan.patch_index)]
         size = raw_bytes([*coarse, *plan.sweeps], camera, bands)
-        looks[words] = PlannedLook(seen, plan.seats, columns, coarse_s + plan.seconds, size, weights)
-    return PlannedField(np.asarray(scene.labels, np.uint8), bands, looks)
+        scan_passes[words] = PlannedPass(seen, plan.patch_index, columns, coarse_s + plan.seconds, size, weights)
+    return PlannedField(np.asarray(scene.labels, np.uint8), bands, scan_passes)
 
 
 SURVEY = Tradeoff(
@@ -320,9 +327,9 @@ SURVEY = Tradeoff(
     run=PlannedField.read,
     judge=PlannedField.miss,
     work=lambda field: float(field.labels.size),
-    modelled_s=lambda field, plan, _drawn: field.looks[plan].seconds,
+    modelled_s=lambda field, plan, _drawn: field.scan_passes[plan].seconds,
     beside={
-        "MB raw": lambda field, plan, _drawn: field.looks[plan].bytes_raw / 1e6,
+        "MB raw": lambda field, plan, _drawn: field.scan_passes[plan].bytes_raw / 1e6,
         "billion multiply-adds": PlannedField.billion_multiply_adds,
     },
 )
@@ -331,13 +338,13 @@ SURVEY = Tradeoff(
 # segment and store: a farm seen coarsely and finely
 
 FARM_SHAPE = (384, 480)
-SHARES = (1.0, 0.35, 0.2, 0.15, 0.1, 0.05, 0.0)
+FRACTIONS = (1.0, 0.35, 0.2, 0.15, 0.1, 0.05, 0.0)
 POLICY = "gain"
 RAW_LINES = 96
 
 
 @dataclass(frozen=True)
-class FarmLook:
+class FarmPass:
     """A farm, the weights that read it, and its sweeps."""
 
     weights: Weights
@@ -347,12 +354,12 @@ class FarmLook:
     full: list[Sweep]
 
 
-def look_at_farm(seed: int) -> FarmLook:
+def view_farm(seed: int) -> FarmPass:
     """Draw a farm and plan its full scan, with the shipped weights at hand."""
     weights, camera = load_weights(shipped_weights()), LineCamera()
     grid = SceneGrid(*FARM_SHAPE, weights.config.patch, weights.config.factor)
     along, full, _ = cheapest_full(grid, camera, CostModel())
-    return FarmLook(weights, SimulatedSource(farm_scene(seed, FARM_SHAPE), Rig(camera), seed), grid, along, list(full))
+    return FarmPass(weights, SimulatedSource(farm_scene(seed, FARM_SHAPE), Rig(camera), seed), grid, along, list(full))
 
 
 @dataclass(frozen=True)
@@ -361,20 +368,20 @@ class FarmToSegment:
 
     weights: Weights
     labels: NDArray[np.uint8]
-    look: CoarseLook
-    columns: Values  # (seat, p, p, column), valid or not
+    scan_pass: CoarsePass
+    columns: Values  # (patch, p, p, column), valid or not
 
-    def draw(self, share: Setting) -> DrawnMap:
+    def draw(self, fraction: Setting) -> DrawnMap:
         """Predict coarsely, score and draw; with every patch there is nothing to choose."""
-        valid, wanted = self.look.grid.valid_share().ravel() > 0, float(share)
+        valid, wanted = self.scan_pass.grid.valid_fraction().ravel() > 0, float(fraction)
         if wanted == 1:
-            seats = np.flatnonzero(valid)
-            return segment(self.weights, self.look, self.columns[seats], seats)
-        seen = read_glance(self.weights, self.look)
-        seats = frame_seats(score_seats(POLICY, seen), wanted, valid).seats
-        return segment(self.weights, seen, self.columns[seats], seats)
+            patch_index = np.flatnonzero(valid)
+            return segment(self.weights, self.scan_pass, self.columns[patch_index], patch_index)
+        seen = read_coarse_prediction(self.weights, self.scan_pass)
+        patch_index = frame_patches(score_patches(POLICY, seen), wanted, valid).patch_index
+        return segment(self.weights, seen, self.columns[patch_index], patch_index)
 
-    def miss(self, _share: Setting, drawn: DrawnMap) -> float:
+    def miss(self, _fraction: Setting, drawn: DrawnMap) -> float:
         """Return 1 - mIoU of a map."""
         return 1 - mean_iou(confusion(self.labels, drawn.classes, self.weights.config.classes))
 
@@ -382,20 +389,22 @@ class FarmToSegment:
 def see_farm(seed: int) -> FarmToSegment:
     """Take a farm coarsely and finely everywhere."""
     keep_freed_memory()  # as surveys do
-    farm = look_at_farm(seed)
+    farm = view_farm(seed)
     mosaic = coarse_mosaic(farm.source, coarse_sweeps(farm.grid, farm.source.camera, farm.along), farm.grid)
-    look = look_coarsely(farm.weights, [mosaic], farm.source.wavelength_nm, farm.grid)
-    columns = columns_of_all_seats(farm.source, farm.full, farm.grid, farm.weights, memory=MEMORY, kernel="catmull-rom")
-    return FarmToSegment(farm.weights, np.asarray(farm.source.scene.labels, np.uint8), look, columns)
+    scan_pass = read_coarse_pass(farm.weights, [mosaic], farm.source.wavelength_nm, farm.grid)
+    columns = columns_of_all_patches(
+        farm.source, farm.full, farm.grid, farm.weights, memory=MEMORY, kernel="catmull-rom"
+    )
+    return FarmToSegment(farm.weights, np.asarray(farm.source.scene.labels, np.uint8), scan_pass, columns)
 
 
 SEGMENT = Tradeoff(
     stage="segment",
-    knob="share of patches",
+    knob="fraction of patches",
     error="1 - mIoU",
     unit="scene px",
     reference=f"labels of a farm of {FARM_SHAPE[1]} x {FARM_SHAPE[0]} px; policy {POLICY}, scores included",
-    settings=SHARES,
+    settings=FRACTIONS,
     prepare=see_farm,
     run=FarmToSegment.draw,
     judge=FarmToSegment.miss,
@@ -405,7 +414,7 @@ SEGMENT = Tradeoff(
 
 def capture_raw(seed: int) -> NDArray[np.uint16]:
     """Take some raw lines (line, sample, band) of a farm."""
-    farm = look_at_farm(seed)
+    farm = view_farm(seed)
     return SimulatedSweep(farm.source, farm.full[0]).read(0, RAW_LINES)
 
 

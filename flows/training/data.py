@@ -69,16 +69,16 @@ def scene_of_file(file: SceneFile, camera: LineCamera) -> RasterScene:
 
 def farm_data(scenes: int | None, validation: int, camera: LineCamera) -> TrainingData:
     """Scenes of the farm on days of the season, on seeds far from those that surveys are shown on."""
-    train = farm_looks(FARM_TRAIN_SEED, FARM_SCENES if scenes is None else scenes)
-    return TrainingData(FARM_LAW, train, farm_looks(FARM_VALIDATION_SEED, validation, odd=True), (), camera)
+    train = farm_days(FARM_TRAIN_SEED, FARM_SCENES if scenes is None else scenes)
+    return TrainingData(FARM_LAW, train, farm_days(FARM_VALIDATION_SEED, validation, odd=True), (), camera)
 
 
 def farm_test_data(scenes: int, camera: LineCamera) -> TrainingData:
     """Scenes of the farm to judge weights on, all of them in ``train``."""
-    return TrainingData(FARM_LAW, farm_looks(FARM_TEST_SEED, scenes, odd=True), (), (), camera)
+    return TrainingData(FARM_LAW, farm_days(FARM_TEST_SEED, scenes, odd=True), (), (), camera)
 
 
-def farm_looks(first_seed: int, count: int, *, odd: bool = False) -> tuple[str, ...]:
+def farm_days(first_seed: int, count: int, *, odd: bool = False) -> tuple[str, ...]:
     """Name scenes of the farm: seeds one after the other, a day of the season and an hour to each.
 
     Days go round the season by the golden section, so that any number of scenes covers it evenly. Weights learn on even
@@ -94,7 +94,7 @@ def farm_looks(first_seed: int, count: int, *, odd: bool = False) -> tuple[str, 
 
 
 def read_farm_name(name: str) -> tuple[int, int, float]:
-    """Seed, day and hour of a name that `farm_looks` gave."""
+    """Seed, day and hour of a name that `farm_days` gave."""
     seed, _, day, _, hour = name.split("-")
     return int(seed), int(day), float(hour)
 
@@ -146,8 +146,8 @@ def open_training_data(
     if scenes is not None:
         raise SettingsError(f"--scenes is for the built-in farms; {dataset} has its own scenes")
     files = load_data_set(Path(dataset), **choices)  # type: ignore[arg-type]
-    share = min(4, len(_labelled_names(files)) // 8)
-    return file_data(files, share if validation is None else validation, camera)
+    fraction = min(4, len(_labelled_names(files)) // 8)
+    return file_data(files, fraction if validation is None else validation, camera)
 
 
 def pack_mask(mask: NDArray[np.bool_]) -> str:

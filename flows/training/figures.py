@@ -20,30 +20,30 @@ from models.evaluation.metrics import (
     iou_per_class,
     mean_iou,
 )
-from models.evaluation.placement import CONTROL_SHARE, Controls, Counts, run_controls
+from models.evaluation.placement import CONTROL_FRACTION, Controls, Counts, run_controls
 from models.network.spectral import patches_of
-from models.reading.inference import glance_of_columns, segment
+from models.reading.inference import coarse_prediction_of_columns, segment
+from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from models.training.examples import Example
-from models.training.looks import REFERENCE_MS, Looks
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 
 Show = Callable[[str], None]
-Patches = NDArray[np.float32]  # (seat, p, p, column) of every seat of the padded grid
+Patches = NDArray[np.float32]  # (patch, p, p, column) of every patch of the padded grid
 
 
 def validate(weights: Weights, examples: Iterable[Example], seed: int, show: Show) -> dict[str, Any] | None:
-    """`agreement` over all scenes together, at one share of the seats; None without a scene."""
+    """`agreement` over all scenes together, at one fraction of the patches; None without a scene."""
     rows = []
     for example in examples:
         grid, cells, labels = _parts(weights, example)
-        seen = glance_of_columns(weights, example.coarse, grid)
-        rows.append(run_controls(weights, seen, cells, labels, share=CONTROL_SHARE, seed=seed, report=show))
+        seen = coarse_prediction_of_columns(weights, example.coarse, grid)
+        rows.append(run_controls(weights, seen, cells, labels, fraction=CONTROL_FRACTION, seed=seed, report=show))
     if not rows:
         return None
     whole = Controls(
-        rows[0].share,
-        sum(row.seats for row in rows),
+        rows[0].fraction,
+        sum(row.patch_index for row in rows),
         _added([row.none for row in rows]),
         _added([row.every for row in rows]),
         {name: _added([row.policies[name] for row in rows]) for name in rows[0].policies},
@@ -51,7 +51,7 @@ def validate(weights: Weights, examples: Iterable[Example], seed: int, show: Sho
     )
     return {
         "scenes": len(rows),
-        "share_of_seats": whole.share,
+        "fraction_of_patches": whole.fraction,
         "none": agreement(whole.none),
         "all": agreement(whole.every),
         **whole.as_dict(),
@@ -63,7 +63,7 @@ SCAN_EXPOSURES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # of the reference; the las
 
 @dataclass(frozen=True)
 class ScanFigures:
-    """What scenes kept from training say of plain scans."""
+    """What scenes kept from training say of uniform scans."""
 
     record: dict[str, Any]  # what their maps scored, for the record of the weights
     scores: MapScores  # how what maps expected of themselves came true
@@ -71,7 +71,7 @@ class ScanFigures:
 
 @dataclass(frozen=True)
 class _JudgedScan:
-    """A map of a plain scan that was read whole, beside its labels."""
+    """A map of a uniform scan that was read whole, beside its labels."""
 
     counts: Counts
     sure: NDArray[np.float64]  # its labelled pixels by their confidence
@@ -81,31 +81,33 @@ class _JudgedScan:
 def judge_scans(
     weights: Weights,
     examples: Sequence[Example],
-    looks: Looks | None,
+    scan_passes: CaptureAugmentation | None,
     seed: int,
     report: Report = lambda what, done, figure: None,
 ) -> ScanFigures | None:
-    """What maps of plain scans that are read whole score on each scene, by step and exposure.
+    """What maps of uniform scans that are read whole score on each scene, by step and exposure.
 
-    None without a scene, and without ``looks``: then training saw none but those of the reference. In the record
+    None without a scene, and without ``scan_passes``: then training saw none but those of the reference. In the record
     ``miou`` and the IoU of each class are tables (step, exposure) of the scenes' means, ``spread`` the standard
     deviation of their mIoU, ``calibration_error`` that of all pixels together. A scan is shown by the law of noise that
     training shows crops by.
     """
     known = [example for example in examples if example.noise is not None]
-    if not known or looks is None:
+    if not known or scan_passes is None:
         return None
     factor = weights.config.factor
-    steps = [step for step in looks.steps if factor % step == 0]
-    lighter = [share * REFERENCE_MS for share in SCAN_EXPOSURES if share * REFERENCE_MS > looks.darkest_ms]
-    exposures = [*lighter, looks.darkest_ms]
+    steps = [step for step in scan_passes.steps if factor % step == 0]
+    lighter = [
+        fraction * REFERENCE_MS for fraction in SCAN_EXPOSURES if fraction * REFERENCE_MS > scan_passes.darkest_ms
+    ]
+    exposures = [*lighter, scan_passes.darkest_ms]
     miou, spread, calibration = np.zeros((3, len(steps), len(exposures)))
     of_classes = np.zeros((len(weights.class_names), len(steps), len(exposures)))
     maps: dict[tuple[int, float], list[ScoredMap]] = {}
     for i, step in enumerate(steps):
         for j, exposure_ms in enumerate(exposures):
             rng = np.random.default_rng([seed, 0x5CA, i, j])
-            judged = [_scanned(weights, one, looks, step, exposure_ms / REFERENCE_MS, rng) for one in known]
+            judged = [_scanned(weights, one, scan_passes, step, exposure_ms / REFERENCE_MS, rng) for one in known]
             counts = [one.counts for one in judged]
             calibration[i, j] = calibration_error(np.sum([one.sure for one in judged], axis=0))
             own = [mean_iou(one) for one in counts]
@@ -113,8 +115,8 @@ def judge_scans(
             with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # a class that no scene has
                 of_classes[:, i, j] = np.nanmean([iou_per_class(one) for one in counts], axis=0)
             maps[step, exposure_ms] = [ScoredMap(one.counts, one.expected) for one in judged]
-            told = f"lines {step} px apart, {exposure_ms:g} ms: {100 * miou[i, j]:.1f}"
-            report("judging scans", len(maps) / miou.size, told)
+            valid = f"lines {step} px apart, {exposure_ms:g} ms: {100 * miou[i, j]:.1f}"
+            report("judging scans", len(maps) / miou.size, valid)
     record = {
         "scenes": len(known),
         "steps": steps,
@@ -132,20 +134,25 @@ def judge_scans(
 
 
 def _scanned(
-    weights: Weights, example: Example, looks: Looks, step: int, light: float, rng: np.random.Generator
+    weights: Weights,
+    example: Example,
+    scan_passes: CaptureAugmentation,
+    step: int,
+    light: float,
+    rng: np.random.Generator,
 ) -> _JudgedScan:
-    """Draw the map of a scene's plain scan, read whole, and set it beside the labels."""
+    """Draw the map of a scene's uniform scan, read whole, and set it beside the labels."""
     assert example.noise is not None
     grid, _, labels = _parts(weights, example)
     plain, classes = example.fine.astype(np.float32), weights.config.classes
-    fine, means = looks.scan(plain, example.noise, grid.factor, light=light, step=step, rng=rng)
-    valid = grid.valid_seats()
-    seen = glance_of_columns(weights, means, grid)
+    fine, means = scan_passes.scan(plain, example.noise, grid.factor, light=light, step=step, rng=rng)
+    valid = grid.valid_patches()
+    seen = coarse_prediction_of_columns(weights, means, grid)
     drawn = segment(weights, seen, patches_of(fine, grid.patch)[valid], valid, every_class=True)
-    told = (labels != UNLABELLED) & np.isfinite(drawn.confidence)
-    sure = confidence_counts(drawn.confidence[told], drawn.classes[told] == labels[told])
+    valid = (labels != UNLABELLED) & np.isfinite(drawn.confidence)
+    sure = confidence_counts(drawn.confidence[valid], drawn.classes[valid] == labels[valid])
     assert drawn.log_probability is not None
-    expected = expected_counts([drawn.log_probability[told]], classes)
+    expected = expected_counts([drawn.log_probability[valid]], classes)
     return _JudgedScan(confusion(labels, drawn.classes, classes), sure, expected)
 
 

@@ -28,7 +28,7 @@ from storage.readers.polygons import is_polygon_file
 from storage.readers.scene_drafts import FoundClass, SceneDraft, draft_scene
 from storage.readers.scene_toml import SETTINGS_NAME
 
-TITLES = {"look": "looking at labels"}
+TITLES = {"extent": "looking at labels"}
 NO_READING = -999.0  # at and below it an edge is filled, not seen
 
 
@@ -63,7 +63,7 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
     path = (place if place.is_dir() and not is_store(place) else place.parent) / SETTINGS_NAME
     with writing(path.parent, "folder"), set_aside(path, force=force):
         with StageProgress(console, TITLES) as progress:
-            draft = draft_scene(source, lambda done, name: progress.show("look", done, name, ended=done == 1))
+            draft = draft_scene(source, lambda done, name: progress.show("extent", done, name, ended=done == 1))
         # The lines of a scene.toml, each with a comment on where it comes from.
         parts = [
             [
@@ -85,7 +85,7 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
         "shape": list(draft.shape),
         "wavelengths_nm": None if draft.wavelength_nm is None else np.asarray(draft.wavelength_nm).tolist(),
         "wavelength_origin": draft.wavelength_origin,
-        "classes": [{"name": one.name, "value": one.value, "share": one.share} for one in draft.classes],
+        "classes": [{"name": one.name, "value": one.value, "fraction": one.fraction} for one in draft.classes],
         "notes": list(draft.notes),
         "unseen": _unseen(draft),
         "next": _next(source, draft),
@@ -126,10 +126,10 @@ def _nodata_lines(draft: SceneDraft) -> list[str]:
     if draft.nodata is not None:
         lines.append(f"# the file itself says that {draft.nodata:g} is no data")
     elif draft.edge is not None:
-        value, share = draft.edge
+        value, fraction = draft.edge
         sure = value <= NO_READING or value > MOST_VALUE
-        told = f"nodata = {value!r}   # {share:.0%} of the first image's edge"
-        lines.append(told if sure else f"# {told}; if it stands for no data there, take away the first #")
+        parts = f"nodata = {value!r}   # {fraction:.0%} of the first image's edge"
+        lines.append(parts if sure else f"# {parts}; if it stands for no data there, take away the first #")
     return lines
 
 
@@ -139,17 +139,19 @@ def _class_lines(draft: SceneDraft) -> list[str]:
         return []
     void = [one for one in classes if one.no_class]
     guess = [] if void else [one for one in classes if one.value in (0, 255, (0, 0, 0), (255, 255, 255))]
-    lines = [f"unlabelled = {_value(one)}   # {one.name}: {one.share:.1%}" for one in void[:1]]
+    lines = [f"unlabelled = {_value(one)}   # {one.name}: {one.fraction:.1%}" for one in void[:1]]
     lines += [
         f"# unlabelled = {_value(one)}   # if it stands for no class: take away the #, and its line below"
         for one in guess[:1]
     ]
     named = f"names from {printable(legend.name)}" if legend is not None else "rename them as you like"
-    told = f"name = value in the label files, share of all pixels; {named}"
+    parts = f"name = value in the label files, fraction of all pixels; {named}"
     if all(is_polygon_file(label) for label in draft.files.labels.values()):
-        told = "name = number, share of the labelled pixels; polygons say the name or the number"
-    lines += ["", f"[classes]   # {told}"]
-    return lines + [f"{_key(one.name)} = {_value(one)}   # {one.share:.1%}" for one in classes if one not in void[:1]]
+        parts = "name = number, fraction of the labelled pixels; polygons say the name or the number"
+    lines += ["", f"[classes]   # {parts}"]
+    return lines + [
+        f"{_key(one.name)} = {_value(one)}   # {one.fraction:.1%}" for one in classes if one not in void[:1]
+    ]
 
 
 def _value(one: FoundClass) -> str:
@@ -166,19 +168,19 @@ def _quoted(text: str) -> str:
 
 def _unseen(draft: SceneDraft) -> list[str]:
     """What somebody has to look at: what could not be told from the files, or does not fit."""
-    found, told = draft.files, []
+    found, parts = draft.files, []
     if found.labels and found.bare:
         images = counted(len(found.bare), "image")
-        told.append(f"labels of {images}, left out of the training: {listed_names(found.bare)}")
+        parts.append(f"labels of {images}, left out of the training: {listed_names(found.bare)}")
     if not found.labels:
-        told.append("label files: beside an image NAME.png they are called NAME_mask.png, or labels/NAME.png")
+        parts.append("label files: beside an image NAME.png they are called NAME_mask.png, or labels/NAME.png")
     if found.alone:
-        told.append(f"the image of {counted(len(found.alone), 'label file')}: {listed_names(found.alone)}")
+        parts.append(f"the image of {counted(len(found.alone), 'label file')}: {listed_names(found.alone)}")
     if draft.wavelength_nm is None:
-        told.append(f"the wavelengths of {draft.shape[2]} bands: write wavelengths_nm into {SETTINGS_NAME}")
+        parts.append(f"the wavelengths of {draft.shape[2]} bands: write wavelengths_nm into {SETTINGS_NAME}")
     if len(draft.classes) == 1:
-        told.append(f"a second class: all labels are {draft.classes[0].name}")
-    return [*told, *draft.unseen]
+        parts.append(f"a second class: all labels are {draft.classes[0].name}")
+    return [*parts, *draft.unseen]
 
 
 def _next(source: str, draft: SceneDraft) -> str:

@@ -15,20 +15,20 @@ from rich.table import Table
 
 from flows.terminal.progress import one_after_the_other
 from flows.training.data import Report, TrainingData, either_mask, open_training_data
-from flows.training.familiarity import SeenScenes, measure_and_add, measured_calibration, trained_on
 from flows.training.figures import judge_scans, validate
+from flows.training.fit_ood import SeenScenes, measure_and_add, measured_calibration, trained_on
 from flows.training.train_scenes import About, TrainRequest, as_read, network_config, observe_all, question_labels
 from models.evaluation.expected_scores import MapScores
 from models.network.machine import choose_device
 from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation
+from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from models.training.examples import Example, measured_normalisation
-from models.training.looks import REFERENCE_MS, Looks
 from models.training.start_weights import Start, StartFile
 from models.training.train import Progress, train
+from models.weights.checksummed_files import read_checkpoint
 from models.weights.files import CALIBRATION, Weights, save_weights, with_record
 from models.weights.parts import MAP_SCORES, TRAINED_ON
-from models.weights.sealed_files import read_checkpoint
 from pipeline.errors import SettingsError, ShapeError
 from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
 
@@ -72,12 +72,12 @@ def train_weights(
     kept, _ = observe_all(request, data, data.validation, "looking at validation scenes", report, about)
     frames = as_read(kept, lesson.normalisation)
     whole = SeenScenes(lesson.examples, frames, about.wavelength_nm, request.settings.darkest_ms, request.settings.seed)
-    told = trained_on(data, whole, about.names)
-    figures, scores = _figures(weights, frames, lesson.looks, request.settings.seed, report)
+    trained = trained_on(data, whole, about.names)
+    figures, scores = _figures(weights, frames, lesson.scan_passes, request.settings.seed, report)
     record = {
         "command": request.command,
         "data": data.law,
-        TRAINED_ON: told.as_dict(),
+        TRAINED_ON: trained.as_dict(),
         "split": split,
         "settings": asdict(request.settings),
         "camera": asdict(request.camera),
@@ -89,7 +89,7 @@ def train_weights(
     save_weights(with_record(weights, **record), request.out)
     checkpoint.unlink(missing_ok=True)
     own = {"command": request.command, **({} if scores is None else {MAP_SCORES: scores.as_dict()})}
-    why = measure_and_add(weights, request.out, whole, told, own, report)
+    why = measure_and_add(weights, request.out, whole, trained, own, report)
     return record if why is None else {**record, "familiar": why}
 
 
@@ -101,7 +101,7 @@ class Lesson:
     config: SegmenterConfig
     normalisation: Normalisation
     examples: list[Example]
-    looks: Looks | None  # None where all light is that of the reference
+    scan_passes: CaptureAugmentation | None  # None where all light is that of the reference
     begun: Start | None
 
 
@@ -117,8 +117,8 @@ def _lesson(
     if start is not None:
         config = replace(config, patch_kernel=start.patch_kernel)
         begun = start.begin(config, about.basis, normalisation, about.names)
-    looks = Looks(normalisation, darkest_ms=darkest_ms) if darkest_ms < REFERENCE_MS else None
-    return Lesson(about, config, normalisation, as_read(seen, normalisation), looks, begun)
+    scan_passes = CaptureAugmentation(normalisation, darkest_ms=darkest_ms) if darkest_ms < REFERENCE_MS else None
+    return Lesson(about, config, normalisation, as_read(seen, normalisation), scan_passes, begun)
 
 
 def _learned(
@@ -136,7 +136,7 @@ def _learned(
         request.settings,
         progress,
         start=None if lesson.begun is None else lesson.begun.state,
-        looks=lesson.looks,
+        scan_passes=lesson.scan_passes,
         checkpoint=checkpoint,
         device=choose_device(request.device),
     )
@@ -145,14 +145,14 @@ def _learned(
 
 
 def _figures(
-    weights: Weights, frames: list[Example], looks: Looks | None, seed: int, report: Report
+    weights: Weights, frames: list[Example], scan_passes: CaptureAugmentation | None, seed: int, report: Report
 ) -> tuple[dict[str, Any], MapScores | None]:
-    """What the record says of scenes kept for validation; of plain scans too, where training saw such looks."""
+    """What the record says of scenes kept for validation; of uniform scans too, where training saw such looks."""
     figures = {"validation": validate(weights, frames, seed, lambda row: report("validating", 0.0, row))}
     if (calibration := measured_calibration(weights, frames, seed)) is not None:
         figures[CALIBRATION] = calibration
         weights = with_record(weights, calibration=calibration)
-    scans = judge_scans(weights, frames, looks, seed, report)
+    scans = judge_scans(weights, frames, scan_passes, seed, report)
     return (figures, None) if scans is None else (figures | {"scans": scans.record}, scans.scores)
 
 
@@ -273,7 +273,9 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
             soft_wrap=True,
         )
         if request.settings.darkest_ms < REFERENCE_MS:
-            console.print("nor has the file a record of plain scans, by which survey --seconds chooses", soft_wrap=True)
+            console.print(
+                "nor has the file a record of uniform scans, by which survey --seconds chooses", soft_wrap=True
+            )
         return
     title = f"{figures['scenes']} scene{'s' if figures['scenes'] > 1 else ''} kept for validation"
     caption = f"none: the coarse pass alone; all: fine everywhere; else fine at {figures['share_of_seats']:.0%}"

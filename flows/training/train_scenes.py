@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.training.data import Report, TrainingData, alike_notes, only_class, pack_mask, trained_pixels
-from flows.training.look import observe_scene
+from flows.training.observed_scenes import observe_scene
 from models.network.machine import PROCESSOR
 from models.network.sizes import Positions, SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
@@ -123,7 +123,7 @@ def _common(request: TrainRequest, scene: RasterScene) -> About:
 
 
 def suggested_patch(shape: tuple[int, int], *, built_in: bool) -> int:
-    """Patch size for scenes of this shape: 16 for the farm, 32 for frames, less where a scene would hold few seats."""
+    """Patch size for scenes of this shape: 16 for the farm, 32 for frames, less where a scene would hold few patches."""
     if built_in:
         return 16
     return 32 if min(shape) >= 512 else 16 if min(shape) >= 256 else 8

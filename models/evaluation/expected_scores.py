@@ -30,14 +30,14 @@ LEAST_IOU = 0.005  # IoU is kept as far from 0 and 1
 LEAST_ERROR = 0.005  # of mIoU: nobody knows better, whatever a few scenes say
 
 
-def expected_counts(strips: Iterable[NDArray[np.floating]], classes: int) -> Floats:
+def expected_counts(swaths: Iterable[NDArray[np.floating]], classes: int) -> Floats:
     """Count pixels by likely class (row) and mapped class (column), (class, class), as `confusion` would with labels.
 
-    ``strips`` are parts (..., class) of the log-probabilities of a map; a pixel of which nothing is known is left out.
+    ``swaths`` are parts (..., class) of the log-probabilities of a map; a pixel of which nothing is known is left out.
     """
     found = np.zeros((classes, classes))
-    for strip in strips:
-        known = strip.reshape(-1, classes)
+    for swath in swaths:
+        known = swath.reshape(-1, classes)
         chance = np.exp(known[np.isfinite(known).all(axis=1)].astype(np.float64))
         mapped = chance.argmax(axis=1)
         for one in np.flatnonzero(np.bincount(mapped, minlength=classes)):
@@ -92,19 +92,19 @@ def fitted_bias(maps: Sequence[ScoredMap]) -> Floats:
     return bias
 
 
-def error_of_looks(maps: Sequence[ScoredMap]) -> float:
+def error_of_passes(maps: Sequence[ScoredMap]) -> float:
     """How far the mIoU of a map lies from the one expected, beyond what small classes explain: each by the others."""
     beyond = []
     for i, one in enumerate(maps):
         others = [*maps[:i], *maps[i + 1 :]]
-        told = expected_score(one.expected, fitted_bias(others or maps), 0.0)
-        beyond.append((told.miou - mean_iou(one.counts)) ** 2 - told.error**2)
+        expected = expected_score(one.expected, fitted_bias(others or maps), 0.0)
+        beyond.append((expected.miou - mean_iou(one.counts)) ** 2 - expected.error**2)
     return max(LEAST_ERROR, math.sqrt(max(float(np.nanmean(beyond)), 0.0)))
 
 
 @dataclass(frozen=True)
 class MapScores:
-    """How what maps of plain scans expect of themselves came true, by step and exposure."""
+    """How what maps of uniform scans expect of themselves came true, by step and exposure."""
 
     steps: tuple[int, ...]
     exposures_ms: tuple[float, ...]  # ascending
@@ -116,13 +116,13 @@ class MapScores:
     def fitted(maps: Mapping[tuple[int, float], Sequence[ScoredMap]]) -> MapScores:
         """Of maps by step and exposure, of the same scenes for every pair of both."""
         steps, exposures = sorted({step for step, _ in maps}), sorted({exposure for _, exposure in maps})
-        looks = [[maps[step, exposure] for exposure in exposures] for step in steps]
+        scan_passes = [[maps[step, exposure] for exposure in exposures] for step in steps]
         return MapScores(
             tuple(steps),
             tuple(exposures),
-            np.array([[fitted_bias(look) for look in row] for row in looks]),
-            np.array([[error_of_looks(look) for look in row] for row in looks]),
-            len(looks[0][0]),
+            np.array([[fitted_bias(coarse_pass) for coarse_pass in row] for row in scan_passes]),
+            np.array([[error_of_passes(coarse_pass) for coarse_pass in row] for row in scan_passes]),
+            len(scan_passes[0][0]),
         )
 
     @staticmethod
@@ -145,7 +145,7 @@ class MapScores:
         }
 
     def expected(self, counts: Floats, step: int, exposure_ms: float) -> ExpectedScore | None:
-        """What a map of a plain scan is likely to score by its `expected_counts`; None of a look beyond these."""
+        """What a map of a uniform scan is likely to score by its `expected_counts`; None of a look beyond these."""
         if step not in self.steps or not self.exposures_ms[0] <= exposure_ms <= self.exposures_ms[-1]:
             return None
         if len(counts) != self.bias.shape[-1]:
@@ -156,7 +156,7 @@ class MapScores:
         return expected_score(counts, bias, float(np.interp(at, known, self.error[row])))
 
 
-def _logit(share: Floats) -> Floats:
-    """Logits of shares 0..1, kept from both ends; a share that is NaN counts as 0."""
-    found: Floats = scipy.special.logit(np.clip(np.nan_to_num(share), LEAST_IOU, 1 - LEAST_IOU))
+def _logit(fraction: Floats) -> Floats:
+    """Logits of shares 0..1, kept from both ends; a fraction that is NaN counts as 0."""
+    found: Floats = scipy.special.logit(np.clip(np.nan_to_num(fraction), LEAST_IOU, 1 - LEAST_IOU))
     return found

@@ -75,18 +75,18 @@ def mean_iou_of_each(counts: NDArray[np.integer]) -> NDArray[np.float64]:
 
 
 def agreement(counts: NDArray[np.int64]) -> dict[str, float]:
-    """Give the figures that stand side by side wherever a map is scored: mIoU and the share of right pixels."""
+    """Give the figures that stand side by side wherever a map is scored: mIoU and the fraction of right pixels."""
     return {"miou": mean_iou(counts), "overall_accuracy": overall_accuracy(counts)}
 
 
 def overall_accuracy(counts: NDArray[np.int64]) -> float:
-    """Share of labelled pixels with the right class; NaN when nothing is labelled."""
+    """Fraction of labelled pixels with the right class; NaN when nothing is labelled."""
     total = counts.sum()
     return float(np.trace(counts) / total) if total else float("nan")
 
 
 def average_accuracy(counts: NDArray[np.int64]) -> float:
-    """Mean over the labelled classes of the share of their pixels found; NaN when nothing is labelled."""
+    """Mean over the labelled classes of the fraction of their pixels found; NaN when nothing is labelled."""
     held = labelled_classes(counts)
     return float((np.diag(counts)[held] / counts.sum(axis=1)[held]).mean()) if held.any() else float("nan")
 
@@ -101,9 +101,9 @@ def kappa(counts: NDArray[np.int64]) -> float:
     return float((agreed - chance) / (1 - chance)) if chance < 1 else float("nan")
 
 
-def gap_closed(reached: float, none: float, all_seats: float) -> float | None:
-    """Share of the way from no fine seat to every fine seat; None where that way is not one point up or more."""
-    way = all_seats - none
+def gap_closed(reached: float, none: float, all_patches: float) -> float | None:
+    """Fraction of the way from no fine patch to every fine patch; None where that way is not one point up or more."""
+    way = all_patches - none
     return (reached - none) / way if way >= 0.01 else None  # NaN is None too
 
 
@@ -121,7 +121,7 @@ def confidence_counts(confidence: NDArray[np.floating], right: NDArray[np.bool_]
 
 
 def calibration_error(counts: NDArray[np.float64]) -> float:
-    """Expected calibration error of `confidence_counts`, 0..1: how far confidence lies beside the share that is right.
+    """Expected calibration error of `confidence_counts`, 0..1: how far confidence lies beside the fraction that is right.
 
     Mean over the bins by their pixels, of |share right - mean confidence|; NaN without a pixel. (Naeini et al. 2015)
     """
@@ -192,9 +192,9 @@ def _means(counts: Counts, times: Numbers, often: Numbers | None = None) -> NDAr
     """
     sums = np.einsum("df,rfij->drij", times, counts)
     each = mean_iou_of_each(sums)
-    share = (~np.isnan(each)) * (1 if often is None else often)
-    number = share.sum(axis=1)
+    fraction = (~np.isnan(each)) * (1 if often is None else often)
+    number = fraction.sum(axis=1)
     means: NDArray[np.float64] = np.divide(
-        (np.nan_to_num(each) * share).sum(axis=1), number, out=np.full(len(each), np.nan), where=number > 0
+        (np.nan_to_num(each) * fraction).sum(axis=1), number, out=np.full(len(each), np.nan), where=number > 0
     )
     return means

@@ -1,4 +1,4 @@
-"""How well seats were placed: against those whose fine look lowers the loss most, and against other placements.
+"""How well patches were placed: against those whose fine look lowers the loss most, and against other placements.
 
 Evaluation only: all of it needs labels and the whole scene at full resolution, none of it is a survey's own cost.
 """
@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from models.evaluation.metrics import agreement, confusion, gap_closed, mean_iou
 from models.network.sizes import MOST_GAIN
-from models.policies.policies import score_seats
-from models.reading.inference import Glance, captured, origin_of, readings_of, segment
+from models.policies.policies import score_patches
+from models.reading.inference import CoarsePrediction, captured, origin_of, readings_of, segment
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import deferred
-from pipeline.planning.selection import frame_seats
+from pipeline.planning.selection import frame_patches
 
 if TYPE_CHECKING:
     import torch
@@ -29,36 +29,36 @@ else:
 
 Values = NDArray[np.floating]
 RANDOM_DRAWS = 5
-CONTROL_SHARE = 0.35  # of the valid seats: K = 35 % of surveys' receipts and of the weights' records
+CONTROL_FRACTION = 0.35  # of the valid patches: K = 35 % of surveys' receipts and of the weights' records
 Counts = NDArray[np.int64]
 
 
 def oracle_gain(
-    weights: Weights, seen: Glance, fine: NDArray[np.floating], labels: NDArray[np.uint8]
+    weights: Weights, seen: CoarsePrediction, fine: NDArray[np.floating], labels: NDArray[np.uint8]
 ) -> NDArray[np.float64]:
-    """Loss with no fine seat minus loss with all of them, (seat,) [nat], mean over a seat's pixels.
+    """Loss with no fine patch minus loss with all of them, (patch,) [nat], mean over a patch's pixels.
 
     The loss is the cross-entropy of the labelled pixels; others, and those beside the scene, add 0 to the mean.
     Clipped to -5..5; negative where the fine look makes the map worse. A patch that shows too little to be read is
     left out, as in the map.
 
-    ``fine`` (seat, p, p, column) are normalised columns of every seat of the padded grid, ``labels`` (y, x) class
+    ``fine`` (patch, p, p, column) are normalised columns of every patch of the padded grid, ``labels`` (y, x) class
     indices of the scene's own size, 255 unlabelled.
     """
     grid, p = seen.grid, seen.grid.patch
     full = np.full(grid.padded_shape, UNLABELLED, np.uint8)
     full[: grid.height, : grid.width] = labels
-    rows, columns = grid.seat_shape
+    rows, columns = grid.patch_shape
     truth = full.reshape(rows, p, columns, p).swapaxes(1, 2).reshape(-1, p, p)
-    gain, valid = np.zeros(len(truth)), grid.valid_seats()
-    patches, seats = captured(fine[valid], valid)
+    gain, valid = np.zeros(len(truth)), grid.valid_patches()
+    patches, patch_index = captured(fine[valid], valid)
     model, first = weights.segmenter.eval(), 0
     with torch.inference_mode():
         (reading,) = readings_of(weights, [seen])
-        numbers = torch.from_numpy(seats).to(model.device)
+        numbers = torch.from_numpy(patch_index).to(model.device)
         for after in model.read_fine_packed([reading], [patches], [numbers], [origin_of(seen)]):
-            some = seats[first : first + len(after)]
-            before = model.bring_up(model.around_seats(reading.logits, numbers[first : first + len(after)][None]))
+            some = patch_index[first : first + len(after)]
+            before = model.bring_up(model.around_patches(reading.logits, numbers[first : first + len(after)][None]))
             lower = _losses(before.cpu().numpy(), truth[some]) - _losses(after.cpu().numpy(), truth[some])
             gain[some] = lower.sum(axis=(1, 2)) / p**2
             first += len(after)
@@ -66,7 +66,7 @@ def oracle_gain(
 
 
 def _losses(logits: NDArray[np.float32], truth: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Cross-entropy of each pixel, (seat, class, y, x) and (seat, y, x) -> (seat, y, x); 0 where unlabelled."""
+    """Cross-entropy of each pixel, (patch, class, y, x) and (patch, y, x) -> (patch, y, x); 0 where unlabelled."""
     labelled = truth != UNLABELLED
     index = np.where(labelled, truth, 0).astype(np.intp)[:, None]
     exact = logits.astype(np.float64)
@@ -75,29 +75,29 @@ def _losses(logits: NDArray[np.float32], truth: NDArray[np.uint8]) -> NDArray[np
 
 
 def gain_sums(gain: Values, chosen: NDArray[np.integer], valid: NDArray[np.integer]) -> tuple[float, float]:
-    """Gain of the chosen seats, and of as many of the best valid ones; add frames up before dividing."""
+    """Gain of the chosen patches, and of as many of the best valid ones; add frames up before dividing."""
     best = np.sort(gain[valid])[::-1][: len(chosen)]
     return float(gain[chosen].sum()), float(best.sum())
 
 
 def captured_gain(bought: float, best: float) -> float | None:
-    """Share of the best seats' gain that the chosen ones have; None where there is none to be had."""
+    """Fraction of the best patches' gain that the chosen ones have; None where there is none to be had."""
     return bought / best if best > 0 else None
 
 
 @dataclass(frozen=True)
 class Controls:
-    """Confusion counts of each placement at one share of the seats (mode ``frame``)."""
+    """Confusion counts of each placement at one fraction of the patches (mode ``frame``)."""
 
-    share: float
-    seats: int
+    fraction: float
+    patch_index: int
     none: Counts
     every: Counts
     policies: dict[str, Counts]
     random: list[Counts]
 
     def as_dict(self) -> dict[str, dict[str, Any]]:
-        """`agreement` of every row, the share of the gap that it closes, and mean and spread of the random placements.
+        """`agreement` of every row, the fraction of the gap that it closes, and mean and spread of the random placements.
 
         All rows are judged by the same labels, and so over the same classes.
         """
@@ -117,34 +117,34 @@ def agreement_of_draws(draws: Sequence[Counts]) -> dict[str, Any]:
 
 def run_controls(
     weights: Weights,
-    seen: Glance,
+    seen: CoarsePrediction,
     fine: NDArray[np.floating],
     labels: NDArray[np.uint8],
     *,
-    share: float,
+    fraction: float,
     seed: int,
     policies: tuple[str, ...] = ("gain", "entropy", "sobel"),
     among: NDArray[np.bool_] | None = None,
     report: Callable[[str], None] = lambda row: None,
 ) -> Controls:
-    """Segment with no seat, every seat, and ``share`` of the valid seats placed by each policy and at random.
+    """Segment with no patch, every patch, and ``fraction`` of the valid patches placed by each policy and at random.
 
-    ``fine`` (seat, p, p, column) are normalised columns of every seat of the padded grid, ``labels`` (y, x) class
-    indices, 255 unlabelled. ``among`` are the seats (seat,) that may be chosen, None for all.
+    ``fine`` (patch, p, p, column) are normalised columns of every patch of the padded grid, ``labels`` (y, x) class
+    indices, 255 unlabelled. ``among`` are the patches (patch,) that may be chosen, None for all.
     """
-    valid = seen.grid.valid_share().ravel() > 0
+    valid = seen.grid.valid_fraction().ravel() > 0
     valid = valid if among is None else valid & among
 
-    def counts(row: str, seats: NDArray[np.integer]) -> Counts:
+    def counts(row: str, patch_index: NDArray[np.integer]) -> Counts:
         report(row)
-        drawn = segment(weights, seen, fine[seats], seats)
+        drawn = segment(weights, seen, fine[patch_index], patch_index)
         return confusion(labels, drawn.classes, weights.config.classes)
 
     def placed(policy: str, number: int = 0) -> NDArray[np.integer]:
-        return frame_seats(score_seats(policy, seen, seed=seed + number), share, valid).seats
+        return frame_patches(score_patches(policy, seen, seed=seed + number), fraction, valid).patch_index
 
     return Controls(
-        share,
+        fraction,
         len(placed("random")),
         counts("none", np.empty(0, np.int64)),
         counts("all", np.flatnonzero(valid)),

@@ -1,7 +1,7 @@
 """Parts of the networks: codes of places, the transformer over tokens, and a patch's pixels down to them and back.
 
 In the transformer coarse tokens read each other and fine tokens read both; nothing flows from fine to coarse. So what a
-coarse pass says is computed once: the glance keeps the keys and values of its tokens, and a second look pays for its
+coarse pass says is computed once: the coarse prediction keeps the keys and values of its tokens, and a second pass pays for its
 own tokens only, however often places are added.
 """
 
@@ -19,14 +19,14 @@ from models.network.self_attention import LAST_QUERIES
 from models.network.sizes import BOTTOM
 from pipeline.errors import ShapeError
 
-LONGEST_PERIOD = 128.0  # seats; the shortest is 2
+LONGEST_PERIOD = 128.0  # patches; the shortest is 2
 Memory = tuple[Tensor, Tensor]  # keys and values of one layer, (B, heads, N, d / heads)
 
 
 def code_2d(yx: Tensor, dim: int) -> Tensor:
-    """Sines and cosines of both coordinates, (..., 2) seats -> (..., dim) float32.
+    """Sines and cosines of both coordinates, (..., 2) patches -> (..., dim) float32.
 
-    Angular frequencies run geometrically from pi (period 2 seats) to pi/64. Computed in float64 and cast once: at
+    Angular frequencies run geometrically from pi (period 2 patches) to pi/64. Computed in float64 and cast once: at
     1e7 px the error stays below 1e-6, where float32 angles would be off by half a turn.
     Raises ShapeError for a width that does not divide by 4, or places in half precision.
     """
@@ -41,17 +41,17 @@ def code_2d(yx: Tensor, dim: int) -> Tensor:
 
 
 def paper_numbers(yx: Tensor, scale: Tensor, columns: int, factor: int) -> Tensor:
-    """One-dimensional positions of the paper: patch n at P = n(m + 1) + 1, its seats at P + 1 ... P + m.
+    """One-dimensional positions of the paper: patch n at P = n(m + 1) + 1, its patches at P + 1 ... P + m.
 
-    ``scale`` is above 0 for patches, 0 for seats. ``columns`` counts the coarse patches of a row, m = factor^2; seats
+    ``scale`` is above 0 for patches, 0 for patches. ``columns`` counts the coarse patches of a row, m = factor^2; patches
     run row by row inside their patch. The paper's text says jumps of four, its formula and its example 21 -> 26 say
     m + 1 = 5: the formula is taken.
     """
     cell = (yx / factor).floor()
     number = (cell[..., 0] * columns + cell[..., 1]) * (factor**2 + 1) + 1
     inside = (yx - cell * factor).floor()
-    seat = inside[..., 0] * factor + inside[..., 1] + 1
-    return torch.where(scale > 0, number, number + seat)
+    patch_number = inside[..., 0] * factor + inside[..., 1] + 1
+    return torch.where(scale > 0, number, number + patch_number)
 
 
 def code_1d(position: Tensor, dim: int) -> Tensor:

@@ -1,6 +1,6 @@
 """The two-scale segmenter: coarse patches everywhere, fine patches where captured, one class map.
 
-Shapes: B scenes of H x W fine px, padded to whole cells of p * s px; coarse image H/s x W/s; seats (H/p) x (W/p);
+Shapes: B scenes of H x W fine px, padded to whole cells of p * s px; coarse image H/s x W/s; patches (H/p) x (W/p);
 coarse patches (H/ps) x (W/ps), each p x p coarse px. J spectral columns, d token width, K fine patches a scene, m
 tokens a side of a patch.
 
@@ -51,7 +51,7 @@ class CoarseReading:
 
 
 class Segmenter(nn.Module):
-    """See the module. ``read_coarse`` is the glance, ``read_fine`` the second look."""
+    """See the module. ``read_coarse`` is the coarse prediction, ``read_fine`` the second pass."""
 
     def __init__(self, config: SegmenterConfig) -> None:
         super().__init__()
@@ -71,7 +71,7 @@ class Segmenter(nn.Module):
         self.pixel_gate = nn.Conv2d(2 * config.width, config.width, 1)
         self.fine_mix = Residual(config.width)
         self.fine_classes = nn.Conv2d(config.width, config.classes, 1)
-        self.scorer = SeatScorer(config)
+        self.scorer = PatchScorer(config)
 
     @property
     def device(self) -> torch.device:
@@ -79,15 +79,15 @@ class Segmenter(nn.Module):
         return self.scale_code.device
 
     def forward(
-        self, coarse: Tensor, fine: Tensor, seats: Tensor, origin: Tensor | None = None
+        self, coarse: Tensor, fine: Tensor, patch_index: Tensor, origin: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """Logits of the coarse image (B, classes, H/s, W/s) and of the fine patches (B, K, classes, p, p).
 
-        ``coarse`` (B, J, H/s, W/s) and ``fine`` (B, K, J, p, p) are normalised columns, ``seats`` (B, K) int64 seat
-        numbers, unique within a scene, ``origin`` (B, 2) seat units added to the places, for crops of larger scenes.
+        ``coarse`` (B, J, H/s, W/s) and ``fine`` (B, K, J, p, p) are normalised columns, ``patch_index`` (B, K) int64 patch
+        numbers, unique within a scene, ``origin`` (B, 2) patch units added to the places, for crops of larger scenes.
         """
         reading = self.read_coarse(coarse, origin)
-        return reading.logits, self.read_fine(reading, fine, seats, origin)
+        return reading.logits, self.read_fine(reading, fine, patch_index, origin)
 
     def read_coarse(self, coarse: Tensor, origin: Tensor | None = None) -> CoarseReading:
         """Read the coarse image alone."""
@@ -111,20 +111,22 @@ class Segmenter(nn.Module):
         return CoarseReading(canvas, self.coarse_classes(F.gelu(canvas)), memory, columns)
 
     def score(self, reading: CoarseReading) -> Tensor:
-        """Tell what a fine look at each seat would gain, (B, H/p, W/p) [nat per px]."""
+        """Tell what a fine look at each patch would gain, (B, H/p, W/p) [nat per px]."""
         gain: Tensor = self.scorer(reading.canvas, reading.logits)
         return gain
 
-    def read_fine(self, reading: CoarseReading, fine: Tensor, seats: Tensor, origin: Tensor | None = None) -> Tensor:
-        """Logits of the fine patches, (B, K, classes, p, p), from their own pixels and what the glance saw."""
-        b, k = seats.shape
+    def read_fine(
+        self, reading: CoarseReading, fine: Tensor, patch_index: Tensor, origin: Tensor | None = None
+    ) -> Tensor:
+        """Logits of the fine patches, (B, K, classes, p, p), from their own pixels and what the coarse prediction saw."""
+        b, k = patch_index.shape
         p = self.config.patch
         if k == 0:  # convolutions take an empty batch forward but not backward
             return fine.new_zeros(b, 0, self.config.classes, p, p)
         features, tokens = self.fine_stem(fine.flatten(0, 1))
-        coded = self.code_fine(tokens.view(b, k, *tokens.shape[1:]), seats, reading.columns, origin)
+        coded = self.code_fine(tokens.view(b, k, *tokens.shape[1:]), patch_index, reading.columns, origin)
         read = self.encoder(coded, reading.memory)[0].view(tokens.shape)
-        logits = self.decode_fine(features, read, self.canvas_windows(reading.canvas, seats))
+        logits = self.decode_fine(features, read, self.canvas_windows(reading.canvas, patch_index))
         return logits.view(b, k, *logits.shape[1:])
 
     def read_coarse_packed(
@@ -165,48 +167,48 @@ class Segmenter(nn.Module):
         self,
         readings: Sequence[CoarseReading],
         patches: Sequence[NDArray[np.floating]],
-        seats: Sequence[Tensor],
+        patch_index: Sequence[Tensor],
         origins: Sequence[Tensor | None],
     ) -> Iterator[Tensor]:
         """Logits of the fine patches of all scenes, one after the other, (some, classes, p, p) at a time.
 
         Of each scene: its reading, patches (K, p, p, J), in which what is not finite counts as 0, the median, and the
-        numbers (K,) int64 of their seats.
+        numbers (K,) int64 of their patches.
         """
         described = [self.fine_stem(chunk.to(self.device)) for chunk in _chunks(patches)]
         if not described:
             return
-        seats = [own.to(self.device) for own in seats]
-        tokens = torch.split(torch.cat([token for _, token in described]), [len(own) for own in seats])
+        patch_index = [own.to(self.device) for own in patch_index]
+        tokens = torch.split(torch.cat([token for _, token in described]), [len(own) for own in patch_index])
         coded = [
             self.code_fine(token[None], own[None], reading.columns, origin)[0]
-            for token, own, reading, origin in zip(tokens, seats, readings, origins, strict=True)
+            for token, own, reading, origin in zip(tokens, patch_index, readings, origins, strict=True)
         ]
         read, _ = encode_packed(self.encoder, coded, [reading.memory for reading in readings])
         under = torch.cat(
-            [self.around_seats(reading.canvas, own[None]) for reading, own in zip(readings, seats, strict=True)]
+            [self.around_patches(reading.canvas, own[None]) for reading, own in zip(readings, patch_index, strict=True)]
         )
         chunks = torch.split(under, PATCHES_AT_ONCE)
         for (features, token), window in zip(_with_tokens(described, torch.cat(read)), chunks, strict=True):
             yield self.decode_fine(features, token, self.bring_up(self.under(window)))
 
-    def code_fine(self, tokens: Tensor, seats: Tensor, columns: int, origin: Tensor | None = None) -> Tensor:
+    def code_fine(self, tokens: Tensor, patch_index: Tensor, columns: int, origin: Tensor | None = None) -> Tensor:
         """Tokens of fine patches, (B, K, m^2, d), with their codes, (B, K m^2, d)."""
         across = columns * self.config.factor
-        places = torch.stack([seats // across, seats % across], dim=-1)
+        places = torch.stack([patch_index // across, patch_index % across], dim=-1)
         return self._coded(tokens, places, columns, origin, fine=True)
 
     def _coded(self, tokens: Tensor, places: Tensor, columns: int, origin: Tensor | None, *, fine: bool) -> Tensor:
         """Tokens with the codes of their scale and place, (B, P, m^2, d) -> (B, P m^2, d).
 
-        ``places`` (B, P, 2) are rows and columns of patches: of seats where ``fine``, else of coarse patches.
+        ``places`` (B, P, 2) are rows and columns of patches: of patches where ``fine``, else of coarse patches.
         """
         side, step = self.config.token_side, 1 if fine else self.config.factor
         exact = torch.device("cpu") if tokens.device.type == "mps" else tokens.device  # that knows no float64
         places, origin = places.to(exact), None if origin is None else origin.to(exact)
         within = (torch.arange(side, device=exact).double() + 0.5) / side
         inside = torch.cartesian_prod(within, within).view(-1, 2)
-        yx = (places.double()[:, :, None] + inside) * step  # centres in seat units, (B, P, m^2, 2)
+        yx = (places.double()[:, :, None] + inside) * step  # centres in patch units, (B, P, m^2, 2)
         if self.config.positions == "paper":
             scale = torch.full(yx.shape[:-1], 0.0 if fine else 1.0, device=exact)
             code = code_1d(paper_numbers(yx, scale, columns, self.config.factor), self.config.dim)
@@ -215,14 +217,14 @@ class Segmenter(nn.Module):
         coded: Tensor = tokens + code.to(tokens.device) + self.scale_code[int(fine)]
         return coded.flatten(1, 2)
 
-    def canvas_windows(self, canvas: Tensor, seats: Tensor) -> Tensor:
-        """The coarse features under each seat at the width of the fine ones, (B * K, width, p, p)."""
-        return self.bring_up(self.under(self.around_seats(canvas, seats)))
+    def canvas_windows(self, canvas: Tensor, patch_index: Tensor) -> Tensor:
+        """The coarse features under each patch at the width of the fine ones, (B * K, width, p, p)."""
+        return self.bring_up(self.under(self.around_patches(canvas, patch_index)))
 
-    def around_seats(self, image: Tensor, seats: Tensor) -> Tensor:
-        """The pixels under each seat of a coarse image (B, c, H/s, W/s) and one more on every side.
+    def around_patches(self, image: Tensor, patch_index: Tensor) -> Tensor:
+        """The pixels under each patch of a coarse image (B, c, H/s, W/s) and one more on every side.
 
-        Given as (B * K, c, p/s + 2, p/s + 2): ``bring_up`` makes of them the window of each seat, equal to that of the
+        Given as (B * K, c, p/s + 2, p/s + 2): ``bring_up`` makes of them the window of each patch, equal to that of the
         whole image brought up bilinearly.
         """
         p, s = self.config.patch, self.config.factor
@@ -230,14 +232,14 @@ class Segmenter(nn.Module):
         padded = F.pad(image, (1, 1, 1, 1), mode="replicate")
         columns = image.shape[-1] // cells
         reach = torch.arange(cells + 2, device=image.device)
-        y = (seats // columns * cells)[..., None] + reach  # (B, K, cells + 2)
-        x = (seats % columns * cells)[..., None] + reach
-        scene = torch.arange(seats.shape[0], device=image.device)[:, None, None, None]
+        y = (patch_index // columns * cells)[..., None] + reach  # (B, K, cells + 2)
+        x = (patch_index % columns * cells)[..., None] + reach
+        scene = torch.arange(patch_index.shape[0], device=image.device)[:, None, None, None]
         windows = padded.permute(0, 2, 3, 1)[scene, y[..., :, None], x[..., None, :]]
         return windows.flatten(0, 1).permute(0, 3, 1, 2)
 
     def bring_up(self, windows: Tensor) -> Tensor:
-        """Bring windows of ``around_seats`` up to fine pixels, (P, c, p/s + 2, p/s + 2) -> (P, c, p, p)."""
+        """Bring windows of ``around_patches`` up to fine pixels, (P, c, p/s + 2, p/s + 2) -> (P, c, p, p)."""
         p, s = self.config.patch, self.config.factor
         return F.interpolate(windows, scale_factor=s, mode="bilinear", align_corners=False)[..., s : s + p, s : s + p]
 
@@ -248,17 +250,17 @@ class Segmenter(nn.Module):
         logits: Tensor = self.fine_classes(F.gelu(self.fine_mix(torch.lerp(under, own, gate))))
         return logits
 
-    def composite(self, coarse_logits: Tensor, fine_logits: Tensor, seats: Tensor) -> Tensor:
+    def composite(self, coarse_logits: Tensor, fine_logits: Tensor, patch_index: Tensor) -> Tensor:
         """Coarse logits brought up to the fine grid, overwritten where a fine patch is, (B, classes, H, W) float32."""
         p, s = self.config.patch, self.config.factor
         full = F.interpolate(coarse_logits.float(), scale_factor=s, mode="bilinear", align_corners=False)
         cells = cut(full, p)
-        index = seats[:, :, None, None, None].expand(-1, -1, *cells.shape[2:])
+        index = patch_index[:, :, None, None, None].expand(-1, -1, *cells.shape[2:])
         return joined(cells.scatter(1, index, fine_logits.float()), full.shape[-1] // p)
 
 
-class SeatScorer(nn.Module):
-    """A few convolutions on the grid of seats. Nothing is learned through it by the segmenter that it judges."""
+class PatchScorer(nn.Module):
+    """A few convolutions on the grid of patches. Nothing is learned through it by the segmenter that it judges."""
 
     def __init__(self, config: SegmenterConfig) -> None:
         super().__init__()
@@ -271,10 +273,10 @@ class SeatScorer(nn.Module):
         self.leave = nn.Conv2d(SCORER_WIDTH, 1, 1)
         nn.init.zeros_(self.leave.weight)
         nn.init.zeros_(self.leave.bias)  # type: ignore[arg-type]
-        self.of_entropy = nn.Parameter(torch.tensor(0.2))  # what is learned is added to a share of the entropy
+        self.of_entropy = nn.Parameter(torch.tensor(0.2))  # what is learned is added to a fraction of the entropy
 
     def forward(self, canvas: Tensor, logits: Tensor) -> Tensor:
-        """Features and logits of the coarse pixels, (B, c, H/s, W/s) -> gain of each seat, (B, H/p, W/p) [nat per px].
+        """Features and logits of the coarse pixels, (B, c, H/s, W/s) -> gain of each patch, (B, H/p, W/p) [nat per px].
 
         No gradient goes back into either.
         """

@@ -1,7 +1,7 @@
 """The encoder's own attention as a policy: how much of what coarse tokens read of each other each of them gives.
 
 The last layer counts: what is read there goes into the map. Softmax rows sum to 1 however many tokens there are, so a
-token that is read as much as the others has a share of 1 / N.
+token that is read as much as the others has a fraction of 1 / N.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def queries_kept() -> Iterator[list[Tensor]]:
 def received_attention(
     queries: NDArray[np.floating], keys: NDArray[np.floating], *, most: int = MOST_WEIGHTS
 ) -> NDArray[np.float64]:
-    """Share of all attention that each token receives, (token,), summing to 1: the mean over heads and queries.
+    """Fraction of all attention that each token receives, (token,), summing to 1: the mean over heads and queries.
 
     ``queries`` and ``keys`` are (head, token, width). At most ``most`` weights are held at once, queries in so many
     blocks as that needs; the result does not depend on it.
@@ -71,26 +71,26 @@ def token_image(values: NDArray[np.floating], cells: tuple[int, int], side: int)
     return np.asarray(values, np.float64).reshape(y, x, side, side).swapaxes(1, 2).reshape(y * side, x * side)
 
 
-def attention_of_seats(read: TokenReading, seats: tuple[int, int], factor: int) -> NDArray[np.float64]:
-    """How often each seat of a (y, x) grid is read, beside the mean token: 1 is as often as the others.
+def attention_of_patches(read: TokenReading, patch_index: tuple[int, int], factor: int) -> NDArray[np.float64]:
+    """How often each patch of a (y, x) grid is read, beside the mean token: 1 is as often as the others.
 
-    Between the centres of tokens it is interpolated bilinearly; a seat that holds several tokens gets their mean.
+    Between the centres of tokens it is interpolated bilinearly; a patch that holds several tokens gets their mean.
     """
-    y, x = (size // factor for size in seats)
+    y, x = (size // factor for size in patch_index)
     living = np.ones(y * x * read.side**2, bool) if read.living is None else read.living
-    share = np.zeros(len(living))  # nobody reads a dead token
+    fraction = np.zeros(len(living))  # nobody reads a dead token
     if living.any():
-        share[living] = received_attention(read.queries, read.keys) * np.count_nonzero(living)
-    image = token_image(share, (y, x), read.side)
-    down, across = (_spread(size * read.side, wanted) for size, wanted in zip((y, x), seats, strict=True))
+        fraction[living] = received_attention(read.queries, read.keys) * np.count_nonzero(living)
+    image = token_image(fraction, (y, x), read.side)
+    down, across = (_spread(size * read.side, wanted) for size, wanted in zip((y, x), patch_index, strict=True))
     found: NDArray[np.float64] = down @ image @ across.T
     return found
 
 
-def _spread(tokens: int, seats: int) -> NDArray[np.float64]:
-    """(seat, token) weights along one axis, each row summing to 1: linear between centres, level beyond the ends."""
-    parts = -(-tokens // seats)  # points of one seat: as many as it has tokens
-    place = (np.arange(seats * parts) + 0.5) * tokens / (seats * parts) - 0.5
+def _spread(tokens: int, patch_index: int) -> NDArray[np.float64]:
+    """(patch, token) weights along one axis, each row summing to 1: linear between centres, level beyond the ends."""
+    parts = -(-tokens // patch_index)  # points of one patch: as many as it has tokens
+    place = (np.arange(patch_index * parts) + 0.5) * tokens / (patch_index * parts) - 0.5
     reach = np.clip(place, 0, tokens - 1)[:, None] - np.arange(tokens)
-    weight: NDArray[np.float64] = np.maximum(1 - np.abs(reach), 0).reshape(seats, parts, tokens).mean(axis=1)
+    weight: NDArray[np.float64] = np.maximum(1 - np.abs(reach), 0).reshape(patch_index, parts, tokens).mean(axis=1)
     return weight

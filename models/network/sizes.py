@@ -31,7 +31,7 @@ MOST = {
 BOTTOM = 4  # pixels a side at the lowest level of a patch
 PATCHES_AT_ONCE = 64  # their features fit the caches; larger chunks go to memory and back at every layer
 TOKEN_PX = 16  # a token stands for at most so many pixels a side
-SCORER_WIDTH = 16  # channels of the network that scores seats
+SCORER_WIDTH = 16  # channels of the network that scores patches
 MOST_GAIN = 5.0  # gains are clipped to this [nat per px]; one confident error would outweigh a field
 BLOCK_PX = 384  # pixels a side that are kept of one block, and at most 15 more: its activations have a bound
 VGG_FROM = (  # in words: what to give, and where it can be had
@@ -105,7 +105,7 @@ class SegmenterConfig:
 
 
 def scorer_inputs(config: SegmenterConfig) -> int:
-    """Numbers that are known of a seat: mean and greatest feature and entropy, and mean probabilities."""
+    """Numbers that are known of a patch: mean and greatest feature and entropy, and mean probabilities."""
     return 2 * config.coarse_width + config.classes + 2
 
 
@@ -183,7 +183,7 @@ def saliency_multiply_adds(shape: tuple[int, int], columns: int, channels: int =
 
 
 @dataclass(frozen=True)
-class MemorySizes:
+class TemporalSizes:
     """All that is needed to build the network again."""
 
     classes: int
@@ -208,21 +208,23 @@ class MemorySizes:
 class MultiplyAdds:
     """Multiply-adds of one survey's segmentation. Norms, activations, softmax and interpolation count as 0."""
 
-    glance: int  # the coarse pass read alone, its part of the map with it
+    coarse_prediction: int  # the coarse pass read alone, its part of the map with it
     score: int  # the policy (`models.policies.policies.score_multiply_adds`)
     encode: int  # fine patches to tokens, and the transformer over these
-    decode: int  # the map at captured seats
+    decode: int  # the map at captured patches
 
     @property
     def total(self) -> int:
         """Everything together."""
-        return self.glance + self.score + self.encode + self.decode
+        return self.coarse_prediction + self.score + self.encode + self.decode
 
 
-def multiply_adds(config: SegmenterConfig, grid: SceneGrid, seats: int, bands: int, *, score: int = 0) -> MultiplyAdds:
-    """Count a survey with ``seats`` fine patches of ``bands`` bands, whose policy took ``score``.
+def multiply_adds(
+    config: SegmenterConfig, grid: SceneGrid, patch_index: int, bands: int, *, score: int = 0
+) -> MultiplyAdds:
+    """Count a survey with ``patch_index`` fine patches of ``bands`` bands, whose policy took ``score``.
 
-    The glance is the reading of the coarse pass, counted once: fine patches read what is kept of it.
+    The coarse prediction is the reading of the coarse pass, counted once: fine patches read what is kept of it.
     """
     p, s = config.patch, config.factor
     rows, columns = (size // (p * s) for size in grid.padded_shape)
@@ -230,11 +232,11 @@ def multiply_adds(config: SegmenterConfig, grid: SceneGrid, seats: int, bands: i
     wide, narrow = config.width, config.coarse_width
     basis = pixels * bands * config.columns
     drawn = _head(config, narrow) + pixels * (9 * narrow**2 + narrow * config.classes)
-    glance = cells * (basis + _stem(config, narrow) + drawn) + _transformer(config, cells * side, 0)
-    encode = seats * (basis + _stem(config, wide)) + _transformer(config, seats * side, cells * side)
+    coarse_prediction = cells * (basis + _stem(config, narrow) + drawn) + _transformer(config, cells * side, 0)
+    encode = patch_index * (basis + _stem(config, wide)) + _transformer(config, patch_index * side, cells * side)
     under = (p // s + 2) ** 2 * narrow * wide
-    decode = seats * (_head(config, wide) + under + pixels * (11 * wide**2 + wide * config.classes))
-    return MultiplyAdds(glance, score, encode, decode)
+    decode = patch_index * (_head(config, wide) + under + pixels * (11 * wide**2 + wide * config.classes))
+    return MultiplyAdds(coarse_prediction, score, encode, decode)
 
 
 def _levels(config: SegmenterConfig, width: int) -> list[tuple[int, int]]:

@@ -16,10 +16,10 @@ from pipeline.readings import MOST_STEPS, SIGMA_OF_MEDIAN
 
 REACH = 1.5  # a column is reached by a band within this many column spacings of its centre
 LONGEST_NM, SHORTEST_NM = 3000.0, 200.0
-SPREAD_FLOOR = 1e-3  # least spread of a column, as a share of the median spread
-VARIANCE_FLOOR = 1e-5  # least variance of a direction that whitening brings to 1, as a share of the largest
+SPREAD_FLOOR = 1e-3  # least spread of a column, as a fraction of the median spread
+VARIANCE_FLOOR = 1e-5  # least variance of a direction that whitening brings to 1, as a fraction of the largest
 Kind = TypeVar("Kind", bound=np.generic)
-MOST_DEAD = 0.5  # a token with more dead pixels than this share is not read
+MOST_DEAD = 0.5  # a token with more dead pixels than this fraction is not read
 MOST_COLUMN = 1e12  # of normalised columns: no reading gives more, and squares of more would end the range of float32
 
 

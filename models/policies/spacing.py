@@ -1,4 +1,4 @@
-"""Policies that see nothing: scores of seats by where they lie on the scene alone."""
+"""Policies that see nothing: scores of patches by where they lie on the scene alone."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ Scores = NDArray[np.float64]
 Whole = NDArray[np.int64]
 Scalar = TypeVar("Scalar", bound=np.generic)
 STEPS = 4096  # of the phase that says which half of a cell begins; keeps the comparison in whole numbers
-BEGINS = (3 * STEPS // 8, 5 * STEPS // 8)  # the half with the first; the larger of two and one seats still begins
+BEGINS = (3 * STEPS // 8, 5 * STEPS // 8)  # the half with the first; the larger of two and one patches still begins
 
 
 def random_scores(grid: SceneGrid, seed: int) -> Scores:
-    """Draw every seat's score by itself, (rows, columns) in 0..1."""
-    return np.random.default_rng([seed, 0x5EA7]).random(grid.seat_shape)
+    """Draw every patch's score by itself, (rows, columns) in 0..1."""
+    return np.random.default_rng([seed, 0x5EA7]).random(grid.patch_shape)
 
 
 def stratified_scores(grid: SceneGrid, seed: int) -> Scores:
-    """Score seats so that the best K, for every K, are one at random in each of K cells of about equal area.
+    """Score patches so that the best K, for every K, are one at random in each of K cells of about equal area.
 
     The scene is halved again and again; the halves of a cell take turns, in an order drawn by ``seed``.
     """
@@ -31,7 +31,7 @@ def stratified_scores(grid: SceneGrid, seed: int) -> Scores:
 
 
 def uniform_scores(grid: SceneGrid, seed: int = 0) -> Scores:
-    """Score seats so that the best K lie on a regular grid, the finer the larger K is; ``seed`` does nothing.
+    """Score patches so that the best K lie on a regular grid, the finer the larger K is; ``seed`` does nothing.
 
     The order is that of an ordered dither: of the quarters of a cell the opposite one comes second.
     """
@@ -39,13 +39,13 @@ def uniform_scores(grid: SceneGrid, seed: int = 0) -> Scores:
 
 
 def centre_scores(grid: SceneGrid, seed: int = 0) -> Scores:
-    """Score seats by how near the middle of their part of the scene lies to that of the scene; ``seed`` does nothing.
+    """Score patches by how near the middle of their part of the scene lies to that of the scene; ``seed`` does nothing.
 
     1 is the middle of the scene, 0 its corners.
     """
     down, across = (
         (np.minimum(np.arange(1, count + 1) * grid.patch, size) + np.arange(count) * grid.patch - size) / 2
-        for count, size in zip(grid.seat_shape, (grid.height, grid.width), strict=True)
+        for count, size in zip(grid.patch_shape, (grid.height, grid.width), strict=True)
     )
     distance = np.hypot(down[:, None], across[None, :])
     scores: Scores = 1.0 - distance / (np.hypot(grid.height, grid.width) / 2)
@@ -54,7 +54,7 @@ def centre_scores(grid: SceneGrid, seed: int = 0) -> Scores:
 
 @dataclass(frozen=True)
 class _Axis:
-    """Cells along one axis: for every seat the start and the end of its cell, and where the last split put it."""
+    """Cells along one axis: for every patch the start and the end of its cell, and where the last split put it."""
 
     start: Whole
     end: Whole
@@ -63,16 +63,16 @@ class _Axis:
 
     @staticmethod
     def whole(size: int) -> _Axis:
-        """One cell of all seats."""
+        """One cell of all patches."""
         return _Axis(np.zeros(size, np.int64), np.full(size, size), np.zeros(size, np.bool_), 0)
 
     @property
     def length(self) -> Whole:
-        """Seats of each seat's cell along this axis."""
+        """Patches of each patch's cell along this axis."""
         return self.end - self.start
 
     def halved(self) -> _Axis:
-        """Give the halves of every cell; the lower one is the larger, and all there is of a cell of one seat."""
+        """Give the halves of every cell; the lower one is the larger, and all there is of a cell of one patch."""
         middle = (self.start + self.end + 1) // 2
         upper = np.arange(len(middle)) >= middle
         start, end = np.where(upper, middle, self.start), np.where(upper, self.end, middle)
@@ -80,17 +80,17 @@ class _Axis:
 
 
 def _by_rank(grid: SceneGrid, random: np.random.Generator | None) -> Scores:
-    """Spread scores from 1 down to 1/n by nested rank over the n seats that hold a pixel; the others get 0."""
+    """Spread scores from 1 down to 1/n by nested rank over the n patches that hold a pixel; the others get 0."""
     rows, columns = -(-grid.height // grid.patch), -(-grid.width // grid.patch)
-    scores = np.zeros(grid.seat_shape)
+    scores = np.zeros(grid.patch_shape)
     scores[:rows, :columns] = 1.0 - _nested_ranks((rows, columns), random) / (rows * columns)
     return scores
 
 
 def _nested_ranks(shape: tuple[int, int], random: np.random.Generator | None) -> Whole:
-    """Ranks 0..n-1, (rows, columns), of which any first K hold of every cell its part of K, to within about a seat.
+    """Ranks 0..n-1, (rows, columns), of which any first K hold of every cell its part of K, to within about a patch.
 
-    Cells are halved across their longer side, down to single seats; from there up the ranks of halves are merged.
+    Cells are halved across their longer side, down to single patches; from there up the ranks of halves are merged.
     """
     axes = [_Axis.whole(size) for size in shape]
     levels = []
@@ -103,12 +103,12 @@ def _nested_ranks(shape: tuple[int, int], random: np.random.Generator | None) ->
         axes[split] = halves
     ranks = np.zeros(shape, np.int64)
     for own, other, upper, phase in reversed(levels):
-        ranks += _seats_before(ranks, own, other, upper, phase)
+        ranks += _patches_before(ranks, own, other, upper, phase)
     return ranks
 
 
 def _phases(axes: list[_Axis], split: int, random: np.random.Generator | None) -> Whole:
-    """Give which half of each cell begins: drawn, or so that its first seat lies a third into it, not at a corner.
+    """Give which half of each cell begins: drawn, or so that its first patch lies a third into it, not at a corner.
 
     For that the lower and the upper half take turns from split to split; of quarters the opposite one comes second.
     """
@@ -125,10 +125,10 @@ def _along(values: NDArray[Scalar], axis: int) -> NDArray[Scalar]:
     return values[:, None] if axis == 0 else values[None, :]
 
 
-def _seats_before(ranks: Whole, own: Whole, other: Whole, upper: NDArray[np.bool_], phase: Whole) -> Whole:
-    """Count the seats of the other half of a cell that come before the seat of each rank in its own half.
+def _patches_before(ranks: Whole, own: Whole, other: Whole, upper: NDArray[np.bool_], phase: Whole) -> Whole:
+    """Count the patches of the other half of a cell that come before the patch of each rank in its own half.
 
-    Seat i of n comes at (i + u) / n: halves are used up at the same rate, and u, the phase, says which begins.
+    Patch i of n comes at (i + u) / n: halves are used up at the same rate, and u, the phase, says which begins.
     """
     here, there = np.where(upper, STEPS - phase, phase), np.where(upper, phase, STEPS - phase)
     lead = (ranks * STEPS + here) * other - there * own

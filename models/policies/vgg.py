@@ -5,7 +5,7 @@ classes are none of a field's, and its layers hold the image to 224 px. A sum is
 read apart. It is taken to the channels that enter VGG, absolute, the largest of them.
 
 A network that learned from data of one's own (the paper's trained attention) is read the same way. The paper says
-neither how it is trained, a choice of seats passing no gradient, nor how more than three bands enter it. Here the user
+neither how it is trained, a choice of patches passing no gradient, nor how more than three bands enter it. Here the user
 trains it on what they like; its channels are what `channels_of` says, each brought to the median 0 and the spread 1 of
 the data that the segmenter was trained on.
 
@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from models.network.sizes import Stretch, VggSizes, stretches
 from models.network.spectral import REACH, checked_wavelengths
-from models.reading.inference import CoarseLook
+from models.reading.inference import CoarsePass
 from models.training.pretrained import LoadReport, load_into, mixed_channels, rgb_response, wavelength_response
 from models.weights.files import Weights
 from models.weights.state_files import read_state
@@ -142,7 +142,7 @@ class VggSaliency:
     network: VggFeatures
     colours: NDArray[np.float32]  # (column, channel)
 
-    def __call__(self, seen: CoarseLook) -> NDArray[np.float64]:
+    def __call__(self, seen: CoarsePass) -> NDArray[np.float64]:
         """(y, x) of the padded coarse grid: never of a finer one, which would need what is not captured yet."""
         picture = seen.columns @ self.colours
         drawn = np.empty(picture.shape[:2])

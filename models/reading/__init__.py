@@ -1,1 +1,1 @@
-"""Trained weights on a scene: glance, regions of a large field."""
+"""Trained weights on a scene: coarse prediction, regions of a large field."""

@@ -1,4 +1,4 @@
-"""Use of a trained segmenter on one scene: glance at the coarse pass, then go on from there with the fine patches."""
+"""Use of a trained segmenter on one scene: coarse prediction at the coarse pass, then go on from there with the fine patches."""
 
 from __future__ import annotations
 
@@ -33,14 +33,16 @@ PATCHES_A_PACK = 256  # scenes are read together up to so many patches; one with
 
 
 @dataclass(frozen=True)
-class CoarseLook:
+class CoarsePass:
     """The coarse pass of a scene, or of a region of a field, on the padded coarse grid."""
 
     grid: SceneGrid
     columns: NDArray[np.float32]  # (y, x, column) normalised
-    origin: tuple[int, int] = field(default=(0, 0), kw_only=True)  # row and column of the field's seat it begins at
+    origin: tuple[int, int] = field(default=(0, 0), kw_only=True)  # row and column of the field's patch it begins at
     living: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (token,) which are read; None: all
-    strange: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (y, x) of the scene: a value is no reading
+    out_of_range: NDArray[np.bool_] | None = field(
+        default=None, kw_only=True
+    )  # (y, x) of the scene: a value is no reading
     filled: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (y, x) nothing was seen of; None: of all was
 
     @property
@@ -53,7 +55,7 @@ class CoarseLook:
 
 @dataclass(frozen=True)
 class Read:
-    """A reading of a coarse look, by whom and of what: the fine patches go on from there."""
+    """A reading of a coarse pass, by whom and of what: the fine patches go on from there."""
 
     by: Segmenter
     columns: NDArray[np.float32]
@@ -62,14 +64,18 @@ class Read:
     precision: Precision = "float32"
     living: NDArray[np.bool_] | None = None
 
-    def fits(self, weights: Weights, look: CoarseLook, precision: Precision) -> bool:
+    def fits(self, weights: Weights, coarse_pass: CoarsePass, precision: Precision) -> bool:
         """Whether these weights would read the same from this look."""
-        whose = self.by is weights.segmenter and self.columns is look.columns
-        return whose and self.living is look.living and (self.origin, self.precision) == (look.origin, precision)
+        whose = self.by is weights.segmenter and self.columns is coarse_pass.columns
+        return (
+            whose
+            and self.living is coarse_pass.living
+            and (self.origin, self.precision) == (coarse_pass.origin, precision)
+        )
 
 
 @dataclass(frozen=True)
-class Glance(CoarseLook):
+class CoarsePrediction(CoarsePass):
     """What the coarse pass alone says of a scene, on the padded coarse grid."""
 
     probability: NDArray[np.float32]  # (y, x, class)
@@ -93,46 +99,48 @@ class DrawnMap:
         return DrawnMap(self.classes[scene].copy(), self.confidence[scene].copy(), every)
 
 
-def glance(
+def coarse_prediction(
     weights: Weights, coarse: NDArray[np.floating], wavelength_nm: NDArray[np.floating], grid: SceneGrid
-) -> Glance:
+) -> CoarsePrediction:
     """Read the coarse mosaic alone.
 
     ``coarse`` (y, x, band) are scene values of the coarse pass, of shape ``grid.coarse_shape``; NaN where nothing was
     captured. What is no reading by the weights' `most_value` counts as NaN.
     """
-    return read_glance(weights, look_coarsely(weights, [coarse], wavelength_nm, grid))
+    return read_coarse_prediction(weights, read_coarse_pass(weights, [coarse], wavelength_nm, grid))
 
 
-def look_coarsely(
+def read_coarse_pass(
     weights: Weights,
     strips: Iterable[NDArray[np.floating]],
     wavelength_nm: NDArray[np.floating],
     grid: SceneGrid,
     *,
     origin: tuple[int, int] = (0, 0),
-) -> CoarseLook:
+) -> CoarsePass:
     """Bring the coarse mosaic to the spectral columns of the weights, some rows at a time.
 
     ``strips`` are (y, x, band) parts of the mosaic from the top down, together of the shape ``grid.coarse_shape``;
-    ``origin`` is the row and column of the seat of a larger field in which the grid begins.
+    ``origin`` is the row and column of the patch of a larger field in which the grid begins.
     """
     config = weights.config
     rows, width = grid.coarse_shape
     columns, filled = np.empty((rows, width, config.columns), np.float32), 0
-    strange: NDArray[np.bool_] | None = None
+    out_of_range: NDArray[np.bool_] | None = None
     for strip in strips:
         last = filled + len(strip)
         columns[filled:last] = weights.columns(strip, wavelength_nm)
         if (wild := beyond_range(strip, weights.normalisation.most_value)) is not None:
-            strange = np.zeros((rows, width), np.bool_) if strange is None else strange
-            strange[filled:last] = wild.any(axis=-1)
+            out_of_range = np.zeros((rows, width), np.bool_) if out_of_range is None else out_of_range
+            out_of_range[filled:last] = wild.any(axis=-1)
         filled = last
     y, x = grid.padded_shape
     columns = np.ascontiguousarray(pad_by_reflection(columns, (y // grid.factor, x // grid.factor)), np.float32)
     dead = dead_pixels(columns)
     living = _mend(columns, config)
-    return CoarseLook(grid, columns, origin=origin, living=living, strange=strange, filled=dead if dead.any() else None)
+    return CoarsePass(
+        grid, columns, origin=origin, living=living, out_of_range=out_of_range, filled=dead if dead.any() else None
+    )
 
 
 def _mend(columns: NDArray[np.float32], config: SegmenterConfig) -> NDArray[np.bool_] | None:
@@ -147,38 +155,51 @@ def _mend(columns: NDArray[np.float32], config: SegmenterConfig) -> NDArray[np.b
     return readable(holes, config.token_side).ravel()
 
 
-def glance_of_columns(weights: Weights, columns: NDArray[np.generic], grid: SceneGrid) -> Glance:
+def coarse_prediction_of_columns(weights: Weights, columns: NDArray[np.generic], grid: SceneGrid) -> CoarsePrediction:
     """Read normalised columns of the padded coarse grid, (y, x, column); dead ones count as in a mosaic."""
     given = np.ascontiguousarray(columns, np.float32)
     mended = given if all_alive(given) else given.copy()
-    return read_glance(weights, CoarseLook(grid, mended, living=_mend(mended, weights.config)))
+    return read_coarse_prediction(weights, CoarsePass(grid, mended, living=_mend(mended, weights.config)))
 
 
-def read_glance(weights: Weights, look: CoarseLook, *, precision: Precision = "float32") -> Glance:
-    """Read a coarse look alone."""
-    return glance_batch(weights, [look], precision=precision)[0]
+def read_coarse_prediction(
+    weights: Weights, coarse_pass: CoarsePass, *, precision: Precision = "float32"
+) -> CoarsePrediction:
+    """Read a coarse pass alone."""
+    return coarse_prediction_batch(weights, [coarse_pass], precision=precision)[0]
 
 
-def glance_batch(weights: Weights, looks: Sequence[CoarseLook], *, precision: Precision = "float32") -> list[Glance]:
-    """Read coarse looks of any sizes, each alone, their patches packed; as ``read_glance`` one by one, but faster."""
-    seen: list[Glance] = []
+def coarse_prediction_batch(
+    weights: Weights, coarse_passes: Sequence[CoarsePass], *, precision: Precision = "float32"
+) -> list[CoarsePrediction]:
+    """Read coarse passes of any sizes, each alone, their patches packed; as ``read_coarse_prediction`` one by one, but faster."""
+    seen: list[CoarsePrediction] = []
     with torch.inference_mode(), _computing_in(precision, weights):
-        for part in packs([_patches_in(look) for look in looks]):
+        for part in packs([_patches_in(coarse_pass) for coarse_pass in coarse_passes]):
             with queries_kept() as queries:
-                readings = _read_coarse(weights, looks[part])
+                readings = _read_coarse(weights, coarse_passes[part])
             asked = torch.split(queries[-1], [reading.memory[-1][0].shape[2] for reading in readings], dim=2)
-            for look, reading, own in zip(looks[part], readings, asked, strict=True):
+            for coarse_pass, reading, own in zip(coarse_passes[part], readings, asked, strict=True):
                 keys = reading.memory[-1][0][0].float().cpu().numpy()
                 seen.append(
-                    Glance(
-                        look.grid,
-                        look.columns,
+                    CoarsePrediction(
+                        coarse_pass.grid,
+                        coarse_pass.columns,
                         np.ascontiguousarray(reading.logits[0].float().softmax(dim=0).permute(1, 2, 0).cpu().numpy()),
-                        origin=look.origin,
-                        living=look.living,
+                        origin=coarse_pass.origin,
+                        living=coarse_pass.living,
                         gain=weights.segmenter.score(reading)[0].float().cpu().numpy(),
-                        read=Read(weights.segmenter, look.columns, look.origin, reading, precision, look.living),
-                        tokens=TokenReading(own[0].float().cpu().numpy(), keys, weights.config.token_side, look.living),
+                        read=Read(
+                            weights.segmenter,
+                            coarse_pass.columns,
+                            coarse_pass.origin,
+                            reading,
+                            precision,
+                            coarse_pass.living,
+                        ),
+                        tokens=TokenReading(
+                            own[0].float().cpu().numpy(), keys, weights.config.token_side, coarse_pass.living
+                        ),
                     )
                 )
     return seen
@@ -186,67 +207,69 @@ def glance_batch(weights: Weights, looks: Sequence[CoarseLook], *, precision: Pr
 
 def segment(
     weights: Weights,
-    seen: CoarseLook,
+    seen: CoarsePass,
     patches: NDArray[np.floating],
-    seats: NDArray[np.integer],
+    patch_index: NDArray[np.integer],
     *,
     precision: Precision = "float32",
     every_class: bool = False,
 ) -> DrawnMap:
-    """Draw the class map from the coarse look and the fine patches, of the scene's own size.
+    """Draw the class map from the coarse pass and the fine patches, of the scene's own size.
 
-    ``patches`` (seat, p, p, column) are normalised columns of the fine pass. A dead pixel (see `dead_pixels`) counts as
-    the mean of its patch; a patch of which more than half is dead counts as not captured. ``seats`` (seat,) are their
-    numbers on the grid, each once; without one the map is the glance brought up to the fine grid. ``precision`` is that
+    ``patches`` (patch, p, p, column) are normalised columns of the fine pass. A dead pixel (see `dead_pixels`) counts as
+    the mean of its patch; a patch of which more than half is dead counts as not captured. ``patch_index`` (patch,) are their
+    numbers on the grid, each once; without one the map is the coarse prediction brought up to the fine grid. ``precision`` is that
     of convolutions and matrix products; norms, softmax and the decision are float32. With ``every_class`` the map holds
     the log-probabilities of all classes too.
 
-    Raises ShapeError for a seat given twice or outside the grid.
+    Raises ShapeError for a patch given twice or outside the grid.
     """
-    return segment_batch(weights, [seen], [patches], [seats], precision=precision, every_class=every_class)[0]
+    return segment_batch(weights, [seen], [patches], [patch_index], precision=precision, every_class=every_class)[0]
 
 
 def segment_batch(
     weights: Weights,
-    seen: Sequence[CoarseLook],
+    seen: Sequence[CoarsePass],
     patches: Sequence[NDArray[np.floating]],
-    seats: Sequence[NDArray[np.integer]],
+    patch_index: Sequence[NDArray[np.integer]],
     *,
     precision: Precision = "float32",
     every_class: bool = False,
 ) -> list[DrawnMap]:
-    """Draw the maps of scenes of any sizes and numbers of seats together, as ``segment`` one by one, but faster."""
+    """Draw the maps of scenes of any sizes and numbers of patches together, as ``segment`` one by one, but faster."""
     scenes = []
-    for look, own, given in zip(seen, patches, seats, strict=True):
+    for coarse_pass, own, given in zip(seen, patches, patch_index, strict=True):
         numbers = np.asarray(given, np.int64)
-        check_seats(numbers, look.grid)
-        scenes.append((look, *captured(own, numbers)))
+        check_patch_index(numbers, coarse_pass.grid)
+        scenes.append((coarse_pass, *captured(own, numbers)))
     with torch.inference_mode(), _computing_in(precision, weights):
-        counts = [_patches_in(look) + len(numbers) for look, _, numbers in scenes]
+        counts = [_patches_in(coarse_pass) + len(numbers) for coarse_pass, _, numbers in scenes]
         return [drawn for part in packs(counts) for drawn in _draw_pack(weights, scenes[part], precision, every_class)]
 
 
 def _draw_pack(
     weights: Weights,
-    pack: Sequence[tuple[CoarseLook, NDArray[np.floating], NDArray[np.int64]]],
+    pack: Sequence[tuple[CoarsePass, NDArray[np.floating], NDArray[np.int64]]],
     precision: Precision,
     every_class: bool,
 ) -> Iterator[DrawnMap]:
     """Maps of scenes that are read together."""
-    looks = [look for look, _, _ in pack]
-    readings = readings_of(weights, looks, precision=precision)
+    coarse_passes = [coarse_pass for coarse_pass, _, _ in pack]
+    readings = readings_of(weights, coarse_passes, precision=precision)
     padded = [
-        draw_coarse(_tempered(reading.logits.float().cpu(), weights), look.grid, every_class=every_class)
-        for reading, look in zip(readings, looks, strict=True)
+        draw_coarse(_tempered(reading.logits.float().cpu(), weights), coarse_pass.grid, every_class=every_class)
+        for reading, coarse_pass in zip(readings, coarse_passes, strict=True)
     ]
     places = (
         (drawn, place)
-        for drawn, (look, _, seats) in zip(padded, pack, strict=True)
-        for place in look.grid.seat_origin(seats)
+        for drawn, (coarse_pass, _, patch_index) in zip(padded, pack, strict=True)
+        for place in coarse_pass.grid.patch_origin(patch_index)
     )
-    parts = [own for _, own, _ in pack], [torch.from_numpy(seats) for *_, seats in pack]
+    parts = [own for _, own, _ in pack], [torch.from_numpy(patch_index) for *_, patch_index in pack]
     p = weights.config.patch
-    for read in weights.segmenter.eval().read_fine_packed(readings, *parts, [origin_of(look) for look in looks]):
+    for read in weights.segmenter.eval().read_fine_packed(
+        readings, *parts, [origin_of(coarse_pass) for coarse_pass in coarse_passes]
+    ):
         logits = _tempered(read.float().cpu(), weights)
         confidence, classes = (part.numpy() for part in decide(logits, dim=1))
         every = logits.log_softmax(dim=1).permute(0, 2, 3, 1).numpy() if every_class else confidence
@@ -255,8 +278,8 @@ def _draw_pack(
             drawn.confidence[y : y + p, x : x + p] = sure
             if drawn.log_probability is not None:
                 drawn.log_probability[y : y + p, x : x + p] = own
-    for drawn, look in zip(padded, looks, strict=True):
-        yield drawn.of_scene(look.grid)
+    for drawn, coarse_pass in zip(padded, coarse_passes, strict=True):
+        yield drawn.of_scene(coarse_pass.grid)
 
 
 def _tempered(logits: Tensor, weights: Weights) -> Tensor:
@@ -264,28 +287,30 @@ def _tempered(logits: Tensor, weights: Weights) -> Tensor:
     return logits if weights.temperature == 1 else logits / weights.temperature
 
 
-def captured(patches: NDArray[np.floating], seats: NDArray[np.int64]) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
-    """Keep the patches that show something of their seats, dead pixels filled, and these seats."""
+def captured(
+    patches: NDArray[np.floating], patch_index: NDArray[np.int64]
+) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
+    """Keep the patches that show something of their patches, dead pixels filled, and these patches."""
     dead = dead_pixels(patches)
     if not dead.any():
-        return patches, seats
+        return patches, patch_index
     shown = readable(dead)[:, 0]
-    return fill_dead(patches[shown], dead[shown]), seats[shown]
+    return fill_dead(patches[shown], dead[shown]), patch_index[shown]
 
 
-def check_seats(seats: NDArray[np.int64], grid: SceneGrid) -> None:
-    """Refuse numbers that are none of the grid's seats, or given twice (ShapeError)."""
-    count = grid.seat_shape[0] * grid.seat_shape[1]
-    if outside := seats[(seats < 0) | (seats >= count)].tolist():
-        raise ShapeError(f"seat {outside[0]} is none of the {count} seats of the scene, 0..{count - 1}")
-    distinct, times = np.unique(seats, return_counts=True)
+def check_patch_index(patch_index: NDArray[np.int64], grid: SceneGrid) -> None:
+    """Refuse numbers that are none of the grid's patches, or given twice (ShapeError)."""
+    count = grid.patch_shape[0] * grid.patch_shape[1]
+    if outside := patch_index[(patch_index < 0) | (patch_index >= count)].tolist():
+        raise ShapeError(f"patch {outside[0]} is none of the {count} patches of the scene, 0..{count - 1}")
+    distinct, times = np.unique(patch_index, return_counts=True)
     if repeated := distinct[times > 1].tolist():
-        raise ShapeError(f"seat {repeated[0]} is given more than once; give each seat one patch")
+        raise ShapeError(f"patch {repeated[0]} is given more than once; give each patch one patch")
 
 
-def _patches_in(look: CoarseLook) -> int:
-    rows, columns = look.grid.seat_shape
-    return rows * columns // look.grid.factor**2
+def _patches_in(coarse_pass: CoarsePass) -> int:
+    rows, columns = coarse_pass.grid.patch_shape
+    return rows * columns // coarse_pass.grid.factor**2
 
 
 @contextmanager
@@ -299,23 +324,33 @@ def _computing_in(precision: Precision, weights: Weights) -> Iterator[None]:
 
 
 def readings_of(
-    weights: Weights, looks: Sequence[CoarseLook], *, precision: Precision = "float32"
+    weights: Weights, coarse_passes: Sequence[CoarsePass], *, precision: Precision = "float32"
 ) -> list[CoarseReading]:
-    """Readings of coarse looks. Nothing flows back from fine patches, so one that a glance kept is not made twice."""
+    """Readings of coarse passes. Nothing flows back from fine patches, so one that a glance kept is not made twice."""
     kept = [
-        look.read.reading
-        if isinstance(look, Glance) and look.read and look.read.fits(weights, look, precision)
+        coarse_pass.read.reading
+        if isinstance(coarse_pass, CoarsePrediction)
+        and coarse_pass.read
+        and coarse_pass.read.fits(weights, coarse_pass, precision)
         else None
-        for look in looks
+        for coarse_pass in coarse_passes
     ]
-    fresh = iter(_read_coarse(weights, [look for look, reading in zip(looks, kept, strict=True) if reading is None]))
+    fresh = iter(
+        _read_coarse(
+            weights, [coarse_pass for coarse_pass, reading in zip(coarse_passes, kept, strict=True) if reading is None]
+        )
+    )
     return [next(fresh) if reading is None else reading for reading in kept]
 
 
-def _read_coarse(weights: Weights, looks: Sequence[CoarseLook]) -> list[CoarseReading]:
-    images = [torch.from_numpy(look.columns).permute(2, 0, 1)[None] for look in looks]
-    living = [None if look.living is None else torch.from_numpy(look.living) for look in looks]
-    return weights.segmenter.eval().read_coarse_packed(images, [origin_of(look) for look in looks], living)
+def _read_coarse(weights: Weights, coarse_passes: Sequence[CoarsePass]) -> list[CoarseReading]:
+    images = [torch.from_numpy(coarse_pass.columns).permute(2, 0, 1)[None] for coarse_pass in coarse_passes]
+    living = [
+        None if coarse_pass.living is None else torch.from_numpy(coarse_pass.living) for coarse_pass in coarse_passes
+    ]
+    return weights.segmenter.eval().read_coarse_packed(
+        images, [origin_of(coarse_pass) for coarse_pass in coarse_passes], living
+    )
 
 
 def packs(counts: Sequence[int], most: int = PATCHES_A_PACK) -> list[slice]:
@@ -329,9 +364,9 @@ def packs(counts: Sequence[int], most: int = PATCHES_A_PACK) -> list[slice]:
     return [slice(start, end) for start, end in zip(starts, [*starts[1:], len(counts)], strict=True)] if counts else []
 
 
-def origin_of(look: CoarseLook) -> Tensor | None:
-    """Seat of the field in which a look begins, (1, 2); None at the field's own corner."""
-    return torch.tensor([look.origin]) if any(look.origin) else None
+def origin_of(coarse_pass: CoarsePass) -> Tensor | None:
+    """Patch of the field in which a look begins, (1, 2); None at the field's own corner."""
+    return torch.tensor([coarse_pass.origin]) if any(coarse_pass.origin) else None
 
 
 def draw_coarse(logits: Tensor, grid: SceneGrid, *, every_class: bool = False) -> DrawnMap:

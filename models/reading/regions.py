@@ -20,7 +20,7 @@ from pipeline.geometry.grid import SceneGrid
 
 REGION_PX = 2560  # a side, at most
 HALO_CELLS = 1  # coarse patches around a region that are read with it; see bench_regions.py for more and for none
-CELL_COPIES, SEAT_COPIES = 8, 2  # of a coarse cell's features, and of a patch's columns, in memory at once
+CELL_COPIES, PATCH_COPIES = 8, 2  # of a coarse cell's features, and of a patch's columns, in memory at once
 MAP_COPIES = 2  # of what is believed of every class: of the look, and of look and memory together
 STRIP_COPIES = 3  # of values on their way from a store to spectral columns
 STRIP_ROWS, PATCHES_READ = 64, 64  # at once: those of a shard
@@ -29,7 +29,7 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 @dataclass(frozen=True)
 class Box:
-    """A rectangle of pixels or seats, ends not included."""
+    """A rectangle of pixels or patches, ends not included."""
 
     top: int
     left: int
@@ -76,20 +76,20 @@ class Region:
 
     @property
     def origin(self) -> tuple[int, int]:
-        """Row and column of the field's seat in which the scene begins: tokens keep the places of the field."""
+        """Row and column of the field's patch in which the scene begins: tokens keep the places of the field."""
         return self.read.top // self.field.patch, self.read.left // self.field.patch
 
     @property
-    def kept_seats(self) -> Box:
-        """What is kept, in seats of the field's padded grid."""
+    def kept_patches(self) -> Box:
+        """What is kept, in patches of the field's padded grid."""
         cells = self.kept.over(self.field.patch * self.field.factor)
         s = self.field.factor
         return Box(s * cells.top, s * cells.left, s * cells.bottom, s * cells.right)
 
-    def numbers_here(self, seats: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Give the scene's numbers of seats of the field; -1 where one lies outside."""
-        (rows, columns), (top, left) = self.grid.seat_shape, self.origin
-        row, column = np.divmod(np.asarray(seats, np.int64), self.field.seat_shape[1])
+    def numbers_here(self, patch_index: NDArray[np.integer]) -> NDArray[np.int64]:
+        """Give the scene's numbers of patches of the field; -1 where one lies outside."""
+        (rows, columns), (top, left) = self.grid.patch_shape, self.origin
+        row, column = np.divmod(np.asarray(patch_index, np.int64), self.field.patch_shape[1])
         row, column = row - top, column - left
         inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
         return np.where(inside, row * columns + column, -1)
@@ -110,10 +110,10 @@ class Region:
         kept, read = self.kept.over(self.field.factor), self.coarse
         return image[kept.top - read.top : kept.bottom - read.top, kept.left - read.left : kept.right - read.left]
 
-    def crop_seats(self, values: NDArray[Scalar]) -> NDArray[Scalar]:
-        """Keep of (seat,) values of the scene's padded grid what belongs to the region, (y, x)."""
-        (top, left), kept = self.origin, self.kept_seats
-        image = values.reshape(self.grid.seat_shape)
+    def crop_patches(self, values: NDArray[Scalar]) -> NDArray[Scalar]:
+        """Keep of (patch,) values of the scene's padded grid what belongs to the region, (y, x)."""
+        (top, left), kept = self.origin, self.kept_patches
+        image = values.reshape(self.grid.patch_shape)
         return image[kept.top - top : kept.bottom - top, kept.left - left : kept.right - left]
 
 
@@ -168,8 +168,8 @@ def _cuts(size: int, unit: int, most: int) -> list[tuple[int, int]]:
     return list(pairwise(edges))
 
 
-def region_bytes(config: SegmenterConfig, region: Region, seats: int, bands: int) -> int:
-    """Memory that reading one region takes at most, ``seats`` fine patches of it in use [bytes].
+def region_bytes(config: SegmenterConfig, region: Region, patch_index: int, bands: int) -> int:
+    """Memory that reading one region takes at most, ``patch_index`` fine patches of it in use [bytes].
 
     Counted: features of coarse patches and of fine ones, what their tokens keep of each layer, columns of the patches,
     the map with every class's probability (a memory takes the room of the columns), and values on their way from the
@@ -177,13 +177,13 @@ def region_bytes(config: SegmenterConfig, region: Region, seats: int, bands: int
     """
     p, s = config.patch, config.factor
     coarse, features = (_feature_bytes(width, p) for width in (config.coarse_width, config.width))
-    rows, columns = region.grid.seat_shape
+    rows, columns = region.grid.patch_shape
     cells = rows * columns // s**2
     memory = 2 * 4 * config.layers * config.dim * config.token_side**2  # keys and values of a patch's tokens
-    patch = features + memory + (SEAT_COPIES * 4 * config.columns + 16) * p**2
+    patch = features + memory + (PATCH_COPIES * 4 * config.columns + 16) * p**2
     believed = MAP_COPIES * 4 * config.classes * rows * columns * p**2
-    strip = max(min(STRIP_ROWS, region.coarse.shape[0]) * region.coarse.shape[1], min(PATCHES_READ, seats) * p**2)
-    read = (CELL_COPIES * coarse + memory) * cells + patch * seats
+    strip = max(min(STRIP_ROWS, region.coarse.shape[0]) * region.coarse.shape[1], min(PATCHES_READ, patch_index) * p**2)
+    read = (CELL_COPIES * coarse + memory) * cells + patch * patch_index
     return read + believed + STRIP_COPIES * 4 * bands * strip
 
 
@@ -192,9 +192,9 @@ def _feature_bytes(width: int, patch: int) -> int:
     return 4 * sum(channels * (patch >> level) ** 2 for level, channels in enumerate(level_widths(width, patch)))
 
 
-def most_bytes(config: SegmenterConfig, regions: Sequence[Region], seats: NDArray[np.integer], bands: int) -> int:
-    """Memory that the most expensive of several regions takes at most, ``seats`` of the field in use [bytes]."""
+def most_bytes(config: SegmenterConfig, regions: Sequence[Region], patch_index: NDArray[np.integer], bands: int) -> int:
+    """Memory that the most expensive of several regions takes at most, ``patch_index`` of the field in use [bytes]."""
     return max(
-        region_bytes(config, region, int(np.count_nonzero(region.numbers_here(seats) >= 0)), bands)
+        region_bytes(config, region, int(np.count_nonzero(region.numbers_here(patch_index) >= 0)), bands)
         for region in regions
     )

@@ -1,4 +1,4 @@
-"""How far the confidence of maps lies beside the share that is right, and the one temperature that puts it there."""
+"""How far the confidence of maps lies beside the fraction that is right, and the one temperature that puts it there."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class JudgedMap:
     @staticmethod
     def of(log_probability: NDArray[np.float32], labels: NDArray[np.uint8]) -> JudgedMap:
         """Take the labelled pixels of (y, x, class) and (y, x)."""
-        told = (labels != UNLABELLED) & np.isfinite(log_probability[..., 0])
-        return JudgedMap(log_probability[told], labels[told])
+        fit = (labels != UNLABELLED) & np.isfinite(log_probability[..., 0])
+        return JudgedMap(log_probability[fit], labels[fit])
 
 
 def judge_confidence(maps: list[JudgedMap], seed: int) -> dict[str, Any]:
@@ -38,11 +38,11 @@ def judge_confidence(maps: list[JudgedMap], seed: int) -> dict[str, Any]:
     these maps are likeliest; ``expected_error_before`` is then the error without it.
     """
     error = _error(maps, 1.0)
-    told: dict[str, Any] = {"scenes": len(maps), "expected_error": error}
+    fit: dict[str, Any] = {"scenes": len(maps), "expected_error": error}
     if not error > BAD_ERROR:
-        return told
+        return fit
     temperature = fitted_temperature(maps, seed)
-    return told | {
+    return fit | {
         "expected_error": _error(maps, temperature),
         "expected_error_before": error,
         "temperature": temperature,
@@ -57,8 +57,8 @@ def fitted_temperature(maps: list[JudgedMap], seed: int) -> float:
     labels = np.concatenate([one.labels[i] for one, i in zip(maps, drawn, strict=True)])
 
     def loss(log_temperature: float) -> float:
-        told = scipy.special.log_softmax(values / np.exp(log_temperature), axis=1)
-        return float(-told[np.arange(len(labels)), labels].mean())
+        fit = scipy.special.log_softmax(values / np.exp(log_temperature), axis=1)
+        return float(-fit[np.arange(len(labels)), labels].mean())
 
     bounds = np.log(COOLEST), np.log(HOTTEST)
     return float(np.exp(scipy.optimize.minimize_scalar(loss, bounds=bounds, method="bounded").x))

@@ -13,13 +13,13 @@ from torch import Tensor
 
 from models.network.layers import cut
 from models.network.spectral import Normalisation, SpectralBasis
-from models.training.looks import REFERENCE_MS, ColumnNoise, Looks
+from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation, ColumnNoise
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera, expose, footprint
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 
-NOISY = 0.25  # share of the crops that get the noise of a shorter exposure
+NOISY = 0.25  # fraction of the crops that get the noise of a shorter exposure
 HALO = 8  # rows around a strip that the footprint reaches, a multiple of every factor up to 8
 
 
@@ -67,7 +67,7 @@ def observe(
     fine = np.empty((rows, width, basis.columns), np.float32)
     coarse = np.empty((rows // s, width // s, basis.columns), np.float32)
     exposure = camera.exposure_ms / DEFAULT_EXPOSURE_MS
-    scale = (scene.panel / (scene.panel_electrons * exposure)).astype(np.float32)
+    scale = (scene.white_reference / (scene.white_reference_electrons * exposure)).astype(np.float32)
     for top, stream in zip(range(0, rows, cell), rng.spawn(rows // cell), strict=True):
         first, last = max(top - HALO, 0), min(top + cell + HALO, rows)
         blurred = footprint(planes[first:last], camera)[top - first : top - first + cell]
@@ -79,7 +79,7 @@ def observe(
 
 def noise_of(scene: RasterScene, matrix: NDArray[np.float32], camera: LineCamera) -> ColumnNoise:
     """What light and readings of a camera leave in the columns of a scene."""
-    return ColumnNoise.of_bands(matrix, scene.panel / scene.panel_electrons, camera.read_noise_e)
+    return ColumnNoise.of_bands(matrix, scene.white_reference / scene.white_reference_electrons, camera.read_noise_e)
 
 
 def electrons_of(scene: RasterScene, planes: NDArray[np.float32], camera: LineCamera) -> NDArray[np.float32]:
@@ -91,7 +91,7 @@ def electrons_of(scene: RasterScene, planes: NDArray[np.float32], camera: LineCa
 
 
 def measured_normalisation(observations: list[Observation], exposure_ms: float = REFERENCE_MS) -> Normalisation:
-    """Normalisation over the fine looks of all scenes (every third pixel of every third row), for looks so exposed."""
+    """Normalisation over the fine passes of all scenes (every third pixel of every third row), for looks so exposed."""
     sample = np.concatenate([seen.fine[::3, ::3].reshape(-1, seen.fine.shape[-1]) for seen in observations])
     noises = [seen.noise for seen in observations if seen.noise is not None]
     if exposure_ms >= REFERENCE_MS or not noises:
@@ -112,9 +112,9 @@ class Batch:
     """Crops for one training step."""
 
     coarse: Tensor  # (B, J, y / s, x / s)
-    fine: Tensor  # (B, seats, J, p, p), every seat of the crop
+    fine: Tensor  # (B, patches, J, p, p), every patch of the crop
     labels: Tensor  # (B, y, x) int64
-    origin: Tensor  # (B, 2) random offsets of the places [seats]
+    origin: Tensor  # (B, 2) random offsets of the places [patches]
 
     def on(self, device: str) -> Batch:
         """The same where a device computes."""
@@ -132,18 +132,18 @@ class CropSampler:
         crop: int,
         *,
         noise: float = 0.0,
-        looks: Looks | None = None,
+        scan_passes: CaptureAugmentation | None = None,
     ) -> None:
-        """``noise`` is the most that is added, in spreads of the normalised columns; with ``looks`` they say it."""
+        """``noise`` is the most that is added, in spreads of the normalised columns; with ``scan_passes`` they say it."""
         cell = config_patch * factor
         smallest = min(min(example.labels.shape) for example in examples)
         self.size = max(cell, min(crop, smallest) // cell * cell)
         self.examples, self.patch, self.factor, self.noise = examples, config_patch, factor, noise
-        self.looks = looks
+        self.scan_passes = scan_passes
         areas = np.array([np.count_nonzero(example.labels != UNLABELLED) for example in examples], np.float64)
         if not areas.any():
             raise SceneError(f"none of {len(examples)} scenes has a labelled pixel; training needs some")
-        self.share = areas / areas.sum()
+        self.fraction = areas / areas.sum()
 
     def draw(self, count: int, rng: np.random.Generator, gain_shift: NDArray[np.float32]) -> Batch:
         """Give ``count`` crops. ``gain_shift`` is centre / spread: what brightness does to normalised columns."""
@@ -154,7 +154,7 @@ class CropSampler:
 
     def _crop(self, rng: np.random.Generator, gain_shift: NDArray[np.float32]) -> tuple[NDArray[np.generic], ...]:
         s, size = self.factor, self.size
-        example = self.examples[rng.choice(len(self.examples), p=self.share)]
+        example = self.examples[rng.choice(len(self.examples), p=self.fraction)]
         for _ in range(20):  # a crop without a label teaches nothing
             y, x = (rng.integers(0, (side - size) // s + 1) * s for side in example.labels.shape)
             labels = example.labels[y : y + size, x : x + size]
@@ -165,8 +165,8 @@ class CropSampler:
         coarse = turn(example.coarse[y // s : (y + size) // s, x // s : (x + size) // s]).astype(np.float32) * gain
         fine = turn(example.fine[y : y + size, x : x + size]).astype(np.float32) * gain
         shift = (gain - 1) * gain_shift
-        if self.looks is not None and example.noise is not None:
-            fine, coarse = self.looks.draw(fine + shift, coarse + shift, example.noise, s, rng)
+        if self.scan_passes is not None and example.noise is not None:
+            fine, coarse = self.scan_passes.draw(fine + shift, coarse + shift, example.noise, s, rng)
             channels = [np.ascontiguousarray(image.transpose(2, 0, 1)) for image in (coarse, fine)]
             return channels[0], channels[1], np.ascontiguousarray(turn(labels)).astype(np.int64)
         channels_first = [np.ascontiguousarray((image + shift).transpose(2, 0, 1)) for image in (coarse, fine)]

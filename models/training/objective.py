@@ -1,8 +1,8 @@
-"""What a training step asks for: seats drawn, the map with them and without, and what the scorer said of them.
+"""What a training step asks for: patches drawn, the map with them and without, and what the scorer said of them.
 
-A crop is read twice: with no fine seat, and with a share of the seats drawn from ``SHARES``. What the loss falls by at
-a captured seat is what the scorer learns to tell; a seat without a label tells it nothing. Three phases follow each
-other: seats are placed at random and by the entropy of the first reading; then also by the scorer; then in larger
+A crop is read twice: with no fine patch, and with a fraction of the patches drawn from ``FRACTIONS``. What the loss falls by at
+a captured patch is what the scorer learns to tell; a patch without a label tells it nothing. Three phases follow each
+other: patches are placed at random and by the entropy of the first reading; then also by the scorer; then in larger
 crops, of which fewer make a batch, as far as the scenes have larger ones.
 """
 
@@ -22,16 +22,26 @@ from models.network.sizes import MOST_GAIN, SegmenterConfig
 from models.training.examples import Batch
 from pipeline.geometry.grid import UNLABELLED
 
-GLANCE_WEIGHT, SCORER_WEIGHT = 0.4, 1.0  # of the map without a seat, and of the scorer, beside the map with seats
-SHARES = ((0.05, 0.15), (0.1, 0.25), (0.2, 0.25), (0.35, 0.15), (0.5, 0.1), (1.0, 0.1))  # (of the seats, how often)
+COARSE_PREDICTION_WEIGHT, SCORER_WEIGHT = (
+    0.4,
+    1.0,
+)  # of the map without a patch, and of the scorer, beside the map with patches
+FRACTIONS = (
+    (0.05, 0.15),
+    (0.1, 0.25),
+    (0.2, 0.25),
+    (0.35, 0.15),
+    (0.5, 0.1),
+    (1.0, 0.1),
+)  # (of the patches, how often)
 HUBER_NAT = 0.1  # errors of the scorer above this count linearly
 RANK_WEIGHT = 0.2
-RANK_NAT = 0.05  # two seats that differ by less are hardly put in order
+RANK_NAT = 0.05  # two patches that differ by less are hardly put in order
 
 
 @dataclass(frozen=True)
 class Phase:
-    """How seats are placed, by odds, and how large crops are beside those of the settings, up to a part of the run."""
+    """How patches are placed, by odds, and how large crops are beside those of the settings, up to a part of the run."""
 
     until: float
     random: float
@@ -53,50 +63,50 @@ def class_weights(labels: Iterable[NDArray[np.uint8]], classes: int, cap: float)
     counts = np.zeros(classes)
     for image in labels:
         counts += np.bincount(image[image != UNLABELLED], minlength=classes)
-    share = counts / max(counts.sum(), 1)
-    weight = np.divide(1, np.sqrt(share), out=np.zeros(classes), where=share > 0)
-    weight /= max((weight * share).sum(), 1e-12)
+    fraction = counts / max(counts.sum(), 1)
+    weight = np.divide(1, np.sqrt(fraction), out=np.zeros(classes), where=fraction > 0)
+    weight /= max((weight * fraction).sum(), 1e-12)
     return torch.from_numpy(np.minimum(weight, cap).astype(np.float32))
 
 
 def batch_loss(
     model: Segmenter, batch: Batch, weight: Tensor, rng: np.random.Generator, phase: Phase, *, soft_dice: bool
 ) -> Tensor:
-    """Loss of one batch: the map with a drawn share of seats, the glance alone, and what the scorer said of them."""
+    """Loss of one batch: the map with a drawn fraction of patches, the coarse prediction alone, and what the scorer said of them."""
     reading = model.read_coarse(batch.coarse, batch.origin)
     score = model.score(reading).flatten(1)
-    seats = draw_seats(reading.logits.detach(), score.detach(), model.config, rng, phase)
-    fine = batch.fine.gather(1, seats[:, :, None, None, None].expand(-1, -1, *batch.fine.shape[2:]))
-    patches = model.read_fine(reading, fine, seats, batch.origin)
-    empty, nothing = seats[:, :0], patches[:, :0]
-    drawn = model.composite(reading.logits, patches, seats), model.composite(reading.logits, nothing, empty)
-    with_seats, without = (pixel_losses(logits, batch.labels) for logits in drawn)
-    gain = F.avg_pool2d((without - with_seats).detach()[:, None], model.config.patch).flatten(1)
+    patch_index = draw_patches(reading.logits.detach(), score.detach(), model.config, rng, phase)
+    fine = batch.fine.gather(1, patch_index[:, :, None, None, None].expand(-1, -1, *batch.fine.shape[2:]))
+    patches = model.read_fine(reading, fine, patch_index, batch.origin)
+    empty, nothing = patch_index[:, :0], patches[:, :0]
+    drawn = model.composite(reading.logits, patches, patch_index), model.composite(reading.logits, nothing, empty)
+    with_patches, without = (pixel_losses(logits, batch.labels) for logits in drawn)
+    gain = F.avg_pool2d((without - with_patches).detach()[:, None], model.config.patch).flatten(1)
     known = F.max_pool2d((batch.labels != UNLABELLED).float()[:, None], model.config.patch).flatten(1) > 0
-    scoring = scoring_loss(score.gather(1, seats), gain.gather(1, seats), known.gather(1, seats))
+    scoring = scoring_loss(score.gather(1, patch_index), gain.gather(1, patch_index), known.gather(1, patch_index))
     maps = [
         map_loss(logits, losses, batch.labels, weight, soft_dice=soft_dice)
-        for logits, losses in zip(drawn, (with_seats, without), strict=True)
+        for logits, losses in zip(drawn, (with_patches, without), strict=True)
     ]
-    return maps[0] + GLANCE_WEIGHT * maps[1] + SCORER_WEIGHT * scoring
+    return maps[0] + COARSE_PREDICTION_WEIGHT * maps[1] + SCORER_WEIGHT * scoring
 
 
-def draw_seats(
-    glance: Tensor, score: Tensor, config: SegmenterConfig, rng: np.random.Generator, phase: Phase
+def draw_patches(
+    coarse_prediction: Tensor, score: Tensor, config: SegmenterConfig, rng: np.random.Generator, phase: Phase
 ) -> Tensor:
-    """Draw how many seats and which: (B, K) distinct seat numbers. By entropy or gain they are placed with some chance.
+    """Draw how many patches and which: (B, K) distinct patch numbers. By entropy or gain they are placed with some chance.
 
-    ``glance`` are logits of the coarse pixels (B, classes, H/s, W/s), ``score`` the gain of the seats (B, seats).
+    ``coarse_prediction`` are logits of the coarse pixels (B, classes, H/s, W/s), ``score`` the gain of the patches (B, patches).
     """
-    shares, odds = zip(*SHARES, strict=True)
-    count = max(1, round(float(rng.choice(shares, p=odds)) * score.shape[1]))
+    fractions, odds = zip(*FRACTIONS, strict=True)
+    count = max(1, round(float(rng.choice(fractions, p=odds)) * score.shape[1]))
     chance = torch.from_numpy(rng.random(score.shape)).to(score.dtype).to(score.device)
     placed = rng.choice(3, p=(phase.random, phase.entropy, phase.gain))
     if placed == 1:
-        entropy = torch.special.entr(glance.float().softmax(dim=1)).sum(dim=1)
+        entropy = torch.special.entr(coarse_prediction.float().softmax(dim=1)).sum(dim=1)
         score = F.avg_pool2d(entropy[:, None], config.patch // config.factor).flatten(1)
-    worth = chance if placed == 0 else score + 0.1 * score.abs().mean() * chance
-    return worth.argsort(dim=1, descending=True, stable=True)[:, :count]
+    expected_gain = chance if placed == 0 else score + 0.1 * score.abs().mean() * chance
+    return expected_gain.argsort(dim=1, descending=True, stable=True)[:, :count]
 
 
 def pixel_losses(logits: Tensor, labels: Tensor) -> Tensor:
@@ -126,18 +136,18 @@ def map_loss(logits: Tensor, losses: Tensor, labels: Tensor, weight: Tensor, *, 
 
 
 def scoring_loss(score: Tensor, gain: Tensor, known: Tensor | None = None) -> Tensor:
-    """How far scores of seats are from what these gained, in size and in order, (B, K) and (B, K); gains are clipped.
+    """How far scores of patches are from what these gained, in size and in order, (B, K) and (B, K); gains are clipped.
 
-    Huber's loss and, with a fifth of its weight, the pairs of a scene that stand in the wrong order. Seats that are not
+    Huber's loss and, with a fifth of its weight, the pairs of a scene that stand in the wrong order. Patches that are not
     ``known`` (B, K), which nothing is labelled in, have no say; 0, with a gradient of 0, where none is known.
     """
-    told = torch.ones_like(score, dtype=torch.bool) if known is None else known
-    if not told.any():
+    known_gain = torch.ones_like(score, dtype=torch.bool) if known is None else known
+    if not known_gain.any():
         return score.sum() * 0.0
     gain = gain.clamp(-MOST_GAIN, MOST_GAIN)
-    size = F.smooth_l1_loss(score[told], gain[told], beta=HUBER_NAT)
+    size = F.smooth_l1_loss(score[known_gain], gain[known_gain], beta=HUBER_NAT)
     apart = gain[:, :, None] - gain[:, None, :]
-    pairs = (apart > 0) & told[:, :, None] & told[:, None, :]
+    pairs = (apart > 0) & known_gain[:, :, None] & known_gain[:, None, :]
     if not pairs.any():
         return size
     wrong = F.softplus((score[:, None, :] - score[:, :, None]) / RANK_NAT)

@@ -43,7 +43,7 @@ START_FROM = (  # in words
     "a vision transformer of timm or DeiT, a Segmenter checkpoint with its variant.yml, or weights that `spectralzoom"
     " train` made"
 )
-SAME_SPREAD = 0.1  # columns of the same data differ by no more, as a share
+SAME_SPREAD = 0.1  # columns of the same data differ by no more, as a fraction
 LICENCES = ("licence", "license")
 CLASS_HEADS = ("coarse_classes", "fine_classes", "scorer")  # the scorer reads probabilities of classes
 _BLOCK = "encoder.blocks.*."

@@ -19,10 +19,10 @@ from torch import Tensor, nn
 from models.network.machine import PROCESSOR, keep_freed_memory
 from models.network.segmenter import Segmenter
 from models.network.sizes import SegmenterConfig
+from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from models.training.examples import Batch, CropSampler, Example
-from models.training.looks import REFERENCE_MS, Looks
 from models.training.objective import PHASES, batch_loss, class_weights, phase_at
-from models.weights.sealed_files import load_checkpoint, save_checkpoint
+from models.weights.checksummed_files import load_checkpoint, save_checkpoint
 from pipeline.errors import PipelineError, WeightsError
 from pipeline.geometry.grid import UNLABELLED
 
@@ -83,7 +83,7 @@ class Trainer:
         gain_shift: NDArray[np.float32],
         settings: TrainingSettings,
         start: Mapping[str, Tensor] | None = None,
-        looks: Looks | None = None,
+        scan_passes: CaptureAugmentation | None = None,
         device: str = PROCESSOR,
     ) -> None:
         self.settings, self.gain_shift, self.device = settings, gain_shift, device
@@ -92,9 +92,11 @@ class Trainer:
             torch.manual_seed(settings.seed)
             self.model = Segmenter(config)
         if start is not None:
-            strange = self.model.load_state_dict(start, strict=False).unexpected_keys
-            if strange:
-                raise WeightsError(f"the network has no place for {len(strange)} tensors, the first {strange[0]}")
+            out_of_range = self.model.load_state_dict(start, strict=False).unexpected_keys
+            if out_of_range:
+                raise WeightsError(
+                    f"the network has no place for {len(out_of_range)} tensors, the first {out_of_range[0]}"
+                )
         self.model.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.averaged = copy.deepcopy(self.model).eval()
         parameters = list(self.model.parameters())  # matrices and kernels decay, gains and shifts do not
@@ -107,7 +109,7 @@ class Trainer:
         for larger in {phase.larger for phase in PHASES}:
             crop = round(settings.crop * math.sqrt(larger))
             self.samplers[larger] = CropSampler(
-                examples, config.patch, config.factor, crop, noise=settings.noise, looks=looks
+                examples, config.patch, config.factor, crop, noise=settings.noise, scan_passes=scan_passes
             )
         self.weight = class_weights([one.labels for one in examples], config.classes, settings.weight_cap).to(device)
         self.course = Course()
@@ -218,14 +220,14 @@ def train(
     report: Callable[[Progress], None] = lambda progress: None,
     *,
     start: Mapping[str, Tensor] | None = None,
-    looks: Looks | None = None,
+    scan_passes: CaptureAugmentation | None = None,
     checkpoint: Path | None = None,
     keep_every_s: float = KEEP_EVERY_S,
     device: str = PROCESSOR,
 ) -> tuple[Segmenter, dict[str, float | int]]:
     """Train a segmenter of these sizes; give its averaged weights and a summary (steps, last loss, seconds).
 
-    The same settings and examples start from the same weights and draw the same crops and seats. What follows is equal
+    The same settings and examples start from the same weights and draw the same crops and patches. What follows is equal
     to rounding only: sums differ in their last bit with where memory lies, and ``minutes`` may end the run elsewhere.
 
     ``start``: Named tensors that the network begins with; others are drawn. ``checkpoint``: File that the state is kept
@@ -236,7 +238,7 @@ def train(
     beside the checkpoint. WeightsError : a tensor of ``start`` that the network has no place for.
     """
     keep_freed_memory()
-    trainer = Trainer(config, examples, gain_shift, settings, start, looks, device)
+    trainer = Trainer(config, examples, gain_shift, settings, start, scan_passes, device)
     identity = run_identity(config, examples, settings, start)
     if checkpoint is not None:
         trainer.go_on(checkpoint, identity)
@@ -276,7 +278,7 @@ def run_identity(
 
 
 def rate_at(done: float) -> float:
-    """Learning rate over the run as a share of the highest: 5 % warm-up, then a cosine down to 1 %."""
+    """Learning rate over the run as a fraction of the highest: 5 % warm-up, then a cosine down to 1 %."""
     if done < 0.05:
         return 0.05 + 0.95 * done / 0.05
     return float(0.01 + 0.99 * 0.5 * (1 + np.cos(np.pi * (done - 0.05) / 0.95)))

@@ -1,1 +1,1 @@
-"""Files of tensors: our own sealed weights, and other people's, read without running anything."""
+"""Files of tensors: our own checksummed weights, and other people's, read without running anything."""

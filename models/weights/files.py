@@ -1,4 +1,4 @@
-"""Weights on disk: one sealed file with the tensors, the spectral basis, the classes and how they were made.
+"""Weights on disk: one checksummed file with the tensors, the spectral basis, the classes and how they were made.
 
 The file may also hold what is familiar to the weights and their reader of prior maps: each adds a description and
 tensors of its own, and leaves the key of the weights as it was.
@@ -18,9 +18,8 @@ from safetensors import safe_open
 
 from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis, check_basis, project
-from models.reading.familiar import Familiar, Limits
-from models.weights.parts import FAMILIAR, READER, FamiliarPart, ReaderPart, TrainedOn
-from models.weights.sealed_files import (
+from models.reading.ood import Limits, OodDetector
+from models.weights.checksummed_files import (
     DAMAGED,
     TENSORS,
     broken_seal,
@@ -29,8 +28,9 @@ from models.weights.sealed_files import (
     key_of,
     own_tensors,
     read_about,
-    write_sealed,
+    write_checksummed,
 )
+from models.weights.parts import OOD, READER, OodPart, ReaderPart, TrainedOn
 from pipeline.errors import WeightsError
 from pipeline.lazy import deferred
 from pipeline.readings import readings_alone
@@ -39,12 +39,12 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-    from models.network import memory_reader, segmenter
-    from models.network.memory_reader import MemoryReader
+    from models.network import segmenter, temporal_reader
     from models.network.segmenter import Segmenter
+    from models.network.temporal_reader import TemporalReader
 else:
     torch = deferred("torch")
-    memory_reader = deferred("models.network.memory_reader")
+    temporal_reader = deferred("models.network.temporal_reader")
     segmenter = deferred("models.network.segmenter")
 
 NORMALISATION = ("centre", "spread", "whitening")
@@ -65,7 +65,7 @@ class Description:
     class_names: tuple[str, ...]
     record: dict[str, Any]
     key: str = ""  # names what the weights hold
-    familiar: FamiliarPart | None = None
+    ood_detector: OodPart | None = None
     reader: ReaderPart | None = None
     about: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)  # all of it, hashes too
 
@@ -112,7 +112,7 @@ class Weights:
 
 
 def save_weights(weights: Weights, path: Path) -> None:
-    """Write the file, sealed, by a temporary name and a rename, so that it is whole or absent.
+    """Write the file, checksummed, by a temporary name and a rename, so that it is whole or absent.
 
     Raises WeightsError where the disk refuses.
     """
@@ -136,28 +136,28 @@ def _key(about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> str:
 
 def _write(path: Path, about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
     try:
-        write_sealed(path, about, tensors)
+        write_checksummed(path, about, tensors)
     except OSError as error:
         raise WeightsError(f"cannot write weights to {path}: {error.strerror}; choose another -o") from error
 
 
-def add_familiar(
-    weights: Path, out: Path, familiar: Familiar, trained_on: TrainedOn, record: Mapping[str, Any]
+def add_ood(
+    weights: Path, out: Path, ood_detector: OodDetector, trained_on: TrainedOn, record: Mapping[str, Any]
 ) -> None:
     """Write the weights of a file with what is familiar to them to ``out``, which may be the same file.
 
     Raises WeightsError: the weights cannot be read, or ``out`` not be written.
     """
-    limits = familiar.limits
-    arrays = {name: getattr(familiar, name) for name in OF_COMPONENTS}
+    limits = ood_detector.limits
+    arrays = {name: getattr(ood_detector, name) for name in OF_COMPONENTS}
     arrays |= {name: getattr(limits, name) for name in OF_LIMITS}
     tensors = {name: torch.from_numpy(np.ascontiguousarray(one, np.float32)) for name, one in arrays.items()}
-    told = {"bands": familiar.bands, "steps": list(limits.steps), "trained_on": trained_on.as_dict()}
-    _add_part(weights, out, FAMILIAR, {**told, "record": dict(record)}, tensors)
+    about = {"bands": ood_detector.bands, "steps": list(limits.steps), "trained_on": trained_on.as_dict()}
+    _add_part(weights, out, OOD, {**about, "record": dict(record)}, tensors)
 
 
-def add_reader(weights: Path, out: Path, reader: MemoryReader, record: Mapping[str, Any]) -> None:
-    """Write the weights of a file with their reader of prior maps to ``out``. Raises as `add_familiar`."""
+def add_reader(weights: Path, out: Path, reader: TemporalReader, record: Mapping[str, Any]) -> None:
+    """Write the weights of a file with their reader of prior maps to ``out``. Raises as `add_ood`."""
     about = {"sizes": reader.sizes.as_dict(), "record": dict(record)}
     _add_part(weights, out, READER, about, dict(reader.state_dict()))
 
@@ -174,26 +174,26 @@ def _add_part(source: Path, out: Path, part: str, about: Mapping[str, Any], tens
     _write(out, {**described.about, "keys": keys, part: about}, kept | added)
 
 
-def load_familiar(weights: Path) -> Familiar:
+def load_ood(weights: Path) -> OodDetector:
     """Read what is familiar to weights. WeightsError: their file has no such part, or it is damaged."""
     described = describe_weights(weights)
-    if described.familiar is None:
+    if described.ood_detector is None:
         raise WeightsError(
             f"{weights} does not say what is familiar to it; measure it with: spectralzoom train DATASET"
             f" --familiar {weights} -o {weights}"
         )
-    tensors, about = _read_part(weights, described, FAMILIAR, spreads=("light", "rates")), described.familiar
+    tensors, about = _read_part(weights, described, OOD, spreads=("light", "rates")), described.ood_detector
     try:
         arrays = {name: tensors[name].double().numpy() for name in (*OF_COMPONENTS, *OF_LIMITS)}
         limits = Limits(arrays["rates"], arrays["light"], about.steps, arrays["fine"], arrays["coarse"])
-        found = Familiar(**{name: arrays[name] for name in OF_COMPONENTS}, limits=limits, bands=about.bands)
+        found = OodDetector(**{name: arrays[name] for name in OF_COMPONENTS}, limits=limits, bands=about.bands)
         found.lit(float(limits.light[0]))  # refuses a covariance that is none
     except (KeyError, ValueError) as error:
         raise WeightsError(f"{weights} is damaged: what is familiar: {error}; copy or measure it again") from error
     return found
 
 
-def load_reader(weights: Path) -> MemoryReader:
+def load_reader(weights: Path) -> TemporalReader:
     """Read the reader of prior maps of weights. WeightsError: their file has none, or it is damaged."""
     described = describe_weights(weights)
     if described.reader is None:
@@ -203,7 +203,7 @@ def load_reader(weights: Path) -> MemoryReader:
         )
     tensors = _read_part(weights, described, READER)
     with torch.device("meta"):
-        reader = memory_reader.MemoryReader(described.reader.sizes)
+        reader = temporal_reader.TemporalReader(described.reader.sizes)
     try:
         reader.load_state_dict(tensors, assign=True)
     except RuntimeError as error:
@@ -217,9 +217,9 @@ def _read_part(path: Path, described: Description, part: str, spreads: Sequence[
     start = f"{part}."
     with _opened(path, "pt") as file:
         tensors = own_tensors(file, start)
-    told = {name: value for name, value in described.about[TENSORS].items() if name.startswith(start)}
+    about = {name: value for name, value in described.about[TENSORS].items() if name.startswith(start)}
     own = {name.removeprefix(start): tensor for name, tensor in tensors.items()}
-    if wrong := changed_tensor(told, tensors) or unusable(own, spreads):
+    if wrong := changed_tensor(about, tensors) or unusable(own, spreads):
         raise WeightsError(f"{path} is damaged: {wrong}; copy or train the file again")
     return own
 
@@ -260,10 +260,10 @@ def read_tensors(path: Path, described: Description) -> dict[str, Tensor]:
         claimed = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
         if wrong := misfit(described.config, claimed):
             raise WeightsError(f"{path}: {wrong}; train it again")
-        parts = (f"{FAMILIAR}.", f"{READER}.")
+        parts = (f"{OOD}.", f"{READER}.")
         tensors = {name: tensor for name, tensor in own_tensors(file).items() if not name.startswith(parts)}
-    told = {name: value for name, value in described.about[TENSORS].items() if not name.startswith(parts)}
-    if wrong := changed_tensor(told, tensors):
+    about = {name: value for name, value in described.about[TENSORS].items() if not name.startswith(parts)}
+    if wrong := changed_tensor(about, tensors):
         raise WeightsError(f"{path} is damaged: {wrong}; copy or train the file again")
     if wrong := unusable(tensors, (SPREAD,)):
         raise WeightsError(f"{path}: {wrong}; copy or train the file again")
@@ -289,14 +289,14 @@ def describe_weights(path: Path) -> Description:
         names, record = tuple(map(str, about["class_names"])), dict(about["record"])
         check_basis(basis, config.columns)
         keys = about["keys"]
-        familiar = FamiliarPart.read(keys[FAMILIAR], about[FAMILIAR]) if FAMILIAR in about else None
+        ood_detector = OodPart.read(keys[OOD], about[OOD]) if OOD in about else None
         reader = ReaderPart.read(keys[READER], about[READER], config) if READER in about else None
         key = str(keys["weights"])
     except (KeyError, TypeError, ValueError) as error:
         raise WeightsError(f"{path}: its description is damaged ({error}); copy or train the file again") from error
     if len(names) != config.classes:
         raise WeightsError(f"{path} names {len(names)} classes, its segmenter has {config.classes}")
-    return Description(config, basis, names, record, key, familiar, reader, about)
+    return Description(config, basis, names, record, key, ood_detector, reader, about)
 
 
 @contextmanager

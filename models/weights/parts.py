@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from models.evaluation.expected_scores import MapScores
-from models.network.sizes import MemorySizes, SegmenterConfig
+from models.network.sizes import SegmenterConfig, TemporalSizes
 
-FAMILIAR, READER = "familiar", "memory"  # their entries in the description, and the beginnings of their tensors' names
+OOD, READER = "familiar", "memory"  # their entries in the description, and the beginnings of their tensors' names
 TRAINED_ON = "trained_on"  # its entry in a record
 MAP_SCORES = "map_scores"  # of the record: how what maps expect to score came true, where that was measured
 MOST_WIDTH = 1024
@@ -55,7 +55,7 @@ class TrainedOn:
 
 
 @dataclass(frozen=True)
-class FamiliarPart:
+class OodPart:
     """What is familiar to weights, by its description."""
 
     key: str  # names what it holds
@@ -65,10 +65,10 @@ class FamiliarPart:
     record: Mapping[str, Any]  # command, scenes, calibration, map scores
 
     @staticmethod
-    def read(key: str, about: Mapping[str, Any]) -> FamiliarPart:
+    def read(key: str, about: Mapping[str, Any]) -> OodPart:
         """Read an entry of a description. Raises KeyError, TypeError or ValueError where something is missing."""
         trained_on, steps = TrainedOn.read(about[TRAINED_ON]), tuple(map(int, about["steps"]))
-        found = FamiliarPart(key, trained_on, steps, int(about["bands"]), about["record"])
+        found = OodPart(key, trained_on, steps, int(about["bands"]), about["record"])
         _ = found.map_scores
         return found
 
@@ -84,13 +84,13 @@ class ReaderPart:
     """The reader of prior maps of weights, by its description."""
 
     key: str
-    sizes: MemorySizes
+    sizes: TemporalSizes
     record: Mapping[str, Any]
 
     @staticmethod
     def read(key: str, about: Mapping[str, Any], config: SegmenterConfig) -> ReaderPart:
         """Read an entry of a description. KeyError, TypeError, ValueError: missing, or not for such a network."""
-        sizes = MemorySizes(**about["sizes"])
+        sizes = TemporalSizes(**about["sizes"])
         if (sizes.classes, sizes.columns, sizes.factor) != (config.classes, config.columns, config.factor):
             raise ValueError(f"its reader of prior maps is for another network: {sizes.as_dict()}")
         if not 0 < sizes.width <= MOST_WIDTH or not 0 < sizes.coarse_width <= MOST_WIDTH:

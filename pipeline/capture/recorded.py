@@ -32,7 +32,7 @@ Numbers = NDArray[np.intp]
 ReadLines = Callable[[Numbers], NDArray[np.uint16]]
 
 BLOCK_LINES = 64  # read at a time
-STRIP_PX = 1.0  # a planned strip may lie so far beside the recorded one
+SWATH_PX = 1.0  # a planned strip may lie so far beside the recorded one
 REACH_STEPS = 0.75  # and a planned line from the nearest recorded one: half their distance, more where that varies,
 PLANNED_REACH = 0.5  # or so much of the planned distance of lines, where that is more
 FINE_ENOUGH = 1.5  # recorded lines may lie so many times farther apart than planned ones
@@ -295,7 +295,7 @@ class RecordedSource:
         return (
             recorded.along == sweep.along
             and sweep.binning % recorded.binning == 0
-            and abs(recorded.strip_px - sweep.strip_px) <= STRIP_PX
+            and abs(recorded.swath_px - sweep.swath_px) <= SWATH_PX
             and one.line_distance / self.camera.ifov_rad <= FINE_ENOUGH * sweep.step
         )
 
@@ -309,16 +309,16 @@ class RecordedSource:
                 f"sweeps along {axes}"
             )
         missing = int(np.argmax(place < 0))
-        planned = np.array([sweep.strip_px, sweep.line_px()[missing]])
+        planned = np.array([sweep.swath_px, sweep.line_px()[missing]])
         apart = [np.hypot(*(one.tangents / self.camera.ifov_rad - planned).T) for one in alike]
         which = int(np.argmin([np.nanmin(distance) for distance in apart]))
         number = int(np.nanargmin(apart[which]))
         recorded = alike[which].sweep
-        strip_px, scan_px = alike[which].tangents[number] / self.camera.ifov_rad
+        swath_px, scan_px = alike[which].tangents[number] / self.camera.ifov_rad
         raise NotRecordedError(
             f"line {missing} of sweep {sweep.name} was never taken: it lies at {planned[1]:g} px of the scan on the "
             f"strip at {planned[0]:g} px (binning {sweep.binning}, step {sweep.step}), the nearest recorded line, "
-            f"{number} of {recorded.name}, at {scan_px:.6g} px on {strip_px:.6g} px (binning {recorded.binning}, step "
+            f"{number} of {recorded.name}, at {scan_px:.6g} px on {swath_px:.6g} px (binning {recorded.binning}, step "
             f"{recorded.step}). Ask for lines on the recording's own strips, no finer than they were recorded"
         )
 
@@ -400,7 +400,7 @@ def sum_references(references: References, samples: int) -> References:
 
 def _same_lines(one: Sweep, other: Sweep) -> bool:
     """Whether two sweeps have the same lines and samples; places are compared as derived sweeps state them."""
-    apart = max(abs(one.strip_px - other.strip_px), abs(one.start_px - other.start_px))
+    apart = max(abs(one.swath_px - other.swath_px), abs(one.start_px - other.start_px))
     return apart <= SAME_PX and (one.along, one.lines, one.step, one.binning) == (
         other.along,
         other.lines,
@@ -411,7 +411,7 @@ def _same_lines(one: Sweep, other: Sweep) -> bool:
 
 def _equal(one: References, other: References) -> bool:
     """Whether all frames of two references are the same, bit for bit."""
-    frames = ("dark", "white", "panel", "bad", "flat")
+    frames = ("dark", "white", "white_reference", "bad", "flat")
     pairs = [(getattr(one, name), getattr(other, name)) for name in frames]
     return one.by_mirror == other.by_mirror and all(
         (left is None) == (right is None) and (left is None or np.array_equal(left, right)) for left, right in pairs

@@ -66,15 +66,15 @@ class RecordedPasses:
 
         Raises NotRecordedError: neither the planned strips nor the recorded ones have the lines.
         """
-        found = self.served(planned) or self.served(self._on_recorded_strips(planned)) or []
+        found = self.served(planned) or self.served(self._on_recorded_swaths(planned)) or []
         if not found:
             for sweep in planned:
                 self.source.pick(sweep)  # names the first line that is missing
         return found
 
-    def strips(self, start_px: float) -> list[Sweep]:
+    def swaths(self, start_px: float) -> list[Sweep]:
         """Give the strips of recorded lines at full resolution, from ``start_px`` on and without lines yet."""
-        places = sorted({sweep.strip_px for sweep in self._full_sweeps()})
+        places = sorted({sweep.swath_px for sweep in self._full_sweeps()})
         return [
             Sweep(f"fine-{number:03d}", "fine", self.axes[0], place, start_px, 0) for number, place in enumerate(places)
         ]
@@ -106,7 +106,7 @@ class RecordedPasses:
         """Recorded sweeps that have every line at full resolution."""
         return [one.sweep for one in self.source.sweeps if one.sweep.step == one.sweep.binning == 1]
 
-    def _on_recorded_strips(self, planned: Sequence[Sweep]) -> list[Sweep]:
+    def _on_recorded_swaths(self, planned: Sequence[Sweep]) -> list[Sweep]:
         """Sweeps of the planned step and binning on every strip of a recorded scan, over the lines taken there."""
         if not planned or len(self._kinds) > 1:  # runs of a fine pass are no scan of the field
             return []
@@ -117,7 +117,7 @@ class RecordedPasses:
             lines = int((high - low) // like.step) + 1
             start = low - (like.step - 1) / 2
             name = f"{like.name.rpartition('-')[0]}-{len(found)}"
-            found.append(replace(like, name=name, strip_px=one.sweep.strip_px, start_px=start, lines=lines))
+            found.append(replace(like, name=name, swath_px=one.sweep.swath_px, start_px=start, lines=lines))
         return found
 
     def _exposure_ms(self, sweep: Sweep) -> float | None:

@@ -2,7 +2,7 @@
 
 The rectification places lines by their positions alone. Of a `Sweep` it takes ``along`` (which axis of the scene a line
 lies along), ``binning`` (pixels a sample), ``step`` (the distance of lines, for gaps, turns and the pitch of
-registration) and ``name``. ``strip_px``, ``start_px`` and ``lines`` matter to whoever plans, and to the choice of
+registration) and ``name``. ``swath_px``, ``start_px`` and ``lines`` matter to whoever plans, and to the choice of
 recorded lines.
 """
 
@@ -86,13 +86,13 @@ def fit_sweep(
             f"sweep {name} turns back at line {lines[np.argmax(turned)]}; give each way of the scan a sweep of its "
             "own, by a column 'sweep' in the pointing table"
         )
-    strip, bend = float(np.median(across)), np.abs(across - np.median(across))
+    swath, bend = float(np.median(across)), np.abs(across - np.median(across))
     most = MOST_BEND * camera.samples
     if bend.max() > most:
         worst = int(np.argmax(bend))
         raise SceneError(
             f"sweep {name} is not straight: line {lines[worst]} lies {bend[worst]:.4g} px beside the strip at "
-            f"{strip:.4g} px, and at most {most:g} px are allowed; cut the scan into straighter parts by a column "
+            f"{swath:.4g} px, and at most {most:g} px are allowed; cut the scan into straighter parts by a column "
             "'sweep', or mark single wrong lines with valid = 0"
         )
     step = max(round(abs(distance)), 1)
@@ -102,7 +102,7 @@ def fit_sweep(
         name,
         "fine" if step == binning == 1 else "coarse",
         along,
-        strip_px=_stated(strip),
+        swath_px=_stated(swath),
         start_px=_stated(lowest - (step - 1) / 2),
         lines=len(position),
         step=step,
@@ -140,8 +140,8 @@ def covered_field(sweeps: Sequence[Sweep], tangents: Sequence[Floats], camera: L
     for sweep, centres in zip(sweeps, tangents, strict=True):
         known = centres[np.isfinite(centres).all(axis=1)] / camera.ifov_rad
         outer = np.array([known[:, 1].min(), known[:, 1].max()])[:, None]
-        _, seen = points_of_scan(sweep.strip_px, camera, outer, ends * camera.ifov_rad)
-        parts.setdefault(round(sweep.strip_px), []).append((float(seen[0].max()), float(seen[1].min())))
+        _, seen = points_of_scan(sweep.swath_px, camera, outer, ends * camera.ifov_rad)
+        parts.setdefault(round(sweep.swath_px), []).append((float(seen[0].max()), float(seen[1].min())))
     begin = max(min(low for low, _ in part) for part in parts.values()) - 0.5
     end = min(max(high for _, high in part) for part in parts.values()) + 0.5
     if end - begin < 1:

@@ -1,4 +1,4 @@
-"""The scene grid: its pixels, seats of the fine pass, coarse pixels, and how sizes that do not divide are padded."""
+"""The scene grid: its pixels, patches of the fine pass, coarse pixels, and how sizes that do not divide are padded."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ UNLABELLED = 255  # in (y, x) uint8 images of class indices: this pixel has none
 
 @dataclass(frozen=True)
 class SceneGrid:
-    """A scene of ``height`` x ``width`` px cut into seats of ``patch`` px, coarse pixels of ``factor`` px.
+    """A scene of ``height`` x ``width`` px cut into patches of ``patch`` px, coarse pixels of ``factor`` px.
 
     The padded grid is the smallest multiple of ``patch * factor`` that holds the scene, so that a coarse patch
-    (``patch`` coarse pixels a side) covers ``factor`` x ``factor`` whole seats. Seats are numbered row by row over the
+    (``patch`` coarse pixels a side) covers ``factor`` x ``factor`` whole patches. Patches are numbered row by row over the
     padded grid; those without a valid pixel are never bought.
     """
 
@@ -38,8 +38,8 @@ class SceneGrid:
         return -(-self.height // cell) * cell, -(-self.width // cell) * cell
 
     @property
-    def seat_shape(self) -> tuple[int, int]:
-        """(rows, columns) of seats on the padded grid."""
+    def patch_shape(self) -> tuple[int, int]:
+        """(rows, columns) of patches on the padded grid."""
         y, x = self.padded_shape
         return y // self.patch, x // self.patch
 
@@ -48,26 +48,26 @@ class SceneGrid:
         """(y, x) of the coarse pixels that hold part of the scene."""
         return -(-self.height // self.factor), -(-self.width // self.factor)
 
-    def valid_share(self) -> NDArray[np.float64]:
-        """Share of each seat's pixels that lie on the scene, (rows, columns) in 0..1."""
-        rows, columns = self.seat_shape
+    def valid_fraction(self) -> NDArray[np.float64]:
+        """Fraction of each patch's pixels that lie on the scene, (rows, columns) in 0..1."""
+        rows, columns = self.patch_shape
         down = np.clip(self.height - np.arange(rows) * self.patch, 0, self.patch)
         across = np.clip(self.width - np.arange(columns) * self.patch, 0, self.patch)
         return down[:, None] * across[None, :] / self.patch**2
 
-    def valid_seats(self) -> NDArray[np.intp]:
-        """Numbers of the seats that hold a valid pixel, ascending."""
-        return np.flatnonzero(self.valid_share().ravel() > 0)
+    def valid_patches(self) -> NDArray[np.intp]:
+        """Numbers of the patches that hold a valid pixel, ascending."""
+        return np.flatnonzero(self.valid_fraction().ravel() > 0)
 
-    def seat_origin(self, seats: NDArray[np.integer]) -> NDArray[np.intp]:
-        """(seat, 2) y and x of the first pixel of each seat."""
-        rows, columns = np.divmod(np.asarray(seats), self.seat_shape[1])
+    def patch_origin(self, patch_index: NDArray[np.integer]) -> NDArray[np.intp]:
+        """(patch, 2) y and x of the first pixel of each patch."""
+        rows, columns = np.divmod(np.asarray(patch_index), self.patch_shape[1])
         return np.stack([rows, columns], axis=-1).astype(np.intp) * self.patch
 
 
-def seat_pixels(grid: SceneGrid, image: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Cut a (y, x) image of the scene into seats, (seat, y, x) by their numbers; False beyond the scene."""
-    (rows, columns), p = grid.seat_shape, grid.patch
+def patch_pixels(grid: SceneGrid, image: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Cut a (y, x) image of the scene into patches, (patch, y, x) by their numbers; False beyond the scene."""
+    (rows, columns), p = grid.patch_shape, grid.patch
     padded = np.zeros(grid.padded_shape, np.bool_)
     padded[: grid.height, : grid.width] = image
     return padded.reshape(rows, p, columns, p).transpose(0, 2, 1, 3).reshape(rows * columns, p, p)

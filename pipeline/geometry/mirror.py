@@ -153,8 +153,8 @@ def mirror_throughput(position: ArrayLike) -> Floats:
     Raises PoseError: a position is not finite or beyond the rim.
     """
     normal = position_to_normal(position)
-    share: Floats = -normal[..., 2] / normal.dtype.type(_HALF)
-    return share
+    fraction: Floats = -normal[..., 2] / normal.dtype.type(_HALF)
+    return fraction
 
 
 def line_centre(along: Floats, scan: Floats, across: ArrayLike) -> Floats:

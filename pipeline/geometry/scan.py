@@ -41,7 +41,7 @@ class Sweep:
     name: str
     kind: Literal["coarse", "fine"]
     along: Axis  # scene axis that the line lies along; the scan goes along the other
-    strip_px: float  # of the line centres, on the axis along the line
+    swath_px: float  # of the line centres, on the axis along the line
     start_px: float  # of the first held position, on the scan axis
     lines: int
     step: int = 1
@@ -117,7 +117,7 @@ def line_positions(sweep: Sweep, camera: LineCamera) -> Floats:
 
 
 def _aim(sweep: Sweep, camera: LineCamera, scan_px: Floats) -> Floats:
-    tangents = np.stack([np.full_like(scan_px, sweep.strip_px), scan_px], axis=-1) * camera.ifov_rad
+    tangents = np.stack([np.full_like(scan_px, sweep.swath_px), scan_px], axis=-1) * camera.ifov_rad
     return direction_to_position(scene_to_direction(tangents))
 
 
@@ -133,26 +133,26 @@ def shifted_position(position: Floats, shift_px: Floats, camera: LineCamera) -> 
 
 
 def scan_of_points(
-    strip_px: float, camera: LineCamera, along_px: ArrayLike, scan_px: ArrayLike
+    swath_px: float, camera: LineCamera, along_px: ArrayLike, scan_px: ArrayLike
 ) -> tuple[Floats, Floats]:
-    """Give the line through scene points and where on it they lie, for line centres on ``strip_px``.
+    """Give the line through scene points and where on it they lie, for line centres on ``swath_px``.
 
     Scan coordinate of the line's centre [px], and the slope k_y / k_z at which the camera sees the point; the points
     ``along_px`` and ``scan_px`` broadcast [px].
     """
-    xi0 = strip_px * camera.ifov_rad
+    xi0 = swath_px * camera.ifov_rad
     xi, eta = np.asarray(along_px, np.float64) * camera.ifov_rad, np.asarray(scan_px, np.float64) * camera.ifov_rad
     centre = line_centre(xi, eta, xi0)
     return centre / camera.ifov_rad, camera_slope(xi, eta, xi0, centre)
 
 
-def points_of_scan(strip_px: float, camera: LineCamera, scan_px: ArrayLike, slope: ArrayLike) -> tuple[Floats, Floats]:
+def points_of_scan(swath_px: float, camera: LineCamera, scan_px: ArrayLike, slope: ArrayLike) -> tuple[Floats, Floats]:
     """Give the scene points (along, scan) [px] that rays of ``slope`` see from line centres at ``scan_px``.
 
     The inverse of ``scan_of_points``. With xi0 the strip, e the scan tangent of the line's centre,
     N = sqrt(1 + xi0^2 + e^2) and q = N - e, the line is eta = e + (xi - xi0) xi0 / q (its slope is tan psi).
     """
-    xi0 = strip_px * camera.ifov_rad
+    xi0 = swath_px * camera.ifov_rad
     e, u = np.asarray(scan_px, np.float64) * camera.ifov_rad, np.asarray(slope, np.float64)
     size = np.sqrt(1 + xi0**2 + e**2)
     q = np.where(e > 0, (1 + xi0**2) / (size + np.maximum(e, 0)), size - np.minimum(e, 0))  # nothing cancels
@@ -162,7 +162,7 @@ def points_of_scan(strip_px: float, camera: LineCamera, scan_px: ArrayLike, slop
 
 def scene_to_sweep(sweep: Sweep, camera: LineCamera, along_px: ArrayLike, scan_px: ArrayLike) -> Floats:
     """Give continuous (line, sample) of scene points on a sweep as planned, (..., 2) float64; integers are centres."""
-    centre, slope = scan_of_points(sweep.strip_px, camera, along_px, scan_px)
+    centre, slope = scan_of_points(sweep.swath_px, camera, along_px, scan_px)
     line = (centre - sweep.start_px - (sweep.step - 1) / 2) / sweep.step
     return np.stack([line, camera.sample_at(slope, sweep.binning)], axis=-1)
 
@@ -170,7 +170,7 @@ def scene_to_sweep(sweep: Sweep, camera: LineCamera, along_px: ArrayLike, scan_p
 def sweep_to_scene(sweep: Sweep, camera: LineCamera) -> tuple[Floats, Floats]:
     """Give the scene points of every sample at mid exposure: along and scan, (line, sample) each [px]."""
     slopes = camera.pixel_slopes(sweep.binning)
-    return points_of_scan(sweep.strip_px, camera, sweep.line_px()[:, None], slopes[None, :])
+    return points_of_scan(sweep.swath_px, camera, sweep.line_px()[:, None], slopes[None, :])
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ Places = Callable[[Floats, Floats], Floats]  # of x and y
 WGS84 = 4326  # by EPSG
 APART_DEG = 1e-3  # of places between which a degree is measured
 STEP_M = 100.0  # over which the slopes of a projection are taken
-TIES = 9  # along each side of a grid, between which the scale of its map is linear
+TIE_POINTS = 9  # along each side of a grid, between which the scale of its map is linear
 
 
 def zoomed_out(geobox: GeoBox, factor: int, shape: tuple[int, int]) -> GeoBox:
@@ -61,7 +61,7 @@ def crs_name(geobox: GeoBox) -> str:
 def class_areas_m2(geobox: GeoBox, classes: NDArray[np.uint8], count: int) -> Floats:
     """Sum the ground under the pixels (y, x) of each class, (count,) [m2]: of the ellipsoid, whatever the map's scale.
 
-    A projection's scale is asked for at `TIES` places along each side, and linear between: off by 2e-5 in a UTM zone.
+    A projection's scale is asked for at `TIE_POINTS` places along each side, and linear between: off by 2e-5 in a UTM zone.
     """
     areas = np.zeros(256)
     for row, line in enumerate(pixel_rows_m2(geobox)):
@@ -79,13 +79,13 @@ def pixel_side_m(geobox: GeoBox) -> float:
 def pixel_rows_m2(geobox: GeoBox) -> Iterator[Floats]:
     """Ground under the pixels of each row, (x,) [m2], from the first row down."""
     rows, columns = geobox.shape
-    ties_y, ties_x = np.linspace(0, rows, TIES), np.linspace(0, columns, TIES)
-    ties = _m2_of_units(geobox, *np.meshgrid(ties_x, ties_y))
+    tie_points_y, tie_points_x = np.linspace(0, rows, TIE_POINTS), np.linspace(0, columns, TIE_POINTS)
+    tie_points = _m2_of_units(geobox, *np.meshgrid(tie_points_x, tie_points_y))
     units = abs(float(geobox.affine.determinant))
-    across = np.array([np.interp(np.arange(columns) + 0.5, ties_x, line) for line in ties])  # (tie, x)
-    place = (np.arange(rows) + 0.5) * (TIES - 1) / rows
-    for above, share in zip(place.astype(int), place % 1, strict=True):
-        yield units * ((1 - share) * across[above] + share * across[above + 1])
+    across = np.array([np.interp(np.arange(columns) + 0.5, tie_points_x, line) for line in tie_points])  # (tie, x)
+    place = (np.arange(rows) + 0.5) * (TIE_POINTS - 1) / rows
+    for above, fraction in zip(place.astype(int), place % 1, strict=True):
+        yield units * ((1 - fraction) * across[above] + fraction * across[above + 1])
 
 
 def _m2_of_units(geobox: GeoBox, column: Floats, row: Floats) -> Floats:

@@ -281,8 +281,8 @@ def round_step(step_m: float) -> float:
 
 def _bounds(frame: MapFrame, outline: Floats) -> tuple[float, float, float, float]:
     """Box on the map around part of a scene, given by its corners [px]; lines of the scene are lines on the ground."""
-    share = np.linspace(0, 1, EDGE_POINTS)[:, None, None]
-    sides = outline + share * (np.roll(outline, -1, axis=0) - outline)
+    fraction = np.linspace(0, 1, EDGE_POINTS)[:, None, None]
+    sides = outline + fraction * (np.roll(outline, -1, axis=0) - outline)
     places = frame.ground_to_map(frame.view.scene_to_ground(sides.reshape(-1, 2)))
     if not np.isfinite(places).all():
         raise PoseError(f"the field's footprint does not fit on the map {frame.crs.name} (pose {frame.view.pose})")
@@ -296,9 +296,9 @@ def _between(exact: Floats, pixels: slice, axis: int) -> Floats:
     count, last = pixels.stop - pixels.start, exact.shape[axis] - 1
     place = (np.arange(count) + 0.5) * (last / count)
     index = np.minimum(place.astype(np.intp), last - 1)
-    share = np.expand_dims(place - index, [other for other in range(exact.ndim) if other != axis])
+    fraction = np.expand_dims(place - index, [other for other in range(exact.ndim) if other != axis])
     lower, upper = np.take(exact, index, axis), np.take(exact, index + 1, axis)
-    between: Floats = lower + share * (upper - lower)
+    between: Floats = lower + fraction * (upper - lower)
     return between
 
 

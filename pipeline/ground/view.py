@@ -185,8 +185,8 @@ class GroundView:
             if excess[here] >= 0:
                 kept.append(corners[here])
             if (excess[here] >= 0) != (excess[there] >= 0):
-                share = excess[here] / (excess[here] - excess[there])
-                kept.append(corners[here] + share * (corners[there] - corners[here]))
+                fraction = excess[here] / (excess[here] - excess[there])
+                kept.append(corners[here] + fraction * (corners[there] - corners[here]))
         return np.array(kept).reshape(-1, 2)
 
 

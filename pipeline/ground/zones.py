@@ -117,17 +117,17 @@ class FieldZones:
         """(y, x) pixels of which no map is drawn."""
         return ~self.kept
 
-    def seat_shares(self, grid: SceneGrid) -> Floats:
-        """Share of each seat's pixels that are kept, (seat,) 0..1; 0 of every seat that a no-go zone touches."""
-        shares = _seat_means(self.kept, grid)
-        return shares if self.no_go is None else np.where(_seat_means(self.no_go, grid) > 0, 0.0, shares)
+    def patch_fractions(self, grid: SceneGrid) -> Floats:
+        """Fraction of each patch's pixels that are kept, (patch,) 0..1; 0 of every patch that a no-go zone touches."""
+        fractions = _patch_means(self.kept, grid)
+        return fractions if self.no_go is None else np.where(_patch_means(self.no_go, grid) > 0, 0.0, fractions)
 
-    def shown_seats(self, grid: SceneGrid) -> Mask:
-        """Seats (seat,) of the patches that are read at once and hold a pixel that is kept: what lines have to show."""
-        rows, columns = grid.seat_shape
-        kept = _seat_means(self.kept, grid).reshape(rows // grid.factor, grid.factor, columns // grid.factor, -1) > 0
+    def shown_patches(self, grid: SceneGrid) -> Mask:
+        """Patches (patch,) of the patches that are read at once and hold a pixel that is kept: what lines have to show."""
+        rows, columns = grid.patch_shape
+        kept = _patch_means(self.kept, grid).reshape(rows // grid.factor, grid.factor, columns // grid.factor, -1) > 0
         shown: Mask = np.repeat(np.repeat(kept.any(axis=(1, 3)), grid.factor, axis=0), grid.factor, axis=1)
-        return (shown & (grid.valid_share() > 0)).ravel()
+        return (shown & (grid.valid_fraction() > 0)).ravel()
 
 
 def field_zones(area: Mask | None, no_go: Mask | None) -> FieldZones | None:
@@ -139,14 +139,14 @@ def field_zones(area: Mask | None, no_go: Mask | None) -> FieldZones | None:
     return None if kept.all() else FieldZones(kept, no_go if no_go is not None and no_go.any() else None)
 
 
-def _seat_means(mask: Mask, grid: SceneGrid) -> Floats:
-    """Mean over the pixels of each seat that lie on the scene, (seat,)."""
+def _patch_means(mask: Mask, grid: SceneGrid) -> Floats:
+    """Mean over the pixels of each patch that lie on the scene, (patch,)."""
     padded = np.zeros(grid.padded_shape, bool)
     padded[: grid.height, : grid.width] = mask
-    rows, columns = grid.seat_shape
+    rows, columns = grid.patch_shape
     total = padded.reshape(rows, grid.patch, columns, grid.patch).sum(axis=(1, 3)) / grid.patch**2
-    share = grid.valid_share()
-    means: Floats = np.divide(total, share, out=np.zeros(share.shape), where=share > 0)
+    fraction = grid.valid_fraction()
+    means: Floats = np.divide(total, fraction, out=np.zeros(fraction.shape), where=fraction > 0)
     return means.ravel()
 
 
@@ -159,7 +159,7 @@ class PlotFigures:
     mapped_pixels: int  # of them, those with a class
     area_m2: float | None  # of the mapped pixels; None where nobody knows how large they are
     confidence: float | None  # mean over the mapped pixels that have one
-    shares: dict[str, float | None]  # of the mapped ground, by class; of the pixels where that is not known
+    fractions: dict[str, float | None]  # of the mapped ground, by class; of the pixels where that is not known
 
 
 def figures_of_plots(

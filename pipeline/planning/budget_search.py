@@ -26,7 +26,7 @@ def spend(field: Field, budget_s: float, floor: float = 0.0) -> Cover:
     """Choose the runs with the most worth found whose true price is at most ``budget_s``.
 
     Between the two covers that the budget lies between, the price of a second is halved down; what then is left goes
-    to one run more, or to one run made longer. ``worth`` counts what was bought for its worth, at least.
+    to one run more, or to one run made longer. ``expected_gain`` counts what was bought for its worth, at least.
 
     With a ``floor`` [worth/s] the price of a second never falls below it, and nothing is bought merely to use up the
     time. A lower floor, or with the same one a bigger budget, never buys less.
@@ -46,14 +46,14 @@ def full_scan_pays(field: Field, full_s: float, floor: float) -> bool:
     The covers asked do not depend on the floor: a full scan that pays at one floor does at every lower one.
     """
     return not floor or all(
-        field.total - cover.worth >= floor * (full_s - seconds)
+        field.total - cover.expected_gain >= floor * (full_s - seconds)
         for cover, seconds in ((cover, cover.seconds(field.prices)) for cover, _ in covers(field))
         if seconds < full_s
     )
 
 
 def _better(one: Cover, other: Cover) -> Cover:
-    return other if other.worth > one.worth else one
+    return other if other.expected_gain > one.expected_gain else one
 
 
 def _between(
@@ -69,7 +69,7 @@ def _between(
         rate = float(np.sqrt(low_rate * high_rate)) if np.isfinite(low_rate) else high_rate / STEP
         middle = best_cover(field, low.runs, rate)
         prices = [cover.seconds(field.prices) for cover in (low, middle, high)]
-        if not (low.worth < middle.worth < high.worth and prices[0] < prices[1] < prices[2]):
+        if not (low.expected_gain < middle.expected_gain < high.expected_gain and prices[0] < prices[1] < prices[2]):
             break
         if prices[1] <= budget_s and rate >= floor:
             low, low_rate, best = middle, rate, _better(best, middle)
@@ -77,18 +77,20 @@ def _between(
             high, high_rate = middle, rate
     for cover in (low, *_peeled(field, high)):
         for found in (cover,) if floor else (cover, _one_more(field, cover, budget_s)):
-            pays = not floor or found.worth - low.worth >= floor * (found.even_s - low.even_s)
+            pays = not floor or found.expected_gain - low.expected_gain >= floor * (found.even_s - low.even_s)
             if pays and found.seconds(field.prices) <= budget_s:
-                best = _better(best, replace(found, worth=min(found.worth, high.worth)))
+                best = _better(best, replace(found, expected_gain=min(found.expected_gain, high.expected_gain)))
     return best
 
 
 def _peeled(field: Field, cover: Cover) -> Iterator[Cover]:
     """Covers with ever less of one: whole runs or their ends go, those first that are worth least per second."""
     for _ in range(PEELS):
-        seats, times = np.unique(np.concatenate([field.shown_seats(run) for run in cover.runs]), return_counts=True)
-        own = np.zeros(len(field.worth))
-        own[seats[times == 1]] = field.worth[seats[times == 1]]
+        patch_index, times = np.unique(
+            np.concatenate([field.shown_patches(run) for run in cover.runs]), return_counts=True
+        )
+        own = np.zeros(len(field.expected_gain))
+        own[patch_index[times == 1]] = field.expected_gain[patch_index[times == 1]]
         cuts = [(cut, place) for place, run in enumerate(cover.runs) for cut in _cuts(field, run, own)]
         (_, rest), place = min(cuts, key=lambda cut: cut[0][0])
         cover = field.cover([*cover.runs[:place], *rest, *cover.runs[place + 1 :]])
@@ -100,13 +102,13 @@ def _peeled(field: Field, cover: Cover) -> Iterator[Cover]:
 def _cuts(field: Field, run: ScanRun, own: Floats) -> list[tuple[float, list[ScanRun]]]:
     """Best way to shorten a run from its start, from its end, and to drop it: worth lost per second, what remains."""
     views, prices = field.shown(run), field.prices
-    worth = own[field.views.seat[views]]
+    expected_gain = own[field.views.patch_number[views]]
     whole = prices.even_seconds(run.stop - run.first, 1)
-    found: list[tuple[float, list[ScanRun]]] = [(float(worth.sum()) / whole, [])]
+    found: list[tuple[float, list[ScanRun]]] = [(float(expected_gain.sum()) / whole, [])]
     for from_start in (True, False):
         away = field.views.first[views] - run.first if from_start else run.stop - field.views.stop[views]
         order = np.argsort(away, kind="stable")
-        saved, lost = away[order][1:], np.cumsum(worth[order])[:-1]  # without the views before each one
+        saved, lost = away[order][1:], np.cumsum(expected_gain[order])[:-1]  # without the views before each one
         if not np.any(saved > 0):
             continue
         density = np.where(saved > 0, lost / np.maximum(saved * prices.even_line_s, prices.line_s), np.inf)
@@ -118,9 +120,9 @@ def _cuts(field: Field, run: ScanRun, own: Floats) -> list[tuple[float, list[Sca
 
 
 def cheapest_cover(field: Field) -> Cover:
-    """Find the least seconds for all seats that are worth something.
+    """Find the least seconds for all patches that are worth something.
 
-    Begun from strips side by side, from each seat on its own, and by the falling prices; the cheapest end is taken.
+    Begun from strips side by side, from each patch on its own, and by the falling prices; the cheapest end is taken.
     """
     if field.total <= 0:
         return Cover()
@@ -133,39 +135,39 @@ def cheapest_cover(field: Field) -> Cover:
 
 
 def covers(field: Field) -> Iterator[tuple[Cover, float]]:
-    """Covers and the price of a second [worth/s] they are best for, falling; the last shows all seats."""
+    """Covers and the price of a second [worth/s] they are best for, falling; the last shows all patches."""
     cover = Cover()
     if field.total <= 0:
         return
     step = STEP if len(field.windows) == 1 else WIDE_STEP
     rate, least, still = _first_rate(field), _least_rate(field), 0
-    while rate > least and cover.worth < field.total * (1 - NEGLIGIBLE):
+    while rate > least and cover.expected_gain < field.total * (1 - NEGLIGIBLE):
         found = best_cover(field, cover.runs, rate)
         still = still + 1 if found.runs == cover.runs else 0
         cover = found
         if not still:
             yield cover, rate
         rate *= step ** (2**still)
-    if cover.worth < field.total * (1 - NEGLIGIBLE):
+    if cover.expected_gain < field.total * (1 - NEGLIGIBLE):
         yield field.cover(_completed(field, cover.runs)), rate
 
 
 def _first_rate(field: Field) -> float:
     """The most worth per second that a single run has: where the first of them pays (Dinkelbach, 1967)."""
-    tables, prices = field.tables(field.worth), field.prices
+    tables, prices = field.tables(field.expected_gain), field.prices
     seconds = prices.even_line_s * tables.unit * np.arange(tables.closed.shape[1])
     rate = 0.0
     for _ in range(MOST_STEPS):
         toll = tables.begun - rate * seconds
         net = tables.closed - rate * seconds - np.minimum.accumulate(toll, axis=1)
-        strip, stop = (int(at) for at in np.unravel_index(int(net.argmax()), net.shape))
-        if net[strip, stop] <= 0:
+        swath, stop = (int(at) for at in np.unravel_index(int(net.argmax()), net.shape))
+        if net[swath, stop] <= 0:
             break
-        first = int(toll[strip, : stop + 1].argmin())
+        first = int(toll[swath, : stop + 1].argmin())
         if first == stop:  # nothing but rounding is left to gain
             break
-        worth = float(tables.closed[strip, stop] - tables.begun[strip, first])
-        density = worth / float(seconds[stop] - seconds[first] + prices.run_s)
+        expected_gain = float(tables.closed[swath, stop] - tables.begun[swath, first])
+        density = expected_gain / float(seconds[stop] - seconds[first] + prices.run_s)
         if density <= rate * (1 + RATE_SLACK):
             break
         rate = density
@@ -173,9 +175,9 @@ def _first_rate(field: Field) -> float:
 
 
 def _least_rate(field: Field) -> float:
-    """A rate at which no seat is too dear."""
+    """A rate at which no patch is too dear."""
     every = field.prices.even_seconds(field.views.lines * len(field.side_by_side), len(field.side_by_side))
-    lowest = float(field.worth[field.worth > 0].min(initial=field.total))
+    lowest = float(field.expected_gain[field.expected_gain > 0].min(initial=field.total))
     return max(LEAST_RATE * field.total, lowest / 2) / max(every, field.prices.line_s)
 
 
@@ -188,34 +190,34 @@ def _one_more(field: Field, cover: Cover, budget_s: float) -> Cover:
     if cells > 0:
         cells = min(cells, tables.closed.shape[1] - 1)
         gain = tables.closed[:, cells:] - tables.begun[:, : tables.begun.shape[1] - cells]
-        strip, at = (int(place) for place in np.unravel_index(int(gain.argmax()), gain.shape))
-        new = ScanRun(strip, at * tables.unit, (at + cells) * tables.unit)
-        options.append((float(gain[strip, at]), [*runs, new]))
+        swath, at = (int(place) for place in np.unravel_index(int(gain.argmax()), gain.shape))
+        new = ScanRun(swath, at * tables.unit, (at + cells) * tables.unit)
+        options.append((float(gain[swath, at]), [*runs, new]))
     lines = prices.most_lines(budget_s, len(runs)) - cover.lines
     for place, run in enumerate(runs if lines > 0 else []):
-        for grown in (ScanRun(run.strip, run.first, run.stop + lines), ScanRun(run.strip, run.first - lines, run.stop)):
+        for grown in (ScanRun(run.swath, run.first, run.stop + lines), ScanRun(run.swath, run.first - lines, run.stop)):
             first, stop = max(grown.first, 0), min(grown.stop, views.lines)
             at, end = -(-first // tables.unit), stop // tables.unit
-            gained = float(tables.closed[run.strip, end] - tables.begun[run.strip, at])
-            options.append((gained, [*runs[:place], ScanRun(run.strip, first, stop), *runs[place + 1 :]]))
+            gained = float(tables.closed[run.swath, end] - tables.begun[run.swath, at])
+            options.append((gained, [*runs[:place], ScanRun(run.swath, first, stop), *runs[place + 1 :]]))
     if not options:
         return cover
     gained, chosen = max(options, key=lambda option: option[0])
     if gained <= NEGLIGIBLE * field.total:
         return cover
-    chosen = field.trimmed(joined(chosen, 0), field.worth)
+    chosen = field.trimmed(joined(chosen, 0), field.expected_gain)
     found = field.cover(chosen)
-    return Cover(found.runs, cover.worth + gained, found.even_s)
+    return Cover(found.runs, cover.expected_gain + gained, found.even_s)
 
 
 def _completed(field: Field, runs: Sequence[ScanRun]) -> list[ScanRun]:
-    """Add, for each seat that no run shows, the shortest run that does."""
+    """Add, for each patch that no run shows, the shortest run that does."""
     views, found = field.views, list(runs)
     lengths = views.stop - views.first
-    order = np.lexsort((np.arange(len(lengths)), lengths, views.seat))
-    shortest = order[np.unique(views.seat[order], return_index=True)[1]]
+    order = np.lexsort((np.arange(len(lengths)), lengths, views.patch_number))
+    shortest = order[np.unique(views.patch_number[order], return_index=True)[1]]
     left = field.left(found)
-    for view in shortest[left[views.seat[shortest]] > 0].tolist():
-        strip = int(np.searchsorted(views.edges, view, side="right")) - 1
-        found.append(ScanRun(strip, int(views.first[view]), int(views.stop[view])))
+    for view in shortest[left[views.patch_number[shortest]] > 0].tolist():
+        swath = int(np.searchsorted(views.edges, view, side="right")) - 1
+        found.append(ScanRun(swath, int(views.first[view]), int(views.stop[view])))
     return joined(found, field.gap)

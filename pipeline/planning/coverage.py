@@ -61,7 +61,7 @@ def coarse_sweeps(
     return [replace(sweep, exposure_ms=exposure_ms) for sweep in covering]
 
 
-def plain_sweeps(
+def uniform_sweeps(
     grid: SceneGrid,
     camera: LineCamera,
     along: Axis,
@@ -147,7 +147,7 @@ def sweep_outline(sweep: Sweep, camera: LineCamera, *, parts: int = 32) -> NDArr
     """Give what a sweep's lines show as a polygon, (point, 2) x and y from the scene's centre [px]."""
     scan = np.linspace(sweep.start_px - 0.5, sweep.start_px + sweep.lines * sweep.step - 0.5, parts + 1)
     edges = np.array([-camera.samples / 2, camera.samples / 2]) * camera.ifov_rad
-    along, across = points_of_scan(sweep.strip_px, camera, scan[:, None], edges)
+    along, across = points_of_scan(sweep.swath_px, camera, scan[:, None], edges)
     sides = np.stack([along, across] if sweep.along == "x" else [across, along], axis=-1)
     return np.concatenate([sides[:, 0], sides[::-1, 1]])
 
@@ -169,16 +169,16 @@ def _cover(grid: SceneGrid, camera: LineCamera, along: Axis, *, step: int, overl
     kind: Literal["coarse", "fine"] = "fine" if step == 1 else "coarse"
     name = "full" if step == 1 else "coarse"
     sweeps = []
-    for number, strip in enumerate(_strip_centres((low, high), scan, camera, step, overlap_px)):
-        ends = strip + reach_px(strip, scan, camera, step)
+    for number, swath in enumerate(_swath_centres((low, high), scan, camera, step, overlap_px)):
+        ends = swath + reach_px(swath, scan, camera, step)
         seen = np.clip(ends, low + step / 2, high - step / 2)
-        start, lines = _scan_range(float(strip), seen, scan, camera, step)
-        sweeps.append(Sweep(f"{name}-{number}", kind, along, float(strip), start, lines, step, step))
+        start, lines = _scan_range(float(swath), seen, scan, camera, step)
+        sweeps.append(Sweep(f"{name}-{number}", kind, along, float(swath), start, lines, step, step))
     check_reach(sweeps, camera)
     return sweeps
 
 
-def _strip_centres(
+def _swath_centres(
     field: tuple[float, float], scan: int, camera: LineCamera, binning: int, least_overlap: float
 ) -> NDArray[np.float64]:
     """Place the fewest strips that cover ``field``, all overlaps equal and half as much beyond either end.
@@ -203,23 +203,23 @@ def _strip_centres(
             return centres
 
 
-def reach_px(strip: float, scan: int, camera: LineCamera, binning: int) -> NDArray[np.float64]:
+def reach_px(swath: float, scan: int, camera: LineCamera, binning: int) -> NDArray[np.float64]:
     """Tell how far the outer edges of a line's samples lie from its centre, at least: (2,) below and above 0 [px]."""
     count = camera.samples // binning
     edges = np.array([-camera.samples / 2, count * binning - camera.samples / 2]) * camera.ifov_rad
     probes = np.append(np.linspace(-scan / 2, scan / 2, _PROBES), 0.0)
-    along, _ = points_of_scan(strip, camera, probes[:, None], edges)
-    return np.array([along[:, 0].max(), along[:, 1].min()]) - strip
+    along, _ = points_of_scan(swath, camera, probes[:, None], edges)
+    return np.array([along[:, 0].max(), along[:, 1].min()]) - swath
 
 
-def _scan_range(strip: float, seen: NDArray[np.float64], scan: int, camera: LineCamera, step: int) -> tuple[float, int]:
+def _scan_range(swath: float, seen: NDArray[np.float64], scan: int, camera: LineCamera, step: int) -> tuple[float, int]:
     """First held position [px] and number of lines that show all rows of ``seen``, rotation and taps included.
 
     Lines stand on the scene's own rows, so that a strip through the axis needs no interpolation along the scan.
     """
     origin = (step - 1 - (scan - 1)) / 2  # centre of the first (coarse) row
     rows = origin + step * np.array([0, -(-scan // step) - 1])
-    centres, _ = scan_of_points(strip, camera, seen[:, None], rows)
+    centres, _ = scan_of_points(swath, camera, seen[:, None], rows)
     # The line through a point moves one way with either coordinate, so the corners hold the extremes.
     first = int(np.floor((centres.min() - origin) / step + ROUNDING_PX)) - TAPS_BEFORE
     last = int(np.floor((centres.max() - origin) / step + ROUNDING_PX)) + TAPS_AFTER
@@ -234,13 +234,13 @@ def check_reach(sweeps: Sequence[Sweep], camera: LineCamera) -> None:
         except PoseError as error:
             end = float(np.abs(sweep.held_px()).max())
             raise PoseError(
-                f"sweep {sweep.name} needs lines centred at {sweep.strip_px:.0f} px along and up to {end:.0f} px "
+                f"sweep {sweep.name} needs lines centred at {sweep.swath_px:.0f} px along and up to {end:.0f} px "
                 f"across, beyond the mirror's range: {error}; use a smaller scene or a smaller angle per pixel"
             ) from error
 
 
 def sweeps_over(sweeps: Sequence[Sweep], grid: SceneGrid, camera: LineCamera, shown: NDArray[np.bool_]) -> list[Sweep]:
-    """Give the lines of sweeps that show some of the ``shown`` (seat,) seats; sweeps that show none are left out.
+    """Give the lines of sweeps that show some of the ``shown`` (patch,) patches; sweeps that show none are left out.
 
     Lines stay where they lie and keep their order, between the first and the last that is needed none is left out, and
     the lines that resampling reads beside a pixel are among them. Of a sweep with all its lines nothing changes.
@@ -254,9 +254,11 @@ def some_lines(sweep: Sweep, first: int, stop: int) -> Sweep:
     return replace(sweep, start_px=sweep.start_px + first * sweep.step, lines=stop - first)
 
 
-def lines_showing(sweep: Sweep, grid: SceneGrid, camera: LineCamera, seats: NDArray[np.intp]) -> tuple[int, int] | None:
-    """Give the first line that shows something of the seats and the one after the last; None where none does."""
-    at = _corners_on(sweep, grid, camera, seats)
+def lines_showing(
+    sweep: Sweep, grid: SceneGrid, camera: LineCamera, patch_index: NDArray[np.intp]
+) -> tuple[int, int] | None:
+    """Give the first line that shows something of the patches and the one after the last; None where none does."""
+    at = _corners_on(sweep, grid, camera, patch_index)
     ends = -0.5 - TAPS_BEFORE, camera.samples // sweep.binning - 0.5 + TAPS_AFTER
     seen = (at[..., 1].max(axis=0) >= ends[0]) & (at[..., 1].min(axis=0) <= ends[1])
     if not seen.any():
@@ -267,22 +269,24 @@ def lines_showing(sweep: Sweep, grid: SceneGrid, camera: LineCamera, seats: NDAr
     return (first, stop) if first < stop else None
 
 
-def seats_shown(sweeps: Sequence[Sweep], grid: SceneGrid, camera: LineCamera) -> NDArray[np.bool_]:
-    """Tell of which seats (seat,) samples of some sweeps show something, without what is read beside them."""
-    seats, shown = grid.valid_seats(), np.zeros(int(np.prod(grid.seat_shape)), np.bool_)
+def patches_shown(sweeps: Sequence[Sweep], grid: SceneGrid, camera: LineCamera) -> NDArray[np.bool_]:
+    """Tell of which patches (patch,) samples of some sweeps show something, without what is read beside them."""
+    patch_index, shown = grid.valid_patches(), np.zeros(int(np.prod(grid.patch_shape)), np.bool_)
     for sweep in sweeps:
-        at = _corners_on(sweep, grid, camera, seats)
+        at = _corners_on(sweep, grid, camera, patch_index)
         ends = sweep.lines - 0.5, camera.samples // sweep.binning - 0.5
-        shown[seats] |= ((at.max(axis=0) > -0.5) & (at.min(axis=0) < ends)).all(axis=-1)
+        shown[patch_index] |= ((at.max(axis=0) > -0.5) & (at.min(axis=0) < ends)).all(axis=-1)
     return shown
 
 
-def _corners_on(sweep: Sweep, grid: SceneGrid, camera: LineCamera, seats: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Line and sample of the corners of seats on a sweep, (corner, seat, 2).
+def _corners_on(
+    sweep: Sweep, grid: SceneGrid, camera: LineCamera, patch_index: NDArray[np.intp]
+) -> NDArray[np.float64]:
+    """Line and sample of the corners of patches on a sweep, (corner, patch, 2).
 
     Either is monotone in either coordinate, so that a rectangle's corners hold its extremes.
     """
-    origin, size = grid.seat_origin(seats), np.array([grid.height, grid.width])
+    origin, size = grid.patch_origin(patch_index), np.array([grid.height, grid.width])
     low, high = origin - size / 2, np.minimum(origin + grid.patch, size) - size / 2
     along, scan = (1, 0) if sweep.along == "x" else (0, 1)
     corners_along = np.stack([low, low, high, high])[..., along]

@@ -1,8 +1,8 @@
 """Two ways to spend seconds on lines that need no model: blocks evenly spaced over the field, or placed at random.
 
-A block is as wide as some rows of seats need, taps and the line's rotation included, so that all it shows is used. Wide
+A block is as wide as some rows of patches need, taps and the line's rotation included, so that all it shows is used. Wide
 blocks waste fewer lines and set-ups, narrow ones are spread better and leave fewer of the seconds unspent: the width
-that shows most seats for the seconds is taken.
+that shows most patches for the seconds is taken.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from numpy.typing import NDArray
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, CostModel, Sweep
-from pipeline.planning.scan_runs import ScanRun, cut_strip, joined
-from pipeline.planning.strips import Views, covered_seats, look_from, strips_at_seats
+from pipeline.planning.scan_runs import ScanRun, cut_swath, joined
+from pipeline.planning.swaths import Views, covered_patches, edges_from, swaths_at_patches
 
-WIDTHS = (1, 2, 3, 4, 6, 8, 16)  # rows of seats in a block
+WIDTHS = (1, 2, 3, 4, 6, 8, 16)  # rows of patches in a block
 
 
 @dataclass(frozen=True)
 class Lines:
-    """Lines of the fine pass and the seats they show, ascending."""
+    """Lines of the fine pass and the patches they show, ascending."""
 
     sweeps: list[Sweep]
-    seats: NDArray[np.intp]
+    patch_index: NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -37,21 +37,21 @@ class LineBlocks:
     grid: SceneGrid
     camera: LineCamera
     cost: CostModel
-    strips: tuple[Sweep, ...]
+    swaths: tuple[Sweep, ...]
     blocks: tuple[ScanRun, ...]
 
     def sweeps(self, chosen: Sequence[ScanRun]) -> list[Sweep]:
         """Blocks as sweeps; those closer than a second set-up takes are scanned through."""
         setup = int(self.cost.setup_seconds(self.camera) / (self.camera.frame_ms * 1e-3))
-        return [cut_strip(self.strips[run.strip], run, f"block-{run.strip}") for run in joined(chosen, setup)]
+        return [cut_swath(self.swaths[run.swath], run, f"block-{run.swath}") for run in joined(chosen, setup)]
 
     def seconds(self, chosen: Sequence[ScanRun]) -> float:
         """Price of some blocks [s]."""
         return self.cost.seconds(self.sweeps(chosen), self.camera)
 
-    def seats(self, chosen: Sequence[ScanRun]) -> NDArray[np.intp]:
-        """Give the seats that blocks show, ascending."""
-        return covered_seats(self.grid, self.camera, self.sweeps(chosen))
+    def patch_index(self, chosen: Sequence[ScanRun]) -> NDArray[np.intp]:
+        """Give the patches that blocks show, ascending."""
+        return covered_patches(self.grid, self.camera, self.sweeps(chosen))
 
     def evenly(self, budget_s: float) -> list[ScanRun]:
         """Choose the most evenly spaced blocks that the seconds pay for."""
@@ -76,33 +76,33 @@ class LineBlocks:
 
 
 def most_shown(options: Sequence[LineBlocks], choose: Callable[[LineBlocks], list[ScanRun]]) -> Lines:
-    """Choose blocks of every width, and give the lines of the one that shows the most seats."""
-    chosen = [Lines(blocks.sweeps(some), blocks.seats(some)) for blocks in options for some in [choose(blocks)]]
-    return max(chosen, key=lambda lines: len(lines.seats))
+    """Choose blocks of every width, and give the lines of the one that shows the most patches."""
+    chosen = [Lines(blocks.sweeps(some), blocks.patch_index(some)) for blocks in options for some in [choose(blocks)]]
+    return max(chosen, key=lambda lines: len(lines.patch_index))
 
 
 def line_blocks(grid: SceneGrid, camera: LineCamera, cost: CostModel, along: Axis, rows: int = 1) -> LineBlocks:
-    """Cut the field into blocks of ``rows`` rows of seats, on the fewest strips that show every seat that can be."""
-    valid = grid.valid_share().ravel() > 0
-    views = look_from(grid, camera, strips_at_seats(grid, camera, along), valid)
-    row, column = np.divmod(np.arange(len(valid)), grid.seat_shape[1])
+    """Cut the field into blocks of ``rows`` rows of patches, on the fewest strips that show every patch that can be."""
+    valid = grid.valid_fraction().ravel() > 0
+    views = edges_from(grid, camera, swaths_at_patches(grid, camera, along), valid)
+    row, column = np.divmod(np.arange(len(valid)), grid.patch_shape[1])
     across, down = (column, row) if along == "x" else (row, column)
-    strips = _fewest_strips(views, across)
+    swaths = _fewest_swaths(views, across)
     blocks = []
-    for number, strip in enumerate(strips):
-        own = slice(views.edges[strip], views.edges[strip + 1])
-        place, first, stop = down[views.seat[own]] // rows, views.first[own], views.stop[own]
+    for number, swath in enumerate(swaths):
+        own = slice(views.edges[swath], views.edges[swath + 1])
+        place, first, stop = down[views.patch_number[own]] // rows, views.first[own], views.stop[own]
         blocks += [
             ScanRun(number, int(first[place == at].min()), int(stop[place == at].max())) for at in np.unique(place)
         ]
-    return LineBlocks(grid, camera, cost, tuple(views.strips[strip] for strip in strips), tuple(blocks))
+    return LineBlocks(grid, camera, cost, tuple(views.swaths[swath] for swath in swaths), tuple(blocks))
 
 
-def _fewest_strips(views: Views, across: NDArray[np.intp]) -> list[int]:
-    """Go along the line: of the strips that show the first seats not shown yet, take the one that shows farthest."""
+def _fewest_swaths(views: Views, across: NDArray[np.intp]) -> list[int]:
+    """Go along the line: of the strips that show the first patches not shown yet, take the one that shows farthest."""
     shown = [
-        np.unique(across[views.seat[views.edges[number] : views.edges[number + 1]]])
-        for number in range(len(views.strips))
+        np.unique(across[views.patch_number[views.edges[number] : views.edges[number + 1]]])
+        for number in range(len(views.swaths))
     ]
     left = set(np.concatenate(shown).tolist()) if shown else set()
     chosen: list[int] = []

@@ -33,7 +33,7 @@ class ScanPrices:
 
     @property
     def even_line_s(self) -> float:
-        """A line with its share of a reload: with this the price is additive, and below the true one by < a reload."""
+        """A line with its fraction of a reload: with this the price is additive, and below the true one by < a reload."""
         return self.line_s + self.reload_s / self.lines_per_reload
 
     def seconds(self, lines: int, runs: int) -> float:
@@ -74,7 +74,7 @@ def check_budget(budget: float, coarse_seconds: float, full_seconds: float) -> f
     Raises BudgetError: the budget is not a number in that range, or less than the coarse pass alone; names the least.
     """
     if not isfinite(budget) or not 0 < budget <= 1:
-        raise BudgetError(f"--budget must be a share of the full scan's time above 0 and at most 1, got {budget}")
+        raise BudgetError(f"--budget must be a fraction of the full scan's time above 0 and at most 1, got {budget}")
     if coarse_seconds > full_seconds:
         raise BudgetError(
             f"the coarse pass alone ({coarse_seconds:.1f} s) takes longer than the full scan ({full_seconds:.1f} s), "

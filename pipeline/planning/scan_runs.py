@@ -1,6 +1,6 @@
 """Runs of lines, the best chains of them at a price of a second, and covers: runs that show the most for their price.
 
-Strips overlap and lie at any offset, so a seat is seen from several and counts once. A cover is several chains of
+Strips overlap and lie at any offset, so a patch is seen from several and counts once. A cover is several chains of
 runs, one run after the other along the scan; each chain in turn is chosen anew over all offsets, exactly (a dynamic
 programme), with the others held, until none gets better.
 """
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.scan import Sweep
 from pipeline.planning.prices import ScanPrices
-from pipeline.planning.strips import Views
+from pipeline.planning.swaths import Views
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -30,7 +30,7 @@ NEGLIGIBLE = 1e-12  # of the total worth
 class ScanRun:
     """Lines ``first`` to ``stop`` (half open) of one strip."""
 
-    strip: int
+    swath: int
     first: int
     stop: int
 
@@ -49,10 +49,10 @@ class Tables:
     block: int  # borders closer than this hold no view between them
 
 
-def cut_strip(strip: Sweep, run: ScanRun, name: str) -> Sweep:
+def cut_swath(swath: Sweep, run: ScanRun, name: str) -> Sweep:
     """Give the sweep of a run's lines, named by its first one."""
-    first, lines = strip.start_px + run.first, run.stop - run.first
-    return replace(strip, name=f"{name}-{run.first:05d}", start_px=first, lines=lines)
+    first, lines = swath.start_px + run.first, run.stop - run.first
+    return replace(swath, name=f"{name}-{run.first:05d}", start_px=first, lines=lines)
 
 
 def best_chains(tables: Tables, windows: Ints, line_price: float, run_price: float) -> list[list[ScanRun]]:
@@ -61,7 +61,7 @@ def best_chains(tables: Tables, windows: Ints, line_price: float, run_price: flo
     best(e) = max(best(e - 1), max over strips and c of best(c) + closed(e) - begun(c) - (e - c) line - run), a block
     of borders at a time: no run opens and closes within one.
 
-    ``windows`` are (window, strip) numbers of strips, the prices of one line and of one run in units of worth. A seat
+    ``windows`` are (window, strip) numbers of strips, the prices of one line and of one run in units of worth. A patch
     that two runs of a chain show, which only lines turned far apart allow, was counted twice: the caller has to check.
     """
     borders = tables.closed.shape[1]
@@ -87,13 +87,13 @@ def best_chains(tables: Tables, windows: Ints, line_price: float, run_price: flo
     return [_traced(*each, tables.unit) for each in zip(windows, pick, since, strict=True)]
 
 
-def _traced(strips: Ints, pick: Ints, since: Ints, unit: int) -> list[ScanRun]:
+def _traced(swaths: Ints, pick: Ints, since: Ints, unit: int) -> list[ScanRun]:
     """Runs of a chain, found from the last one back."""
     closes = np.maximum.accumulate(np.where(pick >= 0, np.arange(len(pick)), 0))
     runs, at = [], int(closes[-1])
     while at > 0:
         first = int(since[at])
-        runs.append(ScanRun(int(strips[pick[at]]), first * unit, at * unit))
+        runs.append(ScanRun(int(swaths[pick[at]]), first * unit, at * unit))
         at = int(closes[first])
     return runs[::-1]
 
@@ -102,19 +102,19 @@ def joined(runs: Sequence[ScanRun], gap: int) -> list[ScanRun]:
     """Join runs of one strip that meet or lie at most ``gap`` lines apart, sorted."""
     found: list[ScanRun] = []
     for run in sorted(runs):
-        if found and found[-1].strip == run.strip and run.first <= found[-1].stop + gap:
+        if found and found[-1].swath == run.swath and run.first <= found[-1].stop + gap:
             last = found.pop()
-            run = ScanRun(last.strip, last.first, max(last.stop, run.stop))
+            run = ScanRun(last.swath, last.first, max(last.stop, run.stop))
         found.append(run)
     return found
 
 
 @dataclass(frozen=True)
 class Cover:
-    """Runs, what the seats they show are worth together, and their additive price."""
+    """Runs, what the patches they show are worth together, and their additive price."""
 
     runs: tuple[ScanRun, ...] = ()
-    worth: float = 0.0
+    expected_gain: float = 0.0
     even_s: float = 0.0
 
     @property
@@ -132,14 +132,14 @@ class Field:
     """What can be seen from where, what it is worth, and what lines cost."""
 
     views: Views
-    worth: Floats  # (seat,), 0 for seats that are not wanted
-    column: Ints  # (seat,) place along the line: strips that share none are planned apart
+    expected_gain: Floats  # (patch,), 0 for patches that are not wanted
+    column: Ints  # (patch,) place along the line: strips that fraction none are planned apart
     prices: ScanPrices
 
     @cached_property
     def total(self) -> float:
-        """Worth of all seats that some strip shows."""
-        return float(self.worth[np.unique(self.views.seat)].sum())
+        """Worth of all patches that some strip shows."""
+        return float(self.expected_gain[np.unique(self.views.patch_number)].sum())
 
     @property
     def gap(self) -> int:
@@ -149,20 +149,20 @@ class Field:
     @cached_property
     def unit(self) -> int:
         """Lines between two borders of the tables: 1 unless the field is too large for that."""
-        return max(-(-(self.views.lines + 1) * len(self.views.strips) // TABLE_CELLS), 1)
+        return max(-(-(self.views.lines + 1) * len(self.views.swaths) // TABLE_CELLS), 1)
 
     @cached_property
     def _cells(self) -> tuple[int, Ints, Ints]:
         """Borders along the scan, and the flat table cells of the views' stops (rounded up) and first lines (down)."""
         borders = -(-self.views.lines // self.unit) + 1
-        row = self.views.strip * borders
+        row = self.views.swath * borders
         begun = np.minimum(self.views.first // self.unit + 1, borders - 1)
         return borders, row - (-self.views.stop // self.unit), row + begun
 
     def tables(self, left: Floats) -> Tables:
-        """Cumulate what is left to show, (seat,), over the lines of every strip."""
+        """Cumulate what is left to show, (patch,), over the lines of every strip."""
         borders, *places = self._cells
-        weight, shape = left[self.views.seat], (len(self.views.strips), borders)
+        weight, shape = left[self.views.patch_number], (len(self.views.swaths), borders)
         closed, begun = (np.bincount(at, weight, shape[0] * borders).reshape(shape) for at in places)
         length = int((self.views.stop - self.views.first).min(initial=self.views.lines))
         block = max(length // self.unit, LEAST_BLOCK)
@@ -170,52 +170,52 @@ class Field:
 
     def shown(self, run: ScanRun) -> Ints:
         """Numbers of the views that lie in a run, (view,)."""
-        low, high = self.views.edges[run.strip : run.strip + 2]
+        low, high = self.views.edges[run.swath : run.swath + 2]
         inside = (self.views.first[low:high] >= run.first) & (self.views.stop[low:high] <= run.stop)
         shown: Ints = low + np.flatnonzero(inside)
         return shown
 
-    def shown_seats(self, run: ScanRun) -> Ints:
-        """Seats that lie in a run, (seat,)."""
-        return self.views.seat[self.shown(run)]
+    def shown_patches(self, run: ScanRun) -> Ints:
+        """Patches that lie in a run, (patch,)."""
+        return self.views.patch_number[self.shown(run)]
 
     def left(self, runs: Sequence[ScanRun]) -> Floats:
-        """Worth of each seat that no run shows, 0 for the others, (seat,)."""
-        left = self.worth.copy()
+        """Worth of each patch that no run shows, 0 for the others, (patch,)."""
+        left = self.expected_gain.copy()
         for run in runs:
-            left[self.shown_seats(run)] = 0.0
+            left[self.shown_patches(run)] = 0.0
         return left
 
     def cover(self, runs: Sequence[ScanRun]) -> Cover:
         """Price runs and count what they show."""
         lines = sum(run.stop - run.first for run in runs)
-        return Cover(tuple(runs), self._seen(runs, self.worth), self.prices.even_seconds(lines, len(runs)))
+        return Cover(tuple(runs), self._seen(runs, self.expected_gain), self.prices.even_seconds(lines, len(runs)))
 
     def net(self, runs: Sequence[ScanRun], left: Floats, rate: float) -> float:
         """Worth less price of runs, given what is left to show and that a second costs ``rate``."""
         lines = sum(run.stop - run.first for run in runs)
         return self._seen(runs, left) - rate * self.prices.even_seconds(lines, len(runs))
 
-    def _seen(self, runs: Sequence[ScanRun], worth: Floats) -> float:
-        """Worth of all seats that runs show, each counted once."""
-        seats = np.unique(np.concatenate([np.zeros(0, np.intp), *map(self.shown_seats, runs)]))
-        return float(worth[seats].sum())
+    def _seen(self, runs: Sequence[ScanRun], expected_gain: Floats) -> float:
+        """Worth of all patches that runs show, each counted once."""
+        patch_index = np.unique(np.concatenate([np.zeros(0, np.intp), *map(self.shown_patches, runs)]))
+        return float(expected_gain[patch_index].sum())
 
     def trimmed(self, runs: Sequence[ScanRun], left: Floats) -> list[ScanRun]:
         """Shorten runs to the views that each adds to what is left, one after the other; drop those that add none."""
         left, kept = left.copy(), []
         for run in runs:
             views = self.shown(run)
-            views = views[left[self.views.seat[views]] > 0]
+            views = views[left[self.views.patch_number[views]] > 0]
             if len(views):
                 first, stop = int(self.views.first[views].min()), int(self.views.stop[views].max())
                 kept.append(replace(run, first=first, stop=stop))
-                left[self.views.seat[views]] = 0.0
+                left[self.views.patch_number[views]] = 0.0
         return kept
 
     @cached_property
     def windows(self) -> tuple[Ints, ...]:
-        """Sets of windows, (window, strip) each, that together hold every strip; those of a set share no seat column.
+        """Sets of windows, (window, strip) each, that together hold every strip; those of a set share no patch column.
 
         One window of all strips where the field is up to about three of them wide.
         """
@@ -234,7 +234,7 @@ class Field:
 
     @cached_property
     def side_by_side(self) -> Ints:
-        """Strips that share no seat column, from the lower end up, (window, 1): the layout of a full scan."""
+        """Strips that fraction no patch column, from the lower end up, (window, 1): the layout of a full scan."""
         low, high = self._spans
         found, last = [0], len(low) - 1
         while high[found[-1]] < high[-1]:
@@ -243,11 +243,11 @@ class Field:
 
     @cached_property
     def _spans(self) -> tuple[Ints, Ints]:
-        """First and last column of the seats that each strip shows, made ascending."""
-        column, count = self.column[self.views.seat], len(self.views.strips)
+        """First and last column of the patches that each strip shows, made ascending."""
+        column, count = self.column[self.views.patch_number], len(self.views.swaths)
         low, high = np.full(count, int(column.max(initial=0))), np.zeros(count, np.intp)
-        np.minimum.at(low, self.views.strip, column)
-        np.maximum.at(high, self.views.strip, column)
+        np.minimum.at(low, self.views.swath, column)
+        np.maximum.at(high, self.views.swath, column)
         return np.minimum.accumulate(low[::-1])[::-1], np.maximum.accumulate(high)
 
 
@@ -259,10 +259,10 @@ def best_cover(field: Field, start: Sequence[ScanRun], rate: float) -> Cover:
     """
     starts = [list(start)]
     if len(field.windows) == 1 or not start:
-        side = best_chains(field.tables(field.worth), field.side_by_side, *_priced(field, rate))
-        starts.append(field.trimmed([run for chain in side for run in chain], field.worth))
+        side = best_chains(field.tables(field.expected_gain), field.side_by_side, *_priced(field, rate))
+        starts.append(field.trimmed([run for chain in side for run in chain], field.expected_gain))
     found = [field.cover(_settle(field, runs, rate)) for runs in starts]
-    return max(found, key=lambda cover: cover.worth - rate * cover.even_s)
+    return max(found, key=lambda cover: cover.expected_gain - rate * cover.even_s)
 
 
 def _settle(field: Field, start: Sequence[ScanRun], rate: float) -> list[ScanRun]:
@@ -282,7 +282,7 @@ def _round(field: Field, runs: list[ScanRun], windows: Ints, rate: float) -> lis
     members = [set(window.tolist()) for window in windows]
     layer, layers = 0, 1
     while layer < layers:
-        chains = [_chains([run for run in runs if run.strip in strips]) for strips in members]
+        chains = [_chains([run for run in runs if run.swath in swaths]) for swaths in members]
         layers = max(map(len, chains)) + 1
         chosen = [chain[layer] if layer < len(chain) else [] for chain in chains]
         runs = _again(field, runs, windows, chosen, rate)
@@ -293,7 +293,7 @@ def _round(field: Field, runs: list[ScanRun], windows: Ints, rate: float) -> lis
 def _chains(runs: Sequence[ScanRun]) -> list[list[ScanRun]]:
     """Share runs among as few chains as it takes."""
     chains: list[list[ScanRun]] = []
-    for run in sorted(runs, key=lambda run: (run.first, run.strip)):
+    for run in sorted(runs, key=lambda run: (run.first, run.swath)):
         home = next((chain for chain in chains if chain[-1].stop <= run.first), None)
         if home is None:
             chains.append(home := [])

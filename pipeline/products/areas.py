@@ -34,17 +34,17 @@ MOST_CELLS = 4_000_000
 
 
 @dataclass(frozen=True)
-class ShareEstimate:
+class FractionEstimate:
     """Shares of the classes in what is mapped, and their standard errors."""
 
-    shares: Floats  # (class,)
+    fractions: Floats  # (class,)
     errors: Floats  # (class,)
 
 
-def stratified_shares(mapped: ArrayLike, confusion: ArrayLike) -> ShareEstimate:
+def stratified_fractions(mapped: ArrayLike, confusion: ArrayLike) -> FractionEstimate:
     """Estimate shares from a map's and what pixels of each mapped class turned out to be.
 
-    ``mapped`` is (class,) shares of the map, ``confusion`` (label, mapped class) counts, as
+    ``mapped`` is (class,) fractions of the map, ``confusion`` (label, mapped class) counts, as
     `models.evaluation.metrics.confusion` gives them. The judged pixels are taken for a random sample of each mapped
     class. NaN where a class that is mapped was judged at fewer than two pixels. Raises ShapeError: the sizes differ.
 
@@ -60,12 +60,12 @@ def stratified_shares(mapped: ArrayLike, confusion: ArrayLike) -> ShareEstimate:
     with np.errstate(all="ignore"):  # a class that was not judged says nothing
         of_map = np.where(weight > 0, counts / judged, 0.0)
         spread = np.where(weight > 0, of_map * (1 - of_map) / (judged - 1), 0.0)
-    shares = (weight * of_map).sum(axis=1)  # [1] Eq. 9
+    fractions = (weight * of_map).sum(axis=1)  # [1] Eq. 9
     errors = np.sqrt((weight**2 * spread).sum(axis=1))  # [1] Eq. 10
-    return ShareEstimate(shares, np.where(np.isfinite(shares), errors, np.nan))
+    return FractionEstimate(fractions, np.where(np.isfinite(fractions), errors, np.nan))
 
 
-def probable_shares(strips: Iterable[NDArray[np.floating]], classes: int) -> ShareEstimate:
+def probable_fractions(swaths: Iterable[NDArray[np.floating]], classes: int) -> FractionEstimate:
     """Estimate shares from probabilities (y, x, class), given as strips of a map from the top down.
 
     NaN where a pixel has no class. Strips are as high as a multiple of ``BLOCK_PX``, but for the last. Each pixel is
@@ -73,18 +73,18 @@ def probable_shares(strips: Iterable[NDArray[np.floating]], classes: int) -> Sha
     independent, so that a map in large patches is not taken for surer than it is. NaN without any pixel.
     """
     total, expected, variance = 0, np.zeros(classes), np.zeros(classes)
-    for strip in strips:
-        known = np.isfinite(strip).all(axis=-1)
-        share = np.where(known[..., None], strip, 0.0).astype(np.float64)
+    for swath in swaths:
+        known = np.isfinite(swath).all(axis=-1)
+        fraction = np.where(known[..., None], swath, 0.0).astype(np.float64)
         total += int(known.sum())
-        expected += share.sum(axis=(0, 1))
-        spread = np.sqrt(share * (1 - share))
+        expected += fraction.sum(axis=(0, 1))
+        spread = np.sqrt(fraction * (1 - fraction))
         for axis in (0, 1):
             spread = np.add.reduceat(spread, np.arange(0, spread.shape[axis], BLOCK_PX), axis=axis)
         variance += (spread**2).sum(axis=(0, 1))
     if not total:
-        return ShareEstimate(np.full(classes, np.nan), np.full(classes, np.nan))
-    return ShareEstimate(expected / total, np.sqrt(variance) / total)
+        return FractionEstimate(np.full(classes, np.nan), np.full(classes, np.nan))
+    return FractionEstimate(expected / total, np.sqrt(variance) / total)
 
 
 @dataclass(frozen=True)
@@ -171,8 +171,8 @@ def count_classes(
     return found.reshape(*grid.shape, count)
 
 
-def dose_cells(counts: NDArray[np.int64], doses: Mapping[int, float], least_share: float) -> Floats:
-    """Give the dose of each cell, (row, column): of the classes with a share above ``least_share`` the greatest.
+def dose_cells(counts: NDArray[np.int64], doses: Mapping[int, float], least_fraction: float) -> Floats:
+    """Give the dose of each cell, (row, column): of the classes with a fraction above ``least_fraction`` the greatest.
 
     ``counts`` are pixels (row, column, class), ``doses`` by the class's number. 0 where no treated class has such a
     share, NaN where the map shows nothing of the cell. Raises ShapeError: a class has no count.
@@ -182,7 +182,7 @@ def dose_cells(counts: NDArray[np.int64], doses: Mapping[int, float], least_shar
     total = counts.sum(axis=2)
     result = np.zeros(total.shape)
     for number, dose in doses.items():
-        result = np.maximum(result, np.where(counts[..., number] > least_share * total, dose, 0.0))
+        result = np.maximum(result, np.where(counts[..., number] > least_fraction * total, dose, 0.0))
     return np.where(total > 0, result, np.nan)
 
 

@@ -15,7 +15,7 @@ TILES = 6  # along the shorter side, where the image allows
 LEAST_TILE = 12  # pixels a side
 LEAST_STRENGTH = 0.12
 LEAST_SIGMAS = 4.0  # that the mean over tiles lies from none
-STRONG_SHARE = 0.98  # quantile at which gradients are cut, so that a track or a wall does not speak for the field
+STRONG_FRACTION = 0.98  # quantile at which gradients are cut, so that a track or a wall does not speak for the field
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def _tile_vectors(pixels: Floats) -> NDArray[np.complex128]:
     known = np.isfinite(size)
     if not np.any(size[known] > 0):
         return np.zeros(0, np.complex128)
-    cut = float(np.quantile(size[known], STRONG_SHARE)) or float(size[known].max())
+    cut = float(np.quantile(size[known], STRONG_FRACTION)) or float(size[known].max())
     with np.errstate(invalid="ignore", divide="ignore"):
         scale = np.where(size > cut, cut / size, 1.0)
     pointed: NDArray[np.complex128] = squared * scale

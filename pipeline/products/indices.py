@@ -26,7 +26,7 @@ else:
 Floats = NDArray[np.float32]
 Formula = Callable[[Mapping[str, Any]], Any]
 
-DARK_SHARE = 0.01  # of white: pixels whose bands are darker on the mean have no index
+DARK_FRACTION = 0.01  # of white: pixels whose bands are darker on the mean have no index
 NARROW_NM = 10.0  # how far a band may lie from the wavelength that a narrow one is meant at
 MOST_REFLECTANCE = 1.5  # a cube of which one value in a hundred is above this holds no reflectance
 LAMBDA = "lambda"  # begins the names of what stands for a band's wavelength in a formula
@@ -198,7 +198,7 @@ def index_values(
     has no finite value, as by a division by zero.
     """
     usable: NDArray[np.bool_] = np.isfinite(values).all(axis=-1)
-    usable &= np.where(usable, values.mean(axis=-1), -np.inf) >= DARK_SHARE * white
+    usable &= np.where(usable, values.mean(axis=-1), -np.inf) >= DARK_FRACTION * white
     planes = {band.symbol: values[..., number].astype(np.float64) for number, band in enumerate(index.bands)}
     nm = {LAMBDA + band.symbol: float(wavelength_nm[number]) for number, band in enumerate(index.bands)}
     with np.errstate(all="ignore"):  # what is not finite is NaN by rule

@@ -31,7 +31,7 @@ else:
     shapely = deferred("shapely")
     skimage_measure = deferred("skimage.measure")
 
-MOST_AREA_ERROR = 0.01  # that simplified borders may change a class's area by, as a share of it
+MOST_AREA_ERROR = 0.01  # that simplified borders may change a class's area by, as a fraction of it
 SMALL = (1, 32, 128, 512, 2048)  # px: regions smaller than so many squares of the tolerance keep their outlines
 Classes = NDArray[np.uint8]
 

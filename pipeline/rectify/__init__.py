@@ -1,1 +1,1 @@
-"""From raw lines to pixels of the scene grid: calibration, lookup, resampling, mosaic."""
+"""From raw lines to pixels of the scene grid: calibration, geolocation grid, resampling, mosaic."""

@@ -26,12 +26,12 @@ class Fill:
     element: NDArray[np.intp]
     before: NDArray[np.intp]
     after: NDArray[np.intp]
-    share: Floats32  # of ``after``
+    fraction: Floats32  # of ``after``
 
     def among(self, first: int, stop: int) -> Fill:
         """Those whose elements lie from ``first`` to before ``stop``."""
         here = slice(*np.searchsorted(self.element, (first, stop)))
-        return Fill(self.element[here], self.before[here], self.after[here], self.share[here])
+        return Fill(self.element[here], self.before[here], self.after[here], self.fraction[here])
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Elements:
             out = out.copy()
             out.flat[fill.element[~within] - first] = True
         element, before, after = (at[within] - first for at in (fill.element, fill.before, fill.after))
-        kept = Fill(element, before, after, fill.share[within])
+        kept = Fill(element, before, after, fill.fraction[within])
         whole = self.references
         references = replace(
             whole,
@@ -105,7 +105,7 @@ def _gain(references: References) -> Floats32:
     gain = np.full(span.shape, np.nan, np.float32)
     known = np.isfinite(span) & (span > 0)
     with np.errstate(over="ignore"):
-        np.divide(np.broadcast_to(references.panel, span.shape), span, out=gain, where=known)
+        np.divide(np.broadcast_to(references.white_reference, span.shape), span, out=gain, where=known)
     return gain
 
 
@@ -122,19 +122,19 @@ def _fill_of(wanted: Bools, good: Bools) -> Fill:
     near = one | other
     sample, band = sample[near], bands[column[near]]
     before, after = np.where(one, before, after)[near], np.where(other, after, before)[near]
-    share = (sample - before) / np.maximum(after - before, 1)
-    return Fill(sample * width + band, before * width + band, after * width + band, share.astype(np.float32))
+    fraction = (sample - before) / np.maximum(after - before, 1)
+    return Fill(sample * width + band, before * width + band, after * width + band, fraction.astype(np.float32))
 
 
 def reflectance(raw: NDArray[np.uint16], references: References, *, position: ArrayLike | None = None) -> Floats32:
-    """Turn raw lines into scene values, ``(raw - dark) / (white - dark) * panel / flat / throughput``.
+    """Turn raw lines into scene values, ``(raw - dark) / (white - dark) * white_reference / flat / throughput``.
 
     A bad element takes the value between the nearest good samples of its line and band, at most 8 away, linear in
     sample, so that it spoils only itself; in a sample with more than half of its bands bad none is filled.
 
     ``raw`` is (line, sample, band) uint16 DN; ``position`` (line, 2) mirror X and Y, needed where the references say
     ``by_mirror``: a line whose position is not finite becomes NaN there. (line, sample, band) float32 in the unit of
-    the panel's values, negative below dark; NaN where the white frame is not above the dark one, a reference is not
+    the white reference's values, negative below dark; NaN where the white frame is not above the dark one, a reference is not
     finite, or a bad element is not filled.
 
     Raises ShapeError: the references or the positions do not fit the lines.
@@ -182,7 +182,7 @@ def of_bands(references: References, bands: Sequence[int]) -> References:
         references,
         dark=references.dark[:, chosen],
         white=references.white[:, chosen],
-        panel=references.panel[chosen],
+        white_reference=references.white_reference[chosen],
         bad=None if references.bad is None else references.bad[:, chosen],
         flat=None if references.flat is None else references.flat[:, chosen],
     )
@@ -221,7 +221,7 @@ def _scene_values(raw: NDArray[np.uint16], elements: Elements, line_gain: Floats
         if len(fill.element):
             flat = part.reshape(len(part), -1)
             before = flat[:, fill.before]
-            flat[:, fill.element] = before + (flat[:, fill.after] - before) * fill.share
+            flat[:, fill.element] = before + (flat[:, fill.after] - before) * fill.fraction
     return values
 
 
@@ -273,6 +273,6 @@ def _judged(raw: NDArray[np.uint16], references: References | Elements) -> Eleme
                 f"the lines have {raw.shape[1]} samples and {raw.shape[2]} bands, the {name} frame {frame.shape}; "
                 "take references with the binning and the bands of the sweep"
             )
-    if plain.panel.shape != raw.shape[2:]:
-        raise ShapeError(f"the lines have {raw.shape[2]} bands, the panel {plain.panel.shape}")
+    if plain.white_reference.shape != raw.shape[2:]:
+        raise ShapeError(f"the lines have {raw.shape[2]} bands, the white reference {plain.white_reference.shape}")
     return references if isinstance(references, Elements) else judge_elements(references)

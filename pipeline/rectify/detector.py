@@ -24,10 +24,10 @@ class BadElementCriteria:
 
     hot_sigmas: float = 8.0  # dark above the band's median
     lit_sigmas: float = 10.0  # least response that can be judged, in spreads of the dark frame ...
-    lit_share: float = 0.1  # ... and of the band's median: beyond the slit's ends there is stray light alone
+    lit_fraction: float = 0.1  # ... and of the band's median: beyond the slit's ends there is stray light alone
     least_response: float = 0.1  # of the neighbours'
     odd_sigmas: float = 8.0  # response off that of the window, in spreads of the band ...
-    odd_share: float = 0.2  # ... and beyond its nearest neighbours by this share of theirs
+    odd_fraction: float = 0.2  # ... and beyond its nearest neighbours by this fraction of theirs
     window: int = 15  # neighbouring samples compared
     near: int = 7  # nearest neighbours, the element among them
     most: float = 0.05  # of all elements, or one column; more mean that the frames are wrong, not the detector
@@ -81,7 +81,7 @@ def _off_neighbours(response: Floats, noise: Floats, limits: BadElementCriteria)
     size = min(limits.window, len(response))
     around = (max(size - 1 + size % 2, 1), 1)  # an odd number of samples
     local: Floats = ndimage.median_filter(_without_gaps(response), around, mode="reflect")
-    least = np.maximum(limits.lit_sigmas * noise, limits.lit_share * _median(response, axis=0))
+    least = np.maximum(limits.lit_sigmas * noise, limits.lit_fraction * _median(response, axis=0))
     judged = np.isfinite(response) & (local > least)
     relative = np.full(response.shape, np.nan)
     np.divide(response, local, out=relative, where=judged)
@@ -95,7 +95,7 @@ def _off_neighbours(response: Floats, noise: Floats, limits: BadElementCriteria)
     # Beyond the nearest neighbours as well; two that stand out side by side do not hide each other.
     filled = _without_gaps(response)
     low, high = (ndimage.rank_filter(filled, rank, (limits.near, 1), mode="reflect") for rank in (2, -3))
-    beyond = (response < low * (1 - limits.odd_share)) | (response > high * (1 + limits.odd_share))
+    beyond = (response < low * (1 - limits.odd_fraction)) | (response > high * (1 + limits.odd_fraction))
     odd: Bools = (np.abs(off) > limits.odd_sigmas * spread) & beyond
     return dead | odd
 

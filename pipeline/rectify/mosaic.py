@@ -20,7 +20,7 @@ from pipeline.rectify.calibrate import calibrate
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.placed import TAPS, Placed, member_lines
 from pipeline.rectify.resample import merge_lines, resample
-from pipeline.rectify.tracks import Track
+from pipeline.rectify.scan_paths import ScanPath
 from pipeline.source import SweepLines
 
 BLOCK_LINES = 64  # a shard of a stored sweep: reading one line of it costs as much as reading all
@@ -130,7 +130,7 @@ class MosaicPart:
 
 
 def edge_distance(coordinates: NDArray[np.float64], lines: int, samples: int) -> NDArray[np.float64]:
-    """Distance of (..., 2) lookup coordinates to the nearest edge of their sweep, (...) [px of it]; NaN off it."""
+    """Distance of (..., 2) geolocation grid coordinates to the nearest edge of their sweep, (...) [px of it]; NaN off it."""
     line, sample = coordinates[..., 0], coordinates[..., 1]
     down = np.minimum(line + 0.5, lines - 0.5 - line)
     across = np.minimum(sample + 0.5, samples - 0.5 - sample)
@@ -164,9 +164,9 @@ def _blend_shared(blended: NDArray[np.float32], parts: Sequence[MosaicPart], poi
     """Write the mixtures at ``points``, which several parts reach."""
     weight = np.stack([part.weight[points] for part in parts])
     edge = np.stack([part.edge_px[points] for part in parts])
-    shares = np.where(weight > 0, weight * np.maximum(np.nan_to_num(edge), LEAST_EDGE_PX), 0.0)
-    total = reduce(np.add, shares)  # part by part: ndarray.sum takes another order where there is one point alone
-    weights = (shares / total).astype(np.float32)
+    fractions = np.where(weight > 0, weight * np.maximum(np.nan_to_num(edge), LEAST_EDGE_PX), 0.0)
+    total = reduce(np.add, fractions)  # part by part: ndarray.sum takes another order where there is one point alone
+    weights = (fractions / total).astype(np.float32)
     for first in range(0, len(points), BLOCK_POINTS):
         block = points[first : first + BLOCK_POINTS]
         mixed = np.zeros((len(block), blended.shape[1]), np.float32)
@@ -193,19 +193,19 @@ def _by_band(
 
 
 @dataclass(frozen=True)
-class LookedUp:
+class LocatedSweep:
     """A track and the (..., 2) knots and samples at which it saw some points, NaN off it."""
 
     placed: Placed
-    track: Track
+    scan_path: ScanPath
     coordinates: NDArray[np.float64]
     read: ReadWindow
 
 
 def read_part(
-    looked: LookedUp, coordinates: NDArray[np.float64], camera: LineCamera, kernel: Kernel
+    observation: LocatedSweep, coordinates: NDArray[np.float64], camera: LineCamera, kernel: Kernel
 ) -> MosaicPart | None:
-    """Calibrate and resample one track at lookup coordinates (n, 2); None where it reaches none of them.
+    """Calibrate and resample one track at geolocation grid coordinates (n, 2); None where it reaches none of them.
 
     Lines that are not valid or that nothing saw, saturated and uncalibrated elements count nothing; where they leave
     less than half of a kernel's weight the point is NaN with weight 0. The result at a point does not depend on the
@@ -214,35 +214,35 @@ def read_part(
     box = _boxes(coordinates[None])[0]
     if np.isnan(box[0]):
         return None
-    lines, track = looked.placed.lines, looked.track
+    lines, scan_path = observation.placed.lines, observation.scan_path
     count = lines.references.dark.shape[0]
-    elements = looked.placed.elements
-    knots, samples = _span(box[0], box[1], len(track)), elements.alone(_span(box[2], box[3], count))
-    members = member_lines(track, knots)
+    elements = observation.placed.elements
+    knots, samples = _span(box[0], box[1], len(scan_path)), elements.alone(_span(box[2], box[3], count))
+    members = member_lines(scan_path, knots)
     values, valid = calibrate(
-        _raw_of(looked.read, members, samples),
+        _raw_of(observation.read, members, samples),
         elements.part(samples),
         saturated_dn=camera.full_scale_dn * lines.sweep.binning,
         position=lines.position[members],
     )
-    starts = track.starts[knots] - track.starts[knots.start]
-    usable = lines.valid_line[members] & np.repeat(track.seen[knots], np.diff(starts, append=len(members)))
+    starts = scan_path.starts[knots] - scan_path.starts[knots.start]
+    usable = lines.valid_line[members] & np.repeat(scan_path.seen[knots], np.diff(starts, append=len(members)))
     if not usable.all():
         valid = valid & usable.reshape(-1, *[1] * (valid.ndim - 1))
     if len(starts) < len(members):
         values, valid = merge_lines(values, valid, starts)
     values_at, weight = resample(values, valid, coordinates - np.array([knots.start, samples.start]), kernel)
-    return MosaicPart(values_at, weight, edge_distance(coordinates, len(track), count))
+    return MosaicPart(values_at, weight, edge_distance(coordinates, len(scan_path), count))
 
 
-def cut_runs(looked: Sequence[NDArray[np.float64]], bands: int) -> list[slice]:
+def cut_runs(observation: Sequence[NDArray[np.float64]], bands: int) -> list[slice]:
     """Cut groups of points into runs (slices, in order) such that little is calibrated that no point needs.
 
     Where lines are turned against the grid, the lines and samples behind a long run of pixels are many times as many
-    as the pixels; short runs have less beside, but each has a price of its own. ``looked`` holds the (group, n, 2)
-    lookup coordinates of each track.
+    as the pixels; short runs have less beside, but each has a price of its own. ``observation`` holds the (group, n, 2)
+    geolocation grid coordinates of each track.
     """
-    boxes = np.stack([_boxes(coordinates) for coordinates in looked])
+    boxes = np.stack([_boxes(coordinates) for coordinates in observation])
 
     def price(
         run: slice,

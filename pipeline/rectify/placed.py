@@ -1,6 +1,6 @@
 """Placed sweeps: lines, the tracks on which they lie, the pixel grid, and what of it each track can reach.
 
-A grid's lookup is kept as ties at every few of its pixels, bilinear between, within a bound that was checked.
+A grid's geolocation grid is kept as ties at every few of its pixels, bilinear between, within a bound that was checked.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, points_of_scan
 from pipeline.rectify.calibrate import Elements, judge_elements
-from pipeline.rectify.lookup import KnotCurve, drop_unseen, grid_points, knots_of_points, track_lookup
-from pipeline.rectify.tracks import Track, make_tracks
+from pipeline.rectify.geolocation import KnotCurve, drop_unseen, grid_points, knots_of_points, path_geolocation
+from pipeline.rectify.scan_paths import ScanPath, make_scan_paths
 from pipeline.source import SweepLines
 
 SAFETY = 1.05  # on the bound of ties, which holds to the second order
@@ -37,7 +37,7 @@ class TieTable:
     continued, so that pixels inside next to its border have four.
     """
 
-    ties: Floats  # (row, column, 2) knot coordinate and sample; tie (i, j) is pixel ``corner`` + (i, j) * spacing
+    tie_points: Floats  # (row, column, 2) knot coordinate and sample; tie (i, j) is pixel ``corner`` + (i, j) * spacing
     spacing: int  # 1: every pixel is a tie, and NaN where it is off the track
     shape: tuple[int, int]  # (y, x) of the grid
     bound_px: float  # largest error of a coordinate [px of the sweep]
@@ -47,7 +47,7 @@ class TieTable:
     kept: tuple[int, int]  # rows and columns of it
 
     def coordinates(self, rows: slice, columns: slice) -> Floats:
-        """Coordinates of a contiguous part of the grid, (y, x, 2), as of ``track_lookup``."""
+        """Coordinates of a contiguous part of the grid, (y, x, 2), as of ``path_geolocation``."""
         asked = [range(size)[one] for one, size in zip((rows, columns), self.shape, strict=True)]
         here = [
             slice(min(max(one.start - first, 0), count), max(min(one.stop - first, count), 0))
@@ -56,13 +56,15 @@ class TieTable:
         if any(part.stop <= part.start for part in here):
             found: Floats = np.empty((0, 0, 2))
         elif self.spacing == 1:
-            found = self.ties[here[0], here[1]].copy()
+            found = self.tie_points[here[0], here[1]].copy()
         else:
             found = self._between(*here)
-            ties = self.ties[tuple(slice(one.start // self.spacing, -(-one.stop // self.spacing) + 1) for one in here)]
+            tie_points = self.tie_points[
+                tuple(slice(one.start // self.spacing, -(-one.stop // self.spacing) + 1) for one in here)
+            ]
             most = np.array([len(self.seen), self.samples]) - 0.5
             if not (
-                self.seen.all() and (ties >= -0.5).all() and (ties <= most).all()
+                self.seen.all() and (tie_points >= -0.5).all() and (tie_points <= most).all()
             ):  # else all between lie on the track
                 drop_unseen(found, self.seen, self.samples)
         if found.shape[:2] == (len(asked[0]), len(asked[1])):
@@ -76,9 +78,9 @@ class TieTable:
         """Straight lines along the few rows of ties first, then, in long runs of memory, down the columns."""
         first, last = rows.start // self.spacing, (rows.stop - 1) // self.spacing
         cell, part = np.divmod(np.arange(columns.start, columns.stop), self.spacing)
-        ties = self.ties[first : last + 2]
-        left = np.take(ties, cell, axis=1)
-        along = left + (part / self.spacing)[:, None] * (np.take(ties, cell + 1, axis=1) - left)
+        tie_points = self.tie_points[first : last + 2]
+        left = np.take(tie_points, cell, axis=1)
+        along = left + (part / self.spacing)[:, None] * (np.take(tie_points, cell + 1, axis=1) - left)
         flat = along.reshape(len(along), -1)  # two axes instead of three: numpy's loops are then twice as fast
         out = np.empty((rows.stop - rows.start, flat.shape[1]))
         for row in range(first, last + 1):
@@ -91,7 +93,7 @@ class TieTable:
 
 
 def tie_table(
-    track: Track,
+    scan_path: ScanPath,
     camera: LineCamera,
     *,
     along: Axis,
@@ -102,7 +104,7 @@ def tie_table(
     tie: int = 16,
     tolerance_px: float = 2e-3,
 ) -> TieTable:
-    """Tabulate a track's lookup over a grid, given by its first centre, the distance of centres [px] and (y, x).
+    """Tabulate a track's geolocation grid over a grid, given by its first centre, the distance of centres [px] and (y, x).
 
     The distance of ties starts at ``tie`` pixels and is halved until the error of the pixels between, in lines and in
     samples, is bound by ``tolerance_px`` [px of the sweep]. The bound is an eighth of the ties' second differences (of
@@ -113,7 +115,7 @@ def tie_table(
     """
     if tie < 1 or not tolerance_px >= 0:
         raise SettingsError(f"expected ties at least 1 px apart and a tolerance from 0, got {tie} and {tolerance_px}")
-    curve, samples = KnotCurve(track), camera.samples // binning
+    curve, samples = KnotCurve(scan_path), camera.samples // binning
     corner, kept = _within_reach(curve, camera, along, (binning, origin_px, spacing_px, shape))
 
     def exact(first: float, step: int, counts: tuple[int, int]) -> Floats:
@@ -121,27 +123,27 @@ def tie_table(
         points = grid_points(origin, step * spacing_px, counts)
         return knots_of_points(curve, camera, points.reshape(-1, 2), along, binning).reshape(*counts, 2)
 
-    step_px = spacing_px * camera.ifov_rad / track.width
+    step_px = spacing_px * camera.ifov_rad / scan_path.width
     while tie > 1:
-        ties, bound = np.empty((0, 0, 2)), _knot_bound(track, tie * step_px)
+        tie_points, bound = np.empty((0, 0, 2)), _knot_bound(scan_path, tie * step_px)
         if bound <= tolerance_px and min(kept) > 0:
             rows, columns = ((size - 1) // tie + 2 for size in kept)
-            ties = exact(0, tie, (rows, columns))
-            corners = _corners(ties)
-            ends = np.array([len(track), samples]) - 0.5
+            tie_points = exact(0, tie, (rows, columns))
+            corners = _corners(tie_points)
+            ends = np.array([len(scan_path), samples]) - 0.5
             cells = ((corners.max(axis=0) >= -0.5) & (corners.min(axis=0) <= ends)).all(
                 axis=-1
             )  # hold points of the track
-            bound = SAFETY * (bound + _tie_bound(ties, cells))
+            bound = SAFETY * (bound + _tie_bound(tie_points, cells))
             if bound <= tolerance_px:
                 middle = exact(tie / 2, tie, (rows - 1, columns - 1))
                 bound = max(bound, float(np.abs(middle - corners.mean(axis=0))[cells].max(initial=0)))
         if bound <= tolerance_px:
-            return TieTable(ties, tie, shape, bound, track.seen, samples, corner, kept)
+            return TieTable(tie_points, tie, shape, bound, scan_path.seen, samples, corner, kept)
         tie //= 2
     pixels = exact(0, 1, kept)
-    drop_unseen(pixels, track.seen, samples)
-    return TieTable(pixels, 1, shape, 0.0, track.seen, samples, corner, kept)
+    drop_unseen(pixels, scan_path.seen, samples)
+    return TieTable(pixels, 1, shape, 0.0, scan_path.seen, samples, corner, kept)
 
 
 def _within_reach(
@@ -149,7 +151,7 @@ def _within_reach(
 ) -> tuple[tuple[int, int], tuple[int, int]]:
     """First row and column of the pixels that lie between the ends of any of the track's lines, and how many."""
     binning, origin_px, spacing_px, shape = grid
-    knots = np.concatenate([[-0.5], np.arange(len(curve.track)), [len(curve.track) - 0.5]])
+    knots = np.concatenate([[-0.5], np.arange(len(curve.scan_path)), [len(curve.scan_path) - 0.5]])
     scan, _, across, _ = (tangent[:, None] / camera.ifov_rad for tangent in curve.at(knots))
     ends = np.array([0, camera.samples // binning * binning]) - camera.samples / 2
     x, y = points_of_scan(across, camera, scan, ends * camera.ifov_rad)  # type: ignore[arg-type]
@@ -162,31 +164,31 @@ def _within_reach(
     return ((low[0], low[1]), kept) if min(kept) > 0 else ((0, 0), (0, 0))
 
 
-def _knot_bound(track: Track, knots: float) -> float:
+def _knot_bound(scan_path: ScanPath, knots: float) -> float:
     """How far knots lie off the middle of straight lines between two others, up to ``knots`` apart [step]."""
-    if track.uniform and track.straight:
+    if scan_path.uniform and scan_path.straight:
         return 0.0
     worst = 0.0
-    for half in range(1, min(int(np.ceil(knots / 2)), (len(track) - 1) // 2) + 1):
-        for tangent in (track.scan, track.across):
+    for half in range(1, min(int(np.ceil(knots / 2)), (len(scan_path) - 1) // 2) + 1):
+        for tangent in (scan_path.scan, scan_path.across):
             middle = (tangent[: -2 * half] + tangent[2 * half :]) / 2
-            worst = max(worst, float(np.abs(tangent[half:-half] - middle).max()) / track.width)
+            worst = max(worst, float(np.abs(tangent[half:-half] - middle).max()) / scan_path.width)
     return worst
 
 
-def _tie_bound(ties: Floats, cells: NDArray[np.bool_]) -> float:
+def _tie_bound(tie_points: Floats, cells: NDArray[np.bool_]) -> float:
     """Largest error of bilinear interpolation in the given cells, by the second differences at their corners."""
-    total = np.zeros_like(ties)
+    total = np.zeros_like(tie_points)
     for axis in (0, 1):
-        if ties.shape[axis] > 2:
-            inner = np.abs(np.diff(ties, 2, axis=axis))
+        if tie_points.shape[axis] > 2:
+            inner = np.abs(np.diff(tie_points, 2, axis=axis))
             total += np.pad(inner, [(1, 1) if at == axis else (0, 0) for at in range(3)], mode="edge")
     return float(np.max(_corners(total), axis=0)[cells].max(initial=0)) / 8
 
 
-def _corners(ties: Floats) -> Floats:
+def _corners(tie_points: Floats) -> Floats:
     """The four ties of each cell, (4, row, column, 2)."""
-    return np.stack([ties[:-1, :-1], ties[:-1, 1:], ties[1:, :-1], ties[1:, 1:]])
+    return np.stack([tie_points[:-1, :-1], tie_points[:-1, 1:], tie_points[1:, :-1], tie_points[1:, 1:]])
 
 
 @dataclass(frozen=True)
@@ -212,37 +214,39 @@ class PixelGrid:
 
 @dataclass(frozen=True)
 class Placed:
-    """One sweep and where its lines lie: tracks, each with the tie table of a grid or None for direct lookup."""
+    """One sweep and where its lines lie: tracks, each with the tie table of a grid or None for direct geolocation grid."""
 
     lines: SweepLines
-    tracks: tuple[tuple[Track, TieTable | None], ...]
+    scan_paths: tuple[tuple[ScanPath, TieTable | None], ...]
     gain: NDArray[np.float32] | None = None  # (band,) what the sweep's values are multiplied by
 
     @cached_property
     def elements(self) -> Elements:
-        """The detector's elements, judged by all of the references; the gain is in the panel's values."""
+        """The detector's elements, judged by all of the references; the gain is in the white reference's values."""
         plain = self.lines.references
         if self.gain is None:
             return judge_elements(plain)
-        if self.gain.shape != plain.panel.shape:
+        if self.gain.shape != plain.white_reference.shape:
             raise ShapeError(
-                f"sweep {self.lines.sweep.name} has {len(plain.panel)} bands, its gain has shape {self.gain.shape}"
+                f"sweep {self.lines.sweep.name} has {len(plain.white_reference)} bands, its gain has shape {self.gain.shape}"
             )
-        return judge_elements(replace(plain, panel=(plain.panel * self.gain).astype(np.float32)))
+        return judge_elements(replace(plain, white_reference=(plain.white_reference * self.gain).astype(np.float32)))
 
     def coordinates(
         self, number: int, camera: LineCamera, grid: PixelGrid, rows: slice, columns: slice
     ) -> NDArray[np.float64]:
         """Knot and sample at which track ``number`` saw a part of the grid's pixels, (y, x, 2); NaN off it."""
-        track, table = self.tracks[number]
+        scan_path, table = self.scan_paths[number]
         if table is not None:
             return table.coordinates(rows, columns)
-        return self.look_up(track, camera, grid.points(rows, columns))
+        return self.locate_point(scan_path, camera, grid.points(rows, columns))
 
-    def look_up(self, track: Track, camera: LineCamera, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    def locate_point(
+        self, scan_path: ScanPath, camera: LineCamera, points_px: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Knot and sample at which a track saw any points, (..., 2); NaN off it."""
         sweep = self.lines.sweep
-        return track_lookup(track, camera, points_px, along=sweep.along, binning=sweep.binning)
+        return path_geolocation(scan_path, camera, points_px, along=sweep.along, binning=sweep.binning)
 
 
 def place(
@@ -265,7 +269,7 @@ def place(
     Raises ShapeError: arrays that do not fit the lines.
     """
     sweep = lines.sweep
-    tracks = make_tracks(
+    scan_paths = make_scan_paths(
         lines.position,
         camera,
         usable=lines.valid_line if usable is None else usable,
@@ -273,13 +277,13 @@ def place(
         binning=sweep.binning,
         step_px=sweep.step,
     )
-    tables = [None if grid is None else _table(track, lines, camera, grid) for track in tracks]
-    return Placed(lines, tuple(zip(tracks, tables, strict=True)), gain)
+    tables = [None if grid is None else _table(scan_path, lines, camera, grid) for scan_path in scan_paths]
+    return Placed(lines, tuple(zip(scan_paths, tables, strict=True)), gain)
 
 
-def _table(track: Track, lines: SweepLines, camera: LineCamera, grid: PixelGrid) -> TieTable | None:
+def _table(scan_path: ScanPath, lines: SweepLines, camera: LineCamera, grid: PixelGrid) -> TieTable | None:
     """A table of the whole grid; None where lines lie too unevenly for ties to save anything."""
-    of_grid = partial(tie_table, track, camera, along=lines.sweep.along, binning=lines.sweep.binning)
+    of_grid = partial(tie_table, scan_path, camera, along=lines.sweep.along, binning=lines.sweep.binning)
     of_shape = partial(of_grid, origin_px=grid.origin_px, spacing_px=grid.spacing_px)
     return None if of_shape(shape=(1, 1)).spacing < LEAST_TIE_PX else of_shape(shape=grid.shape)
 
@@ -300,20 +304,20 @@ class ColumnReach:
         return slice(max(int(hit[0]) - TAPS, 0), min(int(hit[-1]) + TAPS + 1, len(self.top)))
 
 
-class TrackReach:
+class ScanPathReach:
     """Where the lines of a track lie on a grid, in pieces of 64 samples. Never too little, at most a piece too much."""
 
-    def __init__(self, placed: Placed, track: Track, camera: LineCamera, grid: PixelGrid) -> None:
+    def __init__(self, placed: Placed, scan_path: ScanPath, camera: LineCamera, grid: PixelGrid) -> None:
         sweep = placed.lines.sweep
         self._placed = placed
         self._count = camera.samples // sweep.binning
         self._ends = np.append(np.arange(0, self._count, PIECE_SAMPLES), self._count)
         slope = ((self._ends - camera.samples / 2 / sweep.binning) * sweep.binning) * camera.ifov_rad
-        centre = track.scan[:, None] / camera.ifov_rad, track.across[:, None] / camera.ifov_rad
+        centre = scan_path.scan[:, None] / camera.ifov_rad, scan_path.across[:, None] / camera.ifov_rad
         along, scan = points_of_scan(centre[1], camera, centre[0], slope[None, :])  # type: ignore[arg-type]
         y, x = (scan, along) if sweep.along == "x" else (along, scan)
-        steps = np.hypot(np.diff(track.scan), np.diff(track.across))
-        widest = max(float(track.width), float(steps.max(initial=0.0)))
+        steps = np.hypot(np.diff(scan_path.scan), np.diff(scan_path.across))
+        widest = max(float(scan_path.width), float(steps.max(initial=0.0)))
         margin = MARGIN_PX + 0.75 * widest / (camera.ifov_rad * grid.spacing_px)
         self._top, self._bottom = _spans((y - grid.origin_px[0]) / grid.spacing_px, margin)
         self._left, self._right = _spans((x - grid.origin_px[1]) / grid.spacing_px, margin)
@@ -339,7 +343,7 @@ def _spans(place: NDArray[np.float64], margin: float) -> tuple[NDArray[np.float3
     return low.astype(np.float32), high.astype(np.float32)
 
 
-def member_lines(track: Track, knots: slice) -> NDArray[np.intp]:
+def member_lines(scan_path: ScanPath, knots: slice) -> NDArray[np.intp]:
     """Numbers of the lines that some knots are made of, knot by knot."""
-    stop = track.starts[knots.stop] if knots.stop < len(track) else len(track.lines)
-    return track.lines[track.starts[knots.start] : stop]
+    stop = scan_path.starts[knots.stop] if knots.stop < len(scan_path) else len(scan_path.lines)
+    return scan_path.lines[scan_path.starts[knots.start] : stop]

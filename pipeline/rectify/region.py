@@ -14,7 +14,7 @@ from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.mosaic import (
     BLOCK_LINES,
     LineCache,
-    LookedUp,
+    LocatedSweep,
     Raw,
     ReadWindow,
     cut_runs,
@@ -23,8 +23,8 @@ from pipeline.rectify.mosaic import (
     mosaic,
     read_part,
 )
-from pipeline.rectify.placed import TAPS, ColumnReach, PixelGrid, Placed, TrackReach, member_lines, place
-from pipeline.rectify.tracks import Track
+from pipeline.rectify.placed import TAPS, ColumnReach, PixelGrid, Placed, ScanPathReach, member_lines, place
+from pipeline.rectify.scan_paths import ScanPath
 from pipeline.source import SweepLines
 
 COPIES = 5  # of a tile in memory at once: values, parts and calibrated lines, rounded, chunks and shard
@@ -37,7 +37,10 @@ Reaches = Sequence[Sequence[ColumnReach | None]]  # of each sweep, of each of it
 
 def column_reach(placed: Sequence[Placed], camera: LineCamera, grid: PixelGrid, columns: slice) -> Reaches:
     """What every track of every sweep shows of some columns: made once, it serves all tiles of these columns."""
-    return [[TrackReach(one, track, camera, grid).in_columns(columns) for track, _ in one.tracks] for one in placed]
+    return [
+        [ScanPathReach(one, scan_path, camera, grid).in_columns(columns) for scan_path, _ in one.scan_paths]
+        for one in placed
+    ]
 
 
 def mosaic_tile(
@@ -60,23 +63,25 @@ def mosaic_tile(
     (y, x, band) float32 with NaN where no line reached, (y, x) how many sweeps did (a sweep that turns may count
     once for each of its runs).
     """
-    looked = []
-    for one, tracks in zip(placed, reach or column_reach(placed, camera, grid, columns), strict=True):
-        for number, near in enumerate(tracks):
+    observation = []
+    for one, scan_paths in zip(placed, reach or column_reach(placed, camera, grid, columns), strict=True):
+        for number, near in enumerate(scan_paths):
             knots = slice(0, 0) if near is None else near.knots(rows)
             if near is None or knots.stop == knots.start:
                 continue
-            track = one.tracks[number][0]
+            scan_path = one.scan_paths[number][0]
             coordinates = one.coordinates(number, camera, grid, rows, columns)
-            looked.append(LookedUp(one, track, coordinates, _reader(one, track, coordinates, cache, near.samples)))
+            observation.append(
+                LocatedSweep(one, scan_path, coordinates, _reader(one, scan_path, coordinates, cache, near.samples))
+            )
     shape = rows.stop - rows.start, columns.stop - columns.start
-    bands = len(placed[0].lines.references.panel)
+    bands = len(placed[0].lines.references.white_reference)
     values, coverage = np.empty((*shape, bands), np.float32), np.zeros(shape, np.intp)
-    if not looked:
+    if not observation:
         values[...] = np.nan
-    for run in cut_runs([_column_groups(one.coordinates) for one in looked], bands) if looked else []:
+    for run in cut_runs([_column_groups(one.coordinates) for one in observation], bands) if observation else []:
         part = slice(run.start * GROUP_COLUMNS, min(run.stop * GROUP_COLUMNS, shape[1]))
-        seen, counts = _blend([(one, one.coordinates[:, part]) for one in looked], camera, kernel)
+        seen, counts = _blend([(one, one.coordinates[:, part]) for one in observation], camera, kernel)
         values[:, part], coverage[:, part] = seen.reshape(shape[0], -1, bands), counts.reshape(shape[0], -1)
     return values, coverage
 
@@ -98,36 +103,36 @@ def mosaic_rows(
         yield first, *mosaic_tile(placed, camera, pixels, part, columns, reach=reach)
 
 
-def seat_pixels(grid: SceneGrid, seats: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Give the points to look up for whole patches, (seat, p, p, 2), and which of them lie on the scene.
+def patch_pixels(grid: SceneGrid, patch_index: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Give the points to look up for whole patches, (patch, p, p, 2), and which of them lie on the scene.
 
-    A pixel beyond the scene's border repeats one inside by reflection within the seat, or the border pixel.
+    A pixel beyond the scene's border repeats one inside by reflection within the patch, or the border pixel.
     """
     p = grid.patch
     inside = []
     places = []
     for axis, size in enumerate((grid.height, grid.width)):
-        kept, there = _on_the_scene(grid.seat_origin(seats)[:, axis, None], p, size)
+        kept, there = _on_the_scene(grid.patch_origin(patch_index)[:, axis, None], p, size)
         inside.append(there)
         places.append(kept - (size - 1) / 2)
-    y = np.broadcast_to(places[0][:, :, None], (len(seats), p, p))
-    x = np.broadcast_to(places[1][:, None, :], (len(seats), p, p))
+    y = np.broadcast_to(places[0][:, :, None], (len(patch_index), p, p))
+    x = np.broadcast_to(places[1][:, None, :], (len(patch_index), p, p))
     return np.stack([y, x], axis=-1), inside[0][:, :, None] & inside[1][:, None, :]
 
 
 def _on_the_scene(first: NDArray[np.integer], patch: int, size: int) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Pixels of seats along one axis that begin at ``first`` (seat, 1): numbers on the scene, and which are its own."""
+    """Pixels of patches along one axis that begin at ``first`` (patch, 1): numbers on the scene, and which are its own."""
     pixel = first + np.arange(patch)
     mirrored = 2 * (size - 1) - pixel
     return np.where(pixel < size, pixel, np.where(mirrored >= first, mirrored, size - 1)), pixel < size
 
 
-def read_every_seat(
+def read_every_patch(
     placed: Sequence[Placed], camera: LineCamera, grid: SceneGrid, kernel: Kernel = "catmull-rom", *, most_bytes: int
 ) -> Iterator[tuple[Values, NDArray[np.bool_]]]:
-    """Rectify the whole scene into patches, a row of seats at a time, or a column where lines lie along y.
+    """Rectify the whole scene into patches, a row of patches at a time, or a column where lines lie along y.
 
-    Yields what :func:`read_seats` gives for these seats, whose numbers ascend, or go down the columns; with tables of
+    Yields what :func:`read_patches` gives for these patches, whose numbers ascend, or go down the columns; with tables of
     the scene's pixels (:func:`place`) within their bound. Raw lines are kept for the next row, up to ``most_bytes``.
     """
     pixels, p, shape = PixelGrid.of_scene(grid, 1), grid.patch, (grid.height, grid.width)
@@ -148,49 +153,51 @@ def read_every_seat(
         yield values[at].reshape(-1, p, p, values.shape[-1]), seen.reshape(-1, p, p)
 
 
-def read_seats(
+def read_patches(
     sweeps: Sequence[SweepLines | Placed],
     camera: LineCamera,
     grid: SceneGrid,
-    seats: NDArray[np.integer],
+    patch_index: NDArray[np.integer],
     kernel: Kernel = "catmull-rom",
     *,
     cache: LineCache | None = None,
 ) -> tuple[Values, NDArray[np.bool_]]:
     """Rectify whole patches from the sweeps that saw them: placed with :func:`place`, or lines to be placed now.
 
-    Best in the order in which the sweeps pass the seats: neighbours share what is read and calibrated. ``cache`` holds
+    Best in the order in which the sweeps pass the patches: neighbours share what is read and calibrated. ``cache`` holds
     raw lines that earlier calls read; None reads what is needed, once.
 
-    (seat, p, p, band) float32, NaN where no line reached, and (seat, p, p) pixels that lie on the scene and were seen.
+    (patch, p, p, band) float32, NaN where no line reached, and (patch, p, p) pixels that lie on the scene and were seen.
     """
     placed = [one if isinstance(one, Placed) else place(one, camera) for one in sweeps]
-    points, on_scene = seat_pixels(grid, seats)
-    looked = []
+    points, on_scene = patch_pixels(grid, patch_index)
+    observation = []
     for one in placed:
-        for track, _ in one.tracks:
-            coordinates = one.look_up(track, camera, points)
+        for scan_path, _ in one.scan_paths:
+            coordinates = one.locate_point(scan_path, camera, points)
             if np.isfinite(coordinates[..., 0]).any():
                 whole = slice(0, len(one.lines.references.dark))
-                looked.append(LookedUp(one, track, coordinates, _reader(one, track, coordinates, cache, whole)))
-    bands = len(placed[0].lines.references.panel)
+                observation.append(
+                    LocatedSweep(one, scan_path, coordinates, _reader(one, scan_path, coordinates, cache, whole))
+                )
+    bands = len(placed[0].lines.references.white_reference)
     values = np.full((*points.shape[:3], bands), np.nan, np.float32)
     coverage = np.zeros(points.shape[:3], np.intp)
-    for run in cut_runs([one.coordinates for one in looked], bands) if looked else []:
-        seen, counts = _blend([(one, one.coordinates[run]) for one in looked], camera, kernel)
+    for run in cut_runs([one.coordinates for one in observation], bands) if observation else []:
+        seen, counts = _blend([(one, one.coordinates[run]) for one in observation], camera, kernel)
         values[run], coverage[run] = seen.reshape(values[run].shape), counts.reshape(coverage[run].shape)
     return values, on_scene & (coverage > 0)
 
 
 def _blend(
-    looked: Sequence[tuple[LookedUp, NDArray[np.float64]]], camera: LineCamera, kernel: Kernel
+    observation: Sequence[tuple[LocatedSweep, NDArray[np.float64]]], camera: LineCamera, kernel: Kernel
 ) -> tuple[Values, Counts]:
     """Read every track that reaches some of the points and blend them, (n, band) and (n,)."""
-    read = [read_part(one, coordinates.reshape(-1, 2), camera, kernel) for one, coordinates in looked]
+    read = [read_part(one, coordinates.reshape(-1, 2), camera, kernel) for one, coordinates in observation]
     parts = [part for part in read if part is not None]
     if parts:
         return mosaic(parts)
-    count, bands = looked[0][1].size // 2, len(looked[0][0].placed.lines.references.panel)
+    count, bands = observation[0][1].size // 2, len(observation[0][0].placed.lines.references.white_reference)
     return np.full((count, bands), np.nan, np.float32), np.zeros(count, np.intp)
 
 
@@ -206,7 +213,7 @@ def _column_groups(coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _reader(
-    one: Placed, track: Track, coordinates: NDArray[np.float64], cache: LineCache | None, likely: slice
+    one: Placed, scan_path: ScanPath, coordinates: NDArray[np.float64], cache: LineCache | None, likely: slice
 ) -> ReadWindow:
     """How to read windows of a sweep: from the cache, or from one read of all lines that the points need."""
     if cache is not None:
@@ -215,7 +222,7 @@ def _reader(
     if not np.isfinite(knot).any():
         return lambda wanted, samples: one.lines.read(wanted.start, wanted.stop)[:, samples]
     first, last = int(np.floor(np.nanmin(knot))), int(np.ceil(np.nanmax(knot)))
-    members = member_lines(track, slice(max(first - TAPS, 0), min(last + TAPS + 1, len(track))))
+    members = member_lines(scan_path, slice(max(first - TAPS, 0), min(last + TAPS + 1, len(scan_path))))
     origin = int(members.min())
     raw: Raw = one.lines.read(origin, int(members.max()) + 1)
     return lambda wanted, samples: raw[wanted.start - origin : wanted.stop - origin, samples]
@@ -234,10 +241,10 @@ def plan_tiles(
     placed: Sequence[Placed], camera: LineCamera, grid: PixelGrid, tile_shape: tuple[int, int]
 ) -> list[Tile]:
     """List a grid's tiles in the order to make them: down the columns, so that lines read once serve the next tiles."""
-    reaches = [[TrackReach(one, track, camera, grid) for track, _ in one.tracks] for one in placed]
+    reaches = [[ScanPathReach(one, scan_path, camera, grid) for scan_path, _ in one.scan_paths] for one in placed]
     tiles = []
     for columns in _cuts(grid.shape[1], tile_shape[1]):
-        shown = tuple(tuple(reach.in_columns(columns) for reach in tracks) for tracks in reaches)
+        shown = tuple(tuple(reach.in_columns(columns) for reach in scan_paths) for scan_paths in reaches)
         tiles += [Tile(rows, columns, shown) for rows in _cuts(grid.shape[0], tile_shape[0])]
     return tiles
 
@@ -261,13 +268,13 @@ def cache_bytes(placed: Sequence[Placed], tiles: Sequence[Tile], at_once: int) -
 def _blocks_of(placed: Sequence[Placed], tile: Tile) -> dict[tuple[int, int, int, int], int]:
     """Sizes of the blocks of raw lines behind a tile, by sweep, block and samples."""
     blocks = {}
-    for sweep, (one, tracks) in enumerate(zip(placed, tile.reach, strict=True)):
-        bands = len(one.lines.references.panel)
-        for (track, _), near in zip(one.tracks, tracks, strict=True):
+    for sweep, (one, scan_paths) in enumerate(zip(placed, tile.reach, strict=True)):
+        bands = len(one.lines.references.white_reference)
+        for (scan_path, _), near in zip(one.scan_paths, scan_paths, strict=True):
             knots = slice(0, 0) if near is None else near.knots(tile.rows)
             if near is None or knots.start == knots.stop:
                 continue
-            members = member_lines(track, knots)
+            members = member_lines(scan_path, knots)
             held = held_samples(one.lines, near.samples)
             for number in line_blocks(slice(int(members.min()), int(members.max()) + 1)):
                 blocks[sweep, number, held.start, held.stop] = BLOCK_LINES * (held.stop - held.start) * bands * 2

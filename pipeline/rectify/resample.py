@@ -55,10 +55,10 @@ class Damage:
         ``total`` (n,) is the weight on usable samples; unusable elements have entered the sums as 0. Tells of each
         point whether it has a value in any band.
         """
-        share = np.empty((len(at), len(self.bands)), np.float32)
-        weighted_rows(self.usable, torch.from_numpy(self.kind[index.numpy()]), weight, share)
-        point, column = _places(np.abs(share - total[:, None]) > ROUNDING)  # few: the rest is divided as samples are
-        own, rest = divisor(share[point, column]), divisor(total)
+        fraction = np.empty((len(at), len(self.bands)), np.float32)
+        weighted_rows(self.usable, torch.from_numpy(self.kind[index.numpy()]), weight, fraction)
+        point, column = _places(np.abs(fraction - total[:, None]) > ROUNDING)  # few: the rest is divided as samples are
+        own, rest = divisor(fraction[point, column]), divisor(total)
         apart = at[point], self.bands[column]
         mended = out[apart] / own
         divide_rows(out, at, rest)
@@ -80,18 +80,18 @@ class LineTable:
     whole: NDArray[np.bool_] | None  # (line, sample) of a window's corner: all its samples are usable
     damage: Damage | None
 
-    def read(self, placed: Windows, out: NDArray[Any], share: NDArray[np.float32]) -> None:
-        """Write the points' values (n, band), and (n,) the usable share of the kernel's weight."""
+    def read(self, placed: Windows, out: NDArray[Any], fraction: NDArray[np.float32]) -> None:
+        """Write the points' values (n, band), and (n,) the usable fraction of the kernel's weight."""
         whole = _lies_on(placed, self.shape, self.whole)
         if placed.taps == 1:
             self._copy(placed, whole, out)
-            share[:] = whole
+            fraction[:] = whole
         elif whole.all():
-            self._read_whole(placed, out, share)
+            self._read_whole(placed, out, fraction)
         else:
             for which, read in ((whole, self._read_whole), (~whole, self._read_partial)):
                 points = np.flatnonzero(which)
-                read(placed.chosen(points), out, share, points)
+                read(placed.chosen(points), out, fraction, points)
 
     def _copy(self, placed: Windows, whole: NDArray[np.bool_], out: NDArray[Any]) -> None:
         if whole.any():
@@ -102,21 +102,21 @@ class LineTable:
             out[~whole] = np.nan if out.dtype == np.float32 else 0
 
     def _read_whole(
-        self, placed: Windows, out: NDArray[np.float32], share: NDArray[np.float32], at: Rows | None = None
+        self, placed: Windows, out: NDArray[np.float32], fraction: NDArray[np.float32], at: Rows | None = None
     ) -> None:
         """Points (the block's ``at``, or all) whose windows lie on usable samples altogether."""
         index, weight = placed.flat_index(self.shape), placed.joint_weight()
         weighted_rows(self.terms, index, weight, out, at)
-        share[... if at is None else at] = 1
+        fraction[... if at is None else at] = 1
         if self.damage is not None:
             touched = np.flatnonzero(~_lies_on(placed, self.shape, self.damage.sound))
             here, taps = touched if at is None else at[touched], torch.from_numpy(touched)
             one = np.ones(len(touched), np.float32)
-            share[here] = self.damage.mend(out, here, index[taps], weight[taps], one)
+            fraction[here] = self.damage.mend(out, here, index[taps], weight[taps], one)
 
-    def _read_partial(self, placed: Windows, out: NDArray[np.float32], share: NDArray[np.float32], at: Rows) -> None:
+    def _read_partial(self, placed: Windows, out: NDArray[np.float32], fraction: NDArray[np.float32], at: Rows) -> None:
         """Points that miss taps: NaN and 0 where they fail, else what is there, renormalised."""
-        out[at], share[at] = np.nan, 0
+        out[at], fraction[at] = np.nan, 0
         near = np.flatnonzero(placed.touches(self.shape))
         flat, joint = self._usable_taps(placed.chosen(near))
         total = reduce(np.add, joint.T)  # tap by tap, as the sums of a mask by element run: the same to the last bit
@@ -128,7 +128,7 @@ class LineTable:
             known = ~np.isnan(whole)
         else:
             known = self.damage.mend(out, at, index, weight, total)
-        share[at] = np.where(known, np.minimum(total, 1), 0)
+        fraction[at] = np.where(known, np.minimum(total, 1), 0)
 
     def _usable_taps(self, placed: Windows) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """(n, tap * tap) rows and weights; a tap that may not be used has weight 0 and the row of one that may."""
@@ -247,7 +247,7 @@ def resample(
     Returns
     -------
     (n, band) float32, NaN where the point failed in that band; ``nearest`` gives uint16 back as the same uint16, 0
-    where the point failed (float32 with NaN if single elements are invalid). And (n,) float32, the share of the
+    where the point failed (float32 with NaN if single elements are invalid). And (n,) float32, the fraction of the
     kernel's weight that lay on samples with a valid band (0..1): 0 where the point failed in every band.
 
     Raises
@@ -269,12 +269,12 @@ def resample(
     out = np.empty(shape, kind) if out is None else out
     if out.shape != shape or out.dtype != kind or not out.flags.c_contiguous:
         raise ShapeError(f"expected out {shape} of {kind}, rows next to each other, got {out.shape} of {out.dtype}")
-    share = np.zeros(len(coordinates), np.float32)
+    fraction = np.zeros(len(coordinates), np.float32)
     for block in _blocks(len(out)):
         placed = windows(coordinates[block], kernel)
         placed.corner[0] -= first
-        table.read(placed, out[block], share[block])
-    return out, share
+        table.read(placed, out[block], fraction[block])
+    return out, fraction
 
 
 def merge_lines(

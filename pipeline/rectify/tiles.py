@@ -53,7 +53,10 @@ class MosaicWork:
 
         if self.finer is None:
             return tile(rows, columns)
-        times, bands = self.grid.spacing_px // self.finer.spacing_px, len(self.placed[0].lines.references.panel)
+        times, bands = (
+            self.grid.spacing_px // self.finer.spacing_px,
+            len(self.placed[0].lines.references.white_reference),
+        )
         wide = slice(columns.start * times, min(columns.stop * times, self.finer.shape[1]))
         shape = rows.stop - rows.start, columns.stop - columns.start
         values, coverage = np.empty((*shape, bands), np.float32), np.empty(shape, np.intp)
@@ -66,7 +69,7 @@ class MosaicWork:
 
     def tile_memory(self, tiles: Sequence[Tile], tile_shape: tuple[int, int], at_once: int) -> tuple[int, int]:
         """Return the bytes of one tile of (y, x) ``tile_shape`` in the making, and of raw lines that tiles share."""
-        bands = len(self.placed[0].lines.references.panel) if self.placed else 1
+        bands = len(self.placed[0].lines.references.white_reference) if self.placed else 1
         one = tile_bytes(tile_shape, bands)
         if self.finer is None:
             return one, cache_bytes(self.placed, tiles, at_once)

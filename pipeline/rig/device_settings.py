@@ -163,7 +163,7 @@ class MirrorSettings(MirrorLink):
 
 @dataclass(frozen=True)
 class SurveyRig(MirrorLink):
-    """The table [rig] of a survey: both devices, the cable between them, and the white panel.
+    """The table [rig] of a survey: both devices, the cable between them, and the white reference.
 
     Written for the documented protocols and tested against emulators; never run on hardware. ``provenance`` says which
     of the assumed values somebody has confirmed.
@@ -218,7 +218,7 @@ class SurveyRig(MirrorLink):
         False, "Read the mirror's log with pulses too: lines lie where it measured, tied by edges"
     )
     settle_s: float = stated(2.0, "Most that the mirror may take to come to rest", "s", 0.01, 60)
-    panel: float = stated(1.0, "Value of the white panel", "", 1e-6, 1e6)
+    white_reference: float = stated(1.0, "Value of the white reference", "", 1e-6, 1e6)
     white_at_rest: bool = stated(True, "The white frame was taken through the mirror at 0; 0")
     provenance: str = stated("assumed", "Who confirmed the assumed values")
 

@@ -42,7 +42,7 @@ TRIGGERS = "what steps a path"
 MOST_NAMED = 5  # entries of a listing, warnings
 CONNECT = "connect"
 RESTLESS = "look for wind, a loose mount or a drive that hunts; a survey waits for rest in vain"
-LOOK_AT_LINE = "look at cable, plugs and earth if this comes again"
+CHECK_CABLE = "look at cable, plugs and earth if this comes again"
 
 
 @dataclass(frozen=True)
@@ -299,4 +299,4 @@ def _warnings(rows: list[CheckRow], device: Device) -> Iterator[list[str]]:
         if words and rows and rows[0].asked != CONNECT:  # that row says it all
             more = f"; and {len(words) - MOST_NAMED} more" if len(words) > MOST_NAMED else ""
             came = "; ".join(one.partition("; ")[0] for one in words[:MOST_NAMED])
-            rows.append(CheckRow(device, "bytes on the line", came + more, "warn", LOOK_AT_LINE))
+            rows.append(CheckRow(device, "bytes on the line", came + more, "warn", CHECK_CABLE))

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from pipeline.compiled import DOUBLES, FLOATS, OFFSETS, compiled, rows_of
 
-Light = NDArray[np.float32]
+Radiance = NDArray[np.float32]
 _AT_ONCE = 1024  # numbers that stay in the processor's first cache
 _WORDS, _LIGHT, _RAW = rows_of(types.uint32, 1), rows_of(FLOATS, 1), rows_of(types.uint16, 1)
 _ENDLESS = 0x7F800000  # bits of an infinite float32; of what is no number they are more
 
 
 @compiled(_WORDS, OFFSETS, _LIGHT)
-def draw_pairs(words: NDArray[np.uint32], piece: int, drawn: Light) -> None:
+def draw_pairs(words: NDArray[np.uint32], piece: int, drawn: Radiance) -> None:
     """Write standard normal deviates, a piece after the other: of each, words for radii, then as many for turns.
 
     r = sqrt(-2 ln u) and a turn t give r cos t and r sin t. ln is that of 2^e m with m about 1: a polynomial of m - 1,
@@ -69,9 +69,9 @@ def draw_pairs(words: NDArray[np.uint32], piece: int, drawn: Light) -> None:
 
 @compiled(_LIGHT, _LIGHT, _LIGHT, DOUBLES, DOUBLES, DOUBLES, DOUBLES, _RAW)
 def read_merged(
-    light: Light,
-    added: Light,
-    deviate: Light,
+    light: Radiance,
+    added: Radiance,
+    deviate: Radiance,
     read_noise_e: float,
     electrons_per_dn: float,
     dark_dn: float,
@@ -123,7 +123,7 @@ _LINES = rows_of(FLOATS, 3)
 
 
 @compiled(rows_of(FLOATS, 3, read_only=True), rows_of(FLOATS, 3, read_only=True), OFFSETS, _LINES)
-def mix_neighbours(light: Light, weights: Light, first: int, made: Light) -> None:
+def mix_neighbours(light: Radiance, weights: Radiance, first: int, made: Radiance) -> None:
     """Write light (line, sample, band) times weights (tap, sample, band) of bands ``first``, ``first`` + 1, ... beside.
 
     Bands beyond the first and the last are left out. The tap of the band itself is among them.
@@ -147,7 +147,7 @@ def mix_neighbours(light: Light, weights: Light, first: int, made: Light) -> Non
 
 
 Rows = NDArray[np.int64]
-TERMS = 4  # of a sum between two looks at its total, and samples that share what is read for them
+TERMS = 4  # of a sum between two looks at its total, and samples that fraction what is read for them
 LANES = 16  # floats: rows of a mixing matrix are some times as long, and begin where a line of the cache does
 _FLOATS_AT_ONCE = 2048  # floats of every kernel that stay in the processor's cache
 _ROWS = rows_of(OFFSETS, 1)
@@ -155,7 +155,7 @@ _LIGHT1, _LIGHT2, _LIGHT3 = rows_of(FLOATS, 1), rows_of(FLOATS, 2), rows_of(FLOA
 
 
 @compiled(_LIGHT2, _LIGHT2, _LIGHT2)
-def sum_nodes(parts: Light, shares: Light, nodes: Light) -> None:
+def sum_nodes(parts: Radiance, fractions: Radiance, nodes: Radiance) -> None:
     """Write sums (node, value) over kernels of values (kernel, value), times shares (node, kernel)."""
     kernels, count = parts.shape
     for first in range(0, count, _FLOATS_AT_ONCE):
@@ -165,10 +165,10 @@ def sum_nodes(parts: Light, shares: Light, nodes: Light) -> None:
                 nodes[node, start + np.uint64(number)] = np.float32(0)
             for kernel in range(0, kernels, TERMS):
                 k1, k2, k3 = min(kernel + 1, kernels - 1), min(kernel + 2, kernels - 1), min(kernel + 3, kernels - 1)
-                s0 = shares[node, kernel]
-                s1 = shares[node, k1] if k1 == kernel + 1 else np.float32(0)
-                s2 = shares[node, k2] if k2 == kernel + 2 else np.float32(0)
-                s3 = shares[node, k3] if k3 == kernel + 3 else np.float32(0)
+                s0 = fractions[node, kernel]
+                s1 = fractions[node, k1] if k1 == kernel + 1 else np.float32(0)
+                s2 = fractions[node, k2] if k2 == kernel + 2 else np.float32(0)
+                s3 = fractions[node, k3] if k3 == kernel + 3 else np.float32(0)
                 for number in range(some):
                     at = start + np.uint64(number)
                     nodes[node, at] += (
@@ -177,7 +177,7 @@ def sum_nodes(parts: Light, shares: Light, nodes: Light) -> None:
 
 
 @compiled(_LIGHT3, OFFSETS, OFFSETS, OFFSETS, _LIGHT2, _ROWS)
-def _take_terms(nodes: Light, start: int, lower: int, upper: int, taken: Light, rows: Rows) -> int:
+def _take_terms(nodes: Radiance, start: int, lower: int, upper: int, taken: Radiance, rows: Rows) -> int:
     """Write what four samples have of components that any of them has, (sample, term), and their rows of the mixing.
 
     Gives how many that are; the last sample stands for those beyond it, nothing for terms beyond the last.
@@ -198,7 +198,9 @@ def _take_terms(nodes: Light, start: int, lower: int, upper: int, taken: Light, 
 
 
 @compiled(_LIGHT2, _ROWS, OFFSETS, _LIGHT2, _LIGHT1, _LIGHT1, _LIGHT1, _LIGHT1)
-def _mix_four(taken: Light, rows: Rows, count: int, mixing: Light, a: Light, b: Light, c: Light, d: Light) -> None:
+def _mix_four(
+    taken: Radiance, rows: Rows, count: int, mixing: Radiance, a: Radiance, b: Radiance, c: Radiance, d: Radiance
+) -> None:
     """Write totals (band,) of four samples: their terms (sample, term) times rows of the mixing."""
     wide = mixing.shape[1]
     for band in range(wide):
@@ -218,7 +220,9 @@ def _mix_four(taken: Light, rows: Rows, count: int, mixing: Light, a: Light, b: 
 
 
 @compiled(_LIGHT3, OFFSETS, OFFSETS, _LIGHT2, OFFSETS, OFFSETS, _LIGHT2)
-def mix_bands(nodes: Light, lower: int, upper: int, mixing: Light, first: int, bands: int, light: Light) -> None:
+def mix_bands(
+    nodes: Radiance, lower: int, upper: int, mixing: Radiance, first: int, bands: int, light: Radiance
+) -> None:
     """Write some bands of light (n, band), from the first on: components (node, n, component) times their mixing.
 
     Nodes from ``lower`` to before ``upper`` are taken; ``mixing`` (node * component, band) is as `mixing_rows` has it.
@@ -237,7 +241,7 @@ def mix_bands(nodes: Light, lower: int, upper: int, mixing: Light, first: int, b
                     light[start + one, np.uint64(first) + np.uint64(band)] = total[band]
 
 
-def mixing_rows(mixing: Light) -> Light:
+def mixing_rows(mixing: Radiance) -> Radiance:
     """Lay out a matrix (node * component, band) for `mix_bands`: more rows and columns of 0, and rows in line."""
     terms, bands = mixing.shape
     rows, columns = -(-terms // TERMS) * TERMS, -(-bands // LANES) * LANES
@@ -253,14 +257,14 @@ _SHIFTS = rows_of(FLOATS, 3)
 
 @compiled(_SHIFTS, _SHIFTS, _SHIFTS, OFFSETS, DOUBLES, rows_of(DOUBLES, 1))
 def greatest_changes(
-    light: Light, finest: Light, scale: Light, binning: int, rounding: float, greatest: NDArray[np.float64]
+    light: Radiance, finest: Radiance, scale: Radiance, binning: int, rounding: float, greatest: NDArray[np.float64]
 ) -> None:
     """Write the greatest change of each stored number over its unit, (number,): of all shifts and bands.
 
     ``light`` and ``finest`` are (shift, number * binning, band), ``scale`` the unit (shift, number, band). Changes
     count with their signs within a number, and as 0 where they are no more than ``rounding`` times the light.
     """
-    bands, least, share = light.shape[2], np.float32(rounding), np.float32(1 / binning)
+    bands, least, fraction = light.shape[2], np.float32(rounding), np.float32(1 / binning)
     summed, most = np.empty(bands, np.float32), np.empty(bands, np.float32)
     for number in range(len(greatest)):
         for band in range(bands):
@@ -274,7 +278,7 @@ def greatest_changes(
                     change = light[shift, sample, band] - at
                     summed[band] += change if abs(change) > least * abs(at) else np.float32(0)
             for band in range(bands):
-                changed = abs(summed[band]) * share / scale[shift, number, band]
+                changed = abs(summed[band]) * fraction / scale[shift, number, band]
                 most[band] = changed if changed > most[band] else most[band]
         for band in range(bands):
             greatest[number] = max(greatest[number], most[band])

@@ -40,10 +40,10 @@ if TYPE_CHECKING:
 else:
     compiled_loops = deferred("pipeline.simulator.compiled_loops")
 
-Light = NDArray[np.float32]
+Radiance = NDArray[np.float32]
 
 
-def read_out(light: Light, block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> NDArray[np.uint16]:
+def read_out(light: Radiance, block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> NDArray[np.uint16]:
     """Turn expected electrons into DN, with the readout's effects among those chosen.
 
     The converter always rounds (half to even) and never gives less than 0 or more than its full scale.
@@ -62,7 +62,7 @@ def read_out(light: Light, block: SweepBlock, chosen: Mapping[Any, str] | Choice
     return raw
 
 
-def dark_frame(block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> Light:
+def dark_frame(block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> Radiance:
     """Give what the chosen readout shows without light, on average, (sample, band) float32, before rounding. [DN]"""
     readout, camera = Readout(block, Choice.of(chosen)), block.rig.camera
     dark = np.zeros((camera.samples, len(block.wavelength_nm)), np.float32)
@@ -79,7 +79,7 @@ class Readout:
     block: SweepBlock
     choice: Choice
 
-    def numbers(self, light: Light, number: int) -> NDArray[np.uint16]:
+    def numbers(self, light: Radiance, number: int) -> NDArray[np.uint16]:
         """Give the converter's numbers of one line's light, (sample, band) [e-]."""
         if not self._merges:
             return self.converted(self.electrons(light, number))
@@ -103,7 +103,7 @@ class Readout:
             raw.reshape(-1)[dim] = self.converted(exact)
         return raw
 
-    def electrons(self, light: Light, number: int) -> Light:
+    def electrons(self, light: Radiance, number: int) -> Radiance:
         """Give what leaves the amplifier for one line's light, (sample, band); each noise of its own draw. [e-]"""
         expected, shot = self._expected(light, number), self._variant(SHOT.name)
         if shot == OFF:
@@ -118,7 +118,7 @@ class Readout:
         counts.reshape(-1)[dim] = exact
         return self._with_read_noise(self._within_well(counts), number)
 
-    def converted(self, electrons: Light) -> NDArray[np.uint16]:
+    def converted(self, electrons: Radiance) -> NDArray[np.uint16]:
         """Give the converter's numbers, rounded half to even, within 0 and its full scale."""
         camera = self.block.rig.camera
         dn = electrons / np.float32(camera.electrons_per_dn)
@@ -127,18 +127,18 @@ class Readout:
         return dn.astype(np.uint16)
 
     @cached_property
-    def added(self) -> Light | np.float32:
+    def added(self) -> Radiance | np.float32:
         """Electrons that come without light: a number, or (sample, band) where there are hot elements."""
         dark = self._variant(DARK_CURRENT.name) != OFF
         same = np.float32(dark_electrons(self.block.rig) if dark else 0.0)
-        if self._variant(DEFECTS.name) == OFF or not self.block.rig.detector.hot_share:
+        if self._variant(DEFECTS.name) == OFF or not self.block.rig.detector.hot_fraction:
             return same
         return hot_electrons(self.block.rig, len(self.block.wavelength_nm)) + same
 
     @cached_property
     def dead(self) -> NDArray[np.bool_] | None:
         """Elements without response, (sample, band); None where there are none."""
-        if self._variant(DEFECTS.name) == OFF or not self.block.rig.detector.dead_share:
+        if self._variant(DEFECTS.name) == OFF or not self.block.rig.detector.dead_fraction:
             return None
         return dead_elements(self.block.rig, len(self.block.wavelength_nm))
 
@@ -148,18 +148,18 @@ class Readout:
         return 0.0 if self._variant(READ_NOISE.name) == OFF else self.block.rig.camera.read_noise_e
 
     @cached_property
-    def well_e(self) -> float | None:
+    def full_well_e(self) -> float | None:
         """Electrons that an element holds; None where the converter ends before any could overflow, or it is off."""
         on = self._variant(SATURATION.name) != OFF and well_reached(self.block.rig, self.read_noise_e)
-        return self.block.rig.detector.well_e if on else None
+        return self.block.rig.detector.full_well_e if on else None
 
     @cached_property
     def _merges(self) -> bool:
         """Whether shot and read noise come of one draw."""
         cheap = self._variant(SHOT.name) not in (OFF, EXACT)
-        return cheap and self.read_noise_e >= LEAST_MERGED_READ_E and self.well_e is None
+        return cheap and self.read_noise_e >= LEAST_MERGED_READ_E and self.full_well_e is None
 
-    def _expected(self, light: Light, number: int) -> Light:
+    def _expected(self, light: Radiance, number: int) -> Radiance:
         """Electrons that a line's elements expect, (sample, band) (SceneError: one is not finite)."""
         expected = np.maximum(light, 0)
         if self.dead is not None:
@@ -173,15 +173,19 @@ class Readout:
             )
         return expected
 
-    def _within_well(self, electrons: Light) -> Light:
-        return electrons if self.well_e is None else np.minimum(electrons, np.float32(self.well_e), out=electrons)
+    def _within_well(self, electrons: Radiance) -> Radiance:
+        return (
+            electrons
+            if self.full_well_e is None
+            else np.minimum(electrons, np.float32(self.full_well_e), out=electrons)
+        )
 
-    def _with_read_noise(self, electrons: Light, number: int) -> Light:
+    def _with_read_noise(self, electrons: Radiance, number: int) -> Radiance:
         if self.read_noise_e:
             electrons += self._deviates(READ_NOISE.name, number) * np.float32(self.read_noise_e)
         return electrons
 
-    def _deviates(self, stream: str, number: int) -> Light:
+    def _deviates(self, stream: str, number: int) -> Radiance:
         """Standard normal deviates of one line, (sample, band)."""
         size = self.block.rig.camera.samples, len(self.block.wavelength_nm)
         return normal_deviates(self.block.stream(stream, number), math.prod(size)).reshape(size)

@@ -18,14 +18,14 @@ from pipeline.simulator.effects.effect import OFF, Effect, SweepBlock
 from pipeline.simulator.effects.line import box_of, box_parts, folded_positions, smeared_positions
 from pipeline.simulator.optics.kernel_fit import Footprint, Moments, fold
 from pipeline.simulator.optics.rays import RayViews, exact_views, middle_normal, straight_views
-from pipeline.simulator.optics.scene_light import Looker
+from pipeline.simulator.optics.scene_radiance import Looker
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 
 Floats = NDArray[np.float64]
-Light = NDArray[np.float32]
+Radiance = NDArray[np.float32]
 _BEYOND_PX, _RINGS, _TURNS = 1000.0, 97, 16  # places at which tails of footprints are compared
-LOOKS = 17  # lines of a sweep and samples of a line that tell how far a footprint's shape varies
+PROBES = 17  # lines of a sweep and samples of a line that tell how far a footprint's shape varies
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Choice:
         return ((effect, variant) for effect, variant in self.effects if hasattr(effect, action))
 
 
-def expected_light(scene: RasterScene, block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> Light:
+def expected_light(scene: RasterScene, block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> Radiance:
     """Give the electrons that the samples of some lines gather on average, before the readout.
 
     ``chosen``: The effects that are on, in the order of the chain, each with its variant; none is a camera of rays that
@@ -72,11 +72,11 @@ def expected_light(scene: RasterScene, block: SweepBlock, chosen: Mapping[Any, s
     steps = [views.flat() for views in _views(block, choice, scene.shape)]
     exposures = block.rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS
     moments, names = tuple(choice.doing("moments")), tuple(map(choice.variant, ("slit", "smear", "rotation")))
-    light = _looker(block.rig, block.sweep, block.wavelength_nm.tobytes(), moments, names).look(
+    light = _looker(block.rig, block.sweep, block.wavelength_nm.tobytes(), moments, names).scan_pass(
         scene, steps, along_y=block.sweep.along == "y", exposures=exposures
     )
     light = light.reshape(len(block.lines), -1, light.shape[1])
-    pending: Light | None = None
+    pending: Radiance | None = None
     for effect, variant in choice.effects:
         if hasattr(effect, "gain"):
             gain = effect.gain(block, variant)
@@ -146,7 +146,7 @@ def kernel_error(block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> float
 def tails_apart(
     block: SweepBlock, one: Mapping[Any, str] | Choice, other: Mapping[Any, str] | Choice, reach_px: float
 ) -> Floats:
-    """Give the share of light, by size, that the kernels of two choices put elsewhere beyond a reach, (band,).
+    """Give the fraction of light, by size, that the kernels of two choices put elsewhere beyond a reach, (band,).
 
     Where their blurs or held positions differ, other kernels are fitted to the same patterns; where these have tails,
     so has what the kernels are wrong by.
@@ -174,6 +174,6 @@ def _footprint(block: SweepBlock, choice: Choice, held: int) -> Footprint:
 def views_all_over(rig: Rig, sweep: Sweep, *, exact: bool) -> RayViews:
     """Give views all over a sweep: the shape of a footprint varies smoothly between them."""
     whole = line_positions(replace(sweep, lines=max(sweep.lines, 1)), rig.camera)
-    lines = np.linspace(0, len(whole) - 1, LOOKS).round().astype(np.intp)
-    slopes = np.linspace(-0.5, 0.5, LOOKS) * rig.camera.samples * rig.camera.ifov_rad
+    lines = np.linspace(0, len(whole) - 1, PROBES).round().astype(np.intp)
+    slopes = np.linspace(-0.5, 0.5, PROBES) * rig.camera.samples * rig.camera.ifov_rad
     return _tangents(whole[lines][:, None], slopes, exact=exact).flat()

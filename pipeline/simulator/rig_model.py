@@ -30,8 +30,8 @@ class Optics:
     keystone_px: float = assumed(0.15, "Shift along the line, first wavelength to last", "px", 0.0, 1e3)
     smile_nm: float = assumed(0.3, "How much longer wavelengths are at a line's ends", "nm", -100.0, 100.0)
     fwhm_nm: float = stated(6.0, "Width of a band", "nm", 0.0, 1e3, source="data sheet")
-    stray_share: float = assumed(1e-3, "Share of a line's light that is spread over its detector", "", 0.0, 0.5)
-    stray_even: float = assumed(0.5, "Share of the stray light that falls evenly; the rest is a halo", "", 0.0, 1.0)
+    stray_fraction: float = assumed(1e-3, "Fraction of a line's light that is spread over its detector", "", 0.0, 0.5)
+    stray_even: float = assumed(0.5, "Fraction of the stray light that falls evenly; the rest is a halo", "", 0.0, 1.0)
     stray_halo_px: float = assumed(64.0, "Standard deviation of the halo, over samples and bands alike", "px", 2.0, 1e6)
 
 
@@ -61,14 +61,14 @@ class Detector:
     temperature_deg_c: float = assumed(
         25.0, "Temperature of the sensor; the law of dark current holds from -80 to 50", "deg C", -80.0, 50.0
     )
-    response_share: float = assumed(0.01, "Standard deviation of a pixel's gain (PRNU)", "", 0.0, 0.5)
-    stripe_share: float = assumed(
+    prnu_std: float = assumed(0.01, "Standard deviation of a pixel's gain (PRNU)", "", 0.0, 0.5)
+    striping_std: float = assumed(
         0.002, "Standard deviation of the gain that a sample's whole column shares", "", 0.0, 0.5
     )
-    dead_share: float = assumed(0.0, "Pixels that give nothing", "", 0.0, 0.5)
-    hot_share: float = assumed(0.0, "Pixels that glow", "", 0.0, 0.5)
+    dead_fraction: float = assumed(0.0, "Pixels that give nothing", "", 0.0, 0.5)
+    hot_fraction: float = assumed(0.0, "Pixels that glow", "", 0.0, 0.5)
     hot_e_per_s: float = assumed(5e4, "More than a sound pixel's dark current, at 25 deg C", "e-/s", 0.0, 1e9)
-    well_e: float = assumed(math.inf, "Electrons that a pixel holds; inf: the converter clips first", "e-", 1.0)
+    full_well_e: float = assumed(math.inf, "Electrons that a pixel holds; inf: the converter clips first", "e-", 1.0)
     noiseless: bool = stated(False, "An ideal sensor, for references: no shot noise, read noise or dark current")
     unit: int = stated(0, "Which copy of the sensor: its fixed pattern follows from this number", "", 0, 2**31 - 1)
 
@@ -87,7 +87,7 @@ class Air:
     )
     lever_m: float = assumed(0.1, "Virtual pinhole behind the pivot", "m", 0.0, 10.0)
     visibility_km: float = assumed(23.0, "How far one sees", "km", 0.05, 1e6)
-    airlight_share: float = assumed(0.3, "Light of endless air over the white panel's", "", 0.0, 5.0)
+    airlight_fraction: float = assumed(0.3, "Light of endless air over the white reference's", "", 0.0, 5.0)
     vapour_g_per_m3: float = assumed(10.0, "Water in the air, absolute humidity", "g/m^3", 0.0, 100.0)
     turbulence_cn2: float = assumed(1e-13, "Strength of the turbulence", "m^(-2/3)", 0.0, 1e-6)
     wind_amplitude_m: float = assumed(0.0, "How far the canopy sways", "m", 0.0, 100.0)
@@ -105,7 +105,7 @@ class Sky:
     )
     latitude_deg: float = assumed(52.0, "Latitude of the field; south is negative", "deg", -90.0, 90.0)
     longitude_deg: float = assumed(10.0, "Longitude of the field; west is negative", "deg", -180.0, 180.0)
-    cloud_share: float = assumed(0.0, "Share of the light that a cloud takes; 0 is a clear sky", "", 0.0, 1.0)
+    cloud_fraction: float = assumed(0.0, "Fraction of the light that a cloud takes; 0 is a clear sky", "", 0.0, 1.0)
     cloud_px_per_s: float = assumed(20.0, "Speed of the shadow's edge over the scene", "px/s", 0.0, 1e6)
     cloud_size_px: float = assumed(600.0, "Size of the clouds' shadows", "px", 1.0, 1e9)
     brdf_per_rad: float = assumed(0.1, "Change of reflectance with the view angle", "1/rad", 0.0, 5.0)

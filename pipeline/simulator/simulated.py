@@ -33,7 +33,7 @@ from pipeline.source import AT_REST, Line, References
 Raw = NDArray[np.uint16]
 BLOCK_LINES = 16  # rendered at a time: 11 MB of light with 640 samples and 270 bands
 Frame = NDArray[np.float32]
-SEEN = frozenset({RESPONSE.name, SMILE.name, PRNU.name, STRIPING.name})  # by light of the panel
+SEEN = frozenset({RESPONSE.name, SMILE.name, PRNU.name, STRIPING.name})  # by light of the white reference
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ def sweep_block(
 ) -> SweepBlock:
     """Give some lines of a sweep, which starts ``started_s`` after the survey did, as effects ask about them."""
     rig = rig.taking(sweep)
-    white = scene.panel_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
+    white = scene.white_reference_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
     return SweepBlock(rig, sweep, lines, scene.wavelength_nm, scene.shape, seed, started_s, scene.fwhm_nm, white)
 
 
@@ -226,7 +226,7 @@ def take_references(scene: RasterScene, rig: Rig, choice: Choice, sweep: Sweep) 
     """Give mean dark and white frames (sample, band) with the sweep's binning, free of noise. [DN]
 
     The white frame is scaled from a shorter exposure, so that it does not saturate; it is taken with the mirror at
-    rest, by the light of the survey's start. Dead and hot elements are told as bad; the panel's values are in the rig's
+    rest, by the light of the survey's start. Dead and hot elements are told as bad; the white reference's values are in the rig's
     bands.
     """
     rig = rig.taking(sweep)
@@ -249,13 +249,13 @@ def take_references(scene: RasterScene, rig: Rig, choice: Choice, sweep: Sweep) 
         told = dead | (hot_electrons(rig, seen.shape[1]) > 0)  # of a sum one is enough
         bad = _binned(told.astype(np.float32), sweep.binning) > 0 if told.any() else None
     white = dark + seen / np.float32(rig.camera.electrons_per_dn)
-    panel = scene.panel.astype(np.float32)
+    white_reference = scene.white_reference.astype(np.float32)
     if (response := choice.variant(RESPONSE.name)) != OFF:
-        panel = RESPONSE.change(panel[None, None], block, response)[0, 0]
+        white_reference = RESPONSE.change(white_reference[None, None], block, response)[0, 0]
     return References(
         dark=_binned(dark, sweep.binning),
         white=_binned(white, sweep.binning),
-        panel=panel,
+        white_reference=white_reference,
         bad=bad,
         by_mirror=choice.variant(VIGNETTING.name) != OFF,
     )

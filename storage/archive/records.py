@@ -132,7 +132,7 @@ class Run:
         return _text(self.facts.get("created")) or _text(self.receipt.get("finished"))
 
     @property
-    def sealed(self) -> str:
+    def checksummed(self) -> str:
         """When its manifest was written: at its publication, or when something was last added to it; ISO 8601."""
         return extended_at(self.facts) or self.created
 

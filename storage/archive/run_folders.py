@@ -52,7 +52,7 @@ def date_of_store(root: Path, uri: str) -> str:
     folders = published_runs(root)
     if any((folder / MANIFEST_NAME).lstat().st_mtime >= now.timestamp() - TICK_S for folder in folders):
         runs = (read_run(folder, {}) for folder in folders)
-        for known in (run.sealed for run in runs if uri in run.recorded):
+        for known in (run.checksummed for run in runs if uri in run.recorded):
             try:
                 now = max(now, datetime.fromisoformat(known) + timedelta(milliseconds=1))
             except (ValueError, TypeError, OverflowError):

@@ -185,7 +185,7 @@ def disk_advice(error: OSError) -> str | None:
     return _ADVICE.get(error.errno or 0)
 
 
-def disk_words(error: OSError) -> str:
+def format_disk_error(error: OSError) -> str:
     """`disk_advice`, or what the system says."""
     return disk_advice(error) or f"{error.strerror or error}; free space or rights and run again"
 

@@ -40,7 +40,7 @@ OCTAVE_STEP, DARKEST, DARK = 0.0625, -10.0, 255  # log2 of reference exposures; 
 # what the images of a pixel hold of which nothing is known
 NOT_BELIEVED = {"log_probability": NOTHING, "age": NEVER, "log2_light": DARK}
 OLD_CLASS = "changed_from"
-CHANGED = {"long_name": "share of the patch's pixels with another class than remembered", "units": "1"}
+CHANGED = {"long_name": "fraction of the patch's pixels with another class than remembered", "units": "1"}
 Floats = NDArray[np.float32]
 
 
@@ -160,7 +160,7 @@ def load_class_map(path: Path) -> ClassMap:
     return ClassMap(classes, confidence, legend.names, legend.colours, grid_of(dict(group.attrs)))
 
 
-def create_belief(
+def create_probabilities(
     path: Path, shape: tuple[int, int], legend: ClassNames, *, grid: AngularGrid | None = None, goes_on: bool = False
 ) -> None:
     """Begin a store for a field of (y, x) ``shape`` of which nothing is known yet.
@@ -168,7 +168,7 @@ def create_belief(
     Where it ``goes_on`` from an earlier one there is also what its pixels were, where they changed: `OLD_CLASS`.
     """
     names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
-    group, place = create_placed_group(path, "belief", grid, shape, names)
+    group, place = create_placed_group(path, "class_probabilities", grid, shape, names)
     write_counts(group, **{"class": len(legend.names)})
     about: dict[str, Any] = {
         "long_name": "natural logarithm of the probability of each class",
@@ -195,7 +195,7 @@ def old_class_flags(legend: ClassNames) -> dict[str, Any]:
     return {**class_flags(legend.names, legend.colours), "long_name": words}
 
 
-def write_belief_tile(
+def write_probabilities_tile(
     path: Path, origin: tuple[int, int], log_probability: Floats, age_days: Floats, light: Floats
 ) -> None:
     """Store (y, x, class) log-probabilities, (y, x) ages and light of whole shards from row and column ``origin`` on.
@@ -211,7 +211,7 @@ def write_belief_tile(
         names = ("log_probability", "age", "log2_light")
         arrays = [array for name in names if isinstance(array := group[name], zarr.Array)]
     place = tuple(slice(first, first + size) for first, size in zip(origin, age_days.shape, strict=True))
-    whole_shards("the belief", place, arrays[1].shape, arrays[1].shards or ())
+    whole_shards("the class probabilities", place, arrays[1].shape, arrays[1].shards or ())
     for top in range(0, len(age_days), SHARD_ROWS):  # what is packed never lies there for all rows at once
         part = log_probability[top : top + SHARD_ROWS]
         packed = np.rint((np.clip(part, FAINTEST, 0) - FAINTEST) / STEP)
@@ -233,21 +233,21 @@ def write_changes_tile(path: Path, origin: tuple[int, int], old_class: NDArray[n
         array = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)[OLD_CLASS]
         assert isinstance(array, zarr.Array)
     place = tuple(slice(first, first + size) for first, size in zip(origin, old_class.shape, strict=True))
-    whole_shards("the belief", place, array.shape, array.shards or ())
+    whole_shards("the class probabilities", place, array.shape, array.shards or ())
     array[place] = old_class
 
 
 def drop_changes(path: Path) -> None:
-    """Take out of a belief what its pixels were: it goes on from none after all."""
+    """Take out of a class probabilities what its pixels were: it goes on from none after all."""
     with damage_named(str(path)):
         del zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)[OLD_CLASS]
 
 
 def write_changes(path: Path, changed: Floats, patch_px: int) -> None:
-    """Add (seat_y, seat_x) shares of pixels that changed to a stored belief; a seat has ``patch_px`` a side."""
+    """Add (seat_y, seat_x) fractions of pixels that changed to a stored class probabilities; a patch has ``patch_px`` a side."""
     with damage_named(str(path)):
         group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
-    write_image(group, "changed", ("seat_y", "seat_x"), changed, {**CHANGED, "patch_px": patch_px})
+    write_image(group, "changed", ("patch_y", "patch_x"), changed, {**CHANGED, "patch_px": patch_px})
 
 
 def unpacked_days(packed: NDArray[np.uint16]) -> Floats:
@@ -255,8 +255,8 @@ def unpacked_days(packed: NDArray[np.uint16]) -> Floats:
     return np.where(packed == NEVER, np.float32(np.nan), packed * np.float32(DAY_STEP)).astype(np.float32)
 
 
-class BeliefStore:
-    """A stored belief, read in parts. Raises IncompleteStoreError where there is none, or it is damaged."""
+class ProbabilityStore:
+    """A stored class probabilities, read in parts. Raises IncompleteStoreError where there is none, or it is damaged."""
 
     def __init__(self, path: Path) -> None:
         self._group = open_group(path)
@@ -292,9 +292,9 @@ class BeliefStore:
 
     @property
     def patch_px(self) -> int:
-        """Pixels a side of the seats that changes are told of."""
+        """Pixels a side of the patches that changes are told of."""
         return int(self._group["changed"].attrs["patch_px"])  # type: ignore[arg-type]
 
     def changed(self) -> Floats | None:
-        """Shares of pixels that changed, by seat; None of a first look."""
+        """Shares of pixels that changed, by patch; None of a first look."""
         return read_array(self._group, "changed") if "changed" in self._group else None

@@ -59,8 +59,10 @@ class SweepHeader:
                 f"sweep {self.sweep.name}: dark {frame} and white {self.references.white.shape} must both be "
                 f"(sample, band) with {bands} bands; calibrate with the sweep's own binning"
             )
-        if self.references.panel.shape != (bands,):
-            raise ShapeError(f"sweep {self.sweep.name}: panel has shape {self.references.panel.shape}, not ({bands},)")
+        if self.references.white_reference.shape != (bands,):
+            raise ShapeError(
+                f"sweep {self.sweep.name}: panel has shape {self.references.white_reference.shape}, not ({bands},)"
+            )
         for name in ("bad", "flat"):
             extra = getattr(self.references, name)
             if extra is not None and extra.shape != frame:
@@ -85,7 +87,11 @@ class RawCubeWriter:
         known = header.references
         _write_references(self._group, known)
         self._seen = LineThumbnail(
-            header.shape, header.wavelength_nm, dark=known.dark, white=known.white, panel=known.panel
+            header.shape,
+            header.wavelength_nm,
+            dark=known.dark,
+            white=known.white,
+            white_reference=known.white_reference,
         )
         self._waiting: list[Line] = []
         self._facts: list[tuple[float, float, float, float, bool]] = []
@@ -146,7 +152,7 @@ def _write_references(group: zarr.Group, references: References) -> None:
     frames: dict[str, tuple[tuple[str, ...], Any, type[np.generic], str]] = {
         "dark": (("sample", "band"), references.dark, np.float32, "dark reference frame"),
         "white": (("sample", "band"), references.white, np.float32, "white reference frame"),
-        "panel": (("band",), references.panel, np.float32, "scene value of the white panel"),
+        "white_reference": (("band",), references.white_reference, np.float32, "scene value of the white reference"),
         "bad": (("sample", "band"), references.bad, np.bool_, "bad elements of the detector"),
         "flat": (("sample", "band"), references.flat, np.float32, "relative response left over by the white frame"),
     }
@@ -210,7 +216,7 @@ class RawCube:
         return read_array(self.group, "dn", (lines, samples))
 
     def quicklook(self) -> Quicklook | None:
-        """A small picture of the sweep, its values over the white panel; None where it was stored without one."""
+        """A small picture of the sweep, its values over the white reference; None where it was stored without one."""
         return quicklook_of(self.group)
 
 
@@ -221,13 +227,13 @@ def open_raw_cube(path: Path) -> RawCube:
     """
     group = open_group(path)
     wavelength, fwhm = read_bands(group)
-    dark, white, panel = (read_array(group, name) for name in ("dark", "white", "panel"))
+    dark, white, white_reference = (read_array(group, name) for name in ("dark", "white", "white_reference"))
     bad, flat = (read_array(group, name) if name in group else None for name in ("bad", "flat"))
     with damage_named(str(path)):
         sweep = Sweep(**dict(group.attrs)["sweep"])  # type: ignore[arg-type]
     return RawCube(
         sweep=sweep,
-        references=References(dark, white, panel, bad, flat, bool(group.attrs.get("by_mirror", False))),
+        references=References(dark, white, white_reference, bad, flat, bool(group.attrs.get("by_mirror", False))),
         wavelength_nm=wavelength,
         fwhm_nm=fwhm,
         position=np.stack([read_array(group, "mirror_x"), read_array(group, "mirror_y")], axis=-1),

@@ -25,7 +25,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from pipeline.rig.devices import NotKept
-from storage.archive.staging import disk_words, open_plain, plain_reader, plain_size, read_plain, sync_path
+from storage.archive.staging import format_disk_error, open_plain, plain_reader, plain_size, read_plain, sync_path
 
 SYNC_BYTES = 1 << 24
 SUMS = "%sums"  # which no quoted name ends with
@@ -104,7 +104,7 @@ class FetchedFiles:
         except OSError as error:
             _cut(path, before)
             raise NotKept(
-                f"cannot keep byte {before} of {name} in {self.folder}: {disk_words(error)}; the {before} bytes "
+                f"cannot keep byte {before} of {name} in {self.folder}: {format_disk_error(error)}; the {before} bytes "
                 "before it are kept, and the camera still has the file"
             ) from error
 

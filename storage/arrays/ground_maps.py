@@ -100,9 +100,9 @@ class GroundMap:
     picture: NDArray[np.uint8]  # (y, x, 3) red green blue, 0 where not seen
     legend: ClassNames
     geobox: GeoBox
-    areas: dict[str, dict[str, float]]  # of each class: m2, ha, share of the classified area
+    areas: dict[str, dict[str, float]]  # of each class: m2, ha, fraction of the classified area
     age_days: NDArray[np.float32]  # (y, x) since a pixel was looked at, NaN where not seen
-    changed: NDArray[np.float32] | None  # (y, x) share of its patch that changed, NaN where not seen; None at first
+    changed: NDArray[np.float32] | None  # (y, x) fraction of its patch that changed, NaN where not seen; None at first
     old_class: NDArray[np.uint8] | None  # (y, x) class remembered where it is another now, else 255; None at first
 
 
@@ -145,10 +145,10 @@ class GroundMapWriter:
             self._images[name][rows, columns] = image
 
     def finish(self, areas_m2: NDArray[np.float64]) -> None:
-        """Store the area of each class (class,) beside the map: m2, ha and share of the classified area."""
+        """Store the area of each class (class,) beside the map: m2, ha and fraction of the classified area."""
         total = float(areas_m2.sum()) or 1.0
         self._group.attrs["areas"] = {
-            name: {"m2": m2, "ha": m2 / M2_PER_HECTARE, "share": m2 / total}
+            name: {"m2": m2, "ha": m2 / M2_PER_HECTARE, "fraction": m2 / total}
             for name, m2 in zip(self._legend.names, areas_m2.tolist(), strict=True)
         }
 

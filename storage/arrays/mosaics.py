@@ -136,7 +136,7 @@ def load_mosaic(path: Path) -> Mosaic:
     )
 
 
-def mosaic_strips(path: Path, rows: slice = slice(None), columns: slice = slice(None)) -> Iterator[NDArray[np.float32]]:
+def mosaic_rows(path: Path, rows: slice = slice(None), columns: slice = slice(None)) -> Iterator[NDArray[np.float32]]:
     """Read a window of a mosaic from the top down, (y, x, band) strips that end where shards do.
 
     Raises IncompleteStoreError: the mosaic is missing or damaged.
@@ -157,7 +157,7 @@ def mosaic_wavelengths(path: Path) -> NDArray[np.float64]:
 
 def mosaic_brightness(path: Path) -> NDArray[np.float32]:
     """Mean over the bands, (y, x). Raises IncompleteStoreError where the mosaic is missing or damaged."""
-    return np.concatenate([strip.mean(axis=-1) for strip in mosaic_strips(path)])
+    return np.concatenate([strip.mean(axis=-1) for strip in mosaic_rows(path)])
 
 
 PATCHES_A_SHARD = 64
@@ -173,7 +173,7 @@ class PatchWriter:
     def __init__(
         self,
         path: Path,
-        seats: NDArray[np.integer],
+        patch_index: NDArray[np.integer],
         origin_px: NDArray[np.integer],
         patch_px: int,
         wavelength_nm: NDArray[np.float64],
@@ -181,19 +181,21 @@ class PatchWriter:
         fwhm_nm: NDArray[np.float64] | None = None,
         grid: AngularGrid | None = None,
     ) -> None:
-        count, bands = len(seats), len(wavelength_nm)
-        if seats.shape != (count,) or origin_px.shape != (count, 2):
-            raise ShapeError(f"seats {seats.shape} and origins {origin_px.shape} must be (patch,) and (patch, 2)")
+        count, bands = len(patch_index), len(wavelength_nm)
+        if patch_index.shape != (count,) or origin_px.shape != (count, 2):
+            raise ShapeError(
+                f"patches {patch_index.shape} and origins {origin_px.shape} must be (patch,) and (patch, 2)"
+            )
         group = create_group(path, "fine patches", {} if grid is None else {"angular_grid": grid.record()})
         names = write_bands(group, wavelength_nm, fwhm_nm)
         for name, values, meaning in (
-            ("seat", seats, "number of the seat on the padded grid"),
-            ("seat_y", origin_px[:, 0], "row of the patch's first pixel"),
-            ("seat_x", origin_px[:, 1], "column of the patch's first pixel"),
+            ("patch", patch_index, "number of the patch on the padded grid"),
+            ("patch_y", origin_px[:, 0], "row of the patch's first pixel"),
+            ("patch_x", origin_px[:, 1], "column of the patch's first pixel"),
         ):
             write_small(group, name, ("patch",), np.asarray(values, np.int64), {"long_name": meaning, "units": "1"})
         write_counts(group, patch=count, y=patch_px, x=patch_px)
-        coordinates = " ".join(["seat seat_y seat_x", *write_corners(group, grid, origin_px)])
+        coordinates = " ".join(["patch seat_y seat_x", *write_corners(group, grid, origin_px)])
         self._count = count
         shape = (count, patch_px, patch_px)
         about = {"long_name": "scene value", "units": "1", "coordinates": f"{names} {coordinates}"}
@@ -244,7 +246,7 @@ def _create_stack(
 class PatchStore:
     """Stored patches, opened; values are read when asked for."""
 
-    seats: NDArray[np.int64]  # (patch,)
+    patch_index: NDArray[np.int64]  # (patch,)
     group: zarr.Group
 
     def read(self, start: int, stop: int) -> NDArray[np.float32]:
@@ -268,12 +270,12 @@ class PatchStore:
 def open_patches(path: Path) -> PatchStore:
     """Open stored patches. Raises IncompleteStoreError where they are missing or damaged."""
     group = open_group(path)
-    return PatchStore(read_array(group, "seat"), group)
+    return PatchStore(read_array(group, "patch"), group)
 
 
 @dataclass(frozen=True)
 class Attention:
-    """Scores of all seats and the order in which seats were chosen."""
+    """Scores of all patches and the order in which patches were chosen."""
 
     score: NDArray[np.float64]  # (seat_y, seat_x), NaN where there is none
     rank: NDArray[np.int32]  # (seat_y, seat_x), 0 = chosen first, -1 = not chosen
@@ -285,11 +287,11 @@ def write_attention(path: Path, attention: Attention) -> None:
     if attention.score.shape != attention.rank.shape or attention.score.ndim != 2:
         raise ShapeError(f"score {attention.score.shape} and rank {attention.rank.shape} must both be (seat_y, seat_x)")
     group = create_group(path, "attention", {"policy": attention.policy})
-    write_counts(group, seat_y=attention.score.shape[0], seat_x=attention.score.shape[1])
-    dims = ("seat_y", "seat_x")
+    write_counts(group, patch_y=attention.score.shape[0], patch_x=attention.score.shape[1])
+    dims = ("patch_y", "patch_x")
     about = {"long_name": f"worth of a fine look, policy {attention.policy}", "units": "1"}
     write_image(group, "score", dims, np.asarray(attention.score, np.float64), about)
-    about = {"long_name": "order in which the seat was chosen, from 0; -1 where it was not", "units": "1"}
+    about = {"long_name": "order in which the patch was chosen, from 0; -1 where it was not", "units": "1"}
     write_image(group, "rank", dims, np.asarray(attention.rank, np.int32), about)
 
 

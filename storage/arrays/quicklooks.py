@@ -37,7 +37,7 @@ def picture_bands(wavelength_nm: NDArray[np.floating] | None, count: int) -> tup
     Else the longest, the middle and the shortest wavelength; without wavelengths at 3, 2 and 1 quarters of ``count``.
     """
     if wavelength_nm is None or not np.isfinite(wavelength_nm).all():
-        red, green, blue = ((count - 1) * share // 4 for share in (3, 2, 1))
+        red, green, blue = ((count - 1) * fraction // 4 for fraction in (3, 2, 1))
         return (red, green, blue), "by number"
     waves = np.asarray(wavelength_nm, np.float64)
     red, green, blue = (int(np.argmin(np.abs(waves - target))) for target in RGB_NM)
@@ -138,7 +138,7 @@ def develop(image: NDArray[np.generic], field: NDArray[np.generic]) -> NDArray[n
 
 
 class LineThumbnail:
-    """Every n-th line and sample of three bands, gathered as lines pass, over the white panel where it is known."""
+    """Every n-th line and sample of three bands, gathered as lines pass, over the white reference where it is known."""
 
     def __init__(
         self,
@@ -147,7 +147,7 @@ class LineThumbnail:
         *,
         dark: NDArray[np.floating] | None = None,
         white: NDArray[np.floating] | None = None,
-        panel: NDArray[np.floating] | None = None,
+        white_reference: NDArray[np.floating] | None = None,
     ) -> None:
         self._step = picture_step(shape)
         self._bands, kind = picture_bands(wavelength_nm, shape[2])
@@ -155,7 +155,9 @@ class LineThumbnail:
         self._frames: tuple[NDArray[Any], NDArray[Any], NDArray[Any]] | None = None
         if dark is not None and white is not None:
             level, light = (np.asarray(frame[:: self._step][:, chosen], np.float32) for frame in (dark, white))
-            value = np.ones(3, np.float32) if panel is None else np.asarray(panel[chosen], np.float32)
+            value = (
+                np.ones(3, np.float32) if white_reference is None else np.asarray(white_reference[chosen], np.float32)
+            )
             self._frames = level, light, value
         self._together = self._frames is not None and kind == "true colour"
         self._rows: list[NDArray[np.float32]] = []

@@ -29,7 +29,7 @@ from pipeline.errors import RigError
 from pipeline.json_lines import read_checked, with_check
 from pipeline.source import Line
 from storage.archive.keys import plain
-from storage.archive.staging import disk_words, open_plain, plain_reader, sync_path
+from storage.archive.staging import format_disk_error, open_plain, plain_reader, sync_path
 
 ENDING = ".lines"
 SYNC_LINES = 64
@@ -150,7 +150,7 @@ class Spool:
         self.count = max(good, default=-1) + 1
         self.lost = sorted(set(range(self.count)) - set(good))
         if self.lost:
-            LOG.warning("%s: not as it was captured, and asked for again: %s", self.path, line_words(self.lost))
+            LOG.warning("%s: not as it was captured, and asked for again: %s", self.path, line_values(self.lost))
         self._cut_back()
         return self.count
 
@@ -234,10 +234,10 @@ def spool_problems(path: Path) -> Iterator[str]:
     lost = [number for number, line in enumerate(spool.read()) if line is None]
     if lost:
         words = "not as captured (CRC-32), or never on the disk: asked for again when the capture goes on"
-        yield f"{path.name}: {line_words(lost)} {words}"
+        yield f"{path.name}: {line_values(lost)} {words}"
 
 
-def line_words(numbers: Sequence[int]) -> str:
+def line_values(numbers: Sequence[int]) -> str:
     """Numbers of lines for a message: the first few, and how many more."""
     named = ", ".join(str(number) for number in numbers[:MOST_NAMED])
     more = f" and {len(numbers) - MOST_NAMED} more" if len(numbers) > MOST_NAMED else ""
@@ -272,7 +272,7 @@ def _refusals(path: Path, lines: int) -> Iterator[None]:
         raise
     except OSError as error:
         raise RigError(
-            f"cannot write line {lines} to {path}: {disk_words(error)}; the {lines} lines before it are kept"
+            f"cannot write line {lines} to {path}: {format_disk_error(error)}; the {lines} lines before it are kept"
         ) from error
 
 

@@ -22,13 +22,13 @@ from pipeline.rectify.mosaic import LineCache
 from pipeline.rectify.placed import PixelGrid, Placed, place
 from pipeline.rectify.region import Reaches, Tile, plan_tiles
 from pipeline.rectify.registration.alignment import SweepShift, no_shifts
+from pipeline.rectify.scan_paths import LineNumbers, number_lines
 from pipeline.rectify.tiles import MosaicWork
-from pipeline.rectify.tracks import LineNumbers, number_lines
 from storage.archive.manifests import read_table
 from storage.arrays.cubes import RawCube, open_raw_cube
-from storage.arrays.lookups import Tables, open_lookup
+from storage.arrays.geolocation import Tables, open_geolocation
 from storage.arrays.mosaics import MosaicWriter
-from storage.parallel.crew import THREADS, Crew, run_blocks
+from storage.parallel.pool import THREADS, WorkerPool, run_blocks
 
 
 @dataclass(frozen=True)
@@ -97,14 +97,14 @@ class MosaicRecipe:
     camera: LineCamera
     grid: PixelGrid
     kernel: Kernel = "catmull-rom"
-    lookup: Path | None = None  # tables of the sweeps; None looks lines up directly
+    geolocation: Path | None = None  # tables of the sweeps; None looks lines up directly
     registration: Path | None = None  # record of the corrections
     finer: PixelGrid | None = None
 
     @property
     def folders(self) -> list[Path]:
         """What has to be seen by whoever makes tiles."""
-        given = (self.raw, self.lookup, None if self.registration is None else self.registration.parent)
+        given = (self.raw, self.geolocation, None if self.registration is None else self.registration.parent)
         return [path for path in given if path is not None]
 
     def sweeps(self) -> list[Sighted]:
@@ -117,7 +117,7 @@ class MosaicRecipe:
 
         Raises IncompleteStoreError: a sweep or the tables are missing or damaged.
         """
-        tables: Tables = {} if self.lookup is None else open_lookup(self.lookup)
+        tables: Tables = {} if self.geolocation is None else open_geolocation(self.geolocation)
         placed = []
         for one in self.sweeps():  # without tables where its lines lie too unevenly for one
             stored = tables.get(one.cube.sweep.name)
@@ -178,28 +178,28 @@ def write_mosaic(
     writer: MosaicWriter,
     *,
     memory: int,
-    crew: Crew = THREADS,
+    pool: WorkerPool = THREADS,
     seen: Thumbnail | None = None,
     report: Callable[[float], None] = lambda done: None,
 ) -> TileBudget:
     """Rectify and blend sweeps into a stored mosaic, and tell how. Whoever makes the tiles, the same bytes come out.
 
     Fewer tiles are made at a time where ``memory`` [bytes] of this process and those that it starts, not of workers
-    elsewhere, holds fewer. ``seen`` is filled with the pixels that it shows, ``report`` called with the share done
-    after each tile, from the calling thread. Raises SettingsError: not even one tile fits the memory, or the crew
+    elsewhere, holds fewer. ``seen`` is filled with the pixels that it shows, ``report`` called with the fraction done
+    after each tile, from the calling thread. Raises SettingsError: not even one tile fits the memory, or the worker pool
     cannot work here. WorkerError: processes that made tiles were lost.
     """
     work = _work_of(recipe)
     tiles = plan_tiles(work.placed, work.camera, work.grid, writer.tile_shape)
-    budget = tile_budget(work, tiles, writer.tile_shape, memory=memory, crew=crew)
+    budget = tile_budget(work, tiles, writer.tile_shape, memory=memory, pool=pool)
     maker = TileMaker(recipe, writer.path.absolute(), budget.cache, None if seen is None else seen.cut)
-    if crew.shares_memory:
+    if pool.shares_memory:
         _opened(maker)  # before several threads ask for it
-    fewer = not crew.elsewhere and budget.workers < min(crew.count, len(tiles))
+    fewer = not pool.elsewhere and budget.workers < min(pool.count, len(tiles))
     run_blocks(
         maker,
         [(tile.rows, tile.columns) for tile in tiles],
-        Crew(crew.scheduler, budget.workers) if fewer else crew,
+        WorkerPool(pool.scheduler, budget.workers) if fewer else pool,
         keep=False,
         report=report,
         paths=[*recipe.folders, maker.out],
@@ -258,20 +258,20 @@ def let_tiles_go() -> None:
 
 
 def tile_budget(
-    work: MosaicWork, tiles: Sequence[Tile], tile_shape: tuple[int, int], *, memory: int, crew: Crew = THREADS
+    work: MosaicWork, tiles: Sequence[Tile], tile_shape: tuple[int, int], *, memory: int, pool: WorkerPool = THREADS
 ) -> TileBudget:
     """Choose how many tiles to make at a time: as many as are allowed and memory holds; elsewhere memory is no matter.
 
     Raises SettingsError: not even one tile at a time fits the memory.
     """
-    processes = not crew.shares_memory
-    most = max(1, min(1 if crew.elsewhere else crew.count, len(tiles)))
+    processes = not pool.shares_memory
+    most = max(1, min(1 if pool.elsewhere else pool.count, len(tiles)))
     for count in range(most, 0, -1):
         one, lines = work.tile_memory(tiles, tile_shape, 1 if processes else count)
         budget = TileBudget(count, lines, one, processes)
-        if crew.elsewhere or budget.projected <= memory:
+        if pool.elsewhere or budget.projected <= memory:
             return budget
-    bands = len(work.placed[0].lines.references.panel) if work.placed else 1
+    bands = len(work.placed[0].lines.references.white_reference) if work.placed else 1
     raise SettingsError(
         f"projected memory {_mib(budget.projected)} exceeds --memory {_mib(memory)}: one tile of {tile_shape[0]} x "
         f"{tile_shape[1]} px and {bands} bands takes {_mib(one)}, the raw lines behind it {_mib(lines)}, "

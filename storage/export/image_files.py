@@ -26,7 +26,7 @@ from storage.arrays.layout import AngularGrid
 from storage.readers.envi_files import DATA_TYPES
 
 TILE = 512  # px: rasters within one tile need no overviews
-OUTSIDE = 0.02  # share of pixels that a style's colours end before, at either end
+OUTSIDE = 0.02  # fraction of pixels that a style's colours end before, at either end
 ANGULAR = (
     "angular grid of the camera: x and y are tangents of the angle from the undeflected direction [rad], y grows "
     "downwards; there is no CRS"

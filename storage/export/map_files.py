@@ -129,7 +129,7 @@ class TaskGrid:
 
 
 @dataclass(frozen=True)
-class TaskWords:
+class TaskText:
     """What the task is called, and what it is for."""
 
     task: str
@@ -139,7 +139,7 @@ class TaskWords:
     area_m2: float
 
 
-def write_task_data(folder: Path, grid: TaskGrid, words: TaskWords) -> tuple[Path, Path]:
+def write_task_data(folder: Path, grid: TaskGrid, words: TaskText) -> tuple[Path, Path]:
     """Write ``folder/TASKDATA`` with the task and its grid; gives the paths of both files.
 
     Raises SettingsError: a dose is larger than the format can hold. ArchiveError: the disk refuses.
@@ -158,7 +158,7 @@ def write_task_data(folder: Path, grid: TaskGrid, words: TaskWords) -> tuple[Pat
     return place / XML, place / NUMBERS
 
 
-def _task_file(grid: TaskGrid, words: TaskWords, length: int) -> ElementTree.Element:
+def _task_file(grid: TaskGrid, words: TaskText, length: int) -> ElementTree.Element:
     """One planned task of one field with two treatment zones, one of them the grid's."""
     root = ElementTree.Element(
         "ISO11783_TaskData",
@@ -200,9 +200,9 @@ def _grid_fields(grid: TaskGrid, length: int) -> dict[str, str]:
     }
 
 
-def ramp_colour(share: float, ramp: Sequence[Colour]) -> Colour:
-    """The colour at a share, 0 to 1, of a ramp of colours evenly apart."""
-    place = min(max(share, 0.0), 1.0) * (len(ramp) - 1)
+def ramp_colour(fraction: float, ramp: Sequence[Colour]) -> Colour:
+    """The colour at a fraction, 0 to 1, of a ramp of colours evenly apart."""
+    place = min(max(fraction, 0.0), 1.0) * (len(ramp) - 1)
     low = min(int(place), len(ramp) - 2)
     return tuple(round(a + (place - low) * (b - a)) for a, b in zip(ramp[low], ramp[low + 1], strict=True))
 

@@ -46,8 +46,8 @@ def write_recorded_files(cube: RawCube, folder: Path) -> Path:
     about = f"raw numbers of sweep {name}"
     write_envi(header, replace(bands, description=about, ending=".bil", more=axis), blocks())
     known = cube.references
-    panel = ", ".join(repr(value) for value in known.panel.astype(np.float64).tolist())
-    of_white = {"panel": f"{{{panel}}}", **({"mirror at rest": "1"} if known.by_mirror else {})}
+    white_reference = ", ".join(repr(value) for value in known.white_reference.astype(np.float64).tolist())
+    of_white = {"white_reference": f"{{{white_reference}}}", **({"mirror at rest": "1"} if known.by_mirror else {})}
     bad = np.zeros(known.dark.shape, np.bool_) if known.bad is None else known.bad
     frames: dict[str, tuple[NDArray[Any], str, dict[str, str]]] = {
         "dark": (known.dark, "f4", {}),

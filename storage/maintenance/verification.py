@@ -206,7 +206,7 @@ def _identity_problems(catalogue: Catalogue, uri: str) -> Iterator[str]:
         yield f"its {MANIFEST_NAME} is that of {stated}; move it back, or take it out of the archive"
     knowing = catalogue.recorded_by.get(uri, [])
     own = {manifest_sha256(store.ref.path), *cleared_from(store.facts)} if knowing else set()
-    anew = all(store.created > run.sealed for run, _ in knowing)
+    anew = all(store.created > run.checksummed for run, _ in knowing)
     if not anew and not any(sha256 in own for _, sha256 in knowing):
         yield f"its {MANIFEST_NAME} has changed since {knowing[-1][0].uri} was published (its SHA-256 differs)"
 

@@ -97,7 +97,7 @@ class CubeSource:
     bands: Bands = field(default_factory=Bands)
     dark: NDArray[np.float32] | None = None  # (sample, band)
     white: NDArray[np.float32] | None = None  # (sample, band)
-    panel: NDArray[np.float32] | None = None  # (band,) value of the white panel; 1 where None
+    white_reference: NDArray[np.float32] | None = None  # (band,) value of the white reference; 1 where None
     bad: NDArray[np.bool_] | None = None  # (sample, band) elements not to be believed
     flat: NDArray[np.float32] | None = None  # (sample, band) response left over by the white frame
     position: NDArray[np.float64] | None = None  # (line, 2) mirror, where the light falls off with its tilt
@@ -181,7 +181,7 @@ def read_by_chunks(read: ReadLines, lines: int, chunk_lines: int) -> ReadLines:
 
 
 def scene_lines(source: CubeSource, start: int, stop: int) -> NDArray[Any]:
-    """Lines as a scene shows them, (line, sample, band): over the white panel where dark and white are known.
+    """Lines as a scene shows them, (line, sample, band): over the white reference where dark and white are known.
 
     float32 with NaN where a line is missing, an element bad or the file says no data; the source's own numbers where
     nothing is missing and there are no references.
@@ -193,9 +193,11 @@ def scene_lines(source: CubeSource, start: int, stop: int) -> NDArray[Any]:
             return raw
         values = raw.astype(np.float32)
     else:
-        panel = np.ones(source.shape[2], np.float32) if source.panel is None else source.panel
+        white_reference = (
+            np.ones(source.shape[2], np.float32) if source.white_reference is None else source.white_reference
+        )
         by_mirror = source.position is not None
-        references = References(source.dark, source.white, panel, source.bad, source.flat, by_mirror)
+        references = References(source.dark, source.white, white_reference, source.bad, source.flat, by_mirror)
         position = None if source.position is None else source.position[start:stop]
         values, usable = calibrate(raw, references, saturated_dn=np.inf, position=position)
         values[~usable] = np.nan

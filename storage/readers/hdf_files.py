@@ -142,7 +142,7 @@ def _other_place(
     if "glt_x" in names:
         return None, (
             "its pixels are in the sensor's own geometry and have no map grid; for a place on the earth, write it"
-            " orthorectified by its lookup table (glt_x, glt_y) first",
+            " orthorectified by its geolocation grids (glt_x, glt_y) first",
         )
     if {"lat", "latitude"} & names:
         return None, ("its place is told by a latitude and longitude of each pixel, which are not read",)

@@ -52,13 +52,17 @@ def write_ingested_cube(
     SceneError: lines cannot be read.
     """
     kind = stored_dtype(source, lambda done: report(0.3 * done))
-    looked_at = source.dtype.kind in "ui" and source.dtype not in (np.uint8, np.uint16)
-    begin = 0.3 if looked_at else 0.0
+    sampled = source.dtype.kind in "ui" and source.dtype not in (np.uint8, np.uint16)
+    begin = 0.3 if sampled else 0.0
     group = create_group(folder / "cube.zarr", f"{KIND} {name}", _attributes(source, files, name))
     about: dict[str, Any] = {"long_name": "numbers of the file", "units": "1", **_write_coordinates(group, source)}
     array = create_array(group, "values", image_spec(("line", "sample", "band"), source.shape, kind.str), about)
     thumbnail = LineThumbnail(
-        source.shape, source.bands.wavelength_nm, dark=source.dark, white=source.white, panel=source.panel
+        source.shape,
+        source.bands.wavelength_nm,
+        dark=source.dark,
+        white=source.white,
+        white_reference=source.white_reference,
     )
     for start in range(0, source.shape[0], BLOCK_LINES):
         stop = min(start + BLOCK_LINES, source.shape[0])
@@ -142,8 +146,14 @@ def _write_coordinates(group: zarr.Group, source: CubeSource) -> dict[str, str]:
     for name, (frame, title) in frames.items():
         if frame is not None:
             write_small(group, name, ("sample", "band"), np.asarray(frame), {"long_name": title, "units": "1"})
-    if source.panel is not None:
-        write_small(group, "panel", ("band",), source.panel, {"long_name": "scene value of the white panel"})
+    if source.white_reference is not None:
+        write_small(
+            group,
+            "white_reference",
+            ("band",),
+            source.white_reference,
+            {"long_name": "scene value of the white reference"},
+        )
     if source.position is not None:
         for name, axis in zip(("mirror_x", "mirror_y"), source.position.T, strict=True):
             write_small(group, name, ("line",), np.ascontiguousarray(axis), {"long_name": "mirror position"})

@@ -168,8 +168,8 @@ def _index(
             f"labels {where} have {count} px of {_shown(unknown[0], classes)}, which is no class (and "
             f"{len(unknown) - 1} more such values); {MIXED if len(unknown) > _MANY_UNKNOWN else cure}"
         )
-    lookup = np.array([table.get(int(value), UNLABELLED) for value in values], np.uint8)
-    return lookup[inverse.reshape(codes.shape)]
+    geolocation = np.array([table.get(int(value), UNLABELLED) for value in values], np.uint8)
+    return geolocation[inverse.reshape(codes.shape)]
 
 
 def _shown(code: int, classes: Mapping[str, ClassValue]) -> str:

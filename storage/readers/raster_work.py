@@ -16,7 +16,7 @@ from storage.arrays.mosaics import PATCHES_A_SHARD, MosaicWriter, PatchWriter
 from storage.arrays.tile_work import RESERVED_BYTES, Thumbnail
 
 COPIES = 6  # of a block while it is read: the file's numbers, their float32, and what is made of them
-SHARE = 4  # of the memory beside what the process takes anyway: more at once is read no faster
+FRACTION = 4  # of the memory beside what the process takes anyway: more at once is read no faster
 Report = Callable[[float], None]
 
 
@@ -47,7 +47,7 @@ class RasterPixels:
                 f"projected memory {_mib(least)} exceeds --memory {_mib(memory)}: {deep} rows of a raster of "
                 f"{grid.width} px and {self.bands} bands are read at a time; give at least --memory {_mib(least)}"
             )
-        return deep * max(1, (memory - RESERVED_BYTES) // SHARE // (deep * row))
+        return deep * max(1, (memory - RESERVED_BYTES) // FRACTION // (deep * row))
 
 
 def write_means(
@@ -79,33 +79,33 @@ def write_means(
 def write_patches(
     raster: RasterPixels,
     writer: PatchWriter,
-    seats: NDArray[np.integer],
+    patch_index: NDArray[np.integer],
     *,
     memory: int,
     report: Report = lambda done: None,
 ) -> None:
-    """Store the patches of ascending ``seats`` at the raster's own pixels; beyond its edge that is repeated.
+    """Store the patches of ascending ``patch_index`` at the raster's own pixels; beyond its edge that is repeated.
 
     Raises SettingsError: not even one row of patches fits the memory.
     """
     done = 0
-    for values, valid in patches_of(raster, seats, memory=memory):
+    for values, valid in patches_of(raster, patch_index, memory=memory):
         writer.write(values, valid)
         done += len(values)
-        report(done / len(seats))
+        report(done / len(patch_index))
 
 
 def patches_of(
-    raster: RasterPixels, seats: NDArray[np.integer], *, memory: int
+    raster: RasterPixels, patch_index: NDArray[np.integer], *, memory: int
 ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.bool_]]]:
-    """Read the patches of ascending ``seats``: (patch, y, x, band) values and (patch, y, x) validity, rows at a time.
+    """Read the patches of ascending ``patch_index``: (patch, y, x, band) values and (patch, y, x) validity, rows at a time.
 
     Raises SettingsError: not even one row of patches fits the memory.
     """
     grid = raster.grid
-    p, (_, across) = grid.patch, grid.seat_shape
+    p, (_, across) = grid.patch, grid.patch_shape
     deep = raster.rows_at_once(memory) // p
-    row, column = np.divmod(seats, across)
+    row, column = np.divmod(patch_index, across)
     for first in sorted({int(one) // deep * deep for one in np.unique(row)}):
         here = (row >= first) & (row < first + deep)
         top, below = first * p, min((int(row[here].max()) + 1) * p, grid.height)

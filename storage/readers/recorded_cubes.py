@@ -22,7 +22,7 @@ from storage.readers.zarr_files import find_zarr_store
 
 FRAMES = ("dark", "white", "bad", "flat")  # what a cube's name is followed by in those of its frames
 SAMPLED_LINES = 16  # looked at for byte order and bits
-MOST_LINES_OVER = 0.5  # share of numbers above full scale that says the byte order is wrong, if swapped ones fit
+MOST_LINES_OVER = 0.5  # fraction of numbers above full scale that says the byte order is wrong, if swapped ones fit
 SWAPPED_OVER = 0.01
 
 
@@ -136,12 +136,12 @@ def find_references(
     notes: list[str],
     *,
     stated: dict[str, Path | None],
-    panel: NDArray[np.float32],
+    white_reference: NDArray[np.float32],
     at_rest: bool,
 ) -> References:
     """Return the reference frames of a cube whose companions are called ``stem.dark.hdr`` and the like.
 
-    ``stated`` files come first, then those of the cube's name, then the folder's only dark and white frame. ``panel``
+    ``stated`` files come first, then those of the cube's name, then the folder's only dark and white frame. ``white_reference``
     is the value of the white reference, one or (band,), where nothing else says it; ``at_rest`` says that the white
     frame was taken with the mirror at rest. Raises SceneError: a frame has other samples or bands than the cube.
     """
@@ -168,20 +168,22 @@ def find_references(
     if bad is None and measured and files["bad"] is None:
         bad = find_bad_elements(dark, white)
     bands = frame[1]
-    panel = panel if source.panel is None else np.asarray(source.panel, np.float32)
-    if panel.shape not in ((), (bands,)):
+    white_reference = (
+        white_reference if source.white_reference is None else np.asarray(source.white_reference, np.float32)
+    )
+    if white_reference.shape not in ((), (bands,)):
         raise SceneError(
-            f"the white reference has {panel.shape} values, the cube {bands} bands; give one or one a band"
+            f"the white reference has {white_reference.shape} values, the cube {bands} bands; give one or one a band"
         )
     by_mirror, file = at_rest or source.position is not None, files["white"]
     if file is not None and reader_of(file) == "envi":
         fields = load_envi_header(find_envi_pair(file)[0]).fields
-        listed = listed_numbers(fields, "panel", bands, [])
-        panel = panel if listed is None else listed.astype(np.float32)
+        listed = listed_numbers(fields, "white_reference", bands, [])
+        white_reference = white_reference if listed is None else listed.astype(np.float32)
         by_mirror = by_mirror or fields.get("mirror at rest", "0").strip() == "1"
     bad = None if bad is None or not np.any(bad) else np.asarray(bad, np.bool_)
-    panel = np.broadcast_to(panel, bands).copy()
-    return References(dark, white, panel, bad, found.get("flat", source.flat), by_mirror)
+    white_reference = np.broadcast_to(white_reference, bands).copy()
+    return References(dark, white, white_reference, bad, found.get("flat", source.flat), by_mirror)
 
 
 def _load_fitting(file: Path, frame: tuple[int, ...], kind: str, notes: list[str]) -> NDArray[np.float32]:

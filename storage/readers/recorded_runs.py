@@ -55,8 +55,8 @@ def find_recorded_run(address: str | Path) -> tuple[Run, tuple[int, int] | None]
         return None
     archive, run, _ = _run_with_cubes(*named)
     for row in run.stages:
-        if row.get("name") == "attend":
-            grid = read_store(archive.ref("attend", str(row.get("key")))).params.get("grid", {})
+        if row.get("name") == "score":
+            grid = read_store(archive.ref("score", str(row.get("key")))).params.get("grid", {})
             if {"height", "width"} <= set(grid):
                 return run, (int(grid["height"]), int(grid["width"]))
     return run, None

@@ -11,7 +11,7 @@
 Beside a cube ``NAME`` of files are found, where no flag names them: ``NAME.pointing.csv`` (.parquet, .toml),
 ``NAME.dark.hdr``, ``NAME.white.hdr``, ``NAME.bad.hdr``, ``NAME.flat.hdr``, or ``dark*.hdr`` and ``white*.hdr`` for all
 cubes of the folder. The header of an ENVI cube may say ``line axis = y``: lines lie along y of the field, and the scan
-goes along x. The header of a white frame may say ``panel = {...}``, the value of the white reference per band,
+goes along x. The header of a white frame may say ``white_reference = {...}``, the value of the white reference per band,
 and ``mirror at rest = 1`` where it was taken so.
 """
 
@@ -107,7 +107,7 @@ class RecordedWith:
     dark: Path | None = None
     white: Path | None = None
     wavelengths: Sequence[float] | None = None  # of all bands [nm]
-    panel: ArrayLike = 1.0  # value of the white reference, one or (band,)
+    white_reference: ArrayLike = 1.0  # value of the white reference, one or (band,)
     white_at_rest: bool = False  # the white frame was taken with the mirror at rest
     mounting: Mounting = STRAIGHT  # of the device whose positions the pointing has
     pixel_m: float | None = None  # metres a pixel on the ground, for positions in metres
@@ -156,7 +156,7 @@ def open_recording(
 
 
 def _frames(references: References) -> list[NDArray[Any]]:
-    frames = (references.dark, references.white, references.panel, references.bad, references.flat)
+    frames = (references.dark, references.white, references.white_reference, references.bad, references.flat)
     return [np.zeros(0) if frame is None else frame for frame in frames]
 
 
@@ -290,7 +290,7 @@ def _sweeps_of(
         camera,
         notes,
         stated={"dark": given.dark, "white": given.white},
-        panel=np.asarray(given.panel, np.float32),
+        white_reference=np.asarray(given.white_reference, np.float32),
         at_rest=given.white_at_rest,
     )
     names = (cube.name,) if pointing.part is None else tuple(name for name in dict.fromkeys(pointing.part) if name)

@@ -41,11 +41,11 @@ _ROWS_OF_EDGE = 32  # whose first and last pixels are looked at
 
 @dataclass(frozen=True)
 class FoundClass:
-    """A value of the label files: what a scene.toml may call it, and its share of all their pixels."""
+    """A value of the label files: what a scene.toml may call it, and its fraction of all their pixels."""
 
     name: str
     value: ClassValue
-    share: float
+    fraction: float
     no_class: bool = False  # its own name says that it stands for none
 
 
@@ -60,8 +60,8 @@ class SceneDraft:
     wavelength_nm: NDArray[np.float64] | None  # (band,)
     wavelength_origin: str
     nodata: float | None  # as the file itself says
-    edge: tuple[float, float] | None  # value that fills the edge, and its share of it
-    missing: float  # share of NaN among the values looked at
+    edge: tuple[float, float] | None  # value that fills the edge, and its fraction of it
+    missing: float  # fraction of NaN among the values looked at
     classes: tuple[FoundClass, ...] = ()
     legend: Path | None = None
     notes: tuple[str, ...] = ()  # what readers made of the first image
@@ -101,7 +101,7 @@ def draft_scene(address: str | Path, report: Report = lambda done, name: None) -
         classes = _classes(replace(found, labels=pictures), source.shape, legend, unseen, report)
     else:
         classes = _polygon_classes(found, unseen, report)
-    edge, missing = _look_at_edge(source)
+    edge, missing = _check_edge(source)
     return SceneDraft(
         folder=folder,
         files=found,
@@ -177,12 +177,14 @@ def _classes(
         classes.append(FoundClass(name, value, counts[code] / every, (told or "").lower() in NO_CLASS))
     if len({one.name for one in classes}) < len(classes):
         unseen.append(f"{legend.path if legend else 'a legend'} gives one name to two values; classes are numbered")
-        classes = [FoundClass(f"{one.name}_{at}", one.value, one.share, one.no_class) for at, one in enumerate(classes)]
+        classes = [
+            FoundClass(f"{one.name}_{at}", one.value, one.fraction, one.no_class) for at, one in enumerate(classes)
+        ]
     return tuple(classes)
 
 
 def _polygon_classes(found: MatchedFiles, unseen: list[str], report: Report) -> tuple[FoundClass, ...]:
-    """All classes of label files that are polygons, and their shares of the labelled pixels."""
+    """All classes of label files that are polygons, and their fractions of the labelled pixels."""
     settings, counts, readable = SceneSettings(), Counter[str](), list[Path]()
     for number, (image, label) in enumerate(found.labels.items()):
         report(number / len(found.labels), label.name)
@@ -210,8 +212,8 @@ def _refuse_mixed(label: Path, values: NDArray[np.int64], counts: NDArray[np.int
     raise SceneError(f"{label} has {len(values)} different {what}{told}: {MIXED}")
 
 
-def _look_at_edge(source: CubeSource) -> tuple[tuple[float, float] | None, float]:
-    """What fills the edge of a cube, and the share of NaN in the rows that were read for it."""
+def _check_edge(source: CubeSource) -> tuple[tuple[float, float] | None, float]:
+    """What fills the edge of a cube, and the fraction of NaN in the rows that were read for it."""
     height = source.shape[0]
     starts = sorted({round(at) for at in np.linspace(0, height - 1, min(_ROWS_OF_EDGE, height))})
     rows: Sequence[NDArray[np.generic]] = [source.read(start, start + 1) for start in starts]

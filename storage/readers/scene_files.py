@@ -94,7 +94,7 @@ def load_scene_file(
     """Read a scene from an image, .npy, .npz, .mat, ENVI, Zarr, NetCDF, HDF5, Sentinel-2 or a Headwall folder.
 
     ``path`` may be ``FILE.mat:VARIABLE`` or ``STORE.zarr:ARRAY``, and end in a step of time, ``FILE.npy:STEP``. Axes
-    are y, x, band; two axes are one band. What comes in lines with dark and white frames is taken over the white panel.
+    are y, x, band; two axes are one band. What comes in lines with dark and white frames is taken over the white reference.
     What is given here wins over the ``scene.toml`` beside the file, and that over what the file says: a file of class
     numbers or colours on the same pixels, or of polygons (others are found by their names), bands to use, counted from
     0, and wavelengths [nm], one for each band used or for each of the file. ``classes`` are those of a scene.toml that
@@ -167,7 +167,7 @@ def _open(
     )
     light_hash = _light_hash(file, variable, source, chosen, light, settings.nodata, void)
     some = () if chosen == list(range(count)) else (f"bands {bands_text(chosen)} of {count}, counted from 0",)
-    over = ("values are over the white panel",) if calibrated else ()
+    over = ("values are over the white reference",) if calibrated else ()
     of_labels: dict[str, Any] = {
         "labels": None if found is None else found.index,
         "class_names": () if found is None else found.names,

@@ -14,7 +14,7 @@ from pipeline.readings import MOST_STEPS, MOST_VALUE, Beyond, beyond_range, find
 from pipeline.simulator.scenes.scene import BRIGHT_PERCENTILE
 from storage.readers.scene_toml import SETTINGS_NAME
 
-_LOOKED_AT = 1 << 20  # values, evenly spread, by which the range of a scene is told
+_SAMPLED = 1 << 20  # values, evenly spread, by which the range of a scene is told
 
 
 def as_values(
@@ -53,7 +53,7 @@ class ValueCount:
         self.missing = np.zeros(shape, np.bool_)  # (y, x) pixels without a value in more than half of their bands
         self.filled_px = 0  # pixels without a value in a band
         self._path, self._chosen, self._nodata = path, list(chosen), nodata
-        self._every = max(1, shape[0] * shape[1] * len(chosen) // _LOOKED_AT)
+        self._every = max(1, shape[0] * shape[1] * len(chosen) // _SAMPLED)
         self._seen = np.zeros(len(chosen), np.bool_)  # bands with a value somewhere
         self._void = self._infinite = self._absent = self._size = self._row = self._beyond = 0
         self._first_beyond: Beyond | None = None
@@ -63,11 +63,11 @@ class ValueCount:
     def take(self, rows: NDArray[Any], void: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
         """Count the next (y, x, band) rows of the file, and return what `as_values` does."""
         picked, values, empty = _converted(rows, self._chosen, self._nodata, void)
-        if (strange := beyond_range(picked)) is not None and empty is not None:
+        if (out_of_range := beyond_range(picked)) is not None and empty is not None:
             picked = np.where(empty, picked.dtype.type(0), picked)
         self._void += 0 if empty is None else int(np.count_nonzero(empty))
-        if strange is not None:
-            self._note_strange(picked, values)
+        if out_of_range is not None:
+            self._note_out_of_range(picked, values)
         values[np.isinf(values)] = np.nan
         known = np.isfinite(values)
         if not known.all():
@@ -82,7 +82,7 @@ class ValueCount:
         self._row += len(values)
         return values
 
-    def _note_strange(self, picked: NDArray[Any], values: NDArray[np.float32]) -> None:
+    def _note_out_of_range(self, picked: NDArray[Any], values: NDArray[np.float32]) -> None:
         infinite = np.isinf(values)
         if infinite.any() and not self._infinite:
             place = [int(at) for at in np.unravel_index(int(infinite.argmax()), infinite.shape)]

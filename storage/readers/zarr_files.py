@@ -25,7 +25,7 @@ from storage.arrays.layout import missing_codec
 from storage.readers.array_cubes import cube_source, dims_of, find_cube, names_beside
 from storage.readers.cube_sources import BLOCK_LINES, MOST_RATIO, CubeSource, LineFacts, check_memory
 
-FRAMES = ("dark", "white", "panel", "bad", "flat")
+FRAMES = ("dark", "white", "white_reference", "bad", "flat")
 OF_LINES = ("mirror_x", "mirror_y", "valid_line", "time", "exposure_ms", "frame")
 METADATA = ("zarr.json", ".zarray", ".zgroup")
 LARGEST_METADATA = 1 << 24  # bytes
@@ -112,7 +112,7 @@ def _with_own(source: CubeSource, arrays: dict[str, Any], attributes: dict[str, 
         ),
         dark=frame("dark", samples, bands),
         white=frame("white", samples, bands),
-        panel=frame("panel", bands),
+        white_reference=frame("white_reference", bands),
         bad=None if bad is None else bad.astype(np.bool_),
         flat=frame("flat", samples, bands),
         position=None if x is None or y is None else np.stack([x, y], axis=-1).astype(np.float64),

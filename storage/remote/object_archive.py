@@ -83,7 +83,7 @@ class ObjectArchive(Archive):
         """
         ref = self.ref(stage, key)
         whole = self._is_whole(ref.uri)
-        if ref.uri not in self._standing and not self._look_up(ref.uri, keep=whole):
+        if ref.uri not in self._standing and not self._find(ref.uri, keep=whole):
             if not whole:
                 return None
             if self.writes:
@@ -212,7 +212,7 @@ class ObjectArchive(Archive):
 
     def _bring(self, uri: str) -> None:
         with suppress(IncompleteStoreError):  # whoever reads it says so
-            if _is_address(uri) and self._look_up(uri) and uri.startswith("runs/"):
+            if _is_address(uri) and self._find(uri) and uri.startswith("runs/"):
                 self._fetch_files(uri, [RECEIPT])
 
     def now(self) -> datetime:
@@ -297,7 +297,7 @@ class ObjectArchive(Archive):
         path = self.root / uri / MANIFEST_NAME
         return _size(path) == listed.size and int(path.stat().st_mtime) == int(listed.changed.timestamp())
 
-    def _look_up(self, uri: str, *, keep: bool = False) -> bool:
+    def _find(self, uri: str, *, keep: bool = False) -> bool:
         """Whether a manifest stands in the bucket, which is here then; of one that was cleared no, to ``keep`` ours.
 
         Raises IncompleteStoreError: it is damaged.
@@ -350,7 +350,7 @@ class ObjectArchive(Archive):
             self._fetch_files(uri)
         except IncompleteStoreError:
             ours = (self.root / uri / MANIFEST_NAME).read_bytes()
-            if not self._look_up(uri):
+            if not self._find(uri):
                 self._standing.pop(uri, None)
                 raise self._removed(uri) from None
             if (self.root / uri / MANIFEST_NAME).read_bytes() == ours:
@@ -396,7 +396,7 @@ class ObjectArchive(Archive):
             objects.write(f"{uri}/{MANIFEST_NAME}", text)
             objects.remove([path for path in there if ATTEMPT.fullmatch(path) and not path.startswith(f"{place}/")])
         elif not objects.create(f"{uri}/{MANIFEST_NAME}", text):
-            self._look_up(uri)  # whoever came first; or it was this upload, of which the answer was lost
+            self._find(uri)  # whoever came first; or it was this upload, of which the answer was lost
             return
         self._standing[uri] = text
         if uri.startswith("runs/") and (dated := objects.read_dated(f"{uri}/{MANIFEST_NAME}")) is not None:
@@ -410,7 +410,7 @@ class ObjectArchive(Archive):
 
         def ensure(uri: str) -> None:
             whole = self._is_whole(uri)
-            if uri in self._standing or self._look_up(uri, keep=whole):
+            if uri in self._standing or self._find(uri, keep=whole):
                 return
             if not whole:
                 raise self._removed(uri)

@@ -76,7 +76,7 @@ class ObjectPlace:
         """Folder on this machine in which the archive is worked on; its last part is what the archive is called."""
         base = os.environ.get("SPECTRALZOOM_WORK")
         if base is None:
-            base = os.environ.get("XDG_DATA_HOME") or str(Path.home() / ".local" / "share")
+            base = os.environ.get("XDG_DATA_HOME") or str(Path.home() / ".local" / "fraction")
             base = f"{base}/spectralzoom/s3"
         mark = hashlib.sha256(f"{self.endpoint or ''} {self.url}".encode()).hexdigest()[:12]
         return Path(base).expanduser().absolute() / mark / (self.prefix.rpartition("/")[2] or self.bucket)

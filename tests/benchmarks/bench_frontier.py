@@ -1,6 +1,6 @@
-"""The map that a survey draws in its seconds, beside what anybody would do with them: plain scans, exposed shorter.
+"""The map that a survey draws in its seconds, beside what anybody would do with them: uniform scans, exposed shorter.
 
-A plain scan takes every line, every second or every fourth, not binned, with one exposure; its whole picture is read.
+A uniform scan takes every line, every second or every fourth, not binned, with one exposure; its whole picture is read.
 `survey --seconds` takes the one that the weights' record promises most of: it stands beside all that were tried.
 Surveys in two passes have the coarse pass as long exposed as the fine one or a quarter as long. Farms that training
 never saw, each with noise of its own. Below stands how far what each map says of itself lies from what it scores.
@@ -25,9 +25,9 @@ from rich.console import Console
 
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
-from flows.tasks.survey_model import PLAIN_STEPS, shipped_weights
-from flows.tradeoff.stages import plain_look
-from flows.training.look import chosen_effects
+from flows.tasks.survey_model import UNIFORM_STEPS, shipped_weights
+from flows.tradeoff.stages import uniform_pass
+from flows.training.observed_scenes import chosen_effects
 from models.evaluation.expected_scores import MapScores, expected_counts
 from models.evaluation.metrics import confusion, mean_iou
 from models.reading.inference import segment
@@ -35,8 +35,16 @@ from models.weights.files import Weights, describe_weights, load_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel
-from pipeline.planning.coverage import cheapest_full, plain_sweeps
-from pipeline.planning.plain_scans import MIOU, PlainScan, ScanLimits, ScanRecord, choose_scan, plain_scans, scan_words
+from pipeline.planning.coverage import cheapest_full, uniform_sweeps
+from pipeline.planning.uniform_scans import (
+    MIOU,
+    ScanLimits,
+    ScanPerformance,
+    UniformScan,
+    choose_scan,
+    format_scan,
+    uniform_scans,
+)
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import RasterScene
@@ -48,7 +56,7 @@ STEPS = (1, 2, 4)
 EXPOSURES_MS = (100.0, 70.0, 50.0, 35.0, 25.0, 17.0, 14.0, 12.0, 10.0, 8.0, 6.0, 5.0, 4.0, 3.0)
 BUDGETS, COARSE_MS = (0.35, 0.5, 0.65), (100.0, 25.0)
 SECONDS = (3.5, 5.0, 8.0, 15.0, 28.0)  # of surveys that choose their scan
-SLACK = 0.3  # points of mIoU that such a survey may lie below the best plain scan tried
+SLACK = 0.3  # points of mIoU that such a survey may lie below the best uniform scan tried
 LARGE = {107.0: 95.2, 56.0: 95.0, 29.0: 94.3, 20.5: 93.3, 14.0: 91.5, 10.0: 89.0, 8.0: 85.0}  # of 1280 x 1024: goals
 BANDS = 270
 RMS, WITHIN, HELD = 1.5, 1.645, 0.9  # goals of what maps say of themselves; 90 % lie within so many of their errors
@@ -68,9 +76,9 @@ Judged = list[PlanMap]  # of each farm
 
 
 def rows() -> list[Row]:
-    """Every plan by its seconds; a survey's goal is the best plain scan that takes no longer."""
+    """Every plan by its seconds; a survey's goal is the best uniform scan that takes no longer."""
     plain = {
-        scan_words(step, exposure_ms): [_plain(seed, step, exposure_ms) for seed in SEEDS]
+        format_scan(step, exposure_ms): [_plain(seed, step, exposure_ms) for seed in SEEDS]
         for step in STEPS
         for exposure_ms in EXPOSURES_MS
     }
@@ -88,7 +96,7 @@ def rows() -> list[Row]:
 
 
 def _beside(plain: Mapping[str, Judged], what: str, one: Judged, slack: float) -> tuple[float, Row]:
-    """Seconds and the row of a plan whose goal is the best plain scan that takes no longer, less some slack."""
+    """Seconds and the row of a plan whose goal is the best uniform scan that takes no longer, less some slack."""
     best, by = max((_mean(other), said) for said, other in plain.items() if _seconds(other) <= _seconds(one) + 1e-9)
     goal = f">= {best - slack:.1f}, {by}" + (f", less {slack:g}" if slack else "")
     return _seconds(one), Row(what, _figure(one), goal, _mean(one) >= best - slack)
@@ -117,27 +125,27 @@ def large_rows(shape: tuple[int, int], goals: dict[float, float], weights: Weigh
 
 
 def _path(step: int) -> Path:
-    return shipped_weights(plain=step in PLAIN_STEPS)
+    return shipped_weights(plain=step in UNIFORM_STEPS)
 
 
 @cache
 def shipped(step: int = 1) -> Weights:
-    """The weights that plain scans are read with whose lines are so many px apart."""
+    """The weights that uniform scans are read with whose lines are so many px apart."""
     return load_weights(_path(step))
 
 
-def chosen_scan(shape: tuple[int, int], seconds: float, weights: Weights | None = None) -> PlainScan:
-    """The scan that a survey of so many seconds takes, by the weights for plain scans or others."""
+def chosen_scan(shape: tuple[int, int], seconds: float, weights: Weights | None = None) -> UniformScan:
+    """The scan that a survey of so many seconds takes, by the weights for uniform scans or others."""
     weights = weights or shipped()
     grid = SceneGrid(*shape, weights.config.patch, weights.config.factor)
     along, _, _ = cheapest_full(grid, CAMERA, COST)
-    record = ScanRecord.read(weights.record["scans"])
-    sweeps = {step: plain_sweeps(grid, CAMERA, along, step=step) for step in record.steps}
-    scans = plain_scans(record, sweeps, CAMERA, COST, BANDS, seconds=seconds)
+    record = ScanPerformance.read(weights.record["scans"])
+    sweeps = {step: uniform_sweeps(grid, CAMERA, along, step=step) for step in record.steps}
+    scans = uniform_scans(record, sweeps, CAMERA, COST, BANDS, seconds=seconds)
     return choose_scan(scans, ScanLimits(seconds))
 
 
-def _promise(scan: PlainScan) -> str:
+def _promise(scan: UniformScan) -> str:
     return f"{scan.words} (expected {100 * scan.expected[MIOU]:.1f})"
 
 
@@ -157,35 +165,35 @@ def _figure(judged: Judged) -> str:
 @cache
 def scores(step: int) -> MapScores:
     """How what maps by the shipped weights for such lines expect of themselves came true."""
-    familiar = describe_weights(_path(step)).familiar
-    assert familiar is not None
-    assert familiar.map_scores is not None
-    return familiar.map_scores
+    ood_detector = describe_weights(_path(step)).ood_detector
+    assert ood_detector is not None
+    assert ood_detector.map_scores is not None
+    return ood_detector.map_scores
 
 
 @cache
 def _plain(seed: int, step: int, exposure_ms: float) -> PlanMap:
-    """The map of a farm's plain scan."""
+    """The map of a farm's uniform scan."""
     return map_of(farm_scene(seed, SHAPE, camera=CAMERA), seed, step, exposure_ms)
 
 
 def map_of(scene: RasterScene, seed: int, step: int, exposure_ms: float, weights: Weights | None = None) -> PlanMap:
-    """The map of a scene's plain scan; what it says of itself by the house's own weights alone."""
+    """The map of a scene's uniform scan; what it says of itself by the house's own weights alone."""
     others, weights, rig = weights is not None, weights or shipped(step), Rig(CAMERA)
     grid = SceneGrid(*scene.shape, weights.config.patch, weights.config.factor)
     along, _, _ = cheapest_full(grid, CAMERA, COST)
-    sweeps = plain_sweeps(grid, CAMERA, along, step=step, exposure_ms=exposure_ms)
+    sweeps = uniform_sweeps(grid, CAMERA, along, step=step, exposure_ms=exposure_ms)
     chosen = chosen_effects(scene, rig, sweeps)
     source = SimulatedSource(scene, rig, seed, chosen, clock=sweep_starts(sweeps, CAMERA, COST))
-    look = plain_look(weights, source, sweeps, grid, COST)
-    drawn = segment(weights, look.seen, look.columns, look.seats, every_class=True)
+    scan_pass = uniform_pass(weights, source, sweeps, grid, COST)
+    drawn = segment(weights, scan_pass.seen, scan_pass.columns, scan_pass.patch_index, every_class=True)
     judged = _judged(scene, drawn.classes, weights)
     if others:
-        return PlanMap(look.seconds, judged)
+        return PlanMap(scan_pass.seconds, judged)
     assert drawn.log_probability is not None
     told = scores(step).expected(expected_counts([drawn.log_probability], weights.config.classes), step, exposure_ms)
     assert told is not None
-    return PlanMap(look.seconds, judged, 100 * told.miou, 100 * told.error)
+    return PlanMap(scan_pass.seconds, judged, 100 * told.miou, 100 * told.error)
 
 
 def _judged(scene: RasterScene, classes: NDArray[np.uint8], weights: Weights) -> float:

@@ -59,9 +59,9 @@ def rows() -> list[Row]:
     done = subprocess.run(words, capture_output=True, text=True, check=True)
     found = Moments(**json.loads(done.stdout.splitlines()[-1]))
     what = f"rig, {PX} x {PX} x 270: last coarse line to first patch request"
-    share = f"{found.waited_s / found.coarse_s:.1%} of the coarse pass's {found.coarse_s:.0f} s"
+    fraction = f"{found.waited_s / found.coarse_s:.1%} of the coarse pass's {found.coarse_s:.0f} s"
     return [
-        Row(what, f"{found.waited_s:.2f} s ({share})", f"<= {MOST_S:g} s", found.waited_s <= MOST_S),
+        Row(what, f"{found.waited_s:.2f} s ({fraction})", f"<= {MOST_S:g} s", found.waited_s <= MOST_S),
         Row("the same: last exposure to last coarse line (files over FTP, this machine)", f"{found.read_s:.2f} s"),
     ]
 
@@ -78,7 +78,7 @@ def measure(px: int) -> Moments:
             "out": name,
             "engine": "plain",
             "controls": False,
-            "rig.panel": 0.99,
+            "rig.white_reference": 0.99,
             "rig.pulses": "position",
         }
         settings = load_settings(None, told)

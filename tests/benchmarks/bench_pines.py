@@ -31,7 +31,7 @@ from models.evaluation.metrics import average_accuracy, confusion, kappa, overal
 from pipeline.geometry.grid import UNLABELLED  # noqa: E402
 
 if TYPE_CHECKING:
-    from models.reading.inference import Glance
+    from models.reading.inference import CoarsePrediction
     from models.training.train import TrainingSettings
     from models.weights.files import Weights
     from pipeline.simulator.scenes.scene import RasterScene
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 SCENE, MASK = "Indian_pines_corrected.npy", "indianpines_disjoint_dset.mat"
 MASK_CLASSES = (2, 3, 5, 6, 8, 10, 11, 12, 14, 1, 4, 7, 9, 13, 15, 16)  # classes of the labels by the mask's numbers
 WINDOW = 5  # px a side, averaged for the second round of the peers
-SHARES = (0.0, 0.1, 0.2, 0.35, 1.0)  # of the seats, by entropy
+FRACTIONS = (0.0, 0.1, 0.2, 0.35, 1.0)  # of the patches, by entropy
 STEPS = 300
 
 Values = NDArray[np.float32]
@@ -64,7 +64,7 @@ class Result:
     counts: NDArray[np.int64]
     cpu_s: float
     words: str
-    every: bool = False  # the segmenter with every seat
+    every: bool = False  # the segmenter with every patch
 
     @property
     def figures(self) -> tuple[float, float, float]:
@@ -139,10 +139,10 @@ def _peers(split: Split, source: str) -> list[Result]:
     from scipy.ndimage import uniform_filter
 
     smooth = np.asarray(uniform_filter(split.values, (WINDOW, WINDOW, 1), mode="reflect"), np.float32)
-    looks = {"single spectra": split.values, f"{WINDOW} x {WINDOW} px": smooth}
+    scan_passes = {"single spectra": split.values, f"{WINDOW} x {WINDOW} px": smooth}
     return [
-        _peer(f"{source}: {name}, {look}", values, split, *made)
-        for look, values in looks.items()
+        _peer(f"{source}: {name}, {scan_pass}", values, split, *made)
+        for scan_pass, values in scan_passes.items()
         for name, made in _classifiers().items()
     ]
 
@@ -208,19 +208,19 @@ def _seen_by_camera(folder: Path) -> Values:
     scene, camera = _scene(folder), LineCamera()
     electrons = electrons_of(scene, footprint(np.asarray(scene.planes, np.float32), camera), camera)
     values = expose(electrons, camera, step=1, rng=np.random.default_rng(0))
-    return np.asarray(values * (scene.panel / scene.panel_electrons), np.float32)
+    return np.asarray(values * (scene.white_reference / scene.white_reference_electrons), np.float32)
 
 
 def _through_camera(folder: Path, path: Path) -> list[Result]:
-    from flows.evaluate.frames import look_at
+    from flows.evaluate.frames import capture_passes
     from models.weights.files import load_weights
     from pipeline.geometry.camera import LineCamera
 
     weights, scene = load_weights(path), _scene(folder)
     if scene.key not in weights.record.get("split", {}).get("pixels", {}):
         raise ValueError(f"{path} was not trained with --train-mask on {SCENE}: its test pixels may have taught it")
-    look = look_at(scene, scene.name, weights, LineCamera(), 0)
-    return _judged("camera", weights, look.seen, look.fine, look.labels)
+    scan_pass = capture_passes(scene, scene.name, weights, LineCamera(), 0)
+    return _judged("camera", weights, scan_pass.seen, scan_pass.fine, scan_pass.labels)
 
 
 def _of_the_file(folder: Path, split: Split) -> list[Result]:
@@ -228,7 +228,7 @@ def _of_the_file(folder: Path, split: Split) -> list[Result]:
     from models.network.segmenter import Segmenter
     from models.network.sizes import SegmenterConfig
     from models.network.spectral import SpectralBasis, patches_of
-    from models.reading.inference import glance_of_columns
+    from models.reading.inference import coarse_prediction_of_columns
     from models.training.examples import Observation, measured_normalisation, normalised
     from models.training.train import train
     from models.weights.files import Weights
@@ -251,26 +251,28 @@ def _of_the_file(folder: Path, split: Split) -> list[Result]:
     assert isinstance(network, Segmenter)
     weights = Weights(network, basis, normalisation, scene.class_names, scene.class_colours, {"training": record})
     patches = np.asarray(patches_of(example.fine, grid.patch), np.float32)
-    return _judged("file", weights, glance_of_columns(weights, example.coarse, grid), patches, split.test)
+    return _judged("file", weights, coarse_prediction_of_columns(weights, example.coarse, grid), patches, split.test)
 
 
-def _judged(source: str, weights: Weights, seen: Glance, fine: Values, labels: Labels) -> list[Result]:
-    """The map with several shares of the seats, by entropy."""
+def _judged(source: str, weights: Weights, seen: CoarsePrediction, fine: Values, labels: Labels) -> list[Result]:
+    """The map with several fractions of the patches, by entropy."""
     from models.network.machine import one_thread
-    from models.policies.policies import score_seats
-    from models.reading.inference import glance_of_columns, segment
-    from pipeline.planning.selection import frame_seats
+    from models.policies.policies import score_patches
+    from models.reading.inference import coarse_prediction_of_columns, segment
+    from pipeline.planning.selection import frame_patches
 
-    training, valid, found = weights.record["training"], seen.grid.valid_share().ravel() > 0, []
+    training, valid, found = weights.record["training"], seen.grid.valid_fraction().ravel() > 0, []
     words = f"a map; training {training.get('processor_seconds', 0)} s CPU, {training['steps']} steps"
     with one_thread():
-        for share in SHARES:
+        for fraction in FRACTIONS:
             began = time.process_time()
-            looked = glance_of_columns(weights, seen.columns, seen.grid)
-            seats = frame_seats(score_seats("entropy", looked), share, valid).seats
-            drawn = segment(weights, looked, fine[seats], seats).classes
+            observation = coarse_prediction_of_columns(weights, seen.columns, seen.grid)
+            patch_index = frame_patches(score_patches("entropy", observation), fraction, valid).patch_index
+            drawn = segment(weights, observation, fine[patch_index], patch_index).classes
             spent, counts = time.process_time() - began, confusion(labels, drawn, weights.config.classes)
-            found.append(Result(f"{source}: segmenter, {100 * share:.0f} % of seats", counts, spent, words, share == 1))
+            found.append(
+                Result(f"{source}: segmenter, {100 * fraction:.0f} % of patches", counts, spent, words, fraction == 1)
+            )
     return found
 
 

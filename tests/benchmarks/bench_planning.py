@@ -16,15 +16,15 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, CostModel, Sweep
 from pipeline.planning.budget_search import cheapest_cover, covers, spend
 from pipeline.planning.coverage import cheapest_full, coarse_sweeps, full_sweeps
-from pipeline.planning.fine_pass import plan_fine, price_of_seats
+from pipeline.planning.fine_pass import plan_fine, price_of_patches
 from pipeline.planning.prices import ScanPrices, check_budget, prices_of
 from pipeline.planning.scan_runs import Cover, Field
-from pipeline.planning.strips import Views, look_from, strips_at_seats
+from pipeline.planning.swaths import Views, edges_from, swaths_at_patches
 
 CAMERA, COST = LineCamera(), CostModel()
-SHARES = (0.5, 0.8, 0.9, 0.95)
-FRAMES, SEAT = 20, 32
-Worth = NDArray[np.float64]
+FRACTIONS = (0.5, 0.8, 0.9, 0.95)
+FRAMES, PATCH = 20, 32
+ExpectedGain = NDArray[np.float64]
 
 
 def rows() -> list[Row]:
@@ -37,105 +37,107 @@ def rows() -> list[Row]:
 def _frames() -> list[Row]:
     folder = data_folder("cwfid")
     if not folder.is_dir():
-        return [not_run("CWFID, 90 % of the seats with vegetation", folder)]
-    grid, seats = _vegetation(folder)
+        return [not_run("CWFID, 90 % of the patches with vegetation", folder)]
+    grid, patch_index = _vegetation(folder)
     _, full, _ = cheapest_full(grid, CAMERA, COST)
     whole = FRAMES * sum(sweep.lines for sweep in full)
     found, plans = [], []
     for along in ("y", "x"):
-        blocks = [_block_field(grid, along, seat, ScanPrices(0.1, 0.0, 0.0, 1500)) for seat in seats]
-        real = [_real_field(grid, along, seat, prices_of(CAMERA, COST)) for seat in seats]
+        blocks = [
+            _block_field(grid, along, patch_number, ScanPrices(0.1, 0.0, 0.0, 1500)) for patch_number in patch_index
+        ]
+        real = [_real_field(grid, along, patch_number, prices_of(CAMERA, COST)) for patch_number in patch_index]
         plans.append(_plans(real))
         free, exact = _curve(_plans(blocks), FRAMES * 2592), _curve(plans[-1], whole)
         fixed = _curve(_plans([_fixed(field) for field in blocks]), FRAMES * 2592)
         fixed_real = _curve(_plans([_fixed(field) for field in real]), whole)
-        greedy = _greedy_curve(grid, along, seats)
+        greedy = _greedy_curve(grid, along, patch_index)
         side = "short side" if along == "y" else "long side"
         goal = ("50/80/90/95 %: 90 % <= 0.27", free[2] <= 0.27) if along == "y" else ("", None)
         found += [
             Row(
                 f"CWFID, fine lines over full, line along the {side}, blocks of 32 lines as geometry.md counts",
-                _shares(free),
+                _fractions(free),
                 *goal,
-                f"fixed strips {_shares(fixed)}; greedy {_shares(greedy)}; all frames pooled",
+                f"fixed strips {_fractions(fixed)}; greedy {_fractions(greedy)}; all frames pooled",
             ),
             Row(
                 f"the same, true lines: rotation, taps, default prices, line along the {side}",
-                _shares(exact),
+                _fractions(exact),
                 "90 % <= 0.27",
                 exact[2] <= 0.27,
-                f"fixed strips {_shares(fixed_real)}",
+                f"fixed strips {_fractions(fixed_real)}",
             ),
         ]
     coarse = [coarse_sweeps(replace(grid, factor=factor), CAMERA, "y") for factor in (4, 8)]
-    shares = [FRAMES * sum(sweep.lines for sweep in sweeps) / whole for sweeps in coarse]
-    turned = _shares(_curve([one + other for one, other in zip(*plans, strict=True)], whole))
+    fractions = [FRAMES * sum(sweep.lines for sweep in sweeps) / whole for sweeps in coarse]
+    turned = _fractions(_curve([one + other for one, other in zip(*plans, strict=True)], whole))
     found.append(Row("the same, true lines, each frame in its better orientation", turned))
-    return [*found, Row("coarse lines beside it, s = 4 / 8", _shares(shares))]
+    return [*found, Row("coarse lines beside it, s = 4 / 8", _fractions(fractions))]
 
 
-def _shares(values: list[float]) -> str:
+def _fractions(values: list[float]) -> str:
     return "/".join(f"{value:.3f}" for value in values)
 
 
-def _vegetation(folder: Path) -> tuple[SceneGrid, list[Worth]]:
-    """The grid of the frames, and which seats hold a pixel of crop or weed, 1 or 0 (seat,) a frame."""
+def _vegetation(folder: Path) -> tuple[SceneGrid, list[ExpectedGain]]:
+    """The grid of the frames, and which patches hold a pixel of crop or weed, 1 or 0 (patch,) a frame."""
     from storage.readers.labels import load_labels
     from storage.readers.scene_toml import load_scene_settings
 
     stated = load_scene_settings(folder / "scene.toml")
-    seats = []
+    patch_index = []
     for path in sorted((folder / "annotations").glob("*.png"))[:FRAMES]:
         labels = load_labels(path, (966, 1296), classes=stated.classes, unlabelled=stated.unlabelled)
-        grid = SceneGrid(*labels.index.shape, SEAT, 1)
+        grid = SceneGrid(*labels.index.shape, PATCH, 1)
         padded = np.zeros(grid.padded_shape, bool)
         padded[: grid.height, : grid.width] = np.isin(labels.index, [labels.names.index(n) for n in ("crop", "weed")])
-        cells = padded.reshape(grid.seat_shape[0], SEAT, grid.seat_shape[1], SEAT).any(axis=(1, 3))
-        seats.append(cells.ravel().astype(float))
-    return grid, seats
+        cells = padded.reshape(grid.patch_shape[0], PATCH, grid.patch_shape[1], PATCH).any(axis=(1, 3))
+        patch_index.append(cells.ravel().astype(float))
+    return grid, patch_index
 
 
-def _real_field(grid: SceneGrid, along: Axis, worth: Worth, prices: ScanPrices) -> Field:
-    views = look_from(grid, CAMERA, strips_at_seats(grid, CAMERA, along), worth > 0)
-    return Field(views, worth, _columns(grid, along), prices)
+def _real_field(grid: SceneGrid, along: Axis, expected_gain: ExpectedGain, prices: ScanPrices) -> Field:
+    views = edges_from(grid, CAMERA, swaths_at_patches(grid, CAMERA, along), expected_gain > 0)
+    return Field(views, expected_gain, _columns(grid, along), prices)
 
 
 def _columns(grid: SceneGrid, along: Axis) -> NDArray[np.intp]:
-    row, column = np.divmod(np.arange(int(np.prod(grid.seat_shape))), grid.seat_shape[1])
+    row, column = np.divmod(np.arange(int(np.prod(grid.patch_shape))), grid.patch_shape[1])
     return column if along == "x" else row
 
 
-def _block_field(grid: SceneGrid, along: Axis, worth: Worth, prices: ScanPrices) -> Field:
-    """Seats in blocks of lines, 640 px wide and neither turned nor tapped: how the design counts."""
+def _block_field(grid: SceneGrid, along: Axis, expected_gain: ExpectedGain, prices: ScanPrices) -> Field:
+    """Patches in blocks of lines, 640 px wide and neither turned nor tapped: how the design counts."""
     column = _columns(grid, along)
     row = _columns(grid, "y" if along == "x" else "x")
-    most, wanted = CAMERA.samples // grid.patch, np.flatnonzero(worth)
+    most, wanted = CAMERA.samples // grid.patch, np.flatnonzero(expected_gain)
     size = grid.height if along == "x" else grid.width
-    strips = range(max(int(column.max()) + 1 - most, 0) + 1)
-    seen = [wanted[(column[wanted] >= s) & (column[wanted] < s + most)] for s in strips]
-    seat = np.concatenate(seen)
-    sweeps = tuple(Sweep(f"block-{s:03d}", "fine", along, float(s), 0.0, size) for s in strips)
-    first = row[seat] * grid.patch
+    swaths = range(max(int(column.max()) + 1 - most, 0) + 1)
+    seen = [wanted[(column[wanted] >= s) & (column[wanted] < s + most)] for s in swaths]
+    patch_number = np.concatenate(seen)
+    sweeps = tuple(Sweep(f"block-{s:03d}", "fine", along, float(s), 0.0, size) for s in swaths)
+    first = row[patch_number] * grid.patch
     stop = np.minimum(first + grid.patch, -(-size // grid.patch) * grid.patch)
-    views = Views(sweeps, int(stop.max()), np.cumsum([0, *map(len, seen)]), seat, first, stop)
-    return Field(views, worth, column, prices)
+    views = Views(sweeps, int(stop.max()), np.cumsum([0, *map(len, seen)]), patch_number, first, stop)
+    return Field(views, expected_gain, column, prices)
 
 
 def _fixed(field: Field) -> Field:
-    """The same field seen from the strips of a full scan alone, each seat from one: the exact optimum per strip."""
-    views, strips = field.views, field.side_by_side.ravel()
+    """The same field seen from the strips of a full scan alone, each patch from one: the exact optimum per strip."""
+    views, swaths = field.views, field.side_by_side.ravel()
     taken: set[int] = set()
     parts = []
-    for strip in strips.tolist():
-        own = np.arange(views.edges[strip], views.edges[strip + 1])
-        own = own[[seat not in taken for seat in views.seat[own].tolist()]]
-        taken |= set(views.seat[own].tolist())
+    for swath in swaths.tolist():
+        own = np.arange(views.edges[swath], views.edges[swath + 1])
+        own = own[[patch_number not in taken for patch_number in views.patch_number[own].tolist()]]
+        taken |= set(views.patch_number[own].tolist())
         parts.append(own)
     kept = np.concatenate(parts)
-    sweeps = tuple(views.strips[strip] for strip in strips)
+    sweeps = tuple(views.swaths[swath] for swath in swaths)
     edges = np.cumsum([0, *map(len, parts)])
-    few = Views(sweeps, views.lines, edges, views.seat[kept], views.first[kept], views.stop[kept])
-    return Field(few, field.worth, field.column, field.prices)
+    few = Views(sweeps, views.lines, edges, views.patch_number[kept], views.first[kept], views.stop[kept])
+    return Field(few, field.expected_gain, field.column, field.prices)
 
 
 def _plans(fields: list[Field]) -> list[list[Cover]]:
@@ -144,47 +146,50 @@ def _plans(fields: list[Field]) -> list[list[Cover]]:
 
 
 def _curve(plans: list[list[Cover]], whole: int) -> list[float]:
-    """Lines that show given shares of the worth of all frames together, over ``whole``.
+    """Lines that show given fractions of the worth of all frames together, over ``whole``.
 
     Frames go from one of their plans to the next in the order of worth per line.
     """
-    total = sum(frame[-1].worth for frame in plans)
+    total = sum(frame[-1].expected_gain for frame in plans)
     steps = [step for frame in plans for step in _hull(frame)]
     steps.sort(key=lambda step: -step[0] / max(step[1], 1))
-    worth, lines = np.cumsum([step[0] for step in steps]), np.cumsum([step[1] for step in steps])
-    return [float(lines[np.searchsorted(worth, share * total - 1e-9)]) / whole for share in SHARES]
+    expected_gain, lines = np.cumsum([step[0] for step in steps]), np.cumsum([step[1] for step in steps])
+    return [float(lines[np.searchsorted(expected_gain, fraction * total - 1e-9)]) / whole for fraction in FRACTIONS]
 
 
 def _hull(plans: list[Cover]) -> list[tuple[float, int]]:
     """Steps (worth, lines) along the upper hull of plans, from none."""
     hull = [Cover()]
-    for plan in sorted(plans, key=lambda plan: (plan.lines, -plan.worth)):
-        if plan.worth <= hull[-1].worth:
+    for plan in sorted(plans, key=lambda plan: (plan.lines, -plan.expected_gain)):
+        if plan.expected_gain <= hull[-1].expected_gain:
             continue
         while len(hull) > 1 and _slope(hull[-2], hull[-1]) <= _slope(hull[-2], plan):
             hull.pop()
         hull.append(plan)
-    return [(b.worth - a.worth, b.lines - a.lines) for a, b in pairwise(hull)]
+    return [(b.expected_gain - a.expected_gain, b.lines - a.lines) for a, b in pairwise(hull)]
 
 
 def _slope(one: Cover, other: Cover) -> float:
-    return (other.worth - one.worth) / max(other.lines - one.lines, 1e-9)
+    return (other.expected_gain - one.expected_gain) / max(other.lines - one.lines, 1e-9)
 
 
-def _greedy_curve(grid: SceneGrid, along: Axis, seats: list[Worth]) -> list[float]:
-    """Peer: the block of lines that shows most new seats is taken next, over all frames."""
-    fields = [_block_field(grid, along, seat, ScanPrices(0.1, 0.0, 0.0, 1500)) for seat in seats]
+def _greedy_curve(grid: SceneGrid, along: Axis, patch_index: list[ExpectedGain]) -> list[float]:
+    """Peer: the block of lines that shows most new patches is taken next, over all frames."""
+    fields = [_block_field(grid, along, patch_number, ScanPrices(0.1, 0.0, 0.0, 1500)) for patch_number in patch_index]
     steps: list[float] = []
     for field in fields:
-        strips, rows_, views = len(field.views.strips), -(-field.views.lines // SEAT), field.views
-        left = field.worth.copy()
+        swaths, rows_, views = len(field.views.swaths), -(-field.views.lines // PATCH), field.views
+        left = field.expected_gain.copy()
         while left.any():
-            gain = np.bincount(views.strip * rows_ + views.first // SEAT, left[views.seat], strips * rows_)
-            strip, row = divmod(int(gain.argmax()), rows_)
+            gain = np.bincount(views.swath * rows_ + views.first // PATCH, left[views.patch_number], swaths * rows_)
+            swath, row = divmod(int(gain.argmax()), rows_)
             steps.append(float(gain.max()))
-            left[views.seat[(views.strip == strip) & (views.first // SEAT == row)]] = 0
-    worth = np.cumsum(sorted(steps, reverse=True))
-    return [float(np.searchsorted(worth, share * worth[-1] - 1e-9) + 1) * SEAT / (FRAMES * 2592) for share in SHARES]
+            left[views.patch_number[(views.swath == swath) & (views.first // PATCH == row)]] = 0
+    expected_gain = np.cumsum(sorted(steps, reverse=True))
+    return [
+        float(np.searchsorted(expected_gain, fraction * expected_gain[-1] - 1e-9) + 1) * PATCH / (FRAMES * 2592)
+        for fraction in FRACTIONS
+    ]
 
 
 # --- 100 patches of 320 px in 10240 x 10240 px ---
@@ -194,40 +199,42 @@ def _patches() -> list[Row]:
     grid = SceneGrid(10_240, 10_240, 320, 4)
     full = sum(sweep.lines for sweep in full_sweeps(grid, CAMERA, "x"))
     coarse = sum(sweep.lines for sweep in coarse_sweeps(grid, CAMERA, "x"))
-    seats = np.random.default_rng(0).choice(1024, 100, replace=False)
+    patch_index = np.random.default_rng(0).choice(1024, 100, replace=False)
     began = time.process_time()
-    price = price_of_seats(grid, CAMERA, COST, "x", seats)
+    price = price_of_patches(grid, CAMERA, COST, "x", patch_index)
     took = time.process_time() - began
-    worth = np.zeros(1024)
-    worth[seats] = 1
-    field = _real_field(grid, "x", worth, prices_of(CAMERA, COST))
+    expected_gain = np.zeros(1024)
+    expected_gain[patch_index] = 1
+    field = _real_field(grid, "x", expected_gain, prices_of(CAMERA, COST))
     need = field.views.stop - field.views.first
-    single = sum(int(need[field.views.seat == seat].min()) for seat in seats)
-    strips = cheapest_cover(_fixed(field))
-    share, alone, fixed = ((coarse + lines) / full for lines in (price.lines, single, strips.lines))
-    met = share <= min(alone, 0.498, 1.0) and price.lines <= 1.02 * strips.lines
-    text = f"{share:.1%} of {full} lines with the coarse pass ({price.lines} fine), {took:.1f} s"
+    single = sum(int(need[field.views.patch_number == patch_number].min()) for patch_number in patch_index)
+    swaths = cheapest_cover(_fixed(field))
+    fraction, alone, fixed = ((coarse + lines) / full for lines in (price.lines, single, swaths.lines))
+    met = fraction <= min(alone, 0.498, 1.0) and price.lines <= 1.02 * swaths.lines
+    text = f"{fraction:.1%} of {full} lines with the coarse pass ({price.lines} fine), {took:.1f} s"
     goal = "<= one sweep per patch (49.8 %), <= exact per-strip optimum + 2 %, <= 100 %"
-    peers = f"one sweep per patch {alone:.1%} ({single}); exact per-strip optimum {fixed:.1%} ({strips.lines})"
+    peers = f"one sweep per patch {alone:.1%} ({single}); exact per-strip optimum {fixed:.1%} ({swaths.lines})"
     what = "100 patches of 320 px, seed 0, s = 4, rotated footprints"
     return [Row(what, text, goal, met, peers), *_many_patches(grid, coarse, full)]
 
 
 def _many_patches(grid: SceneGrid, coarse: int, full: int) -> list[Row]:
     """Where one sweep per patch costs more than scanning everything, and where runs of lines do too."""
-    seats = np.random.default_rng(0).choice(1024, 400, replace=False)
-    worth = np.zeros(1024)
-    worth[seats] = 1
-    views = _real_field(grid, "x", worth, prices_of(CAMERA, COST)).views
-    alone = sum(int((views.stop - views.first)[views.seat == seat].min()) for seat in seats)
-    share = (coarse + price_of_seats(grid, CAMERA, COST, "x", seats).least[0]) / full
-    wide = price_of_seats(SceneGrid(600, 1280, 400, 1), CAMERA, COST, "x", np.arange(8))
+    patch_index = np.random.default_rng(0).choice(1024, 400, replace=False)
+    expected_gain = np.zeros(1024)
+    expected_gain[patch_index] = 1
+    views = _real_field(grid, "x", expected_gain, prices_of(CAMERA, COST)).views
+    alone = sum(
+        int((views.stop - views.first)[views.patch_number == patch_number].min()) for patch_number in patch_index
+    )
+    fraction = (coarse + price_of_patches(grid, CAMERA, COST, "x", patch_index).least[0]) / full
+    wide = price_of_patches(SceneGrid(600, 1280, 400, 1), CAMERA, COST, "x", np.arange(8))
     return [
         Row(
             "400 patches of 320 px, with the coarse pass",
-            f"{share:.1%} of the full scan's lines",
+            f"{fraction:.1%} of the full scan's lines",
             "<= 100 %",
-            share <= 1,
+            fraction <= 1,
             f"one sweep per patch {(coarse + alone) / full:.1%}",
         ),
         Row(
@@ -244,25 +251,25 @@ def _many_patches(grid: SceneGrid, coarse: int, full: int) -> list[Row]:
 
 
 def _optimum() -> list[Row]:
-    """20 x 12 seats seen 8 columns at a time, four budgets; the programme is solved to 1e-4."""
+    """20 x 12 patches seen 8 columns at a time, four budgets; the programme is solved to 1e-4."""
     grid = SceneGrid(20 * 80, 12 * 80, 80, 1)
-    worth = _smooth((20, 12), seed=0, sigma=1.2).ravel()
+    expected_gain = _smooth((20, 12), seed=0, sigma=1.2).ravel()
     prices = prices_of(CAMERA, COST)
-    field = _block_field(grid, "x", worth, prices)
+    field = _block_field(grid, "x", expected_gain, prices)
     full_s = prices.seconds(2 * 1600, 2)
     ours, best, spent = [], [], [0.0, 0.0]
     for budget in (0.08, 0.2, 0.4, 0.7):
         began = time.perf_counter()
-        ours.append(spend(field, budget * full_s).worth)
+        ours.append(spend(field, budget * full_s).expected_gain)
         spent[0] += time.perf_counter() - began
         began = time.perf_counter()
         best.append(_milp(field, prices, budget * full_s))
         spent[1] += time.perf_counter() - began
-    shares = [a / b for a, b in zip(ours, best, strict=True)]
+    fractions = [a / b for a, b in zip(ours, best, strict=True)]
     return [
         Row(
-            "worth over the optimum, 240 seats, budget .08/.2/.4/.7",
-            "/".join(f"{share:.2%}" for share in shares),
+            "worth over the optimum, 240 patches, budget .08/.2/.4/.7",
+            "/".join(f"{fraction:.2%}" for fraction in fractions),
             "",
             None,
             f"four plans {spent[0]:.2f} s; scipy milp (HiGHS, gap 1e-4) {spent[1]:.1f} s",
@@ -271,34 +278,34 @@ def _optimum() -> list[Row]:
 
 
 def _milp(field: Field, prices: ScanPrices, budget_s: float) -> float:
-    """Most worth for a budget: is a strip on in a row, does it start there, is a seat shown, loads of the memory."""
+    """Most worth for a budget: is a strip on in a row, does it start there, is a patch shown, loads of the memory."""
     from scipy import sparse
     from scipy.optimize import Bounds, LinearConstraint, milp
 
     views, height = field.views, int((field.views.stop - field.views.first)[0])
     rows_ = views.lines // height
-    on = len(views.strips) * rows_
-    seats, place = np.unique(views.seat, return_inverse=True)
-    size = 2 * on + len(seats) + 1
-    cell = views.strip * rows_ + views.first // height
+    on = len(views.swaths) * rows_
+    patch_index, place = np.unique(views.patch_number, return_inverse=True)
+    size = 2 * on + len(patch_index) + 1
+    cell = views.swath * rows_ + views.first // height
     started = sparse.eye(on) - sparse.eye(on, k=-1).multiply((np.arange(on) % rows_ > 0)[:, None])
-    starts = sparse.hstack([started, -sparse.eye(on), sparse.csr_matrix((on, len(seats) + 1))])
+    starts = sparse.hstack([started, -sparse.eye(on), sparse.csr_matrix((on, len(patch_index) + 1))])
     shown = sparse.hstack(
         [
-            -sparse.csr_matrix((np.ones(len(cell)), (place, cell)), (len(seats), on)),
-            sparse.csr_matrix((len(seats), on)),
-            sparse.eye(len(seats)),
-            sparse.csr_matrix((len(seats), 1)),
+            -sparse.csr_matrix((np.ones(len(cell)), (place, cell)), (len(patch_index), on)),
+            sparse.csr_matrix((len(patch_index), on)),
+            sparse.eye(len(patch_index)),
+            sparse.csr_matrix((len(patch_index), 1)),
         ]
     )
     value, seconds, loads = np.zeros(size), np.zeros(size), np.zeros(size)
-    value[2 * on : -1] = field.worth[seats]
+    value[2 * on : -1] = field.expected_gain[patch_index]
     seconds[:on], seconds[on : 2 * on], seconds[-1] = height * prices.line_s, prices.run_s, prices.reload_s
     loads[:on], loads[-1] = height, -prices.lines_per_reload
     limits = LinearConstraint(
         sparse.vstack([starts, shown, sparse.csr_matrix(seconds), sparse.csr_matrix(loads)]),
         -np.inf,
-        np.concatenate([np.zeros(on + len(seats)), [budget_s, 0.0]]),
+        np.concatenate([np.zeros(on + len(patch_index)), [budget_s, 0.0]]),
     )
     top, whole = np.ones(size), np.zeros(size)
     top[-1], whole[:on], whole[-1] = 99, 1, 1
@@ -312,7 +319,7 @@ def _milp(field: Field, prices: ScanPrices, budget_s: float) -> float:
     return float(-found.fun)
 
 
-def _smooth(shape: tuple[int, int], *, seed: int, sigma: float) -> Worth:
+def _smooth(shape: tuple[int, int], *, seed: int, sigma: float) -> ExpectedGain:
     from scipy.ndimage import gaussian_filter
 
     drawn = gaussian_filter(np.random.default_rng(seed).normal(size=shape), sigma, mode="wrap")
@@ -327,14 +334,14 @@ def _farm() -> list[Row]:
     grid = SceneGrid(1024, 1280, 16, 4)
     along, _, full_s = cheapest_full(grid, CAMERA, COST)
     left = check_budget(0.5, COST.seconds(coarse_sweeps(grid, CAMERA, along), CAMERA), full_s)
-    gains, shares = [], []
+    gains, fractions = [], []
     for seed in range(6):
-        scores = _smooth(grid.seat_shape, seed=seed, sigma=(1.5, 3.0)[seed % 2]).ravel()
+        scores = _smooth(grid.patch_shape, seed=seed, sigma=(1.5, 3.0)[seed % 2]).ravel()
         plan = plan_fine(grid, CAMERA, COST, along, scores, budget_s=left)
         fixed = spend(_fixed(_real_field(grid, along, scores, prices_of(CAMERA, COST))), left)
-        gains.append(plan.worth / fixed.worth - 1)
-        shares.append(plan.worth / scores.sum())
-    text = f"{np.mean(shares):.1%} of the score; {np.mean(gains):+.1%} over fixed strips (from {min(gains):+.1%})"
+        gains.append(plan.expected_gain / fixed.expected_gain - 1)
+        fractions.append(plan.expected_gain / scores.sum())
+    text = f"{np.mean(fractions):.1%} of the score; {np.mean(gains):+.1%} over fixed strips (from {min(gains):+.1%})"
     return [Row("farm, budget 0.5, six smooth random score maps", text, "> fixed strips", min(gains) > 0)]
 
 
@@ -343,11 +350,11 @@ def _speed() -> list[Row]:
     for size, patch, goal in (((1024, 1280), 16, 2.0), ((10_240, 10_240), 32, 20.0), ((10_240, 10_240), 320, 20.0)):
         grid = SceneGrid(*size, patch, 4)
         full_s = COST.seconds(full_sweeps(grid, CAMERA, "x"), CAMERA)
-        scores = _smooth(grid.seat_shape, seed=0, sigma=3.0).ravel()
+        scores = _smooth(grid.patch_shape, seed=0, sigma=3.0).ravel()
         began = time.process_time()
         plan = plan_fine(grid, CAMERA, COST, "x", scores, budget_s=0.25 * full_s)
         took = time.process_time() - began
-        what = f"planning {size[1]} x {size[0]} px, {patch} px seats, a quarter of the full scan's seconds"
+        what = f"planning {size[1]} x {size[0]} px, {patch} px patches, a quarter of the full scan's seconds"
         figure = f"{took:.2f} s of processor, {len(plan.sweeps)} runs"
         found.append(Row(what, figure, f"< {goal:.0f} s", took < goal))
     return found

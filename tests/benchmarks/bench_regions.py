@@ -28,21 +28,21 @@ from models.evaluation.metrics import confusion, mean_iou
 from models.network.machine import use_one_thread
 from models.reading.regions import HALO_CELLS, Region, most_bytes, plan_regions
 from pipeline.geometry.grid import SceneGrid
-from pipeline.planning.selection import frame_seats
+from pipeline.planning.selection import frame_patches
 from pipeline.simulator.scenes.farm.spectra import MATERIALS, spectral_library
 from storage.arrays.class_maps import ClassMap, ClassNames, create_class_map, load_class_map
 from storage.arrays.layout import SHARD_ROWS
 from storage.arrays.mosaics import PATCHES_A_SHARD, MosaicWriter, PatchWriter, open_patches
 from storage.arrays.tile_work import RESERVED_BYTES
-from storage.parallel.crew import Crew
+from storage.parallel.pool import WorkerPool
 
 SEEDS, HALOS = (1, 2, 3), (0, 1, 2, 4)
 MOST_PX = (512, 640)  # of 1024 x 1280 px: four regions
-SHARE = 0.35
+FRACTION = 0.35
 SIDES, SYNTHETIC_PX, SYNTHETIC_BANDS = (640, 1920, 3840), (640, 640), 8
 MEMORY = 4 * 2**30
 MOST_GROWTH = 1.25
-MOSAIC_PX, MOSAIC_BANDS, MOSAIC_SHARE = 10240, 4, 0.02
+MOSAIC_PX, MOSAIC_BANDS, MOSAIC_FRACTION = 10240, 4, 0.02
 BLOBS, BLOB_PX = 400, 24.0  # of the coarse mosaic, maize on bare soil
 
 
@@ -51,12 +51,12 @@ class Seams:
     """How the map in regions differs from the map of one region."""
 
     halo: int
-    all_px: float  # share of pixels of the same class
+    all_px: float  # fraction of pixels of the same class
     near_px: float  # the same within one coarse patch of a seam
-    far_px: float  # share of pixels of the same class further than that from every seam
+    far_px: float  # fraction of pixels of the same class further than that from every seam
     step: float  # mean step of confidence across a seam, over the same step in the map of one region
     miou: float  # by the labels
-    seats: float  # share of the chosen seats that both choose
+    patch_index: float  # fraction of the chosen patches that both choose
     extra: float  # pixels read over pixels kept
 
 
@@ -72,8 +72,8 @@ def rows() -> list[Row]:
             f"within a patch of a seam {np.mean([one[halo].near_px for one in table]):.3%}, further away "
             f"{np.mean([one[halo].far_px for one in table]):.3%}; step of confidence across a seam over the same "
             f"without it {np.mean([one[halo].step for one in table]):.3f}; mIoU "
-            f"{np.mean([one[halo].miou - one[-1].miou for one in table]):+.4f}; seats in common "
-            f"{np.mean([one[halo].seats for one in table]):.1%}",
+            f"{np.mean([one[halo].miou - one[-1].miou for one in table]):+.4f}; patches in common "
+            f"{np.mean([one[halo].patch_index for one in table]):.1%}",
         )
         for halo in HALOS
     ]
@@ -93,7 +93,7 @@ def _survey(folder: Path, seed: int) -> dict[int, Seams]:
     run, stages = open_run(settings), {stage["name"]: stage["key"] for stage in published.receipt["stages"]}
     archive = folder / str(seed) / "stages"
     mosaic = archive / "rectify" / stages["rectify"] / "mosaic.zarr"
-    patches = archive / "patches" / stages["cut_patches"] / "patches.zarr"
+    patches = archive / "patches" / stages["extract_patches"] / "patches.zarr"
     drawn = {halo: _read(run, mosaic, patches, halo) for halo in (-1, *HALOS)}
     return {halo: _compared(run, drawn, halo) for halo in drawn}
 
@@ -105,7 +105,7 @@ def _read(run: SurveyRun, mosaic: Path, patches: Path, halo: int) -> Read:
     """Regions, maps and scores for one halo, -1 for the field as one region."""
     whole = FieldWork.of(run)
     regions = whole.regions if halo < 0 else plan_regions(run.grid, SHARD, most_px=MOST_PX, halo=halo)
-    work = FieldWork(whole.weights, regions, Crew(workers=1), MEMORY)
+    work = FieldWork(whole.weights, regions, WorkerPool(workers=1), MEMORY)
     out = mosaic.parents[3] / f"halo{halo}.zarr"
     legend = ClassNames(run.weights.class_names, run.weights.class_colours)
     create_class_map(out, (run.grid.height, run.grid.width), legend)
@@ -119,7 +119,8 @@ def _compared(run: SurveyRun, drawn: dict[int, Read], halo: int) -> Seams:
     near = _near_seams(regions, run.grid.patch * run.grid.factor)
     assert run.labels is not None
     chosen, before = (
-        frame_seats(each.ravel(), SHARE, run.grid.valid_share().ravel() > 0).seats for each in (scores, whole_scores)
+        frame_patches(each.ravel(), FRACTION, run.grid.valid_fraction().ravel() > 0).patch_index
+        for each in (scores, whole_scores)
     )
     return Seams(
         halo,
@@ -188,38 +189,44 @@ def _mosaic() -> list[Row]:
         tempfile.TemporaryDirectory() as name,
         ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool,
     ):
-        peak, regions, seats, hit, cpu_s = pool.submit(_read_mosaic, Path(name)).result()
+        peak, regions, patch_index, hit, cpu_s = pool.submit(_read_mosaic, Path(name)).result()
     return [
         Row(
             f"peak memory of scoring and drawing {MOSAIC_PX} x {MOSAIC_PX} px, {MOSAIC_BANDS} bands, sparse content",
             f"{peak / 2**30:.2f} GiB",
             f"<= {MEMORY / 2**30:g} GiB",
             peak <= MEMORY,
-            f"{regions} regions with their halos, one worker; {seats} seats by one budget over all of them, {hit:.0%} "
+            f"{regions} regions with their halos, one worker; {patch_index} patches by one budget over all of them, {hit:.0%} "
             f"of them on content; CPU {cpu_s:.0f} s",
         )
     ]
 
 
 def _read_mosaic(folder: Path) -> tuple[int, int, int, float, float]:
-    """Peak memory, regions, seats, the share of them that hold content, and processor time, writing included."""
+    """Peak memory, regions, patches, the fraction of them that hold content, and processor time, writing included."""
     use_one_thread()
     file = _shipped()
     weights = file.load()
     config = weights.config
     grid = SceneGrid(MOSAIC_PX, MOSAIC_PX, config.patch, config.factor)
     content = _write_sparse(folder / "mosaic.zarr", grid)
-    work = FieldWork(file, plan_regions(grid, SHARD), Crew(workers=1), MEMORY)
+    work = FieldWork(file, plan_regions(grid, SHARD), WorkerPool(workers=1), MEMORY)
     began = time.process_time()
     scores = work.score("sobel", folder / "mosaic.zarr", lambda done: None)
-    seats = np.sort(frame_seats(scores.ravel(), MOSAIC_SHARE, grid.valid_share().ravel() > 0).seats)
-    _write_patches(folder / "patches.zarr", grid, seats, spectral_library(MOSAIC_BANDS).wavelength_nm)
+    patch_index = np.sort(frame_patches(scores.ravel(), MOSAIC_FRACTION, grid.valid_fraction().ravel() > 0).patch_index)
+    _write_patches(folder / "patches.zarr", grid, patch_index, spectral_library(MOSAIC_BANDS).wavelength_nm)
     legend = ClassNames(weights.class_names, weights.class_colours)
     create_class_map(folder / "map.zarr", (MOSAIC_PX, MOSAIC_PX), legend)
     work.draw(folder / "mosaic.zarr", folder / "patches.zarr", folder / "map.zarr", lambda done: None)
     cells = config.patch // config.factor
-    held = content.reshape(grid.seat_shape[0], cells, grid.seat_shape[1], cells).any(axis=(1, 3)).ravel()
-    return peak_bytes(), len(work.regions), len(seats), float(held[seats].mean()), time.process_time() - began
+    held = content.reshape(grid.patch_shape[0], cells, grid.patch_shape[1], cells).any(axis=(1, 3)).ravel()
+    return (
+        peak_bytes(),
+        len(work.regions),
+        len(patch_index),
+        float(held[patch_index].mean()),
+        time.process_time() - began,
+    )
 
 
 def _write_sparse(path: Path, grid: SceneGrid) -> NDArray[np.bool_]:
@@ -254,21 +261,21 @@ def _alone(folder: Path, side: int, cut: bool) -> tuple[int, int]:
 
 
 def _write_field(folder: Path, side: int) -> None:
-    """Store a random coarse mosaic and patches at 35 % of the seats."""
+    """Store a random coarse mosaic and patches at 35 % of the patches."""
     grid, rng = SceneGrid(side, side, 16, 4), np.random.default_rng(0)
     nm = np.linspace(420, 980, SYNTHETIC_BANDS)
     writer = MosaicWriter(folder / "mosaic.zarr", grid.coarse_shape, nm)
     writer.write_tile(0, 0, rng.uniform(0.1, 0.5, (*grid.coarse_shape, len(nm))), np.ones(grid.coarse_shape))
-    count = int(np.prod(grid.seat_shape))
-    seats = np.sort(rng.choice(count, int(SHARE * count), replace=False))
-    _write_patches(folder / "patches.zarr", grid, seats, nm)
+    count = int(np.prod(grid.patch_shape))
+    patch_index = np.sort(rng.choice(count, int(FRACTION * count), replace=False))
+    _write_patches(folder / "patches.zarr", grid, patch_index, nm)
 
 
-def _write_patches(path: Path, grid: SceneGrid, seats: NDArray[np.integer], nm: NDArray[np.float64]) -> None:
+def _write_patches(path: Path, grid: SceneGrid, patch_index: NDArray[np.integer], nm: NDArray[np.float64]) -> None:
     rng = np.random.default_rng(1)
-    patches = PatchWriter(path, seats, grid.seat_origin(seats), grid.patch, nm)
-    for first in range(0, len(seats), PATCHES_A_SHARD):
-        shape = (min(PATCHES_A_SHARD, len(seats) - first), grid.patch, grid.patch)
+    patches = PatchWriter(path, patch_index, grid.patch_origin(patch_index), grid.patch, nm)
+    for first in range(0, len(patch_index), PATCHES_A_SHARD):
+        shape = (min(PATCHES_A_SHARD, len(patch_index) - first), grid.patch, grid.patch)
         patches.write(rng.uniform(0.1, 0.5, (*shape, len(nm))).astype(np.float32), np.ones(shape, np.bool_))
 
 
@@ -281,10 +288,10 @@ def _draw_field(folder: Path, side: int, cut: bool) -> tuple[int, int]:
     weights, out = file.load(), folder / "map.zarr"
     shutil.rmtree(out, ignore_errors=True)
     create_class_map(out, (side, side), ClassNames(weights.class_names, weights.class_colours))
-    work = FieldWork(file, regions, Crew(workers=1), MEMORY)
+    work = FieldWork(file, regions, WorkerPool(workers=1), MEMORY)
     work.draw(folder / "mosaic.zarr", folder / "patches.zarr", out, lambda done: None)
-    seats = open_patches(folder / "patches.zarr").seats
-    return peak_bytes(), RESERVED_BYTES + most_bytes(weights.config, regions, seats, SYNTHETIC_BANDS)
+    patch_index = open_patches(folder / "patches.zarr").patch_index
+    return peak_bytes(), RESERVED_BYTES + most_bytes(weights.config, regions, patch_index, SYNTHETIC_BANDS)
 
 
 def _shipped() -> WeightsFile:
@@ -293,12 +300,12 @@ def _shipped() -> WeightsFile:
 
 
 def main() -> None:
-    print("seed  halo  same class  near seams    mIoU   seats in common  read/kept")
+    print("seed  halo  same class  near seams    mIoU   patches in common  read/kept")
     for seed, by_halo in zip(SEEDS, measure_halos(), strict=True):
         for halo, one in by_halo.items():
             print(
                 f"{seed:4}  {'one' if halo < 0 else halo:>4}  {one.all_px:10.3%}  {one.near_px:10.3%}  {one.miou:.4f}"
-                f"  {one.seats:15.2%}  {one.extra:9.2f}",
+                f"  {one.patch_index:15.2%}  {one.extra:9.2f}",
                 flush=True,
             )
 

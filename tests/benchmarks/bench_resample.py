@@ -136,9 +136,15 @@ def _over_linear(natural: Turned, flat: Turned) -> list[Row]:
         linear = peers(scene, 1, only="cv2.remap")[0]
         ours, theirs = scene.error(_call(scene, "catmull-rom")()[0]), scene.error(linear.by_pixel(linear.call()))
         listed = f"{ours:.4f}, cv2 linear {theirs:.4f}"
-        share = ours / theirs
+        fraction = ours / theirs
         found.append(
-            Row(f"catmull-rom: error over cv2.remap linear, {what}", f"{share:.3f}", "<= 1/3", share <= 1 / 3, listed)
+            Row(
+                f"catmull-rom: error over cv2.remap linear, {what}",
+                f"{fraction:.3f}",
+                "<= 1/3",
+                fraction <= 1 / 3,
+                listed,
+            )
         )
     out = np.empty(natural.truth.shape, np.float32)
     calls = {"ours": _call(natural, "catmull-rom", out), "joined": peers(natural, 1, only="cv2.remap")[0].call}

@@ -48,13 +48,13 @@ def _waves(name: str, periods: tuple[float, float], snr: float, seeds: int = 20)
         ours.append(np.hypot(*(found.shift - shift)))
         for peer, method in PEERS.items():
             peers[peer].append(np.hypot(*(method(*views) - shift)))
-    found_share = np.isfinite(ours).mean()
+    found_fraction = np.isfinite(ours).mean()
     error = float(np.nanmedian(ours))
     return Row(
         f"registration, {SHAPE[0]} x {SHAPE[1]} px, waves of {name}, SNR {snr:g}: median error",
-        f"{error:.3f} px" + ("" if found_share == 1 else f", {100 * found_share:.0f} % found"),
+        f"{error:.3f} px" + ("" if found_fraction == 1 else f", {100 * found_fraction:.0f} % found"),
         "<= 0.1 px" if snr == 50 else "",
-        error <= 0.1 and found_share == 1 if snr == 50 else None,
+        error <= 0.1 and found_fraction == 1 if snr == 50 else None,
         ", ".join(f"{peer} {np.median(errors):.3f} px" for peer, errors in peers.items()),
     )
 

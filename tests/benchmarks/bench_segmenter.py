@@ -1,4 +1,4 @@
-"""The segmenter's throughput: many frames packed, 270 bands against 4, what a share of the seats costs, half precision.
+"""The segmenter's throughput: many frames packed, 270 bands against 4, what a fraction of the patches costs, half precision.
 
 Weights are drawn, not trained: time does not depend on them. ``bench_regions.py`` has fields too large to read whole.
 """
@@ -19,23 +19,23 @@ from models.network.machine import keep_freed_memory, one_thread
 from models.network.segmenter import Segmenter
 from models.network.sizes import SegmenterConfig, multiply_adds
 from models.network.spectral import Normalisation, SpectralBasis
-from models.policies.policies import score_multiply_adds, score_seats
+from models.policies.policies import score_multiply_adds, score_patches
 from models.reading.inference import (
-    CoarseLook,
+    CoarsePass,
+    CoarsePrediction,
     DrawnMap,
-    Glance,
+    coarse_prediction,
     draw_coarse,
-    glance,
-    read_glance,
+    read_coarse_prediction,
     segment,
     segment_batch,
 )
 from models.weights.files import Weights
 from pipeline.geometry.grid import SceneGrid
-from pipeline.planning.selection import frame_seats
+from pipeline.planning.selection import frame_patches
 
 FRAMES, PADDED_AT_ONCE = 64, 8
-SIDES_PX, SHARES = (96, 480), (0.0, 0.05, 0.1, 0.2, 0.35)
+SIDES_PX, FRACTIONS = (96, 480), (0.0, 0.05, 0.1, 0.2, 0.35)
 FRAME = SceneGrid(966, 1296, 32, 4)
 FRAME_SIZES = {"classes": 3, "columns": 2, "patch": 32, "factor": 4}
 COST_GOALS = {0.05: 0.07, 0.10: 0.10, 0.15: 0.17, 0.20: 0.17, 0.35: None}
@@ -47,17 +47,17 @@ ROUNDS = 5
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame to read: its coarse look, and the patches of some of its seats."""
+    """A frame to read: its coarse pass, and the patches of some of its patches."""
 
-    look: CoarseLook
+    scan_pass: CoarsePass
     patches: NDArray[np.float32]
-    seats: NDArray[np.int64]
+    patch_index: NDArray[np.int64]
 
 
 def rows() -> list[Row]:
     keep_freed_memory()
     with one_thread():
-        return [*_batches(), *_bands(), *_shares()]
+        return [*_batches(), *_bands(), *_fractions()]
 
 
 def drawn_weights(**sizes: int) -> Weights:
@@ -71,22 +71,22 @@ def drawn_weights(**sizes: int) -> Weights:
     return Weights(model, SpectralBasis(400.0, 1000.0, columns), flat, names, colours)
 
 
-def drawn_frame(weights: Weights, grid: SceneGrid, share: float, rng: np.random.Generator) -> Frame:
-    """Noise, with so much of the seats in use."""
+def drawn_frame(weights: Weights, grid: SceneGrid, fraction: float, rng: np.random.Generator) -> Frame:
+    """Noise, with so much of the patches in use."""
     p, columns = grid.patch, weights.config.columns
     y, x = (size // grid.factor for size in grid.padded_shape)
-    valid = grid.valid_seats()
-    seats = np.sort(rng.permutation(valid)[: round(share * len(valid))]).astype(np.int64)
-    patches = rng.standard_normal((len(seats), p, p, columns), dtype=np.float32)
-    return Frame(CoarseLook(grid, rng.standard_normal((y, x, columns), dtype=np.float32)), patches, seats)
+    valid = grid.valid_patches()
+    patch_index = np.sort(rng.permutation(valid)[: round(fraction * len(valid))]).astype(np.int64)
+    patches = rng.standard_normal((len(patch_index), p, p, columns), dtype=np.float32)
+    return Frame(CoarsePass(grid, rng.standard_normal((y, x, columns), dtype=np.float32)), patches, patch_index)
 
 
 def _batches() -> list[Row]:
     weights, rng = drawn_weights(**FRAME_SIZES), np.random.default_rng(0)
-    sides, shares = rng.integers(*SIDES_PX, (FRAMES, 2)), rng.choice(SHARES, FRAMES)
+    sides, fractions = rng.integers(*SIDES_PX, (FRAMES, 2)), rng.choice(FRACTIONS, FRAMES)
     frames = [
-        drawn_frame(weights, SceneGrid(int(y), int(x), 32, 4), float(share), rng)
-        for (y, x), share in zip(sides, shares, strict=True)
+        drawn_frame(weights, SceneGrid(int(y), int(x), 32, 4), float(fraction), rng)
+        for (y, x), fraction in zip(sides, fractions, strict=True)
     ]
     calls = {
         "packed": partial(_packed, weights, frames),
@@ -103,7 +103,7 @@ def _batches() -> list[Row]:
         for one, other in zip(calls["packed"](), calls["one by one"](), strict=True)
     )
     alone, padded = (ratio(clocks, other, "packed") for other in ("one by one", "padded"))
-    sizes = f"sides of {SIDES_PX[0]} to {SIDES_PX[1]} px, 0 to {max(SHARES):.0%} of the seats"
+    sizes = f"sides of {SIDES_PX[0]} to {SIDES_PX[1]} px, 0 to {max(FRACTIONS):.0%} of the patches"
     return [
         Row(
             f"{FRAMES} mixed frames packed ({sizes}): CPU of one by one over packed",
@@ -133,12 +133,14 @@ def _rate(clock: Timing) -> float:
 
 
 def _packed(weights: Weights, frames: Sequence[Frame]) -> list[DrawnMap]:
-    looks, patches, seats = zip(*((one.look, one.patches, one.seats) for one in frames), strict=True)
-    return segment_batch(weights, looks, patches, seats)
+    scan_passes, patches, patch_index = zip(
+        *((one.scan_pass, one.patches, one.patch_index) for one in frames), strict=True
+    )
+    return segment_batch(weights, scan_passes, patches, patch_index)
 
 
 def _one_by_one(weights: Weights, frames: Sequence[Frame]) -> list[DrawnMap]:
-    return [segment(weights, one.look, one.patches, one.seats) for one in frames]
+    return [segment(weights, one.scan_pass, one.patches, one.patch_index) for one in frames]
 
 
 def _padded(weights: Weights, frames: Sequence[Frame]) -> list[DrawnMap]:
@@ -150,22 +152,22 @@ def _padded(weights: Weights, frames: Sequence[Frame]) -> list[DrawnMap]:
 
 def _padded_batch(weights: Weights, frames: Sequence[Frame]) -> list[DrawnMap]:
     model, config, p = weights.segmenter, weights.config, weights.config.patch
-    rows, columns = (max(one.look.columns.shape[axis] for one in frames) // p for axis in (0, 1))
-    most = max(len(one.seats) for one in frames)
+    rows, columns = (max(one.scan_pass.columns.shape[axis] for one in frames) // p for axis in (0, 1))
+    most = max(len(one.patch_index) for one in frames)
     coarse = torch.zeros(len(frames), config.columns, rows * p, columns * p)
     there = torch.zeros(len(frames), rows, columns, dtype=torch.bool)
-    fine, seats = (
+    fine, patch_index = (
         torch.zeros(len(frames), most, config.columns, p, p),
         torch.zeros(len(frames), most, dtype=torch.int64),
     )
     used = torch.zeros(len(frames), most, dtype=torch.bool)
     for number, one in enumerate(frames):
-        y, x = one.look.columns.shape[:2]
-        coarse[number, :, :y, :x] = torch.from_numpy(one.look.columns).permute(2, 0, 1)
+        y, x = one.scan_pass.columns.shape[:2]
+        coarse[number, :, :y, :x] = torch.from_numpy(one.scan_pass.columns).permute(2, 0, 1)
         there[number, : y // p, : x // p] = True
-        row, column = np.divmod(one.seats, one.look.grid.seat_shape[1])
+        row, column = np.divmod(one.patch_index, one.scan_pass.grid.patch_shape[1])
         fine[number, : len(row)] = torch.from_numpy(one.patches).permute(0, 3, 1, 2)
-        seats[number, : len(row)] = torch.from_numpy(row * columns * config.factor + column)
+        patch_index[number, : len(row)] = torch.from_numpy(row * columns * config.factor + column)
         used[number, : len(row)] = True
     side = config.token_side**2
     known, asked = (mask.flatten(1).repeat_interleave(side, dim=1) for mask in (there, used))
@@ -176,9 +178,9 @@ def _padded_batch(weights: Weights, frames: Sequence[Frame]) -> list[DrawnMap]:
     logits = torch.zeros(len(frames), 0, config.classes, p, p)
     if most:
         features, tokens = model.fine_stem(fine.flatten(0, 1))
-        coded = model.code_fine(tokens.view(len(frames), most, *tokens.shape[1:]), seats, columns)
+        coded = model.code_fine(tokens.view(len(frames), most, *tokens.shape[1:]), patch_index, columns)
         read, _ = _masked(model.encoder, coded, torch.cat([known, asked], dim=1), memory)
-        windows = model.canvas_windows(reading.canvas, seats)
+        windows = model.canvas_windows(reading.canvas, patch_index)
         logits = model.decode_fine(features, read.view(tokens.shape), windows).view(len(frames), most, -1, p, p)
     return [_drawn(one, reading.logits[number], logits[number]) for number, one in enumerate(frames)]
 
@@ -194,11 +196,11 @@ def _masked(
 
 
 def _drawn(frame: Frame, coarse: torch.Tensor, fine: torch.Tensor) -> DrawnMap:
-    grid, p = frame.look.grid, frame.look.grid.patch
-    y, x = frame.look.columns.shape[:2]
+    grid, p = frame.scan_pass.grid, frame.scan_pass.grid.patch
+    y, x = frame.scan_pass.columns.shape[:2]
     drawn = draw_coarse(coarse[None, :, :y, :x], grid)
-    confidence, classes = (part.numpy() for part in fine[: len(frame.seats)].softmax(dim=1).max(dim=1))
-    for (top, left), values, sure in zip(grid.seat_origin(frame.seats), classes, confidence, strict=True):
+    confidence, classes = (part.numpy() for part in fine[: len(frame.patch_index)].softmax(dim=1).max(dim=1))
+    for (top, left), values, sure in zip(grid.patch_origin(frame.patch_index), classes, confidence, strict=True):
         drawn.classes[top : top + p, left : left + p] = values
         drawn.confidence[top : top + p, left : left + p] = sure
     scene = np.s_[: grid.height, : grid.width]
@@ -210,22 +212,22 @@ def _bands() -> list[Row]:
     weights, rng = drawn_weights(**FIELD_SIZES), np.random.default_rng(0)
     nm = np.linspace(400, 1000, MANY)
     coarse = rng.uniform(0.1, 0.5, (*FIELD.coarse_shape, MANY)).astype(np.float32)
-    valid = FIELD.valid_seats()
-    seats = np.sort(rng.permutation(valid)[: round(0.35 * len(valid))])
-    fine = rng.uniform(0.1, 0.5, (len(seats), FIELD.patch, FIELD.patch, MANY)).astype(np.float32)
+    valid = FIELD.valid_patches()
+    patch_index = np.sort(rng.permutation(valid)[: round(0.35 * len(valid))])
+    fine = rng.uniform(0.1, 0.5, (len(patch_index), FIELD.patch, FIELD.patch, MANY)).astype(np.float32)
     some = np.linspace(0, MANY - 1, FEW).astype(int)
     few = np.ascontiguousarray(coarse[..., some]), np.ascontiguousarray(fine[..., some])
 
     def draw(coarse: NDArray[np.float32], fine: NDArray[np.float32], nm: NDArray[np.float64]) -> DrawnMap:
-        seen = glance(weights, coarse, nm, FIELD)
-        return segment(weights, seen, weights.columns(fine, nm), seats)
+        seen = coarse_prediction(weights, coarse, nm, FIELD)
+        return segment(weights, seen, weights.columns(fine, nm), patch_index)
 
     clocks = time_in_turn({"many": partial(draw, coarse, fine, nm), "few": partial(draw, *few, nm[some])}, ROUNDS)
     found = ratio(clocks, "many", "few")
     spent = {name: clock.cpu_min_s for name, clock in clocks.items()}
     return [
         Row(
-            f"{MANY} bands over {FEW} of the same pixels: CPU from values to map, 35 % of the seats of "
+            f"{MANY} bands over {FEW} of the same pixels: CPU from values to map, 35 % of the patches of "
             f"{FIELD.width} x {FIELD.height} px",
             f"{found:.2f}",
             f"<= {MOST_BANDS_RATIO}",
@@ -235,33 +237,37 @@ def _bands() -> list[Row]:
     ]
 
 
-def _shares() -> list[Row]:
-    """Glance, scores and map at each share of the seats over the map of every seat on its fastest path."""
+def _fractions() -> list[Row]:
+    """Glance, scores and map at each fraction of the patches over the map of every patch on its fastest path."""
     weights, rng = drawn_weights(**FRAME_SIZES), np.random.default_rng(0)
     every = drawn_frame(weights, FRAME, 1.0, rng)
-    calls = {"all": lambda: segment(weights, every.look, every.patches, every.seats)}
-    seats_of = {}
-    for share in COST_GOALS:
-        count = frame_seats(np.zeros(FRAME.valid_share().size), share, FRAME.valid_share().ravel() > 0).seats
-        seats_of[share] = len(count)
-        calls[f"{share:.0%}"] = partial(_adaptive, weights, every, len(count))
-    calls["35% in bfloat16"] = partial(_adaptive, weights, every, seats_of[0.35], "bfloat16")
-    calls["all in bfloat16"] = lambda: segment(weights, every.look, every.patches, every.seats, precision="bfloat16")
+    calls = {"all": lambda: segment(weights, every.scan_pass, every.patches, every.patch_index)}
+    patches_of = {}
+    for fraction in COST_GOALS:
+        count = frame_patches(
+            np.zeros(FRAME.valid_fraction().size), fraction, FRAME.valid_fraction().ravel() > 0
+        ).patch_index
+        patches_of[fraction] = len(count)
+        calls[f"{fraction:.0%}"] = partial(_adaptive, weights, every, len(count))
+    calls["35% in bfloat16"] = partial(_adaptive, weights, every, patches_of[0.35], "bfloat16")
+    calls["all in bfloat16"] = lambda: segment(
+        weights, every.scan_pass, every.patches, every.patch_index, precision="bfloat16"
+    )
     clocks = time_in_turn(calls, ROUNDS)
-    full = multiply_adds(weights.config, FRAME, len(every.seats), 2).total
+    full = multiply_adds(weights.config, FRAME, len(every.patch_index), 2).total
     found = []
-    for share, goal in COST_GOALS.items():
-        cost = ratio(clocks, f"{share:.0%}", "all")
+    for fraction, goal in COST_GOALS.items():
+        cost = ratio(clocks, f"{fraction:.0%}", "all")
         score = score_multiply_adds("gain", weights.config, FRAME)
-        macs = multiply_adds(weights.config, FRAME, seats_of[share], 2, score=score).total / full
+        macs = multiply_adds(weights.config, FRAME, patches_of[fraction], 2, score=score).total / full
         found.append(
             Row(
-                f"CPU at {share:.0%} of the seats over every seat, frame of {FRAME.width} x {FRAME.height} px",
+                f"CPU at {fraction:.0%} of the patches over every patch, frame of {FRAME.width} x {FRAME.height} px",
                 f"{cost:.3f}",
                 "" if goal is None else f"<= {goal}",
                 None if goal is None else cost <= goal,
-                f"multiply-adds {macs:.3f}; {clocks[f'{share:.0%}'].cpu_min_s:.3f} s against "
-                f"{clocks['all'].cpu_min_s:.2f} s, glance and scorer included",
+                f"multiply-adds {macs:.3f}; {clocks[f'{fraction:.0%}'].cpu_min_s:.3f} s against "
+                f"{clocks['all'].cpu_min_s:.2f} s, coarse prediction and scorer included",
             )
         )
     half = {name: ratio(clocks, f"{name} in bfloat16", name) for name in ("35%", "all")}
@@ -269,15 +275,15 @@ def _shares() -> list[Row]:
     return [
         *found,
         Row(
-            "bfloat16 over float32: CPU at 35 % of the seats",
+            "bfloat16 over float32: CPU at 35 % of the patches",
             f"{half['35%']:.2f}",
-            peers=f"at every seat {half['all']:.2f}; the processor {'has' if native else 'lacks'} bfloat16 arithmetic",
+            peers=f"at every patch {half['all']:.2f}; the processor {'has' if native else 'lacks'} bfloat16 arithmetic",
         ),
     ]
 
 
 def _adaptive(weights: Weights, every: Frame, count: int, precision: str = "float32") -> DrawnMap:
-    seen: Glance = read_glance(weights, every.look, precision=precision)  # type: ignore[arg-type]
-    scores = score_seats("gain", seen).ravel()[every.seats]
+    seen: CoarsePrediction = read_coarse_prediction(weights, every.scan_pass, precision=precision)  # type: ignore[arg-type]
+    scores = score_patches("gain", seen).ravel()[every.patch_index]
     best = np.sort(np.argsort(-scores, kind="stable")[:count])
-    return segment(weights, seen, every.patches[best], every.seats[best], precision=precision)  # type: ignore[arg-type]
+    return segment(weights, seen, every.patches[best], every.patch_index[best], precision=precision)  # type: ignore[arg-type]

@@ -27,12 +27,12 @@ def rows() -> list[Row]:
         folder = Path(name)
         (field, _) = small_fields(folder)
         idle_s, run_s = _served(folder, field.file)
-        plain_s = _plain(folder, field.file)
+        uniform_s = _plain(folder, field.file)
     load = f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}"
     return [
         Row("serve at rest, server and runner", f"{idle_s:.1f} s a minute", "", None, f"processor time; {load}"),
         Row("a scheduled run, all of it", f"{run_s:.1f} s", "", None, f"of its process, and what serve adds; {load}"),
-        Row("the same by survey --engine plain", f"{plain_s:.1f} s", "", None, f"of its process; {load}"),
+        Row("the same by survey --engine plain", f"{uniform_s:.1f} s", "", None, f"of its process; {load}"),
     ]
 
 

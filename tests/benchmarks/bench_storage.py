@@ -1,4 +1,4 @@
-"""Storage: our layout against plain zarr-python of the same arrays, the spool's share of a core, a survey run again."""
+"""Storage: our layout against plain zarr-python of the same arrays, the spool's fraction of a core, a survey run again."""
 
 from __future__ import annotations
 
@@ -77,13 +77,13 @@ def _against_zarr(folder: Path, raw: NDArray[np.uint16]) -> list[Row]:
     size = raw.nbytes / 1e6
     found = []
     for what, clocks in (("write", writes), ("read", reads)):
-        share = ratio(clocks, "plain", "ours")
+        fraction = ratio(clocks, "plain", "ours")
         found.append(
             Row(
                 f"{what} a raw cube of {size:.0f} MB: speed over plain zarr-python's",
-                f"{share:.0%}",
+                f"{fraction:.0%}",
                 ">= 80 %",
-                share >= 0.8,
+                fraction >= 0.8,
                 f"{size / clocks['ours'].wall_min_s:.0f} MB/s, plain {size / clocks['plain'].wall_min_s:.0f} MB/s",
             )
         )
@@ -102,12 +102,12 @@ def _spool(folder: Path, raw: NDArray[np.uint16]) -> Row:
             slowest = max(slowest, time.perf_counter() - before)
         spool.sync()
         cpu, wall = time.process_time() - cpu, time.perf_counter() - began
-    share = cpu / SPOOLED * RATE_HZ
+    fraction = cpu / SPOOLED * RATE_HZ
     return Row(
-        f"spool, lines of {raw[0].nbytes / 1e3:.0f} KB at {RATE_HZ:.0f} Hz: share of one core",
-        f"{share:.0%}",
+        f"spool, lines of {raw[0].nbytes / 1e3:.0f} KB at {RATE_HZ:.0f} Hz: fraction of one core",
+        f"{fraction:.0%}",
         "<= 20 %",
-        share <= 0.2,
+        fraction <= 0.2,
         f"{wall / SPOOLED * 1e3:.2f} ms a line, the slowest {slowest * 1e3:.0f} ms",
     )
 

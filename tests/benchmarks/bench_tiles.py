@@ -35,7 +35,7 @@ from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
 from storage.arrays.layout import ArraySpec, create_array, create_group, image_spec
 from storage.arrays.mosaics import MosaicWriter, load_mosaic
 from storage.arrays.tile_work import MosaicRecipe, write_mosaic
-from storage.parallel.crew import Crew
+from storage.parallel.pool import WorkerPool
 
 CAMERA = LineCamera()
 PATTERN_LINES = 512
@@ -117,13 +117,13 @@ def _against_codec(folder: Path) -> Row:
         write()
 
     clocks = time_in_turn({"stage": stage, "codec": codec, "read": read}, rounds=ROUNDS)
-    share, per = ratio(clocks, "stage", "codec"), 1e9 / stored.values.size
+    fraction, per = ratio(clocks, "stage", "codec"), 1e9 / stored.values.size
     cost = {name: clock.cpu_min_s * per for name, clock in clocks.items()}
     return Row(
         f"rectify and mosaic disk to disk, {SHAPE[0]} x {SHAPE[1]} px, {BANDS} bands, {len(paths)} sweeps",
-        f"{share:.2f} x codec, {cost['stage']:.1f} ns a px and band",
+        f"{fraction:.2f} x codec, {cost['stage']:.1f} ns a px and band",
         "<= 2 x codec",
-        share <= 2,
+        fraction <= 2,
         f"read the sweeps {cost['read']:.1f} ns, with writing the mosaic {cost['codec']:.1f} ns",
     )
 
@@ -207,7 +207,7 @@ def rectify(paths: list[Path], out: Path, grid: PixelGrid, memory: int, workers:
     """The stage: cubes opened, placed, made into one mosaic on disk."""
     wavelength_nm = open_raw_cube(paths[0]).wavelength_nm
     writer = MosaicWriter(out, grid.shape, wavelength_nm)
-    write_mosaic(MosaicRecipe(paths[0].parent, CAMERA, grid), writer, memory=memory, crew=Crew(workers=workers))
+    write_mosaic(MosaicRecipe(paths[0].parent, CAMERA, grid), writer, memory=memory, pool=WorkerPool(workers=workers))
 
 
 def measured(paths: list[Path], out: Path, grid: PixelGrid, memory: int, workers: int | None) -> Spent:

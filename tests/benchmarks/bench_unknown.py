@@ -25,7 +25,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 
 SEEDS, DAYS, SIZE = (21, 22, 23), (120, 172, 250), "640x512"
-LOOKS: dict[str, dict[str, Any]] = {
+PROBES: dict[str, dict[str, Any]] = {
     "every line, 100 ms": {"scan_step": 1},
     "survey --seconds 25": {"seconds": 25},
     "two passes, budget 0.5": {"budget": 0.5},
@@ -42,10 +42,10 @@ Judged = dict[str, float]
 def rows() -> list[Row]:
     """Unknown pixels of known and of other fields, in percent: mean (least - most)."""
     found = []
-    for name, look in LOOKS.items():
-        judged = [_farm(seed, day, look) for seed in SEEDS for day in DAYS]
-        shares = [100 * one["share"] for one in judged]
-        found.append(Row(f"farms, {name}: unknown", _figure(shares, "%"), "<= 1 % each", max(shares) <= 1))
+    for name, scan_pass in PROBES.items():
+        judged = [_farm(seed, day, scan_pass) for seed in SEEDS for day in DAYS]
+        fractions = [100 * one["fraction"] for one in judged]
+        found.append(Row(f"farms, {name}: unknown", _figure(fractions, "%"), "<= 1 % each", max(fractions) <= 1))
         change = [one["change"] for one in judged]
         mean = float(np.mean(change))
         found.append(Row(f"farms, {name}: mIoU with it - without", _figure(change, "points"), ">= -0.1", mean >= -0.1))
@@ -55,9 +55,12 @@ def rows() -> list[Row]:
         print(*(f"{row.what}: {row.figure}" for row in found[-3:]), sep="\n", flush=True)
     with tempfile.TemporaryDirectory() as folder:
         for name, path in other_fields(Path(folder)):
-            for look in ("every line, 100 ms", "every line, 5 ms"):
-                share = 100 * _survey({"scene": str(path), "weights": str(WEIGHTS), **LOOKS[look]}, "auto")["share"]
-                found.append(Row(f"{name}, {look}: unknown", f"{share:.1f} %", ">= 90 %", share >= 90))
+            for scan_pass in ("every line, 100 ms", "every line, 5 ms"):
+                fraction = (
+                    100
+                    * _survey({"scene": str(path), "weights": str(WEIGHTS), **PROBES[scan_pass]}, "auto")["fraction"]
+                )
+                found.append(Row(f"{name}, {scan_pass}: unknown", f"{fraction:.1f} %", ">= 90 %", fraction >= 90))
                 print(f"{found[-1].what}: {found[-1].figure}", flush=True)
     return found if PINES.is_dir() else [*found, not_run("Indian Pines at the farm's brightness", PINES)]
 
@@ -66,9 +69,9 @@ def _figure(values: list[float], unit: str) -> str:
     return f"{np.mean(values):.2f} ({min(values):.2f} - {max(values):.2f}) {unit}"
 
 
-def _farm(seed: int, day: int, look: dict[str, Any]) -> Judged:
-    """A farm's share of unknown pixels, what that changes of its mIoU [points], and the processor time of both maps."""
-    given = {"scene": "farm", "size": SIZE, "seed": seed, "day": day, **look}
+def _farm(seed: int, day: int, scan_pass: dict[str, Any]) -> Judged:
+    """A farm's fraction of unknown pixels, what that changes of its mIoU [points], and the processor time of both maps."""
+    given = {"scene": "farm", "size": SIZE, "seed": seed, "day": day, **scan_pass}
     with tempfile.TemporaryDirectory() as out:
         without, with_it = (_survey({**given, "out": out}, word) for word in ("off", "auto"))
     change = 100 * (with_it["miou"] - without["miou"])
@@ -79,10 +82,10 @@ def _survey(given: dict[str, Any], unknown: str) -> Judged:
     with tempfile.TemporaryDirectory() as out:
         plain = {"engine": "plain", "controls": False, "unknown": unknown, "out": out, **given}
         receipt = run_survey(load_settings(None, plain), Console(quiet=True)).receipt
-    spent = next(stage["cpu_s"] for stage in receipt["stages"] if stage["name"] == "draw_map")
+    spent = next(stage["cpu_s"] for stage in receipt["stages"] if stage["name"] == "segment")
     miou = receipt.get("accuracy", {}).get("miou")
     return {
-        "share": float(receipt.get("unknown", {}).get("share", 0)),
+        "fraction": float(receipt.get("unknown", {}).get("fraction", 0)),
         "miou": float("nan") if miou is None else miou,
         "cpu_s": spent,
     }
@@ -96,7 +99,7 @@ def other_fields(folder: Path) -> Iterator[tuple[str, Path]]:
     grey = np.broadcast_to(boards, (256, 320, len(BANDS_NM)))
     yield "grey boards", _written(folder / "boards", grey, BANDS_NM)
     farm = farm_scene(SEEDS[0], (256, 320), camera=LineCamera(), day=DAYS[1])
-    reflectance = (farm.planes @ farm.electrons / farm.panel_electrons * farm.panel)[..., ::5]
+    reflectance = (farm.planes @ farm.electrons / farm.white_reference_electrons * farm.white_reference)[..., ::5]
     for number in range(3):
         shuffled = np.random.default_rng(number).permutation(reflectance.shape[-1])
         place = folder / f"shuffled{number}"
@@ -115,9 +118,9 @@ def _invented(rng: np.random.Generator) -> NDArray[np.float64]:
 def _picture(spectra: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
     """Patches of the spectra with soft shades and edges, as a photograph has them, (y, x, band)."""
     fields = np.stack([scipy.ndimage.gaussian_filter(rng.standard_normal((256, 320)), 12) for _ in spectra], axis=-1)
-    share = scipy.special.softmax(400 * fields, axis=-1)
+    fraction = scipy.special.softmax(400 * fields, axis=-1)
     shade = 1 + 4 * scipy.ndimage.gaussian_filter(rng.standard_normal((256, 320)), 8)[..., None]
-    return np.asarray((share @ spectra) * np.clip(shade, 0.5, 1.5))
+    return np.asarray((fraction @ spectra) * np.clip(shade, 0.5, 1.5))
 
 
 def _pines(source: Path, folder: Path) -> Path:

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from tests.conftest import Survey, WeightsMaker, patchy_scene
-from tests.remembered_work import without_effects
+from tests.prior_work import without_effects
 
 SETTINGS = (
     'name = "{name}"\nsource = "sim"\nscene = "field.png"\nlabels = "labels.png"\nweights = "mine.safetensors"\n'

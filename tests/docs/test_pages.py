@@ -10,7 +10,7 @@ import pytest
 
 from tests.docs.pages import DOCS, LINKED, PAGES, ROOT, Block, anchors_of, blocks_of, links_of, named_code
 from tests.docs.running import Reader
-from tests.remembered_work import with_effects, without_effects
+from tests.prior_work import with_effects, without_effects
 
 WITH_BLOCKS = [page for page in PAGES if blocks_of(page)]
 OF_EFFECTS = {DOCS / "simulator.md"}  # pages that show which effects are chosen; what others survey is chosen for them

@@ -32,7 +32,7 @@ PLACES = {
     "growing_files": "growing_files:rows",
     "spool_rate": "lost_lines:pace_rows",
     "hostile_rig": "hostile_rig:rows",
-    "sealed_flips": "sealed_flips:weight_rows",
+    "checksummed_flips": "sealed_flips:weight_rows",
 }
 FAULTS = {name: rows_of(f"tests.faults.{place}") for name, place in PLACES.items()}
 

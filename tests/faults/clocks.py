@@ -18,7 +18,7 @@ from typing import Any
 from storage.archive.archive import Archive
 from storage.archive.staging import MANIFEST_NAME
 from storage.maintenance.garbage import clear_up
-from tests.faults.fault_table import Clock, Row, told_wrong
+from tests.faults.fault_table import Clock, Row, reported_wrong
 from tests.faults.nursery import Nursery
 from tests.faults.small_survey import Subject, prepare, problems, words, wrong_after_fault, wrong_after_rerun
 
@@ -81,9 +81,7 @@ def cleared_up(subject: Subject, out: Path, clock: dict[str, Any]) -> list[str]:
     wrong: list[str] = []
     shutil.rmtree(out / "runs")  # killed before it named anything
     archive = Archive.open(out)
-    later = {
-        ref.uri for stage in ("rectify", "attend", "patches", "segment", "evaluate") for ref in archive.refs(stage)
-    }
+    later = {ref.uri for stage in ("rectify", "score", "patches", "segment", "evaluate") for ref in archive.refs(stage)}
     for ref in archive.refs():
         if ref.uri in later:
             _redate(ref.path, clock["shift_s"])
@@ -124,7 +122,7 @@ def _date_files(out: Path) -> None:
 
 
 def _redate(folder: Path, shift_s: float) -> None:
-    """Shift all dates of a store, also that in its manifest, which is sealed again."""
+    """Shift all dates of a store, also that in its manifest, which is checksummed again."""
     from storage.archive.manifests import write_manifest
 
     facts = json.loads((folder / MANIFEST_NAME).read_text())
@@ -154,4 +152,4 @@ def _row(subject: Subject, fault: str, quick: bool) -> Row:
         wrong += [f"{name}: {one}" for one in case(subject, out, WRONG[name])]
         shutil.rmtree(out)
     injected = f"the time that the process sees: {', '.join(chosen)}"
-    return Row(fault, injected, len(chosen), demanded, told_wrong(wrong), not wrong, timer.seconds)
+    return Row(fault, injected, len(chosen), demanded, reported_wrong(wrong), not wrong, timer.seconds)

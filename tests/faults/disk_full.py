@@ -23,7 +23,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from tests.faults.fault_table import Clock, Row, told_wrong
+from tests.faults.fault_table import Clock, Row, reported_wrong
 from tests.faults.injection import ERRORS, label, logged_calls
 from tests.faults.nursery import ROOT, Ended, Nursery
 from tests.faults.small_survey import Subject, prepare, words, wrong_after_fault, wrong_after_rerun
@@ -35,7 +35,7 @@ IN_NAMESPACE = "SPECTRALZOOM_FAULTS_IN_NAMESPACE"
 QUICK = ("spool", "segment manifest", "run")  # kinds for the quick part
 FULL = "disk is full"
 WHERE = {"spool": "spool.", "manifest": "manifests.write_manifest", "run": "run_folder.publish_run"}  # in our functions
-STAGES = ("capture", "locate", "rectify", "attend", "patches", "segment")
+STAGES = ("capture", "locate", "rectify", "score", "patches", "segment")
 EVERYWHERE = {"spool", "run", "run manifest", *STAGES, *(f"{stage} manifest" for stage in STAGES)}
 
 
@@ -51,7 +51,9 @@ class Refusals:
     def words(self) -> str:
         """The figures."""
         places = ", ".join(f"{name} {count}" for name, count in sorted(self.met_at.items()))
-        return f"{self.told} failed with one message, {self.done} ended well; {told_wrong(self.wrong)} (at: {places})"
+        return (
+            f"{self.told} failed with one message, {self.done} ended well; {reported_wrong(self.wrong)} (at: {places})"
+        )
 
 
 # --- full disks -------------------------------------------------------------------------------------------------------

@@ -50,7 +50,7 @@ class Clock:
 Rows = Callable[[bool], Sequence[Row]]  # quick or in full
 
 
-def told_wrong(wrong: Sequence[str]) -> str:
+def reported_wrong(wrong: Sequence[str]) -> str:
     """How many demands were not met, and the first three."""
     return f"{len(wrong)} wrong{': ' + '; '.join(wrong[:3]) if wrong else ''}"
 

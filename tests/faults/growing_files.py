@@ -22,7 +22,7 @@ from pipeline.rig.capture.capture_paths import CaptureRecord
 from pipeline.rig.capture.capture_runner import CaptureJournal
 from storage.arrays.spool import Spool
 from storage.maintenance.verification import verify_growing
-from tests.faults.fault_table import Clock, Row, told_wrong
+from tests.faults.fault_table import Clock, Row, reported_wrong
 from tests.faults.lost_lines import BANDS, HEADER, SAMPLES, fill, line
 
 LINES = 40
@@ -40,7 +40,7 @@ class Rot:
 
     def words(self) -> str:
         """The figures."""
-        return f"{self.told} of {self.flips} told; {told_wrong(self.wrong)}"
+        return f"{self.told} of {self.flips} told; {reported_wrong(self.wrong)}"
 
 
 def flip_spool(name: str, flips: int, folder: Path, seed: int = 0) -> Rot:
@@ -128,12 +128,12 @@ def _guarded(tried: Callable[[], list[str]]) -> list[str]:
 
 
 def rows(quick: bool = False) -> Sequence[Row]:
-    clock, share = Clock(), (200 if quick else FLIPS) // 2
+    clock, fraction = Clock(), (200 if quick else FLIPS) // 2
     with tempfile.TemporaryDirectory(prefix="growing-") as name:
-        found = {kind: flip_spool(kind, share, Path(name)) for kind in ("lines.lines",)}
-        found["journal"] = flip_journal(share)
+        found = {kind: flip_spool(kind, fraction, Path(name)) for kind in ("lines.lines",)}
+        found["journal"] = flip_journal(fraction)
     injected = "one bit of a spool or of a rig's journal"
     demanded = "no other number, no defect, no other line lost"
     words = "; ".join(f"{kind}: {one.words()}" for kind, one in found.items())
     met = not any(one.wrong for one in found.values())
-    return [Row("a bit flips in a file that grows", injected, 2 * share, demanded, words, met, clock.seconds)]
+    return [Row("a bit flips in a file that grows", injected, 2 * fraction, demanded, words, met, clock.seconds)]

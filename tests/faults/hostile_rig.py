@@ -25,7 +25,7 @@ from pipeline.rig.device_settings import CameraAddress, ControlPatience, FileSer
 from pipeline.rig.devices import SYSTEM_CLOCK
 from pipeline.rig.mirror.mirror_controller import open_mirror
 from pipeline.rig.rig_check import CheckRow, check_camera, check_mirror
-from tests.faults.fault_table import Clock, Row, told_wrong
+from tests.faults.fault_table import Clock, Row, reported_wrong
 from tests.pipeline.rig.camera.hostile_camera import (
     REPLIES,
     Answers,
@@ -58,7 +58,7 @@ class Outcome:
     """What came of many encounters: the longest of each by its deadline, and what was not as it must be."""
 
     count: int = 0
-    slowest: float = 0.0  # share of its deadline
+    slowest: float = 0.0  # fraction of its deadline
     wrong: list[str] = field(default_factory=list)
 
     def judge(self, name: str, most_s: float, ask: Callable[[], list[str]]) -> None:
@@ -193,12 +193,12 @@ def rows(quick: bool = False) -> list[Row]:
     found = []
     for name, meet in {"hostile camera": meet_camera, "hostile mirror": meet_mirror}.items():
         clock, one = Clock(), meet_for(seconds, 20, meet)
-        told = f"the slowest took {one.slowest:.0%} of its deadline; {told_wrong(one.wrong)}"
+        told = f"the slowest took {one.slowest:.0%} of its deadline; {reported_wrong(one.wrong)}"
         found.append(Row(name, injected, one.count, demanded, told, not one.wrong, clock.seconds))
     clock = Clock()
     with _quiet():
         chaos = survey_in_chaos(range(2000, 2000 + (FEW_SURVEYS if quick else SURVEYS)))
-    told = f"{chaos.told} told; {chaos.strikes} strikes; {told_wrong(chaos.wrong)}"
+    told = f"{chaos.told} told; {chaos.strikes} strikes; {reported_wrong(chaos.wrong)}"
     injected = "bytes put in, doubled and cut out, control, FTP and its transfers, both ways"
     demanded = "bytes of the undisturbed survey or one message; the rerun gives them all"
     row = Row("line of the camera", injected, chaos.surveys, demanded, told, not chaos.wrong, clock.seconds)

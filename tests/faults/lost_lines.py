@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from pipeline.source import Line
 from storage.arrays.spool import SYNC_LINES, Spool
-from tests.faults.fault_table import Clock, Row, told_wrong
+from tests.faults.fault_table import Clock, Row, reported_wrong
 from tests.faults.nursery import ROOT
 
 SAMPLES, BANDS = 20, 7
@@ -71,10 +71,10 @@ class Losses:
     def words(self) -> str:
         """The figures."""
         each = sorted(self.lost.elements()) or [0]
-        at = [each[len(each) * share // 100] for share in (50, 90)]
+        at = [each[len(each) * fraction // 100] for fraction in (50, 90)]
         return (
             f"lines lost: none in {self.lost[0]}, median {at[0]}, 9 of 10 at most {at[1]}, at most {each[-1]};"
-            f" {told_wrong(self.wrong)}"
+            f" {reported_wrong(self.wrong)}"
         )
 
 
@@ -240,7 +240,7 @@ class Pace:
 
     @property
     def core(self) -> float:
-        """Share of one core."""
+        """Fraction of one core."""
         return self.cpu_s / self.wall_s
 
     @property

@@ -1,6 +1,6 @@
 """Several processes write one archive at once: ``python tests/faults many_writers``.
 
-The same survey two and four times; surveys that share their first stages; and one that is killed in the middle while
+The same survey two and four times; surveys that fraction their first stages; and one that is killed in the middle while
 others wait for what it was making.
 """
 
@@ -15,12 +15,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from storage.archive.archive import Archive
-from tests.faults.fault_table import Clock, Row, told_wrong
+from tests.faults.fault_table import Clock, Row, reported_wrong
 from tests.faults.nursery import Ended, Nursery
 from tests.faults.small_survey import Stored, Subject, prepare, problems, stored, words
 
 ROUNDS = 10
-OTHER = ("--policy", "sobel")  # shares the coarse look, the lookup and the mosaic
+OTHER = ("--policy", "sobel")  # shares the coarse pass, the geolocation grid and the mosaic
 
 
 @dataclass
@@ -32,7 +32,7 @@ class Writings:
 
     def words(self, rounds: int) -> str:
         """The figures."""
-        return f"{rounds} archives, {self.waited} times one was given what another made; {told_wrong(self.wrong)}"
+        return f"{rounds} archives, {self.waited} times one was given what another made; {reported_wrong(self.wrong)}"
 
 
 def write_together(
@@ -89,7 +89,7 @@ def _left(out: Path, *, killed: bool) -> list[str]:
 
 
 def rows(quick: bool = False) -> list[Row]:
-    """Two and four of the same survey, surveys that share stages, and one killed while others wait."""
+    """Two and four of the same survey, surveys that fraction stages, and one killed while others wait."""
     rounds = 1 if quick else ROUNDS
     with tempfile.TemporaryDirectory(prefix="writers-") as name, Nursery(Path(name)) as nursery:
         subject = prepare(nursery)

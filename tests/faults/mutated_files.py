@@ -23,7 +23,7 @@ from typing import Any
 from pipeline.errors import PipelineError
 from storage.readers.envi_files import parse_envi_header
 from tests.faults.cube_files import FORMATS, try_reading
-from tests.faults.fault_table import Clock, Row, told_wrong
+from tests.faults.fault_table import Clock, Row, reported_wrong
 from tests.faults.nursery import ROOT
 
 BATCH = 500  # mutations a process
@@ -74,7 +74,7 @@ class Tally:
     def words(self) -> str:
         """The figures."""
         return (
-            f"{self.read} read, {self.refused} refused, {told_wrong(self.wrong)}; slowest {self.slowest_s * 1000:.0f} "
+            f"{self.read} read, {self.refused} refused, {reported_wrong(self.wrong)}; slowest {self.slowest_s * 1000:.0f} "
             f"ms, {self.most_bytes / 1e6:.1f} MB at most"
         )
 
@@ -142,8 +142,8 @@ def data_for(text: str, rng: random.Random) -> bytes:
         size = header.offset + row * (5 if header.lines is None else header.lines)
     except PipelineError:
         size = rng.choice((0, 47, 4000))
-    share = rng.choice((1.0, 1.0, 1.0, 0.0, 0.5, 0.99, 1.01))
-    return rng.randbytes(min(int(size * share), LARGEST_DATA))
+    fraction = rng.choice((1.0, 1.0, 1.0, 0.0, 0.5, 0.99, 1.01))
+    return rng.randbytes(min(int(size * fraction), LARGEST_DATA))
 
 
 def _set(lines: list[str], key: str, word: str) -> list[str]:

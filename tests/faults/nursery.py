@@ -150,7 +150,7 @@ def serve(choices: Path) -> None:
         "tests.faults.injection",
     ):
         importlib.import_module(name)
-    importlib.import_module("tests.remembered_work").remember(choices)
+    importlib.import_module("tests.prior_work").remember(choices)
     gc.freeze()  # else each child looks through all of it for what may go, and copies it from its parent by that
     for line in sys.stdin:
         request = json.loads(line)

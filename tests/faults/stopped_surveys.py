@@ -26,7 +26,7 @@ from typing import Any
 from flows.publish.receipt import comparable, is_pending
 from flows.terminal.processes import TERMINATED
 from storage.archive.archive import Archive
-from tests.faults.fault_table import Clock, Row, told_wrong
+from tests.faults.fault_table import Clock, Row, reported_wrong
 from tests.faults.nursery import ROOT
 from tests.faults.small_survey import problems, stored
 
@@ -110,7 +110,7 @@ def kill_rows(quick: bool = False) -> list[Row]:
         ended, wrong = kill_surveys(Path(name), count, random.Random(0))
     injected = "SIGKILL at random moments of a survey of 256 x 256 px and 33 bands"
     demanded = "archive verifies, nothing published is lost, rerun bit-identical"
-    found = f"{ended} archives brought to an end; {told_wrong(wrong)}"
+    found = f"{ended} archives brought to an end; {reported_wrong(wrong)}"
     return [Row("survey killed", injected, count, demanded, found, not wrong, clock.seconds)]
 
 
@@ -128,7 +128,7 @@ class Terminations:
         """The figures."""
         return (
             f"{self.told} ended with {TERMINATED} and the sentence, in {self.longest_s:.1f} s at most, {self.ended} by "
-            f"themselves; {self.pending} left a run to be judged; {told_wrong(self.wrong)}"
+            f"themselves; {self.pending} left a run to be judged; {reported_wrong(self.wrong)}"
         )
 
 

@@ -9,6 +9,7 @@ from random import Random
 import pytest
 
 from tests.faults import (
+    checksummed_flips,
     clocks,
     disk_full,
     growing_files,
@@ -16,7 +17,6 @@ from tests.faults import (
     lost_lines,
     many_writers,
     mutated_files,
-    sealed_flips,
     small_survey,
 )
 from tests.faults.cube_files import FORMATS
@@ -98,7 +98,7 @@ def test_devices_that_mean_harm(meet: Callable[..., None]) -> None:
 
 def test_bits_flipped_in_weights_and_checkpoints(tmp_path: Path) -> None:
     """Each is refused in one message, or read as it was written."""
-    found = sealed_flips.flip_bits(150, tmp_path, seed=1)
+    found = checksummed_flips.flip_bits(150, tmp_path, seed=1)
     assert found.wrong == []
     assert found.tried == found.refused + found.same == 150
     assert found.refused > 100

@@ -22,7 +22,7 @@ from storage.archive.archive import Archive
 from storage.remote.opening import verify_archive
 from tests.conftest import Survey
 from tests.flows.small_fields import write_field
-from tests.remembered_work import without_effects
+from tests.prior_work import without_effects
 
 CommandLine = Callable[..., "Ended"]
 FEW_BANDS = ",".join(map(str, range(4, 270, 9)))  # of the farm: the fewest that reach all the shipped weights' columns

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from flows.evaluate.frames import Look, look_at, open_frames
+from flows.evaluate.frames import ScenePasses, capture_passes, open_frames
 from models.weights.files import Weights, load_weights, save_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.scenes.scene import RasterScene
@@ -18,7 +18,7 @@ from tests.models.conftest import make_weights
 
 FRAMES = ("001", "002", "003")
 NAMES = ("soil", "crop")
-QUICK: dict[str, Any] = {"shares": (0.25, 0.5), "policies": ("entropy", "random"), "draws": 20, "rig": False}
+QUICK: dict[str, Any] = {"fractions": (0.25, 0.5), "policies": ("entropy", "random"), "draws": 20, "rig": False}
 
 
 def write_field(root: Path, size: tuple[int, int] = (24, 40), names: Sequence[str] = FRAMES) -> Path:
@@ -53,7 +53,7 @@ def scene_at(data: Path, name: str = "001") -> RasterScene:
     return next(opened.scenes(opened.train))
 
 
-def looked_at(data: Path, path: Path, factor: int = 2, seed: int = 0) -> tuple[Look, Weights]:
+def observed_passes(data: Path, path: Path, factor: int = 2, seed: int = 0) -> tuple[ScenePasses, Weights]:
     """The first frame as small weights see it."""
     weights = load_weights(write_weights(path, seed, factor=factor))
-    return look_at(scene_at(data), "001", weights, LineCamera(), 0), weights
+    return capture_passes(scene_at(data), "001", weights, LineCamera(), 0), weights

@@ -19,7 +19,7 @@ from pipeline.simulator.effects.probe import Probe, noise_electrons
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig, Sky
-from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
 from pipeline.simulator.selection import survey_probe
 from pipeline.simulator.selection.choice import Decision, decide
 from pipeline.simulator.selection.options import acts_on_light
@@ -28,15 +28,15 @@ from pipeline.simulator.simulated import sweep_block
 ROUNDING = 4e-6  # of the light over its noise: sums of float32 in another order
 CAMERA = LineCamera(samples=64)
 RIG = Rig(camera=CAMERA)
-SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-15.5, lines=30)
+SWEEP = Sweep("s", "fine", "x", swath_px=0.0, start_px=-15.5, lines=30)
 NOON = datetime(2026, 6, 21, 11, 20, tzinfo=UTC)
 PROBES: dict[tuple[Any, ...], Probe] = {}  # made already: most of a small decision is its look at the scene
 EVERYTHING = Rig(  # that a rig may have
     camera=CAMERA,
     mirror=MirrorMotion(positions_per_line=0.7, repeatability_urad=40.0, hysteresis_px=2.0, drift_px_per_min=1.0),
-    detector=Detector(dead_share=0.01, hot_share=0.01),
+    detector=Detector(dead_fraction=0.01, hot_fraction=0.01),
     air=Air(distance_m=300.0, nearest_m=100.0, relief="plane", wind_amplitude_m=0.02),
-    sky=Sky(started=NOON, cloud_share=0.3, hot_spot=0.1),
+    sky=Sky(started=NOON, cloud_fraction=0.3, hot_spot=0.1),
 )
 
 
@@ -48,7 +48,7 @@ def scene_of(values: NDArray[np.floating], electrons: float = 5000.0) -> RasterS
         "t",
         "t",
         SceneRaster.of(values.astype(np.float32)),
-        Once.of(SceneLight(light, light)),
+        Once.of(SceneRadiance(light, light)),
         np.ones(bands, np.float32),
         np.linspace(450, 850, bands),
         fwhm_nm=np.full(bands, 6.0),

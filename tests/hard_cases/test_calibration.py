@@ -15,7 +15,7 @@ FULL = 4095
 
 
 def frames(samples: int = 12, bands: int = 10) -> References:
-    """References with a dark of 60.5 DN, a white of 2060.5 DN and a panel of 1."""
+    """References with a dark of 60.5 DN, a white of 2060.5 DN and a white reference of 1."""
     dark = np.full((samples, bands), 60.5, np.float32)
     return References(dark, dark + 2000, np.ones(bands, np.float32))
 

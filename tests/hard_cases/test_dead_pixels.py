@@ -1,6 +1,6 @@
 """Numerical hard cases of what a camera did not see: rows 17, 18 and 21 of the design's table are in the names.
 
-Fine pixels that a survey's mirror missed take the coarse look's columns before they come here; what these rows say
+Fine pixels that a survey's mirror missed take the coarse pass's columns before they come here; what these rows say
 holds for dead pixels, whose captured values are not numbers.
 """
 
@@ -13,8 +13,8 @@ import pytest
 
 from models.evaluation.placement import oracle_gain
 from models.network.spectral import fill_dead
-from models.policies.policies import score_seats
-from models.reading.inference import CoarseLook, Glance, glance, look_coarsely, segment
+from models.policies.policies import score_patches
+from models.reading.inference import CoarsePass, CoarsePrediction, coarse_prediction, read_coarse_pass, segment
 from pipeline.geometry.grid import SceneGrid
 from tests.models.conftest import plain_weights
 
@@ -49,19 +49,19 @@ def test_17_a_token_dead_in_most_of_its_pixels_is_not_read(patch: int, token: in
     values = _scene(2 * patch, patch)
     values[: token // 2, :token] = np.nan
     values[token // 2, :more] = np.nan
-    seen = look_coarsely(weights, [values], NM, grid)
+    seen = read_coarse_pass(weights, [values], NM, grid)
     assert np.isfinite(seen.columns).all()
     assert seen.living is not None
     assert np.flatnonzero(~seen.living).tolist() == [0] * more
-    assert np.isfinite(glance(weights, values, NM, grid).probability).all()
+    assert np.isfinite(coarse_prediction(weights, values, NM, grid).probability).all()
 
 
 def test_17_dead_pixels_are_filled_by_the_mean_of_their_patch():
     """A coarse pixel without a value takes the mean column of the living ones of its patch."""
     weights, grid, values = plain_weights(), SceneGrid(32, 32, 8, 2), _scene(16, 16)
-    whole = look_coarsely(weights, [values], NM, grid).columns
+    whole = read_coarse_pass(weights, [values], NM, grid).columns
     values[2:4, 9:14] = np.nan
-    seen = look_coarsely(weights, [values], NM, grid).columns
+    seen = read_coarse_pass(weights, [values], NM, grid).columns
     hole = np.zeros((16, 16), bool)
     hole[2:4, 9:14] = True
     assert (seen[~hole] == whole[~hole]).all()
@@ -73,26 +73,26 @@ def test_18_a_dead_coarse_patch_is_as_if_the_scene_ended_there():
     """A scene whose last coarse patches are all dead reads outside them as one without them, but for one cell."""
     weights, values = plain_weights(), _scene(24, 32)
     values[:, 24:] = np.nan
-    dead = glance(weights, values, NM, SceneGrid(48, 64, 8, 2))
-    shorter = glance(weights, values[:, :24], NM, SceneGrid(48, 48, 8, 2))
+    dead = coarse_prediction(weights, values, NM, SceneGrid(48, 64, 8, 2))
+    shorter = coarse_prediction(weights, values[:, :24], NM, SceneGrid(48, 48, 8, 2))
     assert np.isfinite(dead.probability).all()
     assert np.abs(dead.probability[:, :20] - shorter.probability[:, :20]).max() <= 1e-5
-    seats = np.array([0, 9, 20])
-    columns, across = np.divmod(seats, 6)
-    drawn = segment(weights, shorter, _patches(3), seats).confidence
+    patch_index = np.array([0, 9, 20])
+    columns, across = np.divmod(patch_index, 6)
+    drawn = segment(weights, shorter, _patches(3), patch_index).confidence
     beside = segment(weights, dead, _patches(3), columns * 8 + across).confidence
     assert np.abs(drawn[:, :40] - beside[:, :40]).max() <= 1e-5
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_18_a_dead_fine_patch_is_as_if_not_captured(bad: float):
-    """A captured patch that is all dead changes nothing anywhere: the map is that without its seat."""
+    """A captured patch that is all dead changes nothing anywhere: the map is that without its patch."""
     weights = plain_weights()
-    seen = glance(weights, _scene(24, 32), NM, SceneGrid(48, 64, 8, 2))
-    patches, seats = _patches(5), np.array([3, 40, 11, 12, 30])
+    seen = coarse_prediction(weights, _scene(24, 32), NM, SceneGrid(48, 64, 8, 2))
+    patches, patch_index = _patches(5), np.array([3, 40, 11, 12, 30])
     patches[1] = bad
-    drawn = segment(weights, seen, patches, seats)
-    without = segment(weights, seen, np.delete(patches, 1, axis=0), np.delete(seats, 1))
+    drawn = segment(weights, seen, patches, patch_index)
+    without = segment(weights, seen, np.delete(patches, 1, axis=0), np.delete(patch_index, 1))
     assert np.abs(drawn.confidence - without.confidence).max() <= 1e-5
     assert (drawn.classes == without.classes).all()
 
@@ -102,13 +102,16 @@ def test_18_what_a_look_showed_is_told_of_the_map_that_is_drawn(bad: float):
     """Holes in either scale: gain compares the map without patches with the one that has them."""
     weights, grid, values = plain_weights(classes=2), SceneGrid(48, 64, 8, 2), _scene(24, 32)
     values[:8, 8:16] = bad
-    seen = glance(weights, values, NM, grid)
-    seats = np.arange(48)
+    seen = coarse_prediction(weights, values, NM, grid)
+    patch_index = np.arange(48)
     patches = _patches(48)
     patches[7], patches[20, :3] = bad, bad
     chances = [
         np.where(drawn.classes == 1, drawn.confidence, 1 - drawn.confidence).astype(np.float64)
-        for drawn in (segment(weights, seen, _patches(0), seats[:0]), segment(weights, seen, patches, seats))
+        for drawn in (
+            segment(weights, seen, _patches(0), patch_index[:0]),
+            segment(weights, seen, patches, patch_index),
+        )
     ]
     before, after = (np.stack([1 - chance, chance]).reshape(2, 6, 8, 8, 8).swapaxes(2, 3) for chance in chances)
     gained = np.log(after[1] / before[1]).mean(axis=(2, 3)).ravel()
@@ -136,7 +139,7 @@ def test_18_holes_in_a_coarse_look_take_no_further_copy_of_it():
         values = _scene(256, 256)
         values[3::8, 4::8] = bad
         tracemalloc.start()
-        seen = look_coarsely(
+        seen = read_coarse_pass(
             weights, [values[row : row + 16] for row in range(0, 256, 16)], NM, SceneGrid(512, 512, 8, 2)
         )
         peaks.append(tracemalloc.get_traced_memory()[1])
@@ -152,7 +155,7 @@ def test_18_what_is_dead_reaches_nobody():
     for bad in (np.nan, np.inf, -np.inf):
         values = _scene(24, 32)
         values[8:16, 8:16], values[:, 29] = bad, bad
-        maps.append(glance(weights, values, NM, grid).probability)
+        maps.append(coarse_prediction(weights, values, NM, grid).probability)
     assert np.isfinite(maps[0]).all()
     assert all((other == maps[0]).all() for other in maps[1:])
 
@@ -160,10 +163,10 @@ def test_18_what_is_dead_reaches_nobody():
 def test_18_a_scene_all_dead_still_has_a_map():
     """Nothing seen at all gives finite probabilities, of every policy's score too, and captured patches still count."""
     weights, grid = plain_weights(), SceneGrid(32, 32, 8, 2)
-    seen = glance(weights, np.full((16, 16, 9), np.nan), NM, grid)
+    seen = coarse_prediction(weights, np.full((16, 16, 9), np.nan), NM, grid)
     assert np.isfinite(seen.probability).all()
     for policy in ("gain", "entropy", "sobel", "self-attention"):
-        assert np.isfinite(score_seats(policy, seen)).all()
+        assert np.isfinite(score_patches(policy, seen)).all()
     drawn = segment(weights, seen, _patches(2), np.array([0, 5]))
     assert np.isfinite(drawn.confidence).all()
 
@@ -171,24 +174,24 @@ def test_18_a_scene_all_dead_still_has_a_map():
 def test_18_a_scene_without_holes_is_read_as_ever():
     """Where every pixel lives no token is left out and nothing is filled."""
     weights, grid = plain_weights(), SceneGrid(30, 31, 8, 2)
-    seen = look_coarsely(weights, [_scene(15, 16)], NM, grid)
+    seen = read_coarse_pass(weights, [_scene(15, 16)], NM, grid)
     assert seen.living is None
-    alone = Glance(grid, seen.columns, np.empty((0, 0, 0), np.float32))
+    alone = CoarsePrediction(grid, seen.columns, np.empty((0, 0, 0), np.float32))
     assert alone.living is None
-    assert CoarseLook(grid, seen.columns).living is None
+    assert CoarsePass(grid, seen.columns).living is None
 
 
 def test_21_the_pad_is_a_mirror_image():
     """Scenes are padded by reflection, by the edge pixel where there is one row or column only.
 
-    No seat of the pad is bought, its pixels have no label and no place on the map. Attention does read the part of a
+    No patch of the pad is bought, its pixels have no label and no place on the map. Attention does read the part of a
     border patch that lies in it: it shows the scene once more, as the crops do that the weights are trained on.
     """
     weights = plain_weights()
     for height, width in ((40, 40), (2, 34), (1, 1)):
         grid = SceneGrid(height, width, 8, 2)
         values = _scene(*grid.coarse_shape)
-        seen = look_coarsely(weights, [values], NM, grid)
+        seen = read_coarse_pass(weights, [values], NM, grid)
         y, x = grid.coarse_shape
         inner = weights.columns(values, NM)
         assert seen.columns[:y, :x] == pytest.approx(inner, abs=1e-6)
@@ -198,7 +201,7 @@ def test_21_the_pad_is_a_mirror_image():
                 one, other = (np.take(seen.columns, at, axis=axis) for at in (size, mirrored))
                 assert (one == other).all()
         assert not (
-            grid.valid_share().ravel()[np.setdiff1d(np.arange(grid.valid_share().size), grid.valid_seats())]
+            grid.valid_fraction().ravel()[np.setdiff1d(np.arange(grid.valid_fraction().size), grid.valid_patches())]
         ).any()
 
 
@@ -207,7 +210,7 @@ def test_18_what_was_filled_is_not_called_seen():
     weights, grid = plain_weights(), SceneGrid(48, 64, 8, 2)
     values = _scene(24, 32)
     values[8:16, 8:16] = np.nan
-    seen = look_coarsely(weights, [values], NM, grid)
+    seen = read_coarse_pass(weights, [values], NM, grid)
     assert np.isfinite(seen.columns).all()
     unseen = np.isnan(seen.seen_columns).all(axis=-1)
     assert unseen[8:16, 8:16].all()

@@ -17,7 +17,7 @@ from models.network.layers import ChannelNorm, TokenAttention
 from models.network.segmenter import Segmenter
 from models.network.sizes import MOST_GAIN, SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
-from models.reading.inference import glance_of_columns
+from models.reading.inference import coarse_prediction_of_columns
 from models.training import train as training
 from models.training.examples import Example
 from models.training.objective import map_loss, pixel_losses, scoring_loss
@@ -151,14 +151,14 @@ def test_28_patches_that_mislead_have_negative_gain():
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         model = Segmenter(SegmenterConfig(**SIZES)).eval()
-    with torch.no_grad():  # the glance says class 0 everywhere, every fine patch class 1
+    with torch.no_grad():  # the coarse prediction says class 0 everywhere, every fine patch class 1
         for layer, likes in ((model.coarse_classes, 0), (model.fine_classes, 1)):
             layer.weight.zero_()
             layer.bias.copy_(torch.tensor([4.0, -4.0] if likes == 0 else [-4.0, 4.0]))
     one = np.ones(4, np.float32)
     normalisation = Normalisation(0 * one, one, np.eye(4, dtype=np.float32))
     weights = Weights(model, SpectralBasis(400.0, 1000.0, 4), normalisation, ("a", "b"), np.zeros((2, 3), np.uint8))
-    seen = glance_of_columns(weights, np.zeros((16, 16, 4), np.float32), SceneGrid(32, 32, 8, 2))
+    seen = coarse_prediction_of_columns(weights, np.zeros((16, 16, 4), np.float32), SceneGrid(32, 32, 8, 2))
     gain = oracle_gain(weights, seen, np.zeros((16, 8, 8, 4), np.float32), np.zeros((32, 32), np.uint8)).ravel()
     assert gain == pytest.approx(-8 * np.ones(16) * (gain[0] / -8), rel=1e-4)
     assert (gain < -1).all()
@@ -173,11 +173,11 @@ def test_28_negative_gains_are_never_bought_by_threshold(threshold: float):
     grid, score = SceneGrid(256, 256, 16, 4), np.full(256, -0.3)
     score[[3, 70, 200]] = -5.0, np.nan, -np.inf
     plan = plan_fine(grid, LineCamera(), CostModel(), "x", score, budget_s=10.0, threshold=threshold)
-    assert (plan.seats.tolist(), plan.sweeps, plan.worth) == ([], [], 0.0)
+    assert (plan.patch_index.tolist(), plan.sweeps, plan.expected_gain) == ([], [], 0.0)
     score[100] = 5.0
     plan = plan_fine(grid, LineCamera(), CostModel(), "x", score, budget_s=10.0, threshold=threshold)
-    assert 100 in plan.seats
-    assert plan.worth == pytest.approx(5.0)
+    assert 100 in plan.patch_index
+    assert plan.expected_gain == pytest.approx(5.0)
 
 
 def test_29_the_batch_of_a_failed_run_is_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

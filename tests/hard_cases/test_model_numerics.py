@@ -20,15 +20,21 @@ from models.evaluation.metrics import average_accuracy, confusion, iou_per_class
 from models.network.layers import Encoder, code_1d, code_2d
 from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation
-from models.policies.policies import pixel_entropy, score_seats
-from models.reading.inference import Glance, check_seats, glance, glance_of_columns, segment
+from models.policies.policies import pixel_entropy, score_patches
+from models.reading.inference import (
+    CoarsePrediction,
+    check_patch_index,
+    coarse_prediction,
+    coarse_prediction_of_columns,
+    segment,
+)
 from models.training import train as training
 from models.training.examples import Example
-from models.training.objective import class_weights, draw_seats, map_loss, phase_at, pixel_losses
+from models.training.objective import class_weights, draw_patches, map_loss, phase_at, pixel_losses
 from models.training.train import TrainingSettings, train
 from models.weights.files import load_weights, save_weights
 from pipeline.geometry.grid import SceneGrid
-from pipeline.planning.selection import frame_seats, select_seats
+from pipeline.planning.selection import frame_patches, select_patches
 from tests.models.conftest import SMALL, make_network, noise, plain_weights
 
 NONE = torch.zeros(1, 0, dtype=torch.int64)
@@ -40,8 +46,8 @@ def _encoder(layers: int = 2) -> Encoder:
         return Encoder(16, layers, 2, 2)
 
 
-def _fine(batch: int, seats: int) -> Tensor:
-    return noise(1, batch, seats, 4, 8, 8)
+def _fine(batch: int, patch_index: int) -> Tensor:
+    return noise(1, batch, patch_index, 4, 8, 8)
 
 
 @pytest.fixture
@@ -86,13 +92,13 @@ def test_3_no_tokens_and_no_images_give_nothing(batch: int, count: int):
 
 
 @torch.inference_mode()
-@pytest.mark.parametrize("seats", [0, 3])
-def test_3_no_images_give_no_maps(seats: int):
-    """The whole segmenter takes a batch of no scene, with and without seats."""
-    model, numbers = make_network(layers=2), torch.zeros(0, seats, dtype=torch.int64)
-    logits, patches = model(torch.zeros(0, 4, 16, 24), torch.zeros(0, seats, 4, 8, 8), numbers)
+@pytest.mark.parametrize("patch_index", [0, 3])
+def test_3_no_images_give_no_maps(patch_index: int):
+    """The whole segmenter takes a batch of no scene, with and without patches."""
+    model, numbers = make_network(layers=2), torch.zeros(0, patch_index, dtype=torch.int64)
+    logits, patches = model(torch.zeros(0, 4, 16, 24), torch.zeros(0, patch_index, 4, 8, 8), numbers)
     assert logits.shape == (0, 3, 16, 24)
-    assert patches.shape == (0, seats, 3, 8, 8)
+    assert patches.shape == (0, patch_index, 3, 8, 8)
     assert model.composite(logits, patches, numbers).shape == (0, 3, 32, 48)
 
 
@@ -117,10 +123,10 @@ def test_4_no_pixels_have_finite_class_weights():
 
 
 @torch.inference_mode()
-def test_5_no_seat_is_the_glance_bit_by_bit():
-    """With K = 0 training's forward, the glance and the survey's map come from one and the same logits."""
+def test_5_no_patch_is_the_coarse_prediction_bit_by_bit():
+    """With K = 0 training's forward, the coarse prediction and the survey's map come from one and the same logits."""
     weights, grid = plain_weights(), SceneGrid(48, 64, 8, 2)
-    seen = glance_of_columns(weights, noise(0, 24, 32, 4).numpy(), grid)
+    seen = coarse_prediction_of_columns(weights, noise(0, 24, 32, 4).numpy(), grid)
     coarse = torch.from_numpy(seen.columns).permute(2, 0, 1)[None].contiguous()
     model = weights.segmenter
     logits, patches = model(coarse, _fine(1, 0), NONE)
@@ -131,8 +137,8 @@ def test_5_no_seat_is_the_glance_bit_by_bit():
 
 
 @torch.inference_mode()
-def test_6_every_seat_in_any_order_is_one_map():
-    """With K = all the order in which a policy ranked the seats does not show."""
+def test_6_every_patch_in_any_order_is_one_map():
+    """With K = all the order in which a policy ranked the patches does not show."""
     model, coarse, fine = make_network(layers=2), noise(0, 1, 4, 16, 24), _fine(1, 24)
     maps = []
     for seed in range(3):
@@ -142,35 +148,35 @@ def test_6_every_seat_in_any_order_is_one_map():
     assert maps[0].std() > 0.05
 
 
-def test_6_every_policy_buys_every_seat_once():
-    """A share of 1 buys each valid seat once, whatever the scores."""
-    seen = _flat_glance(37, 53)
-    valid = seen.grid.valid_share().ravel() > 0
+def test_6_every_policy_buys_every_patch_once():
+    """A fraction of 1 buys each valid patch once, whatever the scores."""
+    seen = _flat_coarse_prediction(37, 53)
+    valid = seen.grid.valid_fraction().ravel() > 0
     for policy in ("entropy", "sobel", "random"):
-        seats = frame_seats(score_seats(policy, seen), 1.0, valid).seats
-        assert sorted(seats.tolist()) == seen.grid.valid_seats().tolist()
+        patch_index = frame_patches(score_patches(policy, seen), 1.0, valid).patch_index
+        assert sorted(patch_index.tolist()) == seen.grid.valid_patches().tolist()
 
 
 @pytest.mark.parametrize("count", [-1, 25, 2.5, float("nan"), "3"])
-def test_7_numbers_of_seats_that_cannot_be_are_refused(count: Any):
-    """Too many seats, less than none and parts of seats are named together with the seats there are."""
+def test_7_numbers_of_patches_that_cannot_be_are_refused(count: Any):
+    """Too many patches, less than none and parts of patches are named together with the patches there are."""
     with pytest.raises(ValueError, match=rf"from 0 to 24, got {count!r}"):
-        select_seats(np.zeros(24), count)
+        select_patches(np.zeros(24), count)
     if count == 25:
-        assert len(select_seats(np.zeros(24), count, clip=True).seats) == 24
+        assert len(select_patches(np.zeros(24), count, clip=True).patch_index) == 24
 
 
-def test_8_ties_go_to_the_lowest_seat():
-    """Equal scores keep the order of the seats, and a larger choice begins with the smaller one."""
-    assert select_seats(np.zeros(256), 5).seats.tolist() == [0, 1, 2, 3, 4]
-    assert select_seats(np.array([3, 2, 3, 2, 1, 3]), 2).seats.tolist() == [0, 2]
+def test_8_ties_go_to_the_lowest_patch():
+    """Equal scores keep the order of the patches, and a larger choice begins with the smaller one."""
+    assert select_patches(np.zeros(256), 5).patch_index.tolist() == [0, 1, 2, 3, 4]
+    assert select_patches(np.array([3, 2, 3, 2, 1, 3]), 2).patch_index.tolist() == [0, 2]
     score = np.random.default_rng(0).integers(0, 4, 60).astype(float)
-    choices = [select_seats(score, count).seats for count in range(61)]
+    choices = [select_patches(score, count).patch_index for count in range(61)]
     assert all((more[:-1] == less).all() for less, more in pairwise(choices))
 
 
 def test_8_training_ranks_ties_by_number():
-    """Where entropy and chance say nothing, training too takes the lowest seats, alike in every scene of a batch."""
+    """Where entropy and chance say nothing, training too takes the lowest patches, alike in every scene of a batch."""
 
     class Even(np.random.Generator):
         def random(self, *size: Any) -> Any:  # a placement by entropy with equal chances
@@ -179,45 +185,45 @@ def test_8_training_ranks_ties_by_number():
         def choice(self, *args: Any, **odds: Any) -> Any:
             return 0.2 if isinstance(args[0], tuple) else 1
 
-    seats = draw_seats(
+    patch_index = draw_patches(
         torch.zeros(16, 3, 16, 16),
         torch.zeros(16, 16),
         make_network(layers=2).config,
         Even(np.random.PCG64(0)),
         phase_at(0.0),
     )
-    assert (seats == torch.arange(seats.shape[1])).all()
+    assert (patch_index == torch.arange(patch_index.shape[1])).all()
 
 
 def test_9_a_dead_score_never_wins():
     """Infinite worth comes first; NaN and minus infinity come last, together, by number."""
     score = np.array([np.nan, 1.0, -np.inf, np.inf, 2.0, np.nan])
-    assert select_seats(score, 6).seats.tolist() == [3, 4, 1, 0, 2, 5]
+    assert select_patches(score, 6).patch_index.tolist() == [3, 4, 1, 0, 2, 5]
 
 
 def test_9_scores_that_are_all_dead_are_spread_and_flagged():
-    """Without one score to rank, seats are spread evenly over the scene and the result says so."""
-    choice = select_seats(np.full(100, np.nan), 10)
+    """Without one score to rank, patches are spread evenly over the scene and the result says so."""
+    choice = select_patches(np.full(100, np.nan), 10)
     assert choice.spread
-    assert np.diff(np.sort(choice.seats)).max() <= 20
-    assert not select_seats(np.arange(100.0), 10).spread
+    assert np.diff(np.sort(choice.patch_index)).max() <= 20
+    assert not select_patches(np.arange(100.0), 10).spread
 
 
-def test_10_a_seat_given_twice_is_refused():
-    """A choice names each seat once; where a caller does not, nothing is added up or overwritten: it is told which."""
-    with pytest.raises(ValueError, match="seat 4 is given more than once"):
-        check_seats(np.array([4, 1, 4]), SceneGrid(37, 53, 8, 2))
+def test_10_a_patch_given_twice_is_refused():
+    """A choice names each patch once; where a caller does not, nothing is added up or overwritten: it is told which."""
+    with pytest.raises(ValueError, match="patch 4 is given more than once"):
+        check_patch_index(np.array([4, 1, 4]), SceneGrid(37, 53, 8, 2))
 
 
 @torch.inference_mode()
 def test_11_bfloat16_agrees():
     """Under autocast to bfloat16 the map differs by 2e-2 at most and nearly all classes agree."""
     model, coarse, fine = make_network(layers=2), noise(0, 1, 4, 32, 32), _fine(1, 20)
-    seats = torch.arange(0, 60, 3)[None]
-    exact = model.composite(*model(coarse, fine, seats), seats).softmax(dim=1)
+    patch_index = torch.arange(0, 60, 3)[None]
+    exact = model.composite(*model(coarse, fine, patch_index), patch_index).softmax(dim=1)
     with warnings.catch_warnings(), torch.autocast("cpu", dtype=torch.bfloat16):
         warnings.filterwarnings("ignore", "Mismatch dtype between input and weight")  # slower, not less exact
-        rough = model.composite(*model(coarse, fine, seats), seats).softmax(dim=1)
+        rough = model.composite(*model(coarse, fine, patch_index), patch_index).softmax(dim=1)
     assert (exact - rough).abs().max() <= 2e-2
     assert (exact.argmax(dim=1) == rough.argmax(dim=1)).float().mean() >= 0.995
 
@@ -244,7 +250,7 @@ def test_12_places_far_out_keep_their_code(place: float):
 
 
 def test_12_a_tile_far_out_has_the_codes_of_its_field():
-    """The origin of a tile is added in float64: codes of its tokens are exact to 1e-6 at 1e7 seats."""
+    """The origin of a tile is added in float64: codes of its tokens are exact to 1e-6 at 1e7 patches."""
     origin = np.array([9_999_997, 10_000_000])
     model = make_network(layers=2, dim=32, patch=32, factor=2)
     coded = model.code_coarse(torch.zeros(6, 4, 32), 2, 3, torch.from_numpy(origin)[None]) - model.scale_code[0]
@@ -259,7 +265,7 @@ def test_12_a_tile_far_out_has_the_codes_of_its_field():
 @pytest.mark.parametrize("code", [code_1d, code_2d])
 @pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16])
 def test_12_places_in_half_precision_are_refused(code: Any, kind: torch.dtype):
-    """Half precision cannot hold the number of a seat; the message says which kind came."""
+    """Half precision cannot hold the number of a patch; the message says which kind came."""
     with pytest.raises(ValueError, match=f"got {kind}"):
         code(torch.zeros(3, 2, dtype=kind), 16)
 
@@ -315,59 +321,62 @@ def test_20_numbers_that_are_no_class_are_refused(label: int, guess: int):
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (37, 53), (100, 31)])
 def test_21_any_size_gives_its_own_map(size: tuple[int, int]):
-    """Scenes that do not divide are padded and cropped back, from one pixel on; no seat of the pad is bought."""
+    """Scenes that do not divide are padded and cropped back, from one pixel on; no patch of the pad is bought."""
     weights, grid = plain_weights(factor=4, patch=8), SceneGrid(*size, 8, 4)
     values = np.random.default_rng(0).uniform(0.1, 0.5, (*grid.coarse_shape, 5))
-    seen = glance(weights, values, np.linspace(450, 950, 5), grid)
-    valid = grid.valid_share().ravel() > 0
-    seats = frame_seats(score_seats("entropy", seen), 0.5, valid).seats
-    assert valid[seats].all()
-    drawn = segment(weights, seen, np.zeros((len(seats), 8, 8, 4), np.float32), seats)
+    seen = coarse_prediction(weights, values, np.linspace(450, 950, 5), grid)
+    valid = grid.valid_fraction().ravel() > 0
+    patch_index = frame_patches(score_patches("entropy", seen), 0.5, valid).patch_index
+    assert valid[patch_index].all()
+    drawn = segment(weights, seen, np.zeros((len(patch_index), 8, 8, 4), np.float32), patch_index)
     assert drawn.classes.shape == size
 
 
-def _flat_glance(height: int, width: int) -> Glance:
+def _flat_coarse_prediction(height: int, width: int) -> CoarsePrediction:
     grid = SceneGrid(height, width, 8, 2)
     y, x = (side // 2 for side in grid.padded_shape)
-    return Glance(grid, np.full((y, x, 4), 0.3, np.float32), np.full((y, x, 3), 1 / 3, np.float32))
+    return CoarsePrediction(grid, np.full((y, x, 4), 0.3, np.float32), np.full((y, x, 3), 1 / 3, np.float32))
 
 
 def test_22_a_scene_alike_everywhere_scores_alike():
-    """Whole seats score equal to 1e-6, at the border too; partly filled ones rank by their pixels on the scene."""
-    seen = _flat_glance(36, 50)
-    share = seen.grid.valid_share().ravel()
+    """Whole patches score equal to 1e-6, at the border too; partly filled ones rank by their pixels on the scene."""
+    seen = _flat_coarse_prediction(36, 50)
+    fraction = seen.grid.valid_fraction().ravel()
     for policy in ("entropy", "margin"):
-        scores = score_seats(policy, seen)
-        assert np.ptp(scores[share == 1]) <= 1e-6
-        ranked = share[select_seats(scores, len(seen.grid.valid_seats()), share > 0).seats]
+        scores = score_patches(policy, seen)
+        assert np.ptp(scores[fraction == 1]) <= 1e-6
+        ranked = fraction[select_patches(scores, len(seen.grid.valid_patches()), fraction > 0).patch_index]
         assert (np.diff(ranked) <= 0).all()
-    assert np.ptp(score_seats("sobel", seen)) <= 1e-6
+    assert np.ptp(score_patches("sobel", seen)) <= 1e-6
 
 
 @torch.inference_mode()
 def test_23_a_scene_reads_alike_alone_and_in_a_batch():
     """Batch-mates, the size of the batch and the order of tokens do not show."""
     model, coarse, fine = make_network(layers=2), noise(0, 8, 4, 16, 16), _fine(8, 5)
-    seats = torch.stack([torch.randperm(16, generator=torch.Generator().manual_seed(i))[:5] for i in range(8)])
-    together = model.composite(*model(coarse, fine, seats), seats)
+    patch_index = torch.stack([torch.randperm(16, generator=torch.Generator().manual_seed(i))[:5] for i in range(8)])
+    together = model.composite(*model(coarse, fine, patch_index), patch_index)
     for i in (0, 3, 7):
         one = slice(i, i + 1)
-        alone = model.composite(*model(coarse[one], fine[one], seats[one]), seats[one])
+        alone = model.composite(*model(coarse[one], fine[one], patch_index[one]), patch_index[one])
         assert (alone - together[one]).abs().max() <= 1e-6
-    turned = seats.flip(1)
+    turned = patch_index.flip(1)
     reordered = model.composite(*model(coarse, fine.flip(1), turned), turned)
     assert (reordered - together).abs().max() <= 2e-6
 
 
 @pytest.mark.parametrize("change", ["reversed", "shuffled", "twice"])
-def test_24_bands_in_any_order_and_number_give_one_glance(change: str):
+def test_24_bands_in_any_order_and_number_give_one_coarse_prediction(change: str):
     """Descending, unsorted and repeated wavelengths change no probability by more than 1e-5."""
     weights, grid = plain_weights(), SceneGrid(32, 32, 8, 2)
     rng, nm = np.random.default_rng(0), np.linspace(400, 1000, 31)
     values = rng.uniform(0.1, 0.5, (16, 16, 31))
     orders = {"reversed": np.arange(31)[::-1], "shuffled": rng.permutation(31), "twice": np.tile(np.arange(31), 2)}
     order = orders[change]
-    first, second = glance(weights, values, nm, grid), glance(weights, values[..., order], nm[order], grid)
+    first, second = (
+        coarse_prediction(weights, values, nm, grid),
+        coarse_prediction(weights, values[..., order], nm[order], grid),
+    )
     assert np.abs(first.probability - second.probability).max() <= 1e-5
 
 
@@ -375,7 +384,7 @@ def test_24_bands_in_any_order_and_number_give_one_glance(change: str):
 def test_24_wavelengths_in_another_unit_are_refused(nm: list[float]):
     """Micrometres and numbers outside 200-3000 nm are a ValueError that says so."""
     with pytest.raises(ValueError, match="outside 200-3000 nm"):
-        glance(plain_weights(), np.zeros((8, 8, 2)), np.array(nm), SceneGrid(16, 16, 8, 2))
+        coarse_prediction(plain_weights(), np.zeros((8, 8, 2)), np.array(nm), SceneGrid(16, 16, 8, 2))
 
 
 def test_25_certainty_has_no_entropy():
@@ -433,7 +442,9 @@ def test_30_a_checkpoint_reads_other_bands(tmp_path: Path):
         torch.equal(a, b) for a, b in zip(weights.segmenter.parameters(), loaded.segmenter.parameters(), strict=True)
     )
     for bands in (1, 3, 200):
-        seen = glance(loaded, np.full((8, 8, bands), 0.3), np.linspace(500, 900, bands), SceneGrid(16, 16, 8, 2))
+        seen = coarse_prediction(
+            loaded, np.full((8, 8, bands), 0.3), np.linspace(500, 900, bands), SceneGrid(16, 16, 8, 2)
+        )
         assert np.isfinite(seen.probability).all()
 
 
@@ -446,16 +457,16 @@ def test_30_another_number_of_classes_names_the_tensor(tmp_path: Path):
         load_weights(path)
 
 
-def test_31_one_and_two_threads_choose_the_same_seats(threads: None):
+def test_31_one_and_two_threads_choose_the_same_patches(threads: None):
     """The same scene gives the same plan on 1 and 2 threads, and no global stream is touched."""
     weights, grid = plain_weights(), SceneGrid(96, 96, 8, 2)
     columns = noise(0, 48, 48, 4).numpy()
     before, plans = torch.random.get_rng_state(), []
     for count in (1, 2):
         torch.set_num_threads(count)
-        seen = glance_of_columns(weights, columns, grid)
+        seen = coarse_prediction_of_columns(weights, columns, grid)
         policies = ("gain", "entropy", "margin", "sobel", "saliency", "self-attention", "random")
-        plans.append([frame_seats(score_seats(policy, seen), 0.3).seats for policy in policies])
+        plans.append([frame_patches(score_patches(policy, seen), 0.3).patch_index for policy in policies])
     assert all((one == two).all() for one, two in zip(*plans, strict=True))
     assert torch.equal(torch.random.get_rng_state(), before)
 

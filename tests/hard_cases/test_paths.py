@@ -9,16 +9,16 @@ from pipeline.errors import PoseError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_position, scene_to_direction
 from pipeline.geometry.scan import points_of_scan
-from pipeline.rectify.lookup import grid_points, lookup, track_lookup
+from pipeline.rectify.geolocation import geolocation, grid_points, path_geolocation
 from pipeline.rectify.placed import tie_table
 from pipeline.rectify.resample import merge_lines, resample
-from pipeline.rectify.tracks import Track, make_tracks, number_lines
+from pipeline.rectify.scan_paths import ScanPath, make_scan_paths, number_lines
 
 CAMERA = LineCamera()
-STRIP = 2600.0
+SWATH = 2600.0
 
 
-def aim(scan_px: np.ndarray, along_px: np.ndarray | float = STRIP) -> np.ndarray:
+def aim(scan_px: np.ndarray, along_px: np.ndarray | float = SWATH) -> np.ndarray:
     """Mirror positions (line, 2) that look at points given in px on the scan and along the line."""
     tangents = np.stack(np.broadcast_arrays(along_px, scan_px), axis=-1) * CAMERA.ifov_rad
     return direction_to_position(scene_to_direction(tangents))
@@ -26,103 +26,107 @@ def aim(scan_px: np.ndarray, along_px: np.ndarray | float = STRIP) -> np.ndarray
 
 def wave(y: np.ndarray, x: np.ndarray) -> np.ndarray:
     """A scene that any good interpolation of lines 1 px apart gives back to a thousandth."""
-    return 2 + np.sin(y / 15) + np.cos((x - STRIP) / 20)
+    return 2 + np.sin(y / 15) + np.cos((x - SWATH) / 20)
 
 
 def captured(scan_px: np.ndarray) -> np.ndarray:
     """What lines at these places see of the wave, (line, sample, 1) float32."""
-    rows = [points_of_scan(STRIP, CAMERA, scan, CAMERA.pixel_slopes()) for scan in scan_px]
+    rows = [points_of_scan(SWATH, CAMERA, scan, CAMERA.pixel_slopes()) for scan in scan_px]
     return np.array([wave(y, x) for x, y in rows], np.float32)[..., None]
 
 
-def seen_through(track: Track, values: np.ndarray, points: np.ndarray) -> np.ndarray:
+def seen_through(scan_path: ScanPath, values: np.ndarray, points: np.ndarray) -> np.ndarray:
     """The scene at points (n, 2) from the lines of one track."""
-    merged, valid = merge_lines(values[track.lines], np.ones((len(track.lines), 640), np.bool_), track.starts)
-    at = track_lookup(track, CAMERA, points, along="x")
-    return resample(merged, valid & track.seen[:, None], at)[0][:, 0]
+    merged, valid = merge_lines(
+        values[scan_path.lines], np.ones((len(scan_path.lines), 640), np.bool_), scan_path.starts
+    )
+    at = path_geolocation(scan_path, CAMERA, points, along="x")
+    return resample(merged, valid & scan_path.seen[:, None], at)[0][:, 0]
 
 
 def points_between(first: float, last: float, count: int = 400) -> np.ndarray:
     """Points (n, 2) that lines between two scan places see, in the middle half of the line."""
     rng = np.random.default_rng(7)
-    x, y = points_of_scan(STRIP, CAMERA, rng.uniform(first, last, count), rng.uniform(-0.016, 0.016, count))
+    x, y = points_of_scan(SWATH, CAMERA, rng.uniform(first, last, count), rng.uniform(-0.016, 0.016, count))
     return np.stack([y, x], axis=-1)
 
 
 def test_repeated_positions_are_averaged() -> None:
     """Two, three and four lines at one place make one knot, whose noise is averaged away, and no step of 0."""
     scan = np.repeat(np.arange(40.0), [2, 3, 4, 1] * 10)
-    (track,) = make_tracks(aim(scan), CAMERA)
-    assert track.uniform
-    assert len(track) == 40
+    (scan_path,) = make_scan_paths(aim(scan), CAMERA)
+    assert scan_path.uniform
+    assert len(scan_path) == 40
     noise = np.tile([1.0, -1, 1, 0, -1, 1, -1, 1, -1, 0], 10)[:, None, None]  # sums to 0 within each dwell
     points = points_between(2, 37)
     np.testing.assert_allclose(
-        seen_through(track, captured(scan) + noise.astype(np.float32), points), wave(*points.T), atol=2e-3
+        seen_through(scan_path, captured(scan) + noise.astype(np.float32), points), wave(*points.T), atol=2e-3
     )
 
 
-def test_reversal_gives_two_tracks_that_agree() -> None:
+def test_reversal_gives_two_scan_paths_that_agree() -> None:
     """A path up and down again is two runs; each shows the scene, the second with its lines turned round."""
     scan = np.concatenate([np.arange(50.0), np.arange(49.0, 9, -1)])
-    up, down = make_tracks(aim(scan), CAMERA)
+    up, down = make_scan_paths(aim(scan), CAMERA)
     assert (up.lines[0], up.lines[-1], down.lines[0], down.lines[-1]) == (0, 49, 89, 50)
     points, values = points_between(13, 46), captured(scan)
-    for track in (up, down):
-        np.testing.assert_allclose(seen_through(track, values, points), wave(*points.T), atol=2e-3)
+    for scan_path in (up, down):
+        np.testing.assert_allclose(seen_through(scan_path, values, points), wave(*points.T), atol=2e-3)
     with pytest.raises(PoseError, match="turns or stands still near line 49"):
-        lookup(aim(scan), CAMERA, points, along="x")
+        geolocation(aim(scan), CAMERA, points, along="x")
 
 
 def test_stop_while_turning_leaves_no_empty_run() -> None:
     """Lines that stand still where the path turns and where it ends belong to a knot; no run is empty or NaN."""
     drift = 1e-9 * np.arange(6)  # which of the lines that stand is the highest must not matter
     scan = np.concatenate([np.arange(30.0), 29 + drift, np.arange(28.0, -1, -1), np.zeros(5)])
-    tracks = make_tracks(aim(scan), CAMERA)
-    assert [len(track) for track in tracks] == [30, 30]
-    assert len(tracks[0].lines) == 30
-    assert sum(len(track.lines) for track in tracks) == len(scan)
-    for track in tracks:
-        assert np.isfinite(track_lookup(track, CAMERA, points_between(-0.4, 29.4), along="x")).all()
+    scan_paths = make_scan_paths(aim(scan), CAMERA)
+    assert [len(scan_path) for scan_path in scan_paths] == [30, 30]
+    assert len(scan_paths[0].lines) == 30
+    assert sum(len(scan_path.lines) for scan_path in scan_paths) == len(scan)
+    for scan_path in scan_paths:
+        assert np.isfinite(path_geolocation(scan_path, CAMERA, points_between(-0.4, 29.4), along="x")).all()
 
 
 def test_mirror_that_never_moves_is_one_line() -> None:
     """A sweep that stands still is one knot of all its lines, as wide as a sample."""
-    (track,) = make_tracks(aim(np.full(20, 5.0)), CAMERA, binning=2)
-    assert len(track) == 1
-    np.testing.assert_array_equal(track.lines, np.arange(20))
-    points = np.array([[5.0, STRIP], [5.9, STRIP], [6.1, STRIP], [3.9, STRIP]])
-    found = track_lookup(track, CAMERA, points, along="x", binning=2)
+    (scan_path,) = make_scan_paths(aim(np.full(20, 5.0)), CAMERA, binning=2)
+    assert len(scan_path) == 1
+    np.testing.assert_array_equal(scan_path.lines, np.arange(20))
+    points = np.array([[5.0, SWATH], [5.9, SWATH], [6.1, SWATH], [3.9, SWATH]])
+    found = path_geolocation(scan_path, CAMERA, points, along="x", binning=2)
     np.testing.assert_array_equal(np.isfinite(found[:, 0]), [True, True, False, False])
 
 
 def test_one_line() -> None:
     """One line is its own track: half a line to both sides, and its values there."""
-    (track,) = make_tracks(aim(np.array([7.0])), CAMERA)
-    found = track_lookup(track, CAMERA, np.array([[6.51, STRIP], [7.0, STRIP], [7.6, STRIP]]), along="x")
+    (scan_path,) = make_scan_paths(aim(np.array([7.0])), CAMERA)
+    found = path_geolocation(scan_path, CAMERA, np.array([[6.51, SWATH], [7.0, SWATH], [7.6, SWATH]]), along="x")
     np.testing.assert_allclose(found, [[-0.49, 319.5], [0, 319.5], [np.nan, np.nan]], atol=1e-6)
-    assert make_tracks(aim(np.zeros(0)), CAMERA) == ()
-    assert make_tracks(aim(np.zeros(3)), CAMERA, usable=np.zeros(3, np.bool_)) == ()
+    assert make_scan_paths(aim(np.zeros(0)), CAMERA) == ()
+    assert make_scan_paths(aim(np.zeros(3)), CAMERA, usable=np.zeros(3, np.bool_)) == ()
 
 
 @pytest.mark.parametrize(("samples", "binning"), [(1, 1), (640, 640), (1, 2)])
 def test_one_sample(samples: int, binning: int) -> None:
     """A camera of one sample, by itself or by binning, is looked up; one binned away altogether sees nothing."""
     camera = LineCamera(samples=samples)
-    (track,) = make_tracks(aim(np.arange(10.0)), camera, binning=binning)
-    x, y = points_of_scan(STRIP, camera, 4.0, np.array([0, 0.4 * samples, 700]) * camera.ifov_rad)
+    (scan_path,) = make_scan_paths(aim(np.arange(10.0)), camera, binning=binning)
+    x, y = points_of_scan(SWATH, camera, 4.0, np.array([0, 0.4 * samples, 700]) * camera.ifov_rad)
     points = np.stack([y, x], axis=-1)
-    found = track_lookup(track, camera, points, along="x", binning=binning)
+    found = path_geolocation(scan_path, camera, points, along="x", binning=binning)
     expected = [samples >= binning] * 2 + [False]
     np.testing.assert_array_equal(np.isfinite(found[:, 1]), expected)
 
 
 def test_1500_and_1501_positions_are_the_same_path() -> None:
     """The vector memory's 1500 positions are no border here: one more line changes nothing for the others."""
-    whole, one_more = (make_tracks(aim(np.arange(-700.0, stop)), CAMERA) for stop in (800, 801))
-    assert [len(track) for track in whole + one_more] == [1500, 1501]
+    whole, one_more = (make_scan_paths(aim(np.arange(-700.0, stop)), CAMERA) for stop in (800, 801))
+    assert [len(scan_path) for scan_path in whole + one_more] == [1500, 1501]
     points = points_between(-700, 799)
-    np.testing.assert_allclose(*(track_lookup(t, CAMERA, points, along="x") for (t,) in (whole, one_more)), atol=1e-7)
+    np.testing.assert_allclose(
+        *(path_geolocation(t, CAMERA, points, along="x") for (t,) in (whole, one_more)), atol=1e-7
+    )
 
 
 def test_lost_frames_are_a_gap_with_nothing_in_it() -> None:
@@ -131,23 +135,23 @@ def test_lost_frames_are_a_gap_with_nothing_in_it() -> None:
     numbers = number_lines(scan * 0.1, 0.1)
     assert numbers.lost == 12
     np.testing.assert_array_equal(numbers.number, scan)
-    (track,) = make_tracks(aim(scan), CAMERA)
+    (scan_path,) = make_scan_paths(aim(scan), CAMERA)
     gap, rest = points_between(29.51, 41.49), np.vstack([points_between(2, 29.2), points_between(41.8, 77)])
-    assert np.isnan(track_lookup(track, CAMERA, gap, along="x")).all()
-    np.testing.assert_allclose(seen_through(track, captured(scan), rest), wave(*rest.T), atol=0.05)
+    assert np.isnan(path_geolocation(scan_path, CAMERA, gap, along="x")).all()
+    np.testing.assert_allclose(seen_through(scan_path, captured(scan), rest), wave(*rest.T), atol=0.05)
     inner = np.vstack([points_between(2, 28), points_between(43, 77)])
-    np.testing.assert_allclose(seen_through(track, captured(scan), inner), wave(*inner.T), atol=2e-3)
+    np.testing.assert_allclose(seen_through(scan_path, captured(scan), inner), wave(*inner.T), atol=2e-3)
 
 
 def test_one_unusable_line_spoils_only_itself() -> None:
     """Points on an unusable line fail, points a third of a step beside it are read from the lines around."""
     scan = np.arange(40.0)
-    (track,) = make_tracks(aim(scan), CAMERA, usable=scan != 20)
+    (scan_path,) = make_scan_paths(aim(scan), CAMERA, usable=scan != 20)
     values = captured(scan)
     values[20] = np.nan
-    assert np.isnan(seen_through(track, values, points_between(19.6, 20.4))).all()
+    assert np.isnan(seen_through(scan_path, values, points_between(19.6, 20.4))).all()
     beside = np.vstack([points_between(2, 19.3), points_between(20.7, 37)])
-    np.testing.assert_allclose(seen_through(track, values, beside), wave(*beside.T), atol=0.05)
+    np.testing.assert_allclose(seen_through(scan_path, values, beside), wave(*beside.T), atol=0.05)
 
 
 def test_equal_and_backward_time_stamps_cost_their_own_lines() -> None:
@@ -158,9 +162,9 @@ def test_equal_and_backward_time_stamps_cost_their_own_lines() -> None:
     np.testing.assert_array_equal(np.flatnonzero(~numbers.usable), [21, 41])
     assert (numbers.repeated, numbers.backward, numbers.lost, numbers.late) == (1, 1, 0, 0)
     position = aim(np.interp(stamps, time, np.arange(50.0)))
-    (track,) = make_tracks(position, CAMERA, usable=numbers.usable)
-    assert track.uniform
-    np.testing.assert_array_equal(track.lines, np.flatnonzero(numbers.usable))
+    (scan_path,) = make_scan_paths(position, CAMERA, usable=numbers.usable)
+    assert scan_path.uniform
+    np.testing.assert_array_equal(scan_path.lines, np.flatnonzero(numbers.usable))
 
 
 def test_late_line_is_used_where_the_mirror_was() -> None:
@@ -168,27 +172,29 @@ def test_late_line_is_used_where_the_mirror_was() -> None:
     stamps = np.arange(60.0)
     stamps[30] += 0.4
     assert number_lines(stamps, 1.0).late == 1
-    (track,) = make_tracks(aim(stamps[:-1]), CAMERA)
+    (scan_path,) = make_scan_paths(aim(stamps[:-1]), CAMERA)
     points = points_between(3, 55)
-    np.testing.assert_allclose(seen_through(track, captured(stamps), points), wave(*points.T), atol=2e-3)
+    np.testing.assert_allclose(seen_through(scan_path, captured(stamps), points), wave(*points.T), atol=2e-3)
 
 
 def test_grid_outside_the_swath_is_nan() -> None:
-    """A grid beside, behind or far beyond the sweep has no coordinates, from the lookup and from the table."""
+    """A grid beside, behind or far beyond the sweep has no coordinates, from the geolocation grid and from the table."""
     position = aim(np.arange(50.0))
-    (track,) = make_tracks(position, CAMERA)
+    (scan_path,) = make_scan_paths(position, CAMERA)
     for origin in ((0.0, 3100.0), (400.0, 2600.0), (-9000.0, -9000.0), (9000.0, 20_000.0)):
         grid = {"origin_px": origin, "spacing_px": 1.0, "shape": (40, 50)}
-        assert np.isnan(lookup(position, CAMERA, grid_points(**grid), along="x")).all()  # type: ignore[arg-type]
-        table = tie_table(track, CAMERA, along="x", **grid)  # type: ignore[arg-type]
+        assert np.isnan(geolocation(position, CAMERA, grid_points(**grid), along="x")).all()  # type: ignore[arg-type]
+        table = tie_table(scan_path, CAMERA, along="x", **grid)  # type: ignore[arg-type]
         assert np.isnan(table.coordinates(slice(None), slice(None))).all()
 
 
 def test_vertical_tangent_is_a_path_like_any_other() -> None:
     """A scan along x, whose slope dY/dX the paper cannot take, is the scan along y with its axes swapped."""
-    (track,) = make_tracks(aim(np.arange(50.0), 0.0), CAMERA)  # X = 0 throughout on the axis: the slope is infinite
+    (scan_path,) = make_scan_paths(
+        aim(np.arange(50.0), 0.0), CAMERA
+    )  # X = 0 throughout on the axis: the slope is infinite
     points = np.random.default_rng(1).uniform((0, -300), (49, 300), (200, 2))
-    across, down = (track_lookup(track, CAMERA, p, along=a) for p, a in ((points, "x"), (points[:, ::-1], "y")))  # type: ignore[arg-type]
+    across, down = (path_geolocation(scan_path, CAMERA, p, along=a) for p, a in ((points, "x"), (points[:, ::-1], "y")))  # type: ignore[arg-type]
     np.testing.assert_array_equal(across, down)
     assert np.isfinite(across).all()
 
@@ -196,11 +202,11 @@ def test_vertical_tangent_is_a_path_like_any_other() -> None:
 def test_uneven_path_shows_the_scene_at_its_own_places() -> None:
     """Lines 0.5 to 1.5 px apart show the scene as well as their distances allow, and far better than taken as even."""
     scan = np.cumsum(np.random.default_rng(3).uniform(0.5, 1.5, 60))
-    (track,) = make_tracks(aim(scan), CAMERA, step_px=1.0)
+    (scan_path,) = make_scan_paths(aim(scan), CAMERA, step_px=1.0)
     points = points_between(scan[2], scan[-3])
-    error = np.abs(seen_through(track, captured(scan), points) - wave(*points.T))
+    error = np.abs(seen_through(scan_path, captured(scan), points) - wave(*points.T))
     even = np.abs(
-        seen_through(make_tracks(aim(np.linspace(scan[0], scan[-1], 60)), CAMERA)[0], captured(scan), points)
+        seen_through(make_scan_paths(aim(np.linspace(scan[0], scan[-1], 60)), CAMERA)[0], captured(scan), points)
         - wave(*points.T)
     )
     assert error.max() < 5e-3
@@ -212,7 +218,7 @@ def test_path_that_leaves_the_disk_is_refused() -> None:
     position = np.stack([np.linspace(0.8, 1.01, 50), np.zeros(50)], axis=-1)
     first = int(np.argmax(position[:, 0] > 1))
     with pytest.raises(PoseError, match=rf"line {first} is at mirror position \(1\.0.*not usable"):
-        make_tracks(position, CAMERA)
-    tracks = make_tracks(position, CAMERA, usable=position[:, 0] <= 1)
-    assert sum(len(track) for track in tracks) == first
-    assert len(make_tracks(np.array([[0.0, 1.0], [1.0, 0.0]]), CAMERA)) == 1
+        make_scan_paths(position, CAMERA)
+    scan_paths = make_scan_paths(position, CAMERA, usable=position[:, 0] <= 1)
+    assert sum(len(scan_path) for scan_path in scan_paths) == first
+    assert len(make_scan_paths(np.array([[0.0, 1.0], [1.0, 0.0]]), CAMERA)) == 1

@@ -28,11 +28,11 @@ def test_every_band_count_is_read_to_its_last_band(kernel: Kernel, bands: int) -
     """All bands of a cube have the weights that one band alone has, for any count and both kinds of numbers."""
     values = np.random.default_rng(bands).integers(0, 60_000, (7, 6, bands), dtype=np.uint16)
     at = np.random.default_rng(1).uniform(0, 5, (30, 2))
-    out, share = resample(values, np.ones((7, 6), bool), at, kernel)
+    out, fraction = resample(values, np.ones((7, 6), bool), at, kernel)
     for band in {0, bands // 2, bands - 1}:
         alone, _ = resample(values[..., band : band + 1].astype(np.float32), np.ones((7, 6), bool), at, kernel)
         np.testing.assert_allclose(out[:, band], alone[:, 0], rtol=1e-5, atol=0.02)
-    assert (share > 0).all()
+    assert (fraction > 0).all()
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -50,20 +50,20 @@ def test_lost_taps_are_made_up_for_by_the_rest() -> None:
     values, valid = np.full((8, 8, 3), 40, np.float32), np.ones((8, 8), bool)
     values[:, 4], valid[:, 4] = np.nan, False
     at = np.stack([np.full(21, 3.5), np.linspace(3, 5, 21)], axis=1)
-    out, share = resample(values, valid, at, "bilinear")
+    out, fraction = resample(values, valid, at, "bilinear")
     left = 1 - np.maximum(0, 1 - np.abs(at[:, 1] - 4))
-    np.testing.assert_allclose(share, np.where(left >= 0.5, left, 0), atol=1e-6)
+    np.testing.assert_allclose(fraction, np.where(left >= 0.5, left, 0), atol=1e-6)
     np.testing.assert_allclose(out[left >= 0.5], 40, rtol=1e-6)
     assert np.isnan(out[left < 0.5]).all()
 
 
-def test_share_is_never_above_one() -> None:
+def test_fraction_is_never_above_one() -> None:
     """Where only taps of negative weight are lost, what is left weighs more than all: it counts as all."""
     valid = np.ones((9, 9), bool)
     valid[:, [2, 5]] = False
-    out, share = resample(np.full((9, 9, 1), 40, np.float32), valid, np.array([[4, 3.5]]))
+    out, fraction = resample(np.full((9, 9, 1), 40, np.float32), valid, np.array([[4, 3.5]]))
     np.testing.assert_allclose(out, 40, rtol=1e-6)
-    assert share.tolist() == [1]
+    assert fraction.tolist() == [1]
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.uint16])
@@ -80,35 +80,35 @@ def test_saturated_element_leaves_the_other_bands() -> None:
     values, valid = ramp(9, 9, 4), np.ones((9, 9, 4), bool)
     values[4, 4, 3], valid[4, 4, 3] = 65_535, False
     at = np.array([[4, 4], [4.2, 4.1], [4.5, 4.5], [1.5, 1.5]])
-    out, share = resample(values, valid, at)
+    out, fraction = resample(values, valid, at)
     np.testing.assert_allclose(out[:, :3], (at @ [10, 1])[:, None] + [0, 1000, 2000], rtol=1e-5)
     assert np.isnan(out[:, 3]).tolist() == [True, True, False, False]
     assert out[2, 3] < 3060
-    assert (share == 1).all()
+    assert (fraction == 1).all()
 
 
-def test_point_that_failed_in_every_band_has_no_share() -> None:
-    """Where each band lacks its own half of the taps nothing is left, and the share says so."""
+def test_point_that_failed_in_every_band_has_no_fraction() -> None:
+    """Where each band lacks its own half of the taps nothing is left, and the fraction says so."""
     values, valid = ramp(6, 6, 2), np.ones((6, 6, 2), bool)
     valid[2, 2, 0] = valid[2, 3, 1] = False
     at = np.array([[2, 2.5], [2, 2.4], [2, 2.6]])
-    out, share = resample(values, valid, at, "bilinear")
+    out, fraction = resample(values, valid, at, "bilinear")
     np.testing.assert_array_equal(np.isnan(out), [[False, False], [True, False], [False, True]])
-    assert (share == 1).all()
+    assert (fraction == 1).all()
     valid[2, 3, 0] = False
-    out, share = resample(values, valid, at[2:], "bilinear")
+    out, fraction = resample(values, valid, at[2:], "bilinear")
     assert np.isnan(out).all()
-    assert share.tolist() == [0]
+    assert fraction.tolist() == [0]
 
 
 def test_unmarked_nan_band_stays_on_its_own() -> None:
     """A band without light is NaN in a valid sample: it stays NaN and touches no other band."""
     values = ramp(6, 6, 3)
     values[..., 1] = np.nan
-    out, share = resample(values, np.ones((6, 6), bool), np.array([[2.5, 2.5], [5, 5]]))
+    out, fraction = resample(values, np.ones((6, 6), bool), np.array([[2.5, 2.5], [5, 5]]))
     assert np.isnan(out[:, 1]).all()
     assert np.isfinite(out[:, [0, 2]]).all()
-    assert (share == 1).all()
+    assert (fraction == 1).all()
 
 
 def test_overshoot_at_a_step_is_kept() -> None:
@@ -128,11 +128,11 @@ def test_right_and_bottom_border_are_part_of_the_sweep(kernel: Kernel) -> None:
     values = ramp(7, 9)
     reach = np.array([-0.49, 0.0, 3.0])
     at = np.stack(np.meshgrid(reach, reach, indexing="ij"), axis=-1).reshape(-1, 2)
-    near, near_share = resample(values, np.ones((7, 9), bool), at, kernel)
-    far, far_share = resample(values[::-1, ::-1], np.ones((7, 9), bool), np.array([6, 8]) - at, kernel)
-    np.testing.assert_allclose(near_share, far_share, atol=1e-6)
+    near, near_fraction = resample(values, np.ones((7, 9), bool), at, kernel)
+    far, far_fraction = resample(values[::-1, ::-1], np.ones((7, 9), bool), np.array([6, 8]) - at, kernel)
+    np.testing.assert_allclose(near_fraction, far_fraction, atol=1e-6)
     np.testing.assert_allclose(near, far, atol=2e-3)
-    assert (near_share[1:] >= 0.5).all()  # beyond both borders a quarter of the weight is left
+    assert (near_fraction[1:] >= 0.5).all()  # beyond both borders a quarter of the weight is left
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -141,11 +141,11 @@ def test_block_without_any_point(kernel: Kernel, kind: type[np.generic]) -> None
     """A block of the grid that no line reaches is empty in the sweep's own type, without a warning."""
     values = ramp(5, 5, 3).astype(kind)
     at = np.array([[np.nan, np.nan], [np.nan, 2], [np.inf, 1], [-np.inf, -np.inf], [1e300, 0]])
-    out, share = resample(values, np.ones((5, 5), bool), at, kernel)
+    out, fraction = resample(values, np.ones((5, 5), bool), at, kernel)
     assert out.shape == (5, 3)
     assert not np.nan_to_num(out).any()
     assert np.isnan(out).all() or out.dtype == np.uint16
-    assert not share.any()
+    assert not fraction.any()
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -153,9 +153,9 @@ def test_points_outside_the_swath_have_no_value(kernel: Kernel) -> None:
     """A grid larger than the swath: values inside, none a pixel outside, none of them from the wrong line."""
     values = ramp(6, 5)
     grid = np.stack(np.meshgrid(np.arange(-4.0, 10), np.arange(-4.0, 9), indexing="ij"), axis=-1).reshape(-1, 2)
-    out, share = resample(values, np.ones((6, 5), bool), grid, kernel)
+    out, fraction = resample(values, np.ones((6, 5), bool), grid, kernel)
     inside = ((grid >= 0) & (grid <= [5, 4])).all(axis=1)
-    np.testing.assert_array_equal(share > 0, inside)
+    np.testing.assert_array_equal(fraction > 0, inside)
     np.testing.assert_array_equal(out[inside, 0], grid[inside] @ [10, 1])
     assert np.isnan(out[~inside]).all()
 
@@ -176,9 +176,9 @@ def test_fewer_pixels_than_taps(kernel: Kernel, shape: tuple[int, int]) -> None:
     """One line, one sample and less than a kernel of either: centres come back, a pixel beyond there is nothing."""
     values, valid = ramp(*shape, 2), np.ones(shape, bool)
     centres = np.argwhere(valid).astype(float)
-    out, share = resample(values, valid, centres, kernel)
+    out, fraction = resample(values, valid, centres, kernel)
     np.testing.assert_array_equal(out.reshape(values.shape), values)
-    assert (share == 1).all()
+    assert (fraction == 1).all()
     for away in ([1, 0], [0, 1], [-1, -1]):
         beyond = centres + np.multiply(away, shape)
         assert not resample(values, valid, beyond, kernel)[1].any()
@@ -189,9 +189,9 @@ def test_sweep_without_a_valid_sample() -> None:
     values = np.full((6, 6, 2), np.nan, np.float32)
     for valid in (np.zeros((6, 6), bool), np.zeros((6, 6, 2), bool)):
         for kernel in KERNELS:
-            out, share = resample(values, valid, np.array([[2.5, 2.5], [0, 0]]), kernel)
+            out, fraction = resample(values, valid, np.array([[2.5, 2.5], [0, 0]]), kernel)
             assert np.isnan(out).all()
-            assert not share.any()
+            assert not fraction.any()
 
 
 def test_threads_at_once_do_not_disturb_each_other() -> None:

@@ -56,7 +56,7 @@ def test_periodic_texture(period: float):
         assert found.peak_ratio < 1.2
 
 
-def test_zero_variance_strip():
+def test_zero_variance_swath():
     """A strip without any variance, in both images or sliding out of one, divides nothing by zero."""
     one, other = texture(3, (200, 80), 4, -3)
     one[:, :30], other[:, 3:33] = 5.0, 5.0

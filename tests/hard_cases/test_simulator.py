@@ -209,6 +209,6 @@ def test_infinite_tolerance_leaves_out_everything_but_the_converter() -> None:
 def test_tolerances_next_to_0_and_infinity_are_kept(tolerance: float) -> None:
     """The least and the greatest numbers that there are decide like 0, but for what is not seen, and like infinity."""
     scene = scene_of(np.ones((60, 80, 3)))
-    decision = decided(scene, replace(RIG, optics=Optics(stray_share=0.0)), tolerance)
+    decision = decided(scene, replace(RIG, optics=Optics(stray_fraction=0.0)), tolerance)
     assert decision.error <= tolerance
     assert ("prnu" in {one.name for one in decision.chosen}) == (tolerance < 1)

@@ -115,7 +115,7 @@ def test_survey_into_the_night_loses_all_of_its_light(variant: str) -> None:
 @pytest.mark.parametrize("sky", [NIGHT, replace(EVENING, started=datetime(2026, 6, 21, 19, 50, tzinfo=UTC))])
 def test_survey_in_the_dark_keeps_every_bound(sky: Sky) -> None:
     """By night and at sunset, with clouds, a hot spot and air: all light is finite, and within what was counted."""
-    rig = replace(RIG, sky=replace(sky, cloud_share=0.5, hot_spot=0.2), air=Air(distance_m=300.0))
+    rig = replace(RIG, sky=replace(sky, cloud_fraction=0.5, hot_spot=0.2), air=Air(distance_m=300.0))
     found = left_out(TEXTURE, rig)
     assert {"drift", "cloud", "brdf", "path-radiance"} <= set(found)
     for change, counted in found.values():
@@ -192,8 +192,8 @@ def test_flat_scene_at_infinity_shows_no_turbulence() -> None:
 
 def test_turbulence_turns_the_ends_of_lines() -> None:
     """Looking beside the plan turns a line of 640 samples: the bound of leaving out rotation counts that."""
-    air = Air(distance_m=300.0, visibility_km=1e6, airlight_share=0.0, vapour_g_per_m3=0.0)
-    rig = Rig(air=air, optics=Optics(focus_m=300.0, aberration_px=0.0, stray_share=0.0))
+    air = Air(distance_m=300.0, visibility_km=1e6, airlight_fraction=0.0, vapour_g_per_m3=0.0)
+    rig = Rig(air=air, optics=Optics(focus_m=300.0, aberration_px=0.0, stray_fraction=0.0))
     scene = scene_of(np.random.default_rng(0).uniform(0.2, 1, (60, 680, 1)))
     change, counted = left_out(scene, rig)["rotation"]
     assert 0.05 < change <= counted

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.effect import Effect, Light
+from pipeline.simulator.effects.effect import Effect, Radiance
 from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.effects.probe import Unit, noise_electrons, stored_mean, unit_at
 from pipeline.simulator.effects.registry import EFFECTS
@@ -28,7 +28,7 @@ from pipeline.simulator.selection.verification import candidate_blocks, verify, 
 from pipeline.simulator.simulated import sweep_block
 from tests.hard_cases.simulated_scene import looking_at_less, scene_of
 
-LOOK: dict[Effect, str] = {ROTATION: ROTATION.variants[0], SLIT: SLIT.variants[-1]}
+FOOTPRINT: dict[Effect, str] = {ROTATION: ROTATION.variants[0], SLIT: SLIT.variants[-1]}
 SHAPE = (40, 64)
 PATTERNS = ("black", "even", "rows", "columns", "checkers", "pixel", "disc", "noise", "decades")
 
@@ -106,7 +106,7 @@ def test_every_permitted_setting_is_decided_and_verified(asked: Asked) -> None:
         probes = probe_survey(scene, rig, sweeps, asked.unit)
     decision = decide(probes, rig, EFFECTS, asked.tolerance)
 
-    def units(light: Light, binning: int) -> Light:
+    def units(light: Radiance, binning: int) -> Radiance:
         return unit_at(light, rig, asked.unit, binning)
 
     chips = [
@@ -116,7 +116,7 @@ def test_every_permitted_setting_is_decided_and_verified(asked: Asked) -> None:
             [sweep_block(scene, rig, sweep, range(sweep.lines)) for sweep in probe.sweeps], probe.places[:4]
         )
     ]
-    worst = worst_blocks(chips, lambda chip: expected_light(scene, chip, LOOK), units)
+    worst = worst_blocks(chips, lambda chip: expected_light(scene, chip, FOOTPRINT), units)
     measured = verify(decision, lambda chip, chosen: expected_light(scene, chip, chosen), worst, units)
     assert np.isfinite(measured[TOTAL])
 

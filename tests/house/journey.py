@@ -2,7 +2,7 @@
 
 A file is passed where it stands on the stack as a function of the house takes or gives pixels: an array of two axes or
 more with at least as many numbers as one line of the camera has, by itself, in a sequence, or as a field of what is
-handed over. What is worked out of lines (tables, looks, beliefs, the map) is pixels too.
+handed over. What is worked out of lines (tables, looks, class probabilities, the map) is pixels too.
 """
 
 from __future__ import annotations

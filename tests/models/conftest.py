@@ -14,7 +14,7 @@ from torch import Tensor
 from models.network.segmenter import Segmenter
 from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
-from models.reading.inference import CoarseLook
+from models.reading.inference import CoarsePass
 from models.training.examples import Example
 from models.training.train import Progress
 from models.weights.files import Weights
@@ -39,22 +39,22 @@ def scene_tensors(config: SegmenterConfig, rows: int = 2, columns: int = 3) -> t
     return noise(0, 1, j, rows * p, columns * p), noise(1, 1, count, j, p, p), torch.arange(count)[None]
 
 
-def scene_columns(weights: Weights, height: int, width: int, seed: int = 0) -> tuple[CoarseLook, np.ndarray]:
-    """A look at a scene of noise, and a patch for every seat of its padded grid."""
+def scene_columns(weights: Weights, height: int, width: int, seed: int = 0) -> tuple[CoarsePass, np.ndarray]:
+    """A look at a scene of noise, and a patch for every patch of its padded grid."""
     p, s, columns = weights.config.patch, weights.config.factor, weights.config.columns
     grid, rng = SceneGrid(height, width, p, s), np.random.default_rng(seed)
     y, x = (side // s for side in grid.padded_shape)
-    look = CoarseLook(grid, rng.standard_normal((y, x, columns), np.float32))
-    return look, rng.standard_normal((int(np.prod(grid.seat_shape)), p, p, columns), np.float32)
+    coarse_pass = CoarsePass(grid, rng.standard_normal((y, x, columns), np.float32))
+    return coarse_pass, rng.standard_normal((int(np.prod(grid.patch_shape)), p, p, columns), np.float32)
 
 
-def block_example(size: int = 32, block: int = 8, share: float = 1.0) -> Example:
-    """Two classes in blocks, told apart by the first column, with noise in the second; a ``share`` is labelled."""
+def block_example(size: int = 32, block: int = 8, fraction: float = 1.0) -> Example:
+    """Two classes in blocks, told apart by the first column, with noise in the second; a ``fraction`` is labelled."""
     rng = np.random.default_rng(4)
     labels = np.kron(rng.integers(0, 2, (size // block, size // block)), np.ones((block, block))).astype(np.uint8)
     fine = np.stack([2.0 * labels - 1, rng.normal(0, 1, labels.shape)], axis=-1)
     coarse = fine.reshape(size // 2, 2, size // 2, 2, 2).mean(axis=(1, 3))
-    labels[rng.random(labels.shape) >= share] = 255
+    labels[rng.random(labels.shape) >= fraction] = 255
     return Example("e", fine.astype(np.float16), coarse.astype(np.float32), labels, labels.shape)
 
 

@@ -80,5 +80,5 @@ def test_other_lines_are_called_what_they_are(text: bytes, state: str) -> None:
 def test_depth_without_end_is_no_line() -> None:
     """Nesting that no parser follows counts as nothing, checksum or not."""
     text = b'{"a": ' + b"[" * 100_000
-    sealed = text + b', "check": "%08x"}' % zlib.crc32(text)
-    assert [one.content for one in read_checked(sealed)] == [None]
+    checksummed = text + b', "check": "%08x"}' % zlib.crc32(text)
+    assert [one.content for one in read_checked(checksummed)] == [None]

@@ -26,7 +26,7 @@ from storage.archive.archive import Archive
 from tests.faults.disk_full import can_mount, small_disk
 from tests.faults.fault_table import Clock, Row
 from tests.faults.nursery import ROOT
-from tests.soak.leftovers import Leftovers, Look, clear, problems_of
+from tests.soak.leftovers import Leftovers, Survey, clear, problems_of
 from tests.soak.pulled_rig import LINK, RigControl, RigProcess
 from tests.soak.resident_memory import Growth, resident_bytes
 from tests.soak.serving import FIELDS, scene_settings, survey_due, write_fields
@@ -57,7 +57,7 @@ class Day:
     endings: dict[Due, str] = field(default_factory=dict)  # "" of a survey that is done, else why it failed
     struck: dict[str, list[Due]] = field(default_factory=lambda: defaultdict(list))  # trouble -> surveys
     samples: list[int] = field(default_factory=list)  # resident memory of this process after each of its surveys
-    spools: dict[str, Look] = field(default_factory=dict)  # name -> the look that it appeared in
+    spools: dict[str, Survey] = field(default_factory=dict)  # name -> the look that it appeared in
 
     def __post_init__(self) -> None:
         self.planned = tuple(self.plan.values())
@@ -72,7 +72,7 @@ class Day:
         dues = [(name, NOON + timedelta(hours=hour)) for hour in range(hours) for name in FIELDS]
         for number, due in enumerate(dues, 1):
             trouble = self.plan.pop(number, None)
-            self.rig.ask("look", due[0])
+            self.rig.ask("extent", due[0])
             if trouble == "kill" and not self.kill(due):
                 self._later(number, trouble)
             if trouble in DEVICES:
@@ -97,7 +97,7 @@ class Day:
             return str(error) or type(error).__name__
         finally:
             self.samples.append(resident_bytes())
-            self._look_at_spools(*due)
+            self._check_spools(*due)
         return ""
 
     def kill(self, due: Due) -> bool:
@@ -113,16 +113,16 @@ class Day:
         finally:
             child.kill()
             code = child.wait()
-        self._look_at_spools(*due)
+        self._check_spools(*due)
         if code != -signal.SIGKILL or len(Archive.open(self.archive).runs()) > known:
             return False
         print(f"  {due[0]} {due[1]:%H:%M} is killed", file=sys.stderr, flush=True)
         self.struck["kill"].append(due)
         return True
 
-    def _look_at_spools(self, name: str, due: datetime) -> None:
+    def _check_spools(self, name: str, due: datetime) -> None:
         for path in (self.archive / "spool").glob("*"):
-            self.spools.setdefault(path.name, look_of(name, due))
+            self.spools.setdefault(path.name, survey_of(name, due))
 
     def _later(self, number: int, trouble: str) -> None:
         number += 1
@@ -152,7 +152,7 @@ def _rows(quick: bool) -> list[Row]:
         day = _live(Path(name), disk, quick)
         archive = Archive.open(day.archive)
         before = problems_of(archive)
-        failed = {look_of(*due) for due, why in day.endings.items() if why}
+        failed = {survey_of(*due) for due, why in day.endings.items() if why}
         left = clear(archive, failed, day.spools)
         return judged(day, left, (before, problems_of(archive)), clock.seconds, quick=quick)
 
@@ -170,7 +170,7 @@ def _live(folder: Path, disk: Path, quick: bool) -> Day:
     return day
 
 
-def look_of(name: str, due: datetime) -> Look:
+def survey_of(name: str, due: datetime) -> Survey:
     """The seed of a field's scene and the name of the visit of a due time."""
     return FIELDS[name], due.isoformat().replace("+00:00", "Z")
 

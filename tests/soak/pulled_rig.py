@@ -45,23 +45,23 @@ class PulledRig:
         self._armed: tuple[Cable, int, int] | None = None  # with the frames to wait for, of which capture on
         self._turn, self._ended = threading.Lock(), threading.Event()
         self.plug()
-        self._thread = threading.Thread(target=self._look_on, name="eye", daemon=True)
+        self._thread = threading.Thread(target=self._keep_looking, name="eye", daemon=True)
         self._thread.start()
 
     def table(self) -> dict[str, Any]:
         """The settings' table [rig]."""
-        panel = self.rig.camera.view.source.scene.panel
+        white_reference = self.rig.camera.view.source.scene.white_reference
         return {
             "port": str(self._folder / LINK),
             "host": "127.0.0.1",
             "control_port": self._address[0],
             "file_port": self._address[1],
             "pulses": self.rig.camera.wired,
-            "panel": round(float(panel.mean()), 6),
+            "white_reference": round(float(white_reference.mean()), 6),
             "provenance": "emulated",
         }
 
-    def look(self, field: str) -> None:
+    def scan_pass(self, field: str) -> None:
         """Stand before another field."""
         self.rig.camera.view = self._views[field]
 
@@ -92,14 +92,14 @@ class PulledRig:
         for cable in ("mirror", "camera"):
             self._let_go(cable)
 
-    def _look_on(self) -> None:
+    def _keep_looking(self) -> None:
         while not self._ended.is_set():
             self.rig.mirror.take_pulses()
             with self._turn:
                 if self._armed is not None and self._far_enough(*self._armed[1:]):
                     self._let_go(self._armed[0])
                     self._armed = None
-            if not self.rig.camera.look_on():
+            if not self.rig.camera.keep_looking():
                 self._ended.wait(NAP_S)
 
     def _far_enough(self, frames: int, first: int) -> bool:

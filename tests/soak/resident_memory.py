@@ -38,18 +38,18 @@ class Growth:
         return cls(float(values[quarter : 2 * quarter].mean()), float(values[-quarter:].mean()), slope, len(values))
 
     @property
-    def share(self) -> float:
-        """By how much the last quarter is above the second, as a share of that."""
+    def fraction(self) -> float:
+        """By how much the last quarter is above the second, as a fraction of that."""
         return self.last / self.second - 1
 
     @property
     def is_flat(self) -> bool:
         """Whether it is within the figure."""
-        return abs(self.share) <= MOST_GROWTH
+        return abs(self.fraction) <= MOST_GROWTH
 
     def words(self) -> str:
         """In one line."""
         return (
-            f"second quarter {self.second / MB:.1f} MB, last {self.last / MB:.1f} MB: {100 * self.share:+.2f} %; "
+            f"second quarter {self.second / MB:.1f} MB, last {self.last / MB:.1f} MB: {100 * self.fraction:+.2f} %; "
             f"{self.each / MB:+.3f} MB from one to the next over the last three quarters of {self.samples}"
         )

@@ -32,7 +32,7 @@ from tests.faults.nursery import ROOT
 SIZE, QUICK_SIZE = "256x256", "128x128"
 QUICK_BANDS = ",".join(map(str, range(8, 264, 16)))
 SPEED, BUDGET, SEED = 10, "0.8", "7"
-MOST_OTHER = 1e-3  # share of the map's pixels that rounding may decide
+MOST_OTHER = 1e-3  # fraction of the map's pixels that rounding may decide
 BEGUN_WITHIN_S, ENDED_WITHIN_S = 120.0, 30.0
 SURVEY = ("survey", "--budget", BUDGET, "--no-controls", "--engine", "plain", "--json")
 
@@ -70,12 +70,15 @@ def rows(quick: bool) -> list[Row]:
         with emulated(folder / "emulated.toml", scene) as (rig, process):
             checked = command("rig", "check", str(rig))
             print(checked.stdout, flush=True)
-            looked = survey(folder / "rig", str(rig), "--visit", "first")
+            observation = survey(folder / "rig", str(rig), "--visit", "first")
         simulated = survey(folder / "simulated", *scene)
-        print(side_by_side(looked, simulated), flush=True)
+        print(side_by_side(observation, simulated), flush=True)
         rounded = survey(folder / "rounded", *scene, program="tests.soak.simulated_as_wired")
-        found = [_of_check(checked), _of_lines(looked, simulated, clock.seconds)]
-        found += [_of_maps(looked, simulated, "as it is", MOST_OTHER), _of_maps(looked, rounded, "rounded alike", 0.0)]
+        found = [_of_check(checked), _of_lines(observation, simulated, clock.seconds)]
+        found += [
+            _of_maps(observation, simulated, "as it is", MOST_OTHER),
+            _of_maps(observation, rounded, "rounded alike", 0.0),
+        ]
         return [*found, _of_end(process.returncode)]
 
 
@@ -138,7 +141,7 @@ def side_by_side(one: Surveyed, other: Surveyed) -> str:
     for name, (label, show) in COST_LABELS.items():
         add(label, lambda found, name=name, show=show: show(found.receipt["savings"][name]["done"]))  # type: ignore[misc]
     add("fine sweeps", lambda found: format_count(len(found.sweeps("raw_fine"))))
-    add("seats seen twice", _seats)
+    add("patches seen twice", _patches)
     add("mIoU", lambda found: f"{100 * found.receipt['accuracy']['miou']:.2f} %")
     for stage in one.receipt["stages"]:
         if any(found.wall_of(stage["name"]) for found in (one, other)):
@@ -149,9 +152,9 @@ def side_by_side(one: Surveyed, other: Surveyed) -> str:
     return "\n".join(f"{a:<{widths[0]}}  {b:>{widths[1]}}  {c:>{widths[2]}}" for a, b, c in lines)
 
 
-def _seats(surveyed: Surveyed) -> str:
+def _patches(surveyed: Surveyed) -> str:
     plan = json.loads((surveyed.archive / surveyed.receipt["products"]["plan"]).read_text())
-    return format_count(len(plan["seats"]))
+    return format_count(len(plan["patches"]))
 
 
 def _size(folder: Path) -> int:

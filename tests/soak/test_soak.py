@@ -58,7 +58,7 @@ def test_memory_that_grows_is_told_from_memory_that_does_not() -> None:
     flat = Growth.of([*range(0, 100, 10), *[100] * 30])
     rising = Growth.of([1000 + 10 * number for number in range(40)])
     assert flat.is_flat
-    assert flat.share == 0.0
+    assert flat.fraction == 0.0
     assert not rising.is_flat
     assert round(rising.each, 6) == 10.0
 

@@ -87,14 +87,14 @@ class Tab:
             assert time.monotonic() < end, f"{expression} did not come true; {self.troubles}"
             time.sleep(0.03)
 
-    def centre(self, selector: str, share: tuple[float, float] = (0.5, 0.5)) -> tuple[float, float]:
-        """A place of an element that is scrolled into view, by its share of width and height, in px of the window."""
+    def centre(self, selector: str, fraction: tuple[float, float] = (0.5, 0.5)) -> tuple[float, float]:
+        """A place of an element that is scrolled into view, by its fraction of width and height, in px of the window."""
         found = self.run(
             f"(() => {{ const one = document.querySelector({json.dumps(selector)}); "
             "one.scrollIntoView({block: 'center', behavior: 'instant'}); "
             "const box = one.getBoundingClientRect(); return [box.x, box.y, box.width, box.height]; })()"
         )
-        return found[0] + share[0] * found[2], found[1] + share[1] * found[3]
+        return found[0] + fraction[0] * found[2], found[1] + fraction[1] * found[3]
 
     def mouse(self, kind: str, x: float, y: float, **words: Any) -> None:
         """Move, press or release the mouse."""

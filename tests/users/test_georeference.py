@@ -21,7 +21,7 @@ from odc.geo.xr import xr_coords
 from rasterio.enums import ColorInterp
 from rich.console import Console
 
-import models.reading.remembered as remembered
+import models.reading.prior_map as prior_map
 from flows.archive.export_command import run_export
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
@@ -29,7 +29,7 @@ from flows.settings.load import load_settings
 from pipeline.ground.georeference import class_areas_m2
 from storage.remote.opening import open_archive, verify_archive
 from tests.conftest import RGB_NM, patchy_scene
-from tests.remembered_work import without_effects
+from tests.prior_work import without_effects
 
 SHAPE = (52, 70)
 NORTH_UP = Affine(0.05, 0, 534_257.65, 0, -0.05, 5_772_301.4)
@@ -175,12 +175,12 @@ def test_transparent_pixels_are_no_data_to_the_end(tmp_path: Path, weights: Path
         assert np.isnan(coarse[:5, :6]).all()  # 20 x 24 px
         assert np.isfinite(coarse[5:]).all()
         assert (mosaic["coverage"].values[:5, :6] == 0).all()
-        for seat in range(patches.sizes["patch"]):
-            y, x = int(patches["seat_y"][seat]), int(patches["seat_x"][seat])
+        for patch_number in range(patches.sizes["patch"]):
+            y, x = int(patches["patch_y"][patch_number]), int(patches["patch_x"][patch_number])
             there = gap[y : y + 8, x : x + 8]
-            one = patches["valid"].values[seat][: there.shape[0], : there.shape[1]]
+            one = patches["valid"].values[patch_number][: there.shape[0], : there.shape[1]]
             assert not one[there].any()
-            assert np.isnan(patches["values"].values[seat][: there.shape[0], : there.shape[1]][there]).all()
+            assert np.isnan(patches["values"].values[patch_number][: there.shape[0], : there.shape[1]][there]).all()
     assert run.receipt["pixels"]["map_without_a_class"] == gap.sum()
     geobox = GeoBox(SHAPE, NORTH_UP, "EPSG:32632")
     ground = run.receipt["ground"]
@@ -188,7 +188,7 @@ def test_transparent_pixels_are_no_data_to_the_end(tmp_path: Path, weights: Path
     whole = class_areas_m2(geobox, np.zeros(SHAPE, np.uint8), 1)[0]
     assert sum(ground["areas_ha"].values()) * 1e4 == pytest.approx(whole * (~gap).mean(), rel=1e-6)
     with opened(run, "attention") as attention:
-        assert (attention["score"].values[:2, :3] == 0).all()  # seats of 8 px without a pixel of the scene
+        assert (attention["score"].values[:2, :3] == 0).all()  # patches of 8 px without a pixel of the scene
 
 
 def test_pixels_that_became_transparent_did_not_change(
@@ -196,17 +196,17 @@ def test_pixels_that_became_transparent_did_not_change(
 ) -> None:
     """To a second visit they are as old as nothing, whatever was put in their place to look at; others did change."""
     for name in ("CERTAIN", "SURE"):  # untrained weights are sure of nothing: what they say is taken for sure
-        monkeypatch.setattr(remembered, name, 1e-6)
+        monkeypatch.setattr(prior_map, name, 1e-6)
     for name in ("first", "later"):
         (tmp_path / name).mkdir()
     scenes = [write_geotiff(tmp_path / name / "a.tif", NORTH_UP, gap=name == "later") for name in ("first", "later")]
     flags = {"name": "north", "prior": "latest", "scan_step": 2, "budget": None}
     for day, scene in enumerate(scenes, 1):
         run = survey(scene, weights, tmp_path / "archive", **flags, visit=f"2026-06-0{day}T10:00:00Z", seed=day)
-    with opened(run, "belief") as belief:
-        old, age, shares = (belief[name].values for name in ("changed_from", "age", "changed"))
+    with opened(run, "class_probabilities") as probabilities:
+        old, age, fractions = (probabilities[name].values for name in ("changed_from", "age", "changed"))
     assert (old != 255).any()
-    assert (shares[:2, :3] == 0).all()  # patches of 8 px
+    assert (fractions[:2, :3] == 0).all()  # patches of 8 px
     assert (old[GAP] == 255).all()
     assert np.isnan(age[GAP]).all()
     assert np.isnan(age).sum() == age[GAP].size
@@ -250,7 +250,7 @@ def test_a_pose_is_the_one_place_of_a_run(tmp_path: Path, weights: Path) -> None
 def test_every_store_opens_without_a_word(tmp_path: Path, weights: Path) -> None:
     """Axes have coordinates with units, a band is found by its wavelength, and classes are whole numbers."""
     run = survey(write_geotiff(tmp_path / "a.tif", NORTH_UP), weights, tmp_path / "archive")
-    for product in ("class_map", "belief", "mosaic", "patches", "attention", "raw_coarse"):
+    for product in ("class_map", "class_probabilities", "mosaic", "patches", "attention", "raw_coarse"):
         address = run.receipt["products"][product]
         stores = sorted((tmp_path / "archive" / address).glob("*.zarr")) or [tmp_path / "archive" / address]
         for store in stores:

@@ -66,7 +66,7 @@ def test_hectares_are_those_of_the_area(scene_files: Path, weights: Path, tmp_pa
     path.write_text(json.dumps(json.loads(path.read_text()) | {"crs": place}))
     half = planned(scene_files, weights, tmp_path, **DOWN, **{"zones.area": str(path)})["field"]
     assert half["hectares"] == pytest.approx(whole["hectares"] / 2, rel=0.05)
-    assert half["kept_share"] == pytest.approx(0.5, abs=0.03)
+    assert half["kept_fraction"] == pytest.approx(0.5, abs=0.03)
 
 
 def _rgb(picture: Path) -> np.ndarray[Any, np.dtype[np.int64]]:
@@ -84,7 +84,7 @@ def _blue(picture: Path) -> int:
 def test_the_preview_of_a_new_archive_shows_sweeps_over_the_outline(
     scene_files: Path, weights: Path, tmp_path: Path
 ) -> None:
-    """Nothing but the picture is written; with a pose there is a panel more."""
+    """Nothing but the picture is written; with a pose there is a white reference more."""
     content = planned(scene_files, weights, tmp_path / "new", tmp_path / "one.png")
     planned(scene_files, weights, tmp_path / "new", tmp_path / "two.png", **DOWN)
     assert content["preview"] == str(tmp_path / "one.png")

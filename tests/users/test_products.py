@@ -33,7 +33,7 @@ from pipeline.products.crop_rows import CropRows
 from pipeline.products.indices import find_index
 from storage.archive.archive import Archive
 from storage.readers.scene_files import load_scene_file
-from tests.remembered_work import without_effects
+from tests.prior_work import without_effects
 from tests.storage.export.stac_rules import core_problems, extension_problems, is_cog
 from tests.users.test_georeference import SHAPE, TURNED, corners_px, survey, write_geotiff
 
@@ -47,7 +47,7 @@ FLAGS = {
     "prescription": "track=2.5,grass=1",
     "cell": 3.0,
     "heading": "20",
-    "least_share": 0.1,
+    "least_fraction": 0.1,
     "least_area": 0.6,
     "buffer": "track=0.8",
 }
@@ -174,8 +174,8 @@ def test_prescribed_cells_hold_the_dose_of_their_classes(posed: Products) -> Non
     sure = 0
     for cell, dose in zip(cells.geometry, cells.dose, strict=True):
         inside = tree.query(cell, predicate="contains")
-        share = grass[inside].mean() if len(inside) else 0.0
-        if share > 0.5:  # far above the least share, whatever the small regions and borders did
+        fraction = grass[inside].mean() if len(inside) else 0.0
+        if fraction > 0.5:  # far above the least fraction, whatever the small regions and borders did
             assert dose >= 1.0
             sure += 1
     assert sure > 10
@@ -224,7 +224,7 @@ def test_task_data_hold_what_the_map_says(posed: Products) -> None:
 
 
 def test_a_table_of_areas_adds_up(posed: Products) -> None:
-    """Pixels of the map, hectares of the receipt, shares of 1, errors said to be by the labels or by probability."""
+    """Pixels of the map, hectares of the receipt, fractions of 1, errors said to be by the labels or by probability."""
     with posed.file("areas").open() as text:
         table = list(csv.DictReader(text))
     names = [row["class"] for row in table]
@@ -232,10 +232,10 @@ def test_a_table_of_areas_adds_up(posed: Products) -> None:
     assert [int(row["pixels"]) for row in table] == counts[: len(names)].tolist()
     hectares = posed.receipt["ground"]["areas_ha"]
     np.testing.assert_allclose([float(row["hectares"]) for row in table], [hectares[name] for name in names], rtol=1e-5)
-    for column in ("share", "estimated_share"):
+    for column in ("fraction", "estimated_fraction"):
         assert sum(float(row[column]) for row in table) == pytest.approx(1, abs=1e-4)
     assert {row["estimated_from"] for row in table} == {"labels"}
-    assert all(float(row["standard_error_share"]) >= 0 for row in table)
+    assert all(float(row["standard_error_fraction"]) >= 0 for row in table)
     by_labels = np.array(posed.receipt["accuracy"]["confusion"])
     assert by_labels.sum() == posed.receipt["accuracy"]["pixels"]
 
@@ -260,7 +260,7 @@ def test_the_catalogue_names_every_product(posed: Products) -> None:
         ({"prescription": "weed=-1"}, "got 'weed=-1'"),
         ({"prescription": "weed=1", "dose_unit": "gal/ac"}, "--dose-unit expects l/ha or kg/ha, got 'gal/ac'"),
         ({"prescription": "weed=1", "cell": 0.0}, "--cell expects metres above 0, got 0"),
-        ({"prescription": "weed=1", "least_share": 1.0}, "--least-share expects a share"),
+        ({"prescription": "weed=1", "least_fraction": 1.0}, "--least-share expects a fraction"),
         ({"prescription": "weed=1", "heading": "north"}, "--heading expects degrees from north, or rows"),
         ({"prescription": "thistle=1"}, "no class 'thistle'; its classes are soil, maize"),
         ({"polygons": True, "buffer": "thistle=1"}, "--buffer: the run has no class 'thistle'"),

@@ -22,7 +22,7 @@ from storage.arrays.class_maps import load_class_map
 from storage.arrays.ground_maps import load_geobox
 from tests.conftest import WeightsMaker
 from tests.flows.small_fields import write_field
-from tests.remembered_work import without_effects
+from tests.prior_work import without_effects
 
 POSE = {"lon_deg": 7.6, "lat_deg": 51.96, "height_m": 30, "heading_deg": 20, "tilt_deg": 35}
 Heard = dict[str, list[float]]
@@ -168,7 +168,7 @@ def test_progress_rises_to_the_end_of_every_stage(surveyed: tuple[OpenedRun, Hea
     run, heard = surveyed
     ran = {row["name"] for row in run.receipt["stages"] if row["state"] == "ran"}
     assert ran <= set(heard)
-    assert all(shares == sorted(shares) and shares[-1] == 1 for shares in heard.values())
+    assert all(fractions == sorted(fractions) and fractions[-1] == 1 for fractions in heard.values())
 
 
 def test_it_is_quiet(asked: dict[str, object], run: OpenedRun, capfd: pytest.CaptureFixture[str]) -> None:
@@ -215,7 +215,7 @@ def test_weights_are_trained_and_judged(tmp_path: Path) -> None:
         data, tmp_path / "mine.safetensors", steps=2, hold_out=["003"], validation=0, **small, progress=told
     )
     assert made == tmp_path / "mine.safetensors"
-    quick = {"shares": [0.25], "policies": ["entropy"], "draws": 10, "rig": False}
+    quick = {"fractions": [0.25], "policies": ["entropy"], "draws": 10, "rig": False}
     scores = spectralzoom.evaluate(data, weights=made, **quick, progress=told)
     assert scores["frames"] == ["003"]
     assert {"training", "looking at scenes"} <= heard
@@ -233,7 +233,7 @@ def test_what_cannot_be_is_one_error(make_weights: WeightsMaker, tmp_path: Path)
     with pytest.raises(spectralzoom.Error, match="needs weights=FILE"):
         spectralzoom.evaluate("farm")
     with pytest.raises(spectralzoom.Error, match="evaluate has no 'share'"):
-        spectralzoom.evaluate("farm", weights=make_weights(), share=[0.1])
+        spectralzoom.evaluate("farm", weights=make_weights(), fraction=[0.1])
     with pytest.raises(AttributeError, match="it has Error"):
         _ = spectralzoom.surveys
     assert not out.exists()

@@ -36,7 +36,7 @@ from storage.remote.opening import verify_archive
 from tests.conftest import Survey, WeightsMaker, patchy_scene
 from tests.flows.conftest import CommandLine, be_version, command_line
 from tests.flows.tasks.test_survey_rig import emulated
-from tests.remembered_work import without_effects
+from tests.prior_work import without_effects
 
 __all__ = ["command_line"]
 pytestmark = pytest.mark.usefixtures("no_effects")
@@ -195,8 +195,8 @@ def test_a_budget_reads_only_the_lines_that_it_asks_for(
     fine = [open_raw_cube(path) for path in (tmp_path / "a" / products["raw_fine"]).glob("*.zarr")]
     coarse = [open_raw_cube(path) for path in (tmp_path / "a" / products["raw_coarse"]).glob("*.zarr")]
     assert fine
-    strips = {round(open_raw_cube(path).sweep.strip_px, 6) for path in raw_cubes(full_scan)}
-    assert {cube.sweep.strip_px for cube in fine} <= strips
+    swaths = {round(open_raw_cube(path).sweep.swath_px, 6) for path in raw_cubes(full_scan)}
+    assert {cube.sweep.swath_px for cube in fine} <= swaths
     asked = sum(cube.sweep.lines for cube in (*coarse, *fine))
     assert len(read) <= asked
     assert told["full_scan_is"] == "recorded"
@@ -357,10 +357,14 @@ BAD: dict[str, tuple[Fault, list[str], str]] = {
     ),
     "a part of the field": (
         lambda at: None,
-        ["--look", "part", "--seconds", "5"],
-        "--look = 'part' chooses lines and exposures for a camera that looks again",
+        ["--extent", "part", "--seconds", "5"],
+        "--extent = 'part' chooses lines and exposures for a camera that looks again",
     ),
-    "two scans": (lambda at: None, ["--scan", "recorded", "--budget", "0.5"], "one plain scan .*leave one of them out"),
+    "two scans": (
+        lambda at: None,
+        ["--scan", "recorded", "--budget", "0.5"],
+        "one uniform scan .*leave one of them out",
+    ),
 }
 
 
@@ -500,7 +504,7 @@ def test_labels_judge_the_map_of_a_recording(
         survey_sweeps(tmp_path / "b", folder / "scan.hdr", weights=str(weights), labels=labels)
 
 
-def test_strips_of_ones_own_are_surveyed_in_two_passes(tmp_path: Path, weights: Path) -> None:
+def test_swaths_of_ones_own_are_surveyed_in_two_passes(tmp_path: Path, weights: Path) -> None:
     """A recording whose strips lie where no plan would put them: both passes go along these strips."""
     own = [Sweep(f"mine-{at}", "fine", "x", at, -52.5, 106) for at in (-35.0, 4.0, 38.0)]
     camera = load_settings(None, dict(NARROW)).camera
@@ -518,8 +522,8 @@ def test_strips_of_ones_own_are_surveyed_in_two_passes(tmp_path: Path, weights: 
         for product in ("raw_coarse", "raw_fine")
         for path in (tmp_path / "a" / published.receipt["products"][product]).glob("*.zarr")
     }
-    assert {round(sweep.strip_px) for sweep in raw.values() if sweep.step == 4} == {-35, 4, 38}
-    assert {round(sweep.strip_px) for sweep in raw.values()} == {-35, 4, 38}
+    assert {round(sweep.swath_px) for sweep in raw.values() if sweep.step == 4} == {-35, 4, 38}
+    assert {round(sweep.swath_px) for sweep in raw.values()} == {-35, 4, 38}
     assert published.receipt["recording"]["lines_read"] < 318
     assert np.isfinite(load_mosaic(tmp_path / "a" / published.receipt["products"]["mosaic"]).values).mean() > 0.99
 

@@ -36,7 +36,7 @@ def known_map() -> FieldMap:
         MapLayer("Truth", picture, opacity=0.5),
         MapLayer("Sweeps", boxes=[((8, 16, 0, WIDTH), f"1 of 1{BAD}")]),
     ]
-    return FieldMap((WIDTH, HEIGHT), layers, [{"name": f"crop{BAD}", "share": "50 %", "colour": "#14c83c"}])
+    return FieldMap((WIDTH, HEIGHT), layers, [{"name": f"crop{BAD}", "fraction": "50 %", "colour": "#14c83c"}])
 
 
 @pytest.fixture(scope="module")

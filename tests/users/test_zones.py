@@ -20,10 +20,10 @@ from flows.tasks.run import SurveyRun, open_run
 from pipeline.errors import SettingsError, ZoneError
 from pipeline.geometry.grid import UNLABELLED
 from storage.archive.archive import Archive
-from storage.arrays.class_maps import BeliefStore, ClassMap, load_class_map
+from storage.arrays.class_maps import ClassMap, ProbabilityStore, load_class_map
 from storage.arrays.mosaics import load_attention, open_patches
 from tests.conftest import Survey
-from tests.remembered_work import without_effects
+from tests.prior_work import without_effects
 from tests.users.zone_sketches import sketch
 
 pytestmark = pytest.mark.usefixtures("no_effects")
@@ -95,15 +95,17 @@ def test_the_map_is_that_of_the_area_without_the_no_go_zones(kept_to: tuple[Path
     assert not classed[inside(NO_GO)].any()
 
 
-def test_no_seat_outside_or_in_a_no_go_zone_is_asked_for(kept_to: tuple[Path, Published]) -> None:
+def test_no_patch_outside_or_in_a_no_go_zone_is_asked_for(kept_to: tuple[Path, Published]) -> None:
     """Scores there are 0, no rank is given, and no patch is cut that touches a no-go zone."""
     out, published = kept_to
     products = published.receipt["products"]
     attention = load_attention(out / products["attention"])
     rows, columns = attention.score.shape
-    seats = [shapely.box(8 * x, 8 * y, 8 * x + 8, 8 * y + 8) for y in range(rows) for x in range(columns)]
-    barred = np.array([not seat.intersects(AREA) or seat.intersection(NO_GO).area > 0 for seat in seats])
-    cut = open_patches(out / products["patches"]).seats
+    patch_index = [shapely.box(8 * x, 8 * y, 8 * x + 8, 8 * y + 8) for y in range(rows) for x in range(columns)]
+    barred = np.array(
+        [not patch_number.intersects(AREA) or patch_number.intersection(NO_GO).area > 0 for patch_number in patch_index]
+    )
+    cut = open_patches(out / products["patches"]).patch_index
     assert len(cut) > 10
     assert not barred[cut].any()
     assert (attention.rank.ravel()[barred] == -1).all()
@@ -138,8 +140,8 @@ def test_plots_are_told_in_receipt_and_csv(kept_to: tuple[Path, Published]) -> N
         mapped = inside(PLOTS[name]) & (found.classes != UNLABELLED)
         counts = np.bincount(found.classes[mapped], minlength=3)
         assert rows[name]["mapped_pixels"] == mapped.sum() == table.loc[name, "mapped_pixels"]
-        assert list(rows[name]["shares"].values()) == pytest.approx(counts / counts.sum())
-        assert table.loc[name, "share_class_1"] == pytest.approx(rows[name]["shares"]["class_1"])
+        assert list(rows[name]["fractions"].values()) == pytest.approx(counts / counts.sum())
+        assert table.loc[name, "fraction_class_1"] == pytest.approx(rows[name]["fractions"]["class_1"])
         assert rows[name]["confidence"] == pytest.approx(found.confidence[mapped].mean(), rel=1e-5)
     assert (rows["away"]["pixels"], rows["away"]["confidence"]) == (0, None)
     assert "plots.csv" in published.receipt["products"]
@@ -149,22 +151,22 @@ def test_plots_are_told_in_receipt_and_csv(kept_to: tuple[Path, Published]) -> N
 def test_nothing_is_believed_of_what_was_left_out(kept_to: tuple[Path, Published]) -> None:
     """What the next visit remembers has no class where zones left pixels out."""
     out, published = kept_to
-    values, age, _ = BeliefStore(out / published.receipt["products"]["belief"]).read()
+    values, age, _ = ProbabilityStore(out / published.receipt["products"]["class_probabilities"]).read()
     classed = drawn(*kept_to).classes != UNLABELLED
     assert np.array_equal(np.isfinite(values[..., 0]), classed)
     assert np.array_equal(np.isfinite(age), classed)
 
 
-def test_a_plain_scan_cuts_the_seats_of_the_area(survey_png: Survey, zones: dict[str, str], tmp_path: Path) -> None:
-    """Each patch shows the picture where it lies; no seat outside is cut, and the map keeps to the area as well."""
+def test_a_plain_scan_cuts_the_patches_of_the_area(survey_png: Survey, zones: dict[str, str], tmp_path: Path) -> None:
+    """Each patch shows the picture where it lies; no patch outside is cut, and the map keeps to the area as well."""
     plain = {"scan_step": 1, "budget": None, "camera.samples": 64, "accuracy": False}
     published = survey_png(tmp_path, **plain, **zones)
     store = open_patches(tmp_path / published.receipt["products"]["patches"])
-    values, (row, column) = store.read(0, len(store.seats)), np.divmod(store.seats, 16)
+    values, (row, column) = store.read(0, len(store.patch_index)), np.divmod(store.patch_index, 16)
     with Image.open(published.receipt["settings"]["scene"]) as found:
         picture = np.asarray(found, np.float64)
     there = [picture[8 * y : 8 * y + 8, 8 * x : 8 * x + 8] for y, x in zip(row, column, strict=True)]
-    assert 20 < len(store.seats) < 16 * 12
+    assert 20 < len(store.patch_index) < 16 * 12
     assert np.abs(np.nan_to_num(values - there)).mean() < 2
     boxes = shapely.box(8 * column, 8 * row, 8 * column + 8, 8 * row + 8)
     assert shapely.intersects(boxes, AREA).all()
@@ -178,7 +180,9 @@ def test_a_visit_with_zones_keeps_the_memory_of_the_rest(
     """What was known outside of the area is known afterwards, and no look counts there."""
     first = surveyed_png(tmp_path)
     second = survey_png(tmp_path, visit="second", prior="latest", accuracy=False, **zones)
-    before, after = (BeliefStore(tmp_path / one.receipt["products"]["belief"]).read() for one in (first, second))
+    before, after = (
+        ProbabilityStore(tmp_path / one.receipt["products"]["class_probabilities"]).read() for one in (first, second)
+    )
     away = drawn(tmp_path, second).classes == UNLABELLED
     assert away.any()
     assert np.array_equal(before[0][away].argmax(axis=-1), after[0][away].argmax(axis=-1))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from flows.tasks.run import SurveyRun
 from flows.tasks.stage import Product, Wanted, stage
 from flows.tasks.stages.effects import source_with
-from flows.tasks.stages.maps import glance_at
+from flows.tasks.stages.maps import coarse_prediction_at
 from flows.tasks.stages.placement import load_registration
 from models.evaluation.metrics import (
     agreement,
@@ -29,13 +29,13 @@ from models.evaluation.metrics import (
     iou_per_class,
     kappa,
 )
-from models.evaluation.placement import CONTROL_SHARE, run_controls
-from models.reading.inference import Glance, segment
+from models.evaluation.placement import CONTROL_FRACTION, run_controls
+from models.reading.inference import CoarsePrediction, segment
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.geometry.scan import Sweep
 from pipeline.rectify.kernels import Kernel
-from pipeline.rectify.region import read_seats
+from pipeline.rectify.region import read_patches
 from pipeline.simulator.effects.pointing import CommonOffset, PointingErrors
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from storage.archive.keys import StageRef, array_digest
@@ -62,11 +62,11 @@ def evaluate(run: SurveyRun, mosaic: StageRef, patches: StageRef, class_map: Sta
     labels = _moved(run, off)
 
     def build(path: Path) -> None:
-        """Write the figures of the map, of the coarse look alone and, where asked for, of other placements."""
+        """Write the figures of the map, of the coarse pass alone and, where asked for, of other placements."""
         drawn = load_class_map(class_map.path / "class_map.zarr")
         classes = drawn.classes
         judged = np.where(classes == UNLABELLED, np.uint8(UNLABELLED), labels)  # what has no class is not
-        seen = glance_at(run, mosaic)
+        seen = coarse_prediction_at(run, mosaic)
         counts = confusion(judged, classes, len(drawn.names))  # with the class unknown, which no label has
         result: dict[str, Any] = _figures(run, counts) | {"confusion": counts.tolist()}
         empty = np.empty((0, run.grid.patch, run.grid.patch, run.weights.basis.columns), np.float32)
@@ -84,7 +84,7 @@ def evaluate(run: SurveyRun, mosaic: StageRef, patches: StageRef, class_map: Sta
         **run.model_key,
         "labels": array_digest(labels),
         "controls": run.controls,
-        "kernel": run.settings.kernel,
+        "resampling": run.settings.resampling,
         **run.source_key(),
     }
     return Wanted(build, params, inputs)
@@ -120,7 +120,7 @@ def _sure_source(run: SurveyRun, off: NDArray[np.float64]) -> SimulatedSource:
 
 
 def _controls(
-    run: SurveyRun, seen: Glance, patches: StageRef, labels: NDArray[np.uint8], result: dict[str, Any]
+    run: SurveyRun, seen: CoarsePrediction, patches: StageRef, labels: NDArray[np.uint8], result: dict[str, Any]
 ) -> dict[str, Any]:
     columns = _columns(run)
     rows = 0
@@ -130,13 +130,13 @@ def _controls(
         rows += 1
         run.report(0.6 + 0.035 * rows)
 
-    among = None if run.zones.shares is None else run.zones.shares > 0
+    among = None if run.zones.fractions is None else run.zones.fractions > 0
     controls = run_controls(
         run.weights,
         seen,
         columns,
         labels,
-        share=_control_share(run, patches),
+        fraction=_control_fraction(run, patches),
         seed=run.settings.seed,
         among=among,
         report=report,
@@ -146,12 +146,12 @@ def _controls(
         "all": figures,
         "gap_closed": gap_closed(result["miou"], result["none"]["miou"], figures["miou"]),
         "controls": controls.as_dict(),
-        "controls_share": controls.share,
+        "controls_fraction": controls.fraction,
     }
 
 
 def _columns(run: SurveyRun) -> NDArray[np.float32]:
-    """Columns of all seats, (seat, p, p, column), from a full scan, or from the raster itself."""
+    """Columns of all patches, (patch, p, p, column), from a full scan, or from the raster itself."""
 
     def report(done: float) -> None:
         run.report(0.6 * done)
@@ -160,16 +160,16 @@ def _columns(run: SurveyRun) -> NDArray[np.float32]:
     if run.raster is not None:
         return columns_of_raster(run.raster, run.weights, run.scene.wavelength_nm, memory=memory, report=report)
     sweeps = run.plan.coarse if run.plan.plain else run.plan.full
-    return columns_of_all_seats(
-        run.simulated, sweeps, run.grid, run.weights, memory=memory, kernel=run.settings.kernel, report=report
+    return columns_of_all_patches(
+        run.simulated, sweeps, run.grid, run.weights, memory=memory, kernel=run.settings.resampling, report=report
     )
 
 
-def _control_share(run: SurveyRun, patches: StageRef) -> float:
-    """Share of the valid seats that other placements get; of a plain scan as many as were kept of it."""
+def _control_fraction(run: SurveyRun, patches: StageRef) -> float:
+    """Fraction of the valid patches that other placements get; of a uniform scan as many as were kept of it."""
     if run.budget is None:
-        return CONTROL_SHARE
-    return len(open_patches(patches.path / "patches.zarr").seats) / len(run.budget.seats)
+        return CONTROL_FRACTION
+    return len(open_patches(patches.path / "patches.zarr").patch_index) / len(run.budget.patch_index)
 
 
 def _figures(run: SurveyRun, counts: NDArray[np.int64]) -> dict[str, Any]:
@@ -204,23 +204,23 @@ def columns_of_raster(
 ) -> NDArray[np.float32]:
     """Read all pixels of a raster some rows at a time, and keep the normalised columns only.
 
-    Gives (seat, p, p, column) float32 of the padded grid; seats beyond the raster, and pixels without a value, are 0.
+    Gives (patch, p, p, column) float32 of the padded grid; patches beyond the raster, and pixels without a value, are 0.
     ``memory`` is in bytes.
     """
-    p, valid, done = raster.grid.patch, raster.grid.valid_seats(), 0
-    columns = np.zeros((int(np.prod(raster.grid.seat_shape)), p, p, weights.basis.columns), np.float32)
+    p, valid, done = raster.grid.patch, raster.grid.valid_patches(), 0
+    columns = np.zeros((int(np.prod(raster.grid.patch_shape)), p, p, weights.basis.columns), np.float32)
     for values, _ in patches_of(raster, valid, memory=memory):
-        seats = valid[done : done + len(values)]
-        columns[seats] = np.nan_to_num(weights.columns(values, wavelength_nm), nan=0.0)
+        patch_index = valid[done : done + len(values)]
+        columns[patch_index] = np.nan_to_num(weights.columns(values, wavelength_nm), nan=0.0)
         done += len(values)
         report(done / len(valid))
     return columns
 
 
-MEMORY_SHARE = 32  # a band of seats may take this part of the memory
+MEMORY_FRACTION = 32  # a band of patches may take this part of the memory
 
 
-def columns_of_all_seats(
+def columns_of_all_patches(
     source: SimulatedSource,
     full: Sequence[Sweep],
     grid: SceneGrid,
@@ -230,22 +230,22 @@ def columns_of_all_seats(
     kernel: Kernel,
     report: Callable[[float], None] = lambda done: None,
 ) -> NDArray[np.float32]:
-    """Scan the scene in full, a band of seats at a time, and keep the normalised columns only.
+    """Scan the scene in full, a band of patches at a time, and keep the normalised columns only.
 
-    Gives (seat, p, p, column) float32 of the padded grid; seats beyond the scene are 0. ``memory`` is in bytes.
+    Gives (patch, p, p, column) float32 of the padded grid; patches beyond the scene are 0. ``memory`` is in bytes.
     """
     sweeps = [SimulatedSweep(source, sweep) for sweep in full]
-    p, valid = grid.patch, grid.valid_seats()
-    columns = np.zeros((int(np.prod(grid.seat_shape)), p, p, weights.basis.columns), np.float32)
-    row, column = np.divmod(valid, grid.seat_shape[1])
+    p, valid = grid.patch, grid.valid_patches()
+    columns = np.zeros((int(np.prod(grid.patch_shape)), p, p, weights.basis.columns), np.float32)
+    row, column = np.divmod(valid, grid.patch_shape[1])
     place = row if full[0].along == "x" else column  # bands lie across the scan, as deep as fits
     one = int(np.count_nonzero(place == 0)) * p**2 * len(source.wavelength_nm) * 4
-    deep = max(1, memory // MEMORY_SHARE // one)
+    deep = max(1, memory // MEMORY_FRACTION // one)
     done = 0
     for band in range(int(place.max()) // deep + 1):
-        seats = valid[place // deep == band]
-        values, _ = read_seats(sweeps, source.camera, grid, seats, kernel)
-        columns[seats] = weights.columns(values, source.wavelength_nm)
-        done += len(seats)
+        patch_index = valid[place // deep == band]
+        values, _ = read_patches(sweeps, source.camera, grid, patch_index, kernel)
+        columns[patch_index] = weights.columns(values, source.wavelength_nm)
+        done += len(patch_index)
         report(done / len(valid))
     return columns

@@ -20,7 +20,7 @@ from storage.archive.keys import StageRef, stage_key
 from storage.archive.manifests import write_table
 from storage.arrays.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
 from storage.arrays.spool import Spool
-from storage.parallel.crew import Crew, run_blocks
+from storage.parallel.pool import WorkerPool, run_blocks
 
 RAW = Product("capture", version=9)
 RIG_RECORD = "rig.json"  # beside the cubes: what a rig's captures were like
@@ -96,7 +96,7 @@ def _capture_sweep(
         for block in spool.blocks():
             cube.write(block)
         run.report((before + spool.count) / total)
-        take_lines(source, sweep, take, run.settings.crew, first=spool.count)
+        take_lines(source, sweep, take, run.settings.pool, first=spool.count)
 
 
 def captured(ref: StageRef) -> list[RawCube]:
@@ -108,7 +108,7 @@ Take = Callable[[Line], None]
 
 
 def take_lines(
-    source: Source, sweep: Sweep, take: Take, crew: Crew, *, first: int = 0, at_once: int = BLOCK_LINES
+    source: Source, sweep: Sweep, take: Take, pool: WorkerPool, *, first: int = 0, at_once: int = BLOCK_LINES
 ) -> None:
     """Give ``take`` the sweep's lines one by one, in order, from line ``first`` on.
 
@@ -117,7 +117,9 @@ def take_lines(
     what the first block that cannot be rendered raises comes once the lines before it are taken. A source that is no
     simulation gives its lines when it has them. Neither the number of workers nor the size of blocks changes a line.
     """
-    workers = Crew("threads", crew.workers)  # whoever else makes blocks, for the scene lies in this process's memory
+    workers = WorkerPool(
+        "threads", pool.workers
+    )  # whoever else makes blocks, for the scene lies in this process's memory
     if workers.count == 1 or not isinstance(source, SimulatedSource):
         for line in source.lines(sweep, first):
             take(line)

@@ -15,7 +15,7 @@ from flows.settings.survey_settings import plain_value
 from flows.tasks.run import CaptureRun
 from flows.tasks.stage import Product, Wanted, stage
 from pipeline.errors import IncompleteStoreError
-from pipeline.simulator.effects.effect import Effect, Light, SweepBlock
+from pipeline.simulator.effects.effect import Effect, Radiance, SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.effects.probe import Probe, unit_at
 from pipeline.simulator.effects.registry import BY_NAME, EFFECTS
@@ -30,7 +30,7 @@ from storage.archive.whole_files import to_json
 
 RECORD = "effects.json"
 MANIFEST = Product("effects", version=8, files=(RECORD,))
-LOOK = {
+FOOTPRINT = {
     ROTATION: ROTATION.variants[0],
     SLIT: SLIT.variants[-1],
 }  # what lines are chosen by: the footprint alone, where lines really lie
@@ -125,12 +125,12 @@ def _verified(run: CaptureRun, decision: Decision, probes: Sequence[Probe]) -> d
         return {TOTAL: 0.0}
     scene, rig = run.scene, run.settings.simulated_rig
 
-    def units(light: Light, binning: int) -> Light:
+    def units(light: Radiance, binning: int) -> Radiance:
         return unit_at(light, rig, decision.unit, binning)
 
     renders = 0
 
-    def render(block: SweepBlock, chosen: Mapping[Effect, str]) -> Light:
+    def render(block: SweepBlock, chosen: Mapping[Effect, str]) -> Radiance:
         nonlocal renders
         renders += 1
         run.report(DRAFT + (VERIFIED - DRAFT) * renders / (renders + len(EFFECTS)))  # how many there will be is open
@@ -146,5 +146,5 @@ def _verified(run: CaptureRun, decision: Decision, probes: Sequence[Probe]) -> d
         for probe in probes
         for block in candidate_blocks([one for one in whole if one.sweep in probe.sweeps], probe.places)
     ]
-    worst = worst_blocks(candidates, lambda block: expected_light(scene, block, LOOK), units)
+    worst = worst_blocks(candidates, lambda block: expected_light(scene, block, FOOTPRINT), units)
     return verify(decision, render, worst, units)

@@ -14,7 +14,7 @@ from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.map_grid import GroundGrid, ground_grid, image_at, map_blocks, nearest_at
 from pipeline.ground.view import GroundView
 from storage.archive.keys import StageRef
-from storage.arrays.class_maps import OLD_CLASS, BeliefStore, ClassMap, ClassNames, load_class_map
+from storage.arrays.class_maps import OLD_CLASS, ClassMap, ClassNames, ProbabilityStore, load_class_map
 from storage.arrays.ground_maps import BLOCK, GroundMapWriter
 from storage.arrays.layout import SHARD_ROWS, open_group, read_array, read_bands
 from storage.arrays.quicklooks import choose_bands, develop, stretch
@@ -54,7 +54,7 @@ def ground(run: SurveyRun, class_map: StageRef, mosaic: StageRef) -> Wanted:
 class Changes:
     """What of a field is another class than remembered."""
 
-    shares: NDArray[np.float32]  # (seat_y, seat_x)
+    fractions: NDArray[np.float32]  # (seat_y, seat_x)
     patch_px: int
     old_class: NDArray[np.uint8]  # (y, x), 255 where it did not change
 
@@ -73,12 +73,12 @@ class ShownField:
     @classmethod
     def read(cls, class_map: StageRef, mosaic: StageRef, factor: int) -> ShownField:
         """Read a map, what is believed beside it and the coarse picture under it."""
-        belief = BeliefStore(class_map.path / "belief.zarr")
-        shares, old_class, changes = belief.changed(), belief.old_class(), None
-        if shares is not None and old_class is not None:
-            changes = Changes(shares, belief.patch_px, old_class)
+        probabilities = ProbabilityStore(class_map.path / "class_probabilities.zarr")
+        fractions, old_class, changes = probabilities.changed(), probabilities.old_class(), None
+        if fractions is not None and old_class is not None:
+            changes = Changes(fractions, probabilities.patch_px, old_class)
         found = load_class_map(class_map.path / "class_map.zarr")
-        return cls(found, np.isnan(found.confidence), belief.age(), changes, coarse_colours(mosaic), factor)
+        return cls(found, np.isnan(found.confidence), probabilities.age(), changes, coarse_colours(mosaic), factor)
 
     def at(self, pixels: NDArray[np.float64]) -> dict[str, NDArray[np.generic]]:
         """All images of a block of the map, by name, at places (row, column, 2); 255, NaN and 0 where nothing is seen.
@@ -95,8 +95,8 @@ class ShownField:
             "age": nearest_at(self.age_days, pixels, np.nan),
         }
         if self.changes is not None:
-            shares, patch = self.changes.shares, self.changes.patch_px
-            images["changed"] = nearest_at(shares, pixels, np.nan, factor=patch)
+            fractions, patch = self.changes.fractions, self.changes.patch_px
+            images["changed"] = nearest_at(fractions, pixels, np.nan, factor=patch)
             images[OLD_CLASS] = nearest_at(self.changes.old_class, pixels, UNLABELLED)
         return images
 

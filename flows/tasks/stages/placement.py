@@ -1,4 +1,4 @@
-"""Where lines lie and what they show: registration (none where the mirror is believed), lookup, mosaic, patches."""
+"""Where lines lie and what they show: registration (none where the mirror is believed), geolocation grid, mosaic, patches."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from flows.tasks.run import SurveyRun
 from flows.tasks.stage import Product, Wanted, stage
 from flows.tasks.stages.attention import load_plan
 from flows.tasks.stages.capture import captured
-from pipeline.geometry.grid import seat_pixels
+from pipeline.geometry.grid import patch_pixels
 from pipeline.rectify.mosaic import LineCache
 from pipeline.rectify.placed import PixelGrid, Placed, TieTable
-from pipeline.rectify.region import read_every_seat, read_seats
+from pipeline.rectify.region import read_every_patch, read_patches
 from pipeline.rectify.registration.alignment import SweepShift
 from pipeline.rectify.registration.illumination import overlap_light, solve_lights
 from pipeline.rectify.registration.overlaps import BroadSweep, broad_bands
 from pipeline.rectify.registration.seams import Anchor, Registration, SeamWindow, anchor_sweep, register_sweeps
-from pipeline.rectify.tracks import Track
+from pipeline.rectify.scan_paths import ScanPath
 from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table, write_table
+from storage.arrays.geolocation import path_digest, write_geolocation
 from storage.arrays.layout import NO_VALUE, blank_coarse, blank_pixels, read_array
-from storage.arrays.lookups import path_digest, write_lookup
 from storage.arrays.mosaics import MosaicWriter, PatchWriter, load_mosaic, open_patches
 from storage.arrays.quicklooks import choose_bands, stretched
 from storage.arrays.tile_work import MosaicRecipe, Sighted, Thumbnail, sight_sweeps, write_mosaic
@@ -135,15 +135,15 @@ def load_registration(registration: StageRef) -> dict[str, Any]:
     return read_table(registration.path / RECORD)
 
 
-LOOKUP = Product("locate", version=2, files=("lookup.zarr",))
+GEOLOCATION = Product("locate", version=2, files=("geolocation.zarr",))
 MOSAIC = Product("rectify", version=4, files=("mosaic.zarr",))
 PATCHES = Product("patches", version=4, files=("patches.zarr",), made_again=True)
 QUICKLOOK_PX = 512
-SEATS_AT_ONCE = 64
-CACHE_SHARE = 8  # raw lines kept for the next patches may take this part of the memory
+PATCHES_AT_ONCE = 64
+CACHE_FRACTION = 8  # raw lines kept for the next patches may take this part of the memory
 
 
-@stage("locate", "lookup", LOOKUP)
+@stage("locate", "lookup", GEOLOCATION)
 def locate(run: SurveyRun, raw: StageRef, registration: StageRef | None = None) -> Wanted:
     """Look up where each coarse pixel was seen: a table that every survey along the same path shares."""
     grid = PixelGrid.of_scene(run.grid, 1 if run.plan.plain else run.grid.factor)
@@ -163,20 +163,20 @@ def locate(run: SurveyRun, raw: StageRef, registration: StageRef | None = None) 
 
     def build(path: Path) -> None:
         """Write the tie tables of each sweep; of one that ties cannot follow, none."""
-        tables: dict[str, list[tuple[Track, TieTable]]] = {}
+        tables: dict[str, list[tuple[ScanPath, TieTable]]] = {}
         for number, one in enumerate(sweeps):
-            made = one.placed(run.camera, grid).tracks
-            whole = [(track, table) for track, table in made if table is not None]
+            made = one.placed(run.camera, grid).scan_paths
+            whole = [(scan_path, table) for scan_path, table in made if table is not None]
             # Where lines lie too unevenly for ties there is nothing to keep: such a sweep is looked up directly.
             tables[one.cube.sweep.name] = whole if len(whole) == len(made) else []
             run.report((number + 1) / len(sweeps))
-        write_lookup(path / "lookup.zarr", tables, params)
+        write_geolocation(path / "geolocation.zarr", tables, params)
 
     return Wanted(build, params)  # keyed by the paths, not by what was seen along them
 
 
 @stage("rectify", "mosaic", MOSAIC)
-def rectify(run: SurveyRun, raw: StageRef, lookup: StageRef, registration: StageRef | None = None) -> Wanted:
+def rectify(run: SurveyRun, raw: StageRef, geolocation: StageRef, registration: StageRef | None = None) -> Wanted:
     """Bring the coarse sweeps onto the scene grid and blend them into one mosaic, tile by tile."""
 
     def build(path: Path) -> None:
@@ -186,8 +186,8 @@ def rectify(run: SurveyRun, raw: StageRef, lookup: StageRef, registration: Stage
             raw.path,
             run.camera,
             grid,
-            run.settings.kernel,
-            lookup=lookup.path / "lookup.zarr",
+            run.settings.resampling,
+            geolocation=geolocation.path / "geolocation.zarr",
             registration=record_of(registration),
             finer=PixelGrid.of_scene(run.grid, 1) if run.plan.plain else None,
         )
@@ -201,7 +201,7 @@ def rectify(run: SurveyRun, raw: StageRef, lookup: StageRef, registration: Stage
         )
         colours, _ = choose_bands(run.scene.wavelength_nm)
         settings, picture = run.settings, Thumbnail(grid.shape, colours, QUICKLOOK_PX)
-        write_mosaic(recipe, writer, memory=settings.memory, crew=settings.crew, seen=picture, report=run.report)
+        write_mosaic(recipe, writer, memory=settings.memory, pool=settings.pool, seen=picture, report=run.report)
         if run.scene.missing is not None:
             gaps = blank_coarse(run.scene.missing, run.grid.factor)
             blank_pixels(path / "mosaic.zarr", gaps, NO_VALUE)
@@ -209,27 +209,27 @@ def rectify(run: SurveyRun, raw: StageRef, lookup: StageRef, registration: Stage
         writer.write_quicklook(stretched(picture.image).image)
         write_table(path / "lines.json", {one.cube.sweep.name: one.facts() for one in recipe.sweeps()})
 
-    params = {"grid": asdict(run.grid), "kernel": run.settings.kernel, **run.place_key}
-    return Wanted(build, params, [raw, lookup, *_there(registration)])
+    params = {"grid": asdict(run.grid), "resampling": run.settings.resampling, **run.place_key}
+    return Wanted(build, params, [raw, geolocation, *_there(registration)])
 
 
-@stage("cut_patches", "fine patches", PATCHES)
-def cut_patches(run: SurveyRun, attention: StageRef, raw: StageRef, registration: StageRef | None = None) -> Wanted:
-    """Bring every chosen seat onto the scene grid, one patch a seat; NaN where nothing was seen, or is no scene.
+@stage("extract_patches", "fine patches", PATCHES)
+def extract_patches(run: SurveyRun, attention: StageRef, raw: StageRef, registration: StageRef | None = None) -> Wanted:
+    """Bring every chosen patch onto the scene grid, one patch a patch; NaN where nothing was seen, or is no scene.
 
-    ``raw`` are the fine sweeps, or those of a plain scan.
+    ``raw`` are the fine sweeps, or those of a uniform scan.
     """
 
     def build(path: Path) -> None:
-        """Write the patches in the order in which sweeps pass them, a batch of seats at a time."""
-        seats = load_plan(attention).seats
-        row, column = np.divmod(seats, run.grid.seat_shape[1])
+        """Write the patches in the order in which sweeps pass them, a batch of patches at a time."""
+        patch_index = load_plan(attention).patch_index
+        row, column = np.divmod(patch_index, run.grid.patch_shape[1])
         # as the sweeps pass them, so that a few of them need few lines at a time
-        ordered = seats[np.lexsort((column, row) if run.plan.along == "x" else (row, column))]
+        ordered = patch_index[np.lexsort((column, row) if run.plan.along == "x" else (row, column))]
         writer = PatchWriter(
             path / "patches.zarr",
             ordered,
-            run.grid.seat_origin(ordered),
+            run.grid.patch_origin(ordered),
             run.grid.patch,
             run.scene.wavelength_nm,
             fwhm_nm=run.scene.fwhm_nm,
@@ -238,52 +238,54 @@ def cut_patches(run: SurveyRun, attention: StageRef, raw: StageRef, registration
         if run.plan.plain and len(ordered):
             _cut_everything(run, sighted(run, raw, registration), writer, ordered)
             return
-        cache = LineCache(run.settings.memory // CACHE_SHARE)
+        cache = LineCache(run.settings.memory // CACHE_FRACTION)
         sweeps = [one.placed(run.camera) for one in sighted(run, raw, registration)]
-        for first in range(0, len(ordered), SEATS_AT_ONCE):
-            seats = ordered[first : first + SEATS_AT_ONCE]
-            seen = read_seats(sweeps, run.camera, run.grid, seats, run.settings.kernel, cache=cache)
-            writer.write(*_on_scene(run, seats, *seen))
-            run.report((first + len(seats)) / len(ordered))
+        for first in range(0, len(ordered), PATCHES_AT_ONCE):
+            patch_index = ordered[first : first + PATCHES_AT_ONCE]
+            seen = read_patches(sweeps, run.camera, run.grid, patch_index, run.settings.resampling, cache=cache)
+            writer.write(*_on_scene(run, patch_index, *seen))
+            run.report((first + len(patch_index)) / len(ordered))
 
-    params = {"grid": asdict(run.grid), "kernel": run.settings.kernel, **run.place_key}
+    params = {"grid": asdict(run.grid), "resampling": run.settings.resampling, **run.place_key}
     return Wanted(build, params, [attention, raw, *_there(registration)])
 
 
 def _on_scene(
-    run: SurveyRun, seats: NDArray[np.integer], values: NDArray[np.float32], valid: NDArray[np.bool_]
+    run: SurveyRun, patch_index: NDArray[np.integer], values: NDArray[np.float32], valid: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """The same patches (patch, y, x, band) with NaN, and no validity, where the scene has no value."""
     if run.scene.missing is None:
         return values, valid
-    gaps = seat_pixels(run.grid, run.scene.missing)[seats]
+    gaps = patch_pixels(run.grid, run.scene.missing)[patch_index]
     return np.where(gaps[..., None], np.float32(np.nan), values), valid & ~gaps
 
 
-def _cut_everything(run: SurveyRun, sweeps: Sequence[Sighted], writer: PatchWriter, seats: NDArray[np.integer]) -> None:
-    """Cut the wanted seats of a plain scan, by tables of its pixels: many times as fast as looking each of them up."""
+def _cut_everything(
+    run: SurveyRun, sweeps: Sequence[Sighted], writer: PatchWriter, patch_index: NDArray[np.integer]
+) -> None:
+    """Cut the wanted patches of a uniform scan, by tables of its pixels: many times as fast as looking each of them up."""
     placed = [one.placed(run.camera, PixelGrid.of_scene(run.grid, 1)) for one in sweeps]
-    done, first, every = 0, 0, run.grid.valid_seats()
-    row, column = np.divmod(every, run.grid.seat_shape[1])
-    wanted = np.isin(every[np.lexsort((column, row) if run.plan.along == "x" else (row, column))], seats)
-    most_bytes = run.settings.memory // CACHE_SHARE
-    for values, seen in read_every_seat(placed, run.camera, run.grid, run.settings.kernel, most_bytes=most_bytes):
+    done, first, every = 0, 0, run.grid.valid_patches()
+    row, column = np.divmod(every, run.grid.patch_shape[1])
+    wanted = np.isin(every[np.lexsort((column, row) if run.plan.along == "x" else (row, column))], patch_index)
+    most_bytes = run.settings.memory // CACHE_FRACTION
+    for values, seen in read_every_patch(placed, run.camera, run.grid, run.settings.resampling, most_bytes=most_bytes):
         kept = wanted[first : first + len(values)]
         first += len(values)
         if not kept.all():
             values, seen = values[kept], seen[kept]
-        writer.write(*_on_scene(run, seats[done : done + len(values)], values, seen))
+        writer.write(*_on_scene(run, patch_index[done : done + len(values)], values, seen))
         done += len(values)
-        run.report(done / len(seats))
+        run.report(done / len(patch_index))
 
 
-def seen_shares(run: SurveyRun, patches: StageRef) -> NDArray[np.float64]:
+def seen_fractions(run: SurveyRun, patches: StageRef) -> NDArray[np.float64]:
     """How much of each patch was seen, (patch,) 0..1 of its pixels on the scene; 1 where it has none there."""
     store = open_patches(patches.path / "patches.zarr")
     seen: NDArray[np.float64] = read_array(store.group, "valid").mean(axis=(1, 2))
-    there = run.grid.valid_share().ravel()[store.seats]
+    there = run.grid.valid_fraction().ravel()[store.patch_index]
     if run.scene.missing is not None:
-        there = there - seat_pixels(run.grid, run.scene.missing)[store.seats].mean(axis=(1, 2))
+        there = there - patch_pixels(run.grid, run.scene.missing)[store.patch_index].mean(axis=(1, 2))
     return np.divide(seen, there, out=np.ones_like(seen), where=there > 0)
 
 

@@ -45,17 +45,17 @@ def take_patches(run: SurveyRun, attention: StageRef) -> Wanted:
 
     def build(path: Path) -> None:
         """Write the patches in the order of their numbers, some rows of the raster at a time."""
-        seats = load_plan(attention).seats
+        patch_index = load_plan(attention).patch_index
         writer = PatchWriter(
             path / "patches.zarr",
-            seats,
-            run.grid.seat_origin(seats),
+            patch_index,
+            run.grid.patch_origin(patch_index),
             run.grid.patch,
             run.scene.wavelength_nm,
             fwhm_nm=run.scene.fwhm_nm,
             grid=run.angular_grid(),
         )
-        write_patches(_pixels(run), writer, seats, memory=run.settings.memory, report=run.report)
+        write_patches(_pixels(run), writer, patch_index, memory=run.settings.memory, report=run.report)
 
     return Wanted(build, _params(run), [attention])
 

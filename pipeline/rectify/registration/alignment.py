@@ -43,7 +43,7 @@ WINDOW_REACH_PX = 8.0  # what the shift of one window may differ by from that of
 AGREE_PX, LOOSELY_PX = 0.5, 1.5  # within which windows say the same, and do so loosely
 LOOSE_SHIFT_PX, LOOSE_EDGE_PX = 2.0, 3.0  # that what they say loosely is believed from: growth looks like less
 TRIED_DEG = (-8.0, 8.0, -16.0, 16.0)  # by which a field may be turned of which windows say nothing as it lies
-LEAST_WINDOWS, LEAST_SHARE = 4, 0.6  # that have to agree, and of those that say something
+LEAST_WINDOWS, LEAST_FRACTION = 4, 0.6  # that have to agree, and of those that say something
 TRIALS = 200
 
 
@@ -254,7 +254,7 @@ def _agreed(
         rng=0,
     )
     count = 0 if inliers is None else int(inliers.sum())
-    if model is None or count < max(LEAST_WINDOWS, LEAST_SHARE * len(pairs)):
+    if model is None or count < max(LEAST_WINDOWS, LEAST_FRACTION * len(pairs)):
         return 0, FieldShift()
     down, across = (model.translation + start).tolist()
     return count, FieldShift((float(down), float(across)), math.degrees(model.rotation))

@@ -17,9 +17,9 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import Sweep, shifted_position
 from pipeline.rectify.calibrate import calibrate, of_bands
-from pipeline.rectify.lookup import track_lookup
+from pipeline.rectify.geolocation import path_geolocation
 from pipeline.rectify.resample import resample
-from pipeline.rectify.tracks import Track, make_tracks
+from pipeline.rectify.scan_paths import ScanPath, make_scan_paths
 from pipeline.source import References, SweepLines
 
 Floats = NDArray[np.float64]
@@ -79,10 +79,10 @@ class PlacedImage:
         return shifted_position(self.broad.position[usable], self.shift_px[usable], self.camera)
 
     @cached_property
-    def tracks(self) -> tuple[tuple[Track, NDArray[np.float32]], ...]:
+    def scan_paths(self) -> tuple[tuple[ScanPath, NDArray[np.float32]], ...]:
         """Every track with its image, (knot, sample): lines that show one place are averaged."""
         broad, found = self.broad, []
-        for track in make_tracks(
+        for scan_path in make_scan_paths(
             broad.position,
             self.camera,
             usable=broad.usable,
@@ -90,34 +90,40 @@ class PlacedImage:
             binning=broad.sweep.binning,
             step_px=broad.sweep.step,
         ):
-            values: NDArray[np.float32] = broad.image[track.lines]
-            if len(track.starts) < len(track.lines):
-                count = np.diff(track.starts, append=len(track.lines))
-                values = (np.add.reduceat(values, track.starts, axis=0) / count[:, None]).astype(np.float32)
-            found.append((track, np.where(track.seen[:, None], values, np.float32(np.nan))))
+            values: NDArray[np.float32] = broad.image[scan_path.lines]
+            if len(scan_path.starts) < len(scan_path.lines):
+                count = np.diff(scan_path.starts, append=len(scan_path.lines))
+                values = (np.add.reduceat(values, scan_path.starts, axis=0) / count[:, None]).astype(np.float32)
+            found.append((scan_path, np.where(scan_path.seen[:, None], values, np.float32(np.nan))))
         return tuple(found)
 
     def seen_at(self, along_px: Floats, scan_px: Floats) -> NDArray[np.float32]:
         """Rectify a window, (scan, along) float32; NaN where nothing was seen."""
         seen = np.full(len(scan_px) * len(along_px), np.nan, np.float32)
-        for _, image, at in self._lookups(along_px, scan_px):
+        for _, image, at in self._geolocations(along_px, scan_px):
             values, _ = resample(image[..., None], np.isfinite(image), at)
             seen = np.where(np.isnan(seen), values[:, 0], seen)
         return seen.reshape(len(scan_px), len(along_px))
 
-    def _lookups(self, along_px: Floats, scan_px: Floats) -> Iterator[tuple[Track, NDArray[np.float32], Floats]]:
+    def _geolocations(
+        self, along_px: Floats, scan_px: Floats
+    ) -> Iterator[tuple[ScanPath, NDArray[np.float32], Floats]]:
         """Every track, its image, and the knot and sample at which it saw the places of a window, row by row."""
         sweep = self.broad.sweep
         scan, line = (values.ravel() for values in np.meshgrid(scan_px, along_px, indexing="ij"))
         points = np.stack([scan, line] if sweep.along == "x" else [line, scan], axis=-1)
-        for track, image in self.tracks:
-            yield track, image, track_lookup(track, self.camera, points, along=sweep.along, binning=sweep.binning)
+        for scan_path, image in self.scan_paths:
+            yield (
+                scan_path,
+                image,
+                path_geolocation(scan_path, self.camera, points, along=sweep.along, binning=sweep.binning),
+            )
 
     def line_and_turn(self, along_px: float, scan_px: float) -> tuple[float, Floats] | None:
         """The line that sees a place, and how the place moves with that line's centre, (2, 2); None off the sweep."""
-        for track, _, (at,) in self._lookups(np.array([along_px]), np.array([scan_px])):
+        for scan_path, _, (at,) in self._geolocations(np.array([along_px]), np.array([scan_px])):
             if np.isfinite(at).all():
-                line = int(track.lines[track.starts[int(np.clip(np.rint(at[0]), 0, len(track.scan) - 1))]])
+                line = int(scan_path.lines[scan_path.starts[int(np.clip(np.rint(at[0]), 0, len(scan_path.scan) - 1))]])
                 return float(line), self._turn(line, float(at[1]))
         return None
 
@@ -205,5 +211,5 @@ def broad_bands(references: References, bands: int = BROAD_BANDS) -> NDArray[np.
         good = good & ~references.bad
     known = np.flatnonzero(good.mean(axis=0) >= 0.9)
     if not len(known):
-        known = np.arange(len(references.panel))
+        known = np.arange(len(references.white_reference))
     return known[np.unique(np.linspace(0, len(known) - 1, max(bands, 1)).round().astype(np.intp))]

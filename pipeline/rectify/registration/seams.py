@@ -75,7 +75,7 @@ def register_sweeps(
     Neighbours are rectified where they should overlap, compared window by window (``window_px`` long), and one offset
     and drift per sweep is solved for from all windows. A second round rectifies again with these corrections and looks
     within 3 px: a line turns with its centre, and the first round cannot see by how much. No pixel is shifted twice:
-    the corrections go into ``place(shift_px=...)``, which makes the lookup again.
+    the corrections go into ``place(shift_px=...)``, which makes the geolocation grid again.
 
     ``prior_px`` is how far any sweep may look beside the position that it reports, in either axis; a pair may be apart
     by twice that. Overlaps need 64 px beyond.

@@ -17,7 +17,7 @@ from pipeline.rectify.kernels import kernel_taps
 Status = Literal["found", "undecidable", "flat", "empty"]
 Floats = NDArray[np.float64]
 
-LEAST_SHARE = 0.25  # of the largest common area; below it a chance likeness wins over the true shift
+LEAST_FRACTION = 0.25  # of the largest common area; below it a chance likeness wins over the true shift
 LEAST_SIDE_PX = 12  # of the pixels compared
 LOBE_PX = 3.0  # shifts nearer than this belong to one peak
 RIVALS = 4
@@ -33,7 +33,7 @@ SETTLED_PX = 1e-3
 REALIGN_PX, REALIGNMENTS = 0.75, 4  # a fit further off is made again from the next integer
 MOST_STEP_PX = 1.0
 SMOOTHING = np.array([1, 4, 6, 4, 1]) / 16
-SMOOTHED_NOISE = float(SMOOTHING @ SMOOTHING) ** 2  # share of white noise's variance that smoothing leaves
+SMOOTHED_NOISE = float(SMOOTHING @ SMOOTHING) ** 2  # fraction of white noise's variance that smoothing leaves
 BORDER_PX = 5  # pixels that smoothing (2), the step (1) and interpolation (2) take from every side
 SINGULAR = 1e-12
 LEAST_MISFIT = 1e-9
@@ -64,7 +64,7 @@ class _Fit:
 
     shift: Floats
     error: Floats
-    misfit: float  # share of the variance left unexplained
+    misfit: float  # fraction of the variance left unexplained
     likeness: float  # correlation of the two images' slopes in the direction that has the least in common
     pixels: int
 
@@ -185,7 +185,7 @@ def _correlate(first: Floats, second: Floats, reach: int) -> tuple[Floats, Float
     count = np.maximum(common, 1)
     sums = at_shifts(1, 0), at_shifts(0, 1)
     variance = at_shifts(2, 0) - sums[0] ** 2 / count, at_shifts(0, 2) - sums[1] ** 2 / count
-    usable = (common >= LEAST_SHARE * common.max()) & (common > 0)
+    usable = (common >= LEAST_FRACTION * common.max()) & (common > 0)
     usable &= np.minimum(*variance) > FLAT_SPREAD * count
     correlation = np.full(common.shape, -1.0)
     covariance = at_shifts(1, 1) - sums[0] * sums[1] / count

@@ -25,7 +25,7 @@ MOST_MISSING = 100_000  # lines between two parts; more means that the names are
 MOST_NUMBERS = 1 << 26  # of a line: a hundred times those of any such camera
 
 Read = Callable[[str], bytes]  # the content of a file by its name
-LEAST_LIT = 0.5  # share of the elements whose white is above their dark
+LEAST_LIT = 0.5  # fraction of the elements whose white is above their dark
 FRAMES_FOR_STUCK = 8  # fewer frames cannot tell an element that never changes from a quiet one
 FRAMES_FOR_JUMPS = 16  # fewer frames do not tell how much an element scatters by itself
 JUMP_SIGMAS = 12.0  # off its median over the frames: in noise that would be one value in 1e32
@@ -267,33 +267,35 @@ def mean_frame(lines: NDArray[np.integer]) -> MeanFrame:
     )
 
 
-def as_references(dark: MeanFrame, white: MeanFrame, *, panel: ArrayLike = 1.0) -> tuple[References, tuple[str, ...]]:
+def as_references(
+    dark: MeanFrame, white: MeanFrame, *, white_reference: ArrayLike = 1.0
+) -> tuple[References, tuple[str, ...]]:
     """Join dark and white into the references of a sweep, and say what was found.
 
     An element is bad where its dark frame is stuck, where either jumps amid its frames, or where
     :func:`pipeline.rectify.detector.find_bad_elements` says so.
 
-    ``panel`` is the value of the white panel, one or (band,). RigError where the frames are of two sizes, swapped,
+    ``white_reference`` is the value of the white reference, one or (band,). RigError where the frames are of two sizes, swapped,
     without light, do not show the same throughout, or too many elements would be bad.
     """
     if dark.mean.shape != white.mean.shape:
         raise RigError(f"dark is {dark.mean.shape} (sample, band), white {white.mean.shape}; take both anew")
-    values = np.asarray(panel, np.float32)
+    values = np.asarray(white_reference, np.float32)
     if values.shape not in ((), (dark.mean.shape[1],)):
         raise RigError(
             f"panel has shape {values.shape}, expected one value or one for each of {dark.mean.shape[1]} bands"
         )
     for name, frame in (("dark", dark), ("white", white)):
-        share = np.count_nonzero(frame.jumping) / frame.jumping.size
+        fraction = np.count_nonzero(frame.jumping) / frame.jumping.size
         if frame.odd_frames:
             first = ", ".join(map(str, frame.odd_frames[:5]))
             raise RigError(
                 f"{len(frame.odd_frames)} of {frame.frames} frames of the {name} reference show something else than "
                 f"the others ({first}); did the light change, or are bytes lost or added in it? Take both again"
             )
-        if share > max(MOST_JUMPING, 1 / frame.jumping.shape[0]):
+        if fraction > max(MOST_JUMPING, 1 / frame.jumping.shape[0]):
             raise RigError(
-                f"{100 * share:.1f} % of the elements jump amid the frames of the {name} reference, at most "
+                f"{100 * fraction:.1f} % of the elements jump amid the frames of the {name} reference, at most "
                 f"{100 * MOST_JUMPING:g} % can; did the light change, or are bytes lost or added in it? Take both again"
             )
     lit = np.count_nonzero(white.mean > dark.mean) / dark.mean.size

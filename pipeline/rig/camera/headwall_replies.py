@@ -68,7 +68,7 @@ class ReplyReader:
 
     def __init__(self) -> None:
         self._held = bytearray()
-        self._looked = 0  # bytes in which no prompt begins that ends a reply
+        self._searched = 0  # bytes in which no prompt begins that ends a reply
         self._passed = 0  # prompts among them
 
     @property
@@ -87,25 +87,25 @@ class ReplyReader:
         while (end := self._prompt_at()) >= 0:
             said += _parse(bytes(self._held[:end]))
             del self._held[: end + len(PROMPT)]
-            self._looked = self._passed = 0
+            self._searched = self._passed = 0
         if len(self._held) > LONGEST_REPLY:
             raise RigError(f"{len(self._held)} bytes came without a prompt 'hpi> '; is this the camera's control port?")
         return said
 
     def _prompt_at(self) -> int:
         """Where the first prompt is: at a line's start, or right behind a reply (a text in a reply may hold one)."""
-        while (at := self._held.find(PROMPT, self._looked)) >= 0:
+        while (at := self._held.find(PROMPT, self._searched)) >= 0:
             if at == 0 or self._held[at - 1] in b"\r\n":
                 return at
             if any(said.reply is not None for said in _parse(bytes(self._held[:at]))):
                 return at
-            self._looked, self._passed = at + 1, self._passed + 1
+            self._searched, self._passed = at + 1, self._passed + 1
             if self._passed > MOST_PROMPTS:
                 raise RigError(
                     f"{self._passed} prompts 'hpi> ' came within one reply, {self.held[:80]!r} and on; is this the "
                     "camera's control port?"
                 )
-        self._looked = max(len(self._held) - len(PROMPT) + 1, self._looked)
+        self._searched = max(len(self._held) - len(PROMPT) + 1, self._searched)
         return -1
 
 

@@ -24,7 +24,7 @@ from pipeline.rig.capture.line_positions import (
     CommandTimes,
     FrameTimes,
     LinePositions,
-    MirrorTrack,
+    MirrorScanPath,
     PlayedPath,
     lines_by_commands,
     lines_by_log,
@@ -56,7 +56,7 @@ def capture_prefix(sweep: Sweep, first: int = 0) -> str:
     SettingsError where the sweep's name holds what a folder's name must not, or is too long.
     """
     sizes = f"{sweep.lines}x{sweep.step}x{sweep.binning}"
-    place = f"{sweep.kind[0]}{sweep.along}{_written(sweep.strip_px)}_{_written(sweep.start_px)}"
+    place = f"{sweep.kind[0]}{sweep.along}{_written(sweep.swath_px)}_{_written(sweep.start_px)}"
     prefix = f"{sweep.name}_{place}_{sizes}_{first}"
     check_capture(0, 0, prefix)
     return prefix
@@ -195,7 +195,11 @@ class PlacedLines:
 
 
 def place_lines(
-    captured: CapturedLines, path: CapturePath, taken: CaptureRecord, camera: LineCamera, track: MirrorTrack | None
+    captured: CapturedLines,
+    path: CapturePath,
+    taken: CaptureRecord,
+    camera: LineCamera,
+    scan_path: MirrorScanPath | None,
 ) -> PlacedLines:
     """Give each line of the path its row of the capture, up to the last one that is there whole.
 
@@ -210,7 +214,7 @@ def place_lines(
     exposed = exposing(camera, path.sweep)
     frames = FrameTimes(number, captured.times.stamp_us[:held], exposed.exposure_ms, exposed.frame_ms)
     try:
-        tied = _tied(frames, path, taken, camera, track, total=len(captured.values))
+        tied = _tied(frames, path, taken, camera, scan_path, total=len(captured.values))
     except RigError as error:
         raise UntiedError(f"{taken.folder}: {error}") from error
     row = np.full(min(int(number.max()) + 1, path.lines), -1, np.int64)
@@ -224,7 +228,7 @@ def _tied(
     path: CapturePath,
     taken: CaptureRecord,
     camera: LineCamera,
-    track: MirrorTrack | None,
+    scan_path: MirrorScanPath | None,
     *,
     total: int,
 ) -> LinePositions:
@@ -242,13 +246,13 @@ def _tied(
                 f"{taken_in_all * path.sweep.step} was expected: edges were lost, or are not one a position (see "
                 f"pulses in [rig])"
             )
-        if track is not None and track.edge_s is not None and len(track.edge_s):
-            return lines_by_log(frames, camera, track, commands=commands)
+        if scan_path is not None and scan_path.edge_s is not None and len(scan_path.edge_s):
+            return lines_by_log(frames, camera, scan_path, commands=commands)
         sent = PlayedPath(path.middle.astype(np.float64), path.rate_hz)
         last = None if counted is None else int(frames.number.max())
         return lines_by_trigger(frames, camera, sent, index_at_end=last)
-    if track is not None and taken.log is not None and len(track.position) > 1:
-        return lines_by_log(frames, camera, track, commands=commands)
+    if scan_path is not None and taken.log is not None and len(scan_path.position) > 1:
+        return lines_by_log(frames, camera, scan_path, commands=commands)
     commands = CommandTimes(taken.run_s, taken.capture_s)
     played = PlayedPath(path.cells.astype(np.float64), path.rate_hz)  # by its own clock
     return lines_by_commands(frames, camera, played, commands)

@@ -27,7 +27,7 @@ from pipeline.json_lines import read_checked, with_check
 from pipeline.rig.camera.camera_files import Kept
 from pipeline.rig.capture import JOURNAL
 from pipeline.rig.capture.capture_paths import LEAD, CapturePath, CaptureRecord, LoggedPath, UntiedError, capture_prefix
-from pipeline.rig.capture.line_positions import LinePositions, MirrorTrack, line_edges
+from pipeline.rig.capture.line_positions import LinePositions, MirrorScanPath, line_edges
 from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.devices import Clock
 from pipeline.rig.drivers import CameraDriver, MirrorDriver
@@ -36,7 +36,7 @@ from pipeline.rig.mirror.pro_mode import Trigger
 from pipeline.source import AT_REST
 
 LOG = logging.getLogger(__name__)
-_TIES = ("method", "residual_us", "residual_px", "offset_s", "drift_ppm")
+_TIE_POINTS = ("method", "residual_us", "residual_px", "offset_s", "drift_ppm")
 SLACK_S = 5.0  # by which a capture may take longer than its frames
 WRITING_S = 120.0  # that a camera may go on writing what it has, once it was told to stop
 POLL_S = 0.05
@@ -55,7 +55,7 @@ class CaptureJournal:
         self._kept = kept
         self._taken: dict[str, CaptureRecord] = {}
         self._origins: dict[str, int] = {}  # stamp of line 0 [us], by the sweep's name
-        self._ties: dict[str, dict[str, Any]] = {}
+        self._tie_points: dict[str, dict[str, Any]] = {}
         self._ended: set[str] = set()  # folders
         self.references: dict[float | None, str] = {}  # folders by the exposure that sweeps have of their own
         self.damage: list[str] = []
@@ -82,8 +82,8 @@ class CaptureJournal:
 
     def tied(self, taken: CaptureRecord, how: LinePositions, notes: Sequence[str]) -> None:
         """Take down how a capture's lines were tied to the mirror, once."""
-        if taken.folder not in self._ties:
-            said = {name: getattr(how, name) for name in _TIES}
+        if taken.folder not in self._tie_points:
+            said = {name: getattr(how, name) for name in _TIE_POINTS}
             self._write({"what": "tied", "folder": taken.folder, **said, "notes": [*notes, *how.notes]})
 
     @property
@@ -91,7 +91,7 @@ class CaptureJournal:
         """Every capture in order: lines of which sweep, where on the camera, how they were tied, why none is left."""
         return [
             {"folder": one.folder, "sweep": one.sweep.name, "first": one.first, "stop": one.stop}
-            | self._ties.get(one.folder, {})
+            | self._tie_points.get(one.folder, {})
             | ({"spent": one.spent} if one.spent else {})
             for one in self._taken.values()
         ]
@@ -134,7 +134,7 @@ class CaptureJournal:
         match record["what"]:
             case "capture":
                 self._taken.pop(record["folder"], None)  # a camera that was emptied gives its folders' names again
-                self._ties.pop(record["folder"], None)
+                self._tie_points.pop(record["folder"], None)
                 self._ended.discard(record["folder"])
                 self._taken[record["folder"]] = CaptureRecord(
                     Sweep(**record["sweep"]),
@@ -153,7 +153,7 @@ class CaptureJournal:
             case "spent":
                 self._taken[record["folder"]] = replace(self._taken[record["folder"]], spent=record["why"])
             case "tied":
-                self._ties[record["folder"]] = {name: record[name] for name in (*_TIES, "notes")}
+                self._tie_points[record["folder"]] = {name: record[name] for name in (*_TIE_POINTS, "notes")}
             case "references":
                 self.references[record.get("exposure_ms")] = record["folder"]
             case "origin":
@@ -260,7 +260,7 @@ class CaptureRunner:
             return taken
         return self._journal.ended(replace(taken, index_at_end=self.devices.steering.index()))
 
-    def look_at_rest(self, prefix: str, exposure_ms: float | None = None) -> str:
+    def capture_at_rest(self, prefix: str, exposure_ms: float | None = None) -> str:
         """Take one frame with the mirror at 0; 0 (unless the settings say otherwise), and give its folder.
 
         ``exposure_ms`` is the camera's own where it is None.
@@ -276,7 +276,7 @@ class CaptureRunner:
             self.wait(CaptureRecord(at_rest, 0, 1, capture.folder, False, at, at))
         return capture.folder
 
-    def log_of(self, taken: CaptureRecord) -> MirrorTrack | None:
+    def log_of(self, taken: CaptureRecord) -> MirrorScanPath | None:
         """Read the mirror's log of a capture; None where there is none, UntiedError where it has changed."""
         if taken.log is None:
             return None
@@ -287,9 +287,9 @@ class CaptureRunner:
         position = np.frombuffer(files[0][: len(files[0]) // 8 * 8], _CELL).reshape(-1, 2).astype(np.float64)
         time_s = np.arange(len(position)) / taken.log.rate_hz
         if not taken.log.index_name:
-            return MirrorTrack(time_s, position)
+            return MirrorScanPath(time_s, position)
         index = np.frombuffer(files[1][: len(files[1]) // 4 * 4], _INDEX).astype(np.int64)
-        return MirrorTrack(time_s, position, line_edges(index, time_s[: len(index)], LEAD, taken.sweep.step))
+        return MirrorScanPath(time_s, position, line_edges(index, time_s[: len(index)], LEAD, taken.sweep.step))
 
     def _configure(self, camera: LineCamera) -> None:
         times_ms = camera.exposure_ms, camera.frame_ms

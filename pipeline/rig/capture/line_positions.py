@@ -254,7 +254,7 @@ _MIDDLE = {"start": 0.5, "middle": 0.0, "end": -0.5}  # exposures from the stamp
 
 
 @dataclass(frozen=True)
-class MirrorTrack:
+class MirrorScanPath:
     """Positions measured by the mirror's log, and the edges of frames that it saw, by the mirror's clock."""
 
     time_s: Floats  # (sample,) in order
@@ -323,7 +323,7 @@ def lines_by_trigger(
 
 
 def lines_by_log(
-    frames: FrameTimes, camera: LineCamera, track: MirrorTrack, *, commands: CommandTimes | None = None
+    frames: FrameTimes, camera: LineCamera, scan_path: MirrorScanPath, *, commands: CommandTimes | None = None
 ) -> LinePositions:
     """Take the logged position at mid exposure of each line, by the clocks' offset and drift.
 
@@ -332,37 +332,43 @@ def lines_by_log(
     far off its own edge counts by that edge. RigError without edges and command times, or where edges and stamps are of
     different events; ShapeError where the track's arrays do not fit each other.
     """
-    if track.time_s.ndim != 1 or not len(track.time_s) or track.position.shape != (len(track.time_s), 2):
+    if (
+        scan_path.time_s.ndim != 1
+        or not len(scan_path.time_s)
+        or scan_path.position.shape != (len(scan_path.time_s), 2)
+    ):
         raise ShapeError(
-            f"expected logged times (sample,) and positions (sample, 2), got {track.time_s.shape} and "
-            f"{track.position.shape}"
+            f"expected logged times (sample,) and positions (sample, 2), got {scan_path.time_s.shape} and "
+            f"{scan_path.position.shape}"
         )
     stamp, number, notes = mend_times(frames)
     first_s = None if commands is None else np.mean(commands.capture_s) - np.mean(commands.run_s)
-    if track.edge_s is None or not len(track.edge_s):
+    if scan_path.edge_s is None or not len(scan_path.edge_s):
         if first_s is None:
             raise RigError("the log holds no edges and there are no command times; nothing ties its clock to frames")
-        return _by_offset(frames, camera, track, stamp, float(first_s) + track.time_s[0], commands, notes)
-    log_s = (float(track.time_s[0]), float(track.time_s[-1]))
+        return _by_offset(frames, camera, scan_path, stamp, float(first_s) + scan_path.time_s[0], commands, notes)
+    log_s = (float(scan_path.time_s[0]), float(scan_path.time_s[-1]))
     near = None if first_s is None else float(first_s) + log_s[0]
-    edge = match_edges(stamp, number, track.edge_s, log_s=log_s, period_s=frames.period_ms * 1e-3, first_near_s=near)
+    edge = match_edges(
+        stamp, number, scan_path.edge_s, log_s=log_s, period_s=frames.period_ms * 1e-3, first_near_s=near
+    )
     tied = edge >= 0
     if not tied.any():
         raise RigError(
             f"none of {len(edge)} frames lies within half a period of one of the log's edges; see the trigger"
         )
-    fit = fit_clocks(stamp[tied], track.edge_s[edge[tied]])
+    fit = fit_clocks(stamp[tied], scan_path.edge_s[edge[tied]])
     began_s = fit.mirror_s(stamp)
-    own = np.where(tied, track.edge_s[edge], began_s)
-    step_s = float(np.median(np.diff(track.time_s))) if len(track.time_s) > 1 else 0.0
+    own = np.where(tied, scan_path.edge_s[edge], began_s)
+    step_s = float(np.median(np.diff(scan_path.time_s))) if len(scan_path.time_s) > 1 else 0.0
     limit_s = max(6 * fit.residual_us * 1e-6, 3 * step_s)
     odd = tied & (np.abs(own - began_s) > limit_s)
     began_s = np.where(odd, own, began_s)
     notes += [f"{np.count_nonzero(tied)} of {len(tied)} frames have an edge in the log"]
     notes += [f"{np.count_nonzero(odd)} frames are stamped off their edge, which counts"] if odd.any() else []
     notes += [f"a drift cannot be told from {np.count_nonzero(tied)} frame"] if np.count_nonzero(tied) == 1 else []
-    placed = _placed(frames, track, began_s, "start", notes)
-    px = _apart_px(track, camera, (began_s[tied & ~odd], own[tied & ~odd]))
+    placed = _placed(frames, scan_path, began_s, "start", notes)
+    px = _apart_px(scan_path, camera, (began_s[tied & ~odd], own[tied & ~odd]))
     return replace(placed, residual_us=fit.residual_us, residual_px=px, offset_s=fit.offset_s, drift_ppm=fit.drift_ppm)
 
 
@@ -386,8 +392,8 @@ def lines_by_commands(
     found = np.full((len(held), 2), np.nan)
     found[valid] = positions[held[valid]]
     unknown_s = _unknown_s(commands)
-    track = MirrorTrack((np.arange(len(positions)) + 0.5) / path.rate_hz, positions)
-    px = _apart_px(track, camera, (middle_s[valid], middle_s[valid] + unknown_s))
+    scan_path = MirrorScanPath((np.arange(len(positions)) + 0.5) / path.rate_hz, positions)
+    px = _apart_px(scan_path, camera, (middle_s[valid], middle_s[valid] + unknown_s))
     notes.append(f"software timing: a constant line offset of about {px:.2g} px stays")
     return LinePositions(
         found,
@@ -418,7 +424,7 @@ def line_edges(index: Ints, time_s: Floats, first: int, step: int) -> Floats:
 def _by_offset(
     frames: FrameTimes,
     camera: LineCamera,
-    track: MirrorTrack,
+    scan_path: MirrorScanPath,
     stamp: Ints,
     first_s: float,
     commands: CommandTimes | None,
@@ -429,10 +435,10 @@ def _by_offset(
     number = whole_numbers(frames.number)[0]
     began_s = first_s + max(int(number[0]), 0) * frames.period_ms * 1e-3 + (stamp - stamp[0]) * 1e-6
     unknown_s = _unknown_s(commands)
-    px = _apart_px(track, camera, (began_s, began_s + unknown_s))
+    px = _apart_px(scan_path, camera, (began_s, began_s + unknown_s))
     notes = [*notes, f"the log has no edges: software timing, a constant line offset of about {px:.2g} px stays"]
     return replace(
-        _placed(frames, track, began_s, frames.stamp_at, notes),
+        _placed(frames, scan_path, began_s, frames.stamp_at, notes),
         residual_us=unknown_s * 1e6,
         residual_px=px,
         offset_s=first_s,
@@ -440,27 +446,27 @@ def _by_offset(
 
 
 def _placed(
-    frames: FrameTimes, track: MirrorTrack, told_s: Floats, told_at: StampAt, notes: list[str]
+    frames: FrameTimes, scan_path: MirrorScanPath, told_s: Floats, told_at: StampAt, notes: list[str]
 ) -> LinePositions:
     """The log's positions at mid exposure of lines of which one moment is told by its clock."""
     middle_s = told_s + frames.exposure_ms * 1e-3 * _MIDDLE[told_at]
-    valid = (middle_s >= track.time_s[0]) & (middle_s <= track.time_s[-1])
+    valid = (middle_s >= scan_path.time_s[0]) & (middle_s <= scan_path.time_s[-1])
     if not valid.all():
         notes = [*notes, f"{np.count_nonzero(~valid)} of {len(valid)} lines lie outside of the log and are not valid"]
-    found = np.where(valid[:, None], _at(track, middle_s), np.nan)
+    found = np.where(valid[:, None], _at(scan_path, middle_s), np.nan)
     return LinePositions(found, np.where(valid, middle_s, np.nan), valid, "log", None, None, notes=tuple(notes))
 
 
-def _at(track: MirrorTrack, time_s: Floats) -> Floats:
+def _at(scan_path: MirrorScanPath, time_s: Floats) -> Floats:
     """Logged positions between samples, (time, 2)."""
-    return np.stack([np.interp(time_s, track.time_s, track.position[:, axis]) for axis in (0, 1)], axis=-1)
+    return np.stack([np.interp(time_s, scan_path.time_s, scan_path.position[:, axis]) for axis in (0, 1)], axis=-1)
 
 
-def _apart_px(track: MirrorTrack, camera: LineCamera, times: tuple[Floats, Floats]) -> float:
+def _apart_px(scan_path: MirrorScanPath, camera: LineCamera, times: tuple[Floats, Floats]) -> float:
     """Root mean square of how far the view moves between two times of each line. [px]"""
     if not len(times[0]):
         return 0.0
-    one, other = (direction_to_scene(position_to_direction(_at(track, time_s))) for time_s in times)
+    one, other = (direction_to_scene(position_to_direction(_at(scan_path, time_s))) for time_s in times)
     return float(np.sqrt(np.mean(np.sum((one - other) ** 2, axis=-1))) / camera.ifov_rad)
 
 

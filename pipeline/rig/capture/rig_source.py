@@ -223,13 +223,13 @@ class RigSource:
             with self.session() as runner:
                 known = self._known_references(runner, folders[exposure_ms]) if exposure_ms in folders else None
                 if not known:
-                    self._journal.refer(runner.look_at_rest(REFERENCES, exposure_ms), exposure_ms)
+                    self._journal.refer(runner.capture_at_rest(REFERENCES, exposure_ms), exposure_ms)
                     known = self._whole_references(runner, folders[exposure_ms])
                 self._whole[folders[exposure_ms]] = known
         whole, _ = self._whole[folders[exposure_ms]]
         bad = None if whole.bad is None or not whole.bad.any() else _sums(whole.bad, sweep.binning) > 0
         dark, white = (_sums(frame, sweep.binning) for frame in (whole.dark, whole.white))
-        return References(dark, white, whole.panel, bad, by_mirror=self.rig.white_at_rest)
+        return References(dark, white, whole.white_reference, bad, by_mirror=self.rig.white_at_rest)
 
     def _known_references(self, runner: CaptureRunner, folder: str) -> tuple[References, tuple[str, ...]] | None:
         """The frames of an earlier session; None where the camera has them no more: it was emptied, or is another."""
@@ -250,7 +250,7 @@ class RigSource:
                 f"{folder} on the camera holds no {' and no '.join(missing)} reference; take both with the camera's "
                 "own program, then run again"
             )
-        whole, notes = as_references(frames["dark"], frames["white"], panel=self.rig.panel)
+        whole, notes = as_references(frames["dark"], frames["white"], white_reference=self.rig.white_reference)
         self._check_size(whole.dark.shape, folder)
         return whole, notes
 

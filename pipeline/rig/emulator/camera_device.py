@@ -215,7 +215,7 @@ class CameraDevice:
     def files(self) -> dict[str, bytes]:
         """All files by their whole names, as they are now."""
         with self._lock:
-            self._look()
+            self._poll()
             return {f"{one.folder}/{name}": data for one in self.captures for name, data in one.files().items()}
 
     def folders(self) -> set[str]:
@@ -225,7 +225,7 @@ class CameraDevice:
             "/" + "/".join(name.split("/")[1:end]) for name in every for end in range(2, name.count("/") + 1)
         }
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         """Look at all frames that are over by now."""
         for capture in self.captures:
             while len(numbers := capture.pending(self.clock.now())):

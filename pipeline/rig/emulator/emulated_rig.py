@@ -247,7 +247,7 @@ class ServedRig(Closing):
         self.host, self.camera_port, self.file_port = self._server.host, self._server.port, self._server.file_port
         rig.camera.aside = True
         self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._look, name="emulated camera's eye", daemon=True)
+        self._thread = threading.Thread(target=self._poll, name="emulated camera's eye", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
@@ -257,12 +257,12 @@ class ServedRig(Closing):
         self._server.close()
         self._port.close()
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         """Look at frames as they are over."""
         try:
             while not self._ended.is_set():
                 self.rig.mirror.take_pulses()
-                if not self.rig.camera.look_on():
+                if not self.rig.camera.keep_looking():
                     SYSTEM_CLOCK.sleep(_NAP_S)
         except Exception:
             LOG.exception("the emulated camera failed")

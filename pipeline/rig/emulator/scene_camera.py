@@ -153,7 +153,7 @@ class SceneCamera(CameraDevice):
     kept
         So many finished captures keep their files, and references always; 0 is all.
 
-    With ``aside`` frames are looked at by calls of :meth:`look_on` alone, from a thread; until then it is capturing.
+    With ``aside`` frames are looked at by calls of :meth:`keep_looking` alone, from a thread; until then it is capturing.
     """
 
     def __init__(
@@ -192,7 +192,7 @@ class SceneCamera(CameraDevice):
             return True
         return self.aside and any(len(capture.pending(self.clock.now(), 1)) for capture in self.captures[-1:])
 
-    def look_on(self) -> bool:
+    def keep_looking(self) -> bool:
         """Look at some frames that are over; False where there are none. Others may speak to the camera meanwhile."""
         with self._lock:
             waiting = ((one, one.pending(self.clock.now(), _AT_ONCE)) for one in self.captures[-2:])
@@ -205,9 +205,9 @@ class SceneCamera(CameraDevice):
             capture.put(lines)
         return True
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         if not self.aside:
-            super()._look()
+            super()._poll()
 
     def _begun(self, folder: str, frames: int, cubes: int) -> EmulatedCapture:
         for capture in self.captures[: -self.kept or None] if self.kept else ():
@@ -228,8 +228,10 @@ class SceneCamera(CameraDevice):
         if told is None:
             number = ((middle_s - capture.began_s) / capture.period_s).astype(int).tolist()
             names = [f"{capture.folder}-{one}" for one in number]
-            looks = zip(names, positions, strict=True)
-            return np.concatenate([self.view.alone(name, place, times_ms, capture.began_s) for name, place in looks])
+            scan_passes = zip(names, positions, strict=True)
+            return np.concatenate(
+                [self.view.alone(name, place, times_ms, capture.began_s) for name, place in scan_passes]
+            )
         step = told.sweep.step  # positions during each exposure
         moments = (np.arange(step) + 0.5) * (capture.exposure_s / step)
         held = self.mirror.sent(middle_s[:, None] - capture.exposure_s / 2 + moments)

@@ -51,7 +51,7 @@ from pipeline.rig.mirror.pro_mode import (
 from pipeline.rig.transports import SerialTransport, Transport, Wire
 
 LOG = logging.getLogger(__name__)
-SAMPLED_EVERY = 10  # frames: the share that "sampled" reads back, besides the ends of both channels
+SAMPLED_EVERY = 10  # frames: the fraction that "sampled" reads back, besides the ends of both channels
 _KINDS = (">f4", ">f4", ">u4")  # of the cells in the log's slots
 Progress = Callable[[int, int], None]  # cells done, cells in all
 

@@ -25,7 +25,7 @@ from pipeline.rig.mirror.pro_mode import (
     ask_status,
     cell_int,
     encode,
-    error_words,
+    format_error,
     go_simple,
 )
 from pipeline.rig.transports import Kind, Receiver, Wire
@@ -210,7 +210,7 @@ class ProLink:
             except ShapeError:
                 size = len(found.payload)
                 raise RigError(f"{name}: {port} answered with an error of {size} bytes, expected 4") from None
-            words = f"the mirror controller on {port} refused {name}: {error_words(code)}"
+            words = f"the mirror controller on {port} refused {name}: {format_error(code)}"
             garbled = code in (ErrorCode.FRAME_INVALID, ErrorCode.CRC_WRONG)
             raise DeviceRefused(words, code, garbled=garbled)
         if found.command != sent.command:

@@ -72,7 +72,7 @@ class ErrorCode(IntEnum):
         return error
 
 
-def error_words(code: int) -> str:
+def format_error(code: int) -> str:
     """Say an error code of the device in words, with its number."""
     known = {error.value: error.words for error in ErrorCode}
     return f"{known.get(code, 'an error that this driver does not know')} (code {code:04X})"

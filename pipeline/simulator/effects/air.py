@@ -17,7 +17,7 @@ from pipeline.simulator.rig_model import Air, Rig
 Floats = NDArray[np.float64]
 PLANE = 2.91  # angle of arrival of a star's light [1]
 NEAR_POINTS = 3 / 8  # of it from a path's end: the mean of (z / d)^(5/3); r0 [2] is (8/3)^(3/5) times as wide
-RISK = 1e-3  # share of the surveys in which a line may stray further than the bound says
+RISK = 1e-3  # fraction of the surveys in which a line may stray further than the bound says
 _REST = math.sqrt(0.5)
 GUST_M = 3.0  # length of the waves that run over a canopy; assumed
 FARTHEST_M = 1e7  # infinity: nothing passes so much air
@@ -170,22 +170,22 @@ class Parallax(Displacement):
         if air.distance_m is None:
             return np.zeros_like(along_px), np.zeros_like(scan_px)
         row, size = (scan_px, block.shape[0]) if sweep.along == "x" else (along_px, block.shape[0])
-        share = air.lever_m * (closeness(air, row / max((size - 1) / 2, 0.5)) - 1 / air.distance_m)
-        return share * (along_px - sweep.strip_px), share * (scan_px - block.scan_px[:, None])
+        fraction = air.lever_m * (closeness(air, row / max((size - 1) / 2, 0.5)) - 1 / air.distance_m)
+        return fraction * (along_px - sweep.swath_px), fraction * (scan_px - block.scan_px[:, None])
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by the slope times the greatest displacement: at a line's ends, at the nearest or farthest surface."""
-        share = greatest_share(rig.air)
-        if share == 0 or not probe.sweeps:
+        fraction = greatest_fraction(rig.air)
+        if fraction == 0 or not probe.sweeps:
             return Bound(0.0, "all of the scene is at one distance")
         half = np.zeros(2)  # greatest way from a line's centre to its ends, slit and pixel included
         ends = np.array([-1.0, 1.0]) * rig.camera.samples / 2 * rig.camera.ifov_rad
         for sweep in probe.sweeps:
             centre = sweep.line_px()[:, None]
-            along, scan = points_of_scan(sweep.strip_px, rig.camera, centre, ends)
-            beside = np.abs(along - sweep.strip_px).max(initial=0.0), np.abs(scan - centre).max(initial=0.0)
+            along, scan = points_of_scan(sweep.swath_px, rig.camera, centre, ends)
+            beside = np.abs(along - sweep.swath_px).max(initial=0.0), np.abs(scan - centre).max(initial=0.0)
             half = np.maximum(half, beside)
-        most_along, most_scan = (share * half).tolist()
+        most_along, most_scan = (fraction * half).tolist()
         near, far = rig.distances_m or (0.0, 0.0)
         why = f"at the lines' ends {most_along:.2g} px between {near:g} and {far:g} m ({rig.air.relief})"
         return Bound(probe.moved(most_along, most_scan), why)
@@ -204,11 +204,11 @@ def closeness(air: Air, row: Floats) -> Floats:
         return np.full_like(row, 1 / air.distance_m)
     if air.relief == "step":
         return np.where(row < 0, far, near)
-    share = (np.clip(row, -1, 1) + 1) / 2
-    return far * (1 - share) + near * share
+    fraction = (np.clip(row, -1, 1) + 1) / 2
+    return far * (1 - fraction) + near * fraction
 
 
-def greatest_share(air: Air) -> float:
+def greatest_fraction(air: Air) -> float:
     """Greatest displacement per px of way from the line's centre."""
     if air.distance_m is None:
         return 0.0
@@ -237,7 +237,7 @@ def sample_distances(block: SweepBlock) -> Floats:
     if ends is None or ends[0] == ends[1]:
         return np.full((1, 1), FARTHEST_M if ends is None else ends[0])
     sweep = block.sweep
-    along, scan = points_of_scan(sweep.strip_px, block.rig.camera, block.scan_px[:, None], block.slopes)
+    along, scan = points_of_scan(sweep.swath_px, block.rig.camera, block.scan_px[:, None], block.slopes)
     row = scan if sweep.along == "x" else along
     inverse = closeness(block.rig.air, row / max((block.shape[0] - 1) / 2, 0.5))
     return 1 / np.clip(inverse, 1 / ends[1], 1 / ends[0])

@@ -27,20 +27,20 @@ _POINT_NS = 0.85  # of each point that stands for a disc
 
 
 def blurred_bound(
-    probe: Probe, cause: str, variance: Floats, share: Floats = _ALONE, mean_way: float = GAUSSIAN_WAY
+    probe: Probe, cause: str, variance: Floats, fraction: Floats = _ALONE, mean_way: float = GAUSSIAN_WAY
 ) -> Bound:
     """Bound what a sum of Gaussians changes, of (kernel, 2, band) variance [px^2] and shares (kernel,).
 
     ``mean_way``: what light is moved along an axis on average, over the standard deviation. ``cause`` says where the
     blur comes from; the sentence names the band that changes most.
     """
-    parts = zip(share, variance, strict=True)
+    parts = zip(fraction, variance, strict=True)
     change = sum((part * probe.change_blurred(one, mean_way) for part, one in parts), np.zeros(1))
     value = float(change.max(initial=0.0))
     if not variance.any():
         return Bound(value, f"{cause}: none")
     band = int(np.argmax(change))
-    nearest = np.sqrt(variance[int(np.argmax(share)), :, band])
+    nearest = np.sqrt(variance[int(np.argmax(fraction)), :, band])
     nm, detail = probe.wavelength_nm[band], probe.curvature[:, band].max()
     return Bound(
         value,
@@ -75,10 +75,10 @@ class Diffraction(Blur):
 
         Each changes the image by no more than its variance does.
         """
-        share, size = airy_gaussians()
+        fraction, size = airy_gaussians()
         found = [_waves(rig, probe.wavelength_nm, normal) for normal in normals_met(probe.sweeps, rig.camera)]
         missing = [[(one * waves) ** 2 for one in size] for waves in found]
-        return blurred_bound(probe, "diffraction", np.max(missing, axis=0), share)
+        return blurred_bound(probe, "diffraction", np.max(missing, axis=0), fraction)
 
 
 @cache  # not at import: SciPy takes its time
@@ -91,9 +91,9 @@ def airy_gaussians() -> tuple[Floats, Floats]:
     weight = 1 / (1 + (u / 0.5) ** 4)
     passed = np.exp(-2 * (np.pi * np.outer(u, size)) ** 2)
     system = np.concatenate([passed * weight[:, None], np.full((1, len(size)), 1e3)])
-    share = scipy.optimize.nnls(system, np.append(pupil_contrast(u) * weight, 1e3))[0]
-    held = share > 0
-    return share[held] / share.sum(), size[held]
+    fraction = scipy.optimize.nnls(system, np.append(pupil_contrast(u) * weight, 1e3))[0]
+    held = fraction > 0
+    return fraction[held] / fraction.sum(), size[held]
 
 
 def _waves(rig: Rig, wavelength_nm: Floats, normal: Floats | None) -> Floats:
@@ -195,8 +195,8 @@ class Keystone(Blur):
 
 def keystone_shift(rig: Rig, wavelength_nm: Floats) -> Floats:
     """Give how far along the line each band sees beside the mirror model's place, (band,) from -k/2 to k/2. [px]"""
-    share = (np.asarray(wavelength_nm, np.float64) - FIRST_NM) / (LAST_NM - FIRST_NM)
-    return rig.optics.keystone_px * (np.clip(share, 0.0, 1.0) - 0.5)
+    fraction = (np.asarray(wavelength_nm, np.float64) - FIRST_NM) / (LAST_NM - FIRST_NM)
+    return rig.optics.keystone_px * (np.clip(fraction, 0.0, 1.0) - 0.5)
 
 
 DIFFRACTION, ABERRATION, DEFOCUS, KEYSTONE = Diffraction(), Aberration(), Defocus(), Keystone()

@@ -19,7 +19,7 @@ from pipeline.simulator.effects.noise import (
     SERIES_FROM_E,
     chip_variation,
     least_expected,
-    told_apart,
+    separable,
 )
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Rig
@@ -30,7 +30,7 @@ DIM_NS = 80.0  # of an exact count below `SERIES_FROM_E`, in lines of any light
 REFERENCE_DEG_C = 25.0
 ZERO_DEG_C_K = 273.15
 BOLTZMANN_EV_PER_K = 8.617333e-5
-Light = NDArray[np.float32]
+Radiance = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 
@@ -51,7 +51,7 @@ class DarkCurrent(Effect):
         if electrons == 0:
             return Bound(0.0, "the sensor has none")
         sd = float(np.hypot(rig.camera.read_noise_e, np.sqrt(max(probe.darkest_e, 0.0))))
-        spread = told_apart(float(np.hypot(sd, np.sqrt(electrons))), sd)
+        spread = separable(float(np.hypot(sd, np.sqrt(electrons))), sd)
         if probe.unit == "dn":
             summed = float(np.sqrt(probe.binning))  # the spread of a sum over that of a sample
             spread *= summed * float(np.hypot(sd, np.sqrt(electrons))) / rig.camera.electrons_per_dn
@@ -102,7 +102,7 @@ class Defects(Effect):
             return Bound(0.0, "no element is dead or hot")
         lost = probe.scaled(dead.any(axis=0).astype(np.float64))
         electrons = float(hot.max())
-        gained = min(electrons, rig.camera.full_well_e)  # the converter's end
+        gained = min(electrons, rig.camera.full_full_well_e)  # the converter's end
         why = f"{dead.sum()} dead and {(hot > 0).sum()} hot elements of {dead.size}, these with {electrons:.3g} e- more"
         added = probe.added(gained, rig.camera.electrons_per_dn) if gained else 0.0
         return Bound(max(lost, added), why)
@@ -110,27 +110,27 @@ class Defects(Effect):
 
 def dead_elements(rig: Rig, bands: int) -> Mask:
     """Give the elements without response, (sample, band) of the whole camera."""
-    return _mask(rig.detector.unit, "dead", rig.camera.samples, bands, share=rig.detector.dead_share)
+    return _mask(rig.detector.unit, "dead", rig.camera.samples, bands, fraction=rig.detector.dead_fraction)
 
 
-def hot_electrons(rig: Rig, bands: int) -> Light:
+def hot_electrons(rig: Rig, bands: int) -> Radiance:
     """Give what hot elements add in one exposure, (sample, band) of the whole camera. [e-]"""
     detector = rig.detector
-    mask = _mask(detector.unit, "hot", rig.camera.samples, bands, share=detector.hot_share)
+    mask = _mask(detector.unit, "hot", rig.camera.samples, bands, fraction=detector.hot_fraction)
     return mask * np.float32(most_hot_electrons(rig))
 
 
 def most_hot_electrons(rig: Rig) -> float:
     """Give what a hot element adds in one exposure; 0 where the sensor has none, or is ideal. [e-]"""
     detector = rig.detector
-    if detector.noiseless or not detector.hot_share:
+    if detector.noiseless or not detector.hot_fraction:
         return 0.0
     return detector.hot_e_per_s * rig.camera.exposure_ms * 1e-3 * warmth(detector.temperature_deg_c)
 
 
 @lru_cache(maxsize=8)
-def _mask(unit: int, kind: str, samples: int, bands: int, *, share: float) -> Mask:
-    below = unit_stream(unit, kind).random((bands, samples)) < share
+def _mask(unit: int, kind: str, samples: int, bands: int, *, fraction: float) -> Mask:
+    below = unit_stream(unit, kind).random((bands, samples)) < fraction
     mask: Mask = np.ascontiguousarray(below.T)
     mask.setflags(write=False)
     return mask
@@ -148,7 +148,7 @@ class Saturation(Effect):
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it by how far the brightest sample, 6 deviations up, reaches above the lower of both limits."""
-        limit = min(rig.camera.full_well_e, rig.detector.well_e)
+        limit = min(rig.camera.full_full_well_e, rig.detector.full_well_e)
         camera, brightest = rig.camera, max(probe.brightest_e, 0.0)
         expected = brightest + dark_electrons(rig) + most_hot_electrons(rig)
         sd = 0.0 if rig.detector.noiseless else float(np.hypot(np.sqrt(expected), camera.read_noise_e))
@@ -157,7 +157,9 @@ class Saturation(Effect):
             return Bound(0.0, f"{expected:.3g} e- and 6 x {sd:.3g} e- of noise stay below {limit:.3g} e-")
         why = f"{expected:.3g} e- and 6 x {sd:.3g} e- of noise reach {over:.3g} e- above the limit of {limit:.3g} e-"
         unit_dn = probe.unit_least_dn
-        if probe.unit == "sigma" and sd > 0 and not rig.detector.hot_share:  # what is lost, is lost where it is bright
+        if (
+            probe.unit == "sigma" and sd > 0 and not rig.detector.hot_fraction
+        ):  # what is lost, is lost where it is bright
             of_sample = float(np.hypot(np.sqrt(brightest), camera.read_noise_e)) / camera.electrons_per_dn
             unit_dn = of_sample / np.sqrt(probe.binning)
         return Bound(over / camera.electrons_per_dn / unit_dn, why)
@@ -167,7 +169,7 @@ def well_reached(rig: Rig, read_noise_e: float) -> bool:
     """Whether a well overflows before the converter ends, 8 deviations of the read noise counted in."""
     camera = rig.camera
     end_e = (camera.full_scale_dn + 1 - camera.dark_dn) * camera.electrons_per_dn
-    return rig.detector.well_e < end_e + 8 * read_noise_e
+    return rig.detector.full_well_e < end_e + 8 * read_noise_e
 
 
 @dataclass(frozen=True)
@@ -175,7 +177,7 @@ class Shot(Effect):
     """Poisson counts. ``gaussian`` has their first three cumulants, and takes the read noise into the same draw.
 
     It is exact where so few electrons are expected that a patch could be told from exact ones. Noise counts as
-    `told_apart`.
+    `separable`.
     """
 
     name = "shot"
@@ -196,7 +198,7 @@ class Shot(Effect):
         return {EXACT: counted, GAUSSIAN: self.cost_ns[GAUSSIAN] + dim * counted}
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound it at the brightest sample, where it is the greatest share of all noise."""
+        """Bound it at the brightest sample, where it is the greatest fraction of all noise."""
         brightest = max(probe.brightest_e, 0.0) + dark_electrons(rig) + most_hot_electrons(rig)
         if rig.detector.noiseless:
             return Bound(0.0, "the sensor is ideal")
@@ -215,7 +217,7 @@ class Shot(Effect):
             )
             return Bound(in_unit(apart, total, probe, rig), why)
         why = f"{total:.3g} e- of noise at {brightest:.3g} e-, {read:.3g} e- without"
-        return Bound(in_unit(told_apart(total, read), total, probe, rig), why)
+        return Bound(in_unit(separable(total, read), total, probe, rig), why)
 
 
 def in_unit(deviations: float, sd_e: float, probe: Probe, rig: Rig) -> float:
@@ -229,7 +231,7 @@ def in_unit(deviations: float, sd_e: float, probe: Probe, rig: Rig) -> float:
 class ReadNoise(Effect):
     """Normal, with the camera's standard deviation. In one draw with the shot noise where that is not exact.
 
-    Noise counts twice the total variation between the distributions of a sample with and without: see `told_apart`.
+    Noise counts twice the total variation between the distributions of a sample with and without: see `separable`.
     """
 
     name = "read-noise"
@@ -242,7 +244,7 @@ class ReadNoise(Effect):
         return Merged(SHOT.name, GAUSSIAN, 0.0)
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound it at the darkest sample, where it is the greatest share of all noise."""
+        """Bound it at the darkest sample, where it is the greatest fraction of all noise."""
         read = rig.camera.read_noise_e
         if rig.detector.noiseless:
             return Bound(0.0, "the sensor is ideal")
@@ -251,7 +253,7 @@ class ReadNoise(Effect):
         shot = float(np.sqrt(max(probe.darkest_e, 0.0)))
         total = float(np.hypot(shot, read))
         why = f"{read:.3g} e- beside at least {shot:.3g} e- of shot noise make {total:.3g} e-"
-        return Bound(in_unit(told_apart(total, shot), total, probe, rig), why)
+        return Bound(in_unit(separable(total, shot), total, probe, rig), why)
 
 
 @dataclass(frozen=True)

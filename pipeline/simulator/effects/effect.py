@@ -23,7 +23,7 @@ from pipeline.simulator.optics.kernel_fit import Moments
 from pipeline.simulator.rig_model import Rig
 
 Floats = NDArray[np.float64]
-Light = NDArray[np.float32]
+Radiance = NDArray[np.float32]
 OFF = "off"
 
 
@@ -98,14 +98,14 @@ class Blur(Effect, Protocol):
 class Gain(Effect, Protocol):
     """Light is multiplied."""
 
-    def gain(self, block: SweepBlock, variant: str) -> Light:
+    def gain(self, block: SweepBlock, variant: str) -> Radiance:
         """Give the factor, an array that broadcasts to (line, sample, band)."""
 
 
 class LightChange(Effect, Protocol):
     """Light is changed in another linear way: spectra mixed, light added."""
 
-    def change(self, light: Light, block: SweepBlock, variant: str) -> Light:
+    def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
         """Give the changed light of a block, (line, sample, band) [e-]; may work in place."""
 
 
@@ -124,7 +124,7 @@ class SweepBlock:
     seed: int = 0
     started_s: float = 0.0
     fwhm_nm: Floats | None = None  # (band,) of the scene's own bands; None where not known
-    white_e: Floats | None = None  # (band,) electrons of the white panel in one exposure; None where not known
+    white_e: Floats | None = None  # (band,) electrons of the white reference in one exposure; None where not known
 
     @property
     def numbers(self) -> NDArray[np.int64]:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulator.effects.air import has_relief, reach_m, sample_distances, spoken_reach
-from pipeline.simulator.effects.effect import OFF, Bound, Gain, Light, LightChange, SweepBlock
+from pipeline.simulator.effects.effect import OFF, Bound, Gain, LightChange, Radiance, SweepBlock
 from pipeline.simulator.effects.lighting import BRDF, CLOUD, DRIFT
 from pipeline.simulator.effects.probe import GainRange, Probe, lights_within, unit_electrons
 from pipeline.simulator.rig_model import Air, Rig
@@ -38,7 +38,7 @@ OXYGEN = np.array([
     (667.6, 0.0), (690.0, 0.15), (710.0, 0.0), (757.5, 0.0), (762.5, 4.0), (767.5, 0.35), (780.0, 0.0),
 ])  # fmt: skip
 AIR_MASS_M = 8434.0  # air at the ground that holds as much as the whole atmosphere above it: standard, 15 deg C
-_LOOKS = 9  # distances at which the spectrum's course is taken for the bounds of others: it is smooth
+_PROBES = 9  # distances at which the spectrum's course is taken for the bounds of others: it is smooth
 _KNOTS = 65  # distances, evenly in the logarithm, between which the transmission is taken as straight in it
 _QUADRATURE = np.linspace(-2.0, 2.0, 33)  # over a band, in standard deviations of its Gaussian
 KOSCHMIEDER = 3.912  # -ln 0.02 [1]
@@ -49,7 +49,7 @@ KRUSE = 0.585  # of the root of 1 km [3]
 
 @dataclass(frozen=True)
 class Absorption(Gain):
-    """Share of the light that gases leave over a distance, averaged over the width of a band.
+    """Fraction of the light that gases leave over a distance, averaged over the width of a band.
 
     Water vapour about 720, 820 and 940 nm, oxygen at 690 and 760 nm: the band model of [2] for whole atmospheres, taken
     to paths of metres (assumed). ``range`` takes each sample's own distance, ``uniform`` the middle.
@@ -62,28 +62,30 @@ class Absorption(Gain):
         return self.cost_ns if has_relief(rig) else dict.fromkeys(self.variants, self.cost_ns[UNIFORM])
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound by level times the share that gases take, or that a variant misses."""
+        """Bound by level times the fraction that gases take, or that a variant misses."""
         reach = reach_m(rig)
         if reach is None:
             return Bound(0.0, "the scene has no distance")
         if variant == UNIFORM and reach[0] == reach[1]:
             return Bound(0.0, "every sample at its own distance")
         near, middle, far = transmission(np.array([reach[0], sum(reach) / 2, reach[1]]), rig, probe.wavelength_nm)
-        share = 1 - far if variant == OFF else np.maximum(near - middle, middle - far)
+        fraction = 1 - far if variant == OFF else np.maximum(near - middle, middle - far)
         verb = "take" if variant == OFF else "at one distance for all are wrong by"
-        where = f" at {probe.wavelength_nm[int(share.argmax())]:.0f} nm" if share.size else ""
-        why = f"oxygen and water vapour {verb} at most {share.max(initial=0.0):.2%}{where} over {spoken_reach(reach)}"
-        return Bound(probe.scaled(share), why)
+        where = f" at {probe.wavelength_nm[int(fraction.argmax())]:.0f} nm" if fraction.size else ""
+        why = (
+            f"oxygen and water vapour {verb} at most {fraction.max(initial=0.0):.2%}{where} over {spoken_reach(reach)}"
+        )
+        return Bound(probe.scaled(fraction), why)
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
         reach, nm = reach_m(rig), np.asarray(probe.wavelength_nm, np.float64)
         if reach is None:
             return GainRange.between(1.0, 1.0, len(nm))
-        passed = transmission(np.geomspace(*reach, _LOOKS), rig, nm)
+        passed = transmission(np.geomspace(*reach, _PROBES), rig, nm)
         return GainRange.of(passed, nm, uneven=float(passed.max(initial=0.0) - passed.min(initial=1.0)))
 
-    def gain(self, block: SweepBlock, variant: str) -> Light:
-        """Give the share that passes, (line, sample, band), or (1, 1, band) where one distance stands for all.
+    def gain(self, block: SweepBlock, variant: str) -> Radiance:
+        """Give the fraction that passes, (line, sample, band), or (1, 1, band) where one distance stands for all.
 
         Every sample's is read off a table over the logarithm of the distance, by straight lines.
         """
@@ -96,13 +98,13 @@ class Absorption(Gain):
         table = transmission(knots, rig, block.wavelength_nm).astype(np.float32)
         place = np.log(sample_distances(block) / reach[0]) / np.log(reach[1] / reach[0]) * (_KNOTS - 1)
         low = np.clip(place.astype(np.int64), 0, _KNOTS - 2)
-        gain: Light = table[low]
+        gain: Radiance = table[low]
         gain += (place - low)[..., None].astype(np.float32) * np.diff(table, axis=0)[low]
         return gain
 
 
 def transmission(metres: Floats, rig: Rig, wavelength_nm: Floats) -> Floats:
-    """Give the share of light that passes so much air near the ground, (distance, band).
+    """Give the fraction of light that passes so much air near the ground, (distance, band).
 
     The bands are Gaussians of ``optics.fwhm_nm``, cut at 2 standard deviations.
     """
@@ -122,8 +124,8 @@ def transmission(metres: Floats, rig: Rig, wavelength_nm: Floats) -> Floats:
 class PathRadiance(LightChange):
     """Light L at a distance d arrives as L exp(-beta d) + H (1 - exp(-beta d)), beta of ``extinction_per_m``.
 
-    H, the light of endless air, is ``air.airlight_share`` of the white panel's and follows the daylight; none is added
-    where the panel's light is not known. ``range`` takes each sample's own distance, ``uniform`` the middle.
+    H, the light of endless air, is ``air.airlight_fraction`` of the white reference's and follows the daylight; none is added
+    where the white reference's light is not known. ``range`` takes each sample's own distance, ``uniform`` the middle.
     """
 
     name = "path-radiance"
@@ -133,7 +135,7 @@ class PathRadiance(LightChange):
         return self.cost_ns if has_relief(rig) else dict.fromkeys(self.variants, self.cost_ns[UNIFORM])
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound by the share that is lost, or that a variant misses, times the greatest difference of signal and H.
+        """Bound by the fraction that is lost, or that a variant misses, times the greatest difference of signal and H.
 
         Over the noise of the signal that difference is greatest where the signal is greatest, or least.
         """
@@ -155,17 +157,17 @@ class PathRadiance(LightChange):
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
         """Give what passes between the nearest and the farthest sample, and the greatest light that air adds. [e-]
 
-        Added light is the airlight's share of the white panel's, where that is known, times what the daylight grows by.
+        Added light is the airlight's fraction of the white reference's, where that is known, times what the daylight grows by.
         """
         reach, nm = reach_m(rig), np.asarray(probe.wavelength_nm, np.float64)
         if reach is None:
             return GainRange.between(1.0, 1.0, len(nm))
-        passed = np.exp(-np.geomspace(*reach, _LOOKS)[:, None] * extinction_per_m(rig.air, nm))
+        passed = np.exp(-np.geomspace(*reach, _PROBES)[:, None] * extinction_per_m(rig.air, nm))
         uneven = float(passed.max(initial=0.0) - passed.min(initial=1.0))
         if probe.white_e is None:
             return GainRange.of(passed, nm, uneven=uneven)
         sun = DRIFT.gain_range(probe, rig)
-        still = rig.air.airlight_share * probe.white_e * (1 - passed)
+        still = rig.air.airlight_fraction * probe.white_e * (1 - passed)
         alone = GainRange.of(passed, nm, uneven=uneven, added_e=still)
         most = sun.greatest.max(initial=1.0)
         return replace(
@@ -175,7 +177,7 @@ class PathRadiance(LightChange):
             added_bend=alone.added_bend * most + 2 * alone.added_steepest * sun.steepest + alone.added_e * sun.bend,
         )
 
-    def change(self, light: Light, block: SweepBlock, variant: str) -> Light:
+    def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
         """Give light (line, sample, band) [e-] with what air takes of it and adds; changed in place."""
         reach = reach_m(block.rig)
         if reach is None:
@@ -185,7 +187,7 @@ class PathRadiance(LightChange):
         lost = -np.expm1(-depth)
         light *= 1 - lost
         if block.white_e is not None:
-            sky, still = block.rig.sky, block.rig.air.airlight_share * np.asarray(block.white_e, np.float64)
+            sky, still = block.rig.sky, block.rig.air.airlight_fraction * np.asarray(block.white_e, np.float64)
             if sky.started is not None:
                 still = still * relative_daylight(sky, block.wavelength_nm, block.time_s)
             horizon = np.atleast_2d(still)[:, None].astype(np.float32)  # of endless air, (line or 1, 1, band)
@@ -220,19 +222,21 @@ def _contrast(probe: Probe, rig: Rig) -> Floats:
     """
     if probe.white_e is None:
         return probe.level
-    horizon, (low, high) = rig.air.airlight_share * probe.white_e, lights_within(probe, rig)
+    horizon, (low, high) = rig.air.airlight_fraction * probe.white_e, lights_within(probe, rig)
     cloud, view = CLOUD.gain_range(probe, rig), BRDF.gain_range(probe, rig)
     lit, shaded = np.maximum(cloud.greatest * view.greatest, 1.0), cloud.least * view.least
     brightest = lit * high
-    share = np.divide(horizon, brightest, out=np.ones_like(brightest), where=brightest > horizon)  # a band may be black
-    above = probe.level * np.clip(1 - share, 0.0, 1.0)
+    fraction = np.divide(
+        horizon, brightest, out=np.ones_like(brightest), where=brightest > horizon
+    )  # a band may be black
+    above = probe.level * np.clip(1 - fraction, 0.0, 1.0)
     sun = DRIFT.gain_range(probe, rig)
     below = np.maximum(horizon - shaded * low, 0.0) * np.maximum(sun.greatest, 1.0)
     return np.asarray(np.maximum(above, below / unit_electrons(shaded * np.minimum(sun.least, 1.0) * low, probe, rig)))
 
 
 def _between(near: Floats, far: Floats) -> Floats:
-    """Share of the light lost between two optical depths, exp(-near) - exp(-far), however near they lie."""
+    """Fraction of the light lost between two optical depths, exp(-near) - exp(-far), however near they lie."""
     return -np.exp(-near) * np.expm1(near - far)
 
 

@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, points_of_scan
-from pipeline.simulator.effects.effect import Bound, Gain, Light, SweepBlock, sweep_stream
+from pipeline.simulator.effects.effect import Bound, Gain, Radiance, SweepBlock, sweep_stream
 from pipeline.simulator.effects.probe import GainRange, Probe
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.daylight import knots_within, relative_daylight, sun_elevation_deg
 
 Floats = NDArray[np.float64]
 _KNOTS_AT_ONCE = 512
-EDGE_SHARE = 0.1  # width of a shadow's edge, over the shadow's size (assumed)
+EDGE_FRACTION = 0.1  # width of a shadow's edge, over the shadow's size (assumed)
 HOT_SPOT_RAD = float(np.deg2rad(2.0))  # from its peak to 1/e (assumed)
-_LOOKS = 65  # lines of a sweep, and samples of a line, at which angles are taken for the bound
+_PROBES = 65  # lines of a sweep, and samples of a line, at which angles are taken for the bound
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Drift(Gain):
         light = relative_daylight(rig.sky, nm, times)
         return GainRange.of(light, nm, uneven=float(np.ptp(light, axis=1).max(initial=0.0)))
 
-    def gain(self, block: SweepBlock, variant: str) -> Light:
+    def gain(self, block: SweepBlock, variant: str) -> Radiance:
         sky = block.rig.sky
         if sky.started is None:
             return np.ones((1, 1, 1), np.float32)
@@ -74,36 +74,38 @@ def _spoken(seconds: float) -> str:
 class Cloud(Gain):
     """Straight bands of shadow, as wide as the gaps between them, that drift over the scene at a constant speed.
 
-    Direction and place follow from the seed alone: all sweeps lie under the same clouds. All bands lose the same share.
+    Direction and place follow from the seed alone: all sweeps lie under the same clouds. All bands lose the same fraction.
     """
 
     name = "cloud"
     cost_ns = MappingProxyType({"shadow": 0.3})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound by level times the share that a cloud takes; whether a shadow comes is up to the seed."""
+        """Bound by level times the fraction that a cloud takes; whether a shadow comes is up to the seed."""
         sky = rig.sky
-        if sky.cloud_share == 0:
+        if sky.cloud_fraction == 0:
             return Bound(0.0, "the sky is clear")
-        why = f"a shadow takes {sky.cloud_share:.0%} of the light and moves {sky.cloud_px_per_s:g} px/s over the scene"
-        return Bound(probe.scaled(sky.cloud_share), why)
+        why = (
+            f"a shadow takes {sky.cloud_fraction:.0%} of the light and moves {sky.cloud_px_per_s:g} px/s over the scene"
+        )
+        return Bound(probe.scaled(sky.cloud_fraction), why)
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
-        share = rig.sky.cloud_share
-        return GainRange.between(1 - share, 1.0, len(probe.wavelength_nm), uneven=share)
+        fraction = rig.sky.cloud_fraction
+        return GainRange.between(1 - fraction, 1.0, len(probe.wavelength_nm), uneven=fraction)
 
-    def gain(self, block: SweepBlock, variant: str) -> Light:
+    def gain(self, block: SweepBlock, variant: str) -> Radiance:
         """Give 1 less what the shadow takes at each sample's place and time, (line, sample, 1); (1, 1, 1) if clear."""
         sky = block.rig.sky
-        if sky.cloud_share == 0:
+        if sky.cloud_fraction == 0:
             return np.ones((1, 1, 1), np.float32)
         sweep = block.sweep
-        along, scan = points_of_scan(sweep.strip_px, block.rig.camera, block.scan_px[:, None], block.slopes)
+        along, scan = points_of_scan(sweep.swath_px, block.rig.camera, block.scan_px[:, None], block.slopes)
         x, y = (along, scan) if sweep.along == "x" else (scan, along)
         turn, place = sweep_stream(block.seed, "", self.name).random(2)  # no sweep's name: the whole survey's
         heading, place = 2 * math.pi * float(turn), 2 * sky.cloud_size_px * float(place)
         way = x * math.cos(heading) + y * math.sin(heading) - sky.cloud_px_per_s * block.time_s[:, None] + place
-        return (1 - sky.cloud_share * shadow(way, sky.cloud_size_px))[..., None].astype(np.float32)
+        return (1 - sky.cloud_fraction * shadow(way, sky.cloud_size_px))[..., None].astype(np.float32)
 
 
 def shadow(way_px: Floats, size_px: float) -> Floats:
@@ -112,7 +114,7 @@ def shadow(way_px: Floats, size_px: float) -> Floats:
     It is 1 about every even multiple of the size, 0 about the odd ones, 1/2 in the middle of an edge.
     """
     from_middle = np.abs((way_px + size_px) % (2 * size_px) - size_px)
-    t = np.clip((size_px / 2 - from_middle) / (EDGE_SHARE * size_px) + 0.5, 0.0, 1.0)
+    t = np.clip((size_px / 2 - from_middle) / (EDGE_FRACTION * size_px) + 0.5, 0.0, 1.0)
     return t * t * (3 - 2 * t)
 
 
@@ -134,10 +136,10 @@ class Brdf(Gain):
         if slope == 0 and hot == 0:
             return Bound(0.0, "the scene reflects alike in all directions")
         angle, phase = _extremes(probe.sweeps, rig.camera)
-        share = slope * angle + hot * float(np.exp(-phase / HOT_SPOT_RAD))
+        fraction = slope * angle + hot * float(np.exp(-phase / HOT_SPOT_RAD))
         peak = f" and a hot spot of {hot:.2g}" if hot else ""
-        why = f"reflectance changes by at most {share:.2%}: {slope:.2g}/rad up to {np.rad2deg(angle):.2f} deg{peak}"
-        return Bound(probe.scaled(share), why)
+        why = f"reflectance changes by at most {fraction:.2%}: {slope:.2g}/rad up to {np.rad2deg(angle):.2f} deg{peak}"
+        return Bound(probe.scaled(fraction), why)
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
         slope, bands = rig.sky.brdf_per_rad, len(probe.wavelength_nm)
@@ -148,7 +150,7 @@ class Brdf(Gain):
         greatest = 1 + slope * angle + rig.sky.hot_spot * float(np.exp(-phase / HOT_SPOT_RAD))
         return GainRange.between(least, greatest, bands, uneven=greatest - least)
 
-    def gain(self, block: SweepBlock, variant: str) -> Light:
+    def gain(self, block: SweepBlock, variant: str) -> Radiance:
         """Give 1 + b a + h exp(-phase / 2 deg) of each sample's direction, (line, sample, 1), 0 where that is below."""
         sky = block.rig.sky
         if sky.brdf_per_rad == 0 and sky.hot_spot == 0:
@@ -161,7 +163,7 @@ class Brdf(Gain):
 
 
 def _angles(sweep: Sweep, camera: LineCamera, scan_px: Floats, slopes: Floats) -> tuple[Floats, Floats]:
-    along, scan = points_of_scan(sweep.strip_px, camera, scan_px[:, None], slopes)
+    along, scan = points_of_scan(sweep.swath_px, camera, scan_px[:, None], slopes)
     x = along if sweep.along == "x" else scan
     return np.arctan(x * camera.ifov_rad), np.arctan(np.hypot(along, scan) * camera.ifov_rad)
 
@@ -170,7 +172,7 @@ def _extremes(sweeps: tuple[Sweep, ...], camera: LineCamera) -> tuple[float, flo
     """Greatest angle from the undeflected direction and least phase within the sweeps [rad]."""
     greatest, least = 0.0, np.inf
     for sweep in (sweep for sweep in sweeps if sweep.lines):
-        ends = [np.linspace(0, count - 1, _LOOKS).round().astype(int) for count in (sweep.lines, camera.samples)]
+        ends = [np.linspace(0, count - 1, _PROBES).round().astype(int) for count in (sweep.lines, camera.samples)]
         lines, samples = map(np.unique, ends)
         angle, phase = _angles(sweep, camera, sweep.line_px()[lines], camera.pixel_slopes()[samples])
         steps = [np.abs(np.diff(phase, axis=axis)).max(initial=0.0) for axis in (0, 1)]

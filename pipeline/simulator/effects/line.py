@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, points_of_scan
-from pipeline.simulator.effects.air import PARALLAX, greatest_share, sway_gradient, turbulence_px
+from pipeline.simulator.effects.air import PARALLAX, greatest_fraction, sway_gradient, turbulence_px
 from pipeline.simulator.effects.effect import OFF, Bound, Effect, SweepBlock
 from pipeline.simulator.effects.mirror_path import beside_plan, greatest_lag_px, transient
 from pipeline.simulator.effects.pointing import at_line_ends, end_gains
@@ -26,7 +26,7 @@ MARGIN = 1.5  # over what the probe measured at the roughest places found
 UPRIGHT = "1x1"  # the slit's variant of one box that does not lie turned
 _RAY_PER_TILT = 2.6  # a ray turns by twice the tilt; the scene plane is oblique to it by up to 30 deg
 Floats = NDArray[np.float64]
-_LOOKS = 33  # lines of a sweep and samples of a line at which its course is taken; both are smooth
+_PROBES = 33  # lines of a sweep and samples of a line at which its course is taken; both are smooth
 _COUNTED: dict[str, Parts] = {"9x3": (9, 3), "5x2": (5, 2), "3x1": (3, 1), UPRIGHT: (1, 1)}
 _STATED = {"1-percent": 0.01, "3-percent": 0.03}  # of the light that a sweep's boxes may misplace
 POSITIONS, FOLDED = "positions", "folded"
@@ -72,11 +72,11 @@ class Rotation(Effect):
 
 def _course(sweep: Sweep, camera: LineCamera, beside: tuple[float, float]) -> tuple[float, float]:
     slopes = camera.pixel_slopes()
-    slopes = slopes[np.unique(np.linspace(0, len(slopes) - 1, _LOOKS).round().astype(int))]
-    numbers = np.unique(np.linspace(0, sweep.lines - 1, _LOOKS).round().astype(int))
-    strip, scan = sweep.strip_px + beside[0], sweep.line_px()[numbers][:, None] + beside[1]
-    along_px, scan_px = points_of_scan(strip, camera, scan, slopes)
-    straight = strip + slopes / camera.ifov_rad
+    slopes = slopes[np.unique(np.linspace(0, len(slopes) - 1, _PROBES).round().astype(int))]
+    numbers = np.unique(np.linspace(0, sweep.lines - 1, _PROBES).round().astype(int))
+    swath, scan = sweep.swath_px + beside[0], sweep.line_px()[numbers][:, None] + beside[1]
+    along_px, scan_px = points_of_scan(swath, camera, scan, slopes)
+    straight = swath + slopes / camera.ifov_rad
     return float(np.abs(along_px - straight).max()), float(np.abs(scan_px - scan).max())
 
 
@@ -154,7 +154,7 @@ class Smear(Effect):
             return Bound(0.0, "the mirror stands still while a line is exposed")
         if variant == FOLDED:
             along, scan = _beside(probe.sweeps, rig)
-            along, scan = along + sway_gradient(rig), scan + sway_gradient(rig) + greatest_share(rig.air)
+            along, scan = along + sway_gradient(rig), scan + sway_gradient(rig) + greatest_fraction(rig.air)
             way, area = np.abs(np.arange(most) - (most - 1) / 2).mean(), 2 * variance
             near = probe.within(most / 2)
             by_scan = np.minimum(near.slope[1] * way, near.curvature[1] * area) * scan

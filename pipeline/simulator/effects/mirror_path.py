@@ -170,8 +170,8 @@ def _impulse(time: Floats, damping: float) -> Floats:
             turn = math.sqrt((1 - damping) * (1 + damping)) * time
             return np.exp(-damping * time) * time * np.sinc(turn / np.pi)
         apart = 2 * math.sqrt((damping - 1) * (damping + 1)) * time
-        share = np.where(apart > 0, -np.expm1(-apart) / np.where(apart > 0, apart, 1.0), 1.0)
-        return np.exp(-_slow_rate(damping) * time) * time * share
+        fraction = np.where(apart > 0, -np.expm1(-apart) / np.where(apart > 0, apart, 1.0), 1.0)
+        return np.exp(-_slow_rate(damping) * time) * time * fraction
 
 
 def _slow_rate(damping: float) -> float:

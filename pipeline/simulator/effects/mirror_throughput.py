@@ -16,10 +16,10 @@ from pipeline.simulator.effects.probe import GainRange, Probe
 from pipeline.simulator.rig_model import Coating, Rig
 
 Floats = NDArray[np.float64]
-Light = NDArray[np.float32]
+Radiance = NDArray[np.float32]
 EXACT = "exact"
 REST_RAD = math.radians(45)
-_LOOKS = 65  # incidences at which the sweeps' factors are taken for the bounds
+_PROBES = 65  # incidences at which the sweeps' factors are taken for the bounds
 Indices = NDArray[np.complex128]
 # Rows: wavelength [nm], n, k; straight between. Evaporated films at room temperature.
 _ALUMINIUM = np.array([  # [2]
@@ -68,26 +68,26 @@ class Vignetting(Gain):
         ends = sweep_ends(probe, rig.camera)
         if not ends.size:
             return Bound(0.0, "no line is taken")
-        shares = np.sqrt(1 - ends)  # |n_z|^2 = (1 - o_z) / 2
-        why = f"the mirror passes {shares.min():.3f} to {shares.max():.3f} of its light at rest"
-        return Bound(probe.scaled(float(np.abs(shares - 1).max())), why)
+        fractions = np.sqrt(1 - ends)  # |n_z|^2 = (1 - o_z) / 2
+        why = f"the mirror passes {fractions.min():.3f} to {fractions.max():.3f} of its light at rest"
+        return Bound(probe.scaled(float(np.abs(fractions - 1).max())), why)
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
-        shares = np.sqrt(1 - sweep_ends(probe, rig.camera))
-        least, greatest = float(shares.min(initial=1.0)), float(shares.max(initial=1.0))
+        fractions = np.sqrt(1 - sweep_ends(probe, rig.camera))
+        least, greatest = float(fractions.min(initial=1.0)), float(fractions.max(initial=1.0))
         return GainRange.between(least, greatest, len(probe.wavelength_nm))
 
-    def gain(self, block: SweepBlock, variant: str) -> Light:
+    def gain(self, block: SweepBlock, variant: str) -> Radiance:
         sweep, camera = block.sweep, block.rig.camera
         scan_px = sweep.held_px()
-        share = np.sqrt(1 - ahead(sweep.strip_px, scan_px[block.numbers], camera)).mean(axis=1)
-        return np.asarray(share.astype(np.float32)[:, None, None])
+        fraction = np.sqrt(1 - ahead(sweep.swath_px, scan_px[block.numbers], camera)).mean(axis=1)
+        return np.asarray(fraction.astype(np.float32)[:, None, None])
 
 
 def sweep_ends(probe: Probe, camera: LineCamera) -> Floats:
     """Give o_z at the first and the last position of every sweep, (2 sweep,); it never turns round in between."""
     ends = [sweep.held_px().ravel()[[0, -1]] for sweep in probe.sweeps]
-    found = [ahead(sweep.strip_px, px, camera) for sweep, px in zip(probe.sweeps, ends, strict=True)]
+    found = [ahead(sweep.swath_px, px, camera) for sweep, px in zip(probe.sweeps, ends, strict=True)]
     return np.concatenate(found) if found else np.zeros(0)
 
 
@@ -134,15 +134,15 @@ class Polarisation(Gain):
             return GainRange.between(1.0, 1.0, len(nm))
         return GainRange.of(_factors_between(incidence, rig, nm), nm, uneven=0.0)
 
-    def gain(self, block: SweepBlock, variant: str) -> Light:
-        looks = ahead(block.sweep.strip_px, block.scan_px, block.rig.camera)
-        factor: Light = _factors(_incidence(looks), block.rig, block.wavelength_nm).astype(np.float32)
+    def gain(self, block: SweepBlock, variant: str) -> Radiance:
+        probes = ahead(block.sweep.swath_px, block.scan_px, block.rig.camera)
+        factor: Radiance = _factors(_incidence(probes), block.rig, block.wavelength_nm).astype(np.float32)
         return factor[:, None, :]
 
 
-def _incidence(looks_ahead: Floats) -> Floats:
+def _incidence(view_directions: Floats) -> Floats:
     """Angle between chief ray and mirror normal where the mirror looks along unit directions of this o_z. [rad]"""
-    return np.arccos(np.sqrt((1 - looks_ahead) / 2))
+    return np.arccos(np.sqrt((1 - view_directions) / 2))
 
 
 def _factors(incidence_rad: Floats, rig: Rig, wavelength_nm: Floats) -> Floats:
@@ -151,11 +151,11 @@ def _factors(incidence_rad: Floats, rig: Rig, wavelength_nm: Floats) -> Floats:
 
 
 def _factors_between(incidence_rad: Floats, rig: Rig, wavelength_nm: Floats) -> Floats:
-    return _factors(np.linspace(incidence_rad.min(), incidence_rad.max(), _LOOKS), rig, wavelength_nm)
+    return _factors(np.linspace(incidence_rad.min(), incidence_rad.max(), _PROBES), rig, wavelength_nm)
 
 
 def reflectance(coating: Coating, wavelength_nm: Floats, incidence_rad: Floats) -> Floats:
-    """Give the share of unpolarised light that a coating reflects, (incidence, band): the mean of both polarisations.
+    """Give the fraction of unpolarised light that a coating reflects, (incidence, band): the mean of both polarisations.
 
     Valid from 311 to 1937 nm, and for films that no light passes (50 nm or more); beyond, the index of the nearest end
     is held.

@@ -22,7 +22,7 @@ else:
     compiled_loops = deferred("pipeline.simulator.compiled_loops")
 
 Floats = NDArray[np.float64]
-Light = NDArray[np.float32]
+Radiance = NDArray[np.float32]
 CHIP_SAMPLES = 1_000_000  # numbers of a patch that later stages judge as one: 61 x 61 px of 270 bands
 MOST_VARIATION = 0.05  # total variation between a patch of cheap draws and one of exact draws
 LEAST_MERGED_READ_E = 1.0  # below, the whole numbers of the counts show through the read noise
@@ -30,7 +30,7 @@ SERIES_FROM_E = 30.0  # expected counts from which the expansion of the quantile
 PIECE = 16384  # elements at a time, so that temporaries stay in the cache
 
 
-def normal_deviates(rng: np.random.Generator, count: int) -> Light:
+def normal_deviates(rng: np.random.Generator, count: int) -> Radiance:
     """Draw ``count`` standard normal deviates by pairs out of 32-bit words, (count,) float32; none exceeds 6.8.
 
     The words come from the bit generator as they are: every deviate takes as many, and the stream may be counted.
@@ -43,7 +43,7 @@ def normal_deviates(rng: np.random.Generator, count: int) -> Light:
     return drawn[:count]
 
 
-def photon_counts(expected: Light, deviate: Light) -> Light:
+def photon_counts(expected: Radiance, deviate: Radiance) -> Radiance:
     """Give exact Poisson counts: the quantile of each deviate's probability; 0 where 0 or less is expected.
 
     ``expected``: Electrons, any shape, finite. [e-]
@@ -65,13 +65,13 @@ def photon_counts(expected: Light, deviate: Light) -> Light:
     return counts.reshape(expected.shape)
 
 
-def rounded_counts(expected: Light, deviate: Light) -> Light:
+def rounded_counts(expected: Radiance, deviate: Radiance) -> Radiance:
     """Give nearly Poisson counts: mean, variance and third cumulant are right; for `least_expected` on.
 
     The first terms of the quantile's expansion, as `photon_counts` has it. Rounding and the square add 5/36 to the
     variance, which is taken off before.
     """
-    spread: Light = np.sqrt(np.maximum(expected - np.float32(5 / 36), 0))
+    spread: Radiance = np.sqrt(np.maximum(expected - np.float32(5 / 36), 0))
     spread += deviate * np.float32(1 / 6)
     spread *= deviate
     spread += expected
@@ -87,9 +87,9 @@ def divergence(expected: Floats, read_noise_e: float) -> Floats:
     cumulant, in units of the standard deviation. Without read noise that is 1 / (216 expected^2).
     """
     variance = np.maximum(expected + read_noise_e**2, np.finfo(float).tiny)
-    share = expected / variance
-    fourth = share / variance * (1 - 4 / 3 * share)
-    second = share**2 / (18 * variance) if read_noise_e else 0.0
+    fraction = expected / variance
+    fourth = fraction / variance * (1 - 4 / 3 * fraction)
+    second = fraction**2 / (18 * variance) if read_noise_e else 0.0
     return np.asarray(second**2 / 2 + fourth**2 / 24, np.float64)
 
 
@@ -111,7 +111,7 @@ def chip_variation(read_noise_e: float) -> float:
     return float(np.sqrt(CHIP_SAMPLES * divergence(levels, read_noise_e).max()) / 2)
 
 
-def told_apart(sd: float, other: float) -> float:
+def separable(sd: float, other: float) -> float:
     """Twice the total variation between two normal distributions of one mean: the deviations that noise counts.
 
     0 where both are alike, 2 where one has no spread. Their densities cross at x^2 = 2 ln(a / b) / (1 / b^2 - 1 / a^2).

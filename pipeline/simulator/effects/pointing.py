@@ -41,11 +41,11 @@ def end_gains(sweep: Sweep, camera: LineCamera) -> Floats:
     slopes = np.array([-0.5, 0.0, 0.5]) * camera.samples * camera.ifov_rad
     centre = sweep.line_px()[:, None]
 
-    def points(strip: float, scan: float) -> Floats:
-        return np.stack(points_of_scan(sweep.strip_px + strip, camera, centre + scan, slopes), axis=-1)
+    def points(swath: float, scan: float) -> Floats:
+        return np.stack(points_of_scan(sweep.swath_px + swath, camera, centre + scan, slopes), axis=-1)
 
-    by_strip, by_scan = (points(1, 0) - points(-1, 0)) / 2, (points(0, 1) - points(0, -1)) / 2
-    return np.stack([by_strip, by_scan], axis=-1)
+    by_swath, by_scan = (points(1, 0) - points(-1, 0)) / 2, (points(0, 1) - points(0, -1)) / 2
+    return np.stack([by_swath, by_scan], axis=-1)
 
 
 def at_line_ends(sweeps: Iterable[Sweep], camera: LineCamera, along: float, scan: float) -> tuple[float, float]:

@@ -22,12 +22,12 @@ from pipeline.simulator.rig_model import Rig
 Floats = NDArray[np.float64]
 Unit = Literal["sigma", "dn"]
 UNITS = {"sigma": "sigma", "dn": "DN"}
-Light = NDArray[np.float32]
+Radiance = NDArray[np.float32]
 Real = TypeVar("Real", np.float32, np.float64)
 
 
 WIDE_PX = 16 / 3  # sd of a blur from which on only means of several pixels count that lie far from a sample
-_FAR_SDS = 3.0  # of a blur, within which derivatives are taken; beyond counts its share of the light and the span
+_FAR_SDS = 3.0  # of a blur, within which derivatives are taken; beyond counts its fraction of the light and the span
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Probe:
     unit_least_dn: float  # the smallest unit met, in DN of a sample: turns electrons into the unit, on the safe side
     lines: int  # of all sweeps
     seconds: float  # from the first line to the last
-    white_e: Floats | None = None  # (band,) electrons of the white panel in one exposure; None where not known
+    white_e: Floats | None = None  # (band,) electrons of the white reference in one exposure; None where not known
     slit_errors: Mapping[str, float] = field(default_factory=dict)  # measured change by variant of the slit, or off
     usual_e: Floats | None = None  # evenly spaced quantiles of the light along the lines; None where not known
     places: Floats = field(default_factory=lambda: np.zeros((0, 2)))  # the telling ones, rows and columns, worst first
@@ -115,7 +115,7 @@ class Probe:
         """Bound what it changes in each band, (band,): C s^2 / 2, or G E|x| where that is less, or the span.
 
         E|x| is ``mean_way`` times s, at most 1; the smaller bound takes over where the image is a step or a point. What
-        lies beside the sweeps counts as far as the kernel reaches, and beyond by the share of it that does; a wide
+        lies beside the sweeps counts as far as the kernel reaches, and beyond by the fraction of it that does; a wide
         Gaussian is a narrow one, and one of the rest of its variance that sees means of several pixels.
         """
         widest = float(np.sqrt(np.max(variance_px2, initial=0.0)))
@@ -149,9 +149,9 @@ class Probe:
         by_slope = _times(self.slope, mean_way * np.sqrt(variance_px2))
         return np.asarray(np.minimum(np.minimum(by_curvature, by_slope).sum(axis=0), self.span))
 
-    def scaled(self, share: float | Floats) -> float:
-        """Bound what multiplying by 1 + ``share`` (or (band,) shares) changes."""
-        return float((self.level * np.abs(share)).max(initial=0.0))
+    def scaled(self, fraction: float | Floats) -> float:
+        """Bound what multiplying by 1 + ``fraction`` (or (band,) shares) changes."""
+        return float((self.level * np.abs(fraction)).max(initial=0.0))
 
     def added(self, electrons: float, electrons_per_dn: float) -> float:
         """Bound what adding so many electrons to every sample changes."""
@@ -175,7 +175,7 @@ def stored_mean(light: NDArray[np.floating], binning: int) -> NDArray[np.floatin
     return np.asarray(whole.mean(axis=-2))
 
 
-def noise_electrons(signal: NDArray[np.floating], rig: Rig, binning: int = 1) -> Light:
+def noise_electrons(signal: NDArray[np.floating], rig: Rig, binning: int = 1) -> Radiance:
     """Give one standard deviation of shot noise, read noise and quantisation at each signal; never 0. [e-]
 
     ``signal`` is the mean of ``binning`` samples, each with noise of its own, and the noise is that of the mean.
@@ -183,11 +183,11 @@ def noise_electrons(signal: NDArray[np.floating], rig: Rig, binning: int = 1) ->
     camera, quantised = rig.camera, rig.camera.electrons_per_dn**2 / 12
     if rig.detector.noiseless:
         return np.full_like(signal, np.sqrt(quantised / binning))
-    noise: Light = np.sqrt(np.maximum(signal, 0) + np.float32(camera.read_noise_e**2 + quantised))
+    noise: Radiance = np.sqrt(np.maximum(signal, 0) + np.float32(camera.read_noise_e**2 + quantised))
     return noise if binning == 1 else noise / np.float32(np.sqrt(binning))
 
 
-def unit_at(signal: NDArray[np.floating], rig: Rig, unit: Unit, binning: int = 1) -> Light:
+def unit_at(signal: NDArray[np.floating], rig: Rig, unit: Unit, binning: int = 1) -> Radiance:
     """Give what a unit of the tolerance, of a number that sums ``binning`` samples, is of their mean signal. [e-]"""
     if unit == "sigma":
         return noise_electrons(signal, rig, binning)

@@ -23,7 +23,7 @@ else:
     compiled_loops = deferred("pipeline.simulator.compiled_loops")
 
 Floats = NDArray[np.float64]
-Light = NDArray[np.float32]
+Radiance = NDArray[np.float32]
 EXACT = "exact"
 FWHM2_PER_VARIANCE = 8 * math.log(2)
 BANDS_AT_ONCE = 32  # bands that one product makes
@@ -36,7 +36,7 @@ class BandGroup(NamedTuple):
 
     made: slice
     taken: slice
-    weights: Light
+    weights: Radiance
 
 
 @dataclass(frozen=True)
@@ -70,11 +70,11 @@ class Response(LightChange):
         why = f"bands widen from {0.0 if known is None else np.nanmin(known):.3g} to {rig.optics.fwhm_nm:.3g} nm"
         return Bound(float(np.minimum(curved, steep).max()), f"{why}: {sd:.2g} nm sd more")
 
-    def change(self, light: Light, block: SweepBlock, variant: str) -> Light:
+    def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
         return widen_bands(light, block.wavelength_nm, block.fwhm_nm, block.rig.optics.fwhm_nm)
 
 
-def widen_bands(spectra: Light, wavelength_nm: Floats, fwhm_nm: Floats | None, wanted_nm: float) -> Light:
+def widen_bands(spectra: Radiance, wavelength_nm: Floats, fwhm_nm: Floats | None, wanted_nm: float) -> Radiance:
     """Give spectra as bands of width ``wanted_nm`` see them; any linear measure of light, (..., band).
 
     Factors of light serve as well as light: (component, band) electrons.
@@ -174,7 +174,7 @@ class Smile(LightChange):
         part = min(shift / float(gaps.min()), 0.5)
         return Bound(steep * shift + min(bent, steep * shift * 2 * part * (1 - part)), why)
 
-    def change(self, light: Light, block: SweepBlock, variant: str) -> Light:
+    def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
         """Give light (line, sample, band) [e-] at the wavelengths that each sample sees; as it is without a smile."""
         camera, smile = block.rig.camera, block.rig.optics.smile_nm
         if smile == 0 or light.shape[-1] < 2:

@@ -88,7 +88,7 @@ _ALONG = np.concatenate([np.outer(_RADII, np.cos(_TURNS)).ravel(), _RADII, 0 * _
 _SCAN = np.concatenate([np.outer(_RADII, np.sin(_TURNS)).ravel(), 0 * _RADII, _RADII])
 # What is wrong of waves longer than 20 px adds up over wide fields: they count up to three times.
 _STRICT = 1 + 2 / (1 + (np.hypot(_ALONG, _SCAN) / 0.05) ** 2)
-_ALIKE_PX = 0.2  # by which widths may differ of kernels that share a window
+_ALIKE_PX = 0.2  # by which widths may differ of kernels that fraction a window
 
 
 @dataclass(frozen=True)
@@ -131,12 +131,12 @@ def _fit(
     passed = _passed(chosen, own)
     for count in _BASIS:
         fitted = _some(order, count)
-        shares = _shares(passed, _wanted(moments[:, fitted], own))
+        fractions = _fractions(passed, _wanted(moments[:, fitted], own))
         between = np.stack([np.interp(place, place[fitted], one) for one in np.eye(len(fitted))])
-        off = np.abs(passed @ (shares @ between[:, judged]) - wanted)
+        off = np.abs(passed @ (fractions @ between[:, judged]) - wanted)
         if off.max() <= enough or count >= bands:
             break
-    return chosen, shares, between, float((off / _STRICT[:, None]).max())
+    return chosen, fractions, between, float((off / _STRICT[:, None]).max())
 
 
 def _needed(passed: Transfer, wanted: Transfer, enough: float) -> list[int]:
@@ -152,7 +152,7 @@ def _needed(passed: Transfer, wanted: Transfer, enough: float) -> list[int]:
 
 
 def _error(passed: Transfer, wanted: Transfer) -> float:
-    return float(np.abs(passed @ _shares(passed, wanted) - wanted).max())
+    return float(np.abs(passed @ _fractions(passed, wanted) - wanted).max())
 
 
 def _some(order: NDArray[np.intp], most: int) -> NDArray[np.intp]:
@@ -247,15 +247,15 @@ def _wanted(moments: Floats, own: Floats) -> Transfer:
     return (own * _seen_at(1))[:, None] * _gaussian(moments[:2], moments[2:4]) * pupil_contrast(across)
 
 
-def _shares(passed: Transfer, wanted: Transfer) -> Floats:
+def _fractions(passed: Transfer, wanted: Transfer) -> Floats:
     """Shares (kernel, band) by least squares, none below 0 and of sum 1, by what kernels and bands pass of waves."""
     count, bands = passed.shape[1], wanted.shape[1]
     system = np.concatenate([passed.real, passed.imag, np.full((1, count), _SUM)])
     right = np.concatenate([wanted.real, wanted.imag, np.full((1, bands), _SUM)])
     basis, triangle = np.linalg.qr(system)
-    shares: Floats = np.stack([scipy.optimize.nnls(triangle, one)[0] for one in (basis.T @ right).T], axis=1)
-    shares /= shares.sum(axis=0)
-    return shares
+    fractions: Floats = np.stack([scipy.optimize.nnls(triangle, one)[0] for one in (basis.T @ right).T], axis=1)
+    fractions /= fractions.sum(axis=0)
+    return fractions
 
 
 @dataclass(frozen=True)
@@ -290,7 +290,7 @@ class Moments:
 class Footprint:
     """Kernels of a footprint and how much each counts in each band. All widths in px of the camera, or of the level.
 
-    ``shift`` and ``variance`` are (2, kernel) along the line and the scan; ``shares`` (kernel, node) of some bands, and
+    ``shift`` and ``variance`` are (2, kernel) along the line and the scan; ``fractions`` (kernel, node) of some bands, and
     ``between`` (node, band) between which two each band lies; ``parts`` how many boxes across and along stand for one
     that lies turned; ``level`` (kernel,) of which pixels each looks at: 1 is all, 2 every second, and so on; ``error``
     by how much of its amplitude a wave is passed too much or too little at most; ``disc`` the diameters along line and
@@ -302,7 +302,7 @@ class Footprint:
     held: int  # positions 1 px apart along the scan
     shift: Floats
     variance: Floats
-    shares: Floats
+    fractions: Floats
     between: Floats
     level: NDArray[np.intp]
     error: float
@@ -315,7 +315,7 @@ class Footprint:
     @property
     def mixing(self) -> Floats:
         """How much each kernel counts in each band, (kernel, band); of sum 1 in each."""
-        return self.shares @ self.between
+        return self.fractions @ self.between
 
     def afar(self, along: Floats, scan: Floats) -> Floats:
         """Give the light at places (place,) some px beyond slit and pixel, (place, band). [1/px^2]
@@ -348,15 +348,15 @@ class Footprint:
         return self._some(fine), None if fine.all() else self._some(~fine)
 
     def _some(self, which: NDArray[np.bool_]) -> Footprint:
-        shift, variance, shares = self.shift[:, which], self.variance[:, which], self.shares[which]
-        return replace(self, shift=shift, variance=variance, shares=shares, level=self.level[which])
+        shift, variance, fractions = self.shift[:, which], self.variance[:, which], self.fractions[which]
+        return replace(self, shift=shift, variance=variance, fractions=fractions, level=self.level[which])
 
     def part(self, level: int, which: NDArray[np.intp]) -> Footprint:
         """Give some kernels of a level, in its px. Beyond level 1 boxes lie upright: they are small beside Gaussians.
 
         What blurs a scene before pixels are left out is taken off the Gaussians.
         """
-        some = replace(self, shares=self.shares[which], level=self.level[which])
+        some = replace(self, fractions=self.fractions[which], level=self.level[which])
         shift, variance = self.shift[:, which], self.variance[:, which]
         if level == 1:
             return replace(some, shift=shift, variance=variance)
@@ -376,8 +376,8 @@ def fold(box: tuple[float, float], parts: tuple[int, int], held: int, blurs: Mom
     """
     waves = blurs.waves if blurs.waves is not None and blurs.waves.any() else np.zeros_like(blurs.shift)
     told, band = np.unique(np.concatenate([blurs.shift, blurs.variance, waves]), axis=1, return_inverse=True)
-    kernels, shares, between, error = _fit(told.tobytes(), told.shape[1], box, held, blurs.disc)
+    kernels, fractions, between, error = _fit(told.tobytes(), told.shape[1], box, held, blurs.disc)
     between = between[:, band.ravel()]
     return Footprint(
-        box, parts, held, kernels.shift, kernels.variance, shares, between, kernels.level, error, blurs.disc
+        box, parts, held, kernels.shift, kernels.variance, fractions, between, kernels.level, error, blurs.disc
     )

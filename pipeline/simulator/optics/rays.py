@@ -121,7 +121,7 @@ def normals_met(sweeps: Iterable[Sweep], camera: LineCamera) -> Floats:
     ends hold the extremes.
     """
     taken = [sweep for sweep in sweeps if sweep.lines > 0]
-    ends = [(sweep.strip_px, scan) for sweep in taken for scan in sweep.held_px().ravel()[[0, -1]]]
+    ends = [(sweep.swath_px, scan) for sweep in taken for scan in sweep.held_px().ravel()[[0, -1]]]
     tangents = np.array(ends, np.float64).reshape(-1, 2) * camera.ifov_rad
     return np.concatenate([REST_NORMAL[None], direction_to_normal(scene_to_direction(tangents))])
 
@@ -129,5 +129,5 @@ def normals_met(sweeps: Iterable[Sweep], camera: LineCamera) -> Floats:
 def middle_normal(sweep: Sweep, camera: LineCamera) -> Floats:
     """Give the mirror's normal in the middle of a sweep, (3,): one kernel for all its lines, whatever the block."""
     middle = sweep.start_px + (sweep.lines * sweep.step - 1) / 2
-    tangents = np.array([sweep.strip_px, middle]) * camera.ifov_rad
+    tangents = np.array([sweep.swath_px, middle]) * camera.ifov_rad
     return direction_to_normal(scene_to_direction(tangents))

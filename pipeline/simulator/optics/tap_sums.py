@@ -26,19 +26,19 @@ else:
     window_sums = deferred("pipeline.simulator.optics.window_sums")
 
 Floats = NDArray[np.float64]
-Light = NDArray[np.float32]
+Radiance = NDArray[np.float32]
 Parts = tuple[int, int]
 LADDER: tuple[Parts, ...] = ((1, 1), (2, 1), (3, 1), (5, 2), (9, 3))  # across and along; the last is taken as exact
 _FINER = (18, 6)  # than any; what they are held against
 _PHASES = (0.0, 0.5)  # of the pixels, along either axis
-TABULATED = 2e-5  # share of the light, by size, that a table of either axis misplaces at most, but for what follows
+TABULATED = 2e-5  # fraction of the light, by size, that a table of either axis misplaces at most, but for what follows
 
 
 @dataclass(frozen=True)
 class ScenePixels:
     """A scene's planes (y, x, component), C-contiguous float32, and whether lines lie along y."""
 
-    planes: Light
+    planes: Radiance
     along_y: bool
 
 
@@ -53,7 +53,7 @@ class Gatherer:
         scale, off = place_parts(footprint, views)
         reach = np.abs(off).max(axis=(0, 2, 3), initial=0.0) + 0.02
         ranges = [(float(one.min()), float(one.max())) for one in scale.swapaxes(0, 1)]
-        tail = TAIL / float(footprint.shares.max(initial=0.0) or 1.0)
+        tail = TAIL / float(footprint.fractions.max(initial=0.0) or 1.0)
         self._kernels = kernels_of(footprint)
         self._along = TapTable.of(width[1] / along, variance[0], 1, ranges[0], float(reach[0]), tail)
         self._scan = TapTable.of(width[0] / across, variance[1], footprint.held, ranges[1], float(reach[1]), tail)
@@ -63,7 +63,9 @@ class Gatherer:
         """How many boxes each kernel is summed over."""
         return int(self._kernels.place.shape[1])
 
-    def gather(self, pixels: ScenePixels, views: RayViews, out: Light, numbers: NDArray[np.intp], gains: Light) -> None:
+    def gather(
+        self, pixels: ScenePixels, views: RayViews, out: Radiance, numbers: NDArray[np.intp], gains: Radiance
+    ) -> None:
         """Add the components that some samples see through every kernel to ``out`` (number, n, component).
 
         They are sums over the parts, times ``gains`` (kernel, component). ``views`` are in px of the pixels,
@@ -88,7 +90,7 @@ def kernels_of(footprint: Footprint) -> window_sums.PartedKernels:
     return window_sums.PartedKernels(shift, variance, between, part_places(footprint))
 
 
-def place_parts(footprint: Footprint, views: RayViews) -> tuple[Floats, Light]:
+def place_parts(footprint: Footprint, views: RayViews) -> tuple[Floats, Radiance]:
     """Give how the parts of kernels lie for samples in the middle of a pixel, along and scan.
 
     Returns scales of one part (kernel, 2, n), and how far beside the pixel parts lie, (kernel, 2, part, n) [px].
@@ -102,7 +104,7 @@ def place_parts(footprint: Footprint, views: RayViews) -> tuple[Floats, Light]:
     return scale, off
 
 
-def part_places(footprint: Footprint) -> Light:
+def part_places(footprint: Footprint) -> Radiance:
     """Give the middles of the parts, (2, part) across and along, in px of the camera: of boxes at a disc's points."""
     across, along = footprint.parts
     turn = ((np.arange(across) + 0.5) / across - 0.5) * footprint.box[0]
@@ -111,24 +113,24 @@ def part_places(footprint: Footprint) -> Light:
     return (boxes[:, :, None] + points[:, None]).reshape(2, -1).astype(np.float32)
 
 
-def fewest_parts(share: float, box: tuple[float, float], views: RayViews) -> Parts:
-    """Give the fewest boxes that misplace at most a ``share`` of the light where views are turned most.
+def fewest_parts(fraction: float, box: tuple[float, float], views: RayViews) -> Parts:
+    """Give the fewest boxes that misplace at most a ``fraction`` of the light where views are turned most.
 
-    ``box`` is across and along [px]. A blur, or held positions, make the share smaller.
+    ``box`` is across and along [px]. A blur, or held positions, make the fraction smaller.
     """
     turn, run = np.abs(views.along_turn), np.abs(views.scan_run)
     most = {int(one.argmax()) for one in (turn, run, turn * box[0] ** 2 + run * box[1] ** 2)}
     columns = views.along_run, views.scan_run, views.along_turn, views.scan_turn
     shapes = [tuple(float(one[number]) for one in columns) for number in sorted(most)]
-    kept = (parts for parts in LADDER if all(misplaced(parts, box, shape) <= share for shape in shapes))
+    kept = (parts for parts in LADDER if all(misplaced(parts, box, shape) <= fraction for shape in shapes))
     return next(kept, LADDER[-1])
 
 
 @lru_cache(maxsize=256)
 def misplaced(parts: Parts, box: tuple[float, float], shape: tuple[float, ...]) -> float:
-    """Give the share of light, by size, that so many boxes put elsewhere than the turned footprint does.
+    """Give the fraction of light, by size, that so many boxes put elsewhere than the turned footprint does.
 
-    ``shape`` is px of the scene along and scan per px of the camera along the line, then across it. Half of the share
+    ``shape`` is px of the scene along and scan per px of the camera along the line, then across it. Half of the fraction
     times the range of a scene within the footprint is the most that a sample changes.
     """
     apart = np.abs(_weights(parts, box, shape) - _weights(_FINER, box, shape))

@@ -13,7 +13,9 @@ Weights = NDArray[np.float32]
 PER_PX = 128  # rows of a table; between them weights are linear, right to 8e-6 of a kernel's curvature
 SCALE_STEP = 1 / 4096  # from one tabulated scale to the next; the nearest is taken
 _WORKED_OUT = 16  # every so many of them are worked out, those between are linear: right to 2e-6
-TAIL = 5e-6  # share of a kernel's weight that may lie beyond its taps; what is left is scaled to sum 1. No tap beyond
+TAIL = (
+    5e-6  # fraction of a kernel's weight that may lie beyond its taps; what is left is scaled to sum 1. No tap beyond
+)
 # has more than that either: weights jump by so much where a tap comes in.
 BETWEEN_ROWS = 1 / (4 * PER_PX**2)  # variance that a kernel gains between two rows at most: half of either [px^2]
 _SDS = 6.5  # of a Gaussian: nothing beyond
@@ -84,8 +86,8 @@ class TapTable(NamedTuple):
         rows = [_rows(place, taps, reach, one).astype(np.float32) for one in found]
         joined = np.empty((len(variance), count, len(place), taps), np.float32)
         for number in range(count):
-            low, share = divmod(number, _WORKED_OUT)
-            between = rows[low] + (rows[low + 1] - rows[low]) * np.float32(share / _WORKED_OUT)
+            low, fraction = divmod(number, _WORKED_OUT)
+            between = rows[low] + (rows[low + 1] - rows[low]) * np.float32(fraction / _WORKED_OUT)
             joined[:, number] = between.swapaxes(1, 2)
         return TapTable(joined.reshape(-1, taps), left, float(place[0]), least, count, len(place))
 

@@ -16,7 +16,7 @@ from pipeline.compiled import DOUBLES, FLOATS, OFFSETS, compiled, record_of, row
 from pipeline.simulator.optics.tap_tables import TapTable
 
 Floats = NDArray[np.float64]
-Light = NDArray[np.float32]
+Radiance = NDArray[np.float32]
 Places = NDArray[np.int64]
 AT_ONCE = 64  # samples whose weights are worked out together: they stay in the processor's first cache
 TAPS_AT_ONCE = 8  # terms of a sum between two looks at its total
@@ -27,10 +27,10 @@ LANES = 16  # components at a time: those of the next pixel are summed with them
 class PartedKernels(NamedTuple):
     """PartedKernels and their parts: shifts (2, kernel) [px], variances (2, kernel) [px^2], places (2, part) [px]."""
 
-    shift: Light
+    shift: Radiance
     variance: Floats
     between: float  # variance across of the parts' places
-    place: Light
+    place: Radiance
 
 
 class PixelTable(NamedTuple):
@@ -51,7 +51,9 @@ _NUMBERS, _PLACES = rows_of(types.intp, 1), rows_of(OFFSETS, 2)
 
 
 @compiled(_VIEWS, _LIGHT2, OFFSETS, _KERNELS, _FLOATS2, _LIGHT3)
-def place_parts(views: Floats, beside: Light, kernel: int, kernels: PartedKernels, scale: Floats, off: Light) -> None:
+def place_parts(
+    views: Floats, beside: Radiance, kernel: int, kernels: PartedKernels, scale: Floats, off: Radiance
+) -> None:
     """Write the scales (2, n) of a kernel and how far beside their pixel its parts lie, (2, part, n) [px].
 
     All along the line, then the scan. ``views`` (6, n) are `RayViews`, ``beside`` (2, n) how far from their pixel they
@@ -78,7 +80,9 @@ def place_parts(views: Floats, beside: Light, kernel: int, kernels: PartedKernel
 
 
 @compiled(_TABLE, OFFSETS, _FLOATS2, _LIGHT3, OFFSETS, OFFSETS, _LIGHT2)
-def read_weights(table: TapTable, kernel: int, scale: Floats, off: Light, axis: int, part: int, weight: Light) -> None:
+def read_weights(
+    table: TapTable, kernel: int, scale: Floats, off: Radiance, axis: int, part: int, weight: Radiance
+) -> None:
     """Write the weights (tap, n) of a kernel at places ``off`` px beside their pixel, linear between rows.
 
     ``scale`` is (axis, n), ``off`` (axis, part, n): of which axis and part is told.
@@ -93,15 +97,15 @@ def read_weights(table: TapTable, kernel: int, scale: Floats, off: Light, axis: 
         row = row if row > 0 else np.float32(0)
         row = row if row < last_row else last_row
         whole = int(row)
-        share = row - np.float32(whole)
+        fraction = row - np.float32(whole)
         at = np.uint64((kernel * table.scales + int(number)) * table.rows + whole)
         for tap in range(taps):
             near, far = table.weight[at, tap], table.weight[at + np.uint64(1), tap]
-            weight[tap, n] = near + share * (far - near)
+            weight[tap, n] = near + fraction * (far - near)
 
 
 @compiled(_LIGHT2, _LIGHT2, types.boolean, _LIGHT2)
-def join_weights(outer: Light, inner: Light, more: bool, joint: Light) -> None:
+def join_weights(outer: Radiance, inner: Radiance, more: bool, joint: Radiance) -> None:
     """Write the products (outer * inner, n) of weights (outer, n) and (inner, n), or add them where there are more."""
     count, wide = joint.shape[1], len(inner)
     for row in range(len(outer)):
@@ -116,7 +120,7 @@ def join_weights(outer: Light, inner: Light, more: bool, joint: Light) -> None:
 
 
 @compiled(_VIEWS, OFFSETS, _FLOATS2, _FLOATS2, _LIGHT2)
-def _take_views(views: Floats, first: int, some: Floats, nearest: Floats, beside: Light) -> None:
+def _take_views(views: Floats, first: int, some: Floats, nearest: Floats, beside: Radiance) -> None:
     """Write some views (6, n) from the first one on, the last again where there are no more, and their pixels."""
     last = views.shape[1] - 1
     for n in range(some.shape[1]):
@@ -154,7 +158,9 @@ def _join_places(rows: Places, columns: Places, places: Places) -> None:
 
 
 @compiled(_PIXELS, _PLACES, _LIGHT2, OFFSETS, OFFSETS, rows_of(FLOATS, 1), OFFSETS)
-def _sum_taps(planes: Light, places: Places, weight: Light, taps: int, n: int, total: Light, components: int) -> None:
+def _sum_taps(
+    planes: Radiance, places: Places, weight: Radiance, taps: int, n: int, total: Radiance, components: int
+) -> None:
     """Write sums over the pixels at places (n, tap) of a sample of their components times the weights (tap, n)."""
     if components <= FEW:
         for one in range(components):
@@ -192,15 +198,15 @@ def _sum_taps(planes: Light, places: Places, weight: Light, taps: int, n: int, t
 
 @compiled(_PIXELS, _RASTER, _VIEWS, _KERNELS, _TABLE, _TABLE, _NUMBERS, _LIGHT2, _LIGHT3)
 def gather_windows(
-    planes: Light,
+    planes: Radiance,
     raster: PixelTable,
     views: Floats,
     kernels: PartedKernels,
     along: TapTable,
     scan: TapTable,
     numbers: NDArray[np.intp],
-    gains: Light,
-    out: Light,
+    gains: Radiance,
+    out: Radiance,
 ) -> None:
     """Add what samples see through kernels, times gains (kernel, component), to ``out`` (number, n, component)."""
     outer, inner = (along, scan) if raster.along_outer else (scan, along)

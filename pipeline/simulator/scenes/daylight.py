@@ -73,12 +73,12 @@ def _irradiance(latitude: float, longitude: float, moments: Floats, wavelength_n
     knot = moments / KNOT_S
     low = np.floor(knot)
     hours, row = np.divmod(low.astype(np.int64), _KNOTS_AN_HOUR)
-    share = (knot - low)[:, None]
+    fraction = (knot - low)[:, None]
     light = np.empty((len(moments), len(wavelength_nm)))
     for hour in np.unique(hours):
         here, table = hours == hour, _table(latitude, longitude, int(hour))
         before, after = table[row[here]], table[row[here] + 1]
-        light[here] = _at_bands(before + share[here] * (after - before), wavelength_nm)
+        light[here] = _at_bands(before + fraction[here] * (after - before), wavelength_nm)
     return light
 
 
@@ -120,8 +120,8 @@ def _at_bands(light: Floats, wavelength_nm: Floats) -> Floats:
     model = _model_wavelengths()
     high = np.clip(np.searchsorted(model, wavelength_nm), 1, len(model) - 1)
     low = high - 1
-    share = np.clip((wavelength_nm - model[low]) / (model[high] - model[low]), 0.0, 1.0)
-    return light[:, low] + share * (light[:, high] - light[:, low])
+    fraction = np.clip((wavelength_nm - model[low]) / (model[high] - model[low]), 0.0, 1.0)
+    return light[:, low] + fraction * (light[:, high] - light[:, low])
 
 
 @lru_cache(maxsize=1)

@@ -28,7 +28,7 @@ _BINOMIAL = (np.array([1, 8, 28, 56, 70, 56, 28, 8, 1]) / 256).astype(np.float32
 _ROWS_AT_ONCE = 4  # of what is halved: they stay in the processor's cache
 THINNED_MARGIN = 4  # pixels of a level beside the scene: as far as the binomial kernel reaches
 DEFAULT_EXPOSURE_MS = 100.0  # the exposure at which a scene's electrons are stated
-WELL_SHARE = 0.6  # of the full well, filled by the bright end of a scene without a radiance law
+WELL_FRACTION = 0.6  # of the full well, filled by the bright end of a scene without a radiance law
 BRIGHT_PERCENTILE = 99.9
 LEAST_BRIGHT = 1e-30  # electrons per unit of less would end the range of float32
 
@@ -107,11 +107,11 @@ def _binomial(planes: NDArray[np.float32], firsts: NDArray[np.intp], axis: int) 
 
 
 @dataclass(frozen=True)
-class SceneLight:
-    """Electrons at the default exposure: (component, band) per unit of component, and (band,) of the white panel."""
+class SceneRadiance:
+    """Electrons at the default exposure: (component, band) per unit of component, and (band,) of the white reference."""
 
     electrons: NDArray[np.float32]
-    panel_electrons: NDArray[np.float32]
+    white_reference_electrons: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class RasterScene:
     ``planes`` is (y, x, component) float32 and ``electrons`` (component, band), or (band,) where each band has its own
     plane. Labels are (y, x) uint8 with 255 for unlabelled. ``filled_px`` counts pixels that came without a value in a
     band; ``missing`` (y, x) are those without one in most bands, of which nothing is known (None: no such pixel).
-    ``panel`` is the scene value of the white panel, ``wavelength_nm`` and ``fwhm_nm`` are centres and widths of the
+    ``white_reference`` is the scene value of the white reference, ``wavelength_nm`` and ``fwhm_nm`` are centres and widths of the
     bands, all (band,); widths are None where not known. Equal keys give equal light.
     ``geobox`` is where the pixels lie on the earth, as the scene's file says (None: it does not); ``pixel_m`` is how
     large a pixel of a scene without one is on the ground, where the scene's own law says so.
@@ -135,8 +135,8 @@ class RasterScene:
     name: str
     key: str
     raster: SceneRaster
-    light: Once[SceneLight]
-    panel: NDArray[np.float32]
+    light: Once[SceneRadiance]
+    white_reference: NDArray[np.float32]
     wavelength_nm: NDArray[np.float64]
     fwhm_nm: NDArray[np.float64] | None = None
     class_names: tuple[str, ...] = ()
@@ -149,9 +149,9 @@ class RasterScene:
     def __post_init__(self) -> None:
         if self.light.is_made():
             self._checked_light()
-        self._check_bands("panel", self.panel)
+        self._check_bands("white_reference", self.white_reference)
 
-    def _checked_light(self) -> SceneLight:
+    def _checked_light(self) -> SceneRadiance:
         light, bands, components = self.light(), len(self.wavelength_nm), self.raster.shape[2]
         wanted = {(components, bands)} | ({(bands,)} if bands == components else set())
         if light.electrons.shape not in wanted:
@@ -159,7 +159,7 @@ class RasterScene:
                 f"scene {self.name}: electrons {light.electrons.shape} do not map {components} components "
                 f"to {bands} bands"
             )
-        self._check_bands("panel_electrons", light.panel_electrons)
+        self._check_bands("white_reference_electrons", light.white_reference_electrons)
         return light
 
     def _check_bands(self, what: str, values: NDArray[np.float32]) -> None:
@@ -177,9 +177,9 @@ class RasterScene:
         return self._checked_light().electrons
 
     @property
-    def panel_electrons(self) -> NDArray[np.float32]:
-        """(band,) electrons that the white panel gives at the default exposure."""
-        return self._checked_light().panel_electrons
+    def white_reference_electrons(self) -> NDArray[np.float32]:
+        """(band,) electrons that the white reference gives at the default exposure."""
+        return self._checked_light().white_reference_electrons
 
     @property
     def planes(self) -> NDArray[np.float32]:
@@ -198,7 +198,7 @@ class RasterScene:
 
     def spectra(self) -> NDArray[np.float32]:
         """Scene value per unit of component, shaped as ``electrons``."""
-        return self.electrons * (self.panel / self.panel_electrons).astype(np.float32)
+        return self.electrons * (self.white_reference / self.white_reference_electrons).astype(np.float32)
 
     def values(self) -> NDArray[np.float32]:
         """(y, x, band) float32 scene values: what a perfect survey returns. The whole cube, in memory."""
@@ -254,12 +254,12 @@ def raster_from_values(
         key=key or content_key(planes),
         raster=SceneRaster.of(planes, labels),
         light=Once.of(
-            SceneLight(
-                np.full(bands, WELL_SHARE * camera.full_well_e / bright, np.float32),
-                np.full(bands, camera.full_well_e, np.float32),
+            SceneRadiance(
+                np.full(bands, WELL_FRACTION * camera.full_full_well_e / bright, np.float32),
+                np.full(bands, camera.full_full_well_e, np.float32),
             )
         ),
-        panel=np.full(bands, bright / WELL_SHARE, np.float32),
+        white_reference=np.full(bands, bright / WELL_FRACTION, np.float32),
         wavelength_nm=np.asarray(wavelength_nm, np.float64),
         fwhm_nm=fwhm_nm,
         class_names=class_names,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, points_of_scan, scene_to_sweep
-from pipeline.simulator.effects.air import greatest_share, sway_gradient
+from pipeline.simulator.effects.air import greatest_fraction, sway_gradient
 from pipeline.simulator.effects.blurs import airy_gaussians
 from pipeline.simulator.effects.effect import OFF, Effect
 from pipeline.simulator.effects.probe import (
@@ -33,7 +33,7 @@ from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, to
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 _CELLS = 40_000  # at which it is asked whether a sweep looks there
-_LOOKS = 65  # lines and samples of a sweep that tell where it sees the scene's repeated edge
+_PROBES = 65  # lines and samples of a sweep that tell where it sees the scene's repeated edge
 
 
 @dataclass(frozen=True)
@@ -86,10 +86,10 @@ def _edge_cells(
     sweep: Sweep, camera: LineCamera, shape: tuple[int, int], cell: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Cells at the scene's edge that a sweep sees repeated outside of it."""
-    count = max(_LOOKS, 2 * max(shape) // cell)
+    count = max(_PROBES, 2 * max(shape) // cell)
     lines = sweep.start_px + np.linspace(0, sweep.lines - 1, count)
     slopes = np.linspace(-0.5, 0.5, count) * camera.samples * camera.ifov_rad
-    along, scan = points_of_scan(sweep.strip_px, camera, lines[:, None], slopes)
+    along, scan = points_of_scan(sweep.swath_px, camera, lines[:, None], slopes)
     places = np.stack([scan, along] if sweep.along == "x" else [along, scan]).reshape(2, -1)
     places += (np.array(shape)[:, None] - 1) / 2
     last = np.array(shape)[:, None] - 1
@@ -98,7 +98,7 @@ def _edge_cells(
     return row, column
 
 
-Light = NDArray[np.float32]
+Radiance = NDArray[np.float32]
 REACHES = (2.0, 6.0, 24.0)  # px beside the sweeps, within which is looked as closely as where they see
 BLOCK_PX = 4  # of the scene, averaged: a blur of `WIDE_PX` and more sees means of two by two of them
 _ROWS_AT_ONCE = 64
@@ -111,11 +111,11 @@ class WideLight:
     ``spectral`` (2, band) are the greatest divided differences over wavelength [e-/nm, e-/nm^2].
     """
 
-    low: Light
-    high: Light
-    slope: Light
-    curvature: Light
-    spectral: Light
+    low: Radiance
+    high: Radiance
+    slope: Radiance
+    curvature: Radiance
+    spectral: Radiance
 
 
 def seen_widely(scene: RasterScene, exposure_ms: float) -> WideLight:
@@ -141,7 +141,7 @@ def seen_widely(scene: RasterScene, exposure_ms: float) -> WideLight:
     return WideLight(low, high, steep, bent, spectral)
 
 
-def _spectral_differences(parts: Light, spectra: Light, wavelength_nm: Floats) -> Light:
+def _spectral_differences(parts: Radiance, spectra: Radiance, wavelength_nm: Floats) -> Radiance:
     """Greatest first and second divided differences over wavelength of light, (2, band) [e-/nm, e-/nm^2]."""
     if spectra.ndim == 1:
         light = to_bands(parts, spectra)
@@ -154,12 +154,12 @@ def _spectral_differences(parts: Light, spectra: Light, wavelength_nm: Floats) -
     return np.stack([steep, _largest(parts @ second_difference(spectra, wavelength_nm))])
 
 
-def _largest(values: Light) -> Light:
+def _largest(values: Radiance) -> Radiance:
     """Greatest size of each band, (band,)."""
     return np.asarray(np.maximum(values.max(axis=(0, 1), initial=0.0), -values.min(axis=(0, 1), initial=0.0)))
 
 
-def _means(scene: RasterScene) -> Iterator[Light]:
+def _means(scene: RasterScene) -> Iterator[Radiance]:
     """Components of windows of two by two blocks, a block apart, in overlapping parts of the scene."""
     planes = scene.planes
     short = [-size % BLOCK_PX for size in scene.shape]
@@ -176,7 +176,7 @@ def _means(scene: RasterScene) -> Iterator[Light]:
             yield part
 
 
-def _thirds(means: Light, axis: int) -> tuple[Light, Light, Light]:
+def _thirds(means: Radiance, axis: int) -> tuple[Radiance, Radiance, Radiance]:
     """Windows ahead of, at and behind each place, side by side along an axis."""
     size = means.shape[axis] - 4
     ahead, middle, behind = (means[(slice(None),) * axis + (slice(at, at + size),)] for at in (4, 2, 0))
@@ -194,7 +194,7 @@ def blended_surroundings(probe: Probe, rig: Rig, moving: Sequence[Effect]) -> Pr
     """
     if probe.anywhere is None:
         return probe
-    probe = _turned(probe, sway_gradient(rig) + greatest_share(rig.air))
+    probe = _turned(probe, sway_gradient(rig) + greatest_fraction(rig.air))
     blurs = [one for one in moving if hasattr(one, "moments")]
     way, parts = greatest_way_px(probe, rig, moving), _blur_parts(probe, rig, blurs)
     own = _blended(probe, 0.0, way, parts)
@@ -207,12 +207,12 @@ def _blended(probe: Probe, reach_px: float, way_px: float, parts: Sequence[tuple
     near = probe.within(reach_px + way_px)
     slope, curvature, span = near.slope, near.curvature, near.span
     spectral = near_spectral = np.stack([near.spectral_slope, near.spectral_curvature])
-    for share, sd in parts:
+    for fraction, sd in parts:
         seen = _seen_through(probe, reach_px + way_px, sd)
-        slope = slope + share * np.maximum(seen.slope - near.slope, 0.0)
-        curvature = curvature + share * np.maximum(seen.curvature - near.curvature, 0.0)
-        span = span + share * np.maximum(seen.span - near.span, 0.0)
-        spectral = spectral + share * np.maximum(seen.spectral - near_spectral, 0.0)
+        slope = slope + fraction * np.maximum(seen.slope - near.slope, 0.0)
+        curvature = curvature + fraction * np.maximum(seen.curvature - near.curvature, 0.0)
+        span = span + fraction * np.maximum(seen.span - near.span, 0.0)
+        spectral = spectral + fraction * np.maximum(seen.spectral - near_spectral, 0.0)
     return Detail(reach_px, span, slope, curvature, spectral)
 
 
@@ -268,9 +268,10 @@ def _blur_parts(probe: Probe, rig: Rig, blurs: Sequence[Any]) -> list[tuple[floa
         both = Moments.together([one.moments(rig, nm, one.variants[0], normal) for one in blurs], len(nm))
         sizes.append(float(np.sqrt(both.spread.max(initial=0.0)) + np.abs(both.shift).max(initial=0.0)))
         waves.append(0.0 if both.waves is None else float(both.waves.max(initial=0.0)))
-    shares, widths = airy_gaussians() if max(waves) > 0 else (np.ones(1), np.zeros(1))
+    fractions, widths = airy_gaussians() if max(waves) > 0 else (np.ones(1), np.zeros(1))
     return [
-        (float(share), math.hypot(width * max(waves), max(sizes))) for share, width in zip(shares, widths, strict=True)
+        (float(fraction), math.hypot(width * max(waves), max(sizes)))
+        for fraction, width in zip(fractions, widths, strict=True)
     ]
 
 

@@ -28,8 +28,8 @@ from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.selection.options import ALWAYS_ON, Menu, Option, cost_of, list_options, unbounded_menu
 
 Reason = Literal["absent", "unseen", "small", "needed", "spent", "exact", "asked", "unasked", "unweighed", "always"]
-CHEAP_SHARE = 0.1  # of the tolerance: what a variant may err by itself in the reference "everything on, cheap"
-UNIT_WORDS: dict[Unit, str] = {"sigma": "sigma of the noise", "dn": "DN"}
+CHEAP_FRACTION = 0.1  # of the tolerance: what a variant may err by itself in the reference "everything on, cheap"
+UNIT_NAMES: dict[Unit, str] = {"sigma": "sigma of the noise", "dn": "DN"}
 TOTAL = "all effects"
 
 
@@ -100,12 +100,12 @@ class Decision:
     def cheap_cost_ns(self) -> float:
         """Per px and band, of everything that the rig has, each as cheap as a tenth of the tolerance lets it be."""
         menus = [one.menu for one in self.taken if one.menu.present]
-        return cost_of(menus, {menu.name: menu.cheapest_within(CHEAP_SHARE * self.tolerance) for menu in menus})
+        return cost_of(menus, {menu.name: menu.cheapest_within(CHEAP_FRACTION * self.tolerance) for menu in menus})
 
     @property
     def cheap(self) -> dict[Effect, str]:
         """Everything that the rig has, each in its cheapest variant that errs by no more than a tenth."""
-        within = CHEAP_SHARE * self.tolerance
+        within = CHEAP_FRACTION * self.tolerance
         return {one.menu.effect: one.menu.cheapest_within(within).variant for one in self.taken if one.menu.present}
 
 
@@ -281,7 +281,7 @@ def sum_up(decision: Decision, measured: Mapping[str, float] | None = None) -> d
 
 def explain(one: Treatment, decision: Decision) -> str:
     """Say why an effect is on or off, with the magnitude that its own bound states."""
-    unit = UNIT_WORDS[decision.unit]
+    unit = UNIT_NAMES[decision.unit]
     said = f"{_said_reason(one, decision)}: {one.menu.off.why}"
     if one.is_on and one.option is not one.menu.exact:
         off_by = f"{_number(one.option.error)} {unit}"
@@ -290,7 +290,7 @@ def explain(one: Treatment, decision: Decision) -> str:
 
 
 def _said_reason(one: Treatment, decision: Decision) -> str:
-    unit, tolerance = UNIT_WORDS[decision.unit], _number(decision.tolerance)
+    unit, tolerance = UNIT_NAMES[decision.unit], _number(decision.tolerance)
     left_out = f"left out it could change a stored number by {_number(one.menu.off.error)} {unit}"
     asked = one.name in [word.strip() for word in decision.asked.split(",")]
     return {
@@ -357,7 +357,7 @@ def _unseen(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit) -
         curvature=both,
         spectral_slope=one,
         spectral_curvature=one,
-        brightest_e=camera.full_well_e,
+        brightest_e=camera.full_full_well_e,
         darkest_e=0.0,
         unit_least_dn=1.0,
         lines=sum(sweep.lines for sweep in sweeps),

@@ -22,7 +22,7 @@ from pipeline.simulator.effects.probe import second_difference, steepest_differe
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, to_bands
 from pipeline.simulator.selection.adjacency import ReachedCells
 
-Light = NDArray[np.float32]
+Radiance = NDArray[np.float32]
 _LEAST_WEIGHT = 1e-3  # of a kernel's tap: enough to find places
 
 
@@ -49,12 +49,12 @@ class PixelOptics:
         """How far kernels, differences and sums reach. [px]"""
         return len(self.slit) // 2 + len(self.pixel) // 2 + 1 + self.binning // 2
 
-    def noise(self, light: Light) -> Light:
+    def noise(self, light: Radiance) -> Radiance:
         """Give one standard deviation at each light [e-]."""
-        noise: Light = np.sqrt(np.maximum(light, 0) + np.float32(self.fixed_noise))
+        noise: Radiance = np.sqrt(np.maximum(light, 0) + np.float32(self.fixed_noise))
         return noise
 
-    def worths(self, light: Light) -> Iterator[Light]:
+    def worths(self, light: Radiance) -> Iterator[Radiance]:
         """Measures of light without its halo, (row, column, band) each: the higher, the more worth a look.
 
         Where samples are summed, sizes are averaged along the line, as the probe does.
@@ -72,16 +72,16 @@ class PixelOptics:
                 ahead, behind = np.roll(seen, -1, axis), np.roll(seen, 1, axis)
                 yield self._summed(np.abs(ahead - behind), line)[inner] / noise
                 yield self._summed(np.abs(ahead + behind - 2 * seen), line)[inner] / noise
-            rise: Light = np.roll(seen, -1, 0) - np.roll(seen, 1, 0)
+            rise: Radiance = np.roll(seen, -1, 0) - np.roll(seen, 1, 0)
             mixed = np.abs(np.roll(rise, -1, 1) - np.roll(rise, 1, 1))  # what a box that does not lie turned misses
             yield np.divide(self._summed(mixed, line)[inner], noise)
 
-    def _summed(self, values: Light, axis: int) -> Light:
+    def _summed(self, values: Radiance, axis: int) -> Radiance:
         """Mean over the samples of a stored number about each pixel, along an axis."""
         if self.binning == 1:
             return values
         steps = np.arange(self.binning) - self.binning // 2
-        total: Light = sum((np.roll(values, -step, axis) for step in steps.tolist()), np.zeros_like(values))
+        total: Radiance = sum((np.roll(values, -step, axis) for step in steps.tolist()), np.zeros_like(values))
         total /= np.float32(self.binning)
         return total
 
@@ -93,9 +93,9 @@ def _short_kernel(width_px: float) -> NDArray[np.float32]:
     return kernel[half - reach : half + reach + 1].astype(np.float32)
 
 
-def _blurred(light: Light, kernel: NDArray[np.float32], axis: int) -> Light:
+def _blurred(light: Radiance, kernel: NDArray[np.float32], axis: int) -> Radiance:
     half = len(kernel) // 2
-    total: Light = kernel[half] * light
+    total: Radiance = kernel[half] * light
     for offset in range(1, half + 1):  # kernels are symmetric
         total += kernel[half + offset] * (np.roll(light, offset, axis) + np.roll(light, -offset, axis))
     return total
@@ -113,9 +113,11 @@ class Ranking:
     def __init__(self) -> None:
         self._offers: dict[Kind, list[Floats]] = {}
 
-    def offer(self, kind: Kind, worth: NDArray[np.floating], row: NDArray[np.intp], column: NDArray[np.intp]) -> None:
+    def offer(
+        self, kind: Kind, expected_gain: NDArray[np.floating], row: NDArray[np.intp], column: NDArray[np.intp]
+    ) -> None:
         """Add places of one kind, (place,) each; those of worth minus infinity are none."""
-        offers = np.stack([worth, row, column]).astype(np.float64)
+        offers = np.stack([expected_gain, row, column]).astype(np.float64)
         self._offers.setdefault(kind, []).append(offers[:, offers[0] > -np.inf])
 
     def best(self, tier: int, most: int) -> Floats:
@@ -143,14 +145,14 @@ def band_groups(bands: int) -> list[slice]:
 class BandTiles:
     """Extremes of every band in the tiles of a scene whose bands have planes of their own."""
 
-    def __init__(self, scene: RasterScene, spectra: Light, optics: PixelOptics, tile: int) -> None:
+    def __init__(self, scene: RasterScene, spectra: Radiance, optics: PixelOptics, tile: int) -> None:
         self._scene, self._spectra, self._optics, self._tile = scene, spectra, optics, tile
         self._groups = band_groups(len(spectra))
         self._wavelength_nm = np.asarray(scene.wavelength_nm, np.float64)
         # Of tiers and measures: worth, row, column and band of tiles, (4, group, tile) of each strip.
         self._found: dict[tuple[int, int], list[Floats]] = {}
 
-    def add(self, first: int, planes: Light, tiers: Mapping[int, NDArray[np.bool_]]) -> None:
+    def add(self, first: int, planes: Radiance, tiers: Mapping[int, NDArray[np.bool_]]) -> None:
         """Take the extremes of a strip of tiles: planes (row, column, band) with the optics' halo about them."""
         halo = self._optics.halo
         light = planes[halo - 1 : 1 - halo, halo - 1 : 1 - halo] * self._spectra
@@ -163,10 +165,10 @@ class BandTiles:
                 rows = np.full(columns.shape, first), columns * self._tile
                 self._found.setdefault((tier, sort), []).append(np.stack([next(some), *rows, next(some)]))
 
-    def _worst_of_groups(self, worth: Light) -> tuple[Light, NDArray[np.intp]]:
+    def _worst_of_groups(self, expected_gain: Radiance) -> tuple[Radiance, NDArray[np.intp]]:
         """Greatest worth of each tile, of worths (tile, band), and its band, (group, tile) both."""
-        bands = np.stack([worth[:, some].argmax(axis=1) + some.start for some in self._groups])
-        return np.take_along_axis(worth.T, bands, axis=0), bands
+        bands = np.stack([expected_gain[:, some].argmax(axis=1) + some.start for some in self._groups])
+        return np.take_along_axis(expected_gain.T, bands, axis=0), bands
 
     def rank(self, ranking: Ranking, cells: ReachedCells, reaches: Sequence[float]) -> None:
         """Measure the worst tiles of every measure and group closely, and offer their best places.
@@ -187,7 +189,12 @@ class BandTiles:
                 self._offer(ranking, tier, windows, np.stack(light, axis=2), np.stack(taken, axis=2))
 
     def _offer(
-        self, ranking: Ranking, tier: int, windows: list[tuple[int, int, int]], light: Light, taken: NDArray[np.bool_]
+        self,
+        ranking: Ranking,
+        tier: int,
+        windows: list[tuple[int, int, int]],
+        light: Radiance,
+        taken: NDArray[np.bool_],
     ) -> None:
         """Offer the best place of each window by every measure; light (row, column, window, neighbouring band)."""
         middle = np.ascontiguousarray(light[..., 1])
@@ -202,21 +209,21 @@ class BandTiles:
             measures = [*self._optics.worths(middle), step, bend]
         rows, columns, bands = np.array(windows).T
         group = np.searchsorted([some.stop for some in self._groups], bands, side="right")
-        for sort, worth in enumerate(measures):
-            shown = np.where(taken, worth, -np.inf).reshape(-1, len(windows))
+        for sort, expected_gain in enumerate(measures):
+            shown = np.where(taken, expected_gain, -np.inf).reshape(-1, len(windows))
             best = shown.argmax(axis=0)
             down, right = np.divmod(best, self._tile)
             offered = shown[best, np.arange(len(windows))], rows + down, columns + right
             for number in np.unique(group).tolist():
                 ranking.offer((tier, sort, number), *(one[group == number] for one in offered))
 
-    def _window(self, row: int, column: int, band: int) -> Light:
+    def _window(self, row: int, column: int, band: int) -> Radiance:
         """Light about a tile in a band and its neighbours, (row, column, 3); the scene's edge is repeated."""
         halo, (rows, columns) = self._optics.halo, self._scene.shape
         down = np.arange(row - halo, row + self._tile + halo).clip(0, rows - 1)
         right = np.arange(column - halo, column + self._tile + halo).clip(0, columns - 1)
         bands = np.arange(band - 1, band + 2).clip(0, len(self._spectra) - 1)
-        found: Light = self._scene.planes[down[:, None, None], right[:, None], bands] * self._spectra[bands]
+        found: Radiance = self._scene.planes[down[:, None, None], right[:, None], bands] * self._spectra[bands]
         return found
 
     def _taken(self, rows: NDArray[np.bool_], column: int) -> NDArray[np.bool_]:
@@ -227,16 +234,16 @@ class BandTiles:
     def _starts(self, columns: int) -> NDArray[np.intp]:
         return np.arange(0, columns, self._tile)
 
-    def _measures(self, light: Light) -> list[Light]:
+    def _measures(self, light: Radiance) -> list[Radiance]:
         """Worth of every tile of a strip for every measure, (tile, band) each; the strip has a pixel beside it."""
         inner = light[1:-1, 1:-1]
         starts = self._starts(inner.shape[1])
 
-        def greatest(values: Light) -> Light:
+        def greatest(values: Radiance) -> Radiance:
             ridge = values.max(axis=0)
             if short := -len(ridge) % self._tile:
                 ridge = np.pad(ridge, [(0, short), (0, 0)], mode="edge")
-            most: Light = ridge.reshape(-1, self._tile, ridge.shape[1]).max(axis=1)
+            most: Radiance = ridge.reshape(-1, self._tile, ridge.shape[1]).max(axis=1)
             return most
 
         high, low = greatest(inner), -greatest(-inner)
@@ -252,11 +259,11 @@ class BandTiles:
         return found
 
     def _wide_steps(
-        self, light: Light, starts: NDArray[np.intp], greatest: Callable[[Light], Light], noise: Light
-    ) -> list[Light]:
+        self, light: Radiance, starts: NDArray[np.intp], greatest: Callable[[Radiance], Radiance], noise: Radiance
+    ) -> list[Radiance]:
         """Between means of half tiles, and between any two pixels: what a slit shows that is wider than a pixel."""
         high, low = light.max(axis=0)[1:-1], light.min(axis=0)[1:-1]
-        span: Light = greatest(high[None]) + greatest(-low[None])
+        span: Radiance = greatest(high[None]) + greatest(-low[None])
         rows, columns = (_halves(size, self._tile) for size in light.shape[:2])
         high = [light[first:last].sum(axis=0) for first, last in pairwise([*rows.tolist(), len(light)])]
         sums = np.add.reduceat(np.stack(high), columns, axis=1)
@@ -267,7 +274,9 @@ class BandTiles:
         firsts = np.searchsorted(columns, starts + 1, side="right") - 1
         return [span / noise, *(np.maximum.reduceat(step, firsts, axis=0) / noise for step in (ahead, aside))]
 
-    def _spectral_steps(self, inner: Light, greatest: Callable[[Light], Light], noise: Light) -> list[Light]:
+    def _spectral_steps(
+        self, inner: Radiance, greatest: Callable[[Radiance], Radiance], noise: Radiance
+    ) -> list[Radiance]:
         if inner.shape[2] < 2:
             return []
         steep = steepest_difference(inner, self._wavelength_nm)
@@ -303,11 +312,11 @@ class Extrema:
 
 
 @dataclass(frozen=True)
-class _Strip:
+class _Swath:
     """Rows from ``first`` on with a halo about them, and which of its pixels each tier holds, by its number."""
 
     first: int
-    planes: Light
+    planes: Radiance
     tiers: dict[int, NDArray[np.bool_]]
 
 
@@ -333,40 +342,40 @@ def find_extrema(
     tiles = BandTiles(scene, spectra, optics, tile) if own_planes and len(spectra) > CHOSEN_BANDS else None
     bands = chosen_bands(spectra)
     high = tile if tiles is not None else _TILES_HIGH * tile
-    for strip in _strips(scene, high, optics.halo, cells, reaches):
-        _check_finite(scene, strip.planes, strip.first - optics.halo)
-        if not any(taken.any() for taken in strip.tiers.values()):
+    for swath in _swaths(scene, high, optics.halo, cells, reaches):
+        _check_finite(scene, swath.planes, swath.first - optics.halo)
+        if not any(taken.any() for taken in swath.tiers.values()):
             continue
         if tiles is not None:
-            tiles.add(strip.first, strip.planes, strip.tiers)
+            tiles.add(swath.first, swath.planes, swath.tiers)
             continue
         some = spectra[bands] if own_planes else np.ascontiguousarray(spectra[:, bands])
-        light = to_bands(strip.planes[..., bands] if own_planes else strip.planes, some)
-        _rank(ranking, strip, light, optics, tile)
+        light = to_bands(swath.planes[..., bands] if own_planes else swath.planes, some)
+        _rank(ranking, swath, light, optics, tile)
     if tiles is not None:
         tiles.rank(ranking, cells, (0.0, *reaches))
     found = [ranking.best(tier, count) for tier, count in zip((*range(len(reaches) + 1), _FAR), most, strict=True)]
     return Extrema(found[0], tuple(found[1:-1]), found[-1])
 
 
-def _rank(ranking: Ranking, strip: _Strip, light: Light, optics: PixelOptics, tile: int) -> None:
-    near = {tier: taken for tier, taken in strip.tiers.items() if tier != _FAR and taken.any()}
-    for sort, worth in enumerate(optics.worths(light) if near else ()):
+def _rank(ranking: Ranking, swath: _Swath, light: Radiance, optics: PixelOptics, tile: int) -> None:
+    near = {tier: taken for tier, taken in swath.tiers.items() if tier != _FAR and taken.any()}
+    for sort, expected_gain in enumerate(optics.worths(light) if near else ()):
         for tier, taken in near.items():
-            _offer(ranking, (tier, sort), worth, taken, strip.first, tile)
-    far, halo = strip.tiers.get(_FAR), optics.halo
+            _offer(ranking, (tier, sort), expected_gain, taken, swath.first, tile)
+    far, halo = swath.tiers.get(_FAR), optics.halo
     if far is not None and far.any():
         inner = light[halo:-halo, halo:-halo]
-        for sort, worth in enumerate((inner, -inner)):
-            _offer(ranking, (_FAR, sort), worth, far, strip.first, tile)
+        for sort, expected_gain in enumerate((inner, -inner)):
+            _offer(ranking, (_FAR, sort), expected_gain, far, swath.first, tile)
 
 
 def _offer(
-    ranking: Ranking, kind: tuple[int, int], worth: Light, taken: NDArray[np.bool_], first: int, tile: int
+    ranking: Ranking, kind: tuple[int, int], expected_gain: Radiance, taken: NDArray[np.bool_], first: int, tile: int
 ) -> None:
     """Offer the greatest of every tile and band; worth (row, column, band) of the strip that begins at a row."""
-    shown = worth if taken.all() else np.where(taken[..., None], worth, np.float32(-np.inf))
-    (rows, columns, bands), none = worth.shape, -np.inf
+    shown = expected_gain if taken.all() else np.where(taken[..., None], expected_gain, np.float32(-np.inf))
+    (rows, columns, bands), none = expected_gain.shape, -np.inf
     shown = np.pad(shown, [(0, -rows % tile), (0, -columns % tile), (0, 0)], constant_values=none)
     tall = shown.reshape(-1, tile, shown.shape[1], bands)  # (row of tiles, row, column, band)
     ridge = tall.max(axis=1).reshape(len(tall), -1, tile, bands)
@@ -379,7 +388,7 @@ def _offer(
         ranking.offer((*kind, band), *(one[..., band].ravel() for one in (greatest, row, column)))
 
 
-def chosen_bands(spectra: Light) -> NDArray[np.intp]:
+def chosen_bands(spectra: Radiance) -> NDArray[np.intp]:
     """Choose the brightest band and those least like the ones chosen, at most ``CHOSEN_BANDS``.
 
     Of bands with planes of their own, which do not tell of each other: as many, evenly.
@@ -393,9 +402,9 @@ def chosen_bands(spectra: Light) -> NDArray[np.intp]:
     return np.unique(chosen)
 
 
-def _strips(
+def _swaths(
     scene: RasterScene, high: int, halo: int, cells: ReachedCells, reaches: Sequence[float]
-) -> Iterator[_Strip]:
+) -> Iterator[_Swath]:
     rows, ends = scene.shape[0], [-1.0, 0.0, *reaches]
     for first in range(0, rows, high):
         down = np.arange(first - halo, min(first + high, rows) + halo).clip(0, rows - 1)
@@ -405,10 +414,10 @@ def _strips(
             numbers = range(1, len(reaches) + 1)
             tiers |= {one: cells.rows_within(first, first + high, ends[one], ends[one + 1]) for one in numbers}
             tiers[_FAR] = cells.rows_within(first, first + high, ends[-1], np.inf)
-        yield _Strip(first, np.pad(inner, ((0, 0), (halo, halo), (0, 0)), mode="edge"), tiers)
+        yield _Swath(first, np.pad(inner, ((0, 0), (halo, halo), (0, 0)), mode="edge"), tiers)
 
 
-def _check_finite(scene: RasterScene, planes: Light, first: int) -> None:
+def _check_finite(scene: RasterScene, planes: Radiance, first: int) -> None:
     with np.errstate(invalid="ignore", over="ignore"):  # infinity less infinity: found out below
         if np.isfinite(planes.sum(dtype=np.float64)):
             return

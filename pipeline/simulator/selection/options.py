@@ -187,7 +187,7 @@ def _cost_ns(costs: Mapping[str, float], variant: str) -> float:
 
 
 def _is_present(effect: Effect, probe: Probe, rig: Rig) -> bool:
-    bright = max(probe.brightest_e, rig.camera.full_well_e)
+    bright = max(probe.brightest_e, rig.camera.full_full_well_e)
     loud = replace(_even_probe(probe, 1.0), brightest_e=bright, slit_errors={})
     shown = max(effect.bound(loud, rig, OFF).value, effect.bound(probe, rig, OFF).value)
     return effect.name in ALWAYS_ON or shown > 0
@@ -324,14 +324,14 @@ def _differences(probe: Probe, rig: Rig, blurs: list[Any], normal: Floats) -> tu
     nm = np.asarray(probe.wavelength_nm, np.float64)
     blurred = Moments.together([blur.moments(rig, nm, blur.variants[0], normal) for blur in blurs], len(nm))
     steep, bend = np.zeros((2, *probe.slope.shape))
-    shares, widths = np.ones(1), np.zeros((1, *blurred.variance.shape))
+    fractions, widths = np.ones(1), np.zeros((1, *blurred.variance.shape))
     if blurred.waves is not None:  # diffraction is a sum of Gaussians
-        shares, sizes = airy_gaussians()
+        fractions, sizes = airy_gaussians()
         widths = sizes[:, None, None] * blurred.waves
-    for share, waves in zip(shares.tolist(), widths, strict=True):
+    for fraction, waves in zip(fractions.tolist(), widths, strict=True):
         near = probe.blurred_by(float(np.sqrt((blurred.spread + waves**2).max(initial=0.0))))
         first, second = _by_gaussian(near, nm, blurred.shift, blurred.variance + waves**2, waves)
-        steep, bend = steep + share * first, bend + share * second
+        steep, bend = steep + fraction * first, bend + fraction * second
     return steep, bend
 
 

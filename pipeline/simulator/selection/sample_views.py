@@ -14,10 +14,10 @@ from pipeline.geometry.mirror import direction_to_normal, scene_to_direction
 from pipeline.geometry.scan import Sweep, points_of_scan, scene_to_sweep
 from pipeline.simulator.optics.kernel_fit import Footprint
 from pipeline.simulator.optics.rays import RayViews, exact_views
-from pipeline.simulator.optics.scene_light import Looker
+from pipeline.simulator.optics.scene_radiance import Looker
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 
-Light = NDArray[np.float32]
+Radiance = NDArray[np.float32]
 Floats = NDArray[np.float64]
 Way = tuple[float, float]
 LINE_SAMPLES = 64  # of a line, evenly from end to end, in sums where samples are summed
@@ -34,7 +34,7 @@ class SampleViews:
     ``binning`` in a row are the samples of one stored number.
     """
 
-    strip_px: Floats
+    swath_px: Floats
     scan_px: Floats
     slope: Floats
     along_y: NDArray[np.bool_]
@@ -68,7 +68,7 @@ def light_seen(
     views: SampleViews,
     footprint: Footprint,
     shifts: Sequence[tuple[Way, Way]] = (((0.0, 0.0), (0.0, 0.0)),),
-) -> Light:
+) -> Radiance:
     """Light (shift, view, band) through a footprint, with rays turned and points moved (along, scan) by shifts [px]."""
     exposures, ifov = camera.exposure_ms / DEFAULT_EXPOSURE_MS, camera.ifov_rad
     light = np.empty((len(shifts), len(views.slope), len(scene.wavelength_nm)), np.float32)
@@ -83,14 +83,14 @@ def light_seen(
             seen = rays_of(some, camera, turned)
             along, scan = seen.along / ifov + moved[0], seen.scan / ifov + moved[1]
             placed = replace(seen, along=along + (size[0] - 1) / 2, scan=scan + (size[1] - 1) / 2)
-            light[number, which] = looker.look(scene, [placed], along_y=along_y, exposures=exposures)
+            light[number, which] = looker.scan_pass(scene, [placed], along_y=along_y, exposures=exposures)
     return light
 
 
 def rays_of(views: SampleViews, camera: LineCamera, turned: Way = (0.0, 0.0)) -> RayViews:
     """Give the middle rays of samples, moved by (along, across) px of the camera, in tangents."""
     ifov = camera.ifov_rad
-    tangents = np.stack([views.strip_px, views.scan_px], axis=-1) * ifov
+    tangents = np.stack([views.swath_px, views.scan_px], axis=-1) * ifov
     normal = direction_to_normal(scene_to_direction(tangents))
     return exact_views(normal, turned[1] * ifov, views.slope + turned[0] * ifov)
 
@@ -113,17 +113,17 @@ def views_of_lines(sweeps: tuple[Sweep, ...], camera: LineCamera, room: int) -> 
     order = {id(sweep): place for place, sweep in enumerate(sweeps)}
     binning = sweeps[0].binning
     numbers = [(sweep, number) for sweep in sweeps for number in {0, sweep.lines // 2, sweep.lines - 1}]
-    numbers.sort(key=lambda one: -float(np.hypot(one[0].strip_px, one[0].line_px()[one[1]])))
+    numbers.sort(key=lambda one: -float(np.hypot(one[0].swath_px, one[0].line_px()[one[1]])))
     most = max(room // (line_sums(camera, binning) * binning), 1)
     kept = numbers[: most // 2 or 1]
-    rest = [(sweep, round(share * (sweep.lines - 1))) for sweep in sweeps for share in (0.25, 0.75)]
+    rest = [(sweep, round(fraction * (sweep.lines - 1))) for sweep in sweeps for fraction in (0.25, 0.75)]
     rest += numbers[len(kept) :]
     kept += [rest[round(at)] for at in np.linspace(0, len(rest) - 1, most - len(kept))] if most > len(kept) else []
     sums = np.linspace(0, camera.samples // binning - 1, line_sums(camera, binning)).round().astype(np.intp)
     slopes = camera.pixel_slopes()[_samples_of(sums, binning)]
     count = len(slopes)
     return SampleViews(
-        np.repeat([sweep.strip_px for sweep, _ in kept], count).astype(np.float64),
+        np.repeat([sweep.swath_px for sweep, _ in kept], count).astype(np.float64),
         np.repeat([sweep.line_px()[number] for sweep, number in kept], count),
         np.tile(slopes, len(kept)),
         np.repeat([sweep.along == "y" for sweep, _ in kept], count),
@@ -145,7 +145,7 @@ def views_of_places(
     for along_y in (False, True):
         numbers = [number for number, sweep in enumerate(sweeps) if (sweep.along == "y") == along_y]
         finest = sorted(numbers, key=lambda number: sweeps[number].step)
-        oblique = sorted(numbers, key=lambda number: -abs(sweeps[number].strip_px))
+        oblique = sorted(numbers, key=lambda number: -abs(sweeps[number].swath_px))
         along, scan = (centred if along_y else centred[:, ::-1]).T
         slack = beside_px or 0.0
         seen = [_first_seeing(order, sweeps, camera, along, scan, slack) for order in (finest, oblique)]
@@ -210,7 +210,7 @@ def _patches(sweep: Sweep, number: int, camera: LineCamera, line: Floats, sample
     slopes = (number_of - (camera.samples - 1) / 2) * camera.ifov_rad
     count = len(slopes)
     return SampleViews(
-        np.full(count, sweep.strip_px),
+        np.full(count, sweep.swath_px),
         sweep.start_px + np.repeat(lines, binning),
         slopes,
         np.full(count, sweep.along == "y"),
@@ -228,7 +228,7 @@ _LINES_AT_ONCE = 256
 
 def line_means(
     scene: RasterScene, camera: LineCamera, sweeps: Sequence[Sweep], beside_px: Sequence[float] = (0.0,)
-) -> Light:
+) -> Radiance:
     """Give the mean over samples and bands of every position that any sweep holds, (position,) [e-].
 
     Of the pixels that middle rays meet: a slit, and positions that one line holds, give means between these. Positions
@@ -240,13 +240,13 @@ def line_means(
     grey = (scene.planes.reshape(-1, scene.planes.shape[2]) @ mean.astype(np.float32)).reshape(scene.shape)
     beyond, found = np.ceil(camera.slit_px / 2 + 1) + max(beside_px), []
     courses = sorted({_course(sweep) for sweep in sweeps if sweep.lines})
-    for along_y, strip, lines in ((one[0], one[1] + beside, one[2]) for one in courses for beside in beside_px):
+    for along_y, swath, lines in ((one[0], one[1] + beside, one[2]) for one in courses for beside in beside_px):
         pixels, middle = (grey.T if along_y else grey), (np.array(scene.shape) - 1) / 2
         down, right = middle[::-1] if along_y else middle
         held = np.arange(lines[0] - beyond, lines[1] + beyond)
         for first in range(0, len(held), _LINES_AT_ONCE):
             some = held[first : first + _LINES_AT_ONCE]
-            along, scan = points_of_scan(strip, camera, some[:, None], camera.pixel_slopes())
+            along, scan = points_of_scan(swath, camera, some[:, None], camera.pixel_slopes())
             row = np.rint(scan + down).clip(0, pixels.shape[0] - 1).astype(np.intp)
             column = np.rint(along + right).clip(0, pixels.shape[1] - 1).astype(np.intp)
             found.append(pixels[row, column].mean(axis=1))
@@ -255,4 +255,4 @@ def line_means(
 
 def _course(sweep: Sweep) -> tuple[bool, float, tuple[float, float]]:
     """Orientation, strip, and the first held position and the one after the last: what tells paths apart."""
-    return sweep.along == "y", sweep.strip_px, (sweep.start_px, sweep.start_px + sweep.lines * sweep.step)
+    return sweep.along == "y", sweep.swath_px, (sweep.start_px, sweep.start_px + sweep.lines * sweep.step)

@@ -52,7 +52,7 @@ else:
     compiled_loops = deferred("pipeline.simulator.compiled_loops")
 
 Floats = NDArray[np.float64]
-Light = NDArray[np.float32]
+Radiance = NDArray[np.float32]
 Way = tuple[float, float]
 _ROUNDING = 2e-6  # of the level: less is rounding of float32
 _NEAR, _FAR = 0.25, 0.5  # px by which the footprint is shifted
@@ -71,25 +71,25 @@ SHIFTS = tuple(_shifts())  # of rays and of points, (along, scan) px each, that 
 
 
 @dataclass(frozen=True)
-class LinesLooked:
+class ProbedLines:
     """Light (shift, view, band) of the sweeps' own samples, and of places within each reach of them and beyond. [e-]
 
     ``scale`` is the unit of the tolerance at each stored number of theirs, (number, band) [e-].
     """
 
-    own: Light
-    around: tuple[Light, ...]
-    scale: Light
+    own: Radiance
+    around: tuple[Radiance, ...]
+    scale: Radiance
     binning: int
     rig: Rig
     unit: Unit
 
     @staticmethod
-    def of(parts: Sequence[Light], binning: int, rig: Rig, unit: Unit) -> LinesLooked:
+    def of(parts: Sequence[Radiance], binning: int, rig: Rig, unit: Unit) -> ProbedLines:
         scale = unit_at(np.asarray(stored_mean(parts[0].min(axis=0), binning), np.float32), rig, unit, binning)
-        return LinesLooked(parts[0], tuple(parts[1:]), scale, binning, rig, unit)
+        return ProbedLines(parts[0], tuple(parts[1:]), scale, binning, rig, unit)
 
-    def span_to(self, low: Light, high: Light) -> Floats:
+    def span_to(self, low: Radiance, high: Radiance) -> Floats:
         """Greatest difference of a stored number and light between two ends, (band,), over its unit."""
         least, most = self.own.min(axis=0), self.own.max(axis=0)
         off = np.maximum(most - low, high - least)
@@ -129,25 +129,25 @@ class LinesLooked:
         return {"beside": tuple(found), "afar": afar, "anywhere": self.span_to(low, high), **between}
 
 
-def sum_up_looks(looks: LinesLooked, scene: RasterScene, sweeps: tuple[Sweep, ...], means: Light) -> Probe:
+def sum_up_probes(probes: ProbedLines, scene: RasterScene, sweeps: tuple[Sweep, ...], means: Radiance) -> Probe:
     """Turn what samples see, and the means of lines (line,), into the probe's maxima."""
-    rig, seen, scale, binning = looks.rig, looks.own, looks.scale, looks.binning
+    rig, seen, scale, binning = probes.rig, probes.own, probes.scale, probes.binning
     camera, least, most = rig.camera, seen.min(axis=0), seen.max(axis=0)
     darkest, brightest = stored_mean(least, binning), stored_mean(most, binning)
     slope, curvature = _derivatives(seen, scale, binning)
     spectral = _spectral_derivatives(seen[0], scene.wavelength_nm, scale, binning)
     low, high = least.min(axis=0), most.max(axis=0)
-    unit_brightest = unit_at(np.asarray(brightest, np.float32), rig, looks.unit, binning)
+    unit_brightest = unit_at(np.asarray(brightest, np.float32), rig, probes.unit, binning)
     level = np.maximum(np.abs(brightest) / unit_brightest, np.abs(darkest) / scale)
     off_mean = np.maximum(most - means.min(), means.max() - least)
     return Probe(
-        unit=looks.unit,
+        unit=probes.unit,
         sweeps=sweeps,
         wavelength_nm=scene.wavelength_nm,
         fwhm_nm=scene.fwhm_nm,
         level=_greatest(level),
         spread=_greatest(stored_mean(_above(off_mean, high), binning) / scale),
-        span=looks.span_to(low, high),
+        span=probes.span_to(low, high),
         slope=slope,
         curvature=curvature,
         spectral_slope=spectral[0],
@@ -157,7 +157,7 @@ def sum_up_looks(looks: LinesLooked, scene: RasterScene, sweeps: tuple[Sweep, ..
         unit_least_dn=float(scale.min()) / camera.electrons_per_dn,
         lines=sum(sweep.lines for sweep in sweeps),
         seconds=CostModel().seconds(list(sweeps), camera),
-        white_e=scene.panel_electrons.astype(np.float64) * (camera.exposure_ms / DEFAULT_EXPOSURE_MS),
+        white_e=scene.white_reference_electrons.astype(np.float64) * (camera.exposure_ms / DEFAULT_EXPOSURE_MS),
         own_e=np.stack([low, high]).astype(np.float64),
         binning=binning,
     )
@@ -202,14 +202,14 @@ def worst_of_groups(probe: Probe) -> Probe:
     )
 
 
-def _derivatives(seen: Light, scale: Light, binning: int) -> tuple[Floats, Floats]:
+def _derivatives(seen: Radiance, scale: Radiance, binning: int) -> tuple[Floats, Floats]:
     """Greatest first and second derivatives, (2, band) each over the unit, by differences within half a px.
 
     Of a stored number the mean size over its samples: they may be moved one way or the other.
     """
     level, high = seen[0], np.abs(seen[0]).max(axis=0)
 
-    def size(difference: Light) -> Floats:
+    def size(difference: Radiance) -> Floats:
         return _greatest(stored_mean(_above(np.abs(difference), high), binning) / scale)
 
     slope, curvature = [], []
@@ -223,7 +223,7 @@ def _derivatives(seen: Light, scale: Light, binning: int) -> tuple[Floats, Float
     return np.array(slope), np.array(curvature)
 
 
-def _spectral_derivatives(level: Light, wavelength_nm: Floats, scale: Light, binning: int) -> Floats:
+def _spectral_derivatives(level: Radiance, wavelength_nm: Floats, scale: Radiance, binning: int) -> Floats:
     """Greatest first and second divided differences over wavelength, (2, band) over the unit; 0 where there is none."""
     nm = np.asarray(wavelength_nm, np.float64)
     if len(nm) < 2:
@@ -232,7 +232,7 @@ def _spectral_derivatives(level: Light, wavelength_nm: Floats, scale: Light, bin
     return np.stack([_greatest(stored_mean(one, binning) / scale) for one in both])
 
 
-def _above(difference: Light, high: Light) -> Light:
+def _above(difference: Radiance, high: Radiance) -> Radiance:
     """0 where a difference is no more than rounding."""
     return np.where(difference > _ROUNDING * np.abs(high), difference, np.float32(0))
 
@@ -247,7 +247,7 @@ USUAL_LIGHTS = 101  # quantiles of the light that are kept
 FINEST_SAMPLES = 1000  # at which variants of the slit are held against the finest
 _LEAST_OF_SWEEP = 50
 _LEAST_PLACES = 24  # that are looked at where samples are summed, however many samples that takes
-_LOOK, _CLOSE = (2, 1), (3, 1)  # boxes that are looked through, and that tell where variants differ
+_PROBE, _CLOSE = (2, 1), (3, 1)  # boxes that are looked through, and that tell where variants differ
 _ALIKE = 0.02  # share by which blurs may differ and count as one
 _OPTICS = (DIFFRACTION, DEFOCUS, ABERRATION, KEYSTONE)
 _LINES_BESIDE = tuple(sign * reach for reach in (0.0, REACHES[-1]) for sign in (-1.0, 1.0))  # whose light may come
@@ -302,14 +302,14 @@ def probe_scene(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Uni
     own = joined([lines, views_of_places(places.seen, scene, camera, taken)])
     beside = _views_beside(scene, camera, taken, places)
     views = joined([own, *beside])
-    seen = light_seen(scene, camera, views, _footprint(SLIT.variants[0], rig, _LOOK, None, scene), SHIFTS)
+    seen = light_seen(scene, camera, views, _footprint(SLIT.variants[0], rig, _PROBE, None, scene), SHIFTS)
     ends = np.cumsum([len(one.slope) for one in (own, *beside)])
-    looks = LinesLooked.of(np.split(seen, ends[:-1], axis=1), binning, rig, unit)
-    summed = sum_up_looks(looks, scene, taken, line_means(scene, camera, taken, _LINES_BESIDE if beside else (0.0,)))
+    probes = ProbedLines.of(np.split(seen, ends[:-1], axis=1), binning, rig, unit)
+    summed = sum_up_probes(probes, scene, taken, line_means(scene, camera, taken, _LINES_BESIDE if beside else (0.0,)))
     usual = np.quantile(seen[0, : len(lines.slope)], np.linspace(0, 1, USUAL_LIGHTS)).astype(np.float64)
     found = replace(summed, usual_e=usual, places=places.seen)
     if beside:
-        found = replace(found, **looks.beside(scene, cells.covers))
+        found = replace(found, **probes.beside(scene, cells.covers))
     moved_to = _within(beside, greatest_way_px(found, rig, EFFECTS)) if beside else []
     found = replace(found, slit_errors=_slit_errors(scene, rig, joined([own, *moved_to]), taken, unit))
     return worst_of_groups(found) if scene.electrons.ndim == 1 and bands > CHOSEN_BANDS else found
@@ -384,7 +384,7 @@ def _roughest(scene: RasterScene, rig: Rig, views: SampleViews, unit: Unit) -> N
 
 
 def _changes(
-    scene: RasterScene, rig: Rig, views: SampleViews, footprint: Footprint, finest: Light, scale: Light
+    scene: RasterScene, rig: Rig, views: SampleViews, footprint: Footprint, finest: Radiance, scale: Radiance
 ) -> Floats:
     """Greatest change of each stored number by another footprint, over the unit, (number,): measured, with its sign."""
     light, greatest = light_seen(scene, rig.camera, views, footprint, _PHASES), np.zeros(views.sums)
@@ -419,6 +419,6 @@ def _moments(rig: Rig, wavelength_nm: Floats, normal: Floats) -> Moments:
     return Moments.together(found, len(wavelength_nm))
 
 
-def _stored(values: Light, views: SampleViews) -> Light:
+def _stored(values: Radiance, views: SampleViews) -> Radiance:
     """Means over the samples of each stored number, (..., number, band)."""
     return np.asarray(stored_mean(values, views.binning), np.float32)

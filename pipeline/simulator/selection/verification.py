@@ -14,22 +14,22 @@ from numpy.typing import NDArray
 from pipeline.errors import BoundError, PoseError, ShapeError
 from pipeline.geometry.scan import Sweep, line_positions, scene_to_sweep
 from pipeline.simulator.effects.blurs import DIFFRACTION
-from pipeline.simulator.effects.effect import OFF, Effect, Light, SweepBlock
+from pipeline.simulator.effects.effect import OFF, Effect, Radiance, SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR, folded_positions
 from pipeline.simulator.effects.probe import stored_mean
 from pipeline.simulator.optics.kernel_fit import NEGLIGIBLE
 from pipeline.simulator.optics.tap_sums import TABULATED
 from pipeline.simulator.render import kernel_error, tails_apart
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.selection.choice import TOTAL, UNIT_WORDS, Decision
+from pipeline.simulator.selection.choice import TOTAL, UNIT_NAMES, Decision
 from pipeline.simulator.selection.options import acts_on_light
 
 Floats = NDArray[np.float64]
-Units = Callable[[Light, int], NDArray[np.floating]]  # of the mean light of so many samples that a number sums
+Units = Callable[[Radiance, int], NDArray[np.floating]]  # of the mean light of so many samples that a number sums
 HARDLY = 1e-3  # units: an effect that changes less is measured together with the others alone
 VERIFIED_LINES = 3  # whole ones, for stray light comes from all of a line
 MOST_CANDIDATES = 40
-Render = Callable[[SweepBlock, Mapping[Effect, str]], Light]
+Render = Callable[[SweepBlock, Mapping[Effect, str]], Radiance]
 ROUNDING = 4e-6  # of the brightest light of some lines: float32 sums
 REACH_PX = 8  # of a footprint's weights, along the line and the scan, but for the tails of diffraction
 TAILS_PX = 128  # of these: beyond, less is put elsewhere than by tables, in bands from 400 to 1000 nm
@@ -50,7 +50,7 @@ def candidate_blocks(whole: Sequence[SweepBlock], places: Floats, *, lines: int 
 
 
 def worst_blocks(
-    candidates: Sequence[SweepBlock], render: Callable[[SweepBlock], Light], units: Units
+    candidates: Sequence[SweepBlock], render: Callable[[SweepBlock], Radiance], units: Units
 ) -> dict[str, SweepBlock]:
     """Choose where bounds are hardest to keep: the steepest, brightest, darkest and most oblique of some blocks.
 
@@ -158,7 +158,7 @@ def verify(decision: Decision, render: Render, blocks: Mapping[str, SweepBlock],
         worst = max(found, key=lambda one: one.unexplained, default=_Change(0.0))
         if not worst.unexplained <= bound:
             raise BoundError(
-                f"{name}: what was left out changes light by {worst.change:.3g} {UNIT_WORDS[decision.unit]} at"
+                f"{name}: what was left out changes light by {worst.change:.3g} {UNIT_NAMES[decision.unit]} at"
                 f" {worst.place}, above its bound of {bound:.3g}; the probe missed how bright or steep the scene is"
                 " there: simulate with --tol 0 or --effects all, and please report it with the rig's settings"
             )
@@ -188,7 +188,7 @@ def _greatest_change(
         return _Change(0.0)
     rounding = np.zeros(change.shape)
     if not change.max() <= bound:
-        rounding = misplaced_electrons(one.light, one.contrast, misplaced_share(one.block, exact, chosen)) / one.unit
+        rounding = misplaced_electrons(one.light, one.contrast, misplaced_fraction(one.block, exact, chosen)) / one.unit
         if not (change - rounding).max() <= bound:
             afar = misplaced_in_tails(one.block, exact, chosen, one.render)
             rounding = rounding + stored_mean(afar, binning) / one.unit
@@ -201,16 +201,16 @@ def _greatest_change(
     )
 
 
-def misplaced_electrons(light: NDArray[np.floating], contrast: NDArray[np.floating], share: float) -> Floats:
+def misplaced_electrons(light: NDArray[np.floating], contrast: NDArray[np.floating], fraction: float) -> Floats:
     """Bound by how much two ways may differ at each number of some lines (line, number, band). [e-]
 
-    ``contrast`` is that of `contrast_about`, stored as the light is, ``share`` that of `misplaced_share`.
+    ``contrast`` is that of `contrast_about`, stored as the light is, ``fraction`` that of `misplaced_fraction`.
     """
-    return share * contrast.astype(np.float64) + ROUNDING * float(np.abs(light).max(initial=0.0))
+    return fraction * contrast.astype(np.float64) + ROUNDING * float(np.abs(light).max(initial=0.0))
 
 
-def misplaced_share(block: SweepBlock, exact: Mapping[Effect, str], chosen: Mapping[Effect, str]) -> float:
-    """Give the share of the contrast about a sample by which two ways to compute its light may differ at most.
+def misplaced_fraction(block: SweepBlock, exact: Mapping[Effect, str], chosen: Mapping[Effect, str]) -> float:
+    """Give the fraction of the contrast about a sample by which two ways to compute its light may differ at most.
 
     Tables of weights misplace up to `TABULATED` of the light along either axis, in either image; where blurs or held
     positions differ, so do the kernels that stand for those of all bands, each right to `NEGLIGIBLE` unless its
@@ -229,14 +229,14 @@ def misplaced_in_tails(
     They do where blurs or held positions are folded otherwise and both ways have the pattern of the pupil. Light that
     is spread `REACH_PX` and more counts by the range of the scene within `TAILS_PX`.
     """
-    share = tails_share(block, exact, chosen)
-    if not share.any():
+    fraction = tails_fraction(block, exact, chosen)
+    if not fraction.any():
         return np.zeros((1, block.rig.camera.samples, len(block.wavelength_nm)))
-    return share * contrast_about(block, render, TAILS_PX)
+    return fraction * contrast_about(block, render, TAILS_PX)
 
 
-def tails_share(block: SweepBlock, exact: Mapping[Effect, str], chosen: Mapping[Effect, str]) -> Floats:
-    """Give the share of light, by size, that two ways put elsewhere beyond `REACH_PX` by other kernels, (band,)."""
+def tails_fraction(block: SweepBlock, exact: Mapping[Effect, str], chosen: Mapping[Effect, str]) -> Floats:
+    """Give the fraction of light, by size, that two ways put elsewhere beyond `REACH_PX` by other kernels, (band,)."""
     positions = (folded_positions(block.sweep, _way(ways, SMEAR)) for ways in (exact, chosen))
     same = len(set(positions)) == 1 and _folded(exact) == _folded(chosen)
     if same or _way(exact, DIFFRACTION) != _way(chosen, DIFFRACTION):
@@ -264,8 +264,8 @@ def contrast_about(block: SweepBlock, render: Render, reach_px: int = REACH_PX) 
     wide = replace(block, sweep=held, lines=range(max(ends[0], 0), min(ends[1], held.lines)))
     if not wide.lines:
         return np.zeros((1, block.rig.camera.samples, len(block.wavelength_nm)))
-    looks = (render(replace(wide, sweep=_beside(held, *way)), MIDDLE_RAYS) for way in _HALVES)
-    ends_e = np.max([(seen.max(axis=0), -seen.min(axis=0)) for seen in looks], axis=0)
+    probes = (render(replace(wide, sweep=_beside(held, *way)), MIDDLE_RAYS) for way in _HALVES)
+    ends_e = np.max([(seen.max(axis=0), -seen.min(axis=0)) for seen in probes], axis=0)
     most, least = (scipy.ndimage.maximum_filter1d(one, 2 * reach_px + 1, axis=0, mode="nearest") for one in ends_e)
     return np.asarray((most + least).astype(np.float64)[None])
 
@@ -282,4 +282,4 @@ def _beyond(sweep: Sweep, rig: Rig, reach_px: int) -> Sweep:
 
 
 def _beside(sweep: Sweep, along_px: float, scan_px: float) -> Sweep:
-    return replace(sweep, strip_px=sweep.strip_px + along_px, start_px=sweep.start_px + scan_px)
+    return replace(sweep, swath_px=sweep.swath_px + along_px, start_px=sweep.start_px + scan_px)

@@ -21,8 +21,8 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import Sweep, shifted_position
 from pipeline.planning.coverage import full_sweeps
+from pipeline.rectify.geolocation import path_geolocation
 from pipeline.rectify.kernels import Kernel
-from pipeline.rectify.lookup import track_lookup
 from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
 from pipeline.rectify.registration.alignment import SweepShift, no_shifts
 from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX, BroadSweep, PlacedImage
@@ -110,7 +110,7 @@ def seam_offsets(survey: Survey, shifts: Sequence[SweepShift]) -> list[Floats]:
     images = survey.images(shifts)
     seams = []
     for one, other in zip(range(len(images) - 1), range(1, len(images)), strict=True):
-        middle = (survey.sweeps[one].sweep.strip_px + survey.sweeps[other].sweep.strip_px) / 2
+        middle = (survey.sweeps[one].sweep.swath_px + survey.sweeps[other].sweep.swath_px) / 2
         scan = np.arange(-survey.grid.height / 2 + MARGIN_PX, survey.grid.height / 2 - MARGIN_PX)
         points = np.stack([scan, np.full_like(scan, middle)], axis=-1)
         seams.append(_shown(survey, images[other], points) - _shown(survey, images[one], points))
@@ -153,26 +153,26 @@ def _captured(source: SimulatedSource, sweep: Sweep) -> CapturedSweep:
 
 def _shown(survey: Survey, image: PlacedImage, points: Floats) -> Floats:
     """Place that a sweep really saw where it is shown at ``points`` (y, x), (n, 2) along and scan [px]."""
-    ((track, _),) = image.tracks
-    at = track_lookup(track, survey.camera, points, along="x")
+    ((scan_path, _),) = image.scan_paths
+    at = path_geolocation(scan_path, survey.camera, points, along="x")
     sweep = image.broad.sweep
     error = survey.pointing.of_lines(sweep.name, range(sweep.lines))
     aimed = shifted_position(image.broad.position, error, survey.camera)
     slope = (at[:, 1] - (survey.camera.samples - 1) / 2) * survey.camera.ifov_rad
     rays = np.stack([np.zeros_like(slope), slope, np.ones_like(slope)], axis=-1)
     before = np.clip(np.floor(at[:, 0]).astype(int), 0, sweep.lines - 2)
-    share = (at[:, 0] - before)[:, None]
+    fraction = (at[:, 0] - before)[:, None]
     ends = [
-        direction_to_scene(reflect(rays, position_to_normal(aimed[track.lines[track.starts[before + k]]])))
+        direction_to_scene(reflect(rays, position_to_normal(aimed[scan_path.lines[scan_path.starts[before + k]]])))
         for k in (0, 1)
     ]
-    place: Floats = ((1 - share) * ends[0] + share * ends[1]) / survey.camera.ifov_rad
+    place: Floats = ((1 - fraction) * ends[0] + fraction * ends[1]) / survey.camera.ifov_rad
     return place
 
 
 @dataclass(frozen=True)
 class Picture:
-    """An image and where its first pixel's centre lies on the grid. Its lookup is a shift and nothing else."""
+    """An image and where its first pixel's centre lies on the grid. Its geolocation grid is a shift and nothing else."""
 
     values: NDArray[np.float32]  # (row, column, band)
     origin_px: Floats  # (2,) row and column of the grid, whole or not
@@ -326,7 +326,7 @@ def wave_views(
 
 
 def row_views(seed: int, shape: tuple[int, int], shift: Floats, snr: float, gaps: float) -> tuple[Floats, Floats]:
-    """Crop rows 12 px apart along the first axis, a share ``gaps`` of their length bare; shifts of up to 50 px."""
+    """Crop rows 12 px apart along the first axis, a fraction ``gaps`` of their length bare; shifts of up to 50 px."""
     rng = np.random.default_rng(seed)
     stand = np.ones((int(shape[1] / ROW_PX) + 12, shape[0] + 120))
     for row in stand:

@@ -13,7 +13,7 @@ import numpy as np
 from measure import Row, Timing, ratio, time_in_turn
 
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.effect import Effect, Light, SweepBlock
+from pipeline.simulator.effects.effect import Effect, Radiance, SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.effects.probe import Probe, noise_electrons
 from pipeline.simulator.effects.registry import EFFECTS
@@ -37,7 +37,7 @@ MOST_LOOSE = 6.0  # median of bound over measured change
 MOST_BINNING = 8  # every case is stored as samples, and in sums of 2 to so many
 TOLERANCE = 0.1
 LEAST_SAVED = 3.0
-LOOK = {ROTATION: ROTATION.variants[0], SLIT: SLIT.variants[1]}
+FOOTPRINT = {ROTATION: ROTATION.variants[0], SLIT: SLIT.variants[1]}
 LINES = range(504, 520)  # of the farm's sweeps that are timed
 RIGS = {"rig at rest": Rig(), "rig 30 m away": Rig(air=Air(distance_m=30.0))}
 
@@ -106,7 +106,7 @@ def _of_effect(name: str, variant: str, cases: list[tuple[int, Trial]], what: st
 
 def _farm() -> list[Row]:
     scene = farm_scene(1, (1024, 1280))
-    sweeps = tuple(Sweep(f"strip {strip:g}", "fine", "x", strip, -512.0, 1024) for strip in (-320.0, 320.0))
+    sweeps = tuple(Sweep(f"strip {swath:g}", "fine", "x", swath, -512.0, 1024) for swath in (-320.0, 320.0))
     return [row for name, rig in RIGS.items() for row in _of_rig(scene, name, rig, sweeps)]
 
 
@@ -131,7 +131,7 @@ def _of_rig(scene: RasterScene, name: str, rig: Rig, sweeps: tuple[Sweep, ...]) 
 
 
 def _block(scene: RasterScene, rig: Rig, sweep: Sweep, lines: range) -> SweepBlock:
-    white = scene.panel_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
+    white = scene.white_reference_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
     return SweepBlock(rig, sweep, lines, scene.wavelength_nm, scene.shape, fwhm_nm=scene.fwhm_nm, white_e=white)
 
 
@@ -139,7 +139,7 @@ def _image(scene: RasterScene, block: SweepBlock, chosen: Mapping[Effect, str]) 
     read_out(expected_light(scene, block, chosen), block, chosen)
 
 
-def _apart(light: Sequence[Light], exact: Sequence[Light], rig: Rig) -> float:
+def _apart(light: Sequence[Radiance], exact: Sequence[Radiance], rig: Rig) -> float:
     pairs = zip(light, exact, strict=True)
     return max(float((np.abs(one - other) / noise_electrons(other, rig)).max()) for one, other in pairs)
 
@@ -171,11 +171,13 @@ def _cpu_row(name: str, against: str, clocks: Mapping[str, Timing], apart: float
 def _verified(scene: RasterScene, name: str, decision: Decision, probe: Probe, before: str) -> Row:
     rig, clock = RIGS[name], time.process_time()
 
-    def units(light: Light, binning: int) -> Light:
+    def units(light: Radiance, binning: int) -> Radiance:
         return noise_electrons(light, rig, binning)
 
     whole = [_block(scene, rig, sweep, range(sweep.lines)) for sweep in probe.sweeps]
-    chips = worst_blocks(candidate_blocks(whole, probe.places), lambda chip: expected_light(scene, chip, LOOK), units)
+    chips = worst_blocks(
+        candidate_blocks(whole, probe.places), lambda chip: expected_light(scene, chip, FOOTPRINT), units
+    )
     measured = verify(decision, lambda chip, chosen: expected_light(scene, chip, chosen), chips, units)
     spent = time.process_time() - clock
     worst = max(measured.values())

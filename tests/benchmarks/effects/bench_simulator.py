@@ -23,14 +23,14 @@ from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
-from pipeline.simulator.selection.choice import CHEAP_SHARE, Decision, decide
+from pipeline.simulator.selection.choice import CHEAP_FRACTION, Decision, decide
 from pipeline.simulator.selection.survey_probe import probe_scene
 
 SIZE = 2560  # px of the scene
 LINES, AT_ONCE = 256, 16
 TOLERANCE = 0.1  # sigma
 RATE, SAVED, MEMORY_GIB, RENDER_NS = 60e6, 3.0, 2.0, 7.0
-STRIPS = (-960.0, -320.0, 320.0, 960.0)
+SWATHS = (-960.0, -320.0, 320.0, 960.0)
 BLURS: dict[Effect, str] = {DIFFRACTION: "airy", ABERRATION: "gaussian", KEYSTONE: "linear"}
 
 
@@ -46,7 +46,7 @@ class Survey:
     def blocks(self) -> list[SweepBlock]:
         """Lines in the middle of one half of an outer sweep, some at a time."""
         exposures = self.rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS
-        white = self.scene.panel_electrons.astype(np.float64) * exposures
+        white = self.scene.white_reference_electrons.astype(np.float64) * exposures
         first = SIZE // 4 - LINES // 2
         whole = SweepBlock(
             self.rig, self.sweeps[0], range(SIZE), self.scene.wavelength_nm, self.scene.shape, white_e=white
@@ -60,7 +60,7 @@ class Survey:
 
 
 def rows() -> list[Row]:
-    """Rate, share of a copy, savings, memory; and what the footprint's variants cost and miss."""
+    """Rate, fraction of a copy, savings, memory; and what the footprint's variants cost and miss."""
     survey = _survey()
     decision, blocks = survey.decision, survey.blocks()
     cheap = _cheap(decision)
@@ -71,8 +71,8 @@ def rows() -> list[Row]:
         "take": _take(survey),
     }
     clocks = time_in_turn(calls, 3)
-    shares = {"auto": 1.0, "cheap": 4 * AT_ONCE / LINES, "exact": AT_ONCE / LINES, "take": 1.0}
-    ns = {name: _ns(clocks[name], survey.values * share) for name, share in shares.items()}
+    fractions = {"auto": 1.0, "cheap": 4 * AT_ONCE / LINES, "exact": AT_ONCE / LINES, "take": 1.0}
+    ns = {name: _ns(clocks[name], survey.values * fraction) for name, fraction in fractions.items()}
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     rate = 1e9 / ns["auto"]
     on = ", ".join(f"{effect.name} {variant}" for effect, variant in decision.chosen.items())
@@ -109,7 +109,7 @@ def rows() -> list[Row]:
 
 def _survey() -> Survey:
     scene, rig = farm_scene(0, (SIZE, SIZE)), Rig()
-    sweeps = tuple(Sweep(f"strip{n}", "fine", "x", at, -(SIZE - 1) / 2, SIZE) for n, at in enumerate(STRIPS))
+    sweeps = tuple(Sweep(f"swath{n}", "fine", "x", at, -(SIZE - 1) / 2, SIZE) for n, at in enumerate(SWATHS))
     decision = decide(probe_scene(scene, rig, sweeps), rig, EFFECTS, TOLERANCE)
     return Survey(scene, rig, sweeps, decision)
 
@@ -121,7 +121,7 @@ def _simulated(survey: Survey, chosen: dict[Effect, str], blocks: list[SweepBloc
 
 def _cheap(decision: Decision) -> dict[Effect, str]:
     """Everything that the rig has, each in the cheapest variant whose own error is a tenth of the tolerance at most."""
-    within = CHEAP_SHARE * decision.tolerance
+    within = CHEAP_FRACTION * decision.tolerance
     menus = [one.menu for one in decision.taken if one.menu.present]
     return {menu.effect: menu.cheapest_within(within).variant for menu in menus}
 

@@ -18,13 +18,13 @@ from visits.farm_visits import (
     SHAPE,
     Mask,
     later,
-    look_at_farm,
     seen_by,
     shipped,
+    view_farm,
 )
 
-from flows.archive.history import CHANGED_SHARE
-from models.reading.remembered import Remembered, changed_from, changed_shares, first_belief
+from flows.archive.history import CHANGED_FRACTION
+from models.reading.prior_map import PriorMap, changed_fractions, changed_from, first_probabilities
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import RasterScene, SceneRaster
 
@@ -38,23 +38,23 @@ def planted_changes() -> Iterator[Row]:
     hits: dict[str, list[bool]] = {}
     false, unchanged = 0, 0
     for seed in PLANTED_SEEDS:
-        before = look_at_farm(seed, FIRST_DAY, HOUR, ANEW)
+        before = view_farm(seed, FIRST_DAY, HOUR, ANEW)
         scene = farm_scene(seed, SHAPE, camera=CAMERA, day=FIRST_DAY + 3, hour=14.0)
         changed, places = plant(scene, np.random.default_rng(seed), names)
         now = seen_by(changed, seed, QUICK)
-        first = first_belief(before.looked)
+        first = first_probabilities(before.observation)
         after = later(before, first, now, 3.0)
-        told = changed_shares(changed_from(Remembered(first, None, 3.0), after), patch) >= CHANGED_SHARE
+        told = changed_fractions(changed_from(PriorMap(first, None, 3.0), after), patch) >= CHANGED_FRACTION
         for kind, place in places:
-            covered = _shares(place, patch) >= 0.5
+            covered = _fractions(place, patch) >= 0.5
             hits.setdefault(kind, []).append(bool((told & covered).any()))
-        same = _shares(before.labels != now.labels, patch) == 0
+        same = _fractions(before.labels != now.labels, patch) == 0
         false, unchanged = false + int((told & same).sum()), unchanged + int(same.sum())
     for kind, found in hits.items():
-        share = float(np.mean(found))
-        yield Row(f"planted: {kind}", f"{sum(found)} of {len(found)} found", ">= 95 %", share >= 0.95)
-    share = false / unchanged
-    yield Row("places said to have changed that did not", f"{share:.2%} of {unchanged}", "<= 2 %", share <= 0.02)
+        fraction = float(np.mean(found))
+        yield Row(f"planted: {kind}", f"{sum(found)} of {len(found)} found", ">= 95 %", fraction >= 0.95)
+    fraction = false / unchanged
+    yield Row("places said to have changed that did not", f"{fraction:.2%} of {unchanged}", "<= 2 %", fraction <= 0.02)
 
 
 def plant(
@@ -91,20 +91,20 @@ def other_light() -> Iterator[Row]:
     """Places said to have changed in half a day between a low sun and a high one, when nothing did."""
     patch = shipped().config.patch
     for early, late in ((LOW_SUN, HIGH_SUN), (HIGH_SUN, LOW_SUN)):
-        false, all_seats = 0, 0
+        false, all_patches = 0, 0
         for seed in SEEDS:
-            before, now = look_at_farm(seed, FIRST_DAY, early, ANEW), look_at_farm(seed, FIRST_DAY, late, QUICK, 1)
-            first = first_belief(before.looked)
+            before, now = view_farm(seed, FIRST_DAY, early, ANEW), view_farm(seed, FIRST_DAY, late, QUICK, 1)
+            first = first_probabilities(before.observation)
             after = later(before, first, now, abs(late - early) / 24)
-            told = changed_shares(changed_from(Remembered(first, None, 0.3), after), patch) >= CHANGED_SHARE
-            same = _shares(before.labels != now.labels, patch) == 0
-            false, all_seats = false + int((told & same).sum()), all_seats + int(same.sum())
-        share = false / all_seats
+            told = changed_fractions(changed_from(PriorMap(first, None, 0.3), after), patch) >= CHANGED_FRACTION
+            same = _fractions(before.labels != now.labels, patch) == 0
+            false, all_patches = false + int((told & same).sum()), all_patches + int(same.sum())
+        fraction = false / all_patches
         what = f"places said to have changed, nothing did, sun at {early:g} h then {late:g} h"
-        yield Row(what, f"{share:.2%} of {all_seats}", "<= 2 %", share <= 0.02)
+        yield Row(what, f"{fraction:.2%} of {all_patches}", "<= 2 %", fraction <= 0.02)
 
 
-def _shares(where: Mask, patch: int) -> NDArray[np.float64]:
+def _fractions(where: Mask, patch: int) -> NDArray[np.float64]:
     y, x = where.shape
-    shares: NDArray[np.float64] = where.reshape(y // patch, patch, x // patch, patch).mean(axis=(1, 3))
-    return shares
+    fractions: NDArray[np.float64] = where.reshape(y // patch, patch, x // patch, patch).mean(axis=(1, 3))
+    return fractions

@@ -10,18 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.tasks.survey_model import shipped_weights
-from flows.tradeoff.stages import plain_look
-from flows.training.look import chosen_effects
+from flows.tradeoff.stages import uniform_pass
+from flows.training.observed_scenes import chosen_effects
 from models.evaluation.metrics import confusion, mean_iou
-from models.network.memory_reader import MemoryReader
+from models.network.temporal_reader import TemporalReader
 from models.reading.inference import segment
-from models.reading.remembered import Belief, Looked, Remembered, first_belief, recall
-from models.training.looks import REFERENCE_MS
+from models.reading.prior_map import ClassProbabilities, Observation, PriorMap, first_probabilities, fuse
+from models.training.capture_augmentation import REFERENCE_MS
 from models.weights.files import Weights, load_reader, load_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel
-from pipeline.planning.coverage import cheapest_full, plain_sweeps
+from pipeline.planning.coverage import cheapest_full, uniform_sweeps
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import RasterScene
@@ -41,7 +41,7 @@ Mask = NDArray[np.bool_]
 class Seen:
     """A look at a farm: what it says, its true classes and the camera's seconds."""
 
-    looked: Looked
+    observation: Observation
     labels: Classes
     seconds: float
 
@@ -52,7 +52,7 @@ class Seen:
     @property
     def alone(self) -> Classes:
         """The map of this look alone."""
-        return first_belief(self.looked).classes()[0]
+        return first_probabilities(self.observation).classes()[0]
 
 
 @cache
@@ -61,11 +61,11 @@ def shipped() -> Weights:
 
 
 @cache
-def shipped_memory() -> MemoryReader:
+def shipped_temporal() -> TemporalReader:
     return load_reader(WEIGHTS)
 
 
-def look_at_farm(seed: int, day: int, hour: float, how: tuple[int, float], noise: int = 0) -> Seen:
+def view_farm(seed: int, day: int, hour: float, how: tuple[int, float], noise: int = 0) -> Seen:
     """Scan a farm as it is on a day, read by the shipped weights."""
     scene = farm_scene(seed, SHAPE, camera=CAMERA, day=day, hour=hour)
     return seen_by(scene, seed + 1000 * day + 100_000_000 * noise, how)
@@ -75,23 +75,29 @@ def seen_by(scene: RasterScene, seed: int, how: tuple[int, float]) -> Seen:
     weights, (step, exposure_ms), rig = shipped(), how, Rig(CAMERA)
     grid = SceneGrid(*SHAPE, weights.config.patch, weights.config.factor)
     along, _, _ = cheapest_full(grid, CAMERA, COST)
-    sweeps = plain_sweeps(grid, CAMERA, along, step=step, exposure_ms=exposure_ms)
+    sweeps = uniform_sweeps(grid, CAMERA, along, step=step, exposure_ms=exposure_ms)
     clock = sweep_starts(sweeps, CAMERA, COST)
     source = SimulatedSource(scene, rig, seed, chosen_effects(scene, rig, sweeps), clock=clock)
-    look = plain_look(weights, source, sweeps, grid, COST)
-    drawn = segment(weights, look.seen, look.columns, look.seats, every_class=True)
+    scan_pass = uniform_pass(weights, source, sweeps, grid, COST)
+    drawn = segment(weights, scan_pass.seen, scan_pass.columns, scan_pass.patch_index, every_class=True)
     assert drawn.log_probability is not None
     seen = np.ones(SHAPE, np.bool_)
-    looked = Looked(drawn.log_probability, seen, look.seen.columns, exposure_ms / REFERENCE_MS, step)
-    return Seen(looked, np.asarray(scene.labels, np.uint8), look.seconds)
+    observation = Observation(drawn.log_probability, seen, scan_pass.seen.columns, exposure_ms / REFERENCE_MS, step)
+    return Seen(observation, np.asarray(scene.labels, np.uint8), scan_pass.seconds)
 
 
 def later(
-    before: Seen, belief: Belief, now: Seen, days: float, *, reader: bool = True, comparable: bool = True
-) -> Belief:
+    before: Seen,
+    probabilities: ClassProbabilities,
+    now: Seen,
+    days: float,
+    *,
+    reader: bool = True,
+    comparable: bool = True,
+) -> ClassProbabilities:
     """What is believed after a later look, whose coarse pixels are ``comparable`` to those of before."""
-    memory = Remembered(belief, before.looked.coarse if comparable else None, days)
-    return recall(memory, now.looked, shipped_memory() if reader else None)
+    memory = PriorMap(probabilities, before.observation.coarse if comparable else None, days)
+    return fuse(memory, now.observation, shipped_temporal() if reader else None)
 
 
 def mean_figure(values: Sequence[float]) -> str:

@@ -17,11 +17,11 @@ from visits.farm_visits import (
     Classes,
     Seen,
     later,
-    look_at_farm,
     mean_figure,
+    view_farm,
 )
 
-from models.reading.remembered import Belief, first_belief
+from models.reading.prior_map import ClassProbabilities, first_probabilities
 
 SIX = (1, 2, 3, 4, 5, 6)
 BEHIND = {1: 0.2, 3: 0.5, 7: 1.0}  # points of mIoU that a later visit may lie behind one that scans anew, by days
@@ -33,23 +33,25 @@ def after_days() -> Iterator[Row]:
     """A quick look after some days, by the memory and by everybody else."""
     found: dict[int, dict[str, list[float]]] = {}
     for seed in SIX:
-        before = look_at_farm(seed, FIRST_DAY, HOUR, ANEW)
+        before = view_farm(seed, FIRST_DAY, HOUR, ANEW)
         for days in BEHIND:
-            now, anew = (look_at_farm(seed, FIRST_DAY + days, HOUR, how, 1) for how in (QUICK, ANEW))
+            now, anew = (view_farm(seed, FIRST_DAY + days, HOUR, how, 1) for how in (QUICK, ANEW))
             maps = {
                 f"scanned anew, {anew.seconds:.1f} s": anew.alone,
                 "old map kept": before.alone,
                 f"quick look alone, {now.seconds:.1f} s": now.alone,
                 "old class unless surer than .97": _unless_surer(before, now),
-                "memory without a reader": later(before, first_belief(before.looked), now, days, reader=False),
-                "memory left by weights of other coarse pixels": later(
-                    before, first_belief(before.looked), now, days, comparable=False
+                "memory without a reader": later(
+                    before, first_probabilities(before.observation), now, days, reader=False
                 ),
-                "memory": later(before, first_belief(before.looked), now, days),
+                "memory left by weights of other coarse pixels": later(
+                    before, first_probabilities(before.observation), now, days, comparable=False
+                ),
+                "memory": later(before, first_probabilities(before.observation), now, days),
             }
             scores = found.setdefault(days, {})
             for name, one in maps.items():
-                classes = one.classes()[0] if isinstance(one, Belief) else one
+                classes = one.classes()[0] if isinstance(one, ClassProbabilities) else one
                 scores.setdefault(name, []).append(now.score(classes))
     for days, scores in found.items():
         anew = next(values for name, values in scores.items() if name.startswith("scanned anew"))
@@ -61,7 +63,7 @@ def after_days() -> Iterator[Row]:
 
 def _unless_surer(before: Seen, now: Seen) -> Classes:
     """The old class, unless the new look is surer than .97 of another."""
-    classes, sure = first_belief(now.looked).classes()
+    classes, sure = first_probabilities(now.observation).classes()
     return np.where(sure > SURE, classes, before.alone)
 
 
@@ -75,13 +77,13 @@ def season() -> Iterator[Row]:
         seconds[name] = spent
 
     for seed in SEEDS:
-        full = [look_at_farm(seed, *moment, REFERENCE) for moment in SEASON]
-        quick = [full[0], *(look_at_farm(seed, *moment, QUICK, 1) for moment in SEASON[1:])]
+        full = [view_farm(seed, *moment, REFERENCE) for moment in SEASON]
+        quick = [full[0], *(view_farm(seed, *moment, QUICK, 1) for moment in SEASON[1:])]
         every, fast = full[0].seconds, quick[1].seconds
         note("full scan at every visit", [one.score(one.alone) for one in full], every)
         note("quick look at every visit, nothing remembered", [one.score(one.alone) for one in quick], fast)
-        note("quick looks and the memory", _remembered(quick), fast)
-        note("quick looks, memory without a reader", _remembered(quick, reader=False), fast)
+        note("quick looks and the memory", _prior_map(quick), fast)
+        note("quick looks, memory without a reader", _prior_map(quick, reader=False), fast)
         for k in HELD:
             maps = [full[number - number % k].alone for number in range(len(full))]
             scores = [one.score(held) for one, held in zip(full, maps, strict=True)]
@@ -96,12 +98,15 @@ def season() -> Iterator[Row]:
         yield Row(f"season, {name}: {seconds[name]:.1f} s a visit", mean_figure(values), *goal)
 
 
-def _remembered(looks: Sequence[Seen], *, reader: bool = True) -> list[float]:
+def _prior_map(scan_passes: Sequence[Seen], *, reader: bool = True) -> list[float]:
     """Scores of a season's maps, each by the memory of all looks before it."""
-    belief, scores = first_belief(looks[0].looked), [looks[0].score(looks[0].alone)]
+    probabilities, scores = (
+        first_probabilities(scan_passes[0].observation),
+        [scan_passes[0].score(scan_passes[0].alone)],
+    )
     moments = [day + hour / 24 for day, hour in SEASON]
-    for number in range(1, len(looks)):
+    for number in range(1, len(scan_passes)):
         days = moments[number] - moments[number - 1]
-        belief = later(looks[number - 1], belief, looks[number], days, reader=reader)
-        scores.append(looks[number].score(belief.classes()[0]))
+        probabilities = later(scan_passes[number - 1], probabilities, scan_passes[number], days, reader=reader)
+        scores.append(scan_passes[number].score(probabilities.classes()[0]))
     return scores

@@ -132,13 +132,13 @@ def test_explain_shows_lineage_and_what_changed(two_budgets: Path, capsys: pytes
     (top,) = content["lineage"]
     assert (top["stage"], top["called"], [one["stage"] for one in top["inputs"]]) == (
         "segment",
-        ["draw_map"],
+        ["segment"],
         ["rectify", "patches"],
     )
     assert top["wall_s"] > 0
     assert content["before"].startswith("stages/segment/")
     kinds = {(one["where"], one["kind"], one["name"]) for one in content["changes"]}
-    assert {("segment", "input", "patches"), ("attend", "parameter", "fine_s")} <= kinds
+    assert {("segment", "input", "patches"), ("score", "parameter", "fine_s")} <= kinds
     explain(two_budgets, "class_map")
     out = capsys.readouterr().out
     assert "segment" in out

@@ -59,10 +59,10 @@ def test_the_archive_is_smaller_and_whole(two_budgets: Path, archive: Archive, c
 
 def test_the_same_survey_makes_the_same_patches(two_budgets: Path, archive: Archive, survey_png: Survey) -> None:
     """Every file by its hash; the map is found as it was."""
-    row = {one.stage: one for one in forecast(_settings(archive)).stages}["cut_patches"]
+    row = {one.stage: one for one in forecast(_settings(archive)).stages}["extract_patches"]
     assert (row.state, row.why) == ("to run", "its files were cleared away by gc")
     states = {row["name"]: row["state"] for row in survey_png(archive.root).receipt["stages"]}
-    assert states.pop("cut_patches") == "ran"
+    assert states.pop("extract_patches") == "ran"
     assert set(states.values()) <= {"cached", "skipped"}
     known, found = _files(Archive.open(two_budgets)), _files(archive)
     made = {key for key, files in found.items() if files}
@@ -91,7 +91,7 @@ def test_other_weights_read_patches_that_are_cut_again(archive: Archive, tmp_pat
     assert run_reprocess(request, QUIET) == DONE
     newest = json.loads((archive.runs()[-1] / "receipt.json").read_text())
     states = {row["name"]: row["state"] for row in newest["stages"]}
-    assert (states["capture_coarse"], states["rectify"], states["draw_map"]) == ("cached", "cached", "ran")
+    assert (states["capture_coarse"], states["rectify"], states["segment"]) == ("cached", "cached", "ran")
     assert run_verify(archive.root, QUIET) == DONE
 
 

@@ -45,7 +45,7 @@ def _map(classes: np.ndarray[Any, Any], names: tuple[str, ...], seed: int = 0) -
 def test_a_run_is_the_same_as_itself(two_budgets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Every class agrees wholly; the picture lies beside the archive, which is left as it is."""
     content = _compared(capsys, two_budgets, "latest", "latest", tmp_path)
-    assert content["differing"] == {"pixels": 0, "share": 0.0}
+    assert content["differing"] == {"pixels": 0, "fraction": 0.0}
     assert (content["settings"], content["made"], content["largest"]) == ([], [], [])
     assert {row["iou"] for row in content["classes"]} == {1.0}
     old, new = (path.name for path in Archive.open(two_budgets).runs())
@@ -71,7 +71,7 @@ def test_two_budgets_are_told_apart_either_way(
         assert picture.width > 3 * 400
     compare(two_budgets, "previous", "latest", out=tmp_path)
     out = capsys.readouterr().out
-    for words in ("budget", "time at the camera", "IoU of A and B", "stage.attend", "compare-"):
+    for words in ("budget", "time at the camera", "IoU of A and B", "stage.score", "compare-"):
         assert words in out
     one, other = (
         _compared(capsys, two_budgets, *runs, tmp_path) for runs in (("previous", "latest"), ("latest", "previous"))
@@ -188,7 +188,7 @@ def test_hectares_are_told_where_both_runs_have_them() -> None:
     half = _by_one_list([_map(np.zeros((2, 2)), ("a", "b")), _map(np.eye(2), ("a", "b"))])
     found = _comparison((bare, bare), half)
     assert [(row["name"], row["pixels"]) for row in found["classes"]] == [("a", [4, 2]), ("b", [0, 2])]
-    assert found["largest"] == [{"from": "a", "to": "b", "pixels": 2, "share": 0.5}]
+    assert found["largest"] == [{"from": "a", "to": "b", "pixels": 2, "fraction": 0.5}]
     (row,) = _comparison((posed, posed), alike)["classes"]
     assert (row["ha"], row["pixels"], row["iou"]) == ([2.5, 2.5], [4, 4], 1.0)
 

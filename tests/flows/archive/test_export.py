@@ -26,7 +26,7 @@ from pipeline.ground.view import RigPose
 from storage.archive.archive import Archive
 from storage.readers.envi_files import open_envi_cube
 from storage.remote.opening import verify_archive
-from tests.remembered_work import without_effects
+from tests.prior_work import without_effects
 from tests.storage.export.stac_rules import core_problems, extension_problems, is_cog
 from tests.storage.small_archive import flip
 
@@ -105,14 +105,14 @@ def posed(exports: list[Exported]) -> Exported:
 
 
 @pytest.mark.parametrize("number", [0, 1])
-def test_images_are_cloud_optimised_and_attention_keeps_its_seats(exports: list[Exported], number: int) -> None:
-    """All checks of the layout pass; one pixel a seat, from the scene's corner on, with the store's scores."""
+def test_images_are_cloud_optimised_and_attention_keeps_its_patches(exports: list[Exported], number: int) -> None:
+    """All checks of the layout pass; one pixel a patch, from the scene's corner on, with the store's scores."""
     assert all(is_cog(exports[number].file(key)) for key in ("class_map", "confidence", "attention", "rgb"))
     done = exports[number]
     score, scene = done.store("attention")["score"].values, done.store("class_map").attrs["spatial:transform"]
     with rasterio.open(done.file("attention")) as file:
         np.testing.assert_array_equal(file.read(1), score)
-        patch = int(file.tags()["seat_px"])
+        patch = int(file.tags()["patch_px"])
         a, b, c, d, e, f = scene
         assert file.transform[:6] == pytest.approx((patch * a, b, c, d, patch * e, f))
         assert file.crs is None

@@ -14,14 +14,14 @@ import xarray as xr
 from PIL import Image
 from rich.console import Console
 
-import models.reading.remembered as remembered
+import models.reading.prior_map as prior_map
 from flows.archive.export_command import run_export
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from pipeline.ground.view import RigPose
 from tests.conftest import RGB_NM, patchy_scene
-from tests.remembered_work import without_effects
+from tests.prior_work import without_effects
 from tests.storage.export.stac_rules import is_cog
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
@@ -85,7 +85,7 @@ def visited(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     runs = []
     with without_effects(), pytest.MonkeyPatch.context() as patch:
         for name in ("CERTAIN", "SURE"):  # untrained weights are sure of nothing: what they say is taken for sure
-            patch.setattr(remembered, name, 1e-6)
+            patch.setattr(prior_map, name, 1e-6)
         for scene, visit, budget in zip(harvested(folder, request.param), VISITS, ("1", "0.8"), strict=True):
             settings = load_settings(
                 None, given | {"scene": str(scene), "source": "sim", "visit": visit, "budget": budget}
@@ -108,7 +108,7 @@ def test_a_first_visit_exports_ages_alone(visited: Visited) -> None:
 def test_images_are_the_stores_numbers(visited: Visited) -> None:
     """Ages in days, NaN where nothing is known; what pixels were with the names of classes; cloud-optimised."""
     posed = "ground_map" in visited.runs[1].receipt["products"]
-    store = visited.store("ground_map" if posed else "belief")
+    store = visited.store("ground_map" if posed else "class_probabilities")
     for key in MEMORY:
         assert is_cog(visited.file(key))
         np.testing.assert_array_equal(visited.image(key), store[key].values)
@@ -123,7 +123,7 @@ def test_images_are_the_stores_numbers(visited: Visited) -> None:
 
 
 def test_images_lie_where_the_class_map_lies(visited: Visited) -> None:
-    """Same CRS and corner, of the share of patches of the field too; its pixels are as large as patches there."""
+    """Same CRS and corner, of the fraction of patches of the field too; its pixels are as large as patches there."""
     grids = {}
     for key in ("class_map", *MEMORY):
         with rasterio.open(visited.file(key)) as file:
@@ -138,12 +138,12 @@ def test_images_lie_where_the_class_map_lies(visited: Visited) -> None:
 
 def test_what_was_not_looked_at_grows_older(visited: Visited) -> None:
     """Three days where no patch was cut, none where one was; the rest of the memory is kept."""
-    belief, patches = visited.store("belief"), visited.store("patches")
-    looked = np.zeros(SHAPE, np.bool_)
-    for y, x in zip(patches["seat_y"].values, patches["seat_x"].values, strict=True):
-        looked[y : y + PATCH, x : x + PATCH] = True
-    assert 0 < looked.mean() < 1
-    np.testing.assert_array_equal(belief["age"].values, np.where(looked, 0.0, 3.0))
+    probabilities, patches = visited.store("class_probabilities"), visited.store("patches")
+    observation = np.zeros(SHAPE, np.bool_)
+    for y, x in zip(patches["patch_y"].values, patches["patch_x"].values, strict=True):
+        observation[y : y + PATCH, x : x + PATCH] = True
+    assert 0 < observation.mean() < 1
+    np.testing.assert_array_equal(probabilities["age"].values, np.where(observation, 0.0, 3.0))
 
 
 def test_receipt_and_page_have_the_hectares(visited: Visited) -> None:
@@ -155,7 +155,7 @@ def test_receipt_and_page_have_the_hectares(visited: Visited) -> None:
     assert "changes_ha" not in first["ground"]
     assert set(first["ground"]["older_ha"].values()) == {0.0}
     posed = "ground_map" in later["products"]
-    store = visited.store("ground_map" if posed else "belief")
+    store = visited.store("ground_map" if posed else "class_probabilities")
     pixel_ha, slack = store.attrs["spatial:transform"][0] ** 2 / 1e4, 0.03 if posed else 1e-3  # footprints' borders
     changes, older = later["ground"]["changes_ha"], later["ground"]["older_ha"]
     changed = (store["changed_from"].values != 255).sum() * pixel_ha

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flows.archive.history import FieldHistory, look_of, read_histories, render_history, render_index, way_to
+from flows.archive.history import FieldHistory, read_histories, render_history, render_index, time_of_visit, way_to
 from storage.archive.archive import Archive
 from storage.archive.records import Run
 from storage.arrays.class_maps import load_class_map
@@ -67,7 +67,7 @@ def test_pages_load_nothing_and_lead_to_reports(archive: Path, command_line: Any
     assert not re.search(r"https?://|@import|url\(", text)
     assert len(found.links) == 2
     assert all((page.parent / link).is_file() for link in found.links)
-    assert all(words in text for words in ("2026-06-01 10:00", "Share of the map"))
+    assert all(words in text for words in ("2026-06-01 10:00", "Fraction of the map"))
     page = tmp_path / "index.html"
     ended = command_line("report", archive, "-o", page)
     assert ended.code == 0, ended.err
@@ -105,7 +105,7 @@ def test_pages_of_little(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("looked", "shares", "drawn"),
+    ("observation", "fractions", "drawn"),
     [
         ("2026-05-10T00:00:00Z", [0.5], 1),
         ("2026-05-10T00:00:00Z", [0.0, 0.0], 0),
@@ -115,13 +115,13 @@ def test_pages_of_little(tmp_path: Path) -> None:
         ("9999-12-31T23:59:59Z", [0.5], 0),
     ],
 )
-def test_whatever_a_receipt_claims_is_drawn_or_left_out(looked: str, shares: list[float], drawn: int) -> None:
+def test_whatever_a_receipt_claims_is_drawn_or_left_out(observation: str, fractions: list[float], drawn: int) -> None:
     """Dates of any year and numbers of any size make no chart that fails or warns; equal rows give equal pages."""
     rows = [
-        {"run": "runs/x", "created": looked, "looked": looked, "unit": "share", "areas": {"so$il": share},
+        {"run": "runs/x", "created": observation, "looked": observation, "unit": "fraction", "areas": {"so$il": fraction},
          "savings": dict.fromkeys(("capture_s", "lines", "bytes_stored", "multiply_adds")), "miou": None,
          "overall_accuracy": None}
-        for share in shares
+        for fraction in fractions
     ]  # fmt: skip
     page = render_history(FieldHistory("north", "archive", rows), "")
     assert page.count("data:image/png") == drawn
@@ -129,7 +129,7 @@ def test_whatever_a_receipt_claims_is_drawn_or_left_out(looked: str, shares: lis
 
 
 @pytest.mark.parametrize(
-    ("settings", "looked"),
+    ("settings", "observation"),
     [
         ({"visit": "2026-06-21T09:30:00Z", "scene": "farm", "day": 130}, "2026-06-21 09:30"),
         ({"visit": "second", "scene": "farm", "day": 130}, "2026-05-10 11:00"),
@@ -139,10 +139,10 @@ def test_whatever_a_receipt_claims_is_drawn_or_left_out(looked: str, shares: lis
         ({"scene": "farm", "day": 10**9}, "2026-11-22 08:00"),
     ],
 )
-def test_a_look_has_the_date_of_the_look(settings: dict[str, Any], looked: str) -> None:
+def test_a_look_has_the_date_of_the_look(settings: dict[str, Any], observation: str) -> None:
     """By its visit's name, by the farm's day; the clock is asked last, when the survey began."""
     receipt = {"settings": settings, "started": "2026-11-22T08:00:00Z"}
     run = Run(Path("x"), {"created": "2026-11-23T00:00:00Z"}, receipt, None, frozenset())
-    found = look_of(run)
+    found = time_of_visit(run)
     assert found is not None
-    assert f"{found:%Y-%m-%d %H:%M}" == looked
+    assert f"{found:%Y-%m-%d %H:%M}" == observation

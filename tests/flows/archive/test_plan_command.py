@@ -22,7 +22,7 @@ from tests.flows.conftest import be_version, python
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 
-WAITS = {"locate": "capture_coarse", "rectify": "locate", "attend": "rectify", "capture_fine": "attend"}
+WAITS = {"locate": "capture_coarse", "rectify": "locate", "score": "rectify", "capture_fine": "score"}
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def _tree(root: Path) -> dict[str, tuple[int, int]]:
     return {str(path): (path.stat().st_size, path.stat().st_mtime_ns) for path in root.rglob("*")}
 
 
-@pytest.mark.parametrize("changes", [{}, {"kernel": "nearest"}, {"seed": 5}], ids=str)
+@pytest.mark.parametrize("changes", [{}, {"resampling": "nearest"}, {"seed": 5}], ids=str)
 def test_the_survey_does_what_the_plan_said(
     settings: Settings, archive: Path, survey_png: Any, changes: dict[str, Any]
 ) -> None:
@@ -102,18 +102,18 @@ def test_the_reason_is_what_differs(
     settings: Settings, archive: Path, make_weights: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A parameter with both values, where it began, weights as such, and the version of a stage."""
-    planned = _plan(settings, archive, kernel="nearest")
+    planned = _plan(settings, archive, resampling="nearest")
     assert planned["rectify"].why == "kernel: catmull-rom before, nearest now"
-    assert planned["attend"].why == "kernel of rectify: catmull-rom before, nearest now"
+    assert planned["score"].why == "kernel of rectify: catmull-rom before, nearest now"
     effects = _plan(settings, archive, effects="none")["capture_coarse"].why
     assert effects == "asked of effects: auto before, none now"
-    assert {(change.where, change.kind) for change in planned["attend"].changes} == {
-        ("attend", "input"),
+    assert {(change.where, change.kind) for change in planned["score"].changes} == {
+        ("score", "input"),
         ("rectify", "parameter"),
     }
     other = _plan(settings, archive, weights=str(make_weights(layers=2)))
     assert other["rectify"].state == "cached"
-    assert other["attend"].why == "other weights than in the newest store"
+    assert other["score"].why == "other weights than in the newest store"
     be_version(monkeypatch, "rectify", 99)
     planned = _plan(settings, archive)
     assert planned["locate"].state == "cached"
@@ -171,7 +171,7 @@ def test_a_damaged_store_blocks_what_needs_it(settings: Settings, archive: Path,
     planned = _plan(settings, archive)
     assert planned["rectify"].state == "blocked"
     assert "verify --repair" in planned["rectify"].why
-    assert planned["attend"].why == "waits for rectify"
+    assert planned["score"].why == "waits for rectify"
     (tmp_path / "file").write_text("no archive")
     with pytest.raises(ArchiveError, match="is a file"):
         _plan(settings, tmp_path / "file")
@@ -179,7 +179,7 @@ def test_a_damaged_store_blocks_what_needs_it(settings: Settings, archive: Path,
 
 def test_plan_as_json_and_as_a_table(settings: Settings, archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """One object with how many stages are ahead; the table names every stage and says what is left to make."""
-    asked = replace(settings, out=str(archive), kernel="nearest")
+    asked = replace(settings, out=str(archive), resampling="nearest")
     _show(asked, as_json=True)
     content = json.loads(capsys.readouterr().out)
     ahead = [row for row in content["stages"] if row["state"] in ("to run", "blocked")]
@@ -197,7 +197,7 @@ def test_a_damaged_plan_of_sweeps_blocks_what_reads_it(
     settings: Settings, archive: Path, survey_png: Any, change: tuple[str, str]
 ) -> None:
     """The plan says so and goes on; the survey stops there with one message, and captures nothing by it."""
-    (path,) = archive.glob("stages/attend/*/plan.json")
+    (path,) = archive.glob("stages/score/*/plan.json")
     path.write_text(path.read_text().replace(*change))
     fine = _plan(settings, archive)["capture_fine"]
     assert (fine.state, "plan.json has changed" in fine.why) == ("blocked", True)

@@ -23,7 +23,7 @@ from flows.archive.product_choice import ProductFlags, choose_products
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.tasks.run import open_run
-from flows.tasks.stages.accuracy import columns_of_all_seats, columns_of_raster
+from flows.tasks.stages.accuracy import columns_of_all_patches, columns_of_raster
 from pipeline.errors import PipelineError, SceneError, SettingsError
 from storage.archive.archive import Archive
 from storage.arrays.layout import KEPT_BITS
@@ -68,8 +68,8 @@ def whole(published: Any, archive: Path, factor: int = 4) -> tuple[NDArray[np.fl
     store = open_patches(archive / products["patches"])
     mosaic = load_mosaic(archive / products["mosaic"]).values
     place = xarray.open_zarr(archive / products["class_map"], consolidated=False)["classes"].shape
-    values, seen = store.read(0, len(store.seats)), np.asarray(store.group["valid"][...])
-    y, x = (np.asarray(store.group[name][...]) for name in ("seat_y", "seat_x"))
+    values, seen = store.read(0, len(store.patch_index)), np.asarray(store.group["valid"][...])
+    y, x = (np.asarray(store.group[name][...]) for name in ("patch_y", "patch_x"))
     patch = values.shape[1]
     image = np.full((place[0] + patch, place[1] + patch, values.shape[3]), np.nan, np.float32)
     for one, valid, top, left in zip(values, seen, y, x, strict=True):
@@ -140,16 +140,16 @@ def test_a_simulated_scan_shows_the_same_but_for_its_noise(
     scanned = open_run(load_settings(None, given | {"scan_step": 1, "effects": "none"}))
     assert pixels.raster is not None
     own = columns_of_raster(pixels.raster, pixels.weights, pixels.scene.wavelength_nm, memory=2**30)
-    seen = columns_of_all_seats(
-        scanned.simulated, scanned.plan.coarse, scanned.grid, scanned.weights, memory=2**30, kernel="nearest"
+    seen = columns_of_all_patches(
+        scanned.simulated, scanned.plan.coarse, scanned.grid, scanned.weights, memory=2**30, resampling="nearest"
     )
-    valid = pixels.grid.valid_seats()
+    valid = pixels.grid.valid_patches()
     assert np.abs(own[valid] - seen[valid]).mean() < 0.02 * own[valid].std()
 
 
 def test_a_receipt_of_a_raster_tells_of_no_camera(surveyed: Raster, scene_files: Path, tmp_path: Path) -> None:
     """No seconds, no lines: its savings are bytes kept and multiply-adds, against keeping and reading all pixels."""
-    published = surveyed(scene_files / "scene.png", labels=str(scene_files / "labels.png"), compute="60%")
+    published = surveyed(scene_files / "scene.png", labels=str(scene_files / "labels.png"), macs="60%")
     receipt = published.receipt
     assert receipt["source"] == receipt["settings"]["source"] == "raster"
     assert set(receipt["savings"]) == {"bytes_stored", "tokens", "multiply_adds"}
@@ -157,7 +157,7 @@ def test_a_receipt_of_a_raster_tells_of_no_camera(surveyed: Raster, scene_files:
     assert receipt["savings"]["bytes_stored"]["ratio"] < 1
     assert receipt["field"]["camera_s"] is receipt["field"]["lines"] is receipt["field"]["view_deg"] is None
     assert [row["name"] for row in receipt["stages"]] == [
-        *("average_raster", "attend", "take_patches", "draw_map", "evaluate")
+        *("average_raster", "score", "take_patches", "segment", "evaluate")
     ]
     assert [found.problem for found in verify_archive(Archive.open(tmp_path / "archive"))] == [None] * 6
 
@@ -234,7 +234,7 @@ def test_an_export_of_a_part_says_which_pixels_are_means(surveyed: Raster, tmp_p
 def test_a_second_visit_goes_on_from_the_first(surveyed: Raster, scene_files: Path) -> None:
     """What the raster of before left is remembered."""
     surveyed(scene_files / "scene.png", visit="2026-06-01T10:00:00Z", prior="latest")
-    later = surveyed(scene_files / "scene.png", visit="2026-06-04T10:00:00Z", prior="latest", compute="60%")
+    later = surveyed(scene_files / "scene.png", visit="2026-06-04T10:00:00Z", prior="latest", macs="60%")
     assert later.receipt["memory"]["days"] == 3
 
 
@@ -245,7 +245,7 @@ def test_a_second_visit_goes_on_from_the_first(surveyed: Raster, scene_files: Pa
         ("budget", 0.5),
         ("effects", "all"),
         ("camera.samples", 64),
-        ("look", "0:0-4"),
+        ("extent", "0:0-4"),
         ("pointing_px", 1),
     ],
 )

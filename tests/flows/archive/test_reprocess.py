@@ -26,7 +26,7 @@ from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from tests.conftest import Survey, WeightsMaker
 from tests.flows.conftest import be_version, turned
-from tests.remembered_work import without_effects
+from tests.prior_work import without_effects
 from tests.storage.small_archive import flip
 
 pytestmark = pytest.mark.usefixtures("no_effects")
@@ -117,7 +117,7 @@ def test_new_weights_make_a_generation_beside_the_old(archive: Path, other: Path
     assert [run.settings["budget"] for run in after[3:]] == [0.8, 0.7]
     for run in after[3:]:
         states = {row["name"]: row["state"] for row in run.stages}
-        assert (states["capture_coarse"], states["rectify"], states["draw_map"]) == ("cached", "cached", "ran")
+        assert (states["capture_coarse"], states["rectify"], states["segment"]) == ("cached", "cached", "ran")
     assert reprocess.states(archive, weights=other) == [("turned", "skipped"), ("scene", "skipped")]
     assert reprocess.states(archive) == [("turned", "skipped"), ("scene", "skipped")]
     assert run_verify(archive, QUIET) == DONE

@@ -26,7 +26,7 @@ from tests.flows.conftest import act_instead
 
 ROOT = Path(__file__).parents[3]
 NM = "460,500,550,600,620,640"
-RAN = "looked twice at"
+RAN = "captured again at"
 CAMERA = "[camera]\nsamples = 64\n"  # a narrow one: most of a small survey's time goes into samples beside the field
 
 
@@ -207,18 +207,18 @@ def test_interrupted_survey_says_how_to_go_on(
     folder: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Ctrl-C in a stage ends with 130 and one line; the same command goes on with what was captured."""
-    real = STAGES["attend"]
+    real = STAGES["score"]
 
     def interrupted(*given: Any) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.chdir(folder)
-    act_instead(monkeypatch, "attend", interrupted)
+    act_instead(monkeypatch, "score", interrupted)
     words = survey_words("--budget 0.7", str(tmp_path / "archive"))
     ended = command_line(*words)
     assert (ended.code, ended.out) == (130, "")
     assert "interrupted; the same command goes on from here" in ended.err
-    monkeypatch.setitem(STAGES, "attend", real)
+    monkeypatch.setitem(STAGES, "score", real)
     ended = command_line(*words)
     assert ended.code == 0
     assert "coarse sweep: 100% cached" in ended.err
@@ -260,7 +260,7 @@ def test_real_process_ends_with_the_code(folder: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "80"}
     ended = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stdout) == (2, "")
-    assert ended.stderr.startswith("error: --budget must be a share of the full scan's seconds")
+    assert ended.stderr.startswith("error: --budget must be a fraction of the full scan's seconds")
     assert ended.stderr.count("\n") == 1
 
 
@@ -320,9 +320,9 @@ def undisturbed(folder: Path, tmp_path_factory: pytest.TempPathFactory, survey_p
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="tells a descriptor's file by /proc")
-@pytest.mark.parametrize("share", [0.0, 0.4, 0.985, 0.9999])
+@pytest.mark.parametrize("fraction", [0.0, 0.4, 0.985, 0.9999])
 def test_full_disk_anywhere_in_a_survey(
-    share: float,
+    fraction: float,
     undisturbed: tuple[int, np.ndarray],
     folder: Path,
     tmp_path: Path,
@@ -333,9 +333,9 @@ def test_full_disk_anywhere_in_a_survey(
     monkeypatch.chdir(folder)
     writes, expected = undisturbed
     out = tmp_path / "archive"
-    with FullDisk(out, int(share * writes)) as disk:
+    with FullDisk(out, int(fraction * writes)) as disk:
         ended = command_line(*survey_words(FULL_WORDS, str(out)))
-    assert disk.writes > int(share * writes)
+    assert disk.writes > int(fraction * writes)
     ended.refused(1, "the disk is full: free some space")
     archive = Archive.open(out)
     published = {ref.uri: contents(ref.path) for ref in archive.refs()}

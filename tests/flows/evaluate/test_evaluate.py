@@ -28,24 +28,24 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.effects.registry import USUAL
 from pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from tests.flows.evaluate.conftest import Judged
-from tests.flows.small_fields import FRAMES, QUICK, looked_at, scene_at, write_field, write_weights
+from tests.flows.small_fields import FRAMES, QUICK, observed_passes, scene_at, write_field, write_weights
 from tests.models.conftest import make_weights
 
 
-def _row(content: dict[str, Any], policy: str, share: float) -> dict[str, Any]:
-    return next(row for row in content["rows"] if (row["policy"], row["share"]) == (policy, share))
+def _row(content: dict[str, Any], policy: str, fraction: float) -> dict[str, Any]:
+    return next(row for row in content["rows"] if (row["policy"], row["fraction"]) == (policy, fraction))
 
 
 TRIAL = Trial((0.5,), (), rig=False)
 
 
 def test_every_row_is_there(judged: Judged):
-    """Every policy at every share, with means of the seeds and their spread; and the files of the folder."""
+    """Every policy at every fraction, with means of the seeds and their spread; and the files of the folder."""
     request, content = judged
     folder = request.out
     assert folder is not None
-    keys = [(row["policy"], row["share"]) for row in content["rows"]]
-    policies = [(policy, share) for policy in ("entropy", "random", ORACLE) for share in (0.25, 0.5)]
+    keys = [(row["policy"], row["fraction"]) for row in content["rows"]]
+    policies = [(policy, fraction) for policy in ("entropy", "random", ORACLE) for fraction in (0.25, 0.5)]
     assert keys == [("none", 0.0), *policies, ("all", 1.0)]
     assert content["frames"] == list(FRAMES)
     assert [one["frames"] for one in content["weights"]] == [3, 3]
@@ -62,7 +62,7 @@ def test_every_row_is_there(judged: Judged):
 def test_costs_stand_beside_all_and_the_oracle_has_all_the_gain(judged: Judged):
     """More patches cost more, `all` is the full scan; what uses labels is marked, and captures all there is to gain."""
     _, content = judged
-    cost = {share: _row(content, "entropy", share)["cost"] for share in (0.25, 0.5)}
+    cost = {fraction: _row(content, "entropy", fraction)["cost"] for fraction in (0.25, 0.5)}
     for column in ("samples", "bytes", "multiply_adds"):
         assert cost[0.25][column]["done"] < cost[0.5][column]["done"]
     assert cost[0.25]["capture_s"]["done"] <= cost[0.5]["capture_s"]["done"]
@@ -81,11 +81,11 @@ def test_a_killed_run_goes_on(data: Path, tmp_path: Path, monkeypatch: pytest.Mo
     request = EvaluateRequest(str(data), weights, tmp_path / "out", **QUICK)
     judged: list[str] = []
 
-    def killed(trial: Trial, look: Any, *rest: Any) -> dict[str, Any]:
+    def killed(trial: Trial, scan_pass: Any, *rest: Any) -> dict[str, Any]:
         if len(judged) == 2:
             raise KeyboardInterrupt
-        judged.append(look.name)
-        return judge_frame(trial, look, *rest)
+        judged.append(scan_pass.name)
+        return judge_frame(trial, scan_pass, *rest)
 
     monkeypatch.setattr(evaluate_command, "judge_frame", killed)
     with pytest.raises(KeyboardInterrupt):
@@ -181,7 +181,7 @@ def test_files_that_leave_different_pixels_are_not_compared(data: Path, tmp_path
 def test_frames_trained_on_are_known_in_other_bands(data: Path, tmp_path: Path):
     """With bands chosen a frame's identity is another, here or in the training: its name tells."""
     split = {"train": {"001": "of other bands"}}
-    quick = {**QUICK, "policies": (), "shares": ()}
+    quick = {**QUICK, "policies": (), "fractions": ()}
     plain = (write_weights(tmp_path / "w.safetensors", data="field", split=split),)
     assert evaluate_weights(EvaluateRequest(str(data), plain, **quick))["left_out"] == []
     chosen = EvaluateRequest(str(data), plain, choices={"bands": [0, 1]}, **quick)
@@ -223,8 +223,8 @@ def test_one_frame_has_accuracies_over_its_pixels(
     request = EvaluateRequest(str(data), weights, frames=("001",), **QUICK)
     row = run_evaluate(request, Console(stderr=True))["rows"][0]
     assert kept == [True]
-    look, loaded = looked_at(data, tmp_path / "w.safetensors")
-    counts = np.array(judge_frame(TRIAL, look, loaded, LineCamera())["rows"][0]["counts"])
+    scan_pass, loaded = observed_passes(data, tmp_path / "w.safetensors")
+    counts = np.array(judge_frame(TRIAL, scan_pass, loaded, LineCamera())["rows"][0]["counts"])
     assert row["pixel_accuracy"] == overall_accuracy(counts)
     assert row["average_accuracy"] == average_accuracy(counts)
     assert row["kappa"] == kappa(counts)
@@ -261,16 +261,16 @@ def test_a_class_that_no_label_has_is_told_apart(judged: Judged, capsys: pytest.
 
 
 def _record(name: str, rng: np.random.Generator) -> dict[str, Any]:
-    given = {"draw": 0, "seats": 2, "samples": 1.0, "bytes": 2.0, "multiply_adds": 3, "gain": 1.0, "best_gain": 2.0}
+    given = {"draw": 0, "patches": 2, "samples": 1.0, "bytes": 2.0, "multiply_adds": 3, "gain": 1.0, "best_gain": 2.0}
     rows = [
-        {"policy": policy, "share": share, "counts": rng.integers(1, 9, (2, 2)).tolist(), **given}
-        for policy, share in (("none", 0.0), ("oracle", 0.5), ("all", 1.0))
+        {"policy": policy, "fraction": fraction, "counts": rng.integers(1, 9, (2, 2)).tolist(), **given}
+        for policy, fraction in (("none", 0.0), ("oracle", 0.5), ("all", 1.0))
     ]
     return {"frame": name, "rows": rows, "plans": []}
 
 
 def test_weights_without_a_common_frame_are_one_seed() -> None:
-    """Folds of one training are joined, weights that share a frame are seeds; what none judged is not counted."""
+    """Folds of one training are joined, weights that fraction a frame are seeds; what none judged is not counted."""
     rng = np.random.default_rng(0)
     runs = [[_record(name, rng) for name in names] for names in ("ab", "c", "abc", "")]
     assert seeds_of(runs) == [[0, 1], [2]]
@@ -294,12 +294,12 @@ QUICK_RIG = replace(COST, slew_s=0.01, settle_frames=0.5, capture_start_s=0.01, 
 def test_no_plan_takes_more_than_its_budget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Each plan that pays for the coarse pass is within its seconds; ours stands against both others."""
     write_field(tmp_path / "field", (48, 64))
-    look, weights = looked_at(tmp_path / "field", tmp_path / "w.safetensors", factor=4, seed=1)
+    scan_pass, weights = observed_passes(tmp_path / "field", tmp_path / "w.safetensors", factor=4, seed=1)
     trial = replace(TRIAL, rig=True)
     monkeypatch.setattr("flows.evaluate.judge.COST", QUICK_RIG)
-    record = judge_frame(trial, look, weights, CAMERA)
+    record = judge_frame(trial, scan_pass, weights, CAMERA)
     for row in record["plans"]:
-        assert row["capture_s"] <= row["share"] * row["full_s"] * (1 + 1e-9)
+        assert row["capture_s"] <= row["fraction"] * row["full_s"] * (1 + 1e-9)
         assert np.sum(row["counts"]) == 48 * 64
     assert len({(row["policy"], row["draw"]) for row in record["plans"]}) == 3 + 5
     found = summarise([[record, {**record, "frame": "002"}]], weights.class_names, trial, 10)["rig"]
@@ -309,16 +309,18 @@ def test_no_plan_takes_more_than_its_budget(tmp_path: Path, monkeypatch: pytest.
     assert ours["against_uniform"]["difference"] == pytest.approx(ours["miou"] - even["miou"])
     assert (ours["frames"], even["against_uniform"]) == (2, None)
     monkeypatch.setattr("flows.evaluate.judge.COST", replace(QUICK_RIG, capture_start_s=30.0))
-    assert judge_frame(trial, look, weights, CAMERA)["plans"] == []  # the coarse pass alone takes longer
+    assert judge_frame(trial, scan_pass, weights, CAMERA)["plans"] == []  # the coarse pass alone takes longer
 
 
 def test_the_farm_is_judged_on_seeds_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Small built-in fields, neither trained on nor shown, noisy."""
     monkeypatch.setattr("flows.training.data.FARM_SHAPE", (32, 48))
-    monkeypatch.setattr("flows.training.look.chosen_effects", lambda *given: USUAL)  # choosing takes seconds a look
+    monkeypatch.setattr(
+        "flows.training.observed_scenes.chosen_effects", lambda *given: USUAL
+    )  # choosing takes seconds a look
     made, weights = make_weights(classes=len(CLASSES), columns=6), tmp_path / "w.safetensors"
     save_weights(replace(made, class_names=CLASSES), weights)
-    quick = {**QUICK, "policies": ("entropy",), "shares": (0.25,)}
+    quick = {**QUICK, "policies": ("entropy",), "fractions": (0.25,)}
     content = evaluate_weights(EvaluateRequest("farm", (weights,), scenes=2, **quick))
     assert content["frames"] == [*farm_test_data(2, LineCamera()).train]
     assert 0 <= _row(content, "none", 0.0)["miou"] <= 1
@@ -327,7 +329,7 @@ def test_the_farm_is_judged_on_seeds_of_its_own(tmp_path: Path, monkeypatch: pyt
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"shares": (10.0,)}, "--shares are shares of the seats from 0 to 1"),
+        ({"fractions": (10.0,)}, "--shares are fractions of the patches from 0 to 1"),
         ({"policies": ("mask",)}, "'mask' is none that can be judged"),
         ({"draws": 0}, "--draws must be at least 1"),
         ({"seed": -1}, "--seed must be at least 0"),

@@ -13,8 +13,8 @@ import xarray as xr
 from flows.publish.findings import changed_hectares, older_hectares
 from flows.publish.receipt_table import finding_rows
 from models.evaluation.expected_scores import MapScores, expected_counts, expected_score
-from models.reading.familiar import Familiar, Limits
-from models.weights.files import add_familiar
+from models.reading.ood import Limits, OodDetector
+from models.weights.files import add_ood
 from models.weights.parts import MAP_SCORES, TrainedOn
 from pipeline.errors import WeightsError
 from pipeline.geometry.grid import UNLABELLED
@@ -68,16 +68,16 @@ def _judged(weights: Path, folder: Path, content: dict[str, Any], limit: float =
     shutil.copy(weights, path)
     one, table = np.eye(3), np.full((1, 1, 2), limit)
     limits = Limits(np.array([0.001, 0.05]), np.ones(1), (1,), table, table[0])
-    familiar = Familiar(np.zeros((1, 3)), one[None], 1e-9 * one[None], 1e-9 * one, limits, 3)
-    add_familiar(path, path, familiar, SEEN, {MAP_SCORES: content})
+    ood_detector = OodDetector(np.zeros((1, 3)), one[None], 1e-9 * one[None], 1e-9 * one, limits, 3)
+    add_ood(path, path, ood_detector, SEEN, {MAP_SCORES: content})
     return path
 
 
 def test_a_plain_scan_is_told_what_its_map_scores_by_itself(survey_png: Survey, weights: Path, tmp_path: Path):
-    """By the stored belief, as another reader opens it, and the bias of its exposure; in words too."""
+    """By the stored class probabilities, as another reader opens it, and the bias of its exposure; in words too."""
     path = _judged(weights, tmp_path, SCORES.as_dict())
     receipt: Any = survey_png(tmp_path / "a", weights=str(path), effects="none", budget=None, scan_step="1").receipt
-    (store,) = (tmp_path / "a").glob("stages/segment/*/belief.zarr")
+    (store,) = (tmp_path / "a").glob("stages/segment/*/class_probabilities.zarr")
     said = xr.open_zarr(store, consolidated=False)["log_probability"].values
     said = said - np.log(np.exp(said).sum(axis=-1, keepdims=True))
     told = expected_score(expected_counts([said], len(CLASSES)), BIAS, 0.01)
@@ -105,7 +105,7 @@ def test_nothing_is_told_of_a_field_that_the_weights_do_not_know(survey_png: Sur
     """Where most of it is unknown the probabilities of the rest say nothing."""
     path = _judged(weights, tmp_path, SCORES.as_dict(), limit=0.2)
     receipt: Any = survey_png(tmp_path / "a", weights=str(path), effects="none", budget=None, scan_step="1").receipt
-    assert 0.2 < receipt["unknown"]["share"] < 1
+    assert 0.2 < receipt["unknown"]["fraction"] < 1
     assert "expected" not in receipt
 
 

@@ -34,7 +34,7 @@ def make_data(height: int, width: int, bands: int = 5, *, patch: int = 16) -> Qu
         wavelength_nm=np.linspace(450, 900, bands),
         score=rng.random((rows, columns)),
         patch_px=patch,
-        seats=np.array([0, 1], np.intp),
+        patch_index=np.array([0, 1], np.intp),
         blocks=((0, min(patch, height), 0, width),),
         class_map=rng.integers(0, 3, (height, width)).astype(np.uint8),
         class_names=("soil", "sugar_beet", r"$\weeds_{$"),
@@ -75,7 +75,7 @@ def test_scores_without_a_range_are_drawn(score):
 
 
 def test_pictures_of_less_and_of_the_same(tmp_path: Path):
-    """No truth, seat, block or score still make a picture; the same data give the same bytes."""
+    """No truth, patch, block or score still make a picture; the same data give the same bytes."""
     for name in ("one", "two"):
         draw_quicklook(tmp_path / name, make_data(32, 48))
     assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
@@ -84,7 +84,7 @@ def test_pictures_of_less_and_of_the_same(tmp_path: Path):
         data,
         truth=None,
         confidence=None,
-        seats=np.array([], np.intp),
+        patch_index=np.array([], np.intp),
         blocks=(),
         score=np.full_like(data.score, np.nan),
         rectified=np.full_like(data.rectified, np.nan),
@@ -133,7 +133,7 @@ def test_stretch_ignores_what_is_missing():
     assert np.isfinite(grey_of(image)).all()
 
 
-def test_outline_is_the_border_of_the_seats():
+def test_outline_is_the_border_of_the_patches():
     """Two neighbours have one common border of six sides, cut off at the scene's edge."""
     chosen = np.zeros((3, 4), bool)
     chosen[0, 0] = chosen[0, 1] = True
@@ -187,7 +187,7 @@ def test_sweeps_stand_apart_and_shorter_ones_are_filled_up():
 
 @pytest.mark.parametrize("confident", [True, False])
 def test_a_plain_scan_shows_how_sure_its_map_is(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, confident):
-    """In the place of where it looked twice, which it did not; all lines are counted, shown or not."""
+    """In the place of where it captured again, which it did not; all lines are counted, shown or not."""
     words = []
     monkeypatch.setattr(quicklook, "_caption", lambda axes, title, text: words.append((title, text)))
     data = make_data(96, 128)
@@ -196,4 +196,4 @@ def test_a_plain_scan_shows_how_sure_its_map_is(monkeypatch: pytest.MonkeyPatch,
     told = dict(words)
     assert told["1  Raw lines"] == "2 sweeps, 2098 lines as they came"
     assert told["2  Confidence"] == ("of the model in its own map" if confident else "the map has none")
-    assert "2  Where it looked twice" not in told
+    assert "2  Where it captured again" not in told

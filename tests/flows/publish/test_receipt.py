@@ -17,7 +17,7 @@ from flows.publish.receipt import COSTS, Receipt, build_receipt, check_receipt, 
 from flows.publish.receipt_table import finding_rows, headline, print_table
 from flows.publish.report import Picture, render_report
 from flows.settings.survey_settings import Settings
-from flows.terminal.figures import area_words
+from flows.terminal.figures import format_area
 from pipeline.errors import ShapeError
 from storage.archive.records import StageRecord
 from storage.archive.whole_files import to_json
@@ -28,7 +28,7 @@ def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
     """A receipt with hand-made figures; every path of the design is in it."""
     saving = {"done": 50, "full": 100, "ratio": 0.5, "full_is": "predicted"}
     savings: dict[str, object] = {name: dict(saving) for name in reversed(COSTS)}
-    savings["multiply_adds"] = {**saving, "glance": 20, "score": 1, "encode": 19, "decode": 10}
+    savings["multiply_adds"] = {**saving, "coarse_prediction": 20, "score": 1, "encode": 19, "decode": 10}
     savings["capture_s"] = {"done": 104.0, "full": 209.0, "ratio": 104 / 209, "full_is": "predicted"}
     accuracy = {  # the map shows wheat, of which the truth has none
         "miou": np.float32(0.75),
@@ -187,7 +187,7 @@ def test_the_table_fits_80_columns():
     for words in ("104 s", "209 s", "50 %"):
         assert words in text, words
     assert max(map(len, _printed(make_receipt(), 80).splitlines())) <= 80
-    assert [area_words(hectares) for hectares in (2.5, 0.1, 0.0999, 0.0012)] == ["2.5 ha", "0.1 ha", "999 m²", "12 m²"]
+    assert [format_area(hectares) for hectares in (2.5, 0.1, 0.0999, 0.0012)] == ["2.5 ha", "0.1 ha", "999 m²", "12 m²"]
 
 
 def _printed(receipt: Receipt, width: int = 100) -> str:
@@ -199,18 +199,18 @@ def _printed(receipt: Receipt, width: int = 100) -> str:
 def test_headline_is_one_paragraph_with_the_figures():
     """Where, how long, how well, and the worst class of the truth; what was not judged is not mentioned."""
     text = headline(make_receipt(), 0.23)
-    assert text.startswith("The camera looked twice at 23 % of the field. Capture took 104 s instead of 209 s")
+    assert text.startswith("The camera captured again at 23 % of the field. Capture took 104 s instead of 209 s")
     assert "75.0 of 100" in text
     assert "93.4 % of its pixels are right" in text
-    assert headline(make_receipt(), 0.0).startswith("The camera looked twice at nothing: no run of fine lines fits")
+    assert headline(make_receipt(), 0.0).startswith("The camera captured again at nothing: no run of fine lines fits")
     assert "truth" not in headline(make_receipt(labels=False))
-    words = "Its worst class is bare weed with 60.0: the coarse look alone gives 20.0, detail everywhere 80.0."
+    words = "Its worst class is bare weed with 60.0: the coarse pass alone gives 20.0, detail everywhere 80.0."
     assert headline(make_receipt()).endswith(words)
     receipt = make_receipt()
     receipt["accuracy"]["all"] = {"miou": None, "per_class_iou": {}}
     text = headline(receipt)
-    assert "the coarse look alone gives 50.0. Its worst class" in text
-    assert text.endswith("bare weed with 60.0: the coarse look alone gives 20.0.")
+    assert "the coarse pass alone gives 50.0. Its worst class" in text
+    assert text.endswith("bare weed with 60.0: the coarse pass alone gives 20.0.")
 
 
 PNG = b"\x89PNG\r\n\x1a\nnot a real picture"

@@ -28,7 +28,7 @@ from flows.tasks.local_server import local_server
 from flows.tasks.open_survey import RIG_LIMIT, OpenSurvey
 from storage.archive.archive import Archive
 from storage.archive.records import read_run
-from storage.parallel.crew import THREADS
+from storage.parallel.pool import THREADS
 from tests.soak.served_week import free_port, server_process
 
 ROOT = Path(__file__).parents[3]
@@ -105,7 +105,7 @@ def test_a_wrong_parameter_ends_a_run_with_the_message_of_the_command_line(north
         planned(deployment, DUE, {"settings": {**settings, "bugdet": 0.5}})
     state = run_here(planned(deployment, DUE, {"settings": {**settings, "budget": 2.0}}))
     assert state.is_failed()
-    assert "--budget must be a share of the full scan's seconds, above 0 and at most 1, got 2.0" in state.message
+    assert "--budget must be a fraction of the full scan's seconds, above 0 and at most 1, got 2.0" in state.message
 
 
 def test_a_run_is_a_visit_of_its_due_time_and_goes_on_from_the_newest(north: Any) -> None:
@@ -167,17 +167,17 @@ def test_two_fields_that_are_due_at_once_take_turns_at_the_rig(tmp_path: Path) -
     inside = threading.Barrier(2)
 
     @flow(persist_result=False)
-    def look() -> None:
+    def scan_pass() -> None:
         inside.wait(PATIENCE_S)
         with OpenSurvey.at_work(plan):
             began = time.monotonic()
             time.sleep(0.5)
             held.append((began, time.monotonic()))
 
-    assert rig.crew == THREADS
+    assert rig.pool == THREADS
     with client() as asked:
         asked.upsert_global_concurrency_limit_by_name(RIG_LIMIT, 1)
-    threads = [threading.Thread(target=copy_context().run, args=(look,)) for _ in range(2)]
+    threads = [threading.Thread(target=copy_context().run, args=(scan_pass,)) for _ in range(2)]
     for one in threads:
         one.start()
     for one in threads:

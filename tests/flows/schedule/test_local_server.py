@@ -78,6 +78,6 @@ def test_another_host_is_refused(server: str) -> None:
 
 
 if __name__ == "__main__":
-    os.environ["DO_NOT_TRACK"] = "1"
+    os.environ["DO_NOT_SCAN_PATH"] = "1"
     with tempfile.TemporaryDirectory() as folder:
         SCHEMA.write_text(migrated_schema(Path(folder)))

@@ -93,7 +93,7 @@ def test_documents_have_every_setting_with_its_default():
     for keys in ({name: one for name, one in SURVEY.items() if name not in TABLES}, *TABLES.values()):
         for name, one in keys.items():
             assert one.item.metadata["description"], name
-            value = one.told["example"] if one.item.default in (None, MISSING) else one.item.default
+            value = one.about["example"] if one.item.default in (None, MISSING) else one.item.default
             assert one.read(str(value) if isinstance(value, Tolerance) else value, name) is not None
 
 
@@ -142,7 +142,7 @@ def test_unit_mistakes_are_refused_with_a_guess(table, words):
 
 @pytest.mark.parametrize("budget", ["abc", 0, "0", -1, 1.5, float("nan"), True, float("inf"), [0.5]])
 def test_budget_out_of_range_is_refused(budget):
-    """A budget is a share above 0 and at most 1; anything else says so and exits with 2."""
+    """A budget is a fraction above 0 and at most 1; anything else says so and exits with 2."""
     with pytest.raises(BudgetError, match="above 0 and at most 1, got") as caught:
         load_settings(flags={"budget": budget})
     assert caught.value.exit_code == 2
@@ -215,7 +215,7 @@ def test_memory_reads_units(text, count):
         ({"camera": 3}, "must be a table"),
         ({"camera": {"dark_dn": 5000}}, "leaves no room"),
         ({"out": " "}, "text that is not empty"),
-        ({"kernel": "cubic"}, "one of catmull-rom, bilinear, nearest; got 'cubic'"),
+        ({"resampling": "cubic"}, "one of catmull-rom, bilinear, nearest; got 'cubic'"),
         ({"pointing_px": -1}, "from 0 to 300 px, got -1"),
         ({"pose": {"lat_deg": 52.1, "tilt_deg": 40}}, r"\[pose\] lacks lon_deg, heading_deg; give every one"),
         ({"pose": POSE | {"range_m": 20}}, r"\[pose\]: .* height_m or range_m, one of the two; got height_m = 12"),
@@ -320,9 +320,9 @@ def test_receipt_settings_read_back_the_same(budget, seed, bands, memory, exposu
         map=MapChoice(resolution_m=0.1 if posed else None),
         pointing_px=slew,
         tol=tolerance,
-        sky=Sky(started=datetime(2026, 6, 1, 10, tzinfo=UTC) if posed else None, cloud_share=budget),
+        sky=Sky(started=datetime(2026, 6, 1, 10, tzinfo=UTC) if posed else None, cloud_fraction=budget),
         air=Air(distance_m=exposure if posed else None),
-        detector=Detector(well_e=exposure + 1),
+        detector=Detector(full_well_e=exposure + 1),
     )
     assert parse_settings(settings.to_dict()) == settings
     assert parse_settings(json.loads(to_json(settings.to_dict()))) == settings

@@ -75,10 +75,10 @@ class Stored:
     along: str
 
     def fine(self, shape: tuple[int, int]) -> NDArray[np.float64]:
-        """Patches laid out on the scene's pixels, NaN where the camera did not look twice."""
+        """Patches laid out on the scene's pixels, NaN where the camera did not capture again."""
         values = self.patches["values"].where(self.patches["valid"]).values
         canvas = np.full((*shape, values.shape[-1]), np.nan)
-        for patch, y, x in zip(values, self.patches["seat_y"].values, self.patches["seat_x"].values, strict=True):
+        for patch, y, x in zip(values, self.patches["patch_y"].values, self.patches["patch_x"].values, strict=True):
             canvas[y : y + len(patch), x : x + len(patch)] = patch
         return canvas
 
@@ -117,7 +117,7 @@ def surveyed(
     return survey
 
 
-def error_share(got: NDArray[np.floating], truth: NDArray[np.floating]) -> float:
+def error_fraction(got: NDArray[np.floating], truth: NDArray[np.floating]) -> float:
     """Rms error over the standard deviation of the truth, the worse of the two bands; NaN in ``got`` is left out."""
     spread = truth.std(axis=(0, 1))
     return float((np.sqrt(np.nanmean((got - truth) ** 2, axis=(0, 1))) / spread).max())
@@ -149,20 +149,20 @@ def test_survey_is_the_scene_through_the_footprint(
     assert stored.along == along
     patches, mosaic, pixels = stored.fine(shape), stored.mosaic["values"].values, convolved(scene, along)
     assert np.isfinite(patches).mean() > 0.3
-    assert error_share(patches, pixels) < BOUND
-    assert error_share(mosaic, coarse_of(pixels)) < BOUND
+    assert error_fraction(patches, pixels) < BOUND
+    assert error_fraction(mosaic, coarse_of(pixels)) < BOUND
     inner, inner_coarse = np.s_[8:-8, 8:-8], np.s_[2:-2, 2:-2]  # at its border the scene ends, the waves go on
-    assert error_share(patches[inner], scene.seen(along)[inner]) < BOUND
-    assert error_share(mosaic[inner_coarse], scene.seen(along, FACTOR)[inner_coarse]) < BOUND
-    assert error_share(patches, scene.raster()) > 4 * BOUND  # the bound tells footprints apart
+    assert error_fraction(patches[inner], scene.seen(along)[inner]) < BOUND
+    assert error_fraction(mosaic[inner_coarse], scene.seen(along, FACTOR)[inner_coarse]) < BOUND
+    assert error_fraction(patches, scene.raster()) > 4 * BOUND  # the bound tells footprints apart
 
 
 @pytest.mark.parametrize("shortest_px", [4, 16])
-def test_survey_of_two_strips(shortest_px: int, surveyed: Callable[[Waves], Stored]) -> None:
+def test_survey_of_two_swaths(shortest_px: int, surveyed: Callable[[Waves], Stored]) -> None:
     """Wider than a line: turned lines and a seam. Patches hold waves from 4 px on, the mosaic from 4 px of its own."""
     scene = waves((32, 240), shortest_px, 10 * shortest_px)
     stored = surveyed(scene)
     pixels = convolved(scene, stored.along)
-    assert error_share(stored.fine(scene.shape), pixels) < BOUND
+    assert error_fraction(stored.fine(scene.shape), pixels) < BOUND
     if shortest_px >= 4 * FACTOR:
-        assert error_share(stored.mosaic["values"].values, coarse_of(pixels)) < BOUND
+        assert error_fraction(stored.mosaic["values"].values, coarse_of(pixels)) < BOUND

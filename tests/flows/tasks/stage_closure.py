@@ -59,7 +59,7 @@ class Sources:
         return changed
 
     def named(self, name: str) -> Target:
-        """Find the only definition of that name: ``attend``, or ``stages.attend`` where several modules have one.
+        """Find the only definition of that name: ``score``, or ``stages.score`` where several modules have one.
 
         Raises
         ------

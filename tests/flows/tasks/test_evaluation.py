@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flows.tasks.scores import false_class_words, score_of, worst_class
+from flows.tasks.scores import format_false_classes, score_of, worst_class
 from flows.tasks.stages import accuracy as evaluation
 from flows.tasks.stages import placement
 from models.evaluation.metrics import confusion
@@ -102,11 +102,11 @@ def test_a_receipt_gives_its_own_figures():
     accuracy["per_class_iou"] = {"wheat": None}
     assert worst_class(accuracy) is None
     accuracy: Any = copy.deepcopy(make_receipt()["accuracy"])
-    accuracy["none"]["false_classes"] = {"wheat": 30, "bare_track": 1}
+    accuracy["none"]["false_classes"] = {"wheat": 30, "bare_scan_path": 1}
     words = "Shown although the truth has none: this survey wheat 2 px; none wheat 30 px, bare track 1 px."
-    assert false_class_words(accuracy) == words
+    assert format_false_classes(accuracy) == words
     accuracy["false_classes"] = accuracy["none"]["false_classes"] = {}
-    assert false_class_words(accuracy) == ""
+    assert format_false_classes(accuracy) == ""
 
 
 @pytest.mark.parametrize("accuracy", [None, 3, {}, {"miou": "x"}, {"per_class_iou": [1], "none": 2, "all": None}])

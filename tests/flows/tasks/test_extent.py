@@ -17,7 +17,7 @@ from pipeline.geometry.grid import SceneGrid
 
 def test_a_large_field_is_counted_region_by_region() -> None:
     """Sixteen times the field takes as many fields and their halos."""
-    small, large = (work_of_map(run, run.grid.valid_seats()) for run in (_run(2560, "gain"), _run(10240, "gain")))
+    small, large = (work_of_map(run, run.grid.valid_patches()) for run in (_run(2560, "gain"), _run(10240, "gain")))
     assert 16 * small.decode < large.decode < 16 * 1.3 * small.decode
     assert 16 * small.total < large.total < 16 * 1.3 * small.total
 
@@ -42,19 +42,22 @@ def _run(side: int, policy: str, *, plain: bool = False) -> SurveyRun:
 
 
 @pytest.mark.parametrize(
-    ("policy", "looks"), [("gain", 2), ("entropy", 2), ("sobel", 1), ("random", 1), ("saliency", 1), ("vgg-static", 1)]
+    ("policy", "scan_passes"),
+    [("gain", 2), ("entropy", 2), ("sobel", 1), ("random", 1), ("saliency", 1), ("vgg-static", 1)],
 )
-def test_a_policy_that_asks_the_glance_reads_the_coarse_look_once_more(policy: str, looks: int) -> None:
-    """The map reads it anyway, from what is stored; scores of the glance read it before that."""
+def test_a_policy_that_asks_the_coarse_prediction_reads_the_coarse_look_once_more(
+    policy: str, scan_passes: int
+) -> None:
+    """The map reads it anyway, from what is stored; scores of the coarse prediction read it before that."""
     run = _run(256, policy)
     score = score_multiply_adds(policy, CONFIG, run.grid)
     done, closed = work_done(run, np.array([3, 8])), multiply_adds(CONFIG, run.grid, 2, BANDS, score=score)
-    assert done.glance == looks * closed.glance
+    assert done.coarse_prediction == scan_passes * closed.coarse_prediction
     assert (done.score, done.encode, done.decode) == (closed.score, closed.encode, closed.decode)
 
 
 def test_a_plain_scan_is_read_and_nothing_scored() -> None:
     """What its map takes, whatever the policy of the settings is."""
-    run, seats = _run(256, "gain", plain=True), np.arange(256)
-    assert work_done(run, seats) == work_of_map(run, seats)
-    assert work_done(run, seats).score == 0
+    run, patch_index = _run(256, "gain", plain=True), np.arange(256)
+    assert work_done(run, patch_index) == work_of_map(run, patch_index)
+    assert work_done(run, patch_index).score == 0

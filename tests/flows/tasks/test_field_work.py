@@ -12,17 +12,17 @@ import pytest
 
 from flows.settings.load import load_settings
 from flows.tasks.drawing import Drawing, draw_field
-from flows.tasks.field_memory import FieldMemory
+from flows.tasks.field_prior_map import FieldPriorMap
 from flows.tasks.field_work import FieldWork, Scoring, WeightsFile, region_params
 from flows.tasks.reading_costs import SHARD
 from flows.tasks.run import SurveyRun, open_run
 from models.reading.regions import Region, plan_regions, whole_field
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
-from storage.arrays.class_maps import ClassNames, create_belief, create_class_map, load_class_map
+from storage.arrays.class_maps import ClassNames, create_class_map, create_probabilities, load_class_map
 from storage.arrays.layout import consolidate_stores
 from storage.arrays.mosaics import load_attention
-from storage.parallel.crew import Crew
+from storage.parallel.pool import WorkerPool
 
 Survey = Callable[..., object]
 MOST_PX = (64, 640)  # of 96 x 128 px: two regions
@@ -51,17 +51,17 @@ def _store(stages: Path, name: str) -> Path:
     return path
 
 
-def _work(run: SurveyRun, crew: Crew, halo: int) -> FieldWork:
-    return replace(FieldWork.of(run), regions=plan_regions(run.grid, SHARD, most_px=MOST_PX, halo=halo), crew=crew)
+def _work(run: SurveyRun, pool: WorkerPool, halo: int) -> FieldWork:
+    return replace(FieldWork.of(run), regions=plan_regions(run.grid, SHARD, most_px=MOST_PX, halo=halo), pool=pool)
 
 
 def _draw(work: FieldWork, run: SurveyRun, stages: Path, out: Path) -> dict[str, bytes]:
     """The bytes of the map that this work draws."""
     legend = ClassNames(run.weights.class_names, run.weights.class_colours)
     create_class_map(out, run.scene.shape, legend, grid=run.angular_grid())
-    create_belief(out.with_suffix(".belief"), run.scene.shape, legend, grid=run.angular_grid())
+    create_probabilities(out.with_suffix(".class_probabilities"), run.scene.shape, legend, grid=run.angular_grid())
     mosaic, patches = _store(stages, "rectify/*/mosaic.zarr"), _store(stages, "patches/*/patches.zarr")
-    drawing = Drawing(work.weights, mosaic, patches, out, out.with_suffix(".belief"), 1.0, 1)
+    drawing = Drawing(work.weights, mosaic, patches, out, out.with_suffix(".class_probabilities"), 1.0, 1)
     draw_field(work, drawing, lambda done: None)
     consolidate_stores(out.parent)  # as a store is published
     return _contents(out)
@@ -71,24 +71,24 @@ def _contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-@pytest.mark.parametrize("crew", [Crew(workers=1), Crew(workers=2)], ids=["one", "two"])
+@pytest.mark.parametrize("pool", [WorkerPool(workers=1), WorkerPool(workers=2)], ids=["one", "two"])
 def test_regions_that_see_the_field_draw_the_map_of_the_field(
-    surveyed: tuple[SurveyRun, Path], tmp_path: Path, crew: Crew
+    surveyed: tuple[SurveyRun, Path], tmp_path: Path, pool: WorkerPool
 ) -> None:
     """With a halo over everything, to the byte, whoever draws them; the stage's own map is that of one region."""
     run, stages = surveyed
     stored = _contents(_store(stages, "segment/*/class_map.zarr"))
-    assert len(_work(run, crew, ALL_CELLS).regions) == 2
-    assert _draw(_work(run, crew, ALL_CELLS), run, stages, tmp_path / "m.zarr") == stored
+    assert len(_work(run, pool, ALL_CELLS).regions) == 2
+    assert _draw(_work(run, pool, ALL_CELLS), run, stages, tmp_path / "m.zarr") == stored
     assert _draw(FieldWork.of(run), run, stages, tmp_path / "one.zarr") == stored
 
 
 @pytest.mark.parametrize("halo", [0, 1])
-def test_every_crew_draws_the_same_regions(surveyed: tuple[SurveyRun, Path], tmp_path: Path, halo: int) -> None:
+def test_every_pool_draws_the_same_regions(surveyed: tuple[SurveyRun, Path], tmp_path: Path, halo: int) -> None:
     """Two at a time or one after the other, the bytes are the same; every pixel has a class."""
     run, stages = surveyed
-    one = _draw(_work(run, Crew(workers=1), halo), run, stages, tmp_path / "one.zarr")
-    assert one == _draw(_work(run, Crew(workers=2), halo), run, stages, tmp_path / "two.zarr")
+    one = _draw(_work(run, WorkerPool(workers=1), halo), run, stages, tmp_path / "one.zarr")
+    assert one == _draw(_work(run, WorkerPool(workers=2), halo), run, stages, tmp_path / "two.zarr")
     found = load_class_map(tmp_path / "one.zarr")
     assert found.classes.max() < len(found.names)
     assert np.isfinite(found.confidence).all()
@@ -96,13 +96,13 @@ def test_every_crew_draws_the_same_regions(surveyed: tuple[SurveyRun, Path], tmp
 
 @pytest.mark.parametrize("policy", ["entropy", "sobel"])
 def test_scores_of_regions_make_those_of_the_field(surveyed: tuple[SurveyRun, Path], policy: str) -> None:
-    """With a halo over everything they are equal, seat by seat, and the stage's own where it used that policy."""
+    """With a halo over everything they are equal, patch by patch, and the stage's own where it used that policy."""
     run, stages = surveyed
     mosaic = _store(stages, "rectify/*/mosaic.zarr")
     whole = FieldWork.of(run).score(policy, mosaic, lambda done: None)
-    assert (_work(run, Crew(workers=2), ALL_CELLS).score(policy, mosaic, lambda done: None) == whole).all()
+    assert (_work(run, WorkerPool(workers=2), ALL_CELLS).score(policy, mosaic, lambda done: None) == whole).all()
     if policy == run.settings.policy:
-        assert (load_attention(_store(stages, "attend/*/attention.zarr")).score == whole).all()
+        assert (load_attention(_store(stages, "score/*/attention.zarr")).score == whole).all()
 
 
 def test_edges_need_one_patch_of_halo_and_work_travels_as_paths(surveyed: tuple[SurveyRun, Path]) -> None:
@@ -110,7 +110,7 @@ def test_edges_need_one_patch_of_halo_and_work_travels_as_paths(surveyed: tuple[
     run, stages = surveyed
     mosaic = _store(stages, "rectify/*/mosaic.zarr")
     whole = FieldWork.of(run).score("sobel", mosaic, lambda done: None)
-    np.testing.assert_allclose(_work(run, Crew(), 1).score("sobel", mosaic, lambda done: None), whole, rtol=1e-5)
+    np.testing.assert_allclose(_work(run, WorkerPool(), 1).score("sobel", mosaic, lambda done: None), whole, rtol=1e-5)
     run, stages = surveyed
     work = FieldWork.of(run)
     scoring = Scoring(work.weights, _store(stages, "rectify/*/mosaic.zarr"), "entropy")
@@ -128,39 +128,41 @@ def test_a_worker_goes_region_by_region(
     let_go: list[bool] = []
     for module in ("field_work", "drawing"):
         monkeypatch.setattr(f"flows.tasks.{module}.let_tiles_go", lambda: let_go.append(True))
-    work = _work(run, Crew(workers=1), 1)
+    work = _work(run, WorkerPool(workers=1), 1)
     work.score("entropy", _store(stages, "rectify/*/mosaic.zarr"), lambda done: None)
     assert len(let_go) == 2
     _draw(work, run, stages, tmp_path / "m.zarr")
     assert len(let_go) == 4
     run, stages = surveyed
     told: list[float] = []
-    work = _work(run, Crew(workers=1), 1)
+    work = _work(run, WorkerPool(workers=1), 1)
     work.score("entropy", _store(stages, "rectify/*/mosaic.zarr"), told.append)
     assert told == [0.5, 1.0]
     regions: Sequence[Region] = work.regions
     assert sum(region.kept.shape[0] for region in regions) == 96
 
 
-@pytest.mark.parametrize(("crew", "words"), [(Crew(), "the process itself"), (Crew("processes"), "each of two proc")])
+@pytest.mark.parametrize(
+    ("pool", "words"), [(WorkerPool(), "the process itself"), (WorkerPool("processes"), "each of two proc")]
+)
 def test_too_little_memory_is_refused_before_the_work(
-    surveyed: tuple[SurveyRun, Path], tmp_path: Path, crew: Crew, words: str
+    surveyed: tuple[SurveyRun, Path], tmp_path: Path, pool: WorkerPool, words: str
 ) -> None:
     """The message says what a region takes and the least memory that does, and that much is enough."""
-    work = replace(FieldWork.of(surveyed[0]), crew=crew, memory=300 * 2**20)
+    work = replace(FieldWork.of(surveyed[0]), pool=pool, memory=300 * 2**20)
     with pytest.raises(SettingsError, match=rf"exceeds --memory 300 MiB: .*96 x 128 px.*{words}") as refused:
-        work.crew_for(np.arange(192), 3)
+        work.pool_for(np.arange(192), 3)
     least = int(str(refused.value).split("--memory")[-1].split()[0])
-    replace(work, memory=least * 2**20).crew_for(np.arange(192), 3)
+    replace(work, memory=least * 2**20).pool_for(np.arange(192), 3)
 
 
 def test_no_more_regions_at_a_time_than_memory_holds(surveyed: tuple[SurveyRun, Path]) -> None:
-    """A crew shrinks to what fits, and stays as it is where all of it does."""
-    work = replace(FieldWork.of(surveyed[0]), crew=Crew(workers=7))
-    assert work.crew_for(np.arange(9), 3) is work.crew
-    crews = [replace(work, memory=size * 2**20).crew_for(np.arange(9), 3).workers for size in (513, 514, 600)]
-    assert crews == sorted(crews, key=int)
-    assert crews[0] < crews[-1] == 7
+    """A worker pool shrinks to what fits, and stays as it is where all of it does."""
+    work = replace(FieldWork.of(surveyed[0]), pool=WorkerPool(workers=7))
+    assert work.pool_for(np.arange(9), 3) is work.pool
+    pools = [replace(work, memory=size * 2**20).pool_for(np.arange(9), 3).workers for size in (513, 514, 600)]
+    assert pools == sorted(pools, key=int)
+    assert pools[0] < pools[-1] == 7
 
 
 def test_weights_that_changed_are_refused(tmp_path: Path, weights: Path) -> None:
@@ -181,17 +183,20 @@ def test_only_keys_of_fields_that_are_cut_know_of_regions(size: tuple[int, int])
 def test_a_memory_is_moved_and_leaves_nothing_behind(surveyed: tuple[SurveyRun, Path], shift: tuple[int, int]) -> None:
     """What lay at a pixel lies ``shift`` further, in fine and coarse pixels alike, and nothing where it came from."""
     run, stages = surveyed
-    belief, mosaic = _store(stages, "segment/*/belief.zarr"), _store(stages, "rectify/*/mosaic.zarr")
+    probabilities, mosaic = (
+        _store(stages, "segment/*/class_probabilities.zarr"),
+        _store(stages, "rectify/*/mosaic.zarr"),
+    )
     region = whole_field(run.grid)
     classes = tuple(range(len(run.weights.class_names)))
-    still = FieldMemory(belief, mosaic, 1.0, classes).of(region, run.weights)
-    moved = FieldMemory(belief, mosaic, 1.0, classes, shift).of(region, run.weights)
+    still = FieldPriorMap(probabilities, mosaic, 1.0, classes).of(region, run.weights)
+    moved = FieldPriorMap(probabilities, mosaic, 1.0, classes, shift).of(region, run.weights)
     coarse = tuple(round(by / run.grid.factor) for by in shift)
     assert still.coarse is not None
     assert moved.coarse is not None
     pairs = [
-        (still.belief.log_probability, moved.belief.log_probability, shift),
-        (still.belief.age_days, moved.belief.age_days, shift),
+        (still.probabilities.log_probability, moved.probabilities.log_probability, shift),
+        (still.probabilities.age_days, moved.probabilities.age_days, shift),
         (still.coarse, moved.coarse, coarse),
     ]
     for before, now, by in pairs:

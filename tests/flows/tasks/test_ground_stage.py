@@ -23,12 +23,12 @@ from storage.archive.keys import StageRef
 from storage.arrays.class_maps import (
     ClassMap,
     ClassNames,
-    create_belief,
+    create_probabilities,
     load_class_map,
-    write_belief_tile,
     write_changes,
     write_changes_tile,
     write_class_map,
+    write_probabilities_tile,
 )
 from storage.arrays.ground_maps import GroundMap, load_ground_map
 from storage.arrays.layout import AngularGrid
@@ -64,21 +64,21 @@ class Run:
 
 
 def believe(folder: Path, age_days: np.ndarray, old_class: np.ndarray | None = None) -> None:
-    """A belief of these ages (y, x), NaN where nothing is known; one that goes on from another with what changed."""
+    """A class probabilities of these ages (y, x), NaN where nothing is known; one that goes on from another with what changed."""
     values = np.where(np.isnan(age_days)[..., None], np.nan, np.log([0.5, 0.5])).astype(np.float32)
-    path = folder / "belief.zarr"
-    create_belief(path, SHAPE, LEGEND, goes_on=old_class is not None)
+    path = folder / "class_probabilities.zarr"
+    create_probabilities(path, SHAPE, LEGEND, goes_on=old_class is not None)
     for top in range(0, SHAPE[0], 64):
         rows = slice(top, top + 64)
-        write_belief_tile(path, (top, 0), values[rows], age_days[rows], np.ones(SHAPE, np.float32)[rows])
+        write_probabilities_tile(path, (top, 0), values[rows], age_days[rows], np.ones(SHAPE, np.float32)[rows])
         if old_class is not None:
             write_changes_tile(path, (top, 0), old_class[rows])
     if old_class is not None:
-        write_changes(path, seat_shares(old_class), 8)
+        write_changes(path, patch_fractions(old_class), 8)
 
 
-def seat_shares(old_class: np.ndarray) -> np.ndarray:
-    """(15, 20) shares of pixels that changed, of seats of 8 px."""
+def patch_fractions(old_class: np.ndarray) -> np.ndarray:
+    """(15, 20) fractions of pixels that changed, of patches of 8 px."""
     return (old_class != UNLABELLED).reshape(15, 8, 20, 8).mean(axis=(1, 3), dtype=np.float32)
 
 
@@ -131,9 +131,9 @@ def test_what_is_unknown_has_no_confidence_on_the_map_either(
     classes[40:70:3, 50:90:3] = 1
     confidence = np.where(classes == 1, np.nan, 0.9).astype(np.float32)
     legend = (("crop", "unknown"), np.array([[0, 255, 0], [255, 0, 255]], np.uint8))
-    write_class_map(tmp_path / "strange" / "class_map.zarr", ClassMap(classes, confidence, *legend))
-    believe(tmp_path / "strange", np.where(classes == 1, np.nan, 0).astype(np.float32))
-    found = load_ground_map(draw(run, (StageRef("segment", "s", tmp_path / "strange"), stores[1])).path / STORE)
+    write_class_map(tmp_path / "out_of_range" / "class_map.zarr", ClassMap(classes, confidence, *legend))
+    believe(tmp_path / "out_of_range", np.where(classes == 1, np.nan, 0).astype(np.float32))
+    found = load_ground_map(draw(run, (StageRef("segment", "s", tmp_path / "out_of_range"), stores[1])).path / STORE)
     assert (found.classes == 1).sum() > 50
     np.testing.assert_array_equal(np.isnan(found.confidence), found.classes != 0)
     np.testing.assert_array_equal(np.isnan(found.age_days), found.classes != 0)
@@ -184,7 +184,7 @@ def field_pixels(run: Run, found: GroundMap) -> tuple[np.ndarray, np.ndarray]:
 def test_age_and_changes_are_those_of_the_pixel_that_is_shown(
     run: Run, stores: tuple[StageRef, StageRef], tmp_path: Path
 ) -> None:
-    """Of a second visit: days, share of the patch and old class are no blend of neighbours; what is unknown is NaN."""
+    """Of a second visit: days, fraction of the patch and old class are no blend of neighbours; what is unknown is NaN."""
     rng = np.random.default_rng(3)
     age = 0.125 * rng.integers(0, 400, SHAPE).astype(np.float32)
     age[rng.random(SHAPE) < 0.1] = np.nan
@@ -198,7 +198,7 @@ def test_age_and_changes_are_those_of_the_pixel_that_is_shown(
     assert found.old_class is not None
     np.testing.assert_array_equal(found.age_days[seen], age[row, column])
     np.testing.assert_array_equal(found.old_class[seen], old[row, column])
-    np.testing.assert_array_equal(found.changed[seen], seat_shares(old)[row // 8, column // 8])
+    np.testing.assert_array_equal(found.changed[seen], patch_fractions(old)[row // 8, column // 8])
     for image in (found.age_days, found.changed):
         assert np.isnan(image[~seen]).all()
     assert (found.old_class[~seen] == UNLABELLED).all()

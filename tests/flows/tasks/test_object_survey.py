@@ -23,7 +23,7 @@ from storage.remote.object_archive import ObjectArchive
 from storage.remote.object_stores import Objects
 from tests.conftest import Survey
 from tests.flows.conftest import FEW_BANDS, CommandLine
-from tests.remembered_work import with_effects
+from tests.prior_work import with_effects
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 

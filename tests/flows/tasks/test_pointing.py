@@ -16,9 +16,9 @@ from flows.publish.receipt_table import finding_rows
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings, parse_settings
 from flows.tasks.capture_plan import plan_capture
-from flows.tasks.field_work import seat_columns
+from flows.tasks.field_work import patch_features
 from models.network.spectral import SpectralBasis
-from models.reading.inference import Glance
+from models.reading.inference import CoarsePrediction
 from models.reading.regions import whole_field
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import SceneGrid
@@ -28,7 +28,7 @@ from pipeline.simulator.effects.pointing import PointingErrors
 from storage.arrays.layout import open_group, read_array
 from storage.arrays.mosaics import PatchWriter, open_patches
 from tests.flows.conftest import FEW_BANDS
-from tests.remembered_work import without_effects
+from tests.prior_work import without_effects
 
 OFF_PX, SEED = 6.0, 0
 
@@ -72,7 +72,7 @@ def test_sweeps_are_put_right_by_seams_and_on_the_mosaic(surveyed: tuple[dict[st
 
 
 def test_what_the_mirror_missed_is_told_and_detail_still_helps(surveyed: tuple[dict[str, Any], Path]) -> None:
-    """Seats seen in part are counted, either pass has its row, and with patches the map is better than without."""
+    """Patches seen in part are counted, either pass has its row, and with patches the map is better than without."""
     receipt, archive = surveyed
     values = read_array(open_group(archive / receipt["products"]["patches"]), "values")
     partly = np.isnan(values).all(axis=3).any(axis=(1, 2))
@@ -84,25 +84,27 @@ def test_what_the_mirror_missed_is_told_and_detail_still_helps(surveyed: tuple[d
 
 
 def test_unseen_pixels_take_the_coarse_look(tmp_path: Path) -> None:
-    """What no line reached of a seat has the columns of the coarse pixel over it; a seat never seen is left out."""
+    """What no line reached of a patch has the columns of the coarse pixel over it; a patch never seen is left out."""
     grid = SceneGrid(12, 16, 4, 2)
     weights = SimpleNamespace(
         basis=SpectralBasis(500, 700, 2), columns=lambda v, nm: v, normalisation=SimpleNamespace(most_value=np.inf)
     )
-    seats = np.array([1, 6, 7])
+    patch_index = np.array([1, 6, 7])
     values = np.random.default_rng(0).normal(size=(3, 4, 4, 2)).astype(np.float16)
     values[0, :3, 1:], values[1] = np.nan, np.nan
     coarse = np.random.default_rng(1).normal(size=(*np.array(grid.padded_shape) // 2, 2)).astype(np.float32)
-    writer = PatchWriter(tmp_path / "patches.zarr", seats, grid.seat_origin(seats), 4, np.array([500.0, 700.0]))
+    writer = PatchWriter(
+        tmp_path / "patches.zarr", patch_index, grid.patch_origin(patch_index), 4, np.array([500.0, 700.0])
+    )
     writer.write(values, np.asarray(np.isfinite(values).all(axis=-1), np.bool_))
-    seen = Glance(grid, coarse, np.empty(0, np.float32))
+    seen = CoarsePrediction(grid, coarse, np.empty(0, np.float32))
     store, nm = open_patches(tmp_path / "patches.zarr"), np.array([500.0, 700.0])
-    told, columns = seat_columns(weights, store, nm, seen, whole_field(grid))  # type: ignore[arg-type]
+    told, columns = patch_features(weights, store, nm, seen, whole_field(grid))  # type: ignore[arg-type]
     assert told.tolist() == [1, 7]
     np.testing.assert_allclose(columns[1], values[2], rtol=1e-3)
     np.testing.assert_allclose(columns[0][:, 0], values[0][:, 0], rtol=1e-3)
     np.testing.assert_allclose(columns[0][3], values[0][3], rtol=1e-3)
-    over = coarse[:2, 2:4].repeat(2, axis=0).repeat(2, axis=1)  # seat 1 begins at row 0, column 4
+    over = coarse[:2, 2:4].repeat(2, axis=0).repeat(2, axis=1)  # patch 1 begins at row 0, column 4
     np.testing.assert_array_equal(columns[0][:3, 1:], over[:3, 1:])
 
 
@@ -132,7 +134,7 @@ TOLD: dict[str, tuple[dict[str, Any], str]] = {
     "partly seen": (
         {"sweeps": {"a": [0, 0], "b": [3, -4]}, "too_narrow": [{}], "partly_seen": 7},
         "put right by up to 5.0 px; 1 overlap too narrow to compare; 7 chosen places not seen whole, mapped there by "
-        "the coarse look",
+        "the coarse pass",
     ),
 }
 
@@ -151,7 +153,7 @@ OFF = 20.0
 def shared_px(sweeps: list[Sweep]) -> float:
     """The least that neighbouring strips share [px]."""
     camera = parse_settings({}).camera
-    reach = [one.strip_px + reach_px(one.strip_px, GRID.height, camera, one.binning) for one in sweeps]
+    reach = [one.swath_px + reach_px(one.swath_px, GRID.height, camera, one.binning) for one in sweeps]
     return min(float(left[1] - right[0]) for left, right in pairwise(reach))
 
 

@@ -21,11 +21,11 @@ from pipeline.simulator.scenes.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Line
 from storage.arrays.spool import Spool
-from storage.parallel.crew import Crew
+from storage.parallel.pool import WorkerPool
 
 CAMERA = LineCamera(samples=48)
-SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-35.0, lines=70)
-TWO = Crew("threads", 2)
+SWEEP = Sweep("s", "fine", "x", swath_px=0.0, start_px=-35.0, lines=70)
+TWO = WorkerPool("threads", 2)
 
 
 def source_of(*effects: str) -> SimulatedSource:
@@ -35,10 +35,10 @@ def source_of(*effects: str) -> SimulatedSource:
     return SimulatedSource(scene, Rig(CAMERA), seed=5, chosen=effects_on(*(effects or BY_NAME)))
 
 
-def taken(source: SimulatedSource, crew: Crew, first: int = 0, at_once: int = 16) -> list[Line]:
+def taken(source: SimulatedSource, pool: WorkerPool, first: int = 0, at_once: int = 16) -> list[Line]:
     """All lines from the first on."""
     lines: list[Line] = []
-    take_lines(source, SWEEP, lines.append, crew, first=first, at_once=at_once)
+    take_lines(source, SWEEP, lines.append, pool, first=first, at_once=at_once)
     return lines
 
 
@@ -58,18 +58,18 @@ def expected() -> list[Line]:
 
 @pytest.mark.parametrize(
     ("scheduler", "workers", "size"),
-    [  # crews without this process's memory, even of a scheduler that is not there, leave it to threads here
+    [  # worker pools without this process's memory, even of a scheduler that is not there, leave it to threads here
         *(("threads", 1, 64), ("threads", 2, 1), ("threads", 2, 70), ("threads", 5, 7)),
         *(("processes", 2, 16), ("tcp://192.0.2.1:8786", 2, 16)),
     ],
 )
-def test_neither_crew_nor_blocks_change_a_number(
+def test_neither_pool_nor_blocks_change_a_number(
     expected: list[Line], monkeypatch: pytest.MonkeyPatch, scheduler: str, workers: int, size: int
 ) -> None:
     """With every effect on, in blocks of 1, 7, 64 and all lines, with nothing remembered from before."""
     monkeypatch.setattr(simulated, "BLOCK_LINES", size)
     render._looker.cache_clear()
-    assert_same(taken(source_of(), Crew(scheduler, workers), at_once=size), expected)
+    assert_same(taken(source_of(), WorkerPool(scheduler, workers), at_once=size), expected)
 
 
 @pytest.mark.parametrize("first", [23, 69, 70])
@@ -83,7 +83,7 @@ def test_the_spool_gets_the_same_bytes(tmp_path: Path) -> None:
     source = source_of("rotation", "shot")
     for workers in (1, 3):
         with Spool.open(tmp_path / str(workers), 48, 3, header={}) as spool:
-            take_lines(source, SWEEP, spool.append, Crew("threads", workers))
+            take_lines(source, SWEEP, spool.append, WorkerPool("threads", workers))
     assert (tmp_path / "1" / "lines.lines").read_bytes() == (tmp_path / "3" / "lines.lines").read_bytes()
 
 
@@ -102,7 +102,7 @@ def test_blocks_wait_for_earlier_ones(monkeypatch: pytest.MonkeyPatch) -> None:
         return real(self, sweep, numbers)
 
     monkeypatch.setattr(SimulatedSource, "lines_of", unfair)
-    lines = taken(source_of("rotation"), Crew("threads", 3), at_once=7)
+    lines = taken(source_of("rotation"), WorkerPool("threads", 3), at_once=7)
     assert [line.number for line in lines] == list(range(70))
 
 
@@ -128,7 +128,7 @@ def test_few_blocks_are_held(monkeypatch: pytest.MonkeyPatch, workers: int) -> N
         count += 1
 
     monkeypatch.setattr(SimulatedSource, "lines_of", counted)
-    take_lines(source_of("rotation"), SWEEP, take, Crew("threads", workers), at_once=2)
+    take_lines(source_of("rotation"), SWEEP, take, WorkerPool("threads", workers), at_once=2)
     assert (count, len(begun)) == (70, 35)
     assert 1 <= most <= workers
     assert held <= workers + 1
@@ -147,7 +147,7 @@ def test_an_error_comes_when_it_is_its_turn(monkeypatch: pytest.MonkeyPatch, wor
     monkeypatch.setattr(SimulatedSource, "lines_of", failing)
     lines: list[Line] = []
     with pytest.raises(SceneError, match="line 28 and on"):
-        take_lines(source_of("rotation"), SWEEP, lines.append, Crew("threads", workers), at_once=7)
+        take_lines(source_of("rotation"), SWEEP, lines.append, WorkerPool("threads", workers), at_once=7)
     assert [line.number for line in lines] == list(range(28))
 
 

@@ -9,17 +9,17 @@ import pytest
 
 from flows.settings.load import load_settings
 from flows.tasks.run import open_run
-from flows.tasks.stages.accuracy import columns_of_all_seats
-from flows.tasks.survey_model import PLAIN_STEPS, shipped_weights, weights_offered, weights_path
+from flows.tasks.stages.accuracy import columns_of_all_patches
+from flows.tasks.survey_model import UNIFORM_STEPS, shipped_weights, weights_offered, weights_path
 from models.evaluation.metrics import mean_iou
 from models.evaluation.placement import Controls, run_controls
-from models.reading.inference import glance
+from models.reading.inference import coarse_prediction
 from models.weights.files import Weights, content_key, describe_weights, load_weights
 from pipeline.errors import BudgetError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.coverage import coarse_sweeps, full_sweeps
-from pipeline.planning.plain_scans import ScanRecord
+from pipeline.planning.uniform_scans import ScanPerformance
 from pipeline.rectify.region import mosaic_rows
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_plan import CLASSES
@@ -44,11 +44,11 @@ def controls(weights: Weights) -> Controls:
     source = SimulatedSource(scene, Rig(camera), 41)
     coarse = [SimulatedSweep(source, sweep) for sweep in coarse_sweeps(grid, camera, "x")]
     mosaic = np.concatenate([rows for _, rows, _ in mosaic_rows(coarse, camera, grid, rows=64)])
-    columns = columns_of_all_seats(
-        source, full_sweeps(grid, camera, "x"), grid, weights, memory=2**30, kernel="catmull-rom"
+    columns = columns_of_all_patches(
+        source, full_sweeps(grid, camera, "x"), grid, weights, memory=2**30, resampling="catmull-rom"
     )
-    seen = glance(weights, mosaic, scene.wavelength_nm, grid)
-    return run_controls(weights, seen, columns, np.asarray(scene.labels), share=0.35, seed=41)
+    seen = coarse_prediction(weights, mosaic, scene.wavelength_nm, grid)
+    return run_controls(weights, seen, columns, np.asarray(scene.labels), fraction=0.35, seed=41)
 
 
 def test_file_is_small_and_tells_its_making(weights: Weights) -> None:
@@ -69,8 +69,8 @@ def test_plain_scans_have_weights_of_their_own() -> None:
     plain, two_passes = (describe_weights(shipped_weights(plain=which)) for which in (True, False))
     assert (plain.config.factor, two_passes.config.factor) == (2, 4)
     assert plain.class_names == two_passes.class_names
-    assert ScanRecord.read(plain.record["scans"]).steps == PLAIN_STEPS
-    assert all(plain.config.factor % step == 0 for step in PLAIN_STEPS)
+    assert ScanPerformance.read(plain.record["scans"]).steps == UNIFORM_STEPS
+    assert all(plain.config.factor % step == 0 for step in UNIFORM_STEPS)
     assert set(two_passes.record["split"]["validation"]) == set(plain.record["split"]["validation"])
 
 
@@ -79,7 +79,7 @@ def test_plain_scans_have_weights_of_their_own() -> None:
     [
         ({"budget": "0.5"}, [False]),
         ({"scan_step": "1"}, [True]),
-        ({"scan_step": "2", "compute": "25%"}, [True]),
+        ({"scan_step": "2", "macs": "25%"}, [True]),
         ({"scan_step": "4"}, [False]),
         ({"seconds": "9"}, [True, False]),
     ],

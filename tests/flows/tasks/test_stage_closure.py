@@ -61,7 +61,7 @@ BESIDE = "from models.light import STEP\n\ndef stage(x):\n    return [STEP for S
 TABLE = "KNOWN = []\n\ndef register(one):\n    KNOWN.append(one)\n    return one\n"
 
 
-@pytest.mark.parametrize("absent", [("average_raster", "take_patches"), ("rectify", "cut_patches")])
+@pytest.mark.parametrize("absent", [("average_raster", "take_patches"), ("rectify", "extract_patches")])
 def test_every_stage_says_once_what_receipts_call_its_store(absent: tuple[str, str]) -> None:
     """No two stages of a survey, of a capture or of a raster, share a name in receipts; each has one at least."""
     ran = [one for name, one in STAGES.items() if name not in absent]

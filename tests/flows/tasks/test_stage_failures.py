@@ -164,7 +164,7 @@ def test_a_stage_that_fails_is_one_message(stage: str, walk: Walk) -> None:
 def test_the_survey_goes_on_as_if_nothing_had_been(walk: Walk) -> None:
     """Each store was begun three times, twice to fail; the run at last reads all but the last, and draws the map."""
     assert walk.builds == dict.fromkeys(walk.keys, 3)
-    assert {name for name, state in walk.last.items() if state == "ran"} == {"draw_map", "evaluate"}
+    assert {name for name, state in walk.last.items() if state == "ran"} == {"segment", "evaluate"}
     np.testing.assert_array_equal(class_map(walk.out), class_map(walk.undisturbed))
     archive = Archive.open(walk.out)
     assert {ref.key for ref in archive.refs()} == set(walk.keys.values())
@@ -223,7 +223,7 @@ def newest_run(flow: str, count: int) -> tuple[Any, dict[str, Any]]:
     return run, {task.name: task for task in tasks}
 
 
-@pytest.mark.parametrize(("stage", "after", "tries"), [("capture_fine", "attend", 3), ("draw_map", "cut_patches", 1)])
+@pytest.mark.parametrize(("stage", "after", "tries"), [("capture_fine", "score", 3), ("segment", "extract_patches", 1)])
 def test_a_stage_that_fails_by_prefect(
     stage: str, after: str, tries: int, server: str, survey_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -261,7 +261,7 @@ def test_a_served_field_of_which_a_stage_fails(
 
     out, file = tmp_path / "archive", field_file("north")
     with monkeypatch.context() as broken:
-        broken.setitem(STAGES, "cut_patches", failing("cut_patches", refusal("cut_patches")))
+        broken.setitem(STAGES, "extract_patches", failing("extract_patches", refusal("extract_patches")))
         state = survey(SurveySettings(settings_file=str(file), name="north"), return_state=True)
     assert (state.is_failed(), FULL_DISK in str(state.message)) == (True, True)
     assert (Archive.open(out).runs(), problems(out)) == ([], [])
@@ -278,7 +278,7 @@ def test_a_reprocessing_of_which_a_stage_fails(
     (missing,) = archive.refs("segment")
     archive.discard(missing)
     with monkeypatch.context() as broken:
-        broken.setitem(STAGES, "draw_map", failing("draw_map", refusal("draw_map")))
+        broken.setitem(STAGES, "segment", failing("segment", refusal("segment")))
         state = reprocess(archive=str(out), return_state=True)
     run, _ = newest_run("reprocess", 0)
     assert (state.is_failed(), run.name, run.state.message) == (True, f"reprocess-{out}", state.message)

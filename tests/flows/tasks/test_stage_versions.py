@@ -90,7 +90,7 @@ def test_an_edited_constant_concerns_the_stages_that_reach_it() -> None:
     assert edited != texts[module]
     changed = sources().edited(module, edited)
     concerned = {stage for stage in ROOTS if digest_of(stage, changed) != digest_of(stage, sources())}
-    assert concerned == {"attend", "segment", "evaluate"}
+    assert concerned == {"score", "segment", "evaluate"}
 
 
 @pytest.mark.parametrize("stage", sorted(VERSIONS))
@@ -111,10 +111,17 @@ def test_every_barrier_stands_in_a_way(barrier: str) -> None:
 @pytest.mark.parametrize(
     ("stage", "names"),
     {
-        "attend": ("SeatScorer", "encode_packed", "fill_dead", "received_attention", "attention_of_seats", "SceneGrid"),
+        "score": (
+            "PatchScorer",
+            "encode_packed",
+            "fill_dead",
+            "received_attention",
+            "attention_of_patches",
+            "SceneGrid",
+        ),
         "segment": ("encode_packed", "fill_dead", "MOST_DEAD", "Segmenter", "write_class_tile"),
         "capture": ("RigSource", "CaptureRunner", "open_mirror", "HeadwallCamera", "fit_clocks", "EFFECTS"),
-        "patches": ("read_seats", "LineCache", "calibrate", "PatchWriter"),
+        "patches": ("read_patches", "LineCache", "calibrate", "PatchWriter"),
     }.items(),
 )
 def test_code_is_watched_however_it_is_reached(stage: str, names: tuple[str, ...]) -> None:

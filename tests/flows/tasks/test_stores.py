@@ -26,7 +26,7 @@ from storage.arrays.quicklooks import load_quicklook
 from storage.arrays.spool import Spool
 from storage.remote.opening import verify_archive
 from tests.conftest import Survey
-from tests.remembered_work import without_effects
+from tests.prior_work import without_effects
 from tests.storage.small_archive import flip
 
 

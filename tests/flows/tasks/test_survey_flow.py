@@ -26,7 +26,7 @@ from pipeline.errors import RigError, SettingsError
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from tests.flows.conftest import CommandLine, act_instead, problems
-from tests.remembered_work import with_effects
+from tests.prior_work import with_effects
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 
@@ -58,18 +58,18 @@ def test_a_survey_in_two_passes_captures_again() -> None:
     """The fine sweeps follow from the plan, and patches are cut from them."""
     found = steps()
     assert list(found) == [
-        *("choose_effects", "capture_coarse", "locate", "rectify", "attend", "capture_fine", "cut_patches"),
-        "draw_map",
+        *("choose_effects", "capture_coarse", "locate", "rectify", "score", "capture_fine", "extract_patches"),
+        "segment",
     ]
-    assert found["capture_fine"] == ["attend", "choose_effects"]
-    assert found["cut_patches"] == ["attend", "capture_fine"]
+    assert found["capture_fine"] == ["score", "choose_effects"]
+    assert found["extract_patches"] == ["score", "capture_fine"]
 
 
 def test_a_uniform_scan_has_no_second_pass() -> None:
     """Patches are cut from the one scan."""
     found = steps(uniform=True)
     assert "capture_fine" not in found
-    assert found["cut_patches"] == ["attend", "capture_coarse"]
+    assert found["extract_patches"] == ["score", "capture_coarse"]
 
 
 @pytest.mark.parametrize(("uniform", "passes"), [(True, ["coarse"]), (False, ["coarse", "fine"])])
@@ -78,17 +78,17 @@ def test_patches_are_placed_by_the_registration_of_their_own_pass(uniform: bool,
     found = steps(registers=True, uniform=uniform)
     assert found["locate"] == ["capture_coarse", "register_coarse"]
     assert [name for name in found if name.startswith("register")] == [f"register_{one}" for one in passes]
-    assert found["cut_patches"] == ["attend", f"capture_{passes[-1]}", f"register_{passes[-1]}"]
+    assert found["extract_patches"] == ["score", f"capture_{passes[-1]}", f"register_{passes[-1]}"]
 
 
 def test_a_posed_survey_is_drawn_on_the_ground() -> None:
     """The map on the ground is made of the class map and the mosaic."""
-    assert steps(on_the_ground=True)["ground"] == ["draw_map", "rectify"]
+    assert steps(on_the_ground=True)["ground"] == ["segment", "rectify"]
 
 
 def test_a_raster_is_neither_captured_nor_rectified() -> None:
-    """Its own pixels take the place of capture, lookup and mosaic."""
-    assert list(steps(is_map=True)) == ["average_raster", "attend", "take_patches", "draw_map"]
+    """Its own pixels take the place of capture, geolocation grid and mosaic."""
+    assert list(steps(is_map=True)) == ["average_raster", "score", "take_patches", "segment"]
 
 
 SETTINGS = [
@@ -137,7 +137,7 @@ def test_the_rig_of_a_pass_is_that_of_its_own_machine(tmp_path: Path) -> None:
 
 def test_a_wrong_parameter_is_refused_with_the_message_of_the_command_line() -> None:
     """Before a run is begun."""
-    with pytest.raises(ValidationError, match="share of the full scan's seconds, above 0 and at most 1, got 3"):
+    with pytest.raises(ValidationError, match="fraction of the full scan's seconds, above 0 and at most 1, got 3"):
         SurveySettings(budget=3)
     with pytest.raises(ValidationError, match=r"unknown setting .*did you mean 'budget'"):
         SurveySettings(bugdet=0.5)
@@ -200,7 +200,7 @@ def test_prefect_makes_the_stores_that_plain_makes(
     )
     assert {one.state.type.value for one in tasks.values()} == {"COMPLETED"}
     assert edges(tasks, "rectify") == {"plan_capture", "capture_coarse", "locate"}
-    assert edges(tasks, "cut_patches") == {"plan_capture", "attend", "capture_fine"}
+    assert edges(tasks, "extract_patches") == {"plan_capture", "score", "capture_fine"}
     assert edges(tasks, "add_accuracy") == {"plan_capture", "publish", "evaluate"}
     assert any(words.startswith("mosaic: ") and "stages/rectify/" in words for words in log)
     assert set(artifacts) == {None, "survey-scene", "savings-scene", "report-scene"}

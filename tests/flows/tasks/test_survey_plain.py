@@ -21,7 +21,7 @@ from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.tasks.scene import open_scene
-from models.reading.inference import glance
+from models.reading.inference import coarse_prediction
 from models.weights.files import load_weights, save_weights
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
@@ -40,10 +40,10 @@ STAGES = [
     "capture_coarse",
     "locate",
     "rectify",
-    "attend",
+    "score",
     "capture_fine",
-    "cut_patches",
-    "draw_map",
+    "extract_patches",
+    "segment",
     "evaluate",
 ]
 FARM = (128, 192)
@@ -120,17 +120,17 @@ def test_all_maps_of_a_receipt_are_judged_over_the_classes_of_the_truth(farm: Do
 
 
 def test_savings_add_up_and_ranks_follow_the_scores(farm: Done) -> None:
-    """Ratios are done over full and capture keeps the budget; of captured seats scores fall with the rank."""
+    """Ratios are done over full and capture keeps the budget; of captured patches scores fall with the rank."""
     savings = farm.receipt["savings"]
     for name, entry in savings.items():
         assert entry["ratio"] == pytest.approx(entry["done"] / entry["full"]), name
     assert savings["capture_s"]["done"] <= 0.9 * farm.receipt["field"]["camera_s"]["full_scan"] + 1e-9
     work = savings["multiply_adds"]
-    assert work["done"] == sum(work[part] for part in ("glance", "score", "encode", "decode"))
+    assert work["done"] == sum(work[part] for part in ("coarse_prediction", "score", "encode", "decode"))
     attention, patches = farm.open("attention"), farm.open("patches")
     score, rank = attention["score"].values.ravel(), attention["rank"].values.ravel()
     chosen = np.flatnonzero(rank >= 0)
-    assert set(chosen) == set(patches["seat"].values.tolist())
+    assert set(chosen) == set(patches["patch"].values.tolist())
     ordered = chosen[np.argsort(rank[chosen])]
     assert (np.sort(rank[chosen]) == np.arange(len(chosen))).all()
     assert (np.diff(score[ordered]) <= 0).all()
@@ -169,7 +169,7 @@ def test_second_run_is_read_from_the_archive(survey_png: Any, surveyed_png: Any,
 
 
 def test_products_open_with_plain_xarray(farm: Done) -> None:
-    """Named axes, wavelengths in nm and GeoZarr's place; patches where seats were chosen; CF flags; facts of lines."""
+    """Named axes, wavelengths in nm and GeoZarr's place; patches where patches were chosen; CF flags; facts of lines."""
     mosaic, attention, patches, found = (farm.open(name) for name in ("mosaic", "attention", "patches", "class_map"))
     assert (mosaic["values"].dims, mosaic["values"].dtype) == (("y", "x", "band"), np.float32)
     assert (mosaic.sizes["y"], mosaic.sizes["x"]) == (FARM[0] // 4, FARM[1] // 4)
@@ -178,9 +178,9 @@ def test_products_open_with_plain_xarray(farm: Done) -> None:
     assert mosaic.attrs["spatial:dimensions"] == ["y", "x"]
     assert "CF" in mosaic.attrs["Conventions"]
     assert patches["values"].dims == ("patch", "y", "x", "band")
-    assert attention["rank"].dims == ("seat_y", "seat_x")
-    across = attention.sizes["seat_x"]
-    np.testing.assert_array_equal(patches["seat_y"].values, patches["seat"].values // across * patches.sizes["y"])
+    assert attention["rank"].dims == ("patch_y", "patch_x")
+    across = attention.sizes["patch_x"]
+    np.testing.assert_array_equal(patches["patch_y"].values, patches["patch"].values // across * patches.sizes["y"])
     assert np.isfinite(patches["values"].values[patches["valid"].values]).all()
     names = found.attrs["class_names"]
     assert (found["classes"].dims, (found.sizes["y"], found.sizes["x"])) == (("y", "x"), FARM)
@@ -196,12 +196,12 @@ def test_products_open_with_plain_xarray(farm: Done) -> None:
         assert cube["exposure_ms"].values.tolist() == [100.0] * cube.sizes["line"]
 
 
-def test_without_a_fine_seat_the_map_is_the_glance(survey_png: Any, weights: Path, tmp_path: Path) -> None:
-    """A budget that pays for the coarse pass alone gives the class of the glance, brought up bilinearly."""
+def test_without_a_fine_patch_the_map_is_the_coarse_prediction(survey_png: Any, weights: Path, tmp_path: Path) -> None:
+    """A budget that pays for the coarse pass alone gives the class of the coarse prediction, brought up bilinearly."""
     done = Done(survey_png(tmp_path, budget="0.45"), tmp_path)
     assert done.published.captured_again == 0
     mosaic, drawn = done.open("mosaic"), done.open("class_map")["classes"].values
-    seen = glance(
+    seen = coarse_prediction(
         load_weights(weights), mosaic["values"].values, mosaic["wavelength"].values, SceneGrid(*drawn.shape, 8, 4)
     )
     logits = torch.from_numpy(seen.probability).log().permute(2, 0, 1)[None]  # up to a constant a pixel
@@ -311,4 +311,4 @@ def test_readings_that_the_weights_cannot_take_are_counted(survey_png: Any, tmp_
     assert pixels["fine_px_no_reading"] >= 0
     assert pixels["map_without_a_class"] == 0
     store = scene.parent / "a" / Path(found.receipt["products"]["class_map"]).parent
-    assert json.loads((store / "strange.json").read_text())["coarse_px"] == 64 * 96 // 16
+    assert json.loads((store / "out_of_range.json").read_text())["coarse_px"] == 64 * 96 // 16

@@ -19,7 +19,7 @@ from flows.settings.load import load_settings, parse_settings
 from flows.tasks.field_work import FieldWork
 from flows.tasks.reading_costs import SHARD
 from flows.tasks.run import open_run
-from flows.tasks.stages.attention import attend
+from flows.tasks.stages.attention import score
 from models.network.sizes import saliency_multiply_adds
 from models.policies.policies import IMAGE_POLICIES, NETWORK_POLICIES, POLICIES, SEEDED_POLICIES
 from models.policies.vgg import VggFeatures
@@ -30,14 +30,14 @@ from storage.archive.keys import StageRef
 from storage.arrays.mosaics import load_attention
 from tests.conftest import Survey
 from tests.flows.conftest import FEW_BANDS
-from tests.remembered_work import without_effects
+from tests.prior_work import without_effects
 
 FREE = [policy for policy in POLICIES if policy not in ("mask", *NETWORK_POLICIES)]
 
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One archive for all, with a survey in it: its coarse look serves the others."""
+    """One archive for all, with a survey in it: its coarse pass serves the others."""
     folder = tmp_path_factory.mktemp("policies")
     with without_effects():
         run_survey(load_settings(None, _flags(folder, "random")), Console(quiet=True))
@@ -56,16 +56,16 @@ def _mosaic(archive: Path) -> Path:
 
 @pytest.mark.parametrize("policy", FREE)
 def test_every_policy_scores_the_field(archive: Path, policy: str) -> None:
-    """Finite scores for all seats, detail where they ask for it; another seed is another key where they are drawn."""
+    """Finite scores for all patches, detail where they ask for it; another seed is another key where they are drawn."""
     run = open_run(load_settings(None, _flags(archive, policy)))
     mosaic = StageRef("rectify", _mosaic(archive).parent.name, _mosaic(archive).parent)
-    ref, _ = attend.produce(run.archive, attend.wants(run, mosaic))
+    ref, _ = score.produce(run.archive, score.wants(run, mosaic))
     attention = load_attention(ref.path / "attention.zarr")
     assert attention.policy == policy
     assert np.isfinite(attention.score).all()
     assert 0 < (attention.rank >= 0).sum() < attention.rank.size
     runs = [replace(run, settings=replace(run.settings, seed=seed)) for seed in (1, 2)]
-    keys = {attend.key(attend.wants(one, mosaic)) for one in runs}
+    keys = {score.key(score.wants(one, mosaic)) for one in runs}
     assert len(keys) == (2 if policy in SEEDED_POLICIES else 1)
 
 
@@ -122,13 +122,13 @@ def test_a_threshold_leaves_seconds_and_says_so(
     assert plan["threshold"] == pytest.approx(1.02 * mean)
     assert plan["seconds"] < without[0].receipt["plan"]["seconds"]
     assert plan["spared_s"] > 0
-    assert plan["spared_share"] == pytest.approx(plan["spared_s"] / receipt["savings"]["capture_s"]["full"])
+    assert plan["spared_fraction"] == pytest.approx(plan["spared_s"] / receipt["savings"]["capture_s"]["full"])
     assert plan["spared_score"] > 0
     assert "unspent: no further run of lines pays" in dict(finding_rows(receipt))["plan"]
     assert "threshold" not in without[0].receipt["plan"]
     receipt: Any = without[0].receipt
-    key = next(stage["key"] for stage in receipt["stages"] if stage["name"] == "attend")
-    folder = without[1] / "stages" / "attend" / key
+    key = next(stage["key"] for stage in receipt["stages"] if stage["name"] == "score")
+    folder = without[1] / "stages" / "score" / key
     assert not {"threshold", "spared_s"} & set(json.loads((folder / "plan.json").read_text()))
     manifest = json.loads((folder / "manifest.json").read_text())
     assert not {"threshold", "rounds", "round"} & set(manifest["params"])
@@ -137,7 +137,7 @@ def test_a_threshold_leaves_seconds_and_says_so(
 
 @pytest.mark.usefixtures("no_effects")
 def test_a_threshold_above_all_gains_draws_the_coarse_map(survey_png: Survey, tmp_path: Path) -> None:
-    """Nothing pays: no fine line, and the map is that of the coarse look alone."""
+    """Nothing pays: no fine line, and the map is that of the coarse pass alone."""
     done = survey_png(tmp_path, threshold="1e6", **FLAGS)
     receipt: Any = done.receipt
     assert done.captured_again == 0

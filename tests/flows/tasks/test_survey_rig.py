@@ -53,7 +53,7 @@ from tests.flows.conftest import CommandLine
 from tests.pipeline.rig.camera_faults import CameraFault, FaultyRig
 from tests.pipeline.rig.in_process import InProcessRig, ManualClock
 from tests.pipeline.rig.mirror_faults import make_fault
-from tests.remembered_work import without_effects
+from tests.prior_work import without_effects
 
 QUIET = Console(quiet=True)
 SMALL: dict[str, Any] = {
@@ -62,7 +62,7 @@ SMALL: dict[str, Any] = {
     "engine": "plain",
     "controls": False,
     "budget": 0.8,
-    "rig.panel": 0.99,  # of the farm's white panel
+    "rig.white_reference": 0.99,  # of the farm's white reference
     "rig.pulses": "position",
     "effects": "rotation,slit,smear,vignetting,shot,read-noise",
 }

@@ -20,8 +20,8 @@ from hypothesis import strategies as st
 from flows.publish.receipt_table import finding_rows
 from flows.settings.load import load_settings
 from flows.tasks.survey_model import beyond_training
-from models.reading.familiar import Familiar, Limits
-from models.weights.files import add_familiar, describe_weights
+from models.reading.ood import Limits, OodDetector
+from models.weights.files import add_ood, describe_weights
 from models.weights.parts import TrainedOn
 from pipeline.errors import WeightsError
 from pipeline.geometry.grid import UNLABELLED
@@ -40,8 +40,8 @@ def judging(weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Maker:
         shutil.copy(weights, path)
         one, table = np.eye(3), np.full((1, 1, 2), limit)
         limits = Limits(np.array([0.001, 0.05]), np.ones(1), (1,), table, table[0])
-        familiar = Familiar(np.zeros((1, 3)), one[None], 1e-9 * one[None], 1e-9 * one, limits, 3)
-        add_familiar(path, path, familiar, SEEN, {})
+        ood_detector = OodDetector(np.zeros((1, 3)), one[None], 1e-9 * one[None], 1e-9 * one, limits, 3)
+        add_ood(path, path, ood_detector, SEEN, {})
         return path
 
     return make
@@ -68,7 +68,7 @@ def both(
     return out, plain, dict(receipt)
 
 
-def test_strange_pixels_get_a_class_of_their_own(both: tuple[Path, Path, dict[str, Any]]) -> None:
+def test_out_of_range_pixels_get_a_class_of_their_own(both: tuple[Path, Path, dict[str, Any]]) -> None:
     """Behind those of the weights and without a confidence; all others have what they have without it."""
     out, plain, receipt = both
     found, before = (_stored(one, "class_map") for one in (out, plain))
@@ -80,7 +80,7 @@ def test_strange_pixels_get_a_class_of_their_own(both: tuple[Path, Path, dict[st
     np.testing.assert_array_equal(classes[~unknown], shown[~unknown])
     assert np.isnan(found["confidence"].values[unknown]).all()
     assert np.isfinite(found["confidence"].values[~unknown]).all()
-    assert receipt["unknown"] == {"pixels": int(unknown.sum()), "share": float(unknown.mean()), "rate": 0.001}
+    assert receipt["unknown"] == {"pixels": int(unknown.sum()), "fraction": float(unknown.mean()), "rate": 0.001}
 
 
 def test_unknown_pixels_count_as_wrong_and_are_no_class_of_the_mean(both: tuple[Path, Path, dict[str, Any]]) -> None:
@@ -105,8 +105,8 @@ def test_without_it_every_bit_is_kept(
 def test_of_unknown_pixels_nothing_is_believed(both: tuple[Path, Path, dict[str, Any]]) -> None:
     """What was seen says nothing of the classes; a later look takes its own word, or a memory keeps its."""
     out, _, _ = both
-    belief, classes = _stored(out, "belief"), _stored(out, "class_map")["classes"].values
-    np.testing.assert_array_equal(np.isnan(belief["log_probability"].values).all(axis=-1), classes == 3)
+    probabilities, classes = _stored(out, "class_probabilities"), _stored(out, "class_map")["classes"].values
+    np.testing.assert_array_equal(np.isnan(probabilities["log_probability"].values).all(axis=-1), classes == 3)
 
 
 def test_a_later_visit_goes_on_from_such_a_map(
@@ -129,7 +129,7 @@ def test_a_map_of_nothing_known_is_published_and_says_what_to_do(
     """Receipt, report, quicklook and accuracy; the sentence names the way out."""
     published = survey_png(tmp_path, weights=str(judging(1e-6)), effects="none")
     receipt: Any = published.receipt
-    assert receipt["unknown"]["share"] == 1
+    assert receipt["unknown"]["fraction"] == 1
     assert receipt["accuracy"]["miou"] == 0
     words = dict(finding_rows(receipt))["unknown"]
     assert "100 % of the map is unknown" in words
@@ -208,6 +208,6 @@ def test_areas_without_labels_count_unknown_pixels_for_sure(
     with found.open() as text:
         table = {row["class"]: row for row in csv.DictReader(text)}
     unknown = table["unknown"]
-    assert float(unknown["estimated_share"]) == pytest.approx(published.receipt["unknown"]["share"], abs=1e-5)
-    assert float(unknown["standard_error_share"]) == 0
-    assert sum(float(row["estimated_share"]) for row in table.values()) == pytest.approx(1, abs=1e-4)
+    assert float(unknown["estimated_fraction"]) == pytest.approx(published.receipt["unknown"]["fraction"], abs=1e-5)
+    assert float(unknown["standard_error_fraction"]) == 0
+    assert sum(float(row["estimated_fraction"]) for row in table.values()) == pytest.approx(1, abs=1e-4)

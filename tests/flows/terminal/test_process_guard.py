@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from flows.terminal.processes import refusal_words
+from flows.terminal.processes import format_refusal
 
 ROOT = Path(__file__).parents[3]
 
@@ -30,7 +30,7 @@ ROOT = Path(__file__).parents[3]
 )
 def test_words(error: Exception, words: str | None) -> None:
     """What was refused and what to do; other errors stay what they are."""
-    found = refusal_words(error)
+    found = format_refusal(error)
     assert found is None if words is None else words in str(found)
 
 

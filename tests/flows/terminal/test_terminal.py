@@ -43,7 +43,7 @@ def _tree(words: str) -> Tree:
 @pytest.mark.parametrize(
     "thing",
     [escape, _table, _tree, lambda words: Panel(escape(words)), lambda words: [words]],
-    ids=["words", "table", "tree", "panel", "list"],
+    ids=["words", "table", "tree", "white_reference", "list"],
 )
 def test_nothing_that_is_printed_steers_the_terminal(thing: Callable[[str], Any]) -> None:
     """Styles and borders are the console's own; in the words no control character is left."""
@@ -72,7 +72,7 @@ def _history(words: str) -> FieldHistory:
         "run": words,
         "created": "2026-06-01T10:00:00Z",
         "miou": 0.5,
-        "unit": "share",
+        "unit": "fraction",
         "overall_accuracy": None,
         "savings": {"capture_s": 0.5},
         "areas": {words: 1.0},

@@ -15,8 +15,8 @@ from flows.archive.stale_runs import asked_again, newest_runs
 from flows.settings.load import load_settings, parse_settings
 from flows.settings.survey_settings import Settings
 from flows.tasks.scene import check_labels, farm_refusal, open_scene
-from flows.training.data import farm_data, farm_looks, farm_test_data, read_farm_name
-from flows.training.look import observe_scene
+from flows.training.data import farm_data, farm_days, farm_test_data, read_farm_name
+from flows.training.observed_scenes import observe_scene
 from models.network.sizes import SegmenterConfig
 from models.network.spectral import SpectralBasis
 from models.training.examples import observe
@@ -161,7 +161,7 @@ def test_training_days_cover_the_season() -> None:
     assert len(seeds) == len(learnt) + len(judged)
     assert min(seeds) >= 100_000  # far above those a user tries
     assert data.law == FARM_LAW
-    assert [read_farm_name(name)[0] for name in farm_looks(7, 2)] == [7, 8]
+    assert [read_farm_name(name)[0] for name in farm_days(7, 2)] == [7, 8]
     assert read_farm_name("100003-day-168-hour-14") == (100_003, 168, 14.0)
 
 

@@ -21,13 +21,13 @@ from flows.tasks.run import open_run
 from flows.training import train as flow
 from flows.training import train_scenes
 from flows.training.data import pack_mask, unpack_mask
-from flows.training.familiarity import FamiliarRequest, measure_familiar
+from flows.training.fit_ood import OodRequest, measure_ood
 from flows.training.train import joined_split, run_train, train_weights
 from flows.training.train_scenes import TrainRequest, observe_all, suggested_patch
 from models.evaluation.expected_scores import MapScores
 from models.training.start_weights import StartFile
 from models.training.train import TrainingSettings
-from models.weights.files import describe_weights, load_familiar, load_weights
+from models.weights.files import describe_weights, load_ood, load_weights
 from models.weights.parts import TrainedOn
 from pipeline.errors import SceneError, SettingsError
 from tests.flows.small_fields import write_field
@@ -69,13 +69,13 @@ def test_the_record_tells_what_was_trained_on(folder: Path, out: Path, tmp_path:
 
 
 def _map_scores(weights: Path) -> MapScores:
-    familiar = describe_weights(weights).familiar
-    assert familiar is not None
-    assert familiar.map_scores is not None
-    return familiar.map_scores
+    ood_detector = describe_weights(weights).ood_detector
+    assert ood_detector is not None
+    assert ood_detector.map_scores is not None
+    return ood_detector.map_scores
 
 
-def test_new_weights_say_what_they_saw_and_know_what_is_familiar(tmp_path: Path):
+def test_new_weights_say_what_they_saw_and_know_what_is_ood(tmp_path: Path):
     """By scenes kept for validation; measured again by the command, the same; without such scenes nothing of it."""
     names = tuple(f"{number:03}" for number in range(1, 5))
     field, out = write_field(tmp_path / "field", (32, 32), names), tmp_path / "w.safetensors"
@@ -83,21 +83,21 @@ def test_new_weights_say_what_they_saw_and_know_what_is_familiar(tmp_path: Path)
     told = TrainedOn.read(load_weights(out).record["trained_on"])
     assert (told.scenes, told.exposure_ms, told.day) == (3, (100.0, 100.0), None)
     assert 0 <= record["calibration"]["expected_error"] <= 1
-    known, part = load_familiar(out), describe_weights(out).familiar
+    known, part = load_ood(out), describe_weights(out).ood_detector
     assert part is not None
     assert part.trained_on == told
     again = tmp_path / "again.safetensors"
-    measure_familiar(FamiliarRequest(str(field), out, again))
-    measured = load_familiar(again)
+    measure_ood(OodRequest(str(field), out, again))
+    measured = load_ood(again)
     np.testing.assert_allclose(measured.centres, known.centres, atol=1e-5)
     np.testing.assert_allclose(measured.limits.fine, known.limits.fine, rtol=1e-4)
     other = write_field(tmp_path / "other", (32, 32), ("007", "008", "009"))
     with pytest.raises(SettingsError, match="give the data set of their training"):
-        measure_familiar(FamiliarRequest(str(other), out, again))
+        measure_ood(OodRequest(str(other), out, again))
     assert "no scene was kept" in train_weights(_request(field, out, validation=0))["familiar"]
-    assert describe_weights(out).familiar is None
+    assert describe_weights(out).ood_detector is None
     with pytest.raises(SettingsError, match="no scene was kept for validation"):
-        measure_familiar(FamiliarRequest(str(field), out, again))
+        measure_ood(OodRequest(str(field), out, again))
 
 
 @pytest.mark.parametrize(
@@ -151,7 +151,7 @@ def test_scenes_of_other_bands_are_not_mixed(folder: Path, out: Path):
     [((512, 640), True, 16), ((1024, 1280), False, 32), ((300, 900), False, 16), ((145, 145), False, 8)],
 )
 def test_patches_follow_the_size_of_scenes(shape: tuple[int, int], built_in: bool, patch: int):
-    """Small scenes get small patches, so that there are seats to choose from."""
+    """Small scenes get small patches, so that there are patches to choose from."""
     assert suggested_patch(shape, built_in=built_in) == patch
 
 
@@ -162,7 +162,7 @@ def test_training_shows_the_figures_of_validation(folder: Path, out: Path, posit
     request = _request(folder, out, validation=1, positions=positions)
     figures = run_train(request, Console(file=shown, width=100))["validation"]
     assert load_weights(out).config.positions == positions
-    assert set(figures) - {"scenes", "share_of_seats"} == rows
+    assert set(figures) - {"scenes", "fraction_of_patches"} == rows
     for name in rows:
         assert all(0 <= figures[name][figure] <= 1 for figure in ("miou", "overall_accuracy"))
         assert name in shown.getvalue()
@@ -253,13 +253,13 @@ def test_weights_begun_from_others_say_so_and_go_on_from_there(folder: Path, ear
     assert all(torch.allclose(after[name], value, atol=1e-7) for name, value in before.items())
 
 
-@pytest.mark.parametrize("share", ["whole", "in part"])
+@pytest.mark.parametrize("fraction", ["whole", "in part"])
 def test_frames_that_the_start_has_seen_validate_nothing(
-    folder: Path, earlier: Path, out: Path, monkeypatch: pytest.MonkeyPatch, share: str
+    folder: Path, earlier: Path, out: Path, monkeypatch: pytest.MonkeyPatch, fraction: str
 ):
     """Figures on them would say nothing, a mask or not: validation counts all pixels that are labelled."""
     split = describe_weights(earlier).record["split"]
-    if share == "in part":
+    if fraction == "in part":
         masks = {key: pack_mask(np.eye(16, dtype=bool)) for key in split["train"].values()}
         monkeypatch.setattr(StartFile, "earlier", property(lambda file: {"split": {**split, "pixels": masks}}))
     with pytest.raises(SettingsError, match="was trained on the scene 001, which is kept for validation"):
@@ -308,7 +308,7 @@ def test_weights_for_short_exposures_have_a_record_of_plain_scans(folder: Path, 
     scores = _map_scores(out)
     assert (scores.steps, scores.exposures_ms, scores.scenes) == ((1, 2), (6.0, 12.0, 25.0, 50.0, 100.0), 2)
     assert np.abs(scores.bias).max() > 0.01
-    measure_familiar(FamiliarRequest(str(folder), out, out))
+    measure_ood(OodRequest(str(folder), out, out))
     np.testing.assert_allclose(_map_scores(out).bias, scores.bias, atol=0.05)
     assert "scans" not in train_weights(_request(folder, out, validation=2))
     assert "scans" not in train_weights(_request(folder, out, validation=0, settings=settings))
@@ -328,7 +328,7 @@ def test_weights_that_will_choose_no_scan_say_so(folder: Path, out: Path, darkes
     shown, settings = io.StringIO(), replace(SETTINGS, darkest_ms=darkest_ms)
     request = _request(folder, out, validation=0, settings=settings)
     run_train(request, Console(file=shown, width=100))
-    assert ("nor has the file a record of plain scans" in shown.getvalue()) == said
+    assert ("nor has the file a record of uniform scans" in shown.getvalue()) == said
 
 
 def test_whitening_knows_the_noise_of_short_exposures(folder: Path, out: Path):

@@ -11,7 +11,7 @@ from models.evaluation.expected_scores import (
     LEAST_ERROR,
     MapScores,
     ScoredMap,
-    error_of_looks,
+    error_of_passes,
     expected_counts,
     expected_score,
     fitted_bias,
@@ -122,14 +122,14 @@ def test_of_nothing_nothing_is_expected():
 
 def test_one_scene_tells_of_no_error_but_the_least():
     """A single map is put right by itself, and nobody takes its error for none."""
-    assert error_of_looks([_scored(1)]) == LEAST_ERROR
+    assert error_of_passes([_scored(1)]) == LEAST_ERROR
 
 
 def test_the_error_of_looks_is_that_of_scenes_which_differ():
     """Maps of which some are too sure and some are not have a larger error than those that are alike."""
     alike = [_scored(seed) for seed in range(6)]
     mixed = [_scored(seed, 0.5 if seed % 2 else 2.0) for seed in range(6)]
-    assert error_of_looks(mixed) > 3 * error_of_looks(alike)
+    assert error_of_passes(mixed) > 3 * error_of_passes(alike)
 
 
 def test_the_error_of_looks_is_judged_by_the_other_scenes():
@@ -142,12 +142,14 @@ def test_the_error_of_looks_is_judged_by_the_other_scenes():
     explained = [expected_score(a.expected, fitted_bias([b]), 0.0).error for a, b in ((one, other), (other, one))]
     by_hand = np.sqrt(np.mean(np.square(off) - np.square(explained)))
     assert by_hand > 0.05
-    assert error_of_looks([one, other]) == pytest.approx(by_hand)
+    assert error_of_passes([one, other]) == pytest.approx(by_hand)
 
 
 def _scores() -> MapScores:
-    looks = {(step, ms): [_scored(7 * step + k, 1 + 2 / ms) for k in range(3)] for step in (2, 1) for ms in (4.0, 64.0)}
-    return MapScores.fitted(looks)
+    scan_passes = {
+        (step, ms): [_scored(7 * step + k, 1 + 2 / ms) for k in range(3)] for step in (2, 1) for ms in (4.0, 64.0)
+    }
+    return MapScores.fitted(scan_passes)
 
 
 def test_scores_come_back_from_a_record():

@@ -108,7 +108,7 @@ def test_better_in_every_class_is_better_in_the_mean(pairs: list[tuple[int, int]
 
 @given(LABELLED, st.data())
 def test_stray_pixels_cost_their_own_class_alone(pairs: list[tuple[int, int]], data: st.DataObject):
-    """Right pixels turned into a false class lower the mean by those pixels' share of their class, over the classes."""
+    """Right pixels turned into a false class lower the mean by those pixels' fraction of their class, over the classes."""
     labels, _ = _maps(pairs)
     drawn = labels.copy()
     stray = data.draw(st.lists(st.integers(0, len(labels) - 1), unique=True))
@@ -153,7 +153,7 @@ def test_a_map_of_another_size_is_refused():
 
 
 def test_a_gap_of_less_than_a_point_is_not_closed():
-    """The share of a way is given only where every seat is better than none by one point of mIoU or more."""
+    """The fraction of a way is given only where every patch is better than none by one point of mIoU or more."""
     assert gap_closed(0.6, 0.5, 0.7) == pytest.approx(0.5)
     assert gap_closed(0.4, 0.5, 0.3) is None
     assert gap_closed(0.8, 0.5, 0.7) == pytest.approx(1.5)

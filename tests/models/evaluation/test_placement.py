@@ -9,29 +9,35 @@ from hypothesis import strategies as st
 
 from models.evaluation.metrics import agreement, mean_iou
 from models.evaluation.placement import RANDOM_DRAWS, Controls, captured_gain, gain_sums, oracle_gain, run_controls
-from models.reading.inference import Glance, glance_of_columns, segment
+from models.reading.inference import CoarsePrediction, coarse_prediction_of_columns, segment
 from models.weights.files import Weights
 from tests.models.conftest import Maker, scene_columns
 
 
 def _two_classes(tiny: Maker, height: int = 24, width: int = 32):
     weights = tiny(classes=2)
-    look, fine = scene_columns(weights, height, width)
-    seen = glance_of_columns(weights, look.columns, look.grid)
-    return weights, look.grid, seen, fine, np.random.default_rng(0).integers(0, 2, (height, width)).astype(np.uint8)
+    coarse_pass, fine = scene_columns(weights, height, width)
+    seen = coarse_prediction_of_columns(weights, coarse_pass.columns, coarse_pass.grid)
+    return (
+        weights,
+        coarse_pass.grid,
+        seen,
+        fine,
+        np.random.default_rng(0).integers(0, 2, (height, width)).astype(np.uint8),
+    )
 
 
-def test_the_gain_is_the_loss_that_all_seats_take_away(tiny: Maker):
+def test_the_gain_is_the_loss_that_all_patches_take_away(tiny: Maker):
     """With two classes a map's confidence gives its loss: the gain is the difference of the two maps' losses."""
     weights, grid, seen, fine, labels = _two_classes(tiny)
-    valid = grid.valid_seats()
+    valid = grid.valid_patches()
 
-    def loss(seats: np.ndarray) -> np.ndarray:
-        drawn = segment(weights, seen, fine[seats], seats)
+    def loss(patch_index: np.ndarray) -> np.ndarray:
+        drawn = segment(weights, seen, fine[patch_index], patch_index)
         right = np.where(drawn.classes == labels, drawn.confidence, 1 - drawn.confidence)
         full = np.zeros(grid.padded_shape)
         full[: grid.height, : grid.width] = -np.log(right.astype(np.float64))
-        rows, columns = grid.seat_shape
+        rows, columns = grid.patch_shape
         return full.reshape(rows, 8, columns, 8).mean(axis=(1, 3)).ravel()
 
     expected = loss(np.empty(0, np.intp)) - loss(valid)
@@ -39,11 +45,11 @@ def test_the_gain_is_the_loss_that_all_seats_take_away(tiny: Maker):
 
 
 def test_what_has_no_label_has_no_gain(tiny: Maker):
-    """A seat without a labelled pixel gains nothing, and one half labelled half as much at most."""
+    """A patch without a labelled pixel gains nothing, and one half labelled half as much at most."""
     weights, grid, seen, fine, labels = _two_classes(tiny, 20, 30)
     labels[:8, :8] = 255
     gain = oracle_gain(weights, seen, fine, labels)
-    outside = np.setdiff1d(np.arange(len(gain)), grid.valid_seats())
+    outside = np.setdiff1d(np.arange(len(gain)), grid.valid_patches())
     assert gain[0] == 0
     assert (gain[outside] == 0).all()
     assert gain.any()
@@ -52,7 +58,7 @@ def test_what_has_no_label_has_no_gain(tiny: Maker):
 
 @given(st.lists(st.integers(-16, 24).map(lambda n: n / 8), min_size=1, max_size=20), st.integers(0, 20))
 def test_the_oracle_captures_all_of_its_own_gain(values: list[float], count: int):
-    """The seats with the most gain have a ratio of 1, where there is any to be had, and no others have more."""
+    """The patches with the most gain have a ratio of 1, where there is any to be had, and no others have more."""
     gain, valid = np.array(values), np.arange(len(values))
     chosen = np.argsort(-gain, kind="stable")[:count]
     own, best = gain_sums(gain, chosen, valid)
@@ -62,29 +68,29 @@ def test_the_oracle_captures_all_of_its_own_gain(values: list[float], count: int
     assert captured_gain(own, best) in (None, pytest.approx(1))
 
 
-def _scene(weights: Weights) -> tuple[Glance, np.ndarray, np.ndarray]:
-    look, fine = scene_columns(weights, 30, 45)
+def _scene(weights: Weights) -> tuple[CoarsePrediction, np.ndarray, np.ndarray]:
+    coarse_pass, fine = scene_columns(weights, 30, 45)
     labels = np.random.default_rng(2).integers(0, 3, (30, 45)).astype(np.uint8)
     labels[:3] = 255
-    return glance_of_columns(weights, look.columns, look.grid), fine, labels
+    return coarse_prediction_of_columns(weights, coarse_pass.columns, coarse_pass.grid), fine, labels
 
 
-def _run(weights: Weights, share: float = 0.35, seed: int = 0) -> Controls:
-    return run_controls(weights, *_scene(weights), share=share, seed=seed)
+def _run(weights: Weights, fraction: float = 0.35, seed: int = 0) -> Controls:
+    return run_controls(weights, *_scene(weights), fraction=fraction, seed=seed)
 
 
 def test_every_row_counts_every_labelled_pixel(tiny: Maker):
-    """Each placement draws the whole scene, with as many seats as the share of the valid ones says."""
+    """Each placement draws the whole scene, with as many patches as the fraction of the valid ones says."""
     controls = _run(tiny())
     rows = [controls.none, controls.every, *controls.policies.values(), *controls.random]
     assert {int(row.sum()) for row in rows} == {27 * 45}
-    assert controls.seats == round(0.35 * 4 * 6)
+    assert controls.patch_index == round(0.35 * 4 * 6)
     assert list(controls.policies) == ["gain", "entropy", "sobel"]
     assert len(controls.random) == RANDOM_DRAWS
 
 
-def test_the_ends_do_not_depend_on_the_share(tiny: Maker):
-    """A share of 0 is the row of no seat, a share of 1 the row of every seat, whatever the policy."""
+def test_the_ends_do_not_depend_on_the_fraction(tiny: Maker):
+    """A fraction of 0 is the row of no patch, a fraction of 1 the row of every patch, whatever the policy."""
     weights = tiny()
     none, every = _run(weights, 0.0), _run(weights, 1.0)
     assert all((row == none.none).all() for row in [*none.policies.values(), *none.random])
@@ -105,7 +111,7 @@ def test_random_rows_follow_the_seed(tiny: Maker):
 def test_rows_are_reported_as_they_start(tiny: Maker):
     """A progress bar hears of each row by name."""
     weights, said = tiny(), list[str]()
-    run_controls(weights, *_scene(weights), share=0.1, seed=0, policies=("entropy",), report=said.append)
+    run_controls(weights, *_scene(weights), fraction=0.1, seed=0, policies=("entropy",), report=said.append)
     assert said == ["none", "all", "entropy"] + ["random"] * RANDOM_DRAWS
 
 
@@ -114,7 +120,7 @@ def _counts(right: int) -> np.ndarray:
 
 
 def test_figures_of_a_worked_case():
-    """Both means and the pixels' accuracy, the share of the gap, and mean and spread of the random placements."""
+    """Both means and the pixels' accuracy, the fraction of the gap, and mean and spread of the random placements."""
     controls = Controls(
         0.35, 10, _counts(60), _counts(90), {"entropy": _counts(80)}, [_counts(62), _counts(66), _counts(64)]
     )
@@ -128,7 +134,7 @@ def test_figures_of_a_worked_case():
     assert rows["random"] == pytest.approx({**figures, "spread": np.std(draws, ddof=1), "gap_closed": closed})
 
 
-def test_one_draw_has_no_spread_and_a_small_gap_no_share():
+def test_one_draw_has_no_spread_and_a_small_gap_no_fraction():
     """What cannot be said is None."""
     rows = Controls(0.35, 10, _counts(60), _counts(60), {"sobel": _counts(61)}, [_counts(60)]).as_dict()
     assert rows["random"] == {**agreement(_counts(60)), "spread": None, "gap_closed": None}
@@ -136,11 +142,11 @@ def test_one_draw_has_no_spread_and_a_small_gap_no_share():
 
 
 def test_a_stray_class_does_not_move_the_gap():
-    """All rows are of one set of classes: a false class in one of the ends leaves the share of the gap as it is."""
+    """All rows are of one set of classes: a false class in one of the ends leaves the fraction of the gap as it is."""
     stray, clean = np.zeros((3, 3), np.int64), np.zeros((3, 3), np.int64)
     stray[:2, :2] = clean[:2, :2] = _counts(80)
     stray[0, 1:] = [19, 1]  # a wrong pixel that shows what the labels lack
     none, every = np.zeros((3, 3), np.int64), np.zeros((3, 3), np.int64)
     none[:2, :2], every[:2, :2] = _counts(60), _counts(90)
-    shares = [Controls(0.35, 10, none, every, {"gain": one}, [none]).as_dict()["gain"] for one in (clean, stray)]
-    assert shares[1]["gap_closed"] == pytest.approx(shares[0]["gap_closed"], abs=0.01)
+    fractions = [Controls(0.35, 10, none, every, {"gain": one}, [none]).as_dict()["gain"] for one in (clean, stray)]
+    assert fractions[1]["gap_closed"] == pytest.approx(fractions[0]["gap_closed"], abs=0.01)

@@ -65,9 +65,9 @@ def _paper(yx: list[list[float]], fine: bool, columns: int = 16, factor: int = 2
 
 @pytest.mark.parametrize(("factor", "size"), [(2, (3, 5)), (4, (2, 3))])
 def test_no_number_is_given_twice(factor: int, size: tuple[int, int]):
-    """Patches and seats of a whole scene together take every number from 1 once."""
+    """Patches and patches of a whole scene together take every number from 1 once."""
     rows, columns = size
     patches = [[(y + 0.5) * factor, (x + 0.5) * factor] for y in range(rows) for x in range(columns)]
-    seats = [[y + 0.5, x + 0.5] for y in range(rows * factor) for x in range(columns * factor)]
-    numbers = _paper(patches, False, columns, factor) + _paper(seats, True, columns, factor)
+    patch_index = [[y + 0.5, x + 0.5] for y in range(rows * factor) for x in range(columns * factor)]
+    numbers = _paper(patches, False, columns, factor) + _paper(patch_index, True, columns, factor)
     assert sorted(numbers) == list(range(1, rows * columns * (factor**2 + 1) + 1))

@@ -10,7 +10,7 @@ from torch import Tensor
 from models.network.machine import choose_device
 from models.network.segmenter import Segmenter, SegmenterConfig
 from models.training.examples import Batch
-from models.training.objective import PHASES, draw_seats
+from models.training.objective import PHASES, draw_patches
 from pipeline.errors import SettingsError
 
 CONFIG = SegmenterConfig(classes=3, columns=6, patch=8, width=8, coarse_width=8, dim=16, layers=2, heads=2)
@@ -57,18 +57,18 @@ def elsewhere() -> Segmenter:
 
 @torch.inference_mode()
 def test_what_a_map_is_drawn_from_is_brought_to_the_network(elsewhere: Segmenter) -> None:
-    """Images, patches, seats and origins come from the processor; what is read lies with the network."""
+    """Images, patches, patches and origins come from the processor; what is read lies with the network."""
     image, origins = torch.zeros(1, 6, 16, 16), [None, torch.tensor([[2, 3]])]
     readings = elsewhere.read_coarse_packed([image, image], origins, [None, None])
     assert {reading.logits.device.type for reading in readings} == {"meta"}
     assert elsewhere.score(readings[0]).device.type == "meta"
-    patches, seats = [np.zeros((2, 8, 8, 6), np.float32)] * 2, [torch.tensor([0, 5])] * 2
-    read = list(elsewhere.read_fine_packed(readings, patches, seats, origins))
+    patches, patch_index = [np.zeros((2, 8, 8, 6), np.float32)] * 2, [torch.tensor([0, 5])] * 2
+    read = list(elsewhere.read_fine_packed(readings, patches, patch_index, origins))
     assert {one.device.type for one in read} == {"meta"}
 
 
 def test_what_a_step_learns_from_is_brought_to_the_network(elsewhere: Segmenter) -> None:
-    """A batch of crops and the seats drawn of it, which chance on the processor has a part in."""
+    """A batch of crops and the patches drawn of it, which chance on the processor has a part in."""
 
     def crops(*shape: int) -> Tensor:
         return torch.zeros(2, *shape, device="cpu")
@@ -77,6 +77,6 @@ def test_what_a_step_learns_from_is_brought_to_the_network(elsewhere: Segmenter)
     assert {one.device.type for one in vars(batch).values()} == {"meta"}
     reading = elsewhere.read_coarse(batch.coarse, batch.origin)
     score = elsewhere.score(reading).flatten(1)
-    seats = draw_seats(reading.logits, score, CONFIG, np.random.default_rng(0), PHASES[1])
-    fine = batch.fine.gather(1, seats[:, :, None, None, None].expand(-1, -1, *batch.fine.shape[2:]))
-    assert elsewhere.read_fine(reading, fine, seats, batch.origin).device.type == "meta"
+    patch_index = draw_patches(reading.logits, score, CONFIG, np.random.default_rng(0), PHASES[1])
+    fine = batch.fine.gather(1, patch_index[:, :, None, None, None].expand(-1, -1, *batch.fine.shape[2:]))
+    assert elsewhere.read_fine(reading, fine, patch_index, batch.origin).device.type == "meta"

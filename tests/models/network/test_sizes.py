@@ -19,8 +19,8 @@ def _attention(q: Any, k: Any, v: Any, *args: Any, out_shape: Any = None, **kwar
 
 
 @pytest.mark.parametrize("kernel", [False, True])
-@pytest.mark.parametrize(("patch", "factor", "seats"), [(16, 4, 7), (8, 2, 1), (32, 4, 3)])
-def test_closed_form_equals_the_counter(patch: int, factor: int, seats: int, kernel: bool) -> None:
+@pytest.mark.parametrize(("patch", "factor", "patch_index"), [(16, 4, 7), (8, 2, 1), (32, 4, 3)])
+def test_closed_form_equals_the_counter(patch: int, factor: int, patch_index: int, kernel: bool) -> None:
     """The closed form counts just what torch counts while the model runs."""
     config = SegmenterConfig(classes=5, columns=6, patch=patch, factor=factor, patch_kernel=kernel)
     model = Segmenter(config).eval()
@@ -30,15 +30,15 @@ def test_closed_form_equals_the_counter(patch: int, factor: int, seats: int, ker
         display=False, custom_mapping={torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: _attention}
     )
     with torch.inference_mode(), counter:
-        model(coarse, torch.zeros(1, seats, 6, patch, patch), torch.arange(seats)[None])
-    assert multiply_adds(config, grid, seats, 0).total == counter.get_total_flops() / 2
+        model(coarse, torch.zeros(1, patch_index, 6, patch, patch), torch.arange(patch_index)[None])
+    assert multiply_adds(config, grid, patch_index, 0).total == counter.get_total_flops() / 2
 
 
-def test_more_seats_cost_more() -> None:
-    """The glance does not depend on the seats; encode and decode grow with them."""
+def test_more_patches_cost_more() -> None:
+    """The coarse prediction does not depend on the patches; encode and decode grow with them."""
     config, grid = SegmenterConfig(classes=5), SceneGrid(256, 256, 16, 4)
-    few, many = (multiply_adds(config, grid, seats, 270) for seats in (1, 20))
-    assert few.glance == many.glance
+    few, many = (multiply_adds(config, grid, patch_index, 270) for patch_index in (1, 20))
+    assert few.coarse_prediction == many.coarse_prediction
     assert few.encode < many.encode
     assert few.decode < many.decode
 

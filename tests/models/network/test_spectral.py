@@ -72,7 +72,7 @@ def test_normalisation_follows_the_order_of_columns():
 
 
 def test_more_light_is_a_gain_and_a_shift():
-    """Light brighter by a share e multiplies normalised columns by 1 + e and adds e times the gain shift."""
+    """Light brighter by a fraction e multiplies normalised columns by 1 + e and adds e times the gain shift."""
     normalisation, reached = Normalisation.measured(_sample()), np.ones(5, bool)
     bright = normalisation.apply(_sample() * 1.1, reached)
     expected = normalisation.apply(_sample(), reached) * 1.1 + 0.1 * normalisation.gain_shift

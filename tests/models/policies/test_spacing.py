@@ -1,4 +1,4 @@
-"""Seats by their place alone: orders of which any first part is spread evenly, distance to the centre, and borders."""
+"""Patches by their place alone: orders of which any first part is spread evenly, distance to the centre, and borders."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy.ndimage import distance_transform_edt
 
 from models.policies.spacing import centre_scores, random_scores, stratified_scores, uniform_scores
 from pipeline.geometry.grid import SceneGrid
-from pipeline.planning.selection import select_seats
+from pipeline.planning.selection import select_patches
 
 Place = Callable[[SceneGrid, int], NDArray[np.float64]]
 even = pytest.mark.parametrize("place", [uniform_scores, stratified_scores])
@@ -23,16 +23,16 @@ def _grid(rows: int, columns: int) -> SceneGrid:
 
 
 def _first(scores: NDArray[np.float64], count: int) -> NDArray[np.bool_]:
-    """Where the best ``count`` seats lie."""
+    """Where the best ``count`` patches lie."""
     chosen = np.zeros(scores.size, np.bool_)
-    chosen[select_seats(scores.ravel(), count).seats] = True
+    chosen[select_patches(scores.ravel(), count).patch_index] = True
     return chosen.reshape(scores.shape)
 
 
 @even
 @pytest.mark.parametrize("shape", SHAPES)
 def test_scores_are_a_rank(place: Place, shape: tuple[int, int]):
-    """The n seats have the scores 1, (n - 1) / n, ... 1 / n, each once: no ties, none worth nothing."""
+    """The n patches have the scores 1, (n - 1) / n, ... 1 / n, each once: no ties, none worth nothing."""
     count = shape[0] * shape[1]
     scores = place(_grid(*shape), 5)
     assert scores.shape == shape
@@ -41,7 +41,7 @@ def test_scores_are_a_rank(place: Place, shape: tuple[int, int]):
 
 @even
 def test_a_larger_choice_keeps_the_smaller(place: Place):
-    """Nested: every seat of the best K is among the best K + 1."""
+    """Nested: every patch of the best K is among the best K + 1."""
     scores = place(_grid(9, 14), 1)
     for count in range(126):
         assert not (_first(scores, count) & ~_first(scores, count + 1)).any()
@@ -51,7 +51,7 @@ def test_a_larger_choice_keeps_the_smaller(place: Place):
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("shape", [(16, 16), (16, 32)])
 def test_every_cell_gets_its_part(place: Place, shape: tuple[int, int], seed: int):
-    """Where halves are equal any first K differ by at most one seat between the halves and between the quarters."""
+    """Where halves are equal any first K differ by at most one patch between the halves and between the quarters."""
     scores = place(_grid(*shape), seed)
     for count in (1, 2, 3, 4, 17, 50, 64, 101, 200):
         chosen = _first(scores, count)
@@ -61,10 +61,10 @@ def test_every_cell_gets_its_part(place: Place, shape: tuple[int, int], seed: in
 
 @even
 @pytest.mark.parametrize("shape", [(64, 80), (61, 79), (45, 150)])
-@pytest.mark.parametrize("share", [0.02, 0.1, 0.35])
-def test_no_hole_as_wide_as_chance_leaves(place: Place, shape: tuple[int, int], share: float):
-    """Blocks of seats get more equal numbers than random seats give them, and no seat is as far from a chosen one."""
-    grid, count = _grid(*shape), round(share * shape[0] * shape[1])
+@pytest.mark.parametrize("fraction", [0.02, 0.1, 0.35])
+def test_no_hole_as_wide_as_chance_leaves(place: Place, shape: tuple[int, int], fraction: float):
+    """Blocks of patches get more equal numbers than random patches give them, and no patch is as far from a chosen one."""
+    grid, count = _grid(*shape), round(fraction * shape[0] * shape[1])
 
     def uneven(place: Place, seed: int) -> tuple[float, float]:
         chosen = _first(place(grid, seed), count)
@@ -78,7 +78,7 @@ def test_no_hole_as_wide_as_chance_leaves(place: Place, shape: tuple[int, int], 
 
 
 def test_uniform_is_a_regular_grid():
-    """The first 4 and the first 16 of 64 seats lie on lattices of 4 and of 2 seats, none of them in a corner."""
+    """The first 4 and the first 16 of 64 patches lie on lattices of 4 and of 2 patches, none of them in a corner."""
     scores = uniform_scores(_grid(8, 8))
     assert np.argwhere(_first(scores, 4)).tolist() == [[2, 2], [2, 6], [6, 2], [6, 6]]
     first = np.argwhere(_first(scores, 16))
@@ -86,7 +86,7 @@ def test_uniform_is_a_regular_grid():
 
 
 def test_stratified_follows_its_seed():
-    """The same seed gives the same order, another another; over seeds every seat comes first about as often."""
+    """The same seed gives the same order, another another; over seeds every patch comes first about as often."""
     grid = _grid(3, 4)
     orders = [stratified_scores(grid, seed) for seed in range(600)]
     assert (stratified_scores(grid, 7) == orders[7]).all()
@@ -97,10 +97,10 @@ def test_stratified_follows_its_seed():
 
 
 def test_the_centre_comes_first():
-    """By hand: of 3 x 3 seats 1 in the middle, by distance around it; four seats are level and the lowest wins."""
+    """By hand: of 3 x 3 patches 1 in the middle, by distance around it; four patches are level and the lowest wins."""
     scores = centre_scores(_grid(3, 3))
     side, corner = 1 - 8 / np.hypot(12, 12), 1 - 8 * np.sqrt(2) / np.hypot(12, 12)
     assert scores == pytest.approx(np.array([[corner, side, corner], [side, 1, side], [corner, side, corner]]))
     four = centre_scores(_grid(2, 2))
     assert four == pytest.approx(np.full((2, 2), 0.5))
-    assert select_seats(four.ravel(), 1).seats.tolist() == [0]
+    assert select_patches(four.ravel(), 1).patch_index.tolist() == [0]

@@ -15,7 +15,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from models.network import sizes
 from models.network.sizes import VggSizes, saliency_multiply_adds
-from models.policies.policies import score_seats
+from models.policies.policies import score_patches
 from models.policies.vgg import (
     PHOTO_MEAN,
     PHOTO_STD,
@@ -28,7 +28,7 @@ from models.policies.vgg import (
     load_vgg,
 )
 from models.policies.vgg_file import VggFile
-from models.reading.inference import CoarseLook, Glance
+from models.reading.inference import CoarsePass, CoarsePrediction
 from models.training.pretrained import rgb_response
 from models.weights.state_files import read_state
 from pipeline.errors import SettingsError, WeightsError
@@ -63,11 +63,11 @@ def drawn(seed: int, *shape: int) -> NDArray[np.float32]:
     return noise(seed, *shape).numpy()
 
 
-def look(columns: NDArray[np.float32], patch: int = 8, factor: int = 2) -> Glance:
+def coarse_pass(columns: NDArray[np.float32], patch: int = 8, factor: int = 2) -> CoarsePrediction:
     """A scene just as large as its padded coarse grid."""
     y, x = columns.shape[:2]
     grid = SceneGrid(y * factor, x * factor, patch, factor)
-    return Glance(grid, columns, np.empty((0, 0, 0), np.float32))
+    return CoarsePrediction(grid, columns, np.empty((0, 0, 0), np.float32))
 
 
 def test_colours_are_those_of_the_scene(tiny: Maker):
@@ -82,13 +82,13 @@ def test_colours_are_those_of_the_scene(tiny: Maker):
 
 @pytest.mark.parametrize("size", [(16, 24), (37, 53), (4, 4)])
 def test_a_flat_scene_scores_alike_everywhere(saliency: VggSaliency, size: tuple[int, int]):
-    """Nothing to see anywhere, borders included: every seat is worth its share of the scene."""
+    """Nothing to see anywhere, borders included: every patch is worth its fraction of the scene."""
     grid = SceneGrid(*size, 8, 2)
     y, x = (side // 2 for side in grid.padded_shape)
-    seen = Glance(grid, np.full((y, x, 4), 0.4, np.float32), np.empty((0, 0, 0), np.float32))
-    scores = score_seats("vgg-static", seen, network=saliency)
-    share = grid.valid_share().ravel()
-    assert scores == pytest.approx(scores.max() / share.max() * share, rel=1e-3)
+    seen = CoarsePrediction(grid, np.full((y, x, 4), 0.4, np.float32), np.empty((0, 0, 0), np.float32))
+    scores = score_patches("vgg-static", seen, network=saliency)
+    fraction = grid.valid_fraction().ravel()
+    assert scores == pytest.approx(scores.max() / fraction.max() * fraction, rel=1e-3)
     assert scores.max() > 0
 
 
@@ -98,19 +98,19 @@ def test_a_moved_scene_has_moved_scores(saliency: VggSaliency):
     detail = drawn(1, 24, 24, 4)
     here[112:136, 112:136] = detail
     there[128:152, 96:120] = detail
-    before, after = saliency(look(here)), saliency(look(there))
+    before, after = saliency(coarse_pass(here)), saliency(coarse_pass(there))
     assert after[96:184, 64:152] == pytest.approx(before[80:168, 80:168], rel=1e-3, abs=1e-4 * before.max())
 
 
 def test_the_score_is_the_greatest_on_the_scene():
-    """A seat takes its greatest coarse pixel; what lies off the scene does not count, and a share is worth a share."""
+    """A patch takes its greatest coarse pixel; what lies off the scene does not count, and a fraction is worth a fraction."""
     grid = SceneGrid(12, 16, 8, 2)
     y, x = (side // 2 for side in grid.padded_shape)
-    seen = Glance(grid, np.zeros((y, x, 4), np.float32), np.empty((0, 0, 0), np.float32))
+    seen = CoarsePrediction(grid, np.zeros((y, x, 4), np.float32), np.empty((0, 0, 0), np.float32))
     pixels = np.zeros((y, x))
     pixels[1, 2], pixels[5, 6], pixels[6:, :] = 5.0, 3.0, 99.0
-    scores = score_seats("vgg-static", seen, network=lambda _: pixels)
-    assert scores.reshape(grid.seat_shape)[:2, :2].tolist() == [[5.0, 0.0], [0.0, 1.5]]
+    scores = score_patches("vgg-static", seen, network=lambda _: pixels)
+    assert scores.reshape(grid.patch_shape)[:2, :2].tolist() == [[5.0, 0.0], [0.0, 1.5]]
 
 
 def test_blocks_join(monkeypatch: pytest.MonkeyPatch):
@@ -119,7 +119,7 @@ def test_blocks_join(monkeypatch: pytest.MonkeyPatch):
         torch.manual_seed(1)
         shallow = VggFeatures(VggSizes((1, 1, 1), (4, 6, 8))).eval().requires_grad_(False)
     saliency = VggSaliency(shallow, np.eye(4, 3, dtype=np.float32))
-    seen = look(drawn(5, 96, 160, 4))
+    seen = coarse_pass(drawn(5, 96, 160, 4))
     whole = saliency(seen)
     monkeypatch.setattr(sizes, "BLOCK_PX", 64)
     parts = saliency(seen)
@@ -161,9 +161,9 @@ def test_which_channels_a_trained_network_reads(tiny: Maker):
 
 def test_a_network_that_is_missing_is_asked_for(tmp_path, tiny: Maker):
     """The policy names its flag, a missing file what could stand there, a changed one that it changed."""
-    seen: CoarseLook = look(drawn(0, 8, 8, 4))
+    seen: CoarsePass = coarse_pass(drawn(0, 8, 8, 4))
     with pytest.raises(SettingsError, match="needs --vgg FILE"):
-        score_seats("vgg-static", seen)  # type: ignore[arg-type]
+        score_patches("vgg-static", seen)  # type: ignore[arg-type]
     with pytest.raises(SettingsError, match=r"no file .*none\.pth; --vgg takes the weights of VGG19: torchvision"):
         VggFile.found(tmp_path / "none.pth")
     with pytest.raises(SettingsError, match=r"no file .*none\.pth; --vgg takes VGG19 trained on data of your own"):

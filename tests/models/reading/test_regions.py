@@ -16,13 +16,13 @@ FIELDS = [(700, 1300, 16, 4), (2561, 90, 32, 4), (1000, 2000, 8, 4), (130, 1921,
 @pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.parametrize("halo", [0, 1, 3])
 def test_regions_cover_a_field_once(field: tuple[int, int, int, int], halo: int):
-    """Every pixel and every seat is kept by one region; borders inside are those of shards and coarse patches."""
+    """Every pixel and every patch is kept by one region; borders inside are those of shards and coarse patches."""
     grid = SceneGrid(*field)
-    pixels, seats = np.zeros((grid.height, grid.width), int), np.zeros(grid.seat_shape, int)
+    pixels, patch_index = np.zeros((grid.height, grid.width), int), np.zeros(grid.patch_shape, int)
     cell = grid.patch * grid.factor
     for region in plan_regions(grid, SHARD, most_px=(64, 640), halo=halo):
         pixels[region.kept.rows, region.kept.columns] += 1
-        seats[region.kept_seats.rows, region.kept_seats.columns] += 1
+        patch_index[region.kept_patches.rows, region.kept_patches.columns] += 1
         for (first, last), size, shard in zip(_edges(region.kept), pixels.shape, SHARD, strict=True):
             assert first % shard == first % cell == 0
             assert last == size or last % shard == last % cell == 0
@@ -31,7 +31,7 @@ def test_regions_cover_a_field_once(field: tuple[int, int, int, int], halo: int)
         ):
             assert (first, last) == (max(kept - halo * cell, 0), min(end + halo * cell, size))
     assert (pixels == 1).all()
-    assert (seats == 1).all()
+    assert (patch_index == 1).all()
 
 
 def _edges(box: Box) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -39,30 +39,30 @@ def _edges(box: Box) -> tuple[tuple[int, int], tuple[int, int]]:
 
 
 @pytest.mark.parametrize("field", FIELDS)
-def test_seats_lie_where_the_field_has_them(field: tuple[int, int, int, int]):
-    """A seat's first pixel in a region is its first pixel in the field; seats outside have no number."""
+def test_patches_lie_where_the_field_has_them(field: tuple[int, int, int, int]):
+    """A patch's first pixel in a region is its first pixel in the field; patches outside have no number."""
     grid = SceneGrid(*field)
-    seats = np.arange(int(np.prod(grid.seat_shape)))
+    patch_index = np.arange(int(np.prod(grid.patch_shape)))
     for region in plan_regions(grid, SHARD, most_px=(64, 640), halo=1):
-        numbers = region.numbers_here(seats)
+        numbers = region.numbers_here(patch_index)
         inside = numbers >= 0
-        assert sorted(numbers[inside]) == list(range(int(np.prod(region.grid.seat_shape))))
-        origin = region.grid.seat_origin(numbers[inside]) + np.array([region.read.top, region.read.left])
-        assert (origin == grid.seat_origin(seats[inside])).all()
+        assert sorted(numbers[inside]) == list(range(int(np.prod(region.grid.patch_shape))))
+        origin = region.grid.patch_origin(numbers[inside]) + np.array([region.read.top, region.read.left])
+        assert (origin == grid.patch_origin(patch_index[inside])).all()
 
 
 @pytest.mark.parametrize("field", FIELDS)
 def test_cropped_parts_make_the_field(field: tuple[int, int, int, int]):
-    """Images and seats that regions keep, put side by side, are those of the field."""
+    """Images and patches that regions keep, put side by side, are those of the field."""
     grid = SceneGrid(*field)
     image = np.arange(grid.height * grid.width).reshape(grid.height, grid.width)
-    seats = np.arange(np.prod(grid.seat_shape)).reshape(grid.seat_shape)
+    patch_index = np.arange(np.prod(grid.patch_shape)).reshape(grid.patch_shape)
     for region in plan_regions(grid, SHARD, most_px=(64, 640), halo=2):
-        (top, left), (rows, columns) = region.origin, region.grid.seat_shape
+        (top, left), (rows, columns) = region.origin, region.grid.patch_shape
         kept = region.crop(image[region.read.rows, region.read.columns])
         assert (kept == image[region.kept.rows, region.kept.columns]).all()
-        own = region.crop_seats(seats[top : top + rows, left : left + columns].ravel())
-        assert (own == seats[region.kept_seats.rows, region.kept_seats.columns]).all()
+        own = region.crop_patches(patch_index[top : top + rows, left : left + columns].ravel())
+        assert (own == patch_index[region.kept_patches.rows, region.kept_patches.columns]).all()
 
 
 def test_memory_is_that_of_a_region_not_of_the_field():

@@ -13,7 +13,7 @@ import torch
 from models.network.sizes import SegmenterConfig
 from models.training.examples import Example
 from models.training.train import TrainingSettings, run_identity, train
-from models.weights.sealed_files import load_checkpoint, save_checkpoint
+from models.weights.checksummed_files import load_checkpoint, save_checkpoint
 from pipeline.errors import WeightsError
 from tests.models.conftest import killed_after
 

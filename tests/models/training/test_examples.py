@@ -37,7 +37,7 @@ def test_both_looks_are_the_cameras_own():
     bright = replace(CAMERA, electrons_per_dn=1e6, read_noise_e=0.0)  # so much light that noise is below rounding
     scene = _scene((32, 48), bright)
     seen, (matrix, _) = _observed(scene, bright), SpectralBasis.spanning(NM).matrix(NM)
-    light, scale = scene.planes * scene.electrons, scene.panel / scene.panel_electrons
+    light, scale = scene.planes * scene.electrons, scene.white_reference / scene.white_reference_electrons
     for step, columns in ((1, seen.fine), (2, seen.coarse)):
         expected = (expose(footprint(light, bright), bright, step=step, rng=None) * scale) @ matrix
         assert columns == pytest.approx(expected, abs=3e-3)
@@ -89,15 +89,15 @@ def _example(shape: tuple[int, int], name: str = "e", labelled: float = 1.0) -> 
     return Example(name, fine, coarse, labels, shape)
 
 
-def _image(seats: Tensor) -> np.ndarray:
-    """Seats of square crops back to images."""
-    b, count, _, p, _ = seats.shape
+def _image(patch_index: Tensor) -> np.ndarray:
+    """Patches of square crops back to images."""
+    b, count, _, p, _ = patch_index.shape
     side = round(count**0.5)
-    return seats[:, :, 0].view(b, side, side, p, p).permute(0, 1, 3, 2, 4).reshape(b, side * p, -1).numpy()
+    return patch_index[:, :, 0].view(b, side, side, p, p).permute(0, 1, 3, 2, 4).reshape(b, side * p, -1).numpy()
 
 
 def test_crops_show_one_place_in_both_looks():
-    """However a crop is turned, its seats, coarse pixels and labels belong together and share one brightness."""
+    """However a crop is turned, its patches, coarse pixels and labels belong together and share one brightness."""
     sampler = CropSampler([_example((64, 96)), _example((48, 48), "other")], 8, 2, 32)
     batch = sampler.draw(12, np.random.default_rng(3), np.zeros(1, np.float32))
     fine, coarse, labels = _image(batch.fine), batch.coarse[:, 0].numpy(), batch.labels.numpy()

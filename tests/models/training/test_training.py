@@ -14,7 +14,7 @@ from models.network.sizes import SegmenterConfig
 from models.training import objective
 from models.training import train as training
 from models.training.examples import CropSampler
-from models.training.objective import batch_loss, class_weights, draw_seats, map_loss, phase_at, pixel_losses
+from models.training.objective import batch_loss, class_weights, draw_patches, map_loss, phase_at, pixel_losses
 from models.training.train import Progress, TrainingSettings, rate_at, train
 from tests.models.conftest import block_example
 
@@ -92,7 +92,7 @@ def test_the_rate_warms_up_and_falls():
 
 
 def test_rare_classes_weigh_more():
-    """Weights go by one over the root of the share, with mean 1 over pixels; a class without a pixel has none."""
+    """Weights go by one over the root of the fraction, with mean 1 over pixels; a class without a pixel has none."""
     labels = np.full((10, 10), 255, np.uint8)
     labels[:8], labels[8:9, :8], labels[9:, :0] = 0, 1, 2
     weight = class_weights([labels], 3, 100.0).numpy()
@@ -102,26 +102,26 @@ def test_rare_classes_weigh_more():
     assert class_weights([labels], 3, 2.0).max() == 2
 
 
-def test_seats_are_drawn_where_the_glance_is_unsure_or_anywhere():
-    """Half of the draws go by entropy: its seats come first there, and by chance elsewhere."""
-    glance = torch.zeros(1, 3, 32, 32)
-    glance[:, 0] = 30.0
-    glance[:, :, :4, :4] = 0.0  # unsure in seat 0 alone
+def test_patches_are_drawn_where_the_coarse_prediction_is_unsure_or_anywhere():
+    """Half of the draws go by entropy: its patches come first there, and by chance elsewhere."""
+    coarse_prediction = torch.zeros(1, 3, 32, 32)
+    coarse_prediction[:, 0] = 30.0
+    coarse_prediction[:, :, :4, :4] = 0.0  # unsure in patch 0 alone
     phase, nothing = phase_at(0.0), torch.zeros(1, 64)
-    drawn = [draw_seats(glance, nothing, CONFIG, np.random.default_rng(seed), phase) for seed in range(60)]
+    drawn = [draw_patches(coarse_prediction, nothing, CONFIG, np.random.default_rng(seed), phase) for seed in range(60)]
     first = np.mean([row[0, 0] == 0 for row in drawn])
     assert 0.35 < first < 0.7
     assert any(0 not in row for row in drawn)
 
 
-def test_late_in_a_run_the_scorer_places_seats_too():
-    """In the last phase some draws begin with the seat that the scorer puts first; in the first phase hardly any do."""
+def test_late_in_a_run_the_scorer_places_patches_too():
+    """In the last phase some draws begin with the patch that the scorer puts first; in the first phase hardly any do."""
     score = torch.zeros(1, 64)
     score[0, 41] = 5.0
 
     def first(done: float) -> float:
         draws = (
-            draw_seats(torch.zeros(1, 3, 32, 32), score, CONFIG, np.random.default_rng(seed), phase_at(done))
+            draw_patches(torch.zeros(1, 3, 32, 32), score, CONFIG, np.random.default_rng(seed), phase_at(done))
             for seed in range(60)
         )
         return float(np.mean([row[0, 0] == 41 for row in draws]))
@@ -146,8 +146,8 @@ def test_unlabelled_pixels_have_no_say():
     )
 
 
-def test_the_scorer_is_told_of_labelled_seats_alone(monkeypatch: pytest.MonkeyPatch):
-    """A seat with one labelled pixel is told of; one with none is not said to gain nothing."""
+def test_the_scorer_is_told_of_labelled_patches_alone(monkeypatch: pytest.MonkeyPatch):
+    """A patch with one labelled pixel is told of; one with none is not said to gain nothing."""
     told: list[tuple[Tensor, ...]] = []
 
     def scoring(*given: Tensor) -> Tensor:
@@ -155,7 +155,7 @@ def test_the_scorer_is_told_of_labelled_seats_alone(monkeypatch: pytest.MonkeyPa
         return given[0].sum() * 0
 
     monkeypatch.setattr(objective, "scoring_loss", scoring)
-    monkeypatch.setattr(objective, "draw_seats", lambda *_: torch.arange(4)[None])
+    monkeypatch.setattr(objective, "draw_patches", lambda *_: torch.arange(4)[None])
     batch = CropSampler([block_example()], 8, 2, 16).draw(1, np.random.default_rng(0), SHIFT)
     batch.labels[:] = 255
     batch.labels[0, 3, 12] = 1

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 import torch
 
-from models.network.memory_reader import MemoryReader
-from models.network.sizes import MemorySizes
-from models.reading.familiar import Familiar
+from models.network.sizes import TemporalSizes
+from models.network.temporal_reader import TemporalReader
+from models.reading.ood import OodDetector
 from models.weights.files import (
-    add_familiar,
+    add_ood,
     add_reader,
     content_key,
     describe_weights,
-    load_familiar,
+    load_ood,
     load_reader,
     load_weights,
     save_weights,
@@ -26,7 +26,7 @@ from models.weights.files import (
 from models.weights.parts import TrainedOn
 from pipeline.errors import WeightsError
 from tests.models.conftest import make_weights
-from tests.models.reading.test_familiar import some_limits
+from tests.models.reading.test_ood import some_limits
 
 SEEN = TrainedOn(10, (400.0, 1000.0), (3.0, 100.0), 48, ("a", "b"), (96, 300), (15.0, 60.0), 0.12)
 
@@ -38,44 +38,48 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "own.safetensors"
 
 
-def with_familiar(path: Path) -> None:
+def with_ood(path: Path) -> None:
     """Add what is familiar to the weights."""
     columns = describe_weights(path).config.columns
     one = np.eye(columns)
-    measured = Familiar(np.zeros((1, columns)), one[None], 0.1 * one[None], 0.1 * one, some_limits(), 10)
-    add_familiar(path, path, measured, SEEN, {"scenes": 48})
+    measured = OodDetector(np.zeros((1, columns)), one[None], 0.1 * one[None], 0.1 * one, some_limits(), 10)
+    add_ood(path, path, measured, SEEN, {"scenes": 48})
 
 
 def with_reader(path: Path, **changed: int) -> None:
     """Add a reader of prior maps."""
     config = describe_weights(path).config
     sizes = {"classes": config.classes, "columns": config.columns, "factor": config.factor, "width": 8}
-    built = MemoryReader(MemorySizes(**{**sizes, "coarse_width": 4, **changed}))
+    built = TemporalReader(TemporalSizes(**{**sizes, "coarse_width": 4, **changed}))
     add_reader(path, path, built, {"seed": 1})
 
 
 def test_what_is_added_is_read_and_leaves_the_weights_as_they_were(path: Path) -> None:
     """Both parts come back in any order; each has a key of its own, which adding it again does not change."""
     bare, weights = describe_weights(path), load_weights(path)
-    assert (bare.familiar, bare.reader) == (None, None)
-    for add in (with_familiar, with_reader, with_familiar):
+    assert (bare.ood_detector, bare.reader) == (None, None)
+    for add in (with_ood, with_reader, with_ood):
         add(path)
     told = describe_weights(path)
     assert content_key(path) == told.key == bare.key
-    assert told.familiar is not None
+    assert told.ood_detector is not None
     assert told.reader is not None
-    assert (told.familiar.trained_on, told.familiar.record, told.reader.record) == (SEEN, {"scenes": 48}, {"seed": 1})
+    assert (told.ood_detector.trained_on, told.ood_detector.record, told.reader.record) == (
+        SEEN,
+        {"scenes": 48},
+        {"seed": 1},
+    )
     key, reader = told.reader.key, load_reader(path)
     add_reader(path, path, reader, {"seed": 1})
     again = describe_weights(path)
     assert again.reader is not None
-    assert (again.reader.key, again.familiar) == (key, told.familiar)
-    assert load_familiar(path).limits.steps == (1, 2)
+    assert (again.reader.key, again.ood_detector) == (key, told.ood_detector)
+    assert load_ood(path).limits.steps == (1, 2)
     for name, tensor in load_weights(path).segmenter.state_dict().items():
         torch.testing.assert_close(weights.segmenter.state_dict()[name], tensor, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize(("load", "words"), [(load_familiar, "--familiar"), (load_reader, "--remember")])
+@pytest.mark.parametrize(("load", "words"), [(load_ood, "--familiar"), (load_reader, "--remember")])
 def test_a_part_that_is_not_there_says_how_it_is_made(path: Path, load: Callable[[Path], object], words: str) -> None:
     """The message names the file and the command."""
     with pytest.raises(WeightsError, match=rf"own\.safetensors.*spectralzoom train DATASET {words}"):
@@ -88,7 +92,7 @@ def test_what_training_saw_is_read_as_it_was_told() -> None:
     assert [TrainedOn.read(one.as_dict()) for one in (SEEN, bare)] == [SEEN, bare]
 
 
-@pytest.mark.parametrize(("add", "load"), [(with_familiar, load_familiar), (with_reader, load_reader)])
+@pytest.mark.parametrize(("add", "load"), [(with_ood, load_ood), (with_reader, load_reader)])
 def test_every_flipped_bit_is_told(path: Path, add: Callable[[Path], None], load: Callable[[Path], object]) -> None:
     """Of a part's own tensors and of the description, in a message that names the file and says what to do."""
     add(path)
@@ -131,9 +135,9 @@ def test_numbers_that_are_none_are_refused(path: Path) -> None:
 
 def test_what_was_read_stays_where_the_file_is_written_over(path: Path) -> None:
     """Copied onto while a survey reads with them, weights, reader and limits are still those that were checked."""
-    with_familiar(path)
+    with_ood(path)
     with_reader(path)
-    weights, told, numbers = load_weights(path), load_familiar(path), load_reader(path).state_dict()
+    weights, told, numbers = load_weights(path), load_ood(path), load_reader(path).state_dict()
     kept = told.read.copy(), weights.normalisation.whitening.copy()
     before = {name: one.clone() for name, one in numbers.items()}
     with path.open("r+b") as opened:

@@ -71,12 +71,12 @@ def test_python_objects_are_refused_unread(tmp_path: Path, how: str):
 
 
 @pytest.mark.parametrize("name", ["w.pth", "w.safetensors"])
-@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.99])
-def test_files_cut_short_are_refused(tmp_path: Path, name: str, share: float):
+@pytest.mark.parametrize("fraction", [0.0, 0.01, 0.5, 0.99])
+def test_files_cut_short_are_refused(tmp_path: Path, name: str, fraction: float):
     """Wherever the file ends early the message names it and says what to do."""
     path = tmp_path / name
     save_file(STATE, path) if name.endswith("safetensors") else torch.save(STATE, path)
-    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    path.write_bytes(path.read_bytes()[: int(fraction * path.stat().st_size)])
     with pytest.raises(WeightsError, match=name):
         read_state(path)
 

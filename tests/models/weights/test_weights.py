@@ -13,8 +13,8 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from models.weights.checksummed_files import SEAL, TENSORS, _seal, hash_of
 from models.weights.files import FORMAT, describe_weights, load_weights, save_weights
-from models.weights.sealed_files import SEAL, TENSORS, _seal, hash_of
 from pipeline.errors import WeightsError
 from tests.models.conftest import Maker
 

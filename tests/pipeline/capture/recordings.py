@@ -16,7 +16,7 @@ from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from tests.pipeline.simulator.small_scenes import image_scene
 
 CAMERA = replace(LineCamera(), samples=64)
-FULL = Sweep("scan-0", "fine", "x", strip_px=0.0, start_px=-39.5, lines=80)
+FULL = Sweep("scan-0", "fine", "x", swath_px=0.0, start_px=-39.5, lines=80)
 
 
 def simulated(camera: LineCamera = CAMERA) -> SimulatedSource:

@@ -98,7 +98,7 @@ def test_a_backward_scan_gives_rising_times() -> None:
         np.testing.assert_array_equal(line.data, same.data)
 
 
-def test_two_sweeps_of_one_strip_serve_a_run_across_both() -> None:
+def test_two_sweeps_of_one_swath_serve_a_run_across_both() -> None:
     """Where one recorded sweep ends and the next begins, lines of both serve, and times go on rising."""
     source = simulated()
     lower, upper = replace(FULL, lines=40), replace(FULL, name="scan-1", start_px=0.5, lines=40)
@@ -182,7 +182,7 @@ def test_a_plan_is_cut_to_what_was_recorded() -> None:
     assert recorded.cut_to_recorded(beyond) == replace(beyond, start_px=-41.5, lines=21)
     inside = replace(lower, name="fine", lines=10)
     assert recorded.cut_to_recorded(inside) == inside
-    assert recorded.cut_to_recorded(replace(inside, strip_px=64.0)) is None
+    assert recorded.cut_to_recorded(replace(inside, swath_px=64.0)) is None
     with pytest.raises(NotRecordedError, match="line 8 of sweep coarse-0 was never taken: it lies at -8 px"):
         next(recorded.lines(replace(beyond, start_px=-41.5, lines=21)))
 
@@ -202,7 +202,7 @@ def test_a_plan_that_differs_by_rounding_is_the_recorded_sweep() -> None:
     whole = record(source, FULL)
     strayed = replace(whole, position=whole.position + np.random.default_rng(0).normal(0, 3e-4, (80, 2)))
     recorded = recorded_source(source, [strayed])
-    picked = recorded.pick(replace(FULL, name="planned", strip_px=3e-7, start_px=FULL.start_px - 2e-7))
+    picked = recorded.pick(replace(FULL, name="planned", swath_px=3e-7, start_px=FULL.start_px - 2e-7))
     assert picked.line.tolist() == list(range(80))
 
 

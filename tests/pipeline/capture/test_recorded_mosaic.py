@@ -64,5 +64,5 @@ def test_the_rectification_goes_by_positions() -> None:
     source = _ramp()
     one = record(source, FULL)
     expected = _mosaic(one)
-    other = replace(one, sweep=replace(one.sweep, strip_px=3.0, start_px=11.0))
+    other = replace(one, sweep=replace(one.sweep, swath_px=3.0, start_px=11.0))
     np.testing.assert_array_equal(_mosaic(other), expected)

@@ -13,7 +13,7 @@ from pipeline.geometry.scan import Sweep
 from tests.pipeline.capture.recordings import CAMERA, FULL, record, recorded_source, simulated
 
 COARSE = Sweep("coarse-0", "coarse", "x", 0.0, -45.5, 23, step=4, binning=4)
-ASIDE = replace(FULL, name="mine", strip_px=7.0)
+ASIDE = replace(FULL, name="mine", swath_px=7.0)
 
 
 def passes_over(*sweeps: Sweep) -> RecordedPasses:
@@ -25,21 +25,21 @@ def passes_over(*sweeps: Sweep) -> RecordedPasses:
 def test_a_planned_pass_is_cut_where_the_recording_ends() -> None:
     """A coarse pass from -44 to 44 px keeps the lines within 2 px of those recorded from -39.5 to 39.5 px."""
     (found,) = passes_over(FULL).first_pass([COARSE])
-    assert (found.strip_px, found.step, found.binning) == (0.0, 4, 4)
+    assert (found.swath_px, found.step, found.binning) == (0.0, 4, 4)
     assert found.line_px()[0] == pytest.approx(-40)
     assert found.line_px()[-1] == pytest.approx(40)
     assert passes_over(FULL).source.serves(found)
 
 
-def test_a_pass_is_laid_on_the_recorded_strips() -> None:
+def test_a_pass_is_laid_on_the_recorded_swaths() -> None:
     """Where no recorded line lies on a planned strip, lines of the same kind go along the recorded one, end to end."""
     passes = passes_over(ASIDE)
     assert passes.served([COARSE]) is None
     (found,) = passes.first_pass([COARSE])
-    assert (found.name, found.strip_px, found.step, found.binning) == ("coarse-0", 7.0, 4, 4)
+    assert (found.name, found.swath_px, found.step, found.binning) == ("coarse-0", 7.0, 4, 4)
     np.testing.assert_allclose(found.line_px(), -39.5 + 4 * np.arange(20))
     assert passes.full_scan([FULL]) == [ASIDE]
-    assert [strip.strip_px for strip in passes.strips(-40.0)] == [7.0]
+    assert [swath.swath_px for swath in passes.swaths(-40.0)] == [7.0]
 
 
 def test_lines_that_serve_twice_count_once() -> None:

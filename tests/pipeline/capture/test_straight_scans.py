@@ -26,10 +26,10 @@ CAMERA = LineCamera()
     st.integers(2, 400),
     st.sampled_from([(1, 1), (4, 4), (8, 2), (1, 4)]),
 )
-def test_a_planned_sweep_comes_back(strip: int, start: int, lines: int, shape: tuple[int, int]) -> None:
+def test_a_planned_sweep_comes_back(swath: int, start: int, lines: int, shape: tuple[int, int]) -> None:
     """Positions of any sweep give that sweep again, exactly; turned round, the same, and backward."""
     step, binning = shape
-    sweep = Sweep("s", "fine" if step == binning == 1 else "coarse", "x", strip / 2, start / 2, lines, step, binning)
+    sweep = Sweep("s", "fine" if step == binning == 1 else "coarse", "x", swath / 2, start / 2, lines, step, binning)
     position = line_positions(sweep, CAMERA)
     forward = fit_sweep(position, CAMERA, name="s", samples=640 // binning)
     back = fit_sweep(position[::-1], CAMERA, name="s", samples=640 // binning)
@@ -46,7 +46,7 @@ def test_noise_and_spikes_do_not_move_the_sweep() -> None:
     position[~valid] = 0.0
     found = fit_sweep(position, CAMERA, name="s", samples=640, valid=valid)
     assert (found.sweep.step, found.sweep.lines) == (1, 800)
-    assert abs(found.sweep.strip_px - 320) < 0.2
+    assert abs(found.sweep.swath_px - 320) < 0.2
     assert abs(found.sweep.start_px + 400) < 0.2
     assert abs(found.distance_px - 1) < 1e-3
 
@@ -104,7 +104,7 @@ def test_the_covered_field_of_one_straight_scan_is_its_size() -> None:
     assert turned.shape == (640, 100)
 
 
-def test_strips_without_a_common_part_are_refused() -> None:
+def test_swaths_without_a_common_part_are_refused() -> None:
     """Two strips whose scans do not meet, and lines along both axes."""
     sweeps = [Sweep("a", "fine", "x", 0.0, 0.0, 50), Sweep("b", "fine", "x", 640.0, 900.0, 50)]
     tangents = [direction_to_scene(position_to_direction(line_positions(sweep, CAMERA))) for sweep in sweeps]

@@ -34,12 +34,12 @@ def unlimited_position(normal: ArrayLike) -> Floats:
     return 2 * device[..., 2:] * device[..., :2] / (c2 * REST_TANGENT)
 
 
-def straight_slope_rotation(strip_px: ArrayLike, scan_px: ArrayLike, camera: LineCamera) -> NDArray[np.float64]:
+def straight_slope_rotation(swath_px: ArrayLike, scan_px: ArrayLike, camera: LineCamera) -> NDArray[np.float64]:
     """Give -atan(dY/dX) of sweeps that are straight in the scene, free of the path's own steps and noise. [rad]
 
     Line centres [px] broadcast; the derivative is a central difference over 2e-6 of tangent.
     """
-    xi, eta = (np.asarray(value, np.float64) * camera.ifov_rad for value in (strip_px, scan_px))
+    xi, eta = (np.asarray(value, np.float64) * camera.ifov_rad for value in (swath_px, scan_px))
     ends = [
         unlimited_position(direction_to_normal(scene_to_direction(np.stack(np.broadcast_arrays(xi, e), axis=-1))))
         for e in (eta - _SMALL_SLOPE, eta + _SMALL_SLOPE)
@@ -50,7 +50,7 @@ def straight_slope_rotation(strip_px: ArrayLike, scan_px: ArrayLike, camera: Lin
 
 
 def line_points(
-    model: LineModel, strip_px: float, scan_px: NDArray[np.float64], camera: LineCamera
+    model: LineModel, swath_px: float, scan_px: NDArray[np.float64], camera: LineCamera
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Give where each sample of each line looks by one of five models of a line: along and scan, (line, sample) [px].
 
@@ -63,23 +63,23 @@ def line_points(
         raise ValueError(f"line model must be one of {', '.join(LINE_MODELS)}, got {model!r}")
     slopes = camera.pixel_slopes()
     if model == "L4":
-        return points_of_scan(strip_px, camera, scan_px[:, None], slopes)
-    tangents = np.stack([np.full_like(scan_px, strip_px), scan_px], axis=-1) * camera.ifov_rad
+        return points_of_scan(swath_px, camera, scan_px[:, None], slopes)
+    tangents = np.stack([np.full_like(scan_px, swath_px), scan_px], axis=-1) * camera.ifov_rad
     if model == "L0":
         angle = np.zeros_like(scan_px)
     elif model == "L1":
-        angle = straight_slope_rotation(strip_px, scan_px, camera)
+        angle = straight_slope_rotation(swath_px, scan_px, camera)
     else:
         angle = line_rotation(scene_to_direction(tangents))
-    length = slopes / camera.ifov_rad * (_local_scale(strip_px, scan_px, camera) if model == "L3" else 1.0)
-    return strip_px + length * np.cos(angle)[:, None], scan_px[:, None] + length * np.sin(angle)[:, None]
+    length = slopes / camera.ifov_rad * (_local_scale(swath_px, scan_px, camera) if model == "L3" else 1.0)
+    return swath_px + length * np.cos(angle)[:, None], scan_px[:, None] + length * np.sin(angle)[:, None]
 
 
-def _local_scale(strip_px: float, scan_px: NDArray[np.float64], camera: LineCamera) -> NDArray[np.float64]:
+def _local_scale(swath_px: float, scan_px: NDArray[np.float64], camera: LineCamera) -> NDArray[np.float64]:
     """Length of the line in the scene for one IFOV at the camera, at the line's centre, (line, 1) [-].
 
     The derivative of :func:`pipeline.geometry.scan.points_of_scan` at its centre: N hypot(1, xi0 / q), q = N - e.
     """
-    xi0, e = strip_px * camera.ifov_rad, scan_px[:, None] * camera.ifov_rad
+    xi0, e = swath_px * camera.ifov_rad, scan_px[:, None] * camera.ifov_rad
     size = np.sqrt(1 + xi0**2 + e**2)
     return size * np.hypot(1.0, xi0 / (size - e))

@@ -16,7 +16,9 @@ from pipeline.geometry.camera import LineCamera, bin_samples, digitise, expose, 
 CAMERA = LineCamera()
 
 
-def look(electrons: np.ndarray, camera: LineCamera, *, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+def scan_pass(
+    electrons: np.ndarray, camera: LineCamera, *, step: int, rng: np.random.Generator | None = None
+) -> np.ndarray:
     """What one pass gives of a grid-aligned scene."""
     return expose(footprint(electrons, camera), camera, step=step, rng=rng)
 
@@ -26,7 +28,7 @@ def test_defaults_describe_the_rig():
     assert CAMERA.ifov_rad == pytest.approx(105.714e-6, rel=1e-5)
     assert CAMERA.slit_px == pytest.approx(2.70, abs=0.005)
     assert CAMERA.full_scale_dn == 4095
-    assert CAMERA.full_well_e == (4095 - 64) * 5
+    assert CAMERA.full_full_well_e == (4095 - 64) * 5
 
 
 @given(st.floats(0.01, 500), st.floats(0, 50), st.floats(1, 400))
@@ -89,7 +91,7 @@ def test_noise_has_the_moments_of_shot_and_read_noise(read_noise: float, expecte
 
 def test_without_noise_rounding_is_to_even_and_ends_clip():
     """Half DN goes to even, light beyond the full well stays at full scale, negative light at the dark level."""
-    electrons = np.array([2.5, 7.5, 1e9, -50.0, CAMERA.full_well_e])
+    electrons = np.array([2.5, 7.5, 1e9, -50.0, CAMERA.full_full_well_e])
     assert digitise(electrons, CAMERA, None).tolist() == [64, 66, 4095, 64, 4095]
 
 
@@ -117,7 +119,7 @@ def test_sums_that_16_bits_do_not_hold_are_refused():
 def test_a_flat_scene_looks_flat_and_its_noise_falls_by_the_root_of_the_step(step: float):
     """The coarse pass averages ``step`` samples of one exposure: noise falls by sqrt(step), not by step."""
     electrons = np.full((256, 256, 2), 5000.0)
-    seen = look(electrons, CAMERA, step=step, rng=np.random.default_rng(2))
+    seen = scan_pass(electrons, CAMERA, step=step, rng=np.random.default_rng(2))
     assert seen.shape == (256 // step, 256 // step, 2)
     spread = np.sqrt(5000 + 400 + 25 / 12)
     assert seen.mean() == pytest.approx(5000, abs=5 * spread / np.sqrt(seen.size * step))
@@ -128,7 +130,7 @@ def test_a_look_is_the_mean_of_footprints_over_the_smear():
     """Without noise a coarse pixel is the block mean of the fine look, to the rounding of DN."""
     electrons = np.random.default_rng(0).uniform(100, 15_000, (16, 24, 3))
     camera = replace(CAMERA, bits=14, electrons_per_dn=1.0)
-    fine = look(electrons, camera, step=1)
-    coarse = look(electrons, camera, step=4)
+    fine = scan_pass(electrons, camera, step=1)
+    coarse = scan_pass(electrons, camera, step=4)
     blocks = fine.reshape(4, 4, 6, 4, 3).mean(axis=(1, 3))
     assert coarse == pytest.approx(blocks, abs=1.0)

@@ -1,4 +1,4 @@
-"""The scene grid: padding, seats, valid shares and reflection."""
+"""The scene grid: padding, patches, valid shares and reflection."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ def test_padded_grid_is_the_least_whole_number_of_coarse_patches(height: int, wi
 
 
 @given(sizes, sizes, st.integers(1, 40), st.integers(1, 8))
-def test_valid_shares_add_up_to_the_scene(height: int, width: int, patch: int, factor: int):
-    """Shares times a seat's area sum to the scene's area, and valid seats are those with a share."""
+def test_valid_fractions_add_up_to_the_scene(height: int, width: int, patch: int, factor: int):
+    """Shares times a patch's area sum to the scene's area, and valid patches are those with a fraction."""
     grid = SceneGrid(height, width, patch, factor)
-    share = grid.valid_share()
-    assert share.sum() * patch**2 == pytest.approx(height * width)
-    assert len(grid.valid_seats()) == -(-height // patch) * -(-width // patch) == np.count_nonzero(share)
+    fraction = grid.valid_fraction()
+    assert fraction.sum() * patch**2 == pytest.approx(height * width)
+    assert len(grid.valid_patches()) == -(-height // patch) * -(-width // patch) == np.count_nonzero(fraction)
 
 
-def test_seats_are_numbered_row_by_row():
-    """Seat 5 of a grid 4 seats wide starts in the second row and column."""
+def test_patches_are_numbered_row_by_row():
+    """Patch 5 of a grid 4 patches wide starts in the second row and column."""
     grid = SceneGrid(64, 64, 16, 2)
-    assert grid.seat_shape == (4, 4)
-    assert grid.seat_origin(np.array([0, 5, 15])).tolist() == [[0, 0], [16, 16], [48, 48]]
+    assert grid.patch_shape == (4, 4)
+    assert grid.patch_origin(np.array([0, 5, 15])).tolist() == [[0, 0], [16, 16], [48, 48]]
 
 
 @pytest.mark.parametrize("field", ["height", "width", "patch", "factor"])

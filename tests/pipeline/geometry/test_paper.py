@@ -78,7 +78,7 @@ def aim(xi_px: object, eta_px: object) -> np.ndarray:
     return unlimited_position(direction_to_normal(scene_to_direction(tangents)))
 
 
-def looked_at(position: np.ndarray) -> np.ndarray:
+def viewed(position: np.ndarray) -> np.ndarray:
     """Scene points (xi, eta) that positions look at. [px]"""
     return direction_to_scene(position_to_direction(position)) / IFOV
 
@@ -122,7 +122,7 @@ def test_e1_e2_positions_differ_as_tabulated(tilt, x, eq7, error_deg, error_px, 
 def test_e2_asking_for_a_step_gives_another():
     """With equation (7) 100 px become 141, 1280 px along the line 1792, and two axes bend: xi 4800 -> (5479, 163)."""
     reached = {
-        asked: looked_at(paper_position(direction_to_normal(scene_to_direction(np.array(asked) * IFOV))))
+        asked: viewed(paper_position(direction_to_normal(scene_to_direction(np.array(asked) * IFOV))))
         for asked in ((100, 0), (0, 100), (0, 1280), (4800, 0))
     }
     assert reached[100, 0][0] == pytest.approx(141, abs=0.5)
@@ -183,7 +183,7 @@ def test_e7_equation_4_loses_its_digits_at_grazing(grazing: float, view_px: floa
 )
 def test_e8_rotation_and_slope_at_seven_positions(position, psi_deg: float, seed_deg: float):
     """What the line really turns by, and what the slope of the path says."""
-    xi, eta = looked_at(np.array(position))
+    xi, eta = viewed(np.array(position))
     assert np.rad2deg(turn_of(np.array(position))) == pytest.approx(psi_deg, abs=0.06)
     assert np.rad2deg(straight_slope_rotation(xi, eta, CAMERA)) == pytest.approx(seed_deg, abs=0.06)
 
@@ -194,7 +194,7 @@ def test_e8_the_slope_is_wrong_by_up_to_twelve_and_a_half_degrees():
     position = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     radius = np.linalg.norm(position, axis=-1)
     position, radius = position[radius <= 1], radius[radius <= 1]
-    off = np.rad2deg(np.abs(straight_slope_rotation(*looked_at(position).T, CAMERA) - turn_of(position)))
+    off = np.rad2deg(np.abs(straight_slope_rotation(*viewed(position).T, CAMERA) - turn_of(position)))
     assert off.max() == pytest.approx(12.5, abs=0.06)
     assert off[radius <= np.tan(np.deg2rad(25)) / REST_TANGENT].max() == pytest.approx(4.4, abs=0.06)
     near = straight_slope_rotation(1.0, 0.0, CAMERA) / turn_of(aim(1.0, 0.0))
@@ -293,9 +293,9 @@ def test_e17_the_full_scan_takes_hours():
 
 
 def test_e18_counts_of_the_table_and_jumps_of_the_encoding():
-    """256 coarse patches and 100 to 500 fine ones are 356 to 756; patches of 4 seats are 5 numbers apart: 21, 26."""
+    """256 coarse patches and 100 to 500 fine ones are 356 to 756; patches of 4 patches are 5 numbers apart: 21, 26."""
     assert [(512 // 32) ** 2 + fine for fine in (100, 200, 300, 400, 500)] == [356, 456, 556, 656, 756]
-    # 4 columns of coarse patches of 2 x 2 seats; patches 4 and 5 are the first two of the second row.
+    # 4 columns of coarse patches of 2 x 2 patches; patches 4 and 5 are the first two of the second row.
     coarse = torch.tensor([[2.0, 0.0], [2.0, 2.0]]) + 1.0
     numbers = paper_numbers(coarse, torch.tensor([2.0, 2.0]), 4, 2)
     assert numbers.tolist() == [21, 26]
@@ -307,8 +307,8 @@ def greatest_errors(field_deg: float) -> list[float]:
     radius = np.tan(np.deg2rad(field_deg)) / REST_TANGENT * np.array([1.0, 0.8, 0.4])
     position = radius[:, None, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
     greatest = np.zeros(len(LINE_MODELS))
-    for strip, centre in looked_at(position.reshape(-1, 2)):
-        points = [line_points(model, strip, np.array([centre]), CAMERA) for model in LINE_MODELS]
+    for swath, centre in viewed(position.reshape(-1, 2)):
+        points = [line_points(model, swath, np.array([centre]), CAMERA) for model in LINE_MODELS]
         off = [np.hypot(a - points[-1][0], b - points[-1][1]).max() for a, b in points]
         greatest = np.maximum(greatest, off)
     return greatest.tolist()
@@ -344,6 +344,6 @@ def test_lines_turn_and_stretch_over_the_field():
 def test_six_decimals_are_enough_to_point():
     """1e-6 in XY moves the view by at most 0.0115 px."""
     rest = direction_to_position(scene_to_direction([0.0, 0.0]))
-    step = [np.linalg.norm(looked_at(rest + d) - looked_at(rest)) for d in ((1e-6, 0.0), (0.0, 1e-6))]
+    step = [np.linalg.norm(viewed(rest + d) - viewed(rest)) for d in ((1e-6, 0.0), (0.0, 1e-6))]
     assert step == pytest.approx([1e-6 * REST_TANGENT / IFOV, 1e-6 * 0.8427 / IFOV], rel=1e-3)
     assert max(step) < 0.0115

@@ -34,14 +34,14 @@ places = st.floats(-5000, 5000)
 
 def sweep(**changes: object) -> Sweep:
     """A short fine sweep off the axis."""
-    values = {"name": "a", "kind": "fine", "along": "x", "strip_px": 700.0, "start_px": -900.0, "lines": 5}
+    values = {"name": "a", "kind": "fine", "along": "x", "swath_px": 700.0, "start_px": -900.0, "lines": 5}
     return Sweep(**{**values, **changes})
 
 
-@pytest.mark.parametrize(("strip", "start"), [(0.0, -1200.0), (2500.0, -4000.0), (-4500.0, 3500.0)])
-def test_sample_points_equal_rays_reflected_by_the_mirror(strip: float, start: float):
+@pytest.mark.parametrize(("swath", "start"), [(0.0, -1200.0), (2500.0, -4000.0), (-4500.0, 3500.0)])
+def test_sample_points_equal_rays_reflected_by_the_mirror(swath: float, start: float):
     """The closed form of a line's points agrees with position, normal and reflection to 1e-9 px."""
-    path = sweep(strip_px=strip, start_px=start, lines=40)
+    path = sweep(swath_px=swath, start_px=start, lines=40)
     slopes = CAMERA.pixel_slopes()
     rays = np.stack([np.zeros_like(slopes), slopes, np.ones_like(slopes)], axis=-1)
     normals = position_to_normal(line_positions(path, CAMERA))
@@ -52,10 +52,10 @@ def test_sample_points_equal_rays_reflected_by_the_mirror(strip: float, start: f
 
 
 @given(places, places, st.floats(-0.034, 0.034))
-def test_scene_points_and_line_points_are_inverse(strip: float, scan: float, slope: float):
+def test_scene_points_and_line_points_are_inverse(swath: float, scan: float, slope: float):
     """Any point of any line finds its line and slope again."""
-    along, across = points_of_scan(strip, CAMERA, scan, slope)
-    centre, back = scan_of_points(strip, CAMERA, along, across)
+    along, across = points_of_scan(swath, CAMERA, scan, slope)
+    centre, back = scan_of_points(swath, CAMERA, along, across)
     assert centre == pytest.approx(scan, abs=1e-8)
     assert back == pytest.approx(slope, abs=1e-12)
 

@@ -99,10 +99,10 @@ def test_whole_numbers_of_samples_shake_nothing(samples: int, lines: int):
 
 def test_lines_stretch_as_their_points_do():
     """The stretch is the derivative of the line's own points, and nowhere below 1."""
-    strips, scan = np.array([-4000.0, 0.0, 3000.0]), np.array([-4500.0, 0.0, 2500.0])
-    found = line_stretch(CAMERA, strips[:, None], scan)
-    for row, strip in enumerate(strips):
-        along, across = line_points("L4", strip, scan, CAMERA)
+    swaths, scan = np.array([-4000.0, 0.0, 3000.0]), np.array([-4500.0, 0.0, 2500.0])
+    found = line_stretch(CAMERA, swaths[:, None], scan)
+    for row, swath in enumerate(swaths):
+        along, across = line_points("L4", swath, scan, CAMERA)
         apart = np.hypot(np.diff(along[:, 319:321]), np.diff(across[:, 319:321]))[:, 0]
         psi = np.arctan2(np.diff(across[:, 319:321]), np.diff(along[:, 319:321]))[:, 0]
         assert found[row] == pytest.approx(apart * np.cos(psi), rel=1e-6)

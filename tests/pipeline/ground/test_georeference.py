@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from odc.geo.geobox import GeoBox
 
-from pipeline.geometry.grid import SceneGrid, seat_pixels
+from pipeline.geometry.grid import SceneGrid, patch_pixels
 from pipeline.ground.georeference import class_areas_m2, pixel_side_m, zoomed_out
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")
@@ -29,10 +29,10 @@ def test_areas_are_those_of_the_ellipsoid(epsg: int, step: float) -> None:
     """In metres, feet and degrees, of any projection: the whole grid is as large as its outline on the ellipsoid."""
     geobox = box(epsg, step)
     rows, columns = geobox.shape
-    share = np.linspace(0, 1, 2000)
+    fraction = np.linspace(0, 1, 2000)
     nothing, whole = np.zeros(2000), np.ones(2000)
-    column = np.concatenate([share, whole, 1 - share, nothing]) * columns
-    row = np.concatenate([nothing, share, whole, 1 - share]) * rows
+    column = np.concatenate([fraction, whole, 1 - fraction, nothing]) * columns
+    row = np.concatenate([nothing, fraction, whole, 1 - fraction]) * rows
     a, b, c, d, e, f = geobox.affine[:6]
     to_degrees = pyproj.Transformer.from_crs(epsg, 4326, always_xy=True)
     places = to_degrees.transform(a * column + b * row + c, d * column + e * row + f)
@@ -44,14 +44,14 @@ def test_areas_are_those_of_the_ellipsoid(epsg: int, step: float) -> None:
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_classes_share_the_ground(seed: int) -> None:
+def test_classes_fraction_the_ground(seed: int) -> None:
     """Areas of all classes and of what has none add up, and no class has any of another's."""
     geobox, rng = box(32632, 0.05, shape=(9, 11)), np.random.default_rng(seed)
     classes = rng.choice(np.array([0, 1, 2, 255], np.uint8), (9, 11))
     areas = class_areas_m2(geobox, classes, 3)
     whole = class_areas_m2(geobox, np.zeros((9, 11), np.uint8), 1)[0]
-    shares = [np.mean(classes == number) for number in range(3)]
-    np.testing.assert_allclose(areas, np.array(shares) * whole, rtol=1e-6, atol=1e-12)
+    fractions = [np.mean(classes == number) for number in range(3)]
+    np.testing.assert_allclose(areas, np.array(fractions) * whole, rtol=1e-6, atol=1e-12)
 
 
 @given(st.integers(1, 70), st.integers(1, 70), st.sampled_from([1, 2, 4, 8]), st.floats(-180, 180))
@@ -70,13 +70,13 @@ def test_a_coarser_grid_begins_at_the_same_corner(height: int, width: int, facto
 
 
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(1, 9), st.integers(1, 3), st.integers(0, 2**32 - 1))
-def test_seats_hold_every_pixel_once(height: int, width: int, patch: int, factor: int, seed: int) -> None:
-    """What lies at a pixel of the scene lies there in its seat; beyond the scene is nothing."""
+def test_patches_hold_every_pixel_once(height: int, width: int, patch: int, factor: int, seed: int) -> None:
+    """What lies at a pixel of the scene lies there in its patch; beyond the scene is nothing."""
     grid = SceneGrid(height, width, patch, factor)
     image = np.random.default_rng(seed).random((height, width)) < 0.5
-    seats = seat_pixels(grid, image)
-    assert seats.sum() == image.sum()
-    numbers = np.arange(len(seats))
-    for (y, x), seat in zip(grid.seat_origin(numbers), seats, strict=True):
+    patch_index = patch_pixels(grid, image)
+    assert patch_index.sum() == image.sum()
+    numbers = np.arange(len(patch_index))
+    for (y, x), patch_number in zip(grid.patch_origin(numbers), patch_index, strict=True):
         part = image[y : y + patch, x : x + patch]
-        np.testing.assert_array_equal(seat[: part.shape[0], : part.shape[1]], part)
+        np.testing.assert_array_equal(patch_number[: part.shape[0], : part.shape[1]], part)

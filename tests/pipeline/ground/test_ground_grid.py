@@ -74,7 +74,7 @@ def test_areas_by_class_are_sums_of_footprints():
 
 
 def test_a_map_pixel_shows_the_scene_pixel_that_sees_it():
-    """Forward from the scene pixel given by the lookup, the ray ends in the map pixel's centre."""
+    """Forward from the scene pixel given by the geolocation grid, the ray ends in the map pixel's centre."""
     grid = ground_grid(view(slope_deg=5.0), (80, 120))
     pixels = whole(grid)
     row, column = (int(at) for at in np.argwhere(np.isfinite(pixels[..., 0]))[1234])
@@ -85,7 +85,7 @@ def test_a_map_pixel_shows_the_scene_pixel_that_sees_it():
 
 @pytest.mark.parametrize(("step", "bound"), [(0.05, 1e-6), (1.0, 2e-5)])
 @pytest.mark.parametrize("pose", [{}, {"lat_deg": 85.0}, {"lat_deg": -79.0, "slope_deg": 12.0}])
-def test_places_between_ties_are_the_exact_ones(pose: dict[str, float], step: float, bound: float):
+def test_places_between_tie_points_are_the_exact_ones(pose: dict[str, float], step: float, bound: float):
     """Linear between exact places every 32 pixels, map pixels lie where PROJ puts them, in parts of a pixel."""
     grid = ground_grid(view(**({"height_m": 1000.0, "tilt_deg": 80.0} | pose)), (900, 900), resolution_m=step)
     rows, columns = (slice(size // 3, size // 3 + 75) for size in grid.shape)
@@ -106,7 +106,7 @@ def test_resolution_is_the_median_footprint_rounded():
     assert ground_grid(rig, (200, 200), resolution_m=0.0123).geobox.resolution.x == pytest.approx(0.0123)
 
 
-def test_grids_of_two_days_share_their_pixels():
+def test_grids_of_two_days_fraction_their_pixels():
     """A rig moved by a metre has another map, with pixels at the same multiples of the resolution."""
     here, there = (ground_grid(view(lat_deg=52.1 + shift), (90, 90)) for shift in (0.0, 1e-5))
     offset = (here.geobox.affine.f - there.geobox.affine.f) / here.geobox.resolution.x
@@ -141,14 +141,14 @@ def test_the_nearest_pixel_is_read_and_no_other():
 
 
 @given(seed=st.integers(0, 2**16), factor=st.integers(1, 9), rows=st.integers(1, 20), columns=st.integers(1, 20))
-def test_a_seat_is_read_at_every_pixel_of_it(seed: int, factor: int, rows: int, columns: int):
-    """As if each seat were so many pixels, also where the last ones reach beyond the scene."""
+def test_a_patch_is_read_at_every_pixel_of_it(seed: int, factor: int, rows: int, columns: int):
+    """As if each patch were so many pixels, also where the last ones reach beyond the scene."""
     rng = np.random.default_rng(seed)
-    seats = rng.random((-(-rows // factor), -(-columns // factor))).astype(np.float32)
+    patch_index = rng.random((-(-rows // factor), -(-columns // factor))).astype(np.float32)
     places = rng.uniform(-0.5, [rows - 0.5, columns - 0.5], (5, 4, 2))
     places[0, 0] = np.nan
-    fine = seats.repeat(factor, axis=0).repeat(factor, axis=1)[:rows, :columns]
-    found = nearest_at(seats, places, np.nan, factor=factor)
+    fine = patch_index.repeat(factor, axis=0).repeat(factor, axis=1)[:rows, :columns]
+    found = nearest_at(patch_index, places, np.nan, factor=factor)
     np.testing.assert_array_equal(found, nearest_at(fine, places, np.nan))
     assert found.dtype == np.float32
     assert np.isnan(found[0, 0])

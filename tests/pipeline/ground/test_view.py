@@ -115,7 +115,7 @@ def test_rays_that_meet_no_ground_are_nan_and_counted():
 
 @given(poses, st.floats(0.01, 1.2))
 def test_the_outline_holds_exactly_the_pixels_that_sink_enough(rig: GroundView, least: float):
-    """Its corners sink by the least or more, and its area over the field's is the share of such pixels."""
+    """Its corners sink by the least or more, and its area over the field's is the fraction of such pixels."""
     outline = rig.outline_px((90, 120), least)
     assert (rig.sink(outline) >= least - 1e-9).all()
     after = np.roll(outline, -1, axis=0)

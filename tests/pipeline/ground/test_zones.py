@@ -1,4 +1,4 @@
-"""Polygons on pixels: laws of masks, areas against shapely's, CRS round trips, and what zones leave of seats."""
+"""Polygons on pixels: laws of masks, areas against shapely's, CRS round trips, and what zones leave of patches."""
 
 from __future__ import annotations
 
@@ -137,19 +137,19 @@ def test_pixels_of_degrees_have_their_area_on_the_ellipsoid() -> None:
 
 
 @given(polygons, polygons)
-def test_no_seat_that_a_no_go_zone_touches_is_worth_anything(area: Any, no_go: Any) -> None:
-    """Nor one outside of the area; a seat wholly inside and untouched counts in full."""
+def test_no_patch_that_a_no_go_zone_touches_is_worth_anything(area: Any, no_go: Any) -> None:
+    """Nor one outside of the area; a patch wholly inside and untouched counts in full."""
     grid = SceneGrid(*SHAPE, 8, 4)
     barred = pixels_inside([no_go], SHAPE, touched=True)
     found = field_zones(pixels_inside([area], SHAPE), barred)
     if found is None:
         return
-    shares, shown = found.seat_shares(grid), found.shown_seats(grid)
-    for seat in grid.valid_seats():
-        y, x = grid.seat_origin(seat)
+    fractions, shown = found.patch_fractions(grid), found.shown_patches(grid)
+    for patch_number in grid.valid_patches():
+        y, x = grid.patch_origin(patch_number)
         kept, stopped = (mask[y : y + 8, x : x + 8] for mask in (found.kept, barred))
-        assert shares[seat] == pytest.approx(0 if stopped.any() else kept.mean())
-        assert shown[seat] or not kept.any()
+        assert fractions[patch_number] == pytest.approx(0 if stopped.any() else kept.mean())
+        assert shown[patch_number] or not kept.any()
     assert not found.kept[barred].any()
 
 
@@ -164,10 +164,10 @@ def test_zones_that_leave_nothing_out_are_none() -> None:
 def test_a_plot_is_as_sure_as_its_pixels_that_are() -> None:
     """Three pixels of 0.5, 0.7 and 0.9, one of the class unknown: the mean is of the three; of none it is None."""
     classes, confidence = np.array([[0, 0], [0, 1]], np.uint8), np.array([[0.5, 0.7], [0.9, np.nan]], np.float32)
-    plots = {"all": shapely.box(0, 0, 2, 2), "strange": shapely.box(1, 1, 2, 2)}
-    whole, strange = figures_of_plots(plots, NoPlace((2, 2)), classes, confidence, ("crop", "unknown"))
+    plots = {"all": shapely.box(0, 0, 2, 2), "out_of_range": shapely.box(1, 1, 2, 2)}
+    whole, out_of_range = figures_of_plots(plots, NoPlace((2, 2)), classes, confidence, ("crop", "unknown"))
     assert (whole.pixels, whole.confidence) == (4, pytest.approx(0.7))
-    assert (whole.shares["unknown"], strange.shares["unknown"], strange.confidence) == (0.25, 1.0, None)
+    assert (whole.fractions["unknown"], out_of_range.fractions["unknown"], out_of_range.confidence) == (0.25, 1.0, None)
 
 
 def test_without_a_place_polygons_are_pixels() -> None:

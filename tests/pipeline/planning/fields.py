@@ -1,4 +1,4 @@
-"""Fields of seats that strips show whole, for what plans over them have to hold."""
+"""Fields of patches that strips show whole, for what plans over them have to hold."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ import numpy as np
 from pipeline.geometry.scan import Sweep
 from pipeline.planning.prices import ScanPrices
 from pipeline.planning.scan_runs import Field
-from pipeline.planning.strips import Views
+from pipeline.planning.swaths import Views
 
 
-def blocks(worth: np.ndarray, most: int, prices: ScanPrices, lines: int) -> Field:
-    """A field of (row, column) seats of ``lines`` lines, seen ``most`` columns at a time from every offset."""
-    rows, columns = worth.shape
-    strips = range(max(columns - most, 0) + 1)
-    seen = [np.argwhere(worth[:, s : s + most] > 0) + np.array([0, s]) for s in strips]
+def blocks(expected_gain: np.ndarray, most: int, prices: ScanPrices, lines: int) -> Field:
+    """A field of (row, column) patches of ``lines`` lines, seen ``most`` columns at a time from every offset."""
+    rows, columns = expected_gain.shape
+    swaths = range(max(columns - most, 0) + 1)
+    seen = [np.argwhere(expected_gain[:, s : s + most] > 0) + np.array([0, s]) for s in swaths]
     row, column = np.concatenate(seen).T
-    sweeps = tuple(Sweep(f"fine-{s:03d}", "fine", "x", float(s), 0.0, rows * lines) for s in strips)
+    sweeps = tuple(Sweep(f"fine-{s:03d}", "fine", "x", float(s), 0.0, rows * lines) for s in swaths)
     edges = np.cumsum([0, *map(len, seen)])
     views = Views(sweeps, rows * lines, edges, row * columns + column, row * lines, (row + 1) * lines)
-    return Field(views, worth.ravel(), np.tile(np.arange(columns), rows), prices)
+    return Field(views, expected_gain.ravel(), np.tile(np.arange(columns), rows), prices)
 
 
 def drawn(rows: int, columns: int, seed: int) -> np.ndarray:
-    """Worth with a few strong seats, one in four worth nothing."""
+    """Worth with a few strong patches, one in four worth nothing."""
     rng = np.random.default_rng(seed)
     return rng.exponential(size=(rows, columns)) ** 2 * (rng.random((rows, columns)) > 0.25)

@@ -11,27 +11,27 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis
 from pipeline.planning.coverage import coarse_sweeps, full_sweeps, sweep_outline, sweeps_over
-from pipeline.planning.strips import covered_seats
+from pipeline.planning.swaths import covered_patches
 
 GRID, CAMERA = SceneGrid(320, 416, 16, 4), LineCamera(samples=160)
 
 
 def shown_of(top: int, left: int, rows: int, columns: int) -> np.ndarray:
-    """Seats of a block, (seat,)."""
-    shown = np.zeros(GRID.seat_shape, bool)
+    """Patches of a block, (patch,)."""
+    shown = np.zeros(GRID.patch_shape, bool)
     shown[top : top + rows, left : left + columns] = True
-    return (shown & (GRID.valid_share() > 0)).ravel()
+    return (shown & (GRID.valid_fraction() > 0)).ravel()
 
 
 blocks = st.builds(shown_of, st.integers(0, 19), st.integers(0, 25), st.integers(1, 8), st.integers(1, 8))
 
 
 @given(blocks, st.sampled_from(["x", "y"]))
-def test_every_seat_that_was_shown_still_is(shown: np.ndarray, along: Axis) -> None:
-    """Of a full scan, seats that lay whole in one of its sweeps do so after it is cut."""
+def test_every_patch_that_was_shown_still_is(shown: np.ndarray, along: Axis) -> None:
+    """Of a full scan, patches that lay whole in one of its sweeps do so after it is cut."""
     sweeps = full_sweeps(GRID, CAMERA, along)
     cut = sweeps_over(sweeps, GRID, CAMERA, shown)
-    before, after = (covered_seats(GRID, CAMERA, one) for one in (sweeps, cut))
+    before, after = (covered_patches(GRID, CAMERA, one) for one in (sweeps, cut))
     assert np.isin(np.intersect1d(before, np.flatnonzero(shown)), after).all()
     assert sum(one.lines for one in cut) < sum(one.lines for one in sweeps)
 
@@ -44,7 +44,7 @@ def test_lines_stay_where_they_lie(shown: np.ndarray) -> None:
         assert np.isin(sweep.held_px(), whole[sweep.name].held_px()).all()
 
 
-def test_strips_beside_the_area_are_left_out() -> None:
+def test_swaths_beside_the_area_are_left_out() -> None:
     """A corner of the field needs one strip of three."""
     sweeps = full_sweeps(GRID, CAMERA, "x")
     assert len(sweeps) == 3

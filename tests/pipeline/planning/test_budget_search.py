@@ -16,30 +16,30 @@ from pipeline.planning.prices import ScanPrices
 from tests.pipeline.planning.fields import blocks, drawn
 
 PRICES = ScanPrices(line_s=0.1, run_s=0.9, reload_s=1.6, lines_per_reload=150)
-LINES = 8  # of a seat
-seats = partial(blocks, prices=PRICES, lines=LINES)
+LINES = 8  # of a patch
+patch_index = partial(blocks, prices=PRICES, lines=LINES)
 
 
-def optimum(worth: np.ndarray, most: int, budget_s: float | None) -> float:
+def optimum(expected_gain: np.ndarray, most: int, budget_s: float | None) -> float:
     """Most worth for a budget, or with None the least seconds for all of it, by an integer programme.
 
-    Unknowns: is a strip on in a row, does it start there, is a seat shown, loads of the memory.
+    Unknowns: is a strip on in a row, does it start there, is a patch shown, loads of the memory.
     """
-    rows, columns = worth.shape
-    strips = columns - most + 1
-    on = rows * strips
-    seats = np.flatnonzero(worth)
-    loads = 2 * on + len(seats)
+    rows, columns = expected_gain.shape
+    swaths = columns - most + 1
+    on = rows * swaths
+    patch_index = np.flatnonzero(expected_gain)
+    loads = 2 * on + len(patch_index)
     cells: list[tuple[int, int, float]] = []
     top: list[float] = []
-    for s in range(strips):
+    for s in range(swaths):
         for r in range(rows):
             cells += [(len(top), s * rows + r, 1), (len(top), on + s * rows + r, -1)]
             cells += [(len(top), s * rows + r - 1, -1)] if r else []
             top.append(0)
-    for place, seat in enumerate(seats.tolist()):
-        r, c = divmod(seat, columns)
-        near = range(max(c - most + 1, 0), min(c, strips - 1) + 1)
+    for place, patch_number in enumerate(patch_index.tolist()):
+        r, c = divmod(patch_number, columns)
+        near = range(max(c - most + 1, 0), min(c, swaths - 1) + 1)
         cells += [(len(top), 2 * on + place, 1), *((len(top), s * rows + r, -1) for s in near)]
         top.append(0)
     cells += [(len(top), i, LINES) for i in range(on)] + [(len(top), loads, -PRICES.lines_per_reload)]
@@ -47,7 +47,7 @@ def optimum(worth: np.ndarray, most: int, budget_s: float | None) -> float:
     seconds = np.zeros(loads + 1)
     seconds[:on], seconds[on : 2 * on], seconds[loads] = LINES * PRICES.line_s, PRICES.run_s, PRICES.reload_s
     value = np.zeros(loads + 1)
-    value[2 * on : loads] = worth.ravel()[seats]
+    value[2 * on : loads] = expected_gain.ravel()[patch_index]
     row, column, entry = zip(*cells, strict=True)
     limits = [LinearConstraint(sparse.csr_matrix((entry, (row, column)), (len(top), loads + 1)), -np.inf, top)]
     least = np.zeros(loads + 1)
@@ -73,39 +73,43 @@ def optimum(worth: np.ndarray, most: int, budget_s: float | None) -> float:
 @given(st.integers(2, 9), st.integers(3, 12), st.integers(0, 99), st.floats(0, 30), st.floats(0, 30))
 def test_a_bigger_budget_never_buys_less(rows: int, columns: int, seed: int, one: float, other: float):
     """The true price, reloads included, stays within the budget, and worth grows with it, in narrow fields and wide."""
-    field = seats(drawn(rows, columns, seed), 3)
+    field = patch_index(drawn(rows, columns, seed), 3)
     small, large = (spend(field, budget) for budget in sorted((one, other)))
     assert small.seconds(PRICES) <= min(one, other)
     assert large.seconds(PRICES) <= max(one, other)
-    assert large.worth >= small.worth - 1e-9
+    assert large.expected_gain >= small.expected_gain - 1e-9
     for cover in (small, large):
-        assert cover.worth <= field.cover(cover.runs).worth + 1e-9
+        assert cover.expected_gain <= field.cover(cover.runs).expected_gain + 1e-9
 
 
 def test_plans_are_near_the_optimum():
     """Over fields of 1.4 and 2.2 strips and three budgets the plan has 99 % of the integer programme's worth."""
-    shares = []
+    fractions = []
     for seed, columns in enumerate((7, 11)):
-        worth = drawn(9, columns, seed)
+        expected_gain = drawn(9, columns, seed)
         for budget_s in (4.0, 7.0, 15.0):
-            shares.append(spend(seats(worth, 5), budget_s).worth / optimum(worth, 5, budget_s))
-    assert min(shares) > 0.95
-    assert np.mean(shares) > 0.99
-    assert max(shares) <= 1 + 1e-9
+            fractions.append(
+                spend(patch_index(expected_gain, 5), budget_s).expected_gain / optimum(expected_gain, 5, budget_s)
+            )
+    assert min(fractions) > 0.95
+    assert np.mean(fractions) > 0.99
+    assert max(fractions) <= 1 + 1e-9
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_all_seats_at_nearly_the_least_price(seed: int):
-    """Covers of every seat take at most 2 % more seconds than the integer programme's."""
+def test_all_patches_at_nearly_the_least_price(seed: int):
+    """Covers of every patch take at most 2 % more seconds than the integer programme's."""
     rng = np.random.default_rng(seed)
-    worth = (rng.random((12, 9)) < 0.12).astype(float)
-    cover = cheapest_cover(seats(worth, 4))
-    assert cover.worth == worth.sum()
-    assert optimum(worth, 4, None) * (1 - 1e-9) <= cover.seconds(PRICES) <= optimum(worth, 4, None) * 1.02
+    expected_gain = (rng.random((12, 9)) < 0.12).astype(float)
+    cover = cheapest_cover(patch_index(expected_gain, 4))
+    assert cover.expected_gain == expected_gain.sum()
+    assert (
+        optimum(expected_gain, 4, None) * (1 - 1e-9) <= cover.seconds(PRICES) <= optimum(expected_gain, 4, None) * 1.02
+    )
 
 
 def test_worths_far_apart_are_all_bought_in_the_end():
-    """A seat a million times weaker than another is bought by a budget for all."""
-    worth = np.zeros((9, 6))
-    worth[0, 0], worth[4, 5], worth[8, 2] = 1e6, 1.0, 1e3
-    assert spend(seats(worth, 3), 1e4).worth == worth.sum()
+    """A patch a million times weaker than another is bought by a budget for all."""
+    expected_gain = np.zeros((9, 6))
+    expected_gain[0, 0], expected_gain[4, 5], expected_gain[8, 2] = 1e6, 1.0, 1e3
+    assert spend(patch_index(expected_gain, 3), 1e4).expected_gain == expected_gain.sum()

@@ -1,4 +1,4 @@
-"""Covering sweeps, the lines of a seat, strips at every offset and what they show: every pixel with its taps."""
+"""Covering sweeps, the lines of a patch, strips at every offset and what they show: every pixel with its taps."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import CostModel, Sweep, line_positions, scene_to_sweep
 from pipeline.planning.coverage import cheapest_full, coarse_sweeps, full_sweeps, on_scene, reach_px, with_margin
-from pipeline.planning.strips import covered_seats, look_from, seat_lines, seats_near, strips_at_seats
+from pipeline.planning.swaths import covered_patches, edges_from, patch_lines, patches_near, swaths_at_patches
 
 CAMERA, COST = LineCamera(), CostModel()
 
@@ -45,16 +45,16 @@ def test_every_pixel_is_seen(height: int, width: int, along: str, factor: int):
     assert unseen(coarse_sweeps(grid, CAMERA, along), grid) == 0
 
 
-@pytest.mark.parametrize(("size", "strips"), [(1, 1), (640, 1), (641, 2), (1280, 2), (1281, 3), (1920, 3)])
-def test_strips_are_the_fewest_that_cover(size: int, strips: int):
+@pytest.mark.parametrize(("size", "swaths"), [(1, 1), (640, 1), (641, 2), (1280, 2), (1281, 3), (1920, 3)])
+def test_swaths_are_the_fewest_that_cover(size: int, swaths: int):
     """A line of 640 samples covers 640 px and a little more away from the axis."""
     grid = SceneGrid(200, size, 16, 4)
     sweeps = full_sweeps(grid, CAMERA, "x")
-    assert len(sweeps) == strips
-    assert [sweep.strip_px for sweep in sweeps] == pytest.approx([-sweep.strip_px for sweep in sweeps[::-1]], abs=1e-6)
+    assert len(sweeps) == swaths
+    assert [sweep.swath_px for sweep in sweeps] == pytest.approx([-sweep.swath_px for sweep in sweeps[::-1]], abs=1e-6)
 
 
-def test_strips_on_the_axis_scan_the_scene_and_its_taps_only():
+def test_swaths_on_the_axis_scan_the_scene_and_its_taps_only():
     """Without rotation a full scan takes the scene's rows and three lines for taps, standing on the rows."""
     (sweep,) = full_sweeps(SceneGrid(480, 600, 16, 4), CAMERA, "x")
     assert sweep.lines == 483
@@ -92,7 +92,7 @@ def test_factors_that_overflow_the_sum_are_refused(factor: int):
 @pytest.mark.parametrize("binning", [1, 4])
 def test_mask_follows_the_rays(along: str, binning: int):
     """Far off the axis the samples on the scene are those whose reflected ray meets one of its pixels."""
-    sweep = Sweep("s", "fine", along, strip_px=2300.3, start_px=-1100.2, lines=90, binning=binning)
+    sweep = Sweep("s", "fine", along, swath_px=2300.3, start_px=-1100.2, lines=90, binning=binning)
     slopes = CAMERA.pixel_slopes(binning)
     rays = np.stack([np.zeros_like(slopes), slopes, np.ones_like(slopes)], axis=-1)
     normals = position_to_normal(line_positions(sweep, CAMERA))
@@ -104,12 +104,12 @@ def test_mask_follows_the_rays(along: str, binning: int):
 
 
 @pytest.mark.parametrize("overlap_px", [0.0, 64.0, 164.0, 320.0])
-def test_strips_overlap_by_what_is_asked(overlap_px: float):
+def test_swaths_overlap_by_what_is_asked(overlap_px: float):
     """Neighbours share at least the overlap, with no strip more than it takes, and 0 changes nothing."""
     grid = SceneGrid(300, 1100, 16, 4)
     for cover in (full_sweeps, coarse_sweeps):
         sweeps = cover(grid, CAMERA, "x", overlap_px=overlap_px)
-        reach = [sweep.strip_px + reach_px(sweep.strip_px, grid.height, CAMERA, sweep.binning) for sweep in sweeps]
+        reach = [sweep.swath_px + reach_px(sweep.swath_px, grid.height, CAMERA, sweep.binning) for sweep in sweeps]
         assert all(left[1] - right[0] >= overlap_px - 1e-3 for left, right in pairwise(reach))
         assert len(sweeps) == int(np.ceil(1100 / (640 - overlap_px)))
     assert full_sweeps(grid, CAMERA, "x", overlap_px=0) == full_sweeps(grid, CAMERA, "x")
@@ -129,66 +129,66 @@ GRID = SceneGrid(200, 900, 32, 4)
 
 
 def everywhere(grid: SceneGrid) -> np.ndarray:
-    """All seats wanted."""
-    return grid.valid_share().ravel() > 0
+    """All patches wanted."""
+    return grid.valid_fraction().ravel() > 0
 
 
 @pytest.mark.parametrize("along", ["x", "y"])
-def test_seat_lines_hold_every_pixel_with_its_taps(along: str):
+def test_patch_lines_hold_every_pixel_with_its_taps(along: str):
     """The interval is the least that holds the kernel's lines of every pixel on the scene."""
     grid = SceneGrid(100, 150, 32, 2)
     path = Sweep("a", "fine", along, 1500.0, -900.0, 1800)
-    seats = grid.valid_seats()
-    lines, reached = seat_lines(grid, CAMERA, path, seats)
+    patch_index = grid.valid_patches()
+    lines, reached = patch_lines(grid, CAMERA, path, patch_index)
     assert not reached.any()
-    for (y, x), (first, stop) in zip(grid.seat_origin(seats), lines, strict=True):
+    for (y, x), (first, stop) in zip(grid.patch_origin(patch_index), lines, strict=True):
         rows, columns = np.mgrid[y : min(y + 32, 100), x : min(x + 32, 150)]
         points = (columns - 149 / 2, rows - 99 / 2) if along == "x" else (rows - 99 / 2, columns - 149 / 2)
         at = np.floor(scene_to_sweep(path, CAMERA, *points)[..., 0] + 1e-6)
         assert (first, stop) == (at.min() - 1, at.max() + 3)
 
 
-def test_seats_beyond_the_samples_are_not_reached():
-    """Of a 900 px scene one strip reaches the seats whose pixels all fall on its samples."""
+def test_patches_beyond_the_samples_are_not_reached():
+    """Of a 900 px scene one strip reaches the patches whose pixels all fall on its samples."""
     (low, high) = full_sweeps(GRID, CAMERA, "x")
-    seats = GRID.valid_seats()
-    reached = np.stack([seat_lines(GRID, CAMERA, path, seats)[1] for path in (low, high)])
+    patch_index = GRID.valid_patches()
+    reached = np.stack([patch_lines(GRID, CAMERA, path, patch_index)[1] for path in (low, high)])
     assert reached.any(axis=0).all()
-    assert 0 < reached[0].sum() < len(seats)
-    padding = np.setdiff1d(np.arange(np.prod(GRID.seat_shape)), seats)
-    assert not seat_lines(GRID, CAMERA, low, padding)[1].any()
+    assert 0 < reached[0].sum() < len(patch_index)
+    padding = np.setdiff1d(np.arange(np.prod(GRID.patch_shape)), patch_index)
+    assert not patch_lines(GRID, CAMERA, low, padding)[1].any()
 
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(-4000, 4000), st.integers(-4000, 4000), st.integers(1, 900), st.sampled_from(["x", "y"]))
-def test_no_shown_seat_lies_beyond_the_rectangle(strip: int, start: int, lines: int, along: str):
-    """Seats shown by a sweep anywhere in a wide field are among those near its footprint."""
+def test_no_shown_patch_lies_beyond_the_rectangle(swath: int, start: int, lines: int, along: str):
+    """Patches shown by a sweep anywhere in a wide field are among those near its footprint."""
     grid = SceneGrid(8000, 7000, 100, 1)
-    sweep = Sweep("a", "fine", along, float(strip), float(start), lines)
-    seats = grid.valid_seats()
-    needs, reached = seat_lines(grid, CAMERA, sweep, seats)
-    shown = seats[reached & (needs[:, 0] >= 0) & (needs[:, 1] <= lines)]
-    assert np.isin(shown, seats_near(grid, CAMERA, sweep)).all()
-    assert covered_seats(grid, CAMERA, [sweep]).tolist() == shown.tolist()
+    sweep = Sweep("a", "fine", along, float(swath), float(start), lines)
+    patch_index = grid.valid_patches()
+    needs, reached = patch_lines(grid, CAMERA, sweep, patch_index)
+    shown = patch_index[reached & (needs[:, 0] >= 0) & (needs[:, 1] <= lines)]
+    assert np.isin(shown, patches_near(grid, CAMERA, sweep)).all()
+    assert covered_patches(grid, CAMERA, [sweep]).tolist() == shown.tolist()
 
 
 @pytest.mark.parametrize("width", [30, 600, 640, 641, 900, 1280, 1296])
-def test_strips_begin_at_seat_edges_and_end_with_the_field(width: int):
+def test_swaths_begin_at_patch_edges_and_end_with_the_field(width: int):
     """One strip where a line holds the field, else one for each column that is not the last strip's."""
     grid = SceneGrid(100, width, 32, 2)
-    strips = strips_at_seats(grid, CAMERA, "x")
-    views = look_from(grid, CAMERA, strips, everywhere(grid))
-    assert np.unique(views.seat).tolist() == grid.valid_seats().tolist()
-    assert len(strips) == (1 if width <= 640 else -(-(width - 640) // 32) + 1)
-    assert np.all(np.diff([strip.strip_px for strip in strips]) > 0)
+    swaths = swaths_at_patches(grid, CAMERA, "x")
+    views = edges_from(grid, CAMERA, swaths, everywhere(grid))
+    assert np.unique(views.patch_number).tolist() == grid.valid_patches().tolist()
+    assert len(swaths) == (1 if width <= 640 else -(-(width - 640) // 32) + 1)
+    assert np.all(np.diff([swath.swath_px for swath in swaths]) > 0)
 
 
-def test_views_agree_with_sweeps_cut_from_the_strips():
-    """A run of a strip's lines shows exactly the seats whose views lie in it."""
-    views = look_from(GRID, CAMERA, strips_at_seats(GRID, CAMERA, "x"), everywhere(GRID))
-    strip = views.strips[3]
-    cut = replace(strip, start_px=strip.start_px + 20, lines=90)
-    inside = (views.strip == 3) & (views.first >= 20) & (views.stop <= 110)
-    assert sorted(views.seat[inside].tolist()) == covered_seats(GRID, CAMERA, [cut]).tolist()
+def test_views_agree_with_sweeps_cut_from_the_swaths():
+    """A run of a strip's lines shows exactly the patches whose views lie in it."""
+    views = edges_from(GRID, CAMERA, swaths_at_patches(GRID, CAMERA, "x"), everywhere(GRID))
+    swath = views.swaths[3]
+    cut = replace(swath, start_px=swath.start_px + 20, lines=90)
+    inside = (views.swath == 3) & (views.first >= 20) & (views.stop <= 110)
+    assert sorted(views.patch_number[inside].tolist()) == covered_patches(GRID, CAMERA, [cut]).tolist()
     assert views.first.min() == 0
     assert views.stop.max() == views.lines

@@ -19,27 +19,27 @@ def _blocks(rows: int = 1, along: Axis = "x") -> LineBlocks:
 
 @pytest.mark.parametrize("along", ["x", "y"])
 @pytest.mark.parametrize("rows", [1, 4])
-def test_all_blocks_show_every_seat(along: Axis, rows: int):
-    """Every strip shows whole seats, and together all of them."""
+def test_all_blocks_show_every_patch(along: Axis, rows: int):
+    """Every strip shows whole patches, and together all of them."""
     blocks = _blocks(rows, along)
-    assert blocks.seats(blocks.blocks).tolist() == list(range(16 * 20))
+    assert blocks.patch_index(blocks.blocks).tolist() == list(range(16 * 20))
 
 
-def test_a_block_shows_a_row_of_its_strip():
-    """One block alone shows as many seats as a line is wide, and its lines are priced with a set-up."""
+def test_a_block_shows_a_row_of_its_swath():
+    """One block alone shows as many patches as a line is wide, and its lines are priced with a set-up."""
     blocks = _blocks()
     one = [blocks.blocks[3]]
-    seats = blocks.seats(one)
-    assert len(seats) == 8
-    assert len(np.unique(seats // 20)) == 1
+    patch_index = blocks.patch_index(one)
+    assert len(patch_index) == 8
+    assert len(np.unique(patch_index // 20)) == 1
     assert blocks.seconds(one) == pytest.approx(COST.seconds(blocks.sweeps(one), CAMERA))
 
 
-@pytest.mark.parametrize("share", [0.1, 0.4, 0.9])
-def test_no_choice_exceeds_its_seconds(share: float):
+@pytest.mark.parametrize("fraction", [0.1, 0.4, 0.9])
+def test_no_choice_exceeds_its_seconds(fraction: float):
     """Even and random choices cost at most what is given, and one more evenly spaced block would be too dear."""
     blocks = _blocks()
-    budget = share * blocks.seconds(blocks.blocks)
+    budget = fraction * blocks.seconds(blocks.blocks)
     even, drawn = blocks.evenly(budget), blocks.at_random(budget, np.random.default_rng(0))
     assert 0 < blocks.seconds(even) <= budget
     assert 0 < blocks.seconds(drawn) <= budget
@@ -62,4 +62,4 @@ def test_wide_blocks_are_tried_where_they_show_more():
         most_shown([line_blocks(grid, camera, COST, "y", rows) for rows in widths], lambda blocks: blocks.evenly(23.0))
         for widths in ((1, 2), WIDTHS)
     )
-    assert len(wide.seats) > 1.5 * len(narrow.seats)
+    assert len(wide.patch_index) > 1.5 * len(narrow.patch_index)

@@ -15,17 +15,17 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel
 from pipeline.planning.coverage import cheapest_full, coarse_sweeps, full_sweeps
-from pipeline.planning.fine_pass import SeatsPrice, plan_fine, price_of_seats
+from pipeline.planning.fine_pass import PatchesPrice, plan_fine, price_of_patches
 from pipeline.planning.prices import check_budget
-from pipeline.planning.strips import covered_seats
+from pipeline.planning.swaths import covered_patches
 
 CAMERA, COST = LineCamera(), CostModel()
 GRID = SceneGrid(200, 900, 32, 4)
 
 
 def drawn(grid: SceneGrid, seed: int = 0) -> np.ndarray:
-    """Scores with a few strong seats."""
-    return np.random.default_rng(seed).exponential(size=int(np.prod(grid.seat_shape))) ** 3
+    """Scores with a few strong patches."""
+    return np.random.default_rng(seed).exponential(size=int(np.prod(grid.patch_shape))) ** 3
 
 
 @settings(max_examples=7, deadline=None)
@@ -40,52 +40,52 @@ def test_price_within_budget_and_worth_grows_with_it(
     small, large = (plan(budget_s=budget_s) for budget_s in sorted((one, other)))
     assert small.seconds <= min(one, other)
     assert large.seconds <= max(one, other)
-    assert large.worth >= small.worth * (1 - 1e-12)
+    assert large.expected_gain >= small.expected_gain * (1 - 1e-12)
 
 
 @settings(max_examples=5, deadline=None)
 @given(st.integers(40, 700), st.integers(40, 1500), st.floats(0, 80), st.integers(0, 99))
 def test_plans_hold_together(height: int, width: int, budget_s: float, seed: int):
-    """Sweeps lie apart, the price is the cost model's, and the seats shown are worth at least what was bought."""
+    """Sweeps lie apart, the price is the cost model's, and the patches shown are worth at least what was bought."""
     grid = SceneGrid(height, width, 32, 2)
     scores = drawn(grid, seed)
     plan = plan_fine(grid, CAMERA, COST, "x", scores, budget_s=budget_s)
     assert plan.seconds == COST.seconds(plan.sweeps, CAMERA) <= budget_s
-    assert plan.seats.tolist() == covered_seats(grid, CAMERA, plan.sweeps).tolist()
-    assert scores[plan.seats].sum() >= plan.worth * (1 - 1e-12)
+    assert plan.patch_index.tolist() == covered_patches(grid, CAMERA, plan.sweeps).tolist()
+    assert scores[plan.patch_index].sum() >= plan.expected_gain * (1 - 1e-12)
     assert len({sweep.name for sweep in plan.sweeps}) == len(plan.sweeps)
 
 
 @pytest.mark.parametrize("width", [600, 900, 1270, 1280, 1296])
-def test_enough_seconds_buy_every_seat(width: int):
-    """A large budget shows all seats, for widths that divide and not."""
+def test_enough_seconds_buy_every_patch(width: int):
+    """A large budget shows all patches, for widths that divide and not."""
     grid = SceneGrid(150, width, 32, 2)
     scores = drawn(grid)
     plan = plan_fine(grid, CAMERA, COST, "x", scores, budget_s=1e4)
-    assert plan.seats.tolist() == grid.valid_seats().tolist()
-    assert plan.worth == pytest.approx(scores[grid.valid_seats()].sum())
+    assert plan.patch_index.tolist() == grid.valid_patches().tolist()
+    assert plan.expected_gain == pytest.approx(scores[grid.valid_patches()].sum())
 
 
-def test_one_strong_seat_is_bought_alone():
-    """A single seat of worth gets one run of just its lines, in either orientation."""
-    scores = np.zeros(np.prod(GRID.seat_shape))
-    scores[GRID.valid_seats()[40]] = 3.0
+def test_one_strong_patch_is_bought_alone():
+    """A single patch of worth gets one run of just its lines, in either orientation."""
+    scores = np.zeros(np.prod(GRID.patch_shape))
+    scores[GRID.valid_patches()[40]] = 3.0
     for along in ("x", "y"):
         plan = plan_fine(GRID, CAMERA, COST, along, scores, budget_s=20.0)
         (sweep,) = plan.sweeps
-        assert GRID.valid_seats()[40] in plan.seats
+        assert GRID.valid_patches()[40] in plan.patch_index
         assert 35 <= sweep.lines < 60
-        assert plan.worth == 3.0
+        assert plan.expected_gain == 3.0
 
 
 def test_an_infinite_score_outweighs_the_one_other():
-    """Of two seats far apart with time for one, the one of score +inf is bought."""
-    first, last = GRID.valid_seats()[[0, -1]]
-    scores = np.zeros(int(np.prod(GRID.seat_shape)))
+    """Of two patches far apart with time for one, the one of score +inf is bought."""
+    first, last = GRID.valid_patches()[[0, -1]]
+    scores = np.zeros(int(np.prod(GRID.patch_shape)))
     scores[first], scores[last] = 5.0, np.inf
     plan = plan_fine(GRID, CAMERA, COST, "x", scores, budget_s=7.0)
-    assert last in plan.seats
-    assert first not in plan.seats
+    assert last in plan.patch_index
+    assert first not in plan.patch_index
 
 
 def test_wrong_budgets_and_patches_are_refused():
@@ -101,60 +101,60 @@ def test_wrong_budgets_and_patches_are_refused():
 
 
 def test_planning_a_farm_pays():
-    """On 1280 x 1024 px with 16 px seats blobs give twice the worth of their share of lines."""
+    """On 1280 x 1024 px with 16 px patches blobs give twice the worth of their fraction of lines."""
     grid = SceneGrid(1024, 1280, 16, 4)
-    rows, columns = np.divmod(np.arange(np.prod(grid.seat_shape)), grid.seat_shape[1])
+    rows, columns = np.divmod(np.arange(np.prod(grid.patch_shape)), grid.patch_shape[1])
     scores = sum(np.exp(-((rows - r) ** 2 + (columns - c) ** 2) / 60) for r, c in ((8, 12), (30, 60), (55, 20)))
     _, _, full = cheapest_full(grid, CAMERA, COST)
     left = check_budget(0.5, COST.seconds(coarse_sweeps(grid, CAMERA, "x"), CAMERA), full)
     plan = plan_fine(grid, CAMERA, COST, "x", scores, budget_s=left)
     assert plan.seconds > left - 3
-    assert plan.worth > 2 * plan.seconds / full * scores.sum()
+    assert plan.expected_gain > 2 * plan.seconds / full * scores.sum()
 
 
-def test_a_seat_alone_costs_its_own_lines():
-    """On a strip through the axis lines are not turned: a seat takes its rows, three for the kernel, and one set-up."""
+def test_a_patch_alone_costs_its_own_lines():
+    """On a strip through the axis lines are not turned: a patch takes its rows, three for the kernel, and one set-up."""
     grid = SceneGrid(100, 150, 16, 4)
-    price = price_of_seats(grid, CAMERA, COST, "x", np.array([24]))
+    price = price_of_patches(grid, CAMERA, COST, "x", np.array([24]))
     assert price.lines == 16 + 3
     assert price.seconds == pytest.approx(price.lines * 0.1 + COST.setup_seconds(CAMERA) + COST.reload_s)
-    nothing = price_of_seats(grid, CAMERA, COST, "x", np.array([], np.intp))
+    nothing = price_of_patches(grid, CAMERA, COST, "x", np.array([], np.intp))
     assert (nothing.lines, nothing.seconds) == (0, 0.0)
 
 
 @settings(max_examples=10, deadline=None)
 @given(st.sets(st.integers(0, 55), min_size=2, max_size=20))
-def test_neighbours_share_their_lines(seats: set[int]):
-    """Seats bought together take at most the lines of each by itself, and no fewer than the dearest of them."""
-    grid = SceneGrid(100, 250, 16, 2)  # 8 x 16 seats with the padding; those of the first rows lie on the scene
-    valid = [seat for seat in seats if grid.valid_share().ravel()[seat] > 0]
-    alone = [price_of_seats(grid, CAMERA, COST, "y", np.array([seat])).lines for seat in valid]
-    together = price_of_seats(grid, CAMERA, COST, "y", np.array(valid, np.intp)).lines
+def test_neighbours_fraction_their_lines(patch_index: set[int]):
+    """Patches bought together take at most the lines of each by itself, and no fewer than the dearest of them."""
+    grid = SceneGrid(100, 250, 16, 2)  # 8 x 16 patches with the padding; those of the first rows lie on the scene
+    valid = [patch_number for patch_number in patch_index if grid.valid_fraction().ravel()[patch_number] > 0]
+    alone = [price_of_patches(grid, CAMERA, COST, "y", np.array([patch_number])).lines for patch_number in valid]
+    together = price_of_patches(grid, CAMERA, COST, "y", np.array(valid, np.intp)).lines
     assert max(alone, default=0) <= together <= sum(alone)
 
 
 def test_runs_lie_at_their_own_offsets():
-    """A block of seats in the middle of a field two strips wide takes one run, whose strip is none of a full scan's."""
+    """A block of patches in the middle of a field two strips wide takes one run, whose strip is none of a full scan's."""
     grid = SceneGrid(320, 1280, 32, 2)
-    scores = np.zeros(grid.seat_shape)
+    scores = np.zeros(grid.patch_shape)
     scores[4:6, 11:29] = 1.0
     plan = plan_fine(grid, CAMERA, COST, "x", scores.ravel(), budget_s=15.0)
     (sweep,) = plan.sweeps
-    assert abs(sweep.strip_px) < 40
-    assert plan.worth == scores.sum()
-    assert plan.worth_per_second == pytest.approx(plan.worth / plan.seconds)
+    assert abs(sweep.swath_px) < 40
+    assert plan.expected_gain == scores.sum()
+    assert plan.gain_per_second == pytest.approx(plan.expected_gain / plan.seconds)
     assert plan.kind == "lines"
 
 
 def scattered(grid: SceneGrid) -> np.ndarray:
-    """Every third seat in every third row: nearly all lines are needed for a ninth of the seats."""
-    rows, columns = np.divmod(np.arange(int(np.prod(grid.seat_shape))), grid.seat_shape[1])
-    on_scene = grid.valid_share().ravel() > 0
+    """Every third patch in every third row: nearly all lines are needed for a ninth of the patches."""
+    rows, columns = np.divmod(np.arange(int(np.prod(grid.patch_shape))), grid.patch_shape[1])
+    on_scene = grid.valid_fraction().ravel() > 0
     return np.where(on_scene & (rows % 2 == 0) & (columns % 3 == 0), 1.0, 0.0)
 
 
 def test_the_full_scan_is_taken_where_runs_are_no_cheaper():
-    """Seats of which a line shows one take four strips, the full scan two: it is taken, shows all seats and says so."""
+    """Patches of which a line shows one take four strips, the full scan two: it is taken, shows all patches and says so."""
     grid = SceneGrid(600, 1280, 400, 1)
     scores = np.ones(8)
     full = full_sweeps(grid, CAMERA, "x")
@@ -162,13 +162,13 @@ def test_the_full_scan_is_taken_where_runs_are_no_cheaper():
     plan = plan_fine(grid, CAMERA, COST, "x", scores, budget_s=full_s)
     assert (plan.kind, plan.seconds, plan.full_seconds) == ("full", full_s, full_s)
     assert plan.sweeps == full
-    assert plan.seats.tolist() == grid.valid_seats().tolist()
-    assert plan.worth == plan.wanted_worth == 8.0
+    assert plan.patch_index.tolist() == grid.valid_patches().tolist()
+    assert plan.expected_gain == plan.wanted_gain == 8.0
     assert "the full scan is taken" in plan.reason
     below = plan_fine(grid, CAMERA, COST, "x", scores, budget_s=full_s - 1e-6)
     assert below.kind == "lines"
-    assert below.worth < 8.0
-    assert price_of_seats(grid, CAMERA, COST, "x", np.arange(8)).least[1] == full_s
+    assert below.expected_gain < 8.0
+    assert price_of_patches(grid, CAMERA, COST, "x", np.arange(8)).least[1] == full_s
 
 
 @pytest.mark.parametrize("budget_s", [0.0, 20.0, 40.0, 80.0, 500.0])
@@ -181,27 +181,27 @@ def test_no_plan_takes_longer_than_the_full_scan(budget_s: float):
 
 
 def test_the_cheaper_way_is_taken():
-    """Few seats are cheaper by runs of lines, dear runs by the full scan, where the mirror reaches all of it."""
-    few = price_of_seats(GRID, CAMERA, COST, "x", GRID.valid_seats()[:2])
+    """Few patches are cheaper by runs of lines, dear runs by the full scan, where the mirror reaches all of it."""
+    few = price_of_patches(GRID, CAMERA, COST, "x", GRID.valid_patches()[:2])
     assert few.least == (few.lines, few.seconds)
-    assert SeatsPrice(900, 95.0, 800, 82.0).least == (800, 82.0)
-    assert SeatsPrice(900, 95.0, None, None).least == (900, 95.0)
+    assert PatchesPrice(900, 95.0, 800, 82.0).least == (800, 82.0)
+    assert PatchesPrice(900, 95.0, None, None).least == (900, 95.0)
 
 
-def test_a_margin_shows_the_seats_wherever_the_mirror_looks() -> None:
-    """Runs planned for a mirror that may be 6 px off still show their seats whole when all of it is."""
+def test_a_margin_shows_the_patches_wherever_the_mirror_looks() -> None:
+    """Runs planned for a mirror that may be 6 px off still show their patches whole when all of it is."""
     grid, camera = SceneGrid(300, 900, 32, 4), LineCamera()
-    scores = np.random.default_rng(2).random(int(np.prod(grid.seat_shape))) ** 4
+    scores = np.random.default_rng(2).random(int(np.prod(grid.patch_shape))) ** 4
     plan = plan_fine(grid, camera, CostModel(), "x", scores, budget_s=20.0, margin_px=6.0)
-    assert len(plan.seats) > 20
+    assert len(plan.patch_index) > 20
     for along, scan in ((6, 6), (-6, 6), (6, -6), (-6, -6)):
-        beside = [replace(one, strip_px=one.strip_px + along, start_px=one.start_px + scan) for one in plan.sweeps]
-        assert set(plan.seats) <= set(covered_seats(grid, camera, beside))
+        beside = [replace(one, swath_px=one.swath_px + along, start_px=one.start_px + scan) for one in plan.sweeps]
+        assert set(plan.patch_index) <= set(covered_patches(grid, camera, beside))
 
 
 @settings(max_examples=5, deadline=None)
 @given(st.floats(0, 4), st.floats(0, 4), st.floats(1, 80), st.integers(0, 99), st.sampled_from(["x", "y"]))
-@example(1.0, 4.0, 46.0, 54, "x")  # the budget pays for the full scan, and at the low threshold the last seats do not
+@example(1.0, 4.0, 46.0, 54, "x")  # the budget pays for the full scan, and at the low threshold the last patches do not
 def test_a_higher_threshold_never_buys_more(one: float, other: float, budget_s: float, seed: int, along: str):
     """Less worth, within the budget, and each plan shows the threshold's score a second, but for a part of a reload."""
     scores = drawn(GRID, seed)
@@ -209,10 +209,10 @@ def test_a_higher_threshold_never_buys_more(one: float, other: float, budget_s: 
         plan_fine(GRID, CAMERA, COST, along, scores, budget_s=budget_s, threshold=limit)
         for limit in sorted((one, other))
     )
-    assert high.worth <= low.worth
+    assert high.expected_gain <= low.expected_gain
     assert max(low.seconds, high.seconds) <= budget_s
     for plan, limit in ((low, min(one, other)), (high, max(one, other))):
-        assert plan.worth >= limit * (plan.seconds - COST.reload_s) * (1 - 1e-9)
+        assert plan.expected_gain >= limit * (plan.seconds - COST.reload_s) * (1 - 1e-9)
 
 
 @pytest.mark.parametrize("budget_s", [0.0, 7.0, 25.0, 60.0])
@@ -222,18 +222,22 @@ def test_a_threshold_of_0_is_none(budget_s: float):
     plain, zero = (
         plan_fine(GRID, CAMERA, COST, "x", scores, budget_s=budget_s, threshold=limit) for limit in (None, 0.0)
     )
-    assert (zero.sweeps, zero.seats.tolist(), zero.worth) == (plain.sweeps, plain.seats.tolist(), plain.worth)
+    assert (zero.sweeps, zero.patch_index.tolist(), zero.expected_gain) == (
+        plain.sweeps,
+        plain.patch_index.tolist(),
+        plain.expected_gain,
+    )
     assert (plain.threshold, zero.threshold, zero.spared_s) == (None, 0.0, None)
 
 
 def test_a_threshold_leaves_seconds_where_nothing_more_pays():
     """Two strong places and a faint field: with a threshold between them only the strong ones are shown."""
-    rows, columns = GRID.seat_shape
+    rows, columns = GRID.patch_shape
     scores = np.full((rows, columns), 0.01)
     scores[2, 3:8] = scores[5, 20:24] = 2.0
     plan = plan_fine(GRID, CAMERA, COST, "x", scores.ravel(), budget_s=40.0, threshold=0.5)
     strong = np.flatnonzero(scores.ravel() > 1)
-    assert set(strong) <= set(plan.seats.tolist())
+    assert set(strong) <= set(plan.patch_index.tolist())
     assert plan.spared_s == pytest.approx(40.0 - plan.seconds)
     assert plan.spared_s > 20
     assert plan.threshold == 0.5
@@ -241,7 +245,7 @@ def test_a_threshold_leaves_seconds_where_nothing_more_pays():
     assert all_of_it.seconds > plan.seconds + 5
     assert all_of_it.spared_s is None
     nothing = plan_fine(GRID, CAMERA, COST, "x", scores.ravel(), budget_s=40.0, threshold=1e3)
-    assert (nothing.sweeps, nothing.worth, nothing.spared_s) == ([], 0.0, 40.0)
+    assert (nothing.sweeps, nothing.expected_gain, nothing.spared_s) == ([], 0.0, 40.0)
 
 
 def test_the_full_scan_has_to_pay_as_well():
@@ -257,23 +261,27 @@ def test_the_full_scan_has_to_pay_as_well():
 @settings(max_examples=5, deadline=None)
 @given(st.integers(0, 99), st.floats(5, 40))
 def test_negative_scores_ride_along_and_change_nothing(seed: int, budget_s: float):
-    """The plan is that of scores of 0 in their place: negative seats are shown by runs made for others alone."""
+    """The plan is that of scores of 0 in their place: negative patches are shown by runs made for others alone."""
     scores = drawn(GRID, seed)
     gone = np.random.default_rng(seed).random(len(scores)) < 0.5
     negative, nothing = np.where(gone, -scores, scores), np.where(gone, 0.0, scores)
     one, other = (plan_fine(GRID, CAMERA, COST, "x", s, budget_s=budget_s, threshold=0.1) for s in (negative, nothing))
-    assert (one.sweeps, one.worth, one.seats.tolist()) == (other.sweeps, other.worth, other.seats.tolist())
+    assert (one.sweeps, one.expected_gain, one.patch_index.tolist()) == (
+        other.sweeps,
+        other.expected_gain,
+        other.patch_index.tolist(),
+    )
     for sweep in one.sweeps:
-        assert nothing[covered_seats(GRID, CAMERA, [sweep])].max() > 0
+        assert nothing[covered_patches(GRID, CAMERA, [sweep])].max() > 0
 
 
 def test_a_threshold_counts_scores_beside_an_infinite_one():
     """Where a score is +inf the threshold still stands for the finite scores as they were given."""
-    rows, columns = GRID.seat_shape
+    rows, columns = GRID.patch_shape
     scores = np.full((rows, columns), 0.001)
     scores[1, 4], scores[5, 10:15] = np.inf, 8.0
     plan = plan_fine(GRID, CAMERA, COST, "x", scores.ravel(), budget_s=40.0, threshold=1.0)
-    assert {columns + 4, *(5 * columns + np.arange(10, 15)).tolist()} <= set(plan.seats.tolist())
+    assert {columns + 4, *(5 * columns + np.arange(10, 15)).tolist()} <= set(plan.patch_index.tolist())
     assert plan.spared_s is not None
     few = plan_fine(GRID, CAMERA, COST, "x", scores.ravel(), budget_s=40.0, threshold=12.0)
-    assert columns + 4 in few.seats
+    assert columns + 4 in few.patch_index

@@ -85,10 +85,10 @@ def test_budgets_that_cannot_be_met_are_refused(budget: float, coarse_s: float, 
 
 
 @given(st.floats(1, 500), st.floats(0.01, 1))
-def test_the_least_budget_is_accepted_and_is_the_least(full: float, share: float):
+def test_the_least_budget_is_accepted_and_is_the_least(full: float, fraction: float):
     """It pays for the coarse pass, and one step of the last digit less does not."""
     assert check_budget(1.0, 56.93, 200.0) == pytest.approx(143.07)
-    least = least_budget(full * share, full)
-    assert 0 <= check_budget(min(least, 1.0), full * share, full) <= full * 1.01e-4
+    least = least_budget(full * fraction, full)
+    assert 0 <= check_budget(min(least, 1.0), full * fraction, full) <= full * 1.01e-4
     with pytest.raises(BudgetError, match=f"the least possible is {least}"):
-        check_budget(least - 1.01e-4, full * share, full)
+        check_budget(least - 1.01e-4, full * fraction, full)

@@ -19,8 +19,8 @@ from pipeline.products.areas import (
     count_classes,
     dose_cells,
     pixel_axes,
-    probable_shares,
-    stratified_shares,
+    probable_fractions,
+    stratified_fractions,
 )
 
 # Olofsson et al. 2014, table 8: rows are mapped classes there, columns what the reference says
@@ -32,8 +32,8 @@ TRANSFORM = Affine(0.5, 0.0, 400_000.0, 0.0, -0.5, 5_000_000.0)
 
 def test_the_stratified_estimate_is_that_of_its_paper() -> None:
     """Deforestation: 21158 ha with a 95 % interval of 6158 ha, as printed there."""
-    found = stratified_shares(MAPPED, EXAMPLE.T)
-    hectares = found.shares * 1e7 * HECTARES_A_PIXEL
+    found = stratified_fractions(MAPPED, EXAMPLE.T)
+    hectares = found.fractions * 1e7 * HECTARES_A_PIXEL
     errors = 1.96 * found.errors * 1e7 * HECTARES_A_PIXEL
     assert hectares[0] == pytest.approx(21_158, abs=1)
     assert errors[0] == pytest.approx(6_158, abs=2)
@@ -43,10 +43,10 @@ def test_the_stratified_estimate_is_that_of_its_paper() -> None:
 def test_a_mapped_class_that_was_not_judged_says_nothing() -> None:
     """NaN instead of a number; one that is not mapped either takes nothing from the others. Sizes that differ raise."""
     counts = np.array([[5, 0, 0], [1, 0, 0], [0, 0, 0]])
-    assert np.isnan(stratified_shares([0.5, 0.5, 0.0], counts).shares).all()
-    np.testing.assert_allclose(stratified_shares([1.0, 0.0, 0.0], counts).shares, [5 / 6, 1 / 6, 0])
+    assert np.isnan(stratified_fractions([0.5, 0.5, 0.0], counts).fractions).all()
+    np.testing.assert_allclose(stratified_fractions([1.0, 0.0, 0.0], counts).fractions, [5 / 6, 1 / 6, 0])
     with pytest.raises(ShapeError, match="2 classes and a confusion matrix"):
-        stratified_shares([0.5, 0.5], counts)
+        stratified_fractions([0.5, 0.5], counts)
 
 
 def test_errors_by_probability_are_those_of_draws() -> None:
@@ -56,16 +56,16 @@ def test_errors_by_probability_are_those_of_draws() -> None:
     first = np.kron(blocks, np.ones((BLOCK_PX, BLOCK_PX)))
     probability = np.stack([first, 1 - first], axis=-1)
     probability[:3, :3] = np.nan
-    found = probable_shares([probability[:BLOCK_PX], probability[BLOCK_PX:]], 2)
+    found = probable_fractions([probability[:BLOCK_PX], probability[BLOCK_PX:]], 2)
     known = np.isfinite(first) & ~np.isnan(probability[..., 0])
     drawn = []
     for _ in range(4000):
         went = np.kron(rng.uniform(0, 1, blocks.shape) < blocks, np.ones((BLOCK_PX, BLOCK_PX)))
         drawn.append(went[known].mean())
-    assert found.shares[0] == pytest.approx(np.mean(drawn), abs=0.005)
+    assert found.fractions[0] == pytest.approx(np.mean(drawn), abs=0.005)
     assert found.errors[0] == pytest.approx(np.std(drawn), rel=0.06)
     assert found.errors[0] == pytest.approx(found.errors[1])
-    assert np.isnan(probable_shares([], 2).shares).all()
+    assert np.isnan(probable_fractions([], 2).fractions).all()
 
 
 @given(st.floats(0, 360), st.integers(0, 9), st.floats(0.4, 7))
@@ -98,8 +98,8 @@ def test_axes_turn_back(degrees: float) -> None:
     np.testing.assert_allclose(Heading(90).to_axes(x, y), np.stack([x, -y], axis=-1), atol=1e-9)
 
 
-def test_doses_go_by_share() -> None:
-    """The greatest dose of the classes above the share, 0 where none is, NaN where nothing is known."""
+def test_doses_go_by_fraction() -> None:
+    """The greatest dose of the classes above the fraction, 0 where none is, NaN where nothing is known."""
     counts = np.array([[[8, 2, 0], [9, 0, 1], [4, 3, 3], [0, 0, 0]]])
     found = dose_cells(counts, {1: 2.0, 2: 5.0}, 0.15)
     np.testing.assert_array_equal(found, [[2.0, 0.0, 5.0, np.nan]])

@@ -12,8 +12,8 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Axis, Sweep
 from pipeline.planning.coverage import on_scene
 from pipeline.rectify.calibrate import calibrate
+from pipeline.rectify.geolocation import geolocation, grid_points
 from pipeline.rectify.kernels import Kernel
-from pipeline.rectify.lookup import grid_points, lookup
 from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
 from pipeline.rectify.resample import resample
 from pipeline.simulator.effects.registry import effects_on
@@ -71,7 +71,7 @@ def waves(shape: tuple[int, int], period_px: tuple[float, float], slope: float, 
 
 def rectified(
     scene: Waves,
-    strips: list[float],
+    swaths: list[float],
     along: Axis,
     *,
     step: int = 1,
@@ -83,16 +83,16 @@ def rectified(
     ``spoil`` overwrites every sample that looks off the scene and marks it as not valid.
     """
     shape = (scene.shape[0] // step, scene.shape[1] // step)
-    parts = [rectified_strip(scene, strip, along, step=step, kernel=kernel, spoil=spoil) for strip in strips]
+    parts = [rectified_swath(scene, swath, along, step=step, kernel=kernel, spoil=spoil) for swath in swaths]
     y, x = (axis.ravel() * step + (step - 1) / 2 for axis in np.mgrid[: shape[0], : shape[1]])
     truth = scene.field_of(y, x, scene.damping(along, step))
     return mosaic(parts)[0].reshape(*shape, 2), truth.reshape(*shape, 2)
 
 
-def rectified_strip(scene: Waves, strip: float, along: Axis, *, step: int, kernel: Kernel, spoil: bool) -> MosaicPart:
+def rectified_swath(scene: Waves, swath: float, along: Axis, *, step: int, kernel: Kernel, spoil: bool) -> MosaicPart:
     """One sweep on the grid of the scene: captured, calibrated, looked up, resampled."""
     source = SimulatedSource(scene.pixels(), Rig(CAMERA), chosen=effects_on("rotation", "slit", "smear"))
-    sweep = sweep_over(scene, strip, along, step)
+    sweep = sweep_over(scene, swath, along, step)
     lines = list(source.lines(sweep))
     raw = np.stack([line.data for line in lines])
     position = np.array([(line.mirror_x, line.mirror_y) for line in lines])
@@ -102,28 +102,28 @@ def rectified_strip(scene: Waves, strip: float, along: Axis, *, step: int, kerne
         values[~inside], valid = np.nan, valid & inside
     origin = (step - scene.shape[0]) / 2, (step - scene.shape[1]) / 2
     points = grid_points(origin, step, (scene.shape[0] // step, scene.shape[1] // step)).reshape(-1, 2)
-    at = lookup(position, CAMERA, points, along=along, binning=step)
+    at = geolocation(position, CAMERA, points, along=along, binning=step)
     return MosaicPart(*resample(values, valid, at, kernel), edge_distance(at, raw.shape[0], raw.shape[1]))
 
 
-def sweep_over(scene: Waves, strip: float, along: Axis, step: int) -> Sweep:
+def sweep_over(scene: Waves, swath: float, along: Axis, step: int) -> Sweep:
     """A strip with a margin for the line's rotation and the kernel's taps."""
     length = scene.shape[0] if along == "x" else scene.shape[1]
-    margin = (3 + int(abs(strip) * 330 * CAMERA.ifov_rad / step)) * step
+    margin = (3 + int(abs(swath) * 330 * CAMERA.ifov_rad / step)) * step
     lines = (length + 2 * margin) // step
-    return Sweep(f"strip {strip}", "fine", along, strip, -(length - 1) / 2 - margin, lines, step, step)
+    return Sweep(f"strip {swath}", "fine", along, swath, -(length - 1) / 2 - margin, lines, step, step)
 
 
-def share_of_spread(
-    scene: Waves, strips: list[float], along: Axis, *, step: int = 1, kernel: Kernel = "catmull-rom"
+def fraction_of_spread(
+    scene: Waves, swaths: list[float], along: Axis, *, step: int = 1, kernel: Kernel = "catmull-rom"
 ) -> float:
     """Error of the mosaic over the standard deviation of its truth; every pixel must have a value."""
-    got, truth = rectified(scene, strips, along, step=step, kernel=kernel)
+    got, truth = rectified(scene, swaths, along, step=step, kernel=kernel)
     return float(np.sqrt(((got - truth) ** 2).mean()) / truth.std(axis=(0, 1)).mean())
 
 
 @pytest.mark.parametrize(
-    ("shape", "along", "strips", "periods", "slope", "step"),
+    ("shape", "along", "swaths", "periods", "slope", "step"),
     [
         ((120, 900), "x", [-200, 200], (4, 40), 1.0, 1),
         ((900, 120), "y", [-200, 200], (4, 40), 1.0, 1),
@@ -133,10 +133,10 @@ def share_of_spread(
     ],
 )
 def test_mosaic_meets_the_analytic_scene(
-    shape: tuple[int, int], along: Axis, strips: list[float], periods: tuple[float, float], slope: float, step: int
+    shape: tuple[int, int], along: Axis, swaths: list[float], periods: tuple[float, float], slope: float, step: int
 ) -> None:
     """Waves with the fall of natural scenes, or none, come back within 0.5 % of their spread, seams included."""
-    assert share_of_spread(waves(shape, periods, slope), strips, along, step=step) < 0.005
+    assert fraction_of_spread(waves(shape, periods, slope), swaths, along, step=step) < 0.005
 
 
 def test_samples_off_the_scene_count_nothing() -> None:
@@ -152,6 +152,6 @@ def test_samples_off_the_scene_count_nothing() -> None:
 def test_kernels_rank_by_taps() -> None:
     """Catmull-Rom beats bilinear beats nearest, each by a factor of at least 2.5."""
     scene = waves((60, 900), (4, 40), slope=1.0)
-    errors = [share_of_spread(scene, [-200, 200], "x", kernel=k) for k in ("catmull-rom", "bilinear", "nearest")]
+    errors = [fraction_of_spread(scene, [-200, 200], "x", kernel=k) for k in ("catmull-rom", "bilinear", "nearest")]
     assert errors[0] * 2.5 < errors[1]
     assert errors[1] * 2.5 < errors[2]

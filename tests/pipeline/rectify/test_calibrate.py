@@ -19,16 +19,16 @@ from pipeline.source import References
 
 
 def frames(samples: int = 4, bands: int = 3) -> References:
-    """References with a dark of 60 DN, a white of 1060 DN and a panel of value 2."""
+    """References with a dark of 60 DN, a white of 1060 DN and a white reference of value 2."""
     return References(
         dark=np.full((samples, bands), 60, np.float32),
         white=np.full((samples, bands), 1060, np.float32),
-        panel=np.full(bands, 2, np.float32),
+        white_reference=np.full(bands, 2, np.float32),
     )
 
 
 def test_hand_worked_values() -> None:
-    """Dark is 0, white is the panel, a quarter of the way is a quarter of the panel; below dark is negative."""
+    """Dark is 0, white is the white reference, a quarter of the way is a quarter of the white reference; below dark is negative."""
     raw = np.tile(np.array([60, 1060, 310, 10], np.uint16)[None, :, None], (2, 1, 3))
     values = reflectance(raw, frames())
     assert values.dtype == np.float32
@@ -183,7 +183,7 @@ def test_references_of_another_binning_are_refused() -> None:
     with pytest.raises(ShapeError, match=r"8 samples and 3 bands, the dark frame \(4, 3\); take references"):
         calibrate(np.zeros((1, 8, 3), np.uint16), frames(), saturated_dn=4095)
     bad = References(frames().dark, frames().white, np.ones(5, np.float32))
-    with pytest.raises(ShapeError, match=r"3 bands, the panel \(5,\)"):
+    with pytest.raises(ShapeError, match=r"3 bands, the white reference \(5,\)"):
         reflectance(np.zeros((1, 4, 3), np.uint16), bad)
     with pytest.raises(ShapeError, match=r"\(line, sample, band\)"):
         reflectance(np.zeros((4, 3), np.uint16), frames())

@@ -109,7 +109,7 @@ def test_drift_between_captured_sweeps_is_taken_out():
 
     told = {name: getattr(other, name) for name in ("sweep", "references", "position", "time_s", "valid_line")}
     placed = [place(plain, camera), place(SimpleNamespace(**told, read=read), camera)]  # type: ignore[arg-type]
-    low, high = sweeps[1].strip_px - 59, sweeps[0].strip_px + 59
+    low, high = sweeps[1].swath_px - 59, sweeps[0].swath_px + 59
     (ratio,) = overlap_light(placed, camera, [Window(0, 1, (low, high), (-45.0, 45.0))])
     found = solve_lights([ratio], 2, scene.wavelength_nm)
     np.testing.assert_allclose(found.light[1] / found.light[0], light * 0.8, rtol=5e-3)

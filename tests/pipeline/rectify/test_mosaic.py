@@ -19,7 +19,7 @@ from pipeline.geometry.scan import Sweep
 from pipeline.planning.coverage import full_sweeps
 from pipeline.rectify.mosaic import LineCache, MosaicPart, edge_distance, mosaic
 from pipeline.rectify.placed import place
-from pipeline.rectify.region import mosaic_rows, read_every_seat, read_seats, seat_pixels
+from pipeline.rectify.region import mosaic_rows, patch_pixels, read_every_patch, read_patches
 from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
@@ -58,9 +58,9 @@ def test_spectra_are_convex_mixtures(seeds: list[int]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("weight", "edge_px", "share"), [((1, 1), (30.0, 10.0), 0.75), ((0.8, 1), (20.0, 20.0), 0.8 / 1.8)]
+    ("weight", "edge_px", "fraction"), [((1, 1), (30.0, 10.0), 0.75), ((0.8, 1), (20.0, 20.0), 0.8 / 1.8)]
 )
-def test_weights_are_those_of_resampling_and_edge(weight: tuple, edge_px: tuple, share: float) -> None:
+def test_weights_are_those_of_resampling_and_edge(weight: tuple, edge_px: tuple, fraction: float) -> None:
     """A point counts by its distance to the sweep's edge, and by how much of the kernel was there."""
     ones, zeros = np.ones((1, 2), np.float32), np.zeros((1, 2), np.float32)
     parts = [
@@ -68,7 +68,7 @@ def test_weights_are_those_of_resampling_and_edge(weight: tuple, edge_px: tuple,
         for values, of, edge in zip((ones, zeros), weight, edge_px, strict=True)
     ]
     values, coverage = mosaic(parts)
-    np.testing.assert_allclose(values, share, rtol=1e-6)
+    np.testing.assert_allclose(values, fraction, rtol=1e-6)
     assert coverage.tolist() == [2]
 
 
@@ -128,7 +128,7 @@ def smooth_scene(shape: tuple[int, int], bands: int = 2) -> RasterScene:
     return raster_from_values(values, CAMERA, name="waves", wavelength_nm=np.linspace(500, 700, bands))
 
 
-def looked_at(scene: RasterScene, sweeps: list[Sweep]) -> list[SimulatedSweep]:
+def viewed(scene: RasterScene, sweeps: list[Sweep]) -> list[SimulatedSweep]:
     """The sweeps without noise."""
     source = SimulatedSource(scene, Rig(CAMERA), 0, effects_on("rotation", "slit", "smear"))
     return [SimulatedSweep(source, sweep) for sweep in sweeps]
@@ -139,7 +139,7 @@ def test_fine_mosaic_is_the_scene_behind_the_footprint(along: str) -> None:
     """In either orientation a full scan gives the scene convolved with slit and pixel, to a percent of its range."""
     scene = smooth_scene((70, 90))
     grid = SceneGrid(70, 90, 16, 4)
-    sweeps = looked_at(scene, full_sweeps(grid, CAMERA, along))  # type: ignore[arg-type]
+    sweeps = viewed(scene, full_sweeps(grid, CAMERA, along))  # type: ignore[arg-type]
     seen = np.concatenate([values for _, values, _ in mosaic_rows(sweeps, CAMERA, grid, rows=32)])
     truth = footprint(scene.values(), CAMERA)
     if along == "y":  # the slit then lies along y and the scan goes along x
@@ -148,19 +148,19 @@ def test_fine_mosaic_is_the_scene_behind_the_footprint(along: str) -> None:
     assert np.abs(seen[inner] - truth[inner]).max() < 0.01 * np.ptp(truth)
 
 
-def test_seats_are_windows_of_the_mosaic() -> None:
-    """A seat read by itself holds the mosaic's own pixels; placed once, with lines kept, none is read twice."""
+def test_patches_are_windows_of_the_mosaic() -> None:
+    """A patch read by itself holds the mosaic's own pixels; placed once, with lines kept, none is read twice."""
     grid = SceneGrid(150, 100, 10, 2)
-    sweeps = looked_at(smooth_scene((150, 100)), full_sweeps(grid, CAMERA, "x"))
+    sweeps = viewed(smooth_scene((150, 100)), full_sweeps(grid, CAMERA, "x"))
     mosaic = np.concatenate([values for _, values, _ in mosaic_rows(sweeps, CAMERA, grid, rows=64)])
-    seats = grid.valid_seats()
-    plain, valid = read_seats(sweeps, CAMERA, grid, seats)
+    patch_index = grid.valid_patches()
+    plain, valid = read_patches(sweeps, CAMERA, grid, patch_index)
     np.testing.assert_array_equal(plain, mosaic.reshape(15, 10, 10, 10, -1).swapaxes(1, 2).reshape(150, 10, 10, -1))
     assert valid.all()
     placed, cache = [place(lines, CAMERA) for lines in sweeps], LineCache(2**30)
-    for first in range(0, len(seats), 7):
+    for first in range(0, len(patch_index), 7):
         part = slice(first, first + 7)
-        values, seen = read_seats(placed, CAMERA, grid, seats[part], cache=cache)
+        values, seen = read_patches(placed, CAMERA, grid, patch_index[part], cache=cache)
         np.testing.assert_array_equal(values, plain[part])
         np.testing.assert_array_equal(seen, valid[part])
     assert cache.reads == sum(-(-lines.sweep.lines // 64) for lines in sweeps)
@@ -168,31 +168,31 @@ def test_seats_are_windows_of_the_mosaic() -> None:
 
 @pytest.mark.parametrize("along", ["x", "y"])
 @pytest.mark.parametrize("shape", [(150, 100), (83, 61)])
-def test_every_seat_at_once_is_each_by_itself(along: str, shape: tuple[int, int]) -> None:
-    """Rows of seats, or columns of them, hold what each seat holds, at the border of the scene too; bit for bit."""
+def test_every_patch_at_once_is_each_by_itself(along: str, shape: tuple[int, int]) -> None:
+    """Rows of patches, or columns of them, hold what each patch holds, at the border of the scene too; bit for bit."""
     grid = SceneGrid(*shape, 10, 2)
     sweeps = full_sweeps(grid, CAMERA, along)  # type: ignore[arg-type]
-    short = [replace(sweep, lines=sweep.lines * 2 // 3) for sweep in sweeps]  # seats that nothing shows
-    placed = [place(lines, CAMERA) for lines in looked_at(smooth_scene(shape), short)]
-    seats = grid.valid_seats()
-    row, column = np.divmod(seats, grid.seat_shape[1])
-    ordered = seats[np.lexsort((column, row) if along == "x" else (row, column))]
+    short = [replace(sweep, lines=sweep.lines * 2 // 3) for sweep in sweeps]  # patches that nothing shows
+    placed = [place(lines, CAMERA) for lines in viewed(smooth_scene(shape), short)]
+    patch_index = grid.valid_patches()
+    row, column = np.divmod(patch_index, grid.patch_shape[1])
+    ordered = patch_index[np.lexsort((column, row) if along == "x" else (row, column))]
     values, seen = (
-        np.concatenate(parts) for parts in zip(*read_every_seat(placed, CAMERA, grid, most_bytes=1 << 30), strict=True)
+        np.concatenate(parts) for parts in zip(*read_every_patch(placed, CAMERA, grid, most_bytes=1 << 30), strict=True)
     )
-    one_by_one, valid = read_seats(placed, CAMERA, grid, ordered)
+    one_by_one, valid = read_patches(placed, CAMERA, grid, ordered)
     np.testing.assert_array_equal(values, one_by_one)
     np.testing.assert_array_equal(seen, valid)
     assert not valid.all()
 
 
-def test_a_partial_seat_is_filled_from_inside() -> None:
-    """Pixels beyond the scene repeat pixels of the same seat and are marked as not on the scene."""
+def test_a_partial_patch_is_filled_from_inside() -> None:
+    """Pixels beyond the scene repeat pixels of the same patch and are marked as not on the scene."""
     grid = SceneGrid(12, 21, 8, 2)
-    seats = grid.valid_seats()
-    points, inside = seat_pixels(grid, seats)
+    patch_index = grid.valid_patches()
+    points, inside = patch_pixels(grid, patch_index)
     assert inside.sum() == 12 * 21
-    origin = grid.seat_origin(seats)[:, None, None, :]
+    origin = grid.patch_origin(patch_index)[:, None, None, :]
     place = points + (np.array([12, 21]) - 1) / 2
     assert (place >= origin).all()
     assert (place <= np.array([11, 20])).all()

@@ -22,7 +22,7 @@ from pipeline.rectify.registration.seams import Registration, place_images, regi
 from pipeline.simulator.effects.pointing import PointingErrors
 from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.scene import SceneLight, raster_from_values
+from pipeline.simulator.scenes.scene import SceneRadiance, raster_from_values
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from tests.pipeline.simulator.small_scenes import seen_at
 
@@ -134,7 +134,7 @@ def test_saturated_samples_are_left_out(factor: int):
     values = np.full((GRID.height, GRID.width, 1), 1.0)
     values[100:140, 120:180] = 2.0  # 60 % of the full well
     scene = raster_from_values(values, CAMERA, name="t", wavelength_nm=np.array([600.0]))
-    bright = replace(scene, light=Once.of(SceneLight(scene.electrons * 2.4, scene.panel_electrons)))
+    bright = replace(scene, light=Once.of(SceneRadiance(scene.electrons * 2.4, scene.white_reference_electrons)))
     sweep = Sweep("s", "fine", "x", 0.0, -40.0, 80 // factor, factor, factor)
     broad = BroadSweep.read(
         SimulatedSweep(SimulatedSource(bright, Rig(CAMERA), 0, effects_on("rotation")), sweep), CAMERA
@@ -154,7 +154,7 @@ def test_bands_that_few_samples_have_take_no_part():
     assert broad_bands(replace(references, white=white)).tolist() == [0, 1, 2, 3]
 
 
-def test_turn_is_how_places_move_with_the_strip():
+def test_turn_is_how_places_move_with_the_swath():
     """Far off the axis the turn says where a sample looks when its strip lies a little further along."""
     sweep = Sweep("s", "fine", "x", 1500.0, -900.0, 3)
     broad = BroadSweep.read(SimulatedSweep(source_of(), sweep), CAMERA)

@@ -37,7 +37,7 @@ def waves(seed: int, shape: tuple[int, int], shift: np.ndarray, snr: float, peri
 
 
 def crop_rows(seed: int, shape: tuple[int, int], shift: np.ndarray, gaps: float, snr: float = 50) -> Field:
-    """Two views of rows 12 px apart, a share ``gaps`` of their length bare."""
+    """Two views of rows 12 px apart, a fraction ``gaps`` of their length bare."""
     rng = np.random.default_rng(seed)
     count, length = shape[1] // 12 + 12, shape[0] + 120
     stand = np.ones((count, length))

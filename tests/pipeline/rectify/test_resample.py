@@ -49,11 +49,11 @@ def test_is_the_sum_written_out(kernel: Kernel, by_element: bool) -> None:
         valid = valid[..., None] & (rng.random((9, 8, 5)) > 0.1)
     values[~valid] = np.nan
     at = rng.uniform(-1.5, 10, (400, 2))
-    out, share = resample(values, valid, at, kernel)
+    out, fraction = resample(values, valid, at, kernel)
     wanted, weight = by_hand(values, valid, at, kernel)
     sure = np.abs(weight - 0.5) > 1e-5
     np.testing.assert_allclose(out[sure], wanted[sure], rtol=1e-4, atol=1e-5)
-    np.testing.assert_array_equal(share > 0, np.isfinite(out).any(axis=1))
+    np.testing.assert_array_equal(fraction > 0, np.isfinite(out).any(axis=1))
 
 
 @given(arrays(np.bool_, (9, 8)), st.floats(-1, 9), st.floats(-1, 8))
@@ -62,18 +62,18 @@ def test_constant_stays_constant_under_any_mask(valid: np.ndarray, line: float, 
     """Renormalised taps keep a constant, whichever samples are missing, or fail with weight 0."""
     values = np.full((9, 8, 2), 3.5, np.float32)
     values[~valid] = np.nan
-    out, share = resample(values, valid, np.array([[line, sample]]))
-    assert np.isnan(out).all() == (share[0] == 0)
-    assert share[0] == 0 or (share[0] >= 0.5 and np.allclose(out, 3.5, rtol=1e-5))
+    out, fraction = resample(values, valid, np.array([[line, sample]]))
+    assert np.isnan(out).all() == (fraction[0] == 0)
+    assert fraction[0] == 0 or (fraction[0] >= 0.5 and np.allclose(out, 3.5, rtol=1e-5))
 
 
 def test_pixel_centres_come_back_unchanged() -> None:
     """At pixel centres resampling is the identity."""
     values = np.random.default_rng(1).random((7, 9, 3), np.float32)
     for kernel in KERNELS:
-        out, share = resample(values, np.ones((7, 9), bool), everywhere(7, 9), kernel)
+        out, fraction = resample(values, np.ones((7, 9), bool), everywhere(7, 9), kernel)
         np.testing.assert_array_equal(out.reshape(values.shape), values)
-        assert (share == 1).all()
+        assert (fraction == 1).all()
 
 
 def test_catmull_rom_keeps_parabolas() -> None:
@@ -92,11 +92,11 @@ def test_result_does_not_depend_on_the_blocks(kernel: Kernel, bands: int) -> Non
     rng = np.random.default_rng(13)
     values, valid = rng.random((14, 15, bands), np.float32), rng.random((14, 15, bands)) > 0.01
     at = rng.uniform(-1, 15, (BLOCK_PX + 300, 2))
-    out, share = resample(values, valid, at, kernel)
+    out, fraction = resample(values, valid, at, kernel)
     order = rng.permutation(len(at))
-    shuffled, shuffled_share = resample(values, valid, at[order], kernel)
+    shuffled, shuffled_fraction = resample(values, valid, at[order], kernel)
     np.testing.assert_array_equal(shuffled, out[order])
-    np.testing.assert_array_equal(shuffled_share, share[order])
+    np.testing.assert_array_equal(shuffled_fraction, fraction[order])
     for point in (*range(60), BLOCK_PX - 1, BLOCK_PX, len(at) - 1):
         np.testing.assert_array_equal(resample(values, valid, at[point : point + 1], kernel)[0], out[[point]])
 
@@ -106,11 +106,11 @@ def test_raw_numbers_come_back_as_they_are() -> None:
     values = np.random.default_rng(14).integers(0, 65_536, (6, 7, 3), dtype=np.uint16)
     valid = np.ones((6, 7), bool)
     valid[2, 2] = False
-    out, share = resample(values, valid, np.concatenate([everywhere(6, 7, 0.3), [[-3, 0], [np.nan, 1]]]), "nearest")
+    out, fraction = resample(values, valid, np.concatenate([everywhere(6, 7, 0.3), [[-3, 0], [np.nan, 1]]]), "nearest")
     assert out.dtype == np.uint16
     np.testing.assert_array_equal(out[:42].reshape(6, 7, 3)[valid], values[valid])
     failed = [2 * 7 + 2, 42, 43]
-    assert np.flatnonzero(share == 0).tolist() == failed
+    assert np.flatnonzero(fraction == 0).tolist() == failed
     assert not out[failed].any()
 
 

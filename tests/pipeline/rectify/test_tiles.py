@@ -14,7 +14,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.rectify.kernels import kernel_taps
 from pipeline.rectify.mosaic import LineCache, cut_runs
-from pipeline.rectify.placed import PixelGrid, Placed, TrackReach, place
+from pipeline.rectify.placed import PixelGrid, Placed, ScanPathReach, place
 from pipeline.rectify.region import cache_bytes, mosaic_tile, plan_tiles
 from pipeline.source import References
 
@@ -72,7 +72,7 @@ def in_tiles(
     placed: list[Placed], grid: PixelGrid, shape: tuple[int, int], cache: LineCache | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """A grid's values and coverage, made in tiles of this shape."""
-    values = np.zeros((*grid.shape, len(placed[0].lines.references.panel)), np.float32)
+    values = np.zeros((*grid.shape, len(placed[0].lines.references.white_reference)), np.float32)
     coverage = np.zeros(grid.shape, np.intp)
     for tile in plan_tiles(placed, CAMERA, grid, shape):
         at = tile.rows, tile.columns
@@ -91,7 +91,7 @@ def partly_lit(lines: Taken) -> Taken:
 
 def two_turned(grid: PixelGrid | None) -> list[Placed]:
     """Two overlapping sweeps of turned lines with all kinds of faults, one by a slit lit in parts."""
-    other = replace(TURNED, name="other", strip_px=-4600.0, start_px=3010.0)
+    other = replace(TURNED, name="other", swath_px=-4600.0, start_px=3010.0)
     gain = np.array([1.0, 0.9, 1.1], np.float32)
     return [
         place(taken(TURNED, faults=True), CAMERA, grid=grid, gain=gain),
@@ -170,27 +170,27 @@ def test_reach_is_never_too_little(row: int, column: int, height: int, width: in
     grid = PixelGrid(CORNER, 1, (400, 400))
     placed = place(taken(TURNED, bands=1), CAMERA)
     rows, columns = slice(row, row + height), slice(column, column + width)
-    track = placed.tracks[0][0]
+    scan_path = placed.scan_paths[0][0]
     at = placed.coordinates(0, CAMERA, grid, rows, columns).reshape(-1, 2)
     at = at[np.isfinite(at[:, 0])]
-    near = TrackReach(placed, track, CAMERA, grid).in_columns(columns)
+    near = ScanPathReach(placed, scan_path, CAMERA, grid).in_columns(columns)
     if len(at):
         assert near is not None
         knots = near.knots(rows)
         assert max(knots.start, 0) <= max(at[:, 0].min() - 2, 0)
-        assert knots.stop >= min(at[:, 0].max() + 3, len(track))
+        assert knots.stop >= min(at[:, 0].max() + 3, len(scan_path))
         assert near.samples.start <= max(at[:, 1].min() - 2, 0)
         assert near.samples.stop >= min(at[:, 1].max() + 3, CAMERA.samples)
 
 
 def test_turned_lines_are_cut_into_short_runs() -> None:
     """A long tile of lines turned by 30 degrees is cut so that less than half as much is calibrated; upright is not."""
-    for tilt, most_share, runs in ((np.tan(np.pi / 6), 0.5, range(4, 20)), (0.0, 1.0, range(1, 2))):
+    for tilt, most_fraction, runs in ((np.tan(np.pi / 6), 0.5, range(4, 20)), (0.0, 1.0, range(1, 2))):
         y, x = np.mgrid[:64, :640]
         place_of = np.stack([y + tilt * x, x - tilt * y], axis=-1).reshape(64, 20, 32, 2).swapaxes(0, 1)
         cuts = cut_runs([place_of], 270)
         areas = [np.prod(np.ptp(place_of[cut].reshape(-1, 2), axis=0)) for cut in cuts]
-        assert sum(areas) <= most_share * np.prod(np.ptp(place_of.reshape(-1, 2), axis=0))
+        assert sum(areas) <= most_fraction * np.prod(np.ptp(place_of.reshape(-1, 2), axis=0))
         assert len(cuts) in runs
         assert np.concatenate([np.arange(20)[cut] for cut in cuts]).tolist() == list(range(20))
 
@@ -288,7 +288,7 @@ def test_a_sweep_that_turns_is_two_sweeps() -> None:
         taken(replace(there.sweep, start_px=0.0, lines=120)), position=path, sweep=replace(there.sweep, lines=120)
     )
     placed = place(both, CAMERA)
-    each = [replace(placed, tracks=(track,)) for track in placed.tracks]
+    each = [replace(placed, scan_paths=(scan_path,)) for scan_path in placed.scan_paths]
     grid = PixelGrid((-20.0, -60.0), 1, (40, 120))
     expected = in_tiles(each, grid, (64, 640))
     assert (expected[1][5:-5, 5:-5] == 2).all()

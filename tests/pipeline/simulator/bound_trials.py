@@ -8,7 +8,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from pipeline.simulator.effects.effect import OFF, Effect, Light, SweepBlock
+from pipeline.simulator.effects.effect import OFF, Effect, Radiance, SweepBlock
 from pipeline.simulator.effects.probe import noise_electrons
 from pipeline.simulator.effects.registry import EFFECTS, READOUT
 from pipeline.simulator.render import expected_light
@@ -18,8 +18,8 @@ from pipeline.simulator.selection.verification import (
     TAILS_PX,
     contrast_about,
     misplaced_electrons,
-    misplaced_share,
-    tails_share,
+    misplaced_fraction,
+    tails_fraction,
 )
 from tests.pipeline.simulator.random_cases import Case
 
@@ -59,17 +59,19 @@ class _Stored:
 
     binning: int
     menus: tuple[Menu, ...]
-    noise: list[Light]  # of each block with everything on, of the sums (line, number, band) [e-]
-    contrast: list[Light]  # of the scene about each sum (1, number, band) [e-]
+    noise: list[Radiance]  # of each block with everything on, of the sums (line, number, band) [e-]
+    contrast: list[Radiance]  # of the scene about each sum (1, number, band) [e-]
     rounding: float
 
-    def change(self, light: list[Light], full: list[Light], share: float, tails: list[Light]) -> tuple[float, float]:
+    def change(
+        self, light: list[Radiance], full: list[Radiance], fraction: float, tails: list[Radiance]
+    ) -> tuple[float, float]:
         """Greatest change of a stored number in its own sigmas, and what of it arithmetic does not explain."""
         most, left = 0.0, 0.0
         every = zip(light, full, self.noise, self.contrast, tails, strict=True)
         for one, other, noise, contrast, tail in every:
             change = np.abs(_summed(one - other, self.binning))
-            misplaced = misplaced_electrons(_summed(other, self.binning), contrast, share)
+            misplaced = misplaced_electrons(_summed(other, self.binning), contrast, fraction)
             misplaced = misplaced + _summed(tail, self.binning)
             most = max(most, float((change / noise).max()))
             left = max(left, float(((change - misplaced) / noise).max()))
@@ -81,15 +83,17 @@ class _Afar:
     """What lies far about the samples of a block; only looked at where tails differ."""
 
     block: SweepBlock
-    render: Callable[..., Light]
+    render: Callable[..., Radiance]
 
     @cached_property
-    def contrast(self) -> Light:
+    def contrast(self) -> Radiance:
         return np.asarray(contrast_about(self.block, self.render, TAILS_PX))
 
-    def of(self, share: Light) -> Light:
+    def of(self, fraction: Radiance) -> Radiance:
         """What tails misplace at each sample, (1, sample, band) [e-]."""
-        return share * self.contrast if share.any() else np.zeros((1, self.block.rig.camera.samples, len(share)))
+        return (
+            fraction * self.contrast if fraction.any() else np.zeros((1, self.block.rig.camera.samples, len(fraction)))
+        )
 
 
 def trials(case: Case, binnings: Sequence[int] = (1,), only: str = "") -> Iterator[Trial]:
@@ -113,26 +117,28 @@ def trials(case: Case, binnings: Sequence[int] = (1,), only: str = "") -> Iterat
             chosen = {effect: variant if effect is menu.effect else way for effect, way in exact.items()}
             light = [_light(case, block, chosen) for block in blocks]
             shown = {one: way for one, way in chosen.items() if way != OFF}
-            share = max(misplaced_share(block, exact, shown) for block in blocks)
-            tails = [far.of(tails_share(block, exact, shown)) for block, far in zip(blocks, afar, strict=True)]
+            fraction = max(misplaced_fraction(block, exact, shown) for block in blocks)
+            tails = [far.of(tails_fraction(block, exact, shown)) for block, far in zip(blocks, afar, strict=True)]
             for one in stored:
                 bound = _error(one.menus, menu.name, variant) / SAFETY
                 yield Trial(
-                    menu.name, variant, one.binning, bound, *one.change(light, full, share, tails), one.rounding
+                    menu.name, variant, one.binning, bound, *one.change(light, full, fraction, tails), one.rounding
                 )
 
 
-def _stored(full: list[Light], contrast: list[Light], case: Case, binning: int, menus: tuple[Menu, ...]) -> _Stored:
+def _stored(
+    full: list[Radiance], contrast: list[Radiance], case: Case, binning: int, menus: tuple[Menu, ...]
+) -> _Stored:
     noise = [np.sqrt(_summed(np.square(noise_electrons(light, case.rig)), binning)) for light in full]
     sums = [_summed(np.abs(light), binning) for light in full]
     level = max(float((light / one).max()) for light, one in zip(sums, noise, strict=True))
     return _Stored(binning, menus, noise, [_summed(one, binning) for one in contrast], ROUNDING * level)
 
 
-def _summed(values: Light, binning: int) -> Light:
+def _summed(values: Radiance, binning: int) -> Radiance:
     """Sums of neighbouring samples, a remainder dropped."""
     count = values.shape[1] // binning
-    sums: Light = values[:, : count * binning].reshape(len(values), count, binning, -1).sum(axis=2)
+    sums: Radiance = values[:, : count * binning].reshape(len(values), count, binning, -1).sum(axis=2)
     return sums
 
 
@@ -141,5 +147,5 @@ def _error(menus: tuple[Menu, ...], name: str, variant: str) -> float:
     return next(option.error for option in (menu.off, *menu.variants) if option.variant == variant)
 
 
-def _light(case: Case, block: SweepBlock, chosen: dict[Effect, str]) -> Light:
+def _light(case: Case, block: SweepBlock, chosen: dict[Effect, str]) -> Radiance:
     return expected_light(case.scene, block, {effect: way for effect, way in chosen.items() if way != OFF})

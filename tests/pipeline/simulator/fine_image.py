@@ -26,7 +26,7 @@ _CYCLES = np.fft.fftfreq(PER_PX * SIZE_PX, 1 / PER_PX)
 ALONG, SCAN = np.meshgrid(_CYCLES, _CYCLES, indexing="ij")  # frequency [1/px]
 _PLACE = np.arange(PER_PX * SIZE_PX) / PER_PX
 BOX = np.sinc(ALONG) * np.sinc(SCAN * LineCamera().slit_px)  # pixel and slit
-SWEEP = Sweep("fine", "fine", "x", strip_px=0.0, start_px=-12.0, lines=24)
+SWEEP = Sweep("fine", "fine", "x", swath_px=0.0, start_px=-12.0, lines=24)
 
 
 def convolved(image: Floats, transfer: NDArray[Any]) -> Floats:

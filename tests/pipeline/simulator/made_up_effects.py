@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.effect import OFF, Bound, Light, SweepBlock
+from pipeline.simulator.effects.effect import OFF, Bound, Radiance, SweepBlock
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Rig
 
@@ -40,12 +40,12 @@ class MadeUp:
 
 @dataclass(frozen=True)
 class Brightening(MadeUp):
-    """Light times 1 + ``share``; ``left_out`` is what its bound says, right or not."""
+    """Light times 1 + ``fraction``; ``left_out`` is what its bound says, right or not."""
 
-    share: float = 0.0
+    fraction: float = 0.0
 
-    def gain(self, block: SweepBlock, variant: str) -> Light:
-        return np.full((1, 1, 1), 1 + self.share, np.float32)
+    def gain(self, block: SweepBlock, variant: str) -> Radiance:
+        return np.full((1, 1, 1), 1 + self.fraction, np.float32)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 WAVELENGTH = np.linspace(400.0, 1000.0, 61)
 BANDS = len(WAVELENGTH)
 CAMERA = LineCamera()
-SWEEP = Sweep("fine", "fine", "x", strip_px=0.0, start_px=-30.0, lines=60)
+SWEEP = Sweep("fine", "fine", "x", swath_px=0.0, start_px=-30.0, lines=60)
 SHAPE = (400, 640)
 NOON, MORNING, NIGHT = (
     datetime(2026, 6, 21, *clock, tzinfo=UTC) for clock in ((11, 22), (5, 34), (0, 20))
@@ -32,10 +32,10 @@ def rig_with(air: Air | None = None, exposure_ms: float = 100.0, **sky: Any) -> 
 
 
 def white_e(exposure_ms: float = 100.0) -> Floats:
-    """Electrons of the white panel in an exposure, (band,): near the farm's."""
+    """Electrons of the white reference in an exposure, (band,): near the farm's."""
     knots = [400, 450, 550, 600, 700, 760, 800, 900, 940, 1000]
     light = np.interp(WAVELENGTH, knots, [0.25, 0.58, 0.95, 1.0, 0.83, 0.6, 0.6, 0.3, 0.1, 0.1])
-    return 0.94 * CAMERA.full_well_e * exposure_ms / 100 * light
+    return 0.94 * CAMERA.full_full_well_e * exposure_ms / 100 * light
 
 
 def materials(exposure_ms: float = 100.0) -> NDArray[np.float32]:

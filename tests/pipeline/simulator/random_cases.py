@@ -20,7 +20,7 @@ from pipeline.lazy import Once
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Air, Coating, Detector, MirrorMotion, Optics, Relief, Rig, Sky
-from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, SceneRadiance, SceneRaster
 from pipeline.simulator.selection.survey_probe import probe_scene
 
 Floats = NDArray[np.float64]
@@ -41,7 +41,7 @@ class Case:
     sweeps: tuple[Sweep, ...]
     seconds: float | None  # from the first line to the last; None is that of the sweeps
     seed: int
-    looked: range | None = None  # lines of every sweep that are measured; None is all
+    observation: range | None = None  # lines of every sweep that are measured; None is all
 
     def stored_in_sums_of(self, binning: int) -> Case:
         """The same, with so many neighbouring samples summed to one number."""
@@ -55,13 +55,13 @@ class Case:
     def blocks(self, probe: Probe) -> list[SweepBlock]:
         """Those lines of every sweep that are measured: the first as the survey starts, the others as it ends."""
         scene, rig = self.scene, self.rig
-        white = scene.panel_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
+        white = scene.white_reference_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
         ends = [0.0, *(probe.seconds - rig.camera.scan_seconds(sweep.lines) for sweep in self.sweeps[1:])]
         return [
             SweepBlock(
                 rig,
                 sweep,
-                self.looked or range(sweep.lines),
+                self.observation or range(sweep.lines),
                 scene.wavelength_nm,
                 scene.shape,
                 seed=self.seed,
@@ -108,13 +108,13 @@ def _scene(rng: np.random.Generator, camera: LineCamera, *, upright: bool, long_
     spectra = np.stack([_spectrum(rng, nm) for _ in range(_COMPONENTS)])
     spectra *= brightest / np.einsum("yxc,cb->yxb", planes[::4, ::4], spectra).max()
     at_default = (DEFAULT_EXPOSURE_MS / camera.exposure_ms * spectra).astype(np.float32)
-    panel = (at_default.sum(axis=0) * rng.uniform(0.5, 2)).astype(np.float32)
+    white_reference = (at_default.sum(axis=0) * rng.uniform(0.5, 2)).astype(np.float32)
     width = rng.choice([0.0, 2.0, 6.0])
     return RasterScene(
         "random",
         "random",
         SceneRaster.of(np.ascontiguousarray(planes, np.float32)),
-        Once.of(SceneLight(at_default, panel)),
+        Once.of(SceneRadiance(at_default, white_reference)),
         np.ones(bands, np.float32),
         nm,
         fwhm_nm=np.full(bands, width) if width else None,
@@ -173,7 +173,7 @@ def _optics(rng: np.random.Generator, distance_m: float | None) -> Optics:
         keystone_px=_some(rng, 0.02, 0.6),
         smile_nm=_some(rng, 0.05, 2) * float(rng.choice([-1, 1])),
         fwhm_nm=float(rng.uniform(3, 10)),
-        stray_share=_some(rng, 1e-4, 1e-2),
+        stray_fraction=_some(rng, 1e-4, 1e-2),
         stray_even=float(rng.uniform(0, 1)),
         stray_halo_px=float(rng.uniform(4, 100)),
     )
@@ -200,7 +200,7 @@ def _mirror(rng: np.random.Generator) -> MirrorMotion:
 
 
 def _detector(rng: np.random.Generator) -> Detector:
-    return Detector(response_share=_some(rng, 1e-3, 0.03), stripe_share=_some(rng, 1e-3, 0.02))
+    return Detector(prnu_std=_some(rng, 1e-3, 0.03), striping_std=_some(rng, 1e-3, 0.02))
 
 
 def _air(rng: np.random.Generator) -> Air:
@@ -214,7 +214,7 @@ def _air(rng: np.random.Generator) -> Air:
         nearest_m=distance * float(rng.uniform(0.5, 1)),
         farthest_m=distance * float(rng.uniform(1, 2)),
         visibility_km=float(rng.uniform(1, 50)),
-        airlight_share=float(rng.uniform(0, 1)),
+        airlight_fraction=float(rng.uniform(0, 1)),
         vapour_g_per_m3=float(rng.uniform(0, 30)),
         turbulence_cn2=float(10 ** rng.uniform(-15, -12)),
         wind_amplitude_m=_some(rng, 1e-3, 0.05),
@@ -226,7 +226,7 @@ def _sky(rng: np.random.Generator) -> Sky:
     day = datetime(2026, 6, 21, 3, 30, tzinfo=UTC) + timedelta(hours=float(rng.uniform(0, 16)))
     return Sky(
         started=day if rng.random() < 0.5 else None,
-        cloud_share=float(rng.choice([0.0, 0.0, rng.uniform(0.05, 0.9)])),
+        cloud_fraction=float(rng.choice([0.0, 0.0, rng.uniform(0.05, 0.9)])),
         cloud_size_px=float(rng.uniform(30, 600)),
         brdf_per_rad=_some(rng, 0.01, 0.5),
         hot_spot=float(rng.choice([0.0, rng.uniform(0.02, 0.5)])),

@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.lazy import Once
-from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster, raster_from_values
+from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster, raster_from_values
 
 
 def made_scene(planes: ArrayLike, electrons: ArrayLike, wavelength_nm: ArrayLike, **more: Any) -> RasterScene:
@@ -20,7 +20,7 @@ def made_scene(planes: ArrayLike, electrons: ArrayLike, wavelength_nm: ArrayLike
     nm = np.asarray(wavelength_nm, np.float64)
     raster = SceneRaster.of(np.ascontiguousarray(planes, np.float32))
     return RasterScene(
-        "made", "made", raster, Once.of(SceneLight(light, white)), np.ones(len(nm), np.float32), nm, **more
+        "made", "made", raster, Once.of(SceneRadiance(light, white)), np.ones(len(nm), np.float32), nm, **more
     )
 
 

@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, SceneRadiance, SceneRaster
 from tests.pipeline.simulator.random_cases import Case, random_rig
 
 Floats = NDArray[np.float64]
@@ -31,8 +31,8 @@ def sparse_case(number: int) -> Case:
     if kind in IN_BANDS:
         values = _cube(rng, kind)
         start, lines = -SHAPE[0] / 2 - 4, SHAPE[0] + 8
-        strips = [0.0] if rng.random() < 0.5 else [-(SHAPE[1] - samples) / 2, (SHAPE[1] - samples) / 2]
-        sweeps = tuple(Sweep(f"s{strip:g}", "fine", "x", strip, start, lines) for strip in strips)
+        swaths = [0.0] if rng.random() < 0.5 else [-(SHAPE[1] - samples) / 2, (SHAPE[1] - samples) / 2]
+        sweeps = tuple(Sweep(f"s{swath:g}", "fine", "x", swath, start, lines) for swath in swaths)
     else:
         lines = int(rng.integers(1, 6)) if kind != "bright line" else 120
         start = float(rng.uniform(-20, 20)) if kind != "bright line" else -60.0
@@ -53,7 +53,7 @@ def _scene(rng: np.random.Generator, values: Floats, rig: Rig) -> RasterScene:
         "sparse",
         "sparse",
         SceneRaster.of(np.ascontiguousarray(values, np.float32)),
-        Once.of(SceneLight(light, light * np.float32(values.max()))),
+        Once.of(SceneRadiance(light, light * np.float32(values.max()))),
         np.ones(bands, np.float32),
         nm,
         fwhm_nm=None if rng.random() < 0.5 else np.full(bands, 2.0),

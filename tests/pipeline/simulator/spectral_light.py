@@ -17,10 +17,10 @@ from pipeline.simulator.scenes.scene import RasterScene
 from tests.pipeline.simulator.small_scenes import made_scene
 
 Floats = NDArray[np.float64]
-Light = NDArray[np.float32]
+Radiance = NDArray[np.float32]
 
 SAMPLES = 64
-SWEEP = Sweep("fine", "fine", "x", strip_px=0.0, start_px=-320.0, lines=640)
+SWEEP = Sweep("fine", "fine", "x", swath_px=0.0, start_px=-320.0, lines=640)
 READ_E = LineCamera().read_noise_e
 
 
@@ -29,7 +29,7 @@ def rig_with(samples: int = SAMPLES, **optics: float) -> Rig:
     return Rig(camera=replace(LineCamera(), samples=samples), optics=replace(Optics(), **optics))
 
 
-def random_light(seed: int, bands: int = 90, samples: int = SAMPLES, lines: int = 6) -> tuple[Floats, Light]:
+def random_light(seed: int, bands: int = 90, samples: int = SAMPLES, lines: int = 6) -> tuple[Floats, Radiance]:
     """Wavelengths [nm] at uneven distances, and patches of a few spectra with edges and absorption lines [e-]."""
     rng = np.random.default_rng(seed)
     wavelength = 400 + np.cumsum(rng.uniform(1.5, 3.0, bands))
@@ -60,14 +60,14 @@ def small_scene(fwhm_nm: float | None = None) -> tuple[Floats, RasterScene]:
     return wavelength, made_scene(planes, spectra, wavelength, fwhm_nm=widths)
 
 
-def units(light: Light, unit: Unit) -> Floats:
+def units(light: Radiance, unit: Unit) -> Floats:
     """The unit at every sample [e-]: shot and read noise, or one DN."""
     electrons = np.asarray(light, np.float64)
     return np.sqrt(electrons + READ_E**2) if unit == "sigma" else np.full(light.shape, LineCamera().electrons_per_dn)
 
 
 def probe_of(
-    light: Light, wavelength_nm: Floats, unit: Unit = "sigma", fwhm_nm: Floats | None = None, sweep: Sweep = SWEEP
+    light: Radiance, wavelength_nm: Floats, unit: Unit = "sigma", fwhm_nm: Floats | None = None, sweep: Sweep = SWEEP
 ) -> Probe:
     """Summary of all samples of some lines."""
     signal, one = np.asarray(light, np.float64), units(light, unit)
@@ -94,7 +94,7 @@ def probe_of(
     )
 
 
-def worst(changed: Light, light: Light, unit: Unit, like: Light | None = None) -> float:
+def worst(changed: Radiance, light: Radiance, unit: Unit, like: Radiance | None = None) -> float:
     """Greatest difference over the unit, which is taken from ``like`` or from ``light``."""
     way = np.abs(np.asarray(changed, np.float64) - light)
     return float((way / units(light if like is None else like, unit)).max())

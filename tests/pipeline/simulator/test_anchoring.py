@@ -54,9 +54,9 @@ def anchored(
     return anchor_sweep(broad, CAMERA, replace(GRID, factor=factor), coarse_mean(seen, factor), prior_px=prior_px)
 
 
-def sweep_of(along: Axis = "x", *, strip: float = -20.0, start: float = -70.0, lines: int = 140) -> Sweep:
+def sweep_of(along: Axis = "x", *, swath: float = -20.0, start: float = -70.0, lines: int = 140) -> Sweep:
     """A fine sweep in the middle of the field."""
-    return Sweep("fine", "fine", along, strip, start, lines)
+    return Sweep("fine", "fine", along, swath, start, lines)
 
 
 @pytest.mark.parametrize("factor", [2, 3, 4])
@@ -108,7 +108,7 @@ def test_sweep_that_shows_nothing_of_the_mosaic_is_empty() -> None:
     mosaic = coarse_mean(textured(), 4)
     assert anchor_sweep(blind, CAMERA, GRID, mosaic, prior_px=8).found.status == "empty"
     assert anchor_sweep(broad, CAMERA, GRID, np.full_like(mosaic, np.nan), prior_px=8).found.status == "empty"
-    beside = BroadSweep.read(SimulatedSweep(source, sweep_of(strip=400.0)), CAMERA)
+    beside = BroadSweep.read(SimulatedSweep(source, sweep_of(swath=400.0)), CAMERA)
     assert anchor_sweep(beside, CAMERA, GRID, mosaic, prior_px=8).found.status == "empty"
 
 

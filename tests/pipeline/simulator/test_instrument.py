@@ -23,7 +23,7 @@ from tests.pipeline.simulator.small_scenes import image_scene, made_scene, seen_
 
 CAMERA = LineCamera()
 OPTICS = effects_on("rotation", "slit", "smear")
-SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-19.5, lines=40)
+SWEEP = Sweep("s", "fine", "x", swath_px=0.0, start_px=-19.5, lines=40)
 
 
 def scene_of(values: np.ndarray) -> RasterScene:
@@ -52,7 +52,7 @@ def smooth(shape: tuple[int, int, int], seed: int = 0) -> np.ndarray:
 def test_flat_scene_gives_flat_lines() -> None:
     """At any pose a flat scene gives each sample the same electrons but for the mirror, by exposure."""
     scene = scene_of(np.full((30, 30, 2), 4.0))
-    far = Sweep("far", "coarse", "y", strip_px=2000.0, start_px=-3000.0, lines=5, step=4, binning=4)
+    far = Sweep("far", "coarse", "y", swath_px=2000.0, start_px=-3000.0, lines=5, step=4, binning=4)
     expected = np.broadcast_to(4 * scene.electrons, (5, 640, 2))
     np.testing.assert_allclose(light_of(scene, far, range(5)), expected, rtol=1e-5)
     longer = light_of(scene, far, range(5), camera=replace(CAMERA, exposure_ms=250.0))
@@ -62,8 +62,8 @@ def test_flat_scene_gives_flat_lines() -> None:
 def test_shifted_lines_see_the_shifted_place() -> None:
     """A line looked at beside its plan is the line planned there."""
     scene = scene_of(smooth((200, 700, 1)))
-    sweep = Sweep("s", "fine", "x", strip_px=10.0, start_px=-50.0, lines=20, step=2)
-    moved = replace(sweep, strip_px=17.0, start_px=-38.5)
+    sweep = Sweep("s", "fine", "x", swath_px=10.0, start_px=-50.0, lines=20, step=2)
+    moved = replace(sweep, swath_px=17.0, start_px=-38.5)
     beside = Choice(((CommonOffset((7.0, 11.5)), "exact"), *OPTICS.effects))
     shifted = light_of(scene, sweep, range(3, 9), beside)
     np.testing.assert_allclose(shifted, light_of(scene, moved, range(3, 9)), rtol=1e-5)
@@ -77,15 +77,15 @@ def test_undeflected_sweep_is_the_operator_on_the_grid(step: int) -> None:
     sweep = replace(SWEEP, lines=40 // step, step=step)
     lines = light_of(scene, sweep, range(sweep.lines))
     exact = replace(CAMERA, electrons_per_dn=1.0, bits=16)  # four of its samples still fit uint16
-    looked = expose(footprint(values.astype(np.float32) * scene.electrons, exact), exact, step=step, rng=None)
+    observation = expose(footprint(values.astype(np.float32) * scene.electrons, exact), exact, step=step, rng=None)
     binned = lines.reshape(sweep.lines, 640 // step, step, 1).mean(axis=2)
-    assert np.abs(binned - looked).max() < 0.02 * looked.std()
+    assert np.abs(binned - observation).max() < 0.02 * observation.std()
 
 
 def test_rays_are_those_of_the_mirror() -> None:
     """Without slit and smear a sample sees the point that the reflected ray of its centre meets."""
     scene = scene_of(smooth((200, 700, 1)))
-    sweep = Sweep("s", "fine", "x", strip_px=150.0, start_px=-50.0, lines=20)
+    sweep = Sweep("s", "fine", "x", swath_px=150.0, start_px=-50.0, lines=20)
     line = light_of(scene, sweep, range(7, 8), effects_on("rotation"))[0, :, 0]
     slope = CAMERA.pixel_slopes()
     ray = np.stack([0 * slope, slope, 1 + 0 * slope], axis=-1)
@@ -117,13 +117,13 @@ def test_samples_off_the_scene_see_its_edge() -> None:
 LOUD = Rig(
     replace(CAMERA, samples=60),
     mirror=MirrorMotion(repeatability_urad=40.0, hysteresis_px=3.0, drift_px_per_min=2.0),
-    detector=Detector(dead_share=0.001, hot_share=0.001),
+    detector=Detector(dead_fraction=0.001, hot_fraction=0.001),
     air=Air(distance_m=40.0, nearest_m=38.0, farthest_m=42.0, relief="step", wind_amplitude_m=0.01),
-    sky=Sky(cloud_share=0.4, hot_spot=0.1),
+    sky=Sky(cloud_fraction=0.4, hot_spot=0.1),
 )
 EVERY = effects_on(*(effect.name for effect in EFFECTS))
-COARSE = Sweep("coarse", "coarse", "y", strip_px=-900.0, start_px=300.0, lines=70, step=3, binning=3)
-FINE = replace(SWEEP, strip_px=700.0, start_px=-400.0, lines=70)
+COARSE = Sweep("coarse", "coarse", "y", swath_px=-900.0, start_px=300.0, lines=70, step=3, binning=3)
+FINE = replace(SWEEP, swath_px=700.0, start_px=-400.0, lines=70)
 
 
 @cache
@@ -173,4 +173,4 @@ def test_no_lines_give_none() -> None:
 def test_lines_beyond_the_mirror_are_refused() -> None:
     """A sweep that the mirror cannot reach is told of, not rendered."""
     with pytest.raises(PoseError):
-        render_lines(scene_of(np.ones((4, 4, 1))), Rig(), USUAL, replace(SWEEP, strip_px=2e4), range(1))
+        render_lines(scene_of(np.ones((4, 4, 1))), Rig(), USUAL, replace(SWEEP, swath_px=2e4), range(1))

@@ -20,7 +20,7 @@ from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
 from pipeline.simulator.optics.kernel_fit import Moments
 from pipeline.simulator.render import Choice, expected_light
 from pipeline.simulator.rig_model import Air, Optics, Rig
-from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
 from tests.pipeline.simulator.small_scenes import image_scene, made_scene
 
 SIZE = 96
@@ -62,19 +62,19 @@ def seen(scene: RasterScene, sweep: Sweep, chosen: dict[Any, str], rig: Rig = RI
     picture=st.sampled_from(sorted(PICTURES)),
     dark=st.sampled_from((0.0, 0.3)),
     chosen=CHOICES,
-    strip=st.floats(-1.0, 1.0),
+    swath=st.floats(-1.0, 1.0),
     start=st.floats(-13.0, -11.0),
     along=st.sampled_from("xy"),
     step=st.sampled_from((1, 4)),
     turned=st.booleans(),
 )
 def test_light_is_within_that_of_the_scene(
-    picture: str, dark: float, chosen: dict[Any, str], strip: float, start: float, along: Any, step: int, turned: bool
+    picture: str, dark: float, chosen: dict[Any, str], swath: float, start: float, along: Any, step: int, turned: bool
 ) -> None:
     """At any place and turn of the lines and through any variants light lies between the scene's least and most."""
     far = 60.0 if turned else 0.0  # the scene's edge is repeated, its lines lie turned
     rows = 24 // step
-    sweep = Sweep("s", "fine" if step == 1 else "coarse", along, strip + far, start + far, rows, step)
+    sweep = Sweep("s", "fine" if step == 1 else "coarse", along, swath + far, start + far, rows, step)
     light = seen(scene_of(picture, dark), sweep, chosen)
     assert light.min() >= dark * (1 - 1e-5)
     assert light.max() <= 1 + 1e-5
@@ -84,19 +84,19 @@ def test_light_is_within_that_of_the_scene(
 @given(
     picture=st.sampled_from(("pixel", "disc")),
     chosen=CHOICES,
-    strip=st.floats(-1.0, 1.0),
+    swath=st.floats(-1.0, 1.0),
     start=st.floats(-20.0, -18.0),
     along=st.sampled_from("xy"),
 )
 def test_light_of_what_is_swept_is_kept(
-    picture: str, chosen: dict[Any, str], strip: float, start: float, along: Any
+    picture: str, chosen: dict[Any, str], swath: float, start: float, along: Any
 ) -> None:
     """Where lines lie straight, samples 1 px apart sum to the light of a spot on black, wherever among them it lies.
 
     Of the tails of diffraction a part falls beside what is swept: they have a law of their own.
     """
     straight = chosen | {ROTATION: OFF, DIFFRACTION: OFF}
-    light = seen(scene_of(picture), Sweep("s", "fine", along, strip, start, 40), straight)
+    light = seen(scene_of(picture), Sweep("s", "fine", along, swath, start, 40), straight)
     np.testing.assert_allclose(light.sum(axis=(0, 1)), PICTURES[picture].sum(), rtol=2e-5)
 
 
@@ -134,14 +134,14 @@ def test_tails_of_diffraction_reach_as_far_as_the_pupil_says() -> None:
     values = np.repeat((np.arange(801) > 400)[None, :, None] * np.ones((400, 1, 4)), 1, axis=2)
     scene = image_scene(values, rig.camera, NM)
     px = np.array([10, 20, 35, 50])
-    sweeps = [Sweep("s", "fine", "x", strip_px=-float(x), start_px=0.0, lines=1) for x in px]
+    sweeps = [Sweep("s", "fine", "x", swath_px=-float(x), start_px=0.0, lines=1) for x in px]
     light = np.concatenate([seen(scene, sweep, {SLIT: "1x1", DIFFRACTION: "airy"}, rig)[:, 8] for sweep in sweeps])
     waves = NM * 1e-9 / 15e-3 / rig.camera.ifov_rad
     np.testing.assert_allclose(light, 2 / np.pi**3 * waves / (px[:, None]), rtol=0.25)
 
 
 CAMERA = LineCamera()
-FINE = Sweep("fine", "fine", "x", strip_px=900.0, start_px=-700.0, lines=20)
+FINE = Sweep("fine", "fine", "x", swath_px=900.0, start_px=-700.0, lines=20)
 PLAIN = {ROTATION: "rays", SMEAR: "positions", SLIT: "3x1"}
 
 
@@ -159,13 +159,13 @@ def block_of(scene: RasterScene, sweep: Sweep, lines: range, **more: object) -> 
     return SweepBlock(Rig(), sweep, lines, scene.wavelength_nm, scene.shape, **more)
 
 
-NEAR = replace(FINE, strip_px=20.0, start_px=-40.0)
+NEAR = replace(FINE, swath_px=20.0, start_px=-40.0)
 
 
 def test_nothing_chosen_is_a_straight_line_of_points() -> None:
     """Without effects a sample at a pixel's centre sees the pixel's value."""
     scene = grainy()
-    sweep = Sweep("s", "fine", "x", strip_px=0.0, start_px=-20.5, lines=30)  # places are pixel centres
+    sweep = Sweep("s", "fine", "x", swath_px=0.0, start_px=-20.5, lines=30)  # places are pixel centres
     light = expected_light(scene, block_of(scene, sweep, range(30)), {})[:, 300:340]
     wanted = scene.planes[24:54, 35:75] @ scene.electrons
     np.testing.assert_allclose(light, wanted, rtol=1e-5)
@@ -174,7 +174,7 @@ def test_nothing_chosen_is_a_straight_line_of_points() -> None:
 def test_diagonal_scene_is_that_of_its_matrix() -> None:
     """A scene with a plane of its own in each band gives what its diagonal matrix of electrons gives."""
     diagonal = image_scene(np.random.default_rng(1).uniform(0, 1, (60, 50, 4)), CAMERA, np.linspace(400, 1000, 4))
-    light = SceneLight(np.diag(diagonal.electrons), diagonal.panel_electrons)
+    light = SceneRadiance(np.diag(diagonal.electrons), diagonal.white_reference_electrons)
     full = replace(diagonal, light=Once.of(light))
     chosen = {**PLAIN, Widening(): "only"}
     one, other = (expected_light(s, block_of(s, NEAR, range(12, 16)), chosen) for s in (diagonal, full))
@@ -199,7 +199,7 @@ def test_blurs_widen_and_shift_each_band_by_its_moments() -> None:
     x = np.arange(160)
     wave = 1 + 0.5 * np.sin(2 * np.pi * x / 20)
     scene = image_scene(np.broadcast_to(wave[None, :, None], (40, 160, 6)), CAMERA, np.linspace(400, 1000, 6))
-    sweep = Sweep("s", "fine", "x", strip_px=0.0, start_px=-0.5, lines=1)
+    sweep = Sweep("s", "fine", "x", swath_px=0.0, start_px=-0.5, lines=1)
     block = block_of(scene, sweep, range(1))
     light = expected_light(scene, block, {SLIT: "3x1", Widening(): "only"})[0, 280:360] / scene.electrons
     grown = np.arange(6) / 6
@@ -231,7 +231,7 @@ class Nudge:
 def test_aims_and_displacements_move_the_view() -> None:
     """Near rest an aim and a displacement by whole px show the neighbouring lines' samples."""
     scene = grainy()
-    sweep = replace(NEAR, strip_px=0.0, start_px=-20.0)
+    sweep = replace(NEAR, swath_px=0.0, start_px=-20.0)
     plain = expected_light(scene, block_of(scene, sweep, range(16)), {SLIT: "3x1"})[:, 310:330]
     for do in ("aim", "displaced"):
         moved = expected_light(scene, block_of(scene, sweep, range(2, 16)), {Nudge(do): "only", SLIT: "3x1"})

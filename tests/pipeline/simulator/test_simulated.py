@@ -27,7 +27,7 @@ from pipeline.source import References, Source
 from tests.pipeline.simulator.small_scenes import image_scene, made_scene
 
 CAMERA = LineCamera()
-SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-19.5, lines=40)
+SWEEP = Sweep("s", "fine", "x", swath_px=0.0, start_px=-19.5, lines=40)
 QUIET = ("rotation", "slit", "smear")
 
 
@@ -115,10 +115,16 @@ def test_references_give_back_scene_values(binning: int, exposure_ms: float) -> 
     source = source_of(values, replace(CAMERA, exposure_ms=exposure_ms), chosen=effects_on(*QUIET))
     sweep = replace(SWEEP, lines=10, step=binning, binning=binning)
     out, valid = calibrate(raw_of(source, sweep), source.references(sweep), saturated_dn=4095 * binning)
-    step = source.scene.panel[0] / source.scene.panel_electrons[0] * CAMERA.electrons_per_dn * 100 / exposure_ms
+    step = (
+        source.scene.white_reference[0]
+        / source.scene.white_reference_electrons[0]
+        * CAMERA.electrons_per_dn
+        * 100
+        / exposure_ms
+    )
     if valid.any():
         np.testing.assert_allclose(out[valid], np.broadcast_to(values[0, 0], out.shape)[valid], atol=0.51 * step)
-    assert valid.all() == (values.max() * source.scene.electrons[0] * exposure_ms / 100 < CAMERA.full_well_e)
+    assert valid.all() == (values.max() * source.scene.electrons[0] * exposure_ms / 100 < CAMERA.full_full_well_e)
 
 
 def test_black_scene_reads_dark() -> None:
@@ -129,7 +135,7 @@ def test_black_scene_reads_dark() -> None:
     position = line_positions(SWEEP, CAMERA)
     out, valid = calibrate(raw, source.references(SWEEP), saturated_dn=4095, position=position)
     assert valid.all()
-    assert abs(out.mean()) < 1e-3 * source.scene.panel[0]
+    assert abs(out.mean()) < 1e-3 * source.scene.white_reference[0]
 
 
 def test_lines_come_one_by_one() -> None:
@@ -207,45 +213,45 @@ def test_light_goes_with_the_clock() -> None:
     assert [line.time_s for line in later.lines(sweep)] == [line.time_s for line in now.lines(sweep)]
 
 
-WHITE_PANEL_CAMERA = LineCamera(
+WHITE_REFERENCE_CAMERA = LineCamera(
     samples=64, bits=16, electrons_per_dn=1.0
 )  # fine steps: rounding is no part of the figures
-RIG = Rig(WHITE_PANEL_CAMERA, detector=Detector(response_share=0.05, stripe_share=0.02, temperature_deg_c=45.0))
-WHITE_PANEL_SWEEP = Sweep("s", "fine", "x", strip_px=900.0, start_px=-1500.0, lines=6)
+RIG = Rig(WHITE_REFERENCE_CAMERA, detector=Detector(prnu_std=0.05, striping_std=0.02, temperature_deg_c=45.0))
+WHITE_REFERENCE_SWEEP = Sweep("s", "fine", "x", swath_px=900.0, start_px=-1500.0, lines=6)
 BANDS = 12
 
 
 def even_scene(fwhm_nm: float = 2.0) -> RasterScene:
-    """An even scene under light with a deep absorption, 40 % as bright as the panel; values are reflectances."""
+    """An even scene under light with a deep absorption, 40 % as bright as the white reference; values are reflectances."""
     nm = np.linspace(740, 784, BANDS)
-    panel_electrons = (30_000 * (1 - 0.6 * np.exp(-(((nm - 762) / 5) ** 2)))).astype(np.float32)
-    return made_scene(np.full((20, 20, 1), 0.4), panel_electrons[None], nm, fwhm_nm=np.full(BANDS, fwhm_nm))
+    white_reference_electrons = (30_000 * (1 - 0.6 * np.exp(-(((nm - 762) / 5) ** 2)))).astype(np.float32)
+    return made_scene(np.full((20, 20, 1), 0.4), white_reference_electrons[None], nm, fwhm_nm=np.full(BANDS, fwhm_nm))
 
 
-def white_panel_source_of(*names: str, rig: Rig = RIG) -> SimulatedSource:
+def white_reference_source_of(*names: str, rig: Rig = RIG) -> SimulatedSource:
     """A source over the even scene with some effects."""
     return SimulatedSource(even_scene(), rig, chosen=effects_on("rotation", *names))
 
 
-def values_of(source: SimulatedSource, sweep: Sweep = WHITE_PANEL_SWEEP) -> np.ndarray:
+def values_of(source: SimulatedSource, sweep: Sweep = WHITE_REFERENCE_SWEEP) -> np.ndarray:
     """Calibrated lines."""
     raw = source.render(sweep, range(sweep.lines))
     values, _ = calibrate(
         raw,
         source.references(sweep),
         saturated_dn=65535 * sweep.binning,
-        position=line_positions(sweep, WHITE_PANEL_CAMERA),
+        position=line_positions(sweep, WHITE_REFERENCE_CAMERA),
     )
     return values
 
 
-def test_plain_frames_are_the_panel_over_the_dark_level() -> None:
-    """Without effects the dark frame is the camera's level, and the white one the panel's light above it."""
-    found = white_panel_source_of().references(WHITE_PANEL_SWEEP)
+def test_plain_frames_are_the_white_reference_over_the_dark_level() -> None:
+    """Without effects the dark frame is the camera's level, and the white one the white reference's light above it."""
+    found = white_reference_source_of().references(WHITE_REFERENCE_SWEEP)
     np.testing.assert_array_equal(found.dark, np.full((64, BANDS), 64, np.float32))
-    np.testing.assert_allclose(found.white - 64, np.tile(even_scene().panel_electrons, (64, 1)), rtol=1e-6)
+    np.testing.assert_allclose(found.white - 64, np.tile(even_scene().white_reference_electrons, (64, 1)), rtol=1e-6)
     assert (found.bad, found.flat, found.by_mirror) == (None, None, False)
-    assert (found.dark.dtype, found.white.dtype, found.panel.dtype) == (np.float32,) * 3
+    assert (found.dark.dtype, found.white.dtype, found.white_reference.dtype) == (np.float32,) * 3
 
 
 @pytest.mark.parametrize(
@@ -266,16 +272,16 @@ def test_calibration_takes_out_what_it_sees(names: tuple[str, ...]) -> None:
 
     The names, then the raw numbers with none of them, are not the same: there was something to take out.
     """
-    source = white_panel_source_of(*names)
+    source = white_reference_source_of(*names)
     np.testing.assert_allclose(values_of(source), 0.4, atol=2e-4)
-    plain = white_panel_source_of().render(WHITE_PANEL_SWEEP, range(6)).astype(int)
-    assert np.abs(source.render(WHITE_PANEL_SWEEP, range(6)).astype(int) - plain).max() > 20
+    plain = white_reference_source_of().render(WHITE_REFERENCE_SWEEP, range(6)).astype(int)
+    assert np.abs(source.render(WHITE_REFERENCE_SWEEP, range(6)).astype(int) - plain).max() > 20
 
 
 def test_binned_frames_are_sums() -> None:
     """Frames of n samples are the sums of theirs, and what is left over of the line is dropped."""
-    source = white_panel_source_of("prnu", "smile", "dark-current")
-    one, three = source.references(WHITE_PANEL_SWEEP), source.references(replace(WHITE_PANEL_SWEEP, binning=3))
+    source = white_reference_source_of("prnu", "smile", "dark-current")
+    one, three = source.references(WHITE_REFERENCE_SWEEP), source.references(replace(WHITE_REFERENCE_SWEEP, binning=3))
     for name in ("dark", "white"):
         sums = getattr(one, name)[:63].reshape(21, 3, BANDS).sum(axis=1)
         np.testing.assert_allclose(getattr(three, name), sums, rtol=1e-6)
@@ -283,16 +289,16 @@ def test_binned_frames_are_sums() -> None:
 
 def test_frames_show_dark_current_and_gains() -> None:
     """The dark frame has the mean dark current, the white frame both gains of every element."""
-    found = white_panel_source_of("dark-current", "prnu", "striping").references(WHITE_PANEL_SWEEP)
+    found = white_reference_source_of("dark-current", "prnu", "striping").references(WHITE_REFERENCE_SWEEP)
     np.testing.assert_allclose(found.dark, 64 + dark_electrons(RIG), rtol=1e-6)
     gains = response_gain(RIG, BANDS) * stripe_gain(RIG)
-    np.testing.assert_allclose(found.white - found.dark, gains * even_scene().panel_electrons, rtol=1e-4)
+    np.testing.assert_allclose(found.white - found.dark, gains * even_scene().white_reference_electrons, rtol=1e-4)
 
 
 def test_defects_are_told_as_bad() -> None:
     """Dead elements show no panel, hot ones are bright in the dark; a sum with one of either is bad."""
-    rig = replace(RIG, detector=Detector(dead_share=0.02, hot_share=0.02, hot_e_per_s=2e4))
-    found = white_panel_source_of("defects", rig=rig).references(WHITE_PANEL_SWEEP)
+    rig = replace(RIG, detector=Detector(dead_fraction=0.02, hot_fraction=0.02, hot_e_per_s=2e4))
+    found = white_reference_source_of("defects", rig=rig).references(WHITE_REFERENCE_SWEEP)
     dead, hot = dead_elements(rig, BANDS), hot_electrons(rig, BANDS) > 0
     assert dead.any()
     assert hot.any()
@@ -300,31 +306,33 @@ def test_defects_are_told_as_bad() -> None:
     np.testing.assert_array_equal(found.bad, dead | hot)
     np.testing.assert_array_equal(found.dark > 1000, hot)
     np.testing.assert_array_equal(found.white == found.dark, dead)
-    binned = white_panel_source_of("defects", rig=rig).references(replace(WHITE_PANEL_SWEEP, binning=4)).bad
+    binned = white_reference_source_of("defects", rig=rig).references(replace(WHITE_REFERENCE_SWEEP, binning=4)).bad
     np.testing.assert_array_equal(binned, (dead | hot).reshape(16, 4, BANDS).any(axis=1))
-    assert white_panel_source_of(rig=rig).references(WHITE_PANEL_SWEEP).bad is None
+    assert white_reference_source_of(rig=rig).references(WHITE_REFERENCE_SWEEP).bad is None
 
 
 def test_a_sound_sensor_has_no_bad_elements() -> None:
     """With defects on and none there, nothing is told as bad."""
-    assert white_panel_source_of("defects").references(WHITE_PANEL_SWEEP).bad is None
+    assert white_reference_source_of("defects").references(WHITE_REFERENCE_SWEEP).bad is None
 
 
 def test_bad_elements_are_filled_by_calibration() -> None:
     """An even scene seen with dead and hot elements comes back even."""
-    rig = replace(RIG, detector=Detector(dead_share=0.02, hot_share=0.02, hot_e_per_s=2e4))
-    np.testing.assert_allclose(values_of(white_panel_source_of("defects", rig=rig)), 0.4, atol=2e-4)
+    rig = replace(RIG, detector=Detector(dead_fraction=0.02, hot_fraction=0.02, hot_e_per_s=2e4))
+    np.testing.assert_allclose(values_of(white_reference_source_of("defects", rig=rig)), 0.4, atol=2e-4)
 
 
-def test_panel_is_stated_in_the_rigs_bands() -> None:
-    """Where the panel's values have detail in the spectrum, the response rounds it as it does the light."""
+def test_white_reference_is_stated_in_the_rigs_bands() -> None:
+    """Where the white reference's values have detail in the spectrum, the response rounds it as it does the light."""
     scene = even_scene()
-    scene = replace(scene, panel=(1 - 0.5 * np.exp(-(((scene.wavelength_nm - 762) / 4) ** 2))).astype(np.float32))
+    scene = replace(
+        scene, white_reference=(1 - 0.5 * np.exp(-(((scene.wavelength_nm - 762) / 4) ** 2))).astype(np.float32)
+    )
     plain, wide = (
-        SimulatedSource(scene, RIG, chosen=effects_on(*names)).references(WHITE_PANEL_SWEEP).panel
+        SimulatedSource(scene, RIG, chosen=effects_on(*names)).references(WHITE_REFERENCE_SWEEP).white_reference
         for names in ((), ("response",))
     )
-    np.testing.assert_array_equal(plain, scene.panel)
+    np.testing.assert_array_equal(plain, scene.white_reference)
     assert wide.min() > plain.min() + 0.05
     np.testing.assert_allclose(wide.mean(), plain.mean(), atol=0.02)
 
@@ -332,11 +340,11 @@ def test_panel_is_stated_in_the_rigs_bands() -> None:
 def test_calibration_does_not_know_the_rest() -> None:
     """Effects that it cannot see change no frame."""
     seen = {"dark-current", "defects", "prnu", "striping", "response", "smile", "vignetting"}
-    plain = white_panel_source_of().references(WHITE_PANEL_SWEEP)
+    plain = white_reference_source_of().references(WHITE_REFERENCE_SWEEP)
     for effect in EFFECTS:
         if effect.name in seen:
             continue
-        found = white_panel_source_of(effect.name).references(WHITE_PANEL_SWEEP)
+        found = white_reference_source_of(effect.name).references(WHITE_REFERENCE_SWEEP)
         assert isinstance(found, References)
         np.testing.assert_array_equal(found.white, plain.white, err_msg=effect.name)
         np.testing.assert_array_equal(found.dark, plain.dark, err_msg=effect.name)
@@ -384,11 +392,11 @@ def test_numbers_that_are_not_finite_are_refused_by_name(part: str, item: Any):
 
 
 def test_numbers_beyond_their_range_are_refused_with_it():
-    """Aperture and share of stray light."""
+    """Aperture and fraction of stray light."""
     with pytest.raises(SettingsError, match=r"optics\.aperture_mm must be a number from 0\.1 to 1000 mm, got 0"):
         with_number("optics", "aperture_mm", 0.0)
-    with pytest.raises(SettingsError, match=r"optics\.stray_share must be a number from 0 to 0\.5, got 0\.6"):
-        with_number("optics", "stray_share", 0.6)
+    with pytest.raises(SettingsError, match=r"optics\.stray_fraction must be a number from 0 to 0\.5, got 0\.6"):
+        with_number("optics", "stray_fraction", 0.6)
 
 
 def test_a_distance_may_be_endless_but_not_nothing():

@@ -346,15 +346,17 @@ def table(tmp_path: Path) -> Path:
     """A table in a store."""
 
     def build(path: Path) -> None:
-        (path / "plan.json").write_text('{"seats": [1, 2], "share": 0.25}')
+        (path / "plan.json").write_text('{"patches": [1, 2], "share": 0.25}')
 
-    return Archive.open(tmp_path).produce("attend", build, version=1, params={})[0].path / "plan.json"
+    return Archive.open(tmp_path).produce("score", build, version=1, params={})[0].path / "plan.json"
 
 
-@pytest.mark.parametrize("content", ['{"seats": [1, 3], "share": 0.25}', '{"seats": [1, 2], "share": 0.25', ""])
+@pytest.mark.parametrize(
+    "content", ['{"patch_index": [1, 3], "fraction": 0.25}', '{"patch_index": [1, 2], "fraction": 0.25', ""]
+)
 def test_a_changed_table_is_not_read(table: Path, content: str) -> None:
     """It comes back as it was written; then one other digit is as bad as what is no JSON."""
-    assert read_table(table) == {"seats": [1, 2], "share": 0.25}
+    assert read_table(table) == {"patch_index": [1, 2], "fraction": 0.25}
     table.write_text(content)
     with pytest.raises(IncompleteStoreError, match=r"plan\.json has .*verify --repair"):
         read_table(table)

@@ -265,7 +265,7 @@ def test_a_run_names_the_stores_of_its_stages(tmp_path: Path, archive: Archive) 
     """Receipts of before name some by their keys alone."""
     small = small_survey(archive, named=False)
     with archive.new_run("farm") as draft:
-        draft.write_file("receipt.json", json.dumps({"stages": [{"name": "draw_map", "key": small.map.key}]}))
+        draft.write_file("receipt.json", json.dumps({"stages": [{"name": "segment", "key": small.map.key}]}))
     catalogue = Catalogue.read(tmp_path)
     assert catalogue.runs[0].names == {small.map.uri}
     assert [run.uri for run in catalogue.named_by(small.raw.uri)] == [catalogue.runs[0].uri]

@@ -108,7 +108,7 @@ def test_a_run_keeps_its_name_and_date(archive: Archive) -> None:
     assert [path.name for path in (archive.root / "runs").iterdir()] == [name] == [folder.name]
     (run,) = Catalogue.read(archive.root).runs
     assert (run.created, figure_of(archive)) == (created, 0.75)
-    assert run.sealed > created
+    assert run.checksummed > created
     assert any(uri.startswith("stages/evaluate/") for uri in run.recorded)
     assert problems(archive) == []
     assert not [*(archive.root / ".locks").glob("runs-*")]
@@ -200,7 +200,7 @@ def test_killed_between_two_renames_verify_and_gc_know(archive: Archive) -> None
 
 
 def test_a_store_that_was_added_is_known_by_its_hash(archive: Archive) -> None:
-    """It is younger than its run; a manifest that somebody has sealed anew is found out all the same."""
+    """It is younger than its run; a manifest that somebody has checksummed anew is found out all the same."""
     extend(archive, run_id(archive))
     (ref,) = archive.refs("evaluate")
     (ref.path / "accuracy.json").write_text(json.dumps({"miou": 0.99}))
@@ -224,9 +224,9 @@ def test_stores_made_after_a_run_was_extended_are_dated_after_it(
         patch.setattr(manifests, "datetime", Tomorrow)
         extend(archive, run_id(archive))
     (ref,), (run,) = archive.refs("evaluate"), Catalogue.read(archive.root).runs
-    ahead = datetime.fromisoformat(run.sealed).timestamp()
+    ahead = datetime.fromisoformat(run.checksummed).timestamp()
     os.utime(run.folder / "manifest.json", (ahead, ahead))
-    assert run_folders.date_of_store(archive.root, ref.uri) > run.sealed > datetime.now(UTC).isoformat()
+    assert run_folders.date_of_store(archive.root, ref.uri) > run.checksummed > datetime.now(UTC).isoformat()
 
 
 def test_verify_under_way_takes_an_extension_for_no_damage(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -207,20 +207,22 @@ def test_mosaic_says_where_its_pixels_lie(tmp_path: Path) -> None:
 def test_patches_round_trip(tmp_path: Path, count: int, at_once: int) -> None:
     """Any number of patches, none included, however many are written at once."""
     rng = np.random.default_rng(count)
-    seats, origin = np.arange(count, dtype=np.int64)[::-1].copy(), rng.integers(0, 900, (count, 2))
+    patch_index, origin = np.arange(count, dtype=np.int64)[::-1].copy(), rng.integers(0, 900, (count, 2))
     values, valid = rng.random((count, 8, 8, 15)).astype(np.float32), rng.random((count, 8, 8)) > 0.3
-    writer = PatchWriter(tmp_path / "p.zarr", seats, origin, 8, np.linspace(400, 900, 15), fwhm_nm=np.full(15, 4.0))
+    writer = PatchWriter(
+        tmp_path / "p.zarr", patch_index, origin, 8, np.linspace(400, 900, 15), fwhm_nm=np.full(15, 4.0)
+    )
     for first in range(0, max(count, 1), at_once):
         writer.write(values[first : first + at_once], valid[first : first + at_once])
     found = open_patches(tmp_path / "p.zarr")
-    np.testing.assert_array_equal(found.seats, seats)
+    np.testing.assert_array_equal(found.patch_index, patch_index)
     np.testing.assert_array_equal(found.read(0, count), round_bits(values))
     np.testing.assert_array_equal(found.read(1, 3), round_bits(values)[1:3])
     with xr.open_zarr(tmp_path / "p.zarr", consolidated=False) as data:
         assert data["values"].dims == ("patch", "y", "x", "band")
-        assert {"seat", "seat_y", "seat_x", "wavelength", "fwhm"} <= set(data.coords)
+        assert {"patch", "patch_y", "patch_x", "wavelength", "fwhm"} <= set(data.coords)
         np.testing.assert_array_equal(data["valid"].values, valid)
-        np.testing.assert_array_equal(np.stack([data["seat_y"], data["seat_x"]], axis=-1), origin)
+        np.testing.assert_array_equal(np.stack([data["patch_y"], data["patch_x"]], axis=-1), origin)
 
 
 @pytest.mark.parametrize(("count", "bands", "chunk"), [(70, 1, 64), (70, 270, 8), (6, 900, 3), (7, 900, 1)])
@@ -233,7 +235,7 @@ def test_chunks_of_patches_have_up_to_4_mb(tmp_path: Path, count: int, bands: in
 
 
 def test_patches_that_do_not_fit_are_refused(tmp_path: Path) -> None:
-    """More than there are seats, of another size, or with the validity of others: nothing of them is kept."""
+    """More than there are patches, of another size, or with the validity of others: nothing of them is kept."""
     writer = PatchWriter(tmp_path / "p.zarr", np.arange(70), np.zeros((70, 2), np.int64), 2, np.array([500.0]))
     values, valid = np.zeros((70, 2, 2, 1), np.float32), np.ones((70, 2, 2), bool)
     writer.write(values[:10], valid[:10])

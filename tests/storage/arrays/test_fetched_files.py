@@ -23,11 +23,11 @@ def test_what_was_appended_is_read_back(tmp_path: Path):
     for data in (b"abc", b"", b"defg"):
         kept.append("/captured/a_000000/raw_0", data)
     kept.append("notes", b"1\n")
-    for look in (kept, FetchedFiles(tmp_path / "camera")):
-        assert look.size("/captured/a_000000/raw_0") == 7
-        assert look.read("/captured/a_000000/raw_0", 2, 5) == b"cde"
-        assert look.read("/captured/a_000000/raw_0", 5, 99) == b"fg"
-        assert look.read("notes", 0, 2) == b"1\n"
+    for scan_pass in (kept, FetchedFiles(tmp_path / "camera")):
+        assert scan_pass.size("/captured/a_000000/raw_0") == 7
+        assert scan_pass.read("/captured/a_000000/raw_0", 2, 5) == b"cde"
+        assert scan_pass.read("/captured/a_000000/raw_0", 5, 99) == b"fg"
+        assert scan_pass.read("notes", 0, 2) == b"1\n"
 
 
 def test_empty_file_is_there(tmp_path: Path):

@@ -74,13 +74,13 @@ def test_a_map_written_in_blocks_comes_back(tmp_path: Path, goes_on: bool) -> No
     assert tuple(found.geobox.shape) == (150, 700)
 
 
-@pytest.mark.parametrize(("areas_m2", "shares"), [((7500.0, 2500.0), (0.75, 0.25)), ((0.0, 0.0), (0.0, 0.0))])
-def test_areas_are_kept_in_hectares(tmp_path: Path, areas_m2: tuple[float, ...], shares: tuple[float, ...]) -> None:
-    """Each class has its square metres, hectares and share; a map of no class has shares of nothing."""
+@pytest.mark.parametrize(("areas_m2", "fractions"), [((7500.0, 2500.0), (0.75, 0.25)), ((0.0, 0.0), (0.0, 0.0))])
+def test_areas_are_kept_in_hectares(tmp_path: Path, areas_m2: tuple[float, ...], fractions: tuple[float, ...]) -> None:
+    """Each class has its square metres, hectares and share; a map of no class has fractions of nothing."""
     begin(tmp_path / "a.zarr").finish(np.array(areas_m2))
     found = load_ground_map(tmp_path / "a.zarr").areas
-    for name, m2, share in zip(LEGEND.names, areas_m2, shares, strict=True):
-        assert found[name] == {"m2": m2, "ha": m2 / 10_000, "share": share}
+    for name, m2, fraction in zip(LEGEND.names, areas_m2, fractions, strict=True):
+        assert found[name] == {"m2": m2, "ha": m2 / 10_000, "fraction": fraction}
 
 
 def test_plain_xarray_opens_it_with_flags_and_areas(tmp_path: Path) -> None:

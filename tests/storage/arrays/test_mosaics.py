@@ -18,7 +18,7 @@ from storage.arrays.mosaics import (
     PatchWriter,
     load_mosaic,
     mosaic_brightness,
-    mosaic_strips,
+    mosaic_rows,
     mosaic_wavelengths,
     open_patches,
 )
@@ -105,11 +105,11 @@ def mosaic(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (slice(70, 71), slice(0, 1), [1]),
     ],
 )
-def test_strips_make_the_window(mosaic: Path, rows: slice, columns: slice, heights: list[int]) -> None:
+def test_swaths_make_the_window(mosaic: Path, rows: slice, columns: slice, heights: list[int]) -> None:
     """They end where shards do, and together are what is stored there."""
-    strips = list(mosaic_strips(mosaic, rows, columns))
-    assert [len(strip) for strip in strips] == heights
-    np.testing.assert_array_equal(np.concatenate(strips), load_mosaic(mosaic).values[rows, columns])
+    swaths = list(mosaic_rows(mosaic, rows, columns))
+    assert [len(strip) for strip in swaths] == heights
+    np.testing.assert_array_equal(np.concatenate(swaths), load_mosaic(mosaic).values[rows, columns])
 
 
 def test_brightness_is_the_mean_over_bands(mosaic: Path) -> None:
@@ -117,7 +117,7 @@ def test_brightness_is_the_mean_over_bands(mosaic: Path) -> None:
     np.testing.assert_array_equal(mosaic_brightness(mosaic), load_mosaic(mosaic).values.mean(axis=-1))
     assert (mosaic_wavelengths(mosaic) == NM).all()
     with pytest.raises(IncompleteStoreError, match="no readable Zarr store"):
-        next(mosaic_strips(mosaic / "none.zarr"))
+        next(mosaic_rows(mosaic / "none.zarr"))
 
 
 @pytest.mark.parametrize("entries", [[], [0], [3, 4, 5], [0, 2, 3, 9], list(range(10))])

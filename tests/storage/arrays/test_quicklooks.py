@@ -61,13 +61,15 @@ def test_pictures_are_every_fourth_line_and_never_large(size: int, step: int) ->
 
 
 def test_a_raw_cube_has_the_picture_of_its_lines(tmp_path: Path) -> None:
-    """Every 4th line and sample of three bands over the white panel, stretched; the raw numbers are as they were."""
+    """Every 4th line and sample of three bands over the white reference, stretched; the raw numbers are as they were."""
     cube = open_raw_cube(_stored(tmp_path / "a.zarr"))
     seen = cube.quicklook()
     assert seen is not None
     thin = LINES[::4, ::4][..., list(seen.bands)]
-    panel, white = (values[..., list(seen.bands)] for values in (cube.references.panel, cube.references.white[0]))
-    truth = (thin - np.float32(90)) / (white - 90) * panel
+    white_reference, white = (
+        values[..., list(seen.bands)] for values in (cube.references.white_reference, cube.references.white[0])
+    )
+    truth = (thin - np.float32(90)) / (white - 90) * white_reference
     np.testing.assert_array_equal(seen.image, stretched(truth, together=True).image)
     np.testing.assert_array_equal(cube.read(), LINES)
     low, high = (np.array(ends) for ends in (seen.low, seen.high))

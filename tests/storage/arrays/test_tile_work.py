@@ -25,13 +25,13 @@ from storage.arrays import tile_work
 from storage.arrays.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
 from storage.arrays.mosaics import MosaicWriter, load_mosaic
 from storage.arrays.tile_work import MosaicRecipe, Thumbnail, ThumbnailCut, TileMaker, tile_budget, write_mosaic
-from storage.parallel.crew import Crew
+from storage.parallel.pool import WorkerPool
 
 CAMERA = LineCamera()
 BANDS = np.array([500.0, 600.0, 700.0])
 GRID = PixelGrid((-70.0, -420.0), 1, (140, 900))
 PLENTY = 4 * 2**30
-ONE, TWO, THREE = (Crew(workers=count) for count in (1, 2, 3))
+ONE, TWO, THREE = (WorkerPool(workers=count) for count in (1, 2, 3))
 
 
 @pytest.fixture(scope="module")
@@ -64,10 +64,10 @@ class KillOnce(ThumbnailCut):
 
 
 @pytest.fixture(scope="module")
-def processes() -> Iterator[Crew]:
+def processes() -> Iterator[WorkerPool]:
     """Two worker processes for all tests here."""
-    with Crew("processes", 2).open() as crew:
-        yield crew
+    with WorkerPool("processes", 2).open() as pool:
+        yield pool
 
 
 def recipe_of(cubes: list[RawCube]) -> MosaicRecipe:
@@ -96,18 +96,18 @@ def digest_of(folder: Path) -> str:
 def test_workers_do_not_change_a_byte(tmp_path: Path, cubes: list[RawCube]) -> None:
     """One tile at a time in a plain loop, or three at once, the files are the same."""
     digests = set()
-    for crew in (ONE, THREE):
-        path = tmp_path / f"{crew.workers}.zarr"
-        budget = write_mosaic(recipe_of(cubes), mosaic_at(path), memory=PLENTY, crew=crew)
-        assert budget.workers == crew.workers
+    for pool in (ONE, THREE):
+        path = tmp_path / f"{pool.workers}.zarr"
+        budget = write_mosaic(recipe_of(cubes), mosaic_at(path), memory=PLENTY, pool=pool)
+        assert budget.workers == pool.workers
         digests.add(digest_of(path))
     assert len(digests) == 1
 
 
 def test_progress_and_tiles_are_told(tmp_path: Path, cubes: list[RawCube]) -> None:
-    """Every tile is shown once with its values, and the share done rises to 1."""
+    """Every tile is shown once with its values, and the fraction done rises to 1."""
     seen: list[tuple[int, int]] = []
-    shares: list[float] = []
+    fractions: list[float] = []
 
     class Watched(Thumbnail):
         def put(self, rows: slice, columns: slice, part: np.ndarray) -> None:
@@ -118,13 +118,13 @@ def test_progress_and_tiles_are_told(tmp_path: Path, cubes: list[RawCube]) -> No
         recipe_of(cubes),
         mosaic_at(tmp_path / "m.zarr"),
         memory=PLENTY,
-        crew=TWO,
+        pool=TWO,
         seen=Watched(GRID.shape, [0, 1, 2], 900),
-        report=shares.append,
+        report=fractions.append,
     )
     assert sorted(seen) == [(y, x) for y in (0, 64, 128) for x in (0, 640)]
-    assert shares == sorted(shares)
-    assert shares[-1] == 1
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1
 
 
 @pytest.mark.parametrize("most_px", [37, 140, 2000])
@@ -132,7 +132,7 @@ def test_thumbnail_is_every_nth_pixel(tmp_path: Path, cubes: list[RawCube], most
     """Whatever tiles it is made of, a thumbnail holds the mosaic's own pixels, at most so many a side."""
     thumbnail = Thumbnail(GRID.shape, [2, 0], most_px)
     path = tmp_path / "m.zarr"
-    write_mosaic(recipe_of(cubes), mosaic_at(path), memory=PLENTY, crew=ONE, seen=thumbnail)
+    write_mosaic(recipe_of(cubes), mosaic_at(path), memory=PLENTY, pool=ONE, seen=thumbnail)
     down, across = (-(-size // most_px) for size in GRID.shape)
     whole = load_mosaic(path).values[::down, ::across, ::-2]
     np.testing.assert_allclose(thumbnail.image, whole, rtol=3e-4)
@@ -142,8 +142,8 @@ def test_thumbnail_is_every_nth_pixel(tmp_path: Path, cubes: list[RawCube], most
 def test_memory_says_how_many_tiles_at_a_time(tmp_path: Path, cubes: list[RawCube]) -> None:
     """With memory for one tile only one is made at a time, whatever is allowed; a byte less and none is."""
     work = recipe_of(cubes)
-    least = write_mosaic(work, mosaic_at(tmp_path / "a.zarr"), memory=PLENTY, crew=ONE).projected
-    tight = write_mosaic(work, mosaic_at(tmp_path / "b.zarr"), memory=least, crew=THREE)
+    least = write_mosaic(work, mosaic_at(tmp_path / "a.zarr"), memory=PLENTY, pool=ONE).projected
+    tight = write_mosaic(work, mosaic_at(tmp_path / "b.zarr"), memory=least, pool=THREE)
     assert tight.workers == 1
     with pytest.raises(SettingsError, match=r"projected memory \d+ MiB exceeds --memory \d+ MiB: one tile of 64 x 640"):
         write_mosaic(work, mosaic_at(tmp_path / "c.zarr"), memory=least - 1)
@@ -154,30 +154,30 @@ def test_an_error_in_a_tile_ends_the_work(tmp_path: Path, cubes: list[RawCube]) 
 
     thumbnail = Thumbnail(GRID.shape, [3], 100)  # a band too far
     with pytest.raises(IndexError, match="index 3 is out of bounds"):
-        write_mosaic(recipe_of(cubes), mosaic_at(tmp_path / "m.zarr"), memory=PLENTY, crew=TWO, seen=thumbnail)
+        write_mosaic(recipe_of(cubes), mosaic_at(tmp_path / "m.zarr"), memory=PLENTY, pool=TWO, seen=thumbnail)
 
 
-def test_processes_write_the_same_bytes(tmp_path: Path, cubes: list[RawCube], processes: Crew) -> None:
+def test_processes_write_the_same_bytes(tmp_path: Path, cubes: list[RawCube], processes: WorkerPool) -> None:
     """From one recipe threads and processes make the same files and the same thumbnail, nothing beside them."""
     made = {}
-    for crew in (ONE, TWO, processes):
-        path, thumbnail = tmp_path / f"{crew.scheduler}{crew.workers}.part" / "m.zarr", Thumbnail(GRID.shape, [2], 50)
-        budget = write_mosaic(recipe_of(cubes), mosaic_at(path), memory=PLENTY, crew=crew, seen=thumbnail)
-        assert (budget.workers, budget.processes) == (crew.workers, crew is processes)
-        made[crew] = digest_of(path), thumbnail.image.tobytes()
+    for pool in (ONE, TWO, processes):
+        path, thumbnail = tmp_path / f"{pool.scheduler}{pool.workers}.part" / "m.zarr", Thumbnail(GRID.shape, [2], 50)
+        budget = write_mosaic(recipe_of(cubes), mosaic_at(path), memory=PLENTY, pool=pool, seen=thumbnail)
+        assert (budget.workers, budget.processes) == (pool.workers, pool is processes)
+        made[pool] = digest_of(path), thumbnail.image.tobytes()
     assert len({*made.values()}) == 1
 
 
 def test_a_worker_killed_between_tiles_changes_nothing(
-    tmp_path: Path, cubes: list[RawCube], processes: Crew, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, cubes: list[RawCube], processes: WorkerPool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """kill -9 of a process that makes tiles, with a shard half written: the mosaic is as an undisturbed one."""
     folder = tmp_path / "key.part"
-    write_mosaic(recipe_of(cubes), mosaic_at(tmp_path / "a.zarr"), memory=PLENTY, crew=ONE)
+    write_mosaic(recipe_of(cubes), mosaic_at(tmp_path / "a.zarr"), memory=PLENTY, pool=ONE)
     kill = KillOnce((1, 1), (0,), str(folder))
     monkeypatch.setattr("storage.arrays.tile_work.ThumbnailCut", lambda *about: kill)
     writer = mosaic_at(folder / "m.zarr")
-    write_mosaic(recipe_of(cubes), writer, memory=PLENTY, crew=processes, seen=Thumbnail(GRID.shape, [0], 900))
+    write_mosaic(recipe_of(cubes), writer, memory=PLENTY, pool=processes, seen=Thumbnail(GRID.shape, [0], 900))
     assert (folder / "killed").exists()
     assert digest_of(folder / "m.zarr") == digest_of(tmp_path / "a.zarr")
 
@@ -187,7 +187,8 @@ def test_each_process_keeps_the_lines_of_one_tile(cubes: list[RawCube]) -> None:
     work = work_of(cubes)
     tiles = plan_tiles(work.placed, CAMERA, GRID, (64, 640))
     kept = [
-        tile_budget(work, tiles, (64, 640), memory=PLENTY, crew=crew).cache for crew in (ONE, TWO, Crew("processes", 2))
+        tile_budget(work, tiles, (64, 640), memory=PLENTY, pool=pool).cache
+        for pool in (ONE, TWO, WorkerPool("processes", 2))
     ]
     assert kept[2] == kept[0] < kept[1]
 
@@ -197,7 +198,7 @@ def test_means_keep_the_lines_of_two_parts_of_a_tile(cubes: list[RawCube], tmp_p
     work = replace(work_of(cubes), grid=PixelGrid((-68.5, -418.5), 4, (35, 225)), finer=GRID)
     writer = MosaicWriter(tmp_path / "m.zarr", work.grid.shape, BANDS)
     tiles = plan_tiles(work.placed, CAMERA, work.grid, writer.tile_shape)
-    budget = tile_budget(work, tiles, writer.tile_shape, memory=PLENTY, crew=ONE)
+    budget = tile_budget(work, tiles, writer.tile_shape, memory=PLENTY, pool=ONE)
     assert budget.cache < cache_bytes(work.placed, tiles, 1)
     kept = LineCache(budget.cache)
     for tile in tiles:
@@ -218,18 +219,18 @@ def test_a_worker_lets_tiles_go(tmp_path: Path, cubes: list[RawCube]) -> None:
 
 def test_memory_of_workers_elsewhere_is_not_counted(tmp_path: Path, cubes: list[RawCube]) -> None:
     """They lie on other machines; here the least memory refuses nothing."""
-    work, elsewhere = work_of(cubes), Crew("tcp://127.0.0.1:9")
+    work, elsewhere = work_of(cubes), WorkerPool("tcp://127.0.0.1:9")
     tiles = plan_tiles(work.placed, CAMERA, GRID, (64, 640))
-    assert tile_budget(work, tiles, (64, 640), memory=1, crew=elsewhere).workers == 1
+    assert tile_budget(work, tiles, (64, 640), memory=1, pool=elsewhere).workers == 1
     with pytest.raises(SettingsError, match="exceeds --memory 1 MiB"):
-        tile_budget(work, tiles, (64, 640), memory=1, crew=ONE)
+        tile_budget(work, tiles, (64, 640), memory=1, pool=ONE)
 
 
-def test_every_process_counts_against_the_memory(tmp_path: Path, cubes: list[RawCube], processes: Crew) -> None:
+def test_every_process_counts_against_the_memory(tmp_path: Path, cubes: list[RawCube], processes: WorkerPool) -> None:
     """Two processes and this one do not fit where one does; the message says what each takes."""
     writer = mosaic_at(tmp_path / "m.zarr")
     with pytest.raises(SettingsError, match=r"each of two processes 512 MiB; give at least --memory 1\d\d\d MiB"):
-        write_mosaic(recipe_of(cubes), writer, memory=2**30, crew=processes)
+        write_mosaic(recipe_of(cubes), writer, memory=2**30, pool=processes)
 
 
 @pytest.mark.parametrize("shape", [(8, 12), (9, 13), (3, 2)])
@@ -262,14 +263,14 @@ def test_means_of_a_block_do_not_depend_on_holes_in_others() -> None:
     assert np.isfinite(torn).all()
 
 
-@pytest.mark.parametrize("crew", [ONE, Crew("processes", 2)])
-def test_a_mosaic_of_means_is_the_mean_of_the_finer_one(cubes: list[RawCube], tmp_path: Path, crew: Crew) -> None:
+@pytest.mark.parametrize("pool", [ONE, WorkerPool("processes", 2)])
+def test_a_mosaic_of_means_is_the_mean_of_the_finer_one(cubes: list[RawCube], tmp_path: Path, pool: WorkerPool) -> None:
     """Whoever makes its tiles: 4 x 4 finer pixels a pixel, those that no line reached left out."""
     fine, coarse = recipe_of(cubes), PixelGrid((-68.5, -418.5), 4, (35, 225))
     made = []
     for name, recipe in {"fine": fine, "means": replace(fine, grid=coarse, finer=GRID)}.items():
         writer = MosaicWriter(tmp_path / f"{name}.zarr", recipe.grid.shape, BANDS)
-        write_mosaic(recipe, writer, memory=PLENTY, crew=crew)
+        write_mosaic(recipe, writer, memory=PLENTY, pool=pool)
         made.append(load_mosaic(tmp_path / f"{name}.zarr"))
     means, covered = block_means(made[0].values, made[0].coverage.astype(np.intp), 4)
     np.testing.assert_allclose(made[1].values, means, rtol=5e-4, atol=1e-6)  # both are stored rounded

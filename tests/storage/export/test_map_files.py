@@ -20,7 +20,7 @@ from storage.export.map_files import (
     REDS,
     UNITS,
     TaskGrid,
-    TaskWords,
+    TaskText,
     ramp_colour,
     write_class_style,
     write_colour_style,
@@ -31,7 +31,7 @@ from storage.export.map_files import (
 
 DOSES = np.array([[0.0, 2.5, np.nan], [200.0, 0.0, 0.01]])
 GRID = TaskGrid(51.960197927, -7.600100835, 2.7e-05, 4.4e-05, DOSES, UNITS["l/ha"])
-WORDS = TaskWords("spot spraying of the northern field", "north", "weed 2.5 l/ha", "0.1.0", 12_345.6)
+WORDS = TaskText("spot spraying of the northern field", "north", "weed 2.5 l/ha", "0.1.0", 12_345.6)
 ENTRIES = [(0, "soil & stones", (158, 119, 82)), (7, 'weed "wild"', (220, 30, 30))]
 
 
@@ -142,7 +142,9 @@ def test_polygons_have_a_symbol_each(tmp_path: Path) -> None:
     assert found == {0.0: "215,215,215,255", 2.5: "150,0,20,255"}
 
 
-@pytest.mark.parametrize(("share", "colour"), [(0, REDS[0]), (0.5, REDS[1]), (1, REDS[2]), (2, REDS[2]), (-1, REDS[0])])
-def test_a_ramp_meets_its_colours(share: float, colour: tuple[int, ...]) -> None:
+@pytest.mark.parametrize(
+    ("fraction", "colour"), [(0, REDS[0]), (0.5, REDS[1]), (1, REDS[2]), (2, REDS[2]), (-1, REDS[0])]
+)
+def test_a_ramp_meets_its_colours(fraction: float, colour: tuple[int, ...]) -> None:
     """At its ends and in its middle; beyond the ends those stay."""
-    assert ramp_colour(share, REDS) == colour
+    assert ramp_colour(fraction, REDS) == colour

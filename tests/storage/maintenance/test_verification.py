@@ -195,7 +195,7 @@ def test_one_run_that_knows_a_manifest_vouches_for_it(archive: Archive) -> None:
     small = small_survey(archive, named=False)
     for _ in range(2):
         time.sleep(0.01)
-        archive.new_run("doubts").publish(rests_on={small.map.uri: "0" * 64})
+        archive.new_run("expected_errors").publish(rests_on={small.map.uri: "0" * 64})
     assert "has changed since runs/" in _found(archive)[small.map.uri][0]
     archive.new_run("knows").publish(rests_on=archive.manifest_hashes([small.map]))
     assert _found(archive) == {}

@@ -17,11 +17,11 @@ import pytest
 from dask.distributed import LocalCluster
 
 from pipeline.errors import SettingsError, ShapeError, WorkerError
-from storage.parallel import crew as crew_module
-from storage.parallel.crew import THREADS_OF, Crew, run_blocks
+from storage.parallel import pool as pool_module
+from storage.parallel.pool import THREADS_OF, WorkerPool, run_blocks
 
 ROOT = Path(__file__).parents[3]
-PROCESSES = Crew("processes", 2)
+PROCESSES = WorkerPool("processes", 2)
 
 
 def square(number: int) -> int:
@@ -57,23 +57,23 @@ def threads_here(number: int) -> tuple[int, str | None]:
 
 
 @pytest.fixture(scope="module")
-def processes() -> Iterator[Crew]:
+def processes() -> Iterator[WorkerPool]:
     """Two worker processes for all tests here."""
-    with PROCESSES.open() as crew:
-        yield crew
+    with PROCESSES.open() as pool:
+        yield pool
 
 
 @pytest.mark.parametrize("workers", [1, 3])
 @pytest.mark.parametrize("count", [0, 1, 7])
 def test_threads_give_results_in_order(workers: int, count: int) -> None:
     """However many threads, each item is made once, results stand in the items' order, and progress ends at 1."""
-    shares: list[float] = []
-    found = run_blocks(lambda item: item * 10, range(count), Crew(workers=workers), report=shares.append)
+    fractions: list[float] = []
+    found = run_blocks(lambda item: item * 10, range(count), WorkerPool(workers=workers), report=fractions.append)
     assert found == [10 * item for item in range(count)]
-    assert shares == [(number + 1) / count for number in range(count)]
+    assert fractions == [(number + 1) / count for number in range(count)]
 
 
-def test_processes_give_results_in_order(processes: Crew) -> None:
+def test_processes_give_results_in_order(processes: WorkerPool) -> None:
     """Other processes give what threads give; each result is shown once, whether it is kept or not."""
     shown: dict[int, int] = {}
     assert run_blocks(square, range(20), processes, each=shown.__setitem__) == [square(item) for item in range(20)]
@@ -81,8 +81,8 @@ def test_processes_give_results_in_order(processes: Crew) -> None:
     assert run_blocks(square, range(20), processes, keep=False) == []
 
 
-def test_workers_are_kept_and_have_one_thread(processes: Crew) -> None:
-    """While a crew is open the same processes work for every call, none of them this one, one thread each."""
+def test_workers_are_kept_and_have_one_thread(processes: WorkerPool) -> None:
+    """While a worker pool is open the same processes work for every call, none of them this one, one thread each."""
     seen = {one for _ in range(4) for one in run_blocks(threads_here, range(8), processes)}
     assert len({process for process, _ in seen}) <= processes.count  # one may do all blocks of a call
     assert {threads for _, threads in seen} == {"1"}
@@ -101,7 +101,7 @@ def test_few_blocks_are_begun_ahead_of_the_oldest(workers: int) -> None:
             go_on.wait(0.3)
             assert max(begun) < workers
 
-    run_blocks(make, range(24), Crew(workers=workers))
+    run_blocks(make, range(24), WorkerPool(workers=workers))
     assert sorted(begun) == list(range(24))
 
 
@@ -109,31 +109,31 @@ def test_few_blocks_are_begun_ahead_of_the_oldest(workers: int) -> None:
 def test_an_error_on_threads_is_raised_here(workers: int) -> None:
     """What a block raises ends the work."""
     with pytest.raises(ShapeError, match="no 3"):
-        run_blocks(partial(square_unless, 3), range(9), Crew(workers=workers))
+        run_blocks(partial(square_unless, 3), range(9), WorkerPool(workers=workers))
 
 
-def test_an_error_of_a_process_is_raised_here(processes: Crew) -> None:
+def test_an_error_of_a_process_is_raised_here(processes: WorkerPool) -> None:
     """What a block raises comes over with its type and message, and the workers serve the next call."""
     with pytest.raises(ShapeError, match="no 3"):
         run_blocks(partial(square_unless, 3), range(9), processes)
     assert run_blocks(square, range(3), processes) == [0, 1, 4]
 
 
-def test_a_killed_worker_costs_only_time(tmp_path: Path, processes: Crew) -> None:
+def test_a_killed_worker_costs_only_time(tmp_path: Path, processes: WorkerPool) -> None:
     """kill -9 of a worker in the middle of a block: the block is made again, by another."""
     assert run_blocks(partial(die_once, tmp_path), range(8), processes) == list(range(8))
     assert (tmp_path / "died").exists()
 
 
 def test_a_block_that_kills_its_workers_is_one_error() -> None:
-    """Where every try kills the worker, the error says so and what to do; a crew kept open gets other workers."""
-    with Crew("processes", 1).open() as crew:
-        (before, _), *_ = run_blocks(threads_here, [0], crew)
+    """Where every try kills the worker, the error says so and what to do; a worker pool kept open gets other workers."""
+    with WorkerPool("processes", 1).open() as pool:
+        (before, _), *_ = run_blocks(threads_here, [0], pool)
         with pytest.raises(
             WorkerError, match=r"1 worker processes: workers died .* in the same block.*--scheduler threads"
         ):
-            run_blocks(die, range(3), crew)
-        (after, _), *_ = run_blocks(threads_here, [0], crew)
+            run_blocks(die, range(3), pool)
+        (after, _), *_ = run_blocks(threads_here, [0], pool)
         assert before != after
 
 
@@ -141,33 +141,33 @@ def test_a_block_that_kills_its_workers_is_one_error() -> None:
 def test_an_unknown_scheduler_is_refused(scheduler: str) -> None:
     """A word that is none, or an address without a port, is refused with what is expected."""
     with pytest.raises(SettingsError, match="threads, processes, or the address of a dask scheduler such as tcp://"):
-        Crew(scheduler)
+        WorkerPool(scheduler)
 
 
 def test_workers_are_counted() -> None:
     """None is a worker for each core; fewer than one is refused."""
-    assert Crew().count == len(os.sched_getaffinity(0))
+    assert WorkerPool().count == len(os.sched_getaffinity(0))
     with pytest.raises(SettingsError, match="at least 1, got 0"):
-        Crew(workers=0)
+        WorkerPool(workers=0)
 
 
 def test_nobody_answers(monkeypatch: pytest.MonkeyPatch) -> None:
     """No scheduler at the address: one error that says where, what was expected and what to do."""
-    monkeypatch.setattr(crew_module, "ANSWER_S", 0.3)
+    monkeypatch.setattr(pool_module, "ANSWER_S", 0.3)
     with pytest.raises(SettingsError, match=r"tcp://127.0.0.1:9: expected a dask scheduler .*start `dask scheduler`"):
-        run_blocks(square, [1], Crew("tcp://127.0.0.1:9"))
+        run_blocks(square, [1], WorkerPool("tcp://127.0.0.1:9"))
 
 
 @pytest.fixture(scope="module")
-def elsewhere() -> Iterator[Crew]:
+def elsewhere() -> Iterator[WorkerPool]:
     """A scheduler with one worker, found by its address."""
     with LocalCluster(n_workers=1, threads_per_worker=2, dashboard_address="127.0.0.1:0") as cluster:
-        crew = Crew(cluster.scheduler_address)
-        with crew.open():
-            yield crew
+        pool = WorkerPool(cluster.scheduler_address)
+        with pool.open():
+            yield pool
 
 
-def test_workers_of_a_scheduler_elsewhere_give_the_same(elsewhere: Crew, tmp_path: Path) -> None:
+def test_workers_of_a_scheduler_elsewhere_give_the_same(elsewhere: WorkerPool, tmp_path: Path) -> None:
     """By the address of a scheduler its workers make the blocks, once they have shown that they see the folder."""
     assert run_blocks(square, range(6), elsewhere, paths=[tmp_path]) == [square(item) for item in range(6)]
 
@@ -181,12 +181,12 @@ def test_workers_of_a_scheduler_elsewhere_give_the_same(elsewhere: Crew, tmp_pat
     ],
 )
 def test_workers_that_differ_are_refused(
-    elsewhere: Crew, monkeypatch: pytest.MonkeyPatch, here: dict[str, str], words: str
+    elsewhere: WorkerPool, monkeypatch: pytest.MonkeyPatch, here: dict[str, str], words: str
 ) -> None:
     """Other code, another numpy or other files would give other bytes: the first that differs is named."""
-    run, true = crew_module.dask_distributed.Client.run, crew_module.about_here([])
-    monkeypatch.setattr(crew_module.dask_distributed.Client, "run", lambda self, ask, folders: run(self, _true, true))
-    monkeypatch.setattr(crew_module, "about_here", lambda folders: {**true, **here})
+    run, true = pool_module.dask_distributed.Client.run, pool_module.about_here([])
+    monkeypatch.setattr(pool_module.dask_distributed.Client, "run", lambda self, ask, folders: run(self, _true, true))
+    monkeypatch.setattr(pool_module, "about_here", lambda folders: {**true, **here})
     with pytest.raises(SettingsError, match=rf"worker tcp:.* {words}"):
         run_blocks(square, [1], elsewhere)
 
@@ -210,11 +210,11 @@ def fail_or_write(folder: Path, number: int) -> None:
 
 
 @pytest.mark.parametrize("scheduler", ["threads", "processes"])
-def test_nobody_writes_after_an_error(tmp_path: Path, processes: Crew, scheduler: str) -> None:
+def test_nobody_writes_after_an_error(tmp_path: Path, processes: WorkerPool, scheduler: str) -> None:
     """Once an error is raised whoever asked may take the folder away: no block comes back to it, none is begun."""
-    crew = processes if scheduler == "processes" else Crew(workers=2)
+    pool = processes if scheduler == "processes" else WorkerPool(workers=2)
     with pytest.raises(ShapeError, match="no 0"):
-        run_blocks(partial(fail_or_write, tmp_path), range(6), crew)
+        run_blocks(partial(fail_or_write, tmp_path), range(6), pool)
     left = sorted(path.name for path in tmp_path.iterdir())
     time.sleep(2 * STALE_S)
     assert sorted(path.name for path in tmp_path.iterdir()) == left
@@ -224,19 +224,19 @@ GONE = """
 import subprocess, sys, time
 from contextlib import suppress
 from pipeline.errors import PipelineError, WorkerError
-from storage.parallel import crew as crew_module
-from storage.parallel.crew import Crew, run_blocks
+from storage.parallel import worker pool as crew_module
+from storage.parallel.worker pool import Crew, run_blocks
 from tests.storage.parallel.test_block_work import nap
 
 def dask(*words):
     command = [sys.executable, "-m", f"distributed.cli.dask_{words[0]}", *words[1:], "--no-dashboard"]
     return subprocess.Popen(command, stderr=subprocess.DEVNULL)
 
-def begin(crew):
-    started = dask("scheduler", "--host", crew.scheduler), dask("worker", crew.scheduler, "--nthreads", "1")
+def begin(worker pool):
+    started = dask("scheduler", "--host", worker pool.scheduler), dask("worker", worker pool.scheduler, "--nthreads", "1")
     while True:
         with suppress(PipelineError):
-            run_blocks(nap, range(1), crew)
+            run_blocks(nap, range(1), worker pool)
             return started
         time.sleep(0.1)
 
@@ -247,15 +247,15 @@ def end(started):
 
 if __name__ == "__main__":
     crew_module.ANSWER_S = 1.0
-    with Crew(sys.argv[1]).open() as crew:
-        started = begin(crew)
+    with Crew(sys.argv[1]).open() as worker pool:
+        started = begin(worker pool)
         try:
-            run_blocks(nap, range(9), crew, each=lambda number, result: started[0].kill())
+            run_blocks(nap, range(9), worker pool, each=lambda number, result: started[0].kill())
         except WorkerError as error:
             print(error)
         end(started)
-        started = begin(crew)
-        print(run_blocks(nap, range(3), crew))
+        started = begin(worker pool)
+        print(run_blocks(nap, range(3), worker pool))
         end(started)
 """
 
@@ -267,7 +267,7 @@ def nap(number: int) -> int:
 
 
 def test_a_scheduler_that_goes_away_is_one_error(tmp_path: Path) -> None:
-    """In the middle of the work: one message, no traceback of dask's; one that comes back serves the same crew."""
+    """In the middle of the work: one message, no traceback of dask's; one that comes back serves the same worker pool."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
     with run_script(tmp_path, GONE, address) as started:
@@ -280,12 +280,12 @@ INTERRUPTED = """
 import signal, sys, time
 from functools import partial
 from pathlib import Path
-from storage.parallel.crew import Crew, run_blocks
+from storage.parallel.pool import WorkerPool, run_blocks
 from tests.storage.parallel.test_block_work import touch_slowly
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs have it ignored
     try:
-        run_blocks(partial(touch_slowly, Path(sys.argv[1])), range(1000), Crew("processes", 1))
+        run_blocks(partial(touch_slowly, Path(sys.argv[1])), range(1000), WorkerPool("processes", 1))
     except KeyboardInterrupt:
         sys.exit(130)
 """
@@ -314,7 +314,7 @@ def is_running(process: int) -> bool:
 
 
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGKILL])
-def test_no_worker_outlives_its_crew(tmp_path: Path, sent: signal.Signals) -> None:
+def test_no_worker_outlives_its_pool(tmp_path: Path, sent: signal.Signals) -> None:
     """Ctrl-C ends the workers without a word of theirs; after kill -9 of the process that started them they end too."""
     begun = tmp_path / "begun"
     begun.mkdir()

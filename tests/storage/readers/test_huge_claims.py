@@ -229,13 +229,13 @@ def test_tiffs_that_claim_too_much(tmp_path: Path, side: int, tile: int) -> None
 
 
 @pytest.mark.parametrize("compression", [None, "zlib"])
-@pytest.mark.parametrize("share", [0.02, 0.3, 0.9, 0.999])
-def test_tiffs_that_are_cut_off(tmp_path: Path, compression: str | None, share: float) -> None:
+@pytest.mark.parametrize("fraction", [0.02, 0.3, 0.9, 0.999])
+def test_tiffs_that_are_cut_off(tmp_path: Path, compression: str | None, fraction: float) -> None:
     """A TIFF that ends too early is refused when its missing rows are asked for, not filled."""
     values = np.random.default_rng(0).integers(1, 255, (200, 100), dtype=np.uint8)
     tifffile.imwrite(tmp_path / "a.tif", values, compression=compression, rowsperstrip=16)
     whole = (tmp_path / "a.tif").read_bytes()
-    (tmp_path / "a.tif").write_bytes(whole[: int(len(whole) * share)])
+    (tmp_path / "a.tif").write_bytes(whole[: int(len(whole) * fraction)])
     with pytest.raises(SceneError, match="cannot be read as TIFF"):
         open_cube(tmp_path / "a.tif").read(0, 200)
 

@@ -151,7 +151,7 @@ def test_a_folder_of_scenes(tmp_path: Path) -> None:
     assert [data.load(name).class_names for name in ("a", "b")] == [("maize", "oats", "wheat")] * 2
     assert (data.load("b").labels == 0).sum() == (TRUTH == 1).sum()
     draft = draft_scene(tmp_path)
-    assert {one.name: (one.value, round(one.share * 140)) for one in draft.classes} == {
+    assert {one.name: (one.value, round(one.fraction * 140)) for one in draft.classes} == {
         "maize": (1, 70),
         "oats": (2, 30),
         "wheat": (3, 40),

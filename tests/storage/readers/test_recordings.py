@@ -125,7 +125,12 @@ def test_frames_that_are_not_there_are_assumed_and_said(files: Path) -> None:
         (files / f"scan-0.{kind}.hdr").unlink()
     recording = open_recording(files, CAMERA)
     known = recording.sweeps[0].references
-    assert (known.dark.max(), known.white.min(), known.white.max(), known.panel.tolist()) == (0, 4095, 4095, [1, 1, 1])
+    assert (known.dark.max(), known.white.min(), known.white.max(), known.white_reference.tolist()) == (
+        0,
+        4095,
+        4095,
+        [1, 1, 1],
+    )
     assert any("has no dark frame: a dark level of 0 is assumed" in note for note in recording.notes)
     assert any(
         "full scale (4095 DN) is assumed to be white, and values are relative" in note for note in recording.notes

@@ -257,7 +257,7 @@ def test_envi_labels(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
     np.testing.assert_array_equal(scene.labels, labels)
 
 
-def test_headwall_scenes_are_taken_over_the_white_panel(tmp_path: Path) -> None:
+def test_headwall_scenes_are_taken_over_the_white_white_reference(tmp_path: Path) -> None:
     """With dark and white frames beside its parts a folder is a scene of reflectance, without them of raw numbers."""
     shown = np.random.default_rng(5).uniform(0.1, 0.9, (6, 40, 5))
     raw = np.rint(100 + shown * 1000).astype(np.uint16)
@@ -269,7 +269,7 @@ def test_headwall_scenes_are_taken_over_the_white_panel(tmp_path: Path) -> None:
         (tmp_path / f"{name}.hdr").write_text(head.replace("lines = 7", f"lines = {len(values)}") + ENVI_NM)
     scene = load_scene_file(tmp_path)
     np.testing.assert_allclose(scene.values, shown, atol=1e-3)
-    assert "values are over the white panel" in scene.provenance
+    assert "values are over the white reference" in scene.provenance
     before = scene.light_hash
     (tmp_path / "whiteReference.hdr").unlink()
     plain = load_scene_file(tmp_path)

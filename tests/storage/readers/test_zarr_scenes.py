@@ -127,13 +127,13 @@ def test_own_mosaic(tmp_path: Path) -> None:
 
 
 def test_own_raw_cube(tmp_path: Path) -> None:
-    """A raw cube of this project is read over its white panel; lines that cannot be used are missing."""
+    """A raw cube of this project is read over its white reference; lines that cannot be used are missing."""
     rng = np.random.default_rng(1)
     shown = rng.uniform(0.1, 0.9, (6, 40, 5))
-    dark, light, panel = np.full((40, 5), 50.0), np.full((40, 5), 1050.0), np.full(5, 0.5)
-    raw = np.rint(dark + shown / panel * (light - dark)).astype(np.uint16)
+    dark, light, white_reference = np.full((40, 5), 50.0), np.full((40, 5), 1050.0), np.full(5, 0.5)
+    raw = np.rint(dark + shown / white_reference * (light - dark)).astype(np.uint16)
     sweep = Sweep("fine-0", "fine", "y", 0.0, 0.0, 6)
-    references = References(dark.astype(np.float32), light.astype(np.float32), panel.astype(np.float32))
+    references = References(dark.astype(np.float32), light.astype(np.float32), white_reference.astype(np.float32))
     with RawCubeWriter(tmp_path / "s0.zarr", SweepHeader(sweep, references, NM)) as cube:
         cube.write([Line(i, raw[i], 0.0, 0.0, i * 0.1, 10.0, i != 3) for i in range(6)])
     scene = load_scene_file(tmp_path / "s0.zarr")

@@ -1,4 +1,4 @@
-"""What the farm is painted on: abundances of the day's materials and shares of classes; surfaces that lie anywhere."""
+"""What the farm is painted on: abundances of the day's materials and fractions of classes; surfaces that lie anywhere."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from pipeline.simulator.scenes.farm.seasons import (
     Sun,
     foliage,
     land_on,
-    lodged_share,
+    lodged_fraction,
     soil_moisture,
-    stage_shares,
+    stage_fractions,
     sun_over_farm,
 )
-from pipeline.simulator.scenes.farm.spectra import MATERIALS, wet_share
+from pipeline.simulator.scenes.farm.spectra import MATERIALS, wet_fraction
 
 _COLOURS = {
     "soil": (158, 119, 82),
@@ -50,11 +50,11 @@ CLASSES, CLASS_COLOURS = tuple(_COLOURS), np.array(list(_COLOURS.values()), np.u
 
 Mixture = dict[str, Field]
 PARCEL_AREA_PX = 95_000.0
-USE_SHARES = {
+USE_FRACTIONS = {
     **{"maize": 0.16, "sugar_beet": 0.15, "wheat_a": 0.15, "wheat_b": 0.15, "stubble": 0.09, "grass": 0.08},
     **{"soil": 0.11, "late_maize": 0.045, "late_beet": 0.045},
 }
-BORDER_SHARES = {"road": 0.20, "ditch": 0.38, "hedge": 0.17, "margin": 0.25}  # of the lines between parcels
+BORDER_FRACTIONS = {"road": 0.20, "ditch": 0.38, "hedge": 0.17, "margin": 0.25}  # of the lines between parcels
 TWINS = {"wheat_a": "wheat_b", "wheat_b": "wheat_a"}
 UNEVEN_DAYS = 9.0  # by which plants of one field are at most ahead of or behind the rest
 _ROWS_ELSEWHERE = {"stubble": (3.4, 4.4), "grass": (36.0, 52.0), "soil": (9.0, 13.0)}
@@ -63,7 +63,7 @@ _WEEDS_ELSEWHERE = {"stubble": (1.0, 6.0), "grass": (0.2, 2.0), "soil": (0.5, 4.
 
 @dataclass(frozen=True)
 class Ground:
-    """What varies over the whole farm, (y, x) each, sd about 1 except ``light`` (share of full light)."""
+    """What varies over the whole farm, (y, x) each, sd about 1 except ``light`` (fraction of full light)."""
 
     moisture: Field
     vigour: Field
@@ -97,11 +97,11 @@ class Canvas:
         self.materials = np.zeros((shape[0] * shape[1], len(materials)), np.float32)
         self.classes = np.zeros((shape[0] * shape[1], len(CLASSES)), np.float32)
 
-    def add(self, index: NDArray[np.intp], cover: Field, mixture: Mixture, shares: Mixture) -> None:
+    def add(self, index: NDArray[np.intp], cover: Field, mixture: Mixture, fractions: Mixture) -> None:
         """Lay a surface beside what is there."""
         for name, part in mixture.items():
             self.materials[index, self._column[name]] += cover * part
-        for name, part in shares.items():
+        for name, part in fractions.items():
             self.classes[index, CLASSES.index(name)] += cover * part
 
     def over(self, index: NDArray[np.intp], cover: Field, mixture: Mixture, label: str | None) -> None:
@@ -135,7 +135,7 @@ class Painting:
 def moist_soil(plan: FarmPlan, here: Ground, wetter: float = 0.0) -> Mixture:
     """Bare soil with its water; clods throw longer shadows under a lower sun, up to a third of the pixel."""
     water = plan.moisture + wetter + 0.035 * here.moisture + 0.008 * here.tuft
-    wet = wet_share(np.clip(water, 0.02, 0.45))
+    wet = wet_fraction(np.clip(water, 0.02, 0.45))
     low = min(float(np.hypot(*plan.sun.cast)), 3.0)
     rough = low * (0.07 + 0.04 * here.grain + 0.01 * here.tuft)
     shade = np.asarray(np.clip(rough, 0, 0.33), np.float32)
@@ -185,8 +185,8 @@ class FieldPlan:
     headland_px: float
     tramlines: Tramlines | None
     late_days: float
-    gap_rate: float  # share of the row's pieces that did not come up
-    lodging: float  # share of the field that lies in the end
+    gap_rate: float  # fraction of the row's pieces that did not come up
+    lodging: float  # fraction of the field that lies in the end
     weeds: float  # plants per 1000 px
     wetter: float  # water in the topsoil against the farm's, by volume
 
@@ -204,9 +204,9 @@ class FieldPlan:
         crop, land = self.crop, self.land_on(day)
         if crop is None or land.phase != "crop":
             return set()
-        names = set(stage_shares(crop, np.linspace(land.days - UNEVEN_DAYS, land.days + UNEVEN_DAYS, 37)))
+        names = set(stage_fractions(crop, np.linspace(land.days - UNEVEN_DAYS, land.days + UNEVEN_DAYS, 37)))
         if self.use in TWINS:
-            if self.lodging * lodged_share(day) > 0:
+            if self.lodging * lodged_fraction(day) > 0:
                 names |= {f"{self.use}_lodged", f"{self.use}_lodged_ripe"}
             names |= {name.replace(self.use, TWINS[self.use]) for name in names}
         return names
@@ -234,7 +234,7 @@ class FarmPlan:
         """Spectra that the scene mixes, in the order of its planes: those that the day can show."""
         there = {"soil_dry", "soil_wet", "gravel", "water", "straw", "straw_grey", "grass_green", "grass_dry", "shade"}
         there |= {"weed_leafy", "weed_red", "volunteer", "blossom"}
-        there |= {name for name, share in foliage(self.day).items() if share > 0}
+        there |= {name for name, fraction in foliage(self.day).items() if fraction > 0}
         for one in self.fields:
             there |= one.materials_on(self.day)
         return tuple(name for name in MATERIALS if name in there)
@@ -250,8 +250,8 @@ def farm_plan(seed: int, shape: tuple[int, int] = (1024, 1280), *, day: int = 17
     sun = sun_over_farm(day, hour)
     size = (max(shape[0] + 80, 640), max(shape[1] + 80, 640))
     parcels, borders = divide_land(stream(seed, "land"), size, PARCEL_AREA_PX)
-    uses = allot(stream(seed, "use"), [visible_area(parcel, shape) for parcel in parcels], USE_SHARES)
-    kinds = allot(stream(seed, "borders"), [border.length for border in borders], BORDER_SHARES)
+    uses = allot(stream(seed, "use"), [visible_area(parcel, shape) for parcel in parcels], USE_FRACTIONS)
+    kinds = allot(stream(seed, "borders"), [border.length for border in borders], BORDER_FRACTIONS)
     fields = tuple(
         _plan_field(stream(seed, f"field {number}"), parcel, use)
         for number, (parcel, use) in enumerate(zip(parcels, uses, strict=True))

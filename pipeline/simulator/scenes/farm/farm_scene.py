@@ -5,8 +5,8 @@ s about 1. Every part draws from its own stream of the seed. What is drawn, and 
 
 * Land (``land``): a rectangle 80 px larger than the scene (and at least 640 x 640) is split along two directions
   (turned by U(-0.6, 0.6) rad, each cut up to 0.12 rad off) at 0.36-0.64 of its length, until a parcel has less than
-  95 000 U(1.15, 1.9) px. Uses go by ``USE_SHARES`` blurred by LN(0.25), the largest parcel to the use that lacks most,
-  each use at least once where there are enough parcels; lines between parcels by ``BORDER_SHARES``, likewise.
+  95 000 U(1.15, 1.9) px. Uses go by ``USE_FRACTIONS`` blurred by LN(0.25), the largest parcel to the use that lacks most,
+  each use at least once where there are enough parcels; lines between parcels by ``BORDER_FRACTIONS``, likewise.
 * ``farm_plan``: heading and period of each field's rows, tramlines, weeds, lodging.
 * ``seasons``: calendars, cover, stages, lodging, weeds' growth, leaves of trees, water in the soil, the sun's place.
 * ``spectra``: materials at their stages, the soil line.
@@ -17,7 +17,7 @@ s about 1. Every part draws from its own stream of the seed. What is drawn, and 
   abundances stay non-negative and sum to 1.
 
 A pixel's label is the class that covers most of it; harvested cereals and maize are stubble until they are tilled, a
-crop that hardly covers the soil is soil. Edges are mixed by the share of the pixel that they cover.
+crop that hardly covers the soil is soil. Edges are mixed by the fraction of the pixel that they cover.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ from pipeline.simulator.scenes.farm.land import (
     stream,
 )
 from pipeline.simulator.scenes.farm.seasons import Sun, foliage
-from pipeline.simulator.scenes.farm.spectra import PANEL_REFLECTANCE, band_centres, spectral_library
-from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.scenes.farm.spectra import WHITE_REFERENCE_REFLECTANCE, band_centres, spectral_library
+from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
 
 # A law is what a seed is drawn by; it stands first in a scene's key, and one that is out there never changes.
 FARM_LAW, REMOVED_LAW = "farm@2", "farm@1"
@@ -105,19 +105,19 @@ def farm_scene(
     seen_by, size = camera or LineCamera(), f"{shape[0]}x{shape[1]}"
     wavelength, fwhm = band_centres(bands)
 
-    def light() -> SceneLight:
+    def light() -> SceneRadiance:
         library = spectral_library(bands, plan.materials)
-        return SceneLight(library.electrons(seen_by), library.panel_electrons(seen_by))
+        return SceneRadiance(library.electrons(seen_by), library.white_reference_electrons(seen_by))
 
     return RasterScene(
         name="farm",
         key=(
             f"{FARM_LAW}/seed={seed}/day={plan.day}/shape={size}/hour={plan.hour:g}/bands={bands}"
-            f"/full_well={seen_by.full_well_e:g}"
+            f"/full_well={seen_by.full_full_well_e:g}"
         ),
         raster=SceneRaster((*shape, len(plan.materials)), labelled=True, draw=lambda: _draw(plan)),
         light=Once(light),
-        panel=np.full(bands, PANEL_REFLECTANCE, np.float32),
+        white_reference=np.full(bands, WHITE_REFERENCE_REFLECTANCE, np.float32),
         wavelength_nm=wavelength,
         fwhm_nm=fwhm,
         class_names=CLASSES,
@@ -156,14 +156,14 @@ def paint_borders(work: Painting) -> None:
                 )
                 here = work.ground.at(band.index)
                 half, bank = rng.uniform(*WIDTHS[kind]), rng.uniform(*BANKS[kind])
-                dryness, strip, inner = rng.uniform(0.25, 0.55), rng.uniform() < 0.5, rng.uniform(0.8, 1.2)
+                dryness, swath, inner = rng.uniform(0.25, 0.55), rng.uniform() < 0.5, rng.uniform(0.8, 1.2)
                 _cover(canvas, band, half + bank, grass(here, dryness), "grass")
                 if kind == "ditch":
                     full = half * (0.75 + 1.4 * plan.moisture)
                     _cover(canvas, band, full, {"water": np.ones_like(band.across)}, "water")
                 if kind == "road":
                     _cover(canvas, band, half, hard_track(here, 0.75), "track")
-                    if strip:
+                    if swath:
                         _cover(canvas, band, inner, grass(here, 0.5), "grass")
 
 
@@ -220,7 +220,7 @@ def plant_trees(work: Painting) -> None:
     canvas, plan = work.canvas, work.plan
     crowns = crowns_of(work)
     centres, radius = crowns[:, :2], crowns[:, 2]
-    leaves = {name: share for name, share in foliage(plan.day).items() if share > 0}
+    leaves = {name: fraction for name, fraction in foliage(plan.day).items() if fraction > 0}
     opaque = 1 - (1 - BARE_CROWN) * leaves.get("twigs", 0.0)
     shadow = crown_shadows(centres, radius, plan.sun, plan.shape).ravel()
     dark = np.flatnonzero(shadow)
@@ -231,7 +231,7 @@ def plant_trees(work: Painting) -> None:
     away /= np.hypot(*plan.sun.cast)
     here = work.ground.at(index)
     shade = np.asarray(np.clip(0.18 + 0.18 * away + 0.08 * here.tuft + 0.05 * here.grain, 0, 0.6), np.float32)
-    mixture = {name: share * (1 - shade) for name, share in leaves.items()}
+    mixture = {name: fraction * (1 - shade) for name, fraction in leaves.items()}
     canvas.over(index, np.asarray(opaque * cover, np.float32), mixture | {"shade": shade}, "tree")
 
 

@@ -38,8 +38,8 @@ from pipeline.simulator.scenes.farm.seasons import (
     canopy_cover,
     crop_height,
     days_since_turned,
-    lodged_share,
-    stage_shares,
+    lodged_fraction,
+    stage_fractions,
     weed_size,
 )
 
@@ -56,17 +56,17 @@ SPECIES: dict[str, tuple[float, float, float]] = {  # share, and first and last 
     "mustard": (0.15, 92.0, 150.0),
 }
 FLOWERING = (36.0, 85.0)  # days since mustard came up
-CLUSTERED, CLUSTER = 0.65, 22  # share of plants in clusters, and plants in one
+CLUSTERED, CLUSTER = 0.65, 22  # fraction of plants in clusters, and plants in one
 ALONG_PX, ASIDE_PX = 16.0, 6.0  # spread of a cluster along the rows and across, sd
 VOLUNTEERS = 1 / 6000  # single plants of another crop per px
 SEEN_PX = 0.35  # least radius of a plant that is drawn
 
 
 class Content(NamedTuple):
-    """Materials and class shares of a surface, each summing to 1 per pixel."""
+    """Materials and class fractions of a surface, each summing to 1 per pixel."""
 
     mixture: Mixture
-    shares: Mixture
+    fractions: Mixture
 
 
 def paint_fields(work: Painting) -> None:
@@ -126,17 +126,17 @@ def _standing_crop(
 
 def _stand(field: FieldPlan, crop: Crop, here: Ground, local: Points, down: Field) -> Mixture:
     """Plants alone, by stage; wheat stands and lies, and 0.80 of a pixel has its own variety's red edge."""
-    shares = stage_shares(crop, local)
+    fractions = stage_fractions(crop, local)
     if field.use not in TWINS:
-        return shares
+        return fractions
     if down.max(initial=0) > 0:
-        ripe = shares.get(f"{field.use}_ripe", np.zeros_like(down))
+        ripe = fractions.get(f"{field.use}_ripe", np.zeros_like(down))
         swirl = np.clip(0.07 + 0.07 * here.tuft, 0, 0.3)  # stems lie this way and that
         lying = {f"{field.use}_lodged": (1 - ripe) * (1 - swirl), f"{field.use}_lodged_ripe": ripe * (1 - swirl)}
-        shares = blend(shares, lying | {"shade": swirl}, down)
+        fractions = blend(fractions, lying | {"shade": swirl}, down)
     own = np.clip(0.80 + 0.05 * here.vigour + 0.17 * here.grain, 0, 1)
-    stand = {name: part * own for name, part in shares.items()}
-    for name, part in shares.items():
+    stand = {name: part * own for name, part in fractions.items()}
+    for name, part in fractions.items():
         other = name.replace(field.use, TWINS[field.use])
         stand[other] = stand.get(other, np.float32(0)) + part * (1 - own)
     return stand
@@ -148,7 +148,7 @@ def _with_wheel_marks(content: Content, field: FieldPlan, rows: Rows, soil: Mixt
     marks = wheel_marks(field, rows)
     trodden = blend(soil, {"gravel": np.ones_like(marks)}, np.full_like(marks, 0.22))
     mixture = blend(content.mixture, trodden, marks)
-    return Content(mixture, blend(content.shares, {"track": np.ones_like(marks)}, marks))
+    return Content(mixture, blend(content.fractions, {"track": np.ones_like(marks)}, marks))
 
 
 def _stubble_field(rows: Rows, field: FieldPlan, here: Ground, soil: Mixture, days: float) -> Content:
@@ -185,17 +185,17 @@ def _lodging_field(work: Painting) -> Field | None:
     """Random field whose highest parts lie first, (y, x); None where nothing lies on the day."""
     plan = work.plan
     standing = any(one.lodging > 0 and one.land_on(plan.day).phase == "crop" for one in plan.fields)
-    if lodged_share(plan.day) == 0 or not standing:
+    if lodged_fraction(plan.day) == 0 or not standing:
         return None
     return smooth_noise(stream(plan.seed, "lodging"), plan.shape, LODGED_PATCH_PX)
 
 
 def _lodged(noise: Field, field: FieldPlan, day: int) -> Field:
-    share = field.lodging * lodged_share(day)
+    fraction = field.lodging * lodged_fraction(day)
     crop = field.crop
-    if share <= 0 or crop is None or field.land_on(day).phase != "crop" or field.land_on(day).days < 150:
+    if fraction <= 0 or crop is None or field.land_on(day).phase != "crop" or field.land_on(day).days < 150:
         return np.zeros_like(noise)
-    return np.asarray(np.clip((noise - NormalDist().inv_cdf(1 - share)) / 0.2 + 0.5, 0, 1), np.float32)
+    return np.asarray(np.clip((noise - NormalDist().inv_cdf(1 - fraction)) / 0.2 + 0.5, 0, 1), np.float32)
 
 
 @dataclass(frozen=True)
@@ -234,7 +234,7 @@ def rows_of(rng: np.random.Generator, field: FieldPlan, centres: Points) -> Rows
 
 
 def row_gaps(salt: int, field: FieldPlan, rows: Rows, here: Ground) -> Field:
-    """Share of each pixel where nothing came up: pieces of rows, more of them where vigour is poor."""
+    """Fraction of each pixel where nothing came up: pieces of rows, more of them where vigour is poor."""
     number = np.rint(rows.place / field.row_period_px).astype(np.int64)
     position = rows.onward / PIECE_PX + _scatter(number, number, salt)
     piece = np.floor(position).astype(np.int64)
@@ -246,7 +246,7 @@ def row_gaps(salt: int, field: FieldPlan, rows: Rows, here: Ground) -> Field:
 
 
 def row_shadow(sun: Sun, height: float, rows: Rows, period: float, width: Floats) -> Field:
-    """Share of each pixel in the shadow of rows of a height, outside the rows themselves."""
+    """Fraction of each pixel in the shadow of rows of a height, outside the rows themselves."""
     room = np.maximum(period - width, 0)
     shift = np.clip(height * (rows.normal @ sun.cast), -room, room)
     both = stripes_of(rows.place - shift / 2, period, width + np.abs(shift))
@@ -254,7 +254,7 @@ def row_shadow(sun: Sun, height: float, rows: Rows, period: float, width: Floats
 
 
 def stripes_of(place: Floats, period: float, width: Floats) -> Field:
-    """Share of each pixel covered by stripes whose width differs from pixel to pixel (``land.stripes``)."""
+    """Fraction of each pixel covered by stripes whose width differs from pixel to pixel (``land.stripes``)."""
     start = place + (width - 1) / 2
     whole, rest = np.divmod(start, period)
     last, left = np.divmod(start + 1, period)
@@ -262,7 +262,7 @@ def stripes_of(place: Floats, period: float, width: Floats) -> Field:
 
 
 def wheel_marks(field: FieldPlan, rows: Rows) -> Field:
-    """Share of each pixel under tramlines, which also go round on the headland; 0 where the field has none."""
+    """Fraction of each pixel under tramlines, which also go round on the headland; 0 where the field has none."""
     trams = field.tramlines
     if trams is None:
         return np.zeros(len(rows.across), np.float32)
@@ -304,7 +304,7 @@ def field_weeds(rng: np.random.Generator, field: FieldPlan, day: int) -> dict[st
     area = polygon_area(corners)
     count, single = rng.poisson(field.weeds * area / 1000), rng.poisson(VOLUNTEERS * area)
     places, radius = _clustered(rng, field, count), rng.uniform(0.9, 2.4, count)
-    kinds = rng.choice(list(SPECIES), count, p=[share for share, _, _ in SPECIES.values()])
+    kinds = rng.choice(list(SPECIES), count, p=[fraction for fraction, _, _ in SPECIES.values()])
     first, last = (np.array([SPECIES[kind][end] for kind in kinds]).reshape(-1) for end in (1, 2))
     emergence = rng.uniform(size=count) * (last - first) + first
     kinds = np.append(kinds, np.full(single, "volunteer"))

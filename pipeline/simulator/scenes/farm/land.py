@@ -106,15 +106,15 @@ def visible_area(parcel: Parcel, shape: tuple[int, int]) -> float:
     return polygon_area(corners)
 
 
-def allot(rng: np.random.Generator, sizes: list[float], shares: dict[str, float]) -> list[str]:
+def allot(rng: np.random.Generator, sizes: list[float], fractions: dict[str, float]) -> list[str]:
     """Give every piece a kind so that sizes approach the shares, each kind at least once where pieces suffice.
 
     The shares are first blurred by a log-normal factor (sigma 0.25), so that no two farms are alike.
     """
-    wanted = {kind: share * float(np.exp(0.25 * rng.standard_normal())) for kind, share in shares.items()}
+    wanted = {kind: fraction * float(np.exp(0.25 * rng.standard_normal())) for kind, fraction in fractions.items()}
     scale = sum(sizes) / sum(wanted.values())
-    lack = {kind: share * scale for kind, share in wanted.items()}
-    kinds, missing = [""] * len(sizes), set(shares)
+    lack = {kind: fraction * scale for kind, fraction in wanted.items()}
+    kinds, missing = [""] * len(sizes), set(fractions)
     order = sorted(range(len(sizes)), key=lambda piece: -sizes[piece])
     for rank, piece in enumerate(order):
         forced = missing and len(order) - rank <= len(missing)
@@ -162,7 +162,7 @@ def band_pixels(border: Border, reach: float, shape: tuple[int, int]) -> Band:
 
 
 def stripes(position: NDArray[np.floating], period: float, width: float) -> Field:
-    """Share of each pixel covered by stripes of ``width`` centred on multiples of ``period`` (box of 1 px)."""
+    """Fraction of each pixel covered by stripes of ``width`` centred on multiples of ``period`` (box of 1 px)."""
     start = np.asarray(position, dtype=np.float64) + (width - 1) / 2
     whole, rest = np.divmod(np.stack([start, start + 1]), period)
     filled = whole * width + np.minimum(rest, width)

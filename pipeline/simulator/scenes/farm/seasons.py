@@ -36,7 +36,7 @@ class Crop:
     """One crop: its class, dates (day of the year), stages and cover.
 
     ``stages`` are (days since emergence, spectrum) with straight mixing between, ``heights`` (days, px). ``cover`` is
-    AquaCrop's: share of the ground at emergence, growth a day, and share in the end.
+    AquaCrop's: fraction of the ground at emergence, growth a day, and share in the end.
     """
 
     label: str
@@ -49,7 +49,7 @@ class Crop:
     row_px: tuple[float, float]  # least and greatest distance between rows
     weeds: tuple[float, float]  # plants per 1000 px, least and greatest
     tram_chance: float = 0.3
-    lodging: float = 0.0  # greatest share of a field that lies in the end
+    lodging: float = 0.0  # greatest fraction of a field that lies in the end
 
 
 class Land(NamedTuple):
@@ -145,7 +145,7 @@ def land_on(use: str, day: float, late: float) -> Land:
 
 
 def canopy_cover(crop: Crop, age: ArrayLike) -> NDArray[np.float64]:
-    """Share of the ground under plants, by days since emergence; 0 before, never falling: brown plants cover too."""
+    """Fraction of the ground under plants, by days since emergence; 0 before, never falling: brown plants cover too."""
     first, growth, last = crop.cover
     days = np.asarray(age, np.float64)
     half_way = np.log(last / (2 * first)) / growth
@@ -154,15 +154,15 @@ def canopy_cover(crop: Crop, age: ArrayLike) -> NDArray[np.float64]:
     return np.where(days < 0, 0.0, np.where(days < half_way, early, late))
 
 
-def stage_shares(crop: Crop, age: ArrayLike) -> dict[str, Field]:
+def stage_fractions(crop: Crop, age: ArrayLike) -> dict[str, Field]:
     """Mix a stand's spectra by days since emergence: shares that sum to 1, without those that are 0 all over."""
     days, names = [day for day, _ in crop.stages], [name for _, name in crop.stages]
-    shares: dict[str, Field] = {}
+    fractions: dict[str, Field] = {}
     for name in dict.fromkeys(names):
-        share = np.interp(np.asarray(age, np.float64), days, [float(other == name) for other in names])
-        if share.size and share.max() > 0:
-            shares[name] = np.asarray(share, np.float32)
-    return shares
+        fraction = np.interp(np.asarray(age, np.float64), days, [float(other == name) for other in names])
+        if fraction.size and fraction.max() > 0:
+            fractions[name] = np.asarray(fraction, np.float32)
+    return fractions
 
 
 def crop_height(crop: Crop, age: float) -> float:
@@ -170,14 +170,14 @@ def crop_height(crop: Crop, age: float) -> float:
     return float(np.interp(age, days, heights))
 
 
-def lodged_share(day: float) -> float:
-    """Share of what will lodge in a cereal that lies already: 0 before ``LODGES``, 1 after, smooth between."""
+def lodged_fraction(day: float) -> float:
+    """Fraction of what will lodge in a cereal that lies already: 0 before ``LODGES``, 1 after, smooth between."""
     t = float(np.clip((day - LODGES[0]) / (LODGES[1] - LODGES[0]), 0, 1))
     return t * t * (3 - 2 * t)
 
 
 def weed_size(day: float, emergence: NDArray[np.float64], turned: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Share of its full radius that a weed has, by the day it comes up and days since its soil was turned; 0: none.
+    """Fraction of its full radius that a weed has, by the day it comes up and days since its soil was turned; 0: none.
 
     It grows to 63 % in 22 days, is killed by tillage, and dies 170 days old.
     """

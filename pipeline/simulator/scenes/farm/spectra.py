@@ -37,7 +37,7 @@ Spectrum = NDArray[np.float64]
 
 FIRST_NM, LAST_NM = 400.0, 1000.0
 FWHM_NM = 6.0  # assumed
-PANEL_REFLECTANCE = 0.99
+WHITE_REFERENCE_REFLECTANCE = 0.99
 FILL = 0.95  # of the full well, by a perfect white in the brightest band
 TWIN_CENTRE_NM, TWIN_HALF_WIDTH_NM, TWIN_CONTRAST = 715.0, 25.0, 0.10
 RIPE_CONTRAST = 0.4  # of the twins' contrast, in ripe wheat (law of this project)
@@ -53,7 +53,7 @@ class Canopy:
 
     Ranges of living plants here: structure n 1.3-2.1; chlorophyll ``cab`` 8-62, carotenoids ``car`` 4-14 and
     anthocyanins ``ant`` 0-6 ug/cm2; brown pigment 0-1; water ``cw`` 0.004-0.030 cm; dry matter ``cm`` 0.003-0.012
-    g/cm2; leaf area index 1-6; mean leaf angle ``lidfa`` 16-72 degrees from the horizontal; ``dry_soil`` is the share
+    g/cm2; leaf area index 1-6; mean leaf angle ``lidfa`` 16-72 degrees from the horizontal; ``dry_soil`` is the fraction
     of dry soil below.
     """
 
@@ -117,11 +117,11 @@ class SpectralLibrary:
 
         Exposure and aperture are such that a perfect white fills 95 % of the full well in the brightest band.
         """
-        return (self.reflectance * self.light * FILL * camera.full_well_e).astype(np.float32)
+        return (self.reflectance * self.light * FILL * camera.full_full_well_e).astype(np.float32)
 
-    def panel_electrons(self, camera: LineCamera) -> NDArray[np.float32]:
+    def white_reference_electrons(self, camera: LineCamera) -> NDArray[np.float32]:
         """Expected electrons of the white reference panel, (band,) [e-]."""
-        return (PANEL_REFLECTANCE * self.light * FILL * camera.full_well_e).astype(np.float32)
+        return (WHITE_REFERENCE_REFLECTANCE * self.light * FILL * camera.full_full_well_e).astype(np.float32)
 
 
 def band_centres(bands: int) -> tuple[Spectrum, Spectrum]:
@@ -154,8 +154,8 @@ def spectral_library(bands: int, materials: tuple[str, ...] = MATERIALS) -> Spec
     return SpectralLibrary(*parts)
 
 
-def wet_share(moisture: ArrayLike) -> NDArray[np.float32]:
-    """Share of the wet soil's spectrum by water in the topsoil (by volume), from 0 to below 1.
+def wet_fraction(moisture: ArrayLike) -> NDArray[np.float32]:
+    """Fraction of the wet soil's spectrum by water in the topsoil (by volume), from 0 to below 1.
 
     The exponential law of [3] with one exponent for all bands, so that bare soil lies on one line.
     """

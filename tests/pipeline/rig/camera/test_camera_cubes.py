@@ -177,23 +177,23 @@ def test_stuck_and_dead_elements_are_told() -> None:
     dark, white = frames(64), frames(3000)
     dark[:, 3, 4] = 70
     white[:, 20, 5] = 66
-    references, notes = as_references(mean_frame(dark), mean_frame(white), panel=0.5)
+    references, notes = as_references(mean_frame(dark), mean_frame(white), white_reference=0.5)
     assert references.bad is not None
     assert np.argwhere(references.bad).tolist() == [[3, 4], [20, 5]]
-    assert references.panel.tolist() == [0.5] * 10
+    assert references.white_reference.tolist() == [0.5] * 10
     assert "dark: the mean of 40 frames; 1 of 400 elements are stuck" in notes
     assert "2 of 400 elements are bad" in notes
 
 
 def test_references_that_do_not_fit() -> None:
-    """Swapped frames, two sizes and a panel of other bands are refused; one frame cannot tell stuck elements."""
+    """Swapped frames, two sizes and a white reference of other bands are refused; one frame cannot tell stuck elements."""
     dark, white = mean_frame(frames(64)), mean_frame(frames(3000))
     with pytest.raises(RigError, match="are they swapped, or was the lamp off"):
         as_references(white, dark)
     with pytest.raises(RigError, match="take both anew"):
         as_references(dark, mean_frame(frames(3000, shape=(40, 9))))
     with pytest.raises(RigError, match="one value or one for each of 10 bands"):
-        as_references(dark, white, panel=[1, 2])
+        as_references(dark, white, white_reference=[1, 2])
     with pytest.raises(ShapeError, match="at least one frame"):
         mean_frame(np.zeros((0, 2, 3), np.uint16))
     one = mean_frame(frames(64, 1))

@@ -62,7 +62,7 @@ def undisturbed() -> list[Line]:
 
 
 @dataclass
-class Looks:
+class Polls:
     """Sweeps through one emulated rig, each with its fault; what was sent and waited for is noted."""
 
     rig: SmallRig
@@ -119,10 +119,10 @@ class Looks:
 
 
 @pytest.fixture(scope="module")
-def looks() -> Iterator[Looks]:
+def scan_passes() -> Iterator[Polls]:
     """One rig for all sessions of this file."""
     with small_rig(vector_pairs=PAIRS) as rig:
-        yield Looks(rig)
+        yield Polls(rig)
 
 
 def assert_right(lines: list[Line], undisturbed: list[Line]) -> None:
@@ -142,31 +142,31 @@ def assert_clear(error: RigError) -> None:
     assert 20 < len(words) < 900, words
 
 
-def session(looks: Looks, undisturbed: list[Line], camera: CameraFaults, mirror: tuple[Fault, ...] = ()) -> None:
+def session(scan_passes: Polls, undisturbed: list[Line], camera: CameraFaults, mirror: tuple[Fault, ...] = ()) -> None:
     """A sweep with a fault, then the rest of it without: every line once, and right."""
     kept, lines = KeptInMemory(), list[Line]()
-    for noted in (looks.asked_s, looks.captured_s, looks.errors):
+    for noted in (scan_passes.asked_s, scan_passes.captured_s, scan_passes.errors):
         noted.clear()
-    began_s, captures = looks.rig.line.clock.now(), looks.rig.emulated.camera.captures
+    began_s, captures = scan_passes.rig.line.clock.now(), scan_passes.rig.emulated.camera.captures
     captures.clear()  # of the session before
-    looks.strike(camera, mirror)
-    looks.go_on(kept, lines)
-    assert looks.rig.line.clock.now() - began_s <= MOST_TAKEN_S
-    assert max(looks.asked_s, default=0.0) <= MOST_ASKED_S, max(looks.asked_s)
-    assert max(looks.captured_s, default=0.0) <= MOST_CAPTURED_S, max(looks.captured_s)
+    scan_passes.strike(camera, mirror)
+    scan_passes.go_on(kept, lines)
+    assert scan_passes.rig.line.clock.now() - began_s <= MOST_TAKEN_S
+    assert max(scan_passes.asked_s, default=0.0) <= MOST_ASKED_S, max(scan_passes.asked_s)
+    assert max(scan_passes.captured_s, default=0.0) <= MOST_CAPTURED_S, max(scan_passes.captured_s)
     assert_right(lines, undisturbed)
-    assert looks.errors or len(lines) == SWEEP.lines
-    for error in looks.errors:
+    assert scan_passes.errors or len(lines) == SWEEP.lines
+    for error in scan_passes.errors:
         assert_clear(error)
-    motions = [data for data in looks.sent if moves(data)]  # there and along the path, in turn
+    motions = [data for data in scan_passes.sent if moves(data)]  # there and along the path, in turn
     assert all(one != other for one, other in pairwise(motions)), "a motion was sent twice"
-    broke = len(looks.errors)
-    looks.mend()
-    looks.go_on(kept, lines)
-    assert len(looks.errors) == broke, looks.errors[-1]
+    broke = len(scan_passes.errors)
+    scan_passes.mend()
+    scan_passes.go_on(kept, lines)
+    assert len(scan_passes.errors) == broke, scan_passes.errors[-1]
     assert len(lines) == SWEEP.lines
     assert_right(lines, undisturbed)
-    told = looks.rig.source(kept).record["captures"]
+    told = scan_passes.rig.source(kept).record["captures"]
     ranges = [(one["first"], one["stop"]) for one in told if "spent" not in one]
     assert sorted(ranges) == ranges
     assert all(one[1] <= other[0] for one, other in pairwise(ranges)), ranges
@@ -174,7 +174,9 @@ def session(looks: Looks, undisturbed: list[Line], camera: CameraFaults, mirror:
 
 
 @pytest.mark.parametrize("fault", CameraFault, ids=lambda fault: fault.name)
-def test_no_fault_of_the_camera_loses_lines_or_hangs(fault: CameraFault, looks: Looks, undisturbed: list[Line]) -> None:
+def test_no_fault_of_the_camera_loses_lines_or_hangs(
+    fault: CameraFault, scan_passes: Polls, undisturbed: list[Line]
+) -> None:
     """Eight sweeps with each: struck once at some occasion, or so often that asking again does not help."""
     ended, struck = 0, 0
     for seed in SEEDS:
@@ -184,22 +186,22 @@ def test_no_fault_of_the_camera_loses_lines_or_hangs(fault: CameraFault, looks: 
             fault, TRANSFERS if fault in OF_FILES else COMMANDS
         )
         faults = CameraFaults({fault: often}, seed, int(rng.integers(occasions)))
-        session(looks, undisturbed, faults)
+        session(scan_passes, undisturbed, faults)
         struck += faults.left[fault] < often
-        ended += bool(looks.errors)
+        ended += bool(scan_passes.errors)
         if fault in HARMLESS:
-            assert not looks.errors, (seed, looks.errors)
+            assert not scan_passes.errors, (seed, scan_passes.errors)
         if fault in OF_FILES and often == 1:
-            assert not looks.errors, (seed, looks.errors)
+            assert not scan_passes.errors, (seed, scan_passes.errors)
     assert struck == len(SEEDS)
     assert ended > 0 or fault in (*HARMLESS, CameraFault.CUT_CUBE, CameraFault.BREAKS_OFF)
 
 
 @pytest.mark.parametrize("name", OF_MIRROR)
-def test_no_fault_of_the_mirror_spoils_a_sweep(name: str, looks: Looks, undisturbed: list[Line]) -> None:
+def test_no_fault_of_the_mirror_spoils_a_sweep(name: str, scan_passes: Polls, undisturbed: list[Line]) -> None:
     """Eight sweeps with each: lines are right or not given, and the sweep is ended once the mirror is mended."""
     ended = 0
     for seed in SEEDS:
-        session(looks, undisturbed, CameraFaults(), (make_fault(name, seed),))
-        ended += bool(looks.errors)
+        session(scan_passes, undisturbed, CameraFaults(), (make_fault(name, seed),))
+        ended += bool(scan_passes.errors)
     assert ended > 0 or name in ("split-replies", "reply-bit-flipped")

@@ -22,7 +22,7 @@ from pipeline.rig.capture.capture_paths import (
     next_path,
     place_lines,
 )
-from pipeline.rig.capture.line_positions import MirrorTrack
+from pipeline.rig.capture.line_positions import MirrorScanPath
 from pipeline.rig.device_settings import check_capture
 from tests.pipeline.rig.small_rig import CAMERA, COARSE, FINE
 
@@ -38,8 +38,8 @@ def test_every_sweep_comes_back() -> None:
     rng = np.random.default_rng(0)
     for number in range(300):
         odd = rng.normal(size=2) * 10.0 ** rng.integers(-9, 9, 2)
-        strip, start = (float(rng.choice([one, -0.5, -0.0, 7.0, 1e300])) for one in odd)
-        turned = Sweep(f"fine-{number:03d}", "fine", "y", strip, start, int(rng.integers(1, 3000)), 4, 4)
+        swath, start = (float(rng.choice([one, -0.5, -0.0, 7.0, 1e300])) for one in odd)
+        turned = Sweep(f"fine-{number:03d}", "fine", "y", swath, start, int(rng.integers(1, 3000)), 4, 4)
         sweep = turned if number % 2 else replace(turned, kind="coarse", along="x")
         told = Announced(sweep, int(rng.integers(sweep.lines)))
         prefix = capture_prefix(*vars(told).values())
@@ -127,8 +127,8 @@ def test_log_began_before_its_acknowledgement():
     path = next_path(FINE, 3, CAMERA, vector_pairs=6, triggered=False)
     log = LoggedPath("/captured/x/mirror_log", 1000.0, started_s=0.06, start_error_s=0.04)
     taken = CaptureRecord(FINE, 3, 9, "/captured/x", False, (5.0, 5.1), (0.1, 0.2), log=log)
-    track = MirrorTrack(np.arange(1000) / 1000, np.zeros((1000, 2)))
-    tied = place_lines(frames(list(range(6))), path, taken, CAMERA, track).tied
+    scan_path = MirrorScanPath(np.arange(1000) / 1000, np.zeros((1000, 2)))
+    tied = place_lines(frames(list(range(6))), path, taken, CAMERA, scan_path).tied
     assert tied.method == "log"
     assert tied.offset_s == pytest.approx(0.15 - 0.04)
     assert tied.residual_us == pytest.approx((0.1 + 0.04) / 2 * 1e6)

@@ -13,7 +13,7 @@ from pipeline.rig.capture.line_positions import (
     CommandTimes,
     FrameTimes,
     LinePositions,
-    MirrorTrack,
+    MirrorScanPath,
     PlayedPath,
     line_edges,
     lines_by_commands,
@@ -43,11 +43,11 @@ def edges(count: int = LINES) -> np.ndarray:
     return START_S + np.arange(count) * PERIOD_S
 
 
-def track(until_s: float = 6.0, *, from_s: float = 0.0, with_edges: bool = True) -> MirrorTrack:
+def scan_path(until_s: float = 6.0, *, from_s: float = 0.0, with_edges: bool = True) -> MirrorScanPath:
     """The 10 kHz log, edges known to a sample."""
     time_s = np.arange(round(from_s * 1e4), round(until_s * 1e4)) / 1e4
     at = edges()[(edges() > time_s[0]) & (edges() < time_s[-1])]
-    return MirrorTrack(time_s, sweep(time_s), np.round(at * 1e4) / 1e4 if with_edges else None)
+    return MirrorScanPath(time_s, sweep(time_s), np.round(at * 1e4) / 1e4 if with_edges else None)
 
 
 def check_truth(found: LinePositions, lines: np.ndarray | None = None, atol_s: float = 3e-5) -> None:
@@ -60,7 +60,7 @@ def check_truth(found: LinePositions, lines: np.ndarray | None = None, atol_s: f
 
 def test_by_log() -> None:
     """The fit finds 100 ppm and the offset, far within a sample of the log; residuals are told in us and px."""
-    found = lines_by_log(frames(), CAMERA, track())
+    found = lines_by_log(frames(), CAMERA, scan_path())
     check_truth(found)
     assert found.valid.all()
     assert found.method == "log"
@@ -75,7 +75,9 @@ def test_missing_and_repeated_frames() -> None:
     """Frames that were dropped, numbered or not, and one that is there twice, do not move the others."""
     whole = frames()
     lines = np.concatenate([np.arange(50), np.arange(53, 200), [199], np.arange(200, 400)])
-    found = lines_by_log(replace(whole, number=whole.number[lines], stamp_us=whole.stamp_us[lines]), CAMERA, track())
+    found = lines_by_log(
+        replace(whole, number=whole.number[lines], stamp_us=whole.stamp_us[lines]), CAMERA, scan_path()
+    )
     check_truth(found, lines)
     assert "3 frames are missing between the lines" in found.notes
     assert "1 frames are there twice or out of order" in found.notes
@@ -86,30 +88,30 @@ def test_frames_dropped_without_a_number() -> None:
     whole = frames()
     kept = np.concatenate([np.arange(50), np.arange(51, 200), np.arange(203, LINES)])
     dropped = replace(whole, number=np.arange(len(kept)), stamp_us=whole.stamp_us[kept])
-    check_truth(lines_by_log(dropped, CAMERA, track()), kept)
+    check_truth(lines_by_log(dropped, CAMERA, scan_path()), kept)
     with pytest.raises(RigError, match="counted 400 triggers, the camera's last frame is number 395"):
         lines_by_trigger(dropped, CAMERA, PlayedPath(sweep(np.arange(LINES) / 100), 100.0), index_at_end=LINES - 1)
 
 
 def test_log_shorter_than_the_capture() -> None:
     """Lines beyond the log have no position and are not valid; the others are as good as ever."""
-    found = lines_by_log(frames(), CAMERA, track(3.0))
+    found = lines_by_log(frames(), CAMERA, scan_path(3.0))
     check_truth(found)
     assert np.count_nonzero(~found.valid) == np.count_nonzero(edges() + 0.004 > 2.9999)
     assert np.isnan(found.position[~found.valid]).all()
     assert any("lie outside of the log and are not valid" in note for note in found.notes)
-    late = lines_by_log(frames(), CAMERA, track(6.0, from_s=2.0))
+    late = lines_by_log(frames(), CAMERA, scan_path(6.0, from_s=2.0))
     check_truth(late)
     assert not late.valid[:100].any()
     with pytest.raises(RigError, match="start the log before the capture"):
-        lines_by_log(frames(), CAMERA, track(3.0, from_s=2.0))
-    check_truth(lines_by_log(frames(), CAMERA, replace(track(3.0, from_s=0.0)), commands=COMMANDS))
+        lines_by_log(frames(), CAMERA, scan_path(3.0, from_s=2.0))
+    check_truth(lines_by_log(frames(), CAMERA, replace(scan_path(3.0, from_s=0.0)), commands=COMMANDS))
 
 
 def test_jitter_and_no_stamps() -> None:
     """Edges that jitter by 0.3 ms average out, and the residual says so; without an index they follow their period."""
     rng = np.random.default_rng(4)
-    whole = track()
+    whole = scan_path()
     jittered = replace(whole, edge_s=np.sort(edges() + rng.normal(0, 3e-4, LINES)))
     found = lines_by_log(frames(), CAMERA, jittered)
     check_truth(found, atol_s=1.5e-4)
@@ -127,7 +129,7 @@ def test_stamps_that_go_back() -> None:
     stamp[200:210] = -1
     stamp[300] += 9_000_000_000
     for stamp_at in ("start", "middle", "end"):
-        found = lines_by_log(replace(whole, stamp_us=stamp, stamp_at=stamp_at), CAMERA, track())
+        found = lines_by_log(replace(whole, stamp_us=stamp, stamp_at=stamp_at), CAMERA, scan_path())
         check_truth(found)
         assert found.valid.all()
         assert "12 time stamps are missing or stray, and follow their neighbours" in found.notes
@@ -138,7 +140,7 @@ def test_clock_that_is_set_back(line: int) -> None:
     """A camera clock set back by a second somewhere: that is taken off and said."""
     whole = frames()
     stamp = whole.stamp_us - np.where(np.arange(LINES) >= line, 1_000_000, 0)
-    found = lines_by_log(replace(whole, stamp_us=stamp), CAMERA, track())
+    found = lines_by_log(replace(whole, stamp_us=stamp), CAMERA, scan_path())
     check_truth(found)
     assert found.valid.all()
     assert any("the camera's clock was set back 1 times" in note or "stray" in note for note in found.notes)
@@ -146,7 +148,7 @@ def test_clock_that_is_set_back(line: int) -> None:
 
 def test_one_frame() -> None:
     """One frame has its own edge, and no drift."""
-    one = replace(track(), edge_s=edges(1))
+    one = replace(scan_path(), edge_s=edges(1))
     found = lines_by_log(frames(1), CAMERA, one)
     check_truth(found)
     assert found.drift_ppm == 0
@@ -157,19 +159,19 @@ def test_one_frame() -> None:
 
 def test_log_without_edges() -> None:
     """By the commands' times alone the offset is as uncertain as they are, and that is said; without them none."""
-    found = lines_by_log(frames(), CAMERA, track(with_edges=False), commands=COMMANDS)
+    found = lines_by_log(frames(), CAMERA, scan_path(with_edges=False), commands=COMMANDS)
     check_truth(found, atol_s=2e-3)
     assert found.residual_us == pytest.approx(2000)
     assert any("a constant line offset of about" in note for note in found.notes)
     with pytest.raises(RigError, match="no edges and there are no command times"):
-        lines_by_log(frames(), CAMERA, track(with_edges=False))
+        lines_by_log(frames(), CAMERA, scan_path(with_edges=False))
     with pytest.raises(ShapeError, match="expected logged times"):
-        lines_by_log(frames(), CAMERA, replace(track(), time_s=np.arange(3.0)))
+        lines_by_log(frames(), CAMERA, replace(scan_path(), time_s=np.arange(3.0)))
 
 
 def test_moments_of_stamps_count_without_edges() -> None:
     """A stamp of the start lies half an exposure before the middle, one of the end as much behind it."""
-    log, path = track(with_edges=False), PlayedPath(sweep(np.arange(6000) / 1000), 1000.0)
+    log, path = scan_path(with_edges=False), PlayedPath(sweep(np.arange(6000) / 1000), 1000.0)
     for stamp_at, late_s in (("start", 0.004), ("middle", 0.0), ("end", -0.004)):
         told = replace(frames(), stamp_at=stamp_at)
         by_log = lines_by_log(told, CAMERA, log, commands=COMMANDS)
@@ -185,7 +187,7 @@ def test_first_frames_that_were_dropped_without_edges() -> None:
     whole = frames()
     late = replace(whole, number=whole.number[50:], stamp_us=whole.stamp_us[50:])
     lines = np.arange(50, LINES)
-    check_truth(lines_by_log(late, CAMERA, track(with_edges=False), commands=COMMANDS), lines, atol_s=2e-3)
+    check_truth(lines_by_log(late, CAMERA, scan_path(with_edges=False), commands=COMMANDS), lines, atol_s=2e-3)
     path = PlayedPath(sweep(np.arange(6000) / 1000), 1000.0)
     check_truth(lines_by_commands(late, CAMERA, path, COMMANDS), lines, atol_s=3e-3)
 
@@ -193,9 +195,9 @@ def test_first_frames_that_were_dropped_without_edges() -> None:
 def test_commands_count_from_the_logs_own_start() -> None:
     """A log begins with its first sample, at 0 or not: without edges, and where edges do not tell the frame."""
     late = replace(COMMANDS, run_s=(10.3, 10.302))
-    check_truth(lines_by_log(frames(), CAMERA, track(from_s=0.3, with_edges=False), commands=late), atol_s=2e-3)
+    check_truth(lines_by_log(frames(), CAMERA, scan_path(from_s=0.3, with_edges=False), commands=late), atol_s=2e-3)
     amid = replace(COMMANDS, run_s=(10.9, 10.902))
-    found = lines_by_log(frames(), CAMERA, track(3.0, from_s=0.9), commands=amid)
+    found = lines_by_log(frames(), CAMERA, scan_path(3.0, from_s=0.9), commands=amid)
     check_truth(found)
     assert np.count_nonzero(found.valid) > 200
 

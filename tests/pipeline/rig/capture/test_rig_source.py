@@ -121,13 +121,13 @@ def test_loads_of_the_vector_memory_change_no_line(sweep: Sweep, captures: int):
 @pytest.mark.parametrize("white_at_rest", [True, False])
 def test_references_are_the_mean_of_the_cameras_frames(white_at_rest: bool):
     """Those of the simulated source to the frames' rounding, of one capture; the mirror moves only if it shall rest."""
-    with small_rig(panel=2.0, white_at_rest=white_at_rest) as rig:
+    with small_rig(white_reference=2.0, white_at_rest=white_at_rest) as rig:
         source = rig.source()
         for sweep in (COARSE, FINE):
             found, expected = source.references(sweep), small_source().references(sweep)
             np.testing.assert_allclose(found.dark, expected.dark, atol=sweep.binning / 64)
             np.testing.assert_allclose(found.white, expected.white, atol=sweep.binning / 64)
-            assert found.panel.tolist() == [2.0] * 3
+            assert found.white_reference.tolist() == [2.0] * 3
             assert found.by_mirror == white_at_rest
             assert found.bad is None
         assert sum("references" in said for said in rig.emulated.camera.commands if "capture(" in said) == 1

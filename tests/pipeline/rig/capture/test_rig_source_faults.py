@@ -161,7 +161,7 @@ class SlowEye:
         camera.aside, command = True, camera.command
 
         def later(line: str) -> object:
-            while self.rig.line.clock.now() > self.after_s and camera.look_on():
+            while self.rig.line.clock.now() > self.after_s and camera.keep_looking():
                 pass
             return command(line)
 
@@ -282,13 +282,13 @@ def test_camera_that_was_emptied_in_between_is_gone_on_with(earlier: int):
     assert source.record["captures"][0]["spent"]
 
 
-@pytest.mark.parametrize("look", ["lines", "references"])
-def test_mirror_that_never_rests_is_not_captured_with(look: str):
+@pytest.mark.parametrize("scan_pass", ["lines", "references"])
+def test_mirror_that_never_rests_is_not_captured_with(scan_pass: str):
     """Neither a path nor a look at rest is begun while the mirror is not there yet."""
     with small_rig(mirror_faults=[make_fault("never-stable", at=0)]) as rig:
         source = rig.source()
         with pytest.raises(RigError, match="is not at rest after"):
-            list(source.lines(FINE)) if look == "lines" else source.references(FINE)
+            list(source.lines(FINE)) if scan_pass == "lines" else source.references(FINE)
         assert not any(said.startswith("capture(") for said in rig.emulated.camera.commands)
 
 
@@ -324,7 +324,7 @@ def test_lines_that_no_capture_gives_any_more_are_lost(gone: str):
         assert (line.mirror_x, line.mirror_y) == (given[line.number].mirror_x, given[line.number].mirror_y)
 
 
-def test_log_that_has_changed_ties_no_line():
+def test_log_that_has_changed_tie_points_no_line():
     """A bit of the kept log flips: its capture is taken again, and no position of it is believed."""
     with small_rig(pulses="none", log_samples=16000) as rig:
         kept = KeptInMemory()

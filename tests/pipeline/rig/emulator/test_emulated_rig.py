@@ -93,7 +93,7 @@ def test_lines_are_those_where_the_mirror_is() -> None:
         folder = pair.play(replace(FINE, start_px=FINE.start_px + 2, lines=FINE.lines - 2), told=FINE)
         np.testing.assert_array_equal(pair.lines(folder), planned(FINE, range(2, FINE.lines)))
     source = small_source(chosen=QUIET)
-    beside = replace(FINE, strip_px=FINE.strip_px + 0.5)
+    beside = replace(FINE, swath_px=FINE.swath_px + 0.5)
     with connected(source) as (pair, _):
         found = pair.lines(pair.play(beside, told=FINE)).astype(int)
     assert np.abs(found - planned(beside, range(FINE.lines), source)).max() <= 1
@@ -104,13 +104,13 @@ def test_captures_that_announce_nothing_have_streams_of_their_own() -> None:
     """Two looks at one place differ by their noise alone."""
     with connected() as (pair, _):
         pair.mirror.goto(0.0, 0.0)
-        looks = []
+        scan_passes = []
         for _ in range(2):
             folder = pair.camera.capture(3).folder
             wait_for(pair.camera, MOST_S)
-            looks.append(pair.lines(folder).astype(int))
+            scan_passes.append(pair.lines(folder).astype(int))
     rest = planned(Sweep("rest", "fine", "x", 0.0, 0.0, 1), range(1), small_source(chosen=QUIET))
-    every = np.concatenate(looks)
+    every = np.concatenate(scan_passes)
     assert len(np.unique(every.reshape(6, -1), axis=0)) == 6
     assert np.abs(every - rest).mean() < 20  # of 1700 DN
 
@@ -147,7 +147,7 @@ def test_frames_that_wait_to_be_looked_at_keep_the_camera_busy() -> None:
         pair.clock.sleep(30.0)
         assert pair.camera.is_capturing()
         assert not [name for name in rig.camera.files() if "raw_" in name]
-        assert [rig.camera.look_on() for _ in range(4)] == [True, True, True, False]
+        assert [rig.camera.keep_looking() for _ in range(4)] == [True, True, True, False]
         assert not pair.camera.is_capturing()
         assert len(pair.lines(folder)) == 20
 

@@ -162,8 +162,8 @@ def test_a_lost_frame_ends_the_upload():
     assert len(memory.frames) == 4
 
 
-@pytest.mark.parametrize(("read_back", "share"), [("none", 0.0), ("sampled", 0.11), ("all", 1.0)])
-def test_an_upload_takes_the_wire_time(read_back: ReadBack, share: float):
+@pytest.mark.parametrize(("read_back", "fraction"), [("none", 0.0), ("sampled", 0.11), ("all", 1.0)])
+def test_an_upload_takes_the_wire_time(read_back: ReadBack, fraction: float):
     """1500 positions are 300 frames of 52 bytes and acknowledgements of 7, and reading back costs as much again.
 
     Bytes that need an escape come on top, below 1 %; nothing else does: the clock passed by what the wire took.
@@ -172,7 +172,7 @@ def test_an_upload_takes_the_wire_time(read_back: ReadBack, share: float):
     upload(link(memory), path(1500), read_back)
     plain_s = 300 * (52 + 7) * 10 / BAUD
     wire_s = memory.passed * BITS_PER_BYTE / BAUD
-    assert wire_s == pytest.approx(plain_s * (1 + share), rel=0.02)
+    assert wire_s == pytest.approx(plain_s * (1 + fraction), rel=0.02)
     assert memory.clock.now() == pytest.approx(wire_s)
 
 

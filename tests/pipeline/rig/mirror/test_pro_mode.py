@@ -27,8 +27,8 @@ from pipeline.rig.mirror.pro_mode import (
     cell_float,
     cell_int,
     encode,
-    error_words,
     float_cell,
+    format_error,
     get_value,
     get_values,
     get_vector,
@@ -158,9 +158,9 @@ def test_damage_is_said(data: str, reason: str):
 def test_error_codes_have_words():
     """Every known code is said in words and by number; others by number."""
     for code in ErrorCode:
-        assert f"(code {code:04X})" in error_words(code)
-        assert "does not know" not in error_words(code)
-    assert "does not know (code 7777)" in error_words(0x7777)
+        assert f"(code {code:04X})" in format_error(code)
+        assert "does not know" not in format_error(code)
+    assert "does not know (code 7777)" in format_error(0x7777)
 
 
 def test_a_wrong_crc_is_a_frame_all_the_same():

@@ -115,7 +115,7 @@ def test_risk_of_the_bound():
     assert 8 <= np.count_nonzero(ways > allowed) <= 34
 
 
-SWEEP = Sweep("strip", "fine", "x", 0.0, -100.0, 201)
+SWEEP = Sweep("swath", "fine", "x", 0.0, -100.0, 201)
 STEP = Air(distance_m=30.0, relief="step", nearest_m=3.0)
 
 
@@ -139,15 +139,15 @@ def test_line_ends_move_by_half_a_line_times_the_lever():
     assert np.abs(scan).max() < 0.1
 
 
-@pytest.mark.parametrize("strip_px", [0.0, 1500.0, -3000.0])
-def test_rays_of_a_pinhole_behind_the_pivot(strip_px: float):
+@pytest.mark.parametrize("swath_px", [0.0, 1500.0, -3000.0])
+def test_rays_of_a_pinhole_behind_the_pivot(swath_px: float):
     """Points seen from the lever behind the pivot, on a plane across the chief ray's distance, are met exactly."""
-    sweep = replace(SWEEP, strip_px=strip_px, start_px=900.0)
+    sweep = replace(SWEEP, swath_px=swath_px, start_px=900.0)
     air = Air(distance_m=math.inf, relief="step", nearest_m=4.0, farthest_m=4.0, lever_m=0.1)
     camera = Rig().camera
     along, scan = sweep_to_scene(sweep, camera)
     found = np.stack([along, scan], axis=-1) + np.stack(shown(air, sweep), axis=-1)
-    centre = np.stack([np.full(201, strip_px), sweep.line_px()], axis=-1) * camera.ifov_rad
+    centre = np.stack([np.full(201, swath_px), sweep.line_px()], axis=-1) * camera.ifov_rad
     chief = scene_to_direction(centre)[:, None]
     ray = scene_to_direction(np.stack([along, scan], axis=-1) * camera.ifov_rad)
     depth = 4.0 * chief[..., 0]  # of the plane that the chief ray meets 4 m from the pivot
@@ -186,11 +186,11 @@ def test_sizes():
     assert size.max() == pytest.approx(6.306, rel=0.01)
 
 
-@pytest.mark.parametrize(("exposure_ms", "share"), [(3.0, 0.0188), (100.0, 0.618), (2000.0, 2.0)])
-def test_the_smear_that_is_not_modelled_is_told(exposure_ms: float, share: float):
+@pytest.mark.parametrize(("exposure_ms", "fraction"), [(3.0, 0.0188), (100.0, 0.618), (2000.0, 2.0)])
+def test_the_smear_that_is_not_modelled_is_told(exposure_ms: float, fraction: float):
     """Little of the sway in 3 ms, most of it in 100 ms, all of its way in 2 s; the reason gives the px."""
     rig = Rig(camera=LineCamera(exposure_ms=exposure_ms), air=BREEZE)
-    assert within_exposure_px(rig) == pytest.approx(share * sway_px(rig), rel=5e-3)
+    assert within_exposure_px(rig) == pytest.approx(fraction * sway_px(rig), rel=5e-3)
     assert (
         f"up to {within_exposure_px(rig):.2g} px of smear within an exposure"
         in WIND.bound(steep_probe((1.0, 1.0)), rig).why

@@ -117,7 +117,7 @@ def test_beyond_the_spectrograph_the_shift_stays():
 
 RENDERED_BLURS_NM = np.array([400.0, 600.0, 1000.0])
 RIG = Rig(optics=Optics(aberration_px=0.3, keystone_px=0.4), air=Air(distance_m=120.0))
-WAVES_SWEEP = Sweep("fine", "fine", "x", strip_px=0.0, start_px=-20.0, lines=40)
+WAVES_SWEEP = Sweep("fine", "fine", "x", swath_px=0.0, start_px=-20.0, lines=40)
 
 
 def scene_of(planes: NDArray[np.float32]) -> RasterScene:

@@ -93,18 +93,18 @@ def test_the_bound_of_the_cheap_draw_is_stated_for_a_patch() -> None:
 def test_defects_of_bands_that_are_not_used_do_not_matter() -> None:
     """A sensor without defects, or whose masks are empty, has a bound of 0."""
     assert DEFECTS.bound(probe(100, 1000), RIG).value == 0
-    few = Rig(detector=Detector(dead_share=1e-9, hot_share=1e-9))
+    few = Rig(detector=Detector(dead_fraction=1e-9, hot_fraction=1e-9))
     assert not dead_elements(few, 3).any()
     assert not hot_electrons(few, 3).any()
     assert DEFECTS.bound(probe(100, 1000), few).value == 0
-    assert not hot_electrons(Rig(detector=Detector(hot_share=0.1, noiseless=True)), 3).any()
+    assert not hot_electrons(Rig(detector=Detector(hot_fraction=0.1, noiseless=True)), 3).any()
 
 
 def test_more_defects_keep_those_there_were() -> None:
-    """A larger share adds elements; a sensor of another number has others; dead and hot are drawn apart."""
+    """A larger fraction adds elements; a sensor of another number has others; dead and hot are drawn apart."""
     few, many, other = (
-        Rig(detector=Detector(dead_share=share, hot_share=share, unit=unit))
-        for share, unit in ((0.01, 0), (0.05, 0), (0.05, 1))
+        Rig(detector=Detector(dead_fraction=fraction, hot_fraction=fraction, unit=unit))
+        for fraction, unit in ((0.01, 0), (0.05, 0), (0.05, 1))
     )
     assert (dead_elements(many, 20) >= dead_elements(few, 20)).all()
     assert not np.array_equal(dead_elements(many, 20), dead_elements(other, 20))
@@ -114,7 +114,7 @@ def test_more_defects_keep_those_there_were() -> None:
 @pytest.mark.parametrize("unit", ["sigma", "dn"])
 def test_a_bright_roof_saturates(unit: Unit) -> None:
     """Six deviations below full scale the bound is 0; above it is what is clipped."""
-    well = LineCamera().full_well_e
+    well = LineCamera().full_full_well_e
     assert SATURATION.bound(probe(100, well - 6.2 * np.sqrt(well + 400) - 20, unit), RIG).value == 0
     bound = SATURATION.bound(probe(100, 30_000, unit), RIG)
     lost = 30_000 + 20 - well
@@ -125,7 +125,7 @@ def test_a_bright_roof_saturates(unit: Unit) -> None:
     assert SATURATION.bound(replace(probe(100, 30_000, unit), unit_least_dn=0.29), ideal).value == pytest.approx(
         (lost - 20) / 5 / 0.29
     )
-    small = Rig(detector=Detector(well_e=5000))
+    small = Rig(detector=Detector(full_well_e=5000))
     assert SATURATION.bound(probe(100, 6000), small).value > 0
     assert SATURATION.bound(probe(100, 6000), RIG).value == 0
 

@@ -65,7 +65,7 @@ def test_rendered_waves_are_those_of_the_pupil(axis: int, cycles: float):
     wave = 1 + np.cos(2 * np.pi * cycles * where)
     planes = np.ones((900, 900, 1), np.float32) * (wave[:, None, None] if axis == 0 else wave[None, :, None])
     scene = made_scene(planes, np.ones((1, 3)), NM)
-    sweep = Sweep("s", "fine", "x", strip_px=0.0, start_px=-20.0, lines=40)
+    sweep = Sweep("s", "fine", "x", swath_px=0.0, start_px=-20.0, lines=40)
     block = SweepBlock(RIG, sweep, range(40), NM, scene.shape)
     found = expected_light(scene, block, {SLIT: "1x1", DIFFRACTION: "airy"})[:, 300:340]
     profile = found.mean(axis=1 - axis)

@@ -36,11 +36,11 @@ from tests.pipeline.simulator.small_scenes import made_scene
 
 RIG = Rig(  # that has every effect
     LineCamera(samples=48, exposure_ms=20.0),
-    Optics(aberration_px=0.3, keystone_px=0.4, smile_nm=0.8, stray_share=0.02, stray_halo_px=8.0),
+    Optics(aberration_px=0.3, keystone_px=0.4, smile_nm=0.8, stray_fraction=0.02, stray_halo_px=8.0),
     MirrorMotion(positions_per_line=1.5, repeatability_urad=40.0, hysteresis_px=3.0, drift_px_per_min=50.0),
-    Detector(dead_share=0.02, hot_share=0.02, temperature_deg_c=45.0, well_e=15_000.0),
+    Detector(dead_fraction=0.02, hot_fraction=0.02, temperature_deg_c=45.0, full_well_e=15_000.0),
     Air(40.0, "step", 30.0, 60.0, visibility_km=2.0, turbulence_cn2=1e-12, wind_amplitude_m=0.02),
-    Sky(datetime(2026, 6, 21, 5, 34, tzinfo=UTC), cloud_share=0.4, cloud_size_px=40.0, hot_spot=0.1),
+    Sky(datetime(2026, 6, 21, 5, 34, tzinfo=UTC), cloud_fraction=0.4, cloud_size_px=40.0, hot_spot=0.1),
 )
 WITHOUT: dict[str, dict[str, Any]] = {  # what a rig is like that lacks an effect
     "staircase": {"mirror": {"positions_per_line": 1.0}},
@@ -54,18 +54,18 @@ WITHOUT: dict[str, dict[str, Any]] = {  # what a rig is like that lacks an effec
     "aberration": {"optics": {"aberration_px": 0.0}},
     "keystone": {"optics": {"keystone_px": 0.0}},
     "drift": {"sky": {"started": None}},
-    "cloud": {"sky": {"cloud_share": 0.0}},
+    "cloud": {"sky": {"cloud_fraction": 0.0}},
     "brdf": {"sky": {"brdf_per_rad": 0.0, "hot_spot": 0.0}},
     "path-radiance": {"air": {"distance_m": None}},
     "absorption": {"air": {"distance_m": None}},
     "response": {"optics": {"fwhm_nm": 0.0}},
     "smile": {"optics": {"smile_nm": 0.0}},
     "polarisation": {"mirror": {"coating": "ideal"}},
-    "stray-light": {"optics": {"stray_share": 0.0}},
-    "prnu": {"detector": {"response_share": 0.0}},
-    "striping": {"detector": {"stripe_share": 0.0}},
+    "stray-light": {"optics": {"stray_fraction": 0.0}},
+    "prnu": {"detector": {"prnu_std": 0.0}},
+    "striping": {"detector": {"striping_std": 0.0}},
     "dark-current": {"detector": {"dark_e_per_s": 0.0}},
-    "defects": {"detector": {"dead_share": 0.0, "hot_share": 0.0}},
+    "defects": {"detector": {"dead_fraction": 0.0, "hot_fraction": 0.0}},
     "shot": {"detector": {"noiseless": True}},
     "read-noise": {"camera": {"read_noise_e": 0.0}},
 }

@@ -84,7 +84,7 @@ def test_fog_is_grey() -> None:
 
 
 def test_endless_air_is_the_horizon() -> None:
-    """At infinity every scene is the horizon: 0.3 of the white panel."""
+    """At infinity every scene is the horizon: 0.3 of the white reference."""
     rig = rig_with(Air(math.inf))
     light = PATH_RADIANCE.change(np.full((2, 640, BANDS), 5e3, np.float32), block_of(rig, range(2)), "range")
     np.testing.assert_allclose(light, np.broadcast_to(0.3 * white_e(), light.shape), rtol=1e-6)
@@ -127,7 +127,7 @@ def test_air_as_bright_as_the_scene_is_not_seen() -> None:
         brightest_e=float(light.max()),
     )
     assert PATH_RADIANCE.bound(probe, rig).value == pytest.approx(0, abs=1e-6)
-    shaded = rig_with(HAZY_300_M, cloud_share=0.5)
+    shaded = rig_with(HAZY_300_M, cloud_fraction=0.5)
     assert PATH_RADIANCE.bound(probe, shaded).value > 1
 
 

@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.lighting import BRDF, CLOUD, DRIFT, EDGE_SHARE, HOT_SPOT_RAD, shadow
+from pipeline.simulator.effects.lighting import BRDF, CLOUD, DRIFT, EDGE_FRACTION, HOT_SPOT_RAD, shadow
 from tests.pipeline.simulator.outdoors import MORNING, NIGHT, NOON, SWEEP, block_of, measured, probe_of, rig_with
 
-FAR = replace(SWEEP, strip_px=900.0, start_px=500.0)
-ACROSS = replace(SWEEP, along="y", strip_px=-700.0)
+FAR = replace(SWEEP, swath_px=900.0, start_px=500.0)
+ACROSS = replace(SWEEP, along="y", swath_px=-700.0)
 
 
 def test_slope_along_a_line_by_hand() -> None:
@@ -40,7 +40,7 @@ def test_hot_spot_is_a_cusp() -> None:
 def test_reflectance_is_never_negative() -> None:
     """The steepest slope ends at 0."""
     rig = rig_with(brdf_per_rad=5.0)
-    gain = BRDF.gain(block_of(rig, sweep=replace(SWEEP, strip_px=-3000.0)), "angles")
+    gain = BRDF.gain(block_of(rig, sweep=replace(SWEEP, swath_px=-3000.0)), "angles")
     assert gain.min() == 0
 
 
@@ -59,8 +59,8 @@ def test_bound_holds_and_is_near(sweep: Sweep, slope: float, hot: float) -> None
 def test_crossing_sweeps_agree() -> None:
     """Reflectance belongs to the scene: two sweeps that cross see the same at the same place."""
     rig = rig_with(brdf_per_rad=0.4, hot_spot=0.1)
-    along_x = replace(SWEEP, strip_px=0.0, start_px=100.0)
-    along_y = replace(SWEEP, along="y", strip_px=100.0, start_px=0.0)
+    along_x = replace(SWEEP, swath_px=0.0, start_px=100.0)
+    along_y = replace(SWEEP, along="y", swath_px=100.0, start_px=0.0)
     seen = [
         BRDF.gain(block_of(rig, range(1), sweep=sweep), "angles")[0, 319:321].mean() for sweep in (along_x, along_y)
     ]
@@ -68,7 +68,7 @@ def test_crossing_sweeps_agree() -> None:
 
 
 SIZE = 300.0
-RIG = rig_with(cloud_share=0.6, cloud_size_px=SIZE)
+RIG = rig_with(cloud_fraction=0.6, cloud_size_px=SIZE)
 
 
 def test_a_shadow_by_hand() -> None:
@@ -82,7 +82,7 @@ def test_shadows_are_soft_and_come_again(way: float, size: float) -> None:
     step = 1e-3 * size
     here, there = shadow(np.array([way, way + step]), size)
     assert 0 <= here <= 1
-    assert abs(there - here) <= 1.5 / EDGE_SHARE * 1e-3 + 1e-6
+    assert abs(there - here) <= 1.5 / EDGE_FRACTION * 1e-3 + 1e-6
     assert shadow(np.array([-way]), size)[0] == pytest.approx(here, abs=1e-6)
     assert shadow(np.array([way + 2 * size]), size)[0] == pytest.approx(here, abs=1e-6)
 
@@ -90,14 +90,14 @@ def test_shadows_are_soft_and_come_again(way: float, size: float) -> None:
 def test_cloud_bound_holds_and_is_near() -> None:
     """Wherever the shadow is, the change is within the bound; under its middle it is the bound."""
     bound = CLOUD.bound(probe_of(RIG), RIG).value
-    looks = [measured(CLOUD, RIG, seed=seed) for seed in range(4)]
-    assert max(looks) == pytest.approx(bound, rel=1e-6)
+    scan_passes = [measured(CLOUD, RIG, seed=seed) for seed in range(4)]
+    assert max(scan_passes) == pytest.approx(bound, rel=1e-6)
     assert CLOUD.bound(probe_of(RIG), RIG, "shadow").value == 0
 
 
 def test_shadow_moves_at_its_speed() -> None:
     """Where a shadow is, it has come by its speed: a later line sees what another place saw before."""
-    still, quick = (rig_with(cloud_share=0.6, cloud_size_px=SIZE, cloud_px_per_s=speed) for speed in (0.0, 50.0))
+    still, quick = (rig_with(cloud_fraction=0.6, cloud_size_px=SIZE, cloud_px_per_s=speed) for speed in (0.0, 50.0))
     now, later = (CLOUD.gain(block_of(quick, range(1), started_s=start), "shadow") for start in (0.0, 12.0))
     np.testing.assert_allclose(now, later, atol=1e-5)  # 12 s at 50 px/s are one period
     assert np.abs(now - CLOUD.gain(block_of(quick, range(1), started_s=3.0), "shadow")).max() > 0.1
@@ -107,8 +107,8 @@ def test_shadow_moves_at_its_speed() -> None:
 
 def test_crossing_sweeps_see_the_same_shadow() -> None:
     """Two sweeps of any name that cross see the same light where and when they do."""
-    along_x = replace(SWEEP, name="a", strip_px=0.0, start_px=0.0)
-    along_y = replace(SWEEP, name="b", along="y", strip_px=0.0, start_px=0.0)
+    along_x = replace(SWEEP, name="a", swath_px=0.0, start_px=0.0)
+    along_y = replace(SWEEP, name="b", along="y", swath_px=0.0, start_px=0.0)
     seen = [
         CLOUD.gain(block_of(RIG, range(1), sweep=sweep), "shadow")[0, 319:321].mean() for sweep in (along_x, along_y)
     ]
@@ -132,9 +132,9 @@ def test_drift_bound_holds_and_is_near(started: datetime) -> None:
     rig = rig_with(started=started)
     seconds = FOUR_HOURS + 5.9
     bound = DRIFT.bound(probe_of(rig, seconds=seconds), rig).value
-    looks = [measured(DRIFT, rig, "off", started_s=start) for start in (0, 7200, 10800, 14400)]
-    assert max(looks) <= 1.0001 * bound
-    assert max(looks) > bound / 6
+    scan_passes = [measured(DRIFT, rig, "off", started_s=start) for start in (0, 7200, 10800, 14400)]
+    assert max(scan_passes) <= 1.0001 * bound
+    assert max(scan_passes) > bound / 6
 
 
 def test_night_is_dark() -> None:

@@ -32,27 +32,27 @@ from tests.pipeline.simulator.random_cases import random_case
 from tests.pipeline.simulator.small_scenes import image_scene
 
 RIG = Rig(camera=LineCamera(samples=64))
-SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-14.5, lines=30)
+SWEEP = Sweep("s", "fine", "x", swath_px=0.0, start_px=-14.5, lines=30)
 
 
-def boxes(variant: str, strip: float, rig: Rig = RIG) -> tuple[int, int]:
+def boxes(variant: str, swath: float, rig: Rig = RIG) -> tuple[int, int]:
     """Those that a variant takes for a sweep of a survey of 2560 px."""
-    sweep = replace(SWEEP, strip_px=strip, start_px=-1280.0, lines=2560)
+    sweep = replace(SWEEP, swath_px=swath, start_px=-1280.0, lines=2560)
     return box_parts(variant, rig, views_all_over(rig, sweep, exact=True))
 
 
 def test_counted_variants_have_their_boxes_anywhere() -> None:
     """The exact variant has 27 boxes, off is one without any width."""
-    for strip in (0.0, 960.0):
-        assert [boxes(variant, strip) for variant in ("9x3", "3x1", "1x1", "off")] == [(9, 3), (3, 1), (1, 1), (1, 1)]
+    for swath in (0.0, 960.0):
+        assert [boxes(variant, swath) for variant in ("9x3", "3x1", "1x1", "off")] == [(9, 3), (3, 1), (1, 1), (1, 1)]
     assert box_of("off", RIG) == (0.0, 0.0)
     assert set(SLIT.cost_ns) == set(SLIT.variants)
 
 
 def test_stated_variants_take_more_boxes_the_more_lines_are_turned() -> None:
     """One in the middle, few at the outer strips, and never fewer for the smaller error."""
-    strips = (0.0, 60.0, 160.0, 320.0, 640.0, 960.0)
-    found = {variant: [np.prod(boxes(variant, strip)) for strip in strips] for variant in ("1-percent", "3-percent")}
+    swaths = (0.0, 60.0, 160.0, 320.0, 640.0, 960.0)
+    found = {variant: [np.prod(boxes(variant, swath)) for swath in swaths] for variant in ("1-percent", "3-percent")}
     for counts in found.values():
         assert counts[0] == 1
         assert counts[-1] > 1
@@ -62,20 +62,20 @@ def test_stated_variants_take_more_boxes_the_more_lines_are_turned() -> None:
 
 def test_straight_lines_need_one_box() -> None:
     """Where rotation is off nothing is turned."""
-    sweep = replace(SWEEP, strip_px=960.0)
+    sweep = replace(SWEEP, swath_px=960.0)
     assert box_parts("1-percent", RIG, views_all_over(RIG, sweep, exact=False)) == (1, 1)
 
 
 @pytest.mark.parametrize("width", [1.0, 2.7, 4.0])
-@pytest.mark.parametrize("strip", [60.0, 320.0, 960.0])
-def test_stated_share_is_kept(width: float, strip: float) -> None:
+@pytest.mark.parametrize("swath", [60.0, 320.0, 960.0])
+def test_stated_fraction_is_kept(width: float, swath: float) -> None:
     """What the boxes misplace, worked out in closed form, is no more than the variant says."""
-    views = views_all_over(RIG, replace(SWEEP, strip_px=strip, start_px=-1280.0, lines=2560), exact=True)
-    for share in (0.003, 0.01, 0.03):
-        parts = fewest_parts(share, (width, 1.0), views)
+    views = views_all_over(RIG, replace(SWEEP, swath_px=swath, start_px=-1280.0, lines=2560), exact=True)
+    for fraction in (0.003, 0.01, 0.03):
+        parts = fewest_parts(fraction, (width, 1.0), views)
         shapes = zip(views.along_run, views.scan_run, views.along_turn, views.scan_turn, strict=True)
         worst = max(misplaced(parts, (width, 1.0), shape) for shape in list(shapes)[::16])
-        assert worst <= 1.1 * share
+        assert worst <= 1.1 * fraction
 
 
 @pytest.mark.parametrize("variant", SLIT.variants)
@@ -120,7 +120,7 @@ def test_slit_of_no_width_sees_what_a_pixel_sees() -> None:
 @pytest.mark.parametrize("step", [1, 2, 8])
 def test_positions_are_held_by_the_mirror_or_the_footprint(step: int) -> None:
     """All positions of an exposure stand for it, or one in whose footprint they are."""
-    sweep = Sweep("s", "coarse", "x", strip_px=0.0, start_px=0.0, lines=4, step=step)
+    sweep = Sweep("s", "coarse", "x", swath_px=0.0, start_px=0.0, lines=4, step=step)
     block = SweepBlock(RIG, sweep, range(4), np.array([550.0]), (30, 60))
     found = {variant: smeared_positions(block, variant).shape[1] for variant in ("off", *SMEAR.variants)}
     assert found == {"off": 1, "positions": step, "folded": 1}
@@ -129,7 +129,7 @@ def test_positions_are_held_by_the_mirror_or_the_footprint(step: int) -> None:
 
 def test_no_smear_where_every_line_has_one_position() -> None:
     """Fine lines stand still: the bound is 0 and the position that of mid exposure."""
-    sweep = Sweep("s", "fine", "x", strip_px=0.0, start_px=0.0, lines=4)
+    sweep = Sweep("s", "fine", "x", swath_px=0.0, start_px=0.0, lines=4)
     scene = image_scene(np.random.default_rng(0).uniform(0, 1, (30, 60, 1)), RIG.camera, [550.0])
     assert SMEAR.bound(probe_scene(scene, RIG, [sweep]), RIG).value == 0
     block = SweepBlock(RIG, sweep, range(4), scene.wavelength_nm, scene.shape)
@@ -143,7 +143,7 @@ def test_change_is_within_the_bound(step: int, period: float) -> None:
     y, x = np.mgrid[:90, :80]
     values = 1 + 0.4 * np.sin(2 * np.pi * y / period) + 0.1 * np.cos(2 * np.pi * x / 17)
     scene = image_scene(values[..., None], RIG.camera, [550.0])
-    sweep = Sweep("s", "coarse", "x", strip_px=3.0, start_px=-36.0, lines=72 // step, step=step, binning=step)
+    sweep = Sweep("s", "coarse", "x", swath_px=3.0, start_px=-36.0, lines=72 // step, step=step, binning=step)
     probe = probe_scene(scene, RIG, [sweep])
     block = SweepBlock(RIG, sweep, range(sweep.lines), scene.wavelength_nm, scene.shape)
     exact = expected_light(scene, block, {ROTATION: "rays", SMEAR: "positions", SLIT: "3x1"})
@@ -175,10 +175,10 @@ def waves(seed: int) -> np.ndarray:
     return 1 + 0.02 * sum(np.sin((y * a + x * b) / 30 + c) for a, b, c in rng.normal(size=(5, 3)))
 
 
-@pytest.mark.parametrize(("strip", "start"), [(0.0, -20.0), (150.0, -150.0), (-120.0, 90.0)])
-def test_change_is_within_the_bound_and_not_far_from_it(strip: float, start: float) -> None:
+@pytest.mark.parametrize(("swath", "start"), [(0.0, -20.0), (150.0, -150.0), (-120.0, 90.0)])
+def test_change_is_within_the_bound_and_not_far_from_it(swath: float, start: float) -> None:
     """Straight lines at nominal scale err by at most 1.2 bounds; the bound is within 6 of the change."""
-    sweep, scene = Sweep("s", "fine", "x", strip_px=strip, start_px=start, lines=30), scene_of(waves(2))
+    sweep, scene = Sweep("s", "fine", "x", swath_px=swath, start_px=start, lines=30), scene_of(waves(2))
     bound = ROTATION.bound(probe_scene(scene, ROTATION_RIG, [sweep]), ROTATION_RIG)
     block = SweepBlock(ROTATION_RIG, sweep, range(30), scene.wavelength_nm, scene.shape)
     exact = expected_light(scene, block, {ROTATION: "rays", SLIT: "3x1"})
@@ -191,7 +191,7 @@ def test_change_is_within_the_bound_and_not_far_from_it(strip: float, start: flo
 def test_ends_of_a_line_are_turned_by_the_line_rotation() -> None:
     """The ends of a line of 640 samples lie 320 px times the sine of its rotation off the plan, and stretched."""
     camera = LineCamera()
-    sweep = Sweep("s", "fine", "x", strip_px=1500.0, start_px=800.0, lines=1)
+    sweep = Sweep("s", "fine", "x", swath_px=1500.0, start_px=800.0, lines=1)
     scene = image_scene(np.ones((4, 4, 1)), camera, [550.0])
     why = ROTATION.bound(probe_scene(scene, Rig(), [sweep]), Rig()).why
     scan = float(why.split(" px along the scan")[0].split()[-1])

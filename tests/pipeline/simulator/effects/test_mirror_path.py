@@ -18,7 +18,7 @@ from pipeline.simulator.effects.mirror_path import LAG, STAIRCASE, beside_plan, 
 from pipeline.simulator.rig_model import MirrorMotion, Rig
 from tests.pipeline.simulator.made_up_effects import steep_probe
 
-SWEEP = Sweep("strip", "fine", "x", 0.0, -100.0, 200)
+SWEEP = Sweep("swath", "fine", "x", 0.0, -100.0, 200)
 
 
 def rig(exposure_ms: float = 3.0, **mirror: float) -> Rig:
@@ -94,7 +94,7 @@ def test_any_mirror_is_finite_and_within_its_bound(damping: float, ms: float, hz
     assert np.abs(exact - off).max() <= LAG.bound(steep_probe(sweeps=(sweep,), span=2.0), of_mirror).value + 1e-9
 
 
-STAIRCASE_SWEEP = Sweep("strip", "fine", "x", 0.0, -20.0, 41)
+STAIRCASE_SWEEP = Sweep("swath", "fine", "x", 0.0, -20.0, 41)
 
 
 def staircase_rig(positions: float) -> Rig:
@@ -134,7 +134,7 @@ def test_whole_numbers_do_not_shake_lines(positions: float):
 def test_bound_holds_and_is_tight(positions: float, image: str):
     """The change of analytic images stays below the bound, which is at most six times as much."""
     width = 1.2
-    look, slope, curvature = {
+    scan_pass, slope, curvature = {
         "waves": (lambda s: np.sin(s) + np.cos(2.3 * s), 3.3, 1 + 2.3**2),
         "step": (lambda s: np.tanh(s / width), 1 / width, 0.77 / width**2),
         "point": (lambda s: np.exp(-(s**2) / 2), 0.607, 1.0),
@@ -142,9 +142,9 @@ def test_bound_holds_and_is_tight(positions: float, image: str):
     shift = STAIRCASE.aim(block(positions), "exact")[:, :, 1]
     worst = {"off": 0.0, "centres": 0.0}
     for place in np.linspace(-3, 3, 61):
-        exact = look(place + shift).mean(axis=1)
-        worst["off"] = max(worst["off"], np.abs(exact - look(place)).max())
-        worst["centres"] = max(worst["centres"], np.abs(exact - look(place + shift.mean(axis=1))).max())
+        exact = scan_pass(place + shift).mean(axis=1)
+        worst["off"] = max(worst["off"], np.abs(exact - scan_pass(place)).max())
+        worst["centres"] = max(worst["centres"], np.abs(exact - scan_pass(place + shift.mean(axis=1))).max())
     for variant, measured in worst.items():
         bound = STAIRCASE.bound(
             steep_probe((0.0, slope), (STAIRCASE_SWEEP,), curvature=(0.0, curvature)), staircase_rig(positions), variant

@@ -1,4 +1,4 @@
-"""What the tilted mirror passes: Fresnel's laws and published metals, shares of its area, bounds over whole sweeps."""
+"""What the tilted mirror passes: Fresnel's laws and published metals, fractions of its area, bounds over whole sweeps."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from tests.pipeline.simulator.spectral_light import probe_of, rig_with
 NM = np.linspace(400.0, 1000.0, 61)
 
 
-def sweep_at(strip_px, start_px, lines):
+def sweep_at(swath_px, start_px, lines):
     """A sweep along x."""
-    return Sweep("fine", "fine", "x", strip_px=strip_px, start_px=start_px, lines=lines)
+    return Sweep("fine", "fine", "x", swath_px=swath_px, start_px=start_px, lines=lines)
 
 
 def coated(coating="aluminium"):
@@ -70,9 +70,9 @@ VIGNETTING_RIG, VIGNETTING_NM = Rig(), np.array([700.0])
 VIGNETTING_FLAT = np.full((2, 8, 1), 10_000, np.float32)
 
 
-def vignetting_sweep_at(strip_px, start_px, lines, step=1):
+def vignetting_sweep_at(swath_px, start_px, lines, step=1):
     """A sweep along x."""
-    return Sweep("fine", "fine", "x", strip_px=strip_px, start_px=start_px, lines=lines, step=step)
+    return Sweep("fine", "fine", "x", swath_px=swath_px, start_px=start_px, lines=lines, step=step)
 
 
 def vignetting_factors(sweep, variant="held"):
@@ -84,13 +84,13 @@ def vignetting_factors(sweep, variant="held"):
 
 
 @pytest.mark.parametrize(("variant", "at"), [("held", "positions"), ("middle", "middle")])
-def test_shares_are_those_of_the_mirror(variant, at):
+def test_fractions_are_those_of_the_mirror(variant, at):
     """What calibration divides by is what the lines are multiplied by, at any place of the field."""
     sweep = vignetting_sweep_at(-2300, 1700, 50, 4)
-    shares = mirror_throughput(
+    fractions = mirror_throughput(
         getattr(SweepBlock(VIGNETTING_RIG, sweep, range(50), VIGNETTING_NM, (640, 640)), at)
     ).reshape(50, -1)
-    np.testing.assert_allclose(vignetting_factors(sweep, variant), shares.mean(axis=1), rtol=1e-7)
+    np.testing.assert_allclose(vignetting_factors(sweep, variant), fractions.mean(axis=1), rtol=1e-7)
 
 
 def test_one_sweep_of_640_lines_changes_138_dn():
@@ -105,9 +105,9 @@ def test_one_sweep_of_640_lines_changes_138_dn():
 
 @given(st.integers(-4500, 4500), st.integers(-4500, 4000), st.integers(1, 60), st.integers(1, 8))
 @settings(max_examples=60, deadline=None)
-def test_bounds_hold_and_are_tight(strip_px, start_px, lines, step):
+def test_bounds_hold_and_are_tight(swath_px, start_px, lines, step):
     """The greatest way from 1 among all lines is the bound's, within 1 %."""
-    sweep = vignetting_sweep_at(strip_px, start_px, lines, step)
+    sweep = vignetting_sweep_at(swath_px, start_px, lines, step)
     probe, held = probe_of(VIGNETTING_FLAT, VIGNETTING_NM, sweep=sweep), vignetting_factors(sweep)
     bound, signal = VIGNETTING.bound(probe, VIGNETTING_RIG).value, float(probe.level[0])
     way = signal * np.abs(held - 1).max()
@@ -149,7 +149,7 @@ def test_glass_by_hand() -> None:
 
 
 @pytest.mark.parametrize(
-    ("coating", "nm", "share"),
+    ("coating", "nm", "fraction"),
     [
         ("aluminium", 550, 0.916),
         ("aluminium", 800, 0.867),
@@ -159,10 +159,10 @@ def test_glass_by_hand() -> None:
         ("silver", 550, 0.983),
     ],
 )
-def test_published_reflectances_head_on(coating: str, nm: float, share: float) -> None:
+def test_published_reflectances_head_on(coating: str, nm: float, fraction: float) -> None:
     """Of evaporated films (Hass in the American Institute of Physics Handbook, table 6g): within 2 points."""
     found = reflectance(coating, np.array([nm]), np.zeros(1))
-    assert found[0, 0] == pytest.approx(share, abs=0.02)
+    assert found[0, 0] == pytest.approx(fraction, abs=0.02)
 
 
 @pytest.mark.parametrize("coating", METALS)

@@ -20,26 +20,26 @@ from pipeline.simulator.effects.noise import (
     normal_deviates,
     photon_counts,
     rounded_counts,
-    told_apart,
+    separable,
 )
 
 DRAWS = 200_000
 DARK_DN = 1000.0
 LEVELS = (1.0, 3.0, 10.0, 29.5, 30.0, 50.0, 100.0, 300.0, 1000.0, 3000.0, 10_000.0, 30_000.0, 60_000.0)
-Light = NDArray[np.float32]
+Radiance = NDArray[np.float32]
 
 
-def deviates(count: int = DRAWS, seed: int = 0) -> Light:
+def deviates(count: int = DRAWS, seed: int = 0) -> Radiance:
     """Standard normal numbers of one seed."""
     return normal_deviates(np.random.Generator(np.random.Philox(seed)), count)
 
 
-def even(level: float, count: int = DRAWS) -> Light:
+def even(level: float, count: int = DRAWS) -> Radiance:
     """Light that is the same everywhere."""
     return np.full(count, level, np.float32)
 
 
-def read(light: Light, deviate: Light, added: Light | None = None) -> NDArray[np.float64]:
+def read(light: Radiance, deviate: Radiance, added: Radiance | None = None) -> NDArray[np.float64]:
     """Numbers of light with its own noise and 20 e- of the amplifier, of 1 e- each, from `DARK_DN` on."""
     raw = np.empty(len(light), np.uint16)
     more = np.zeros(1, np.float32) if added is None else added
@@ -47,13 +47,13 @@ def read(light: Light, deviate: Light, added: Light | None = None) -> NDArray[np
     return raw.astype(np.float64)
 
 
-def fit(counts: Light, edges: NDArray[np.float64], chances: NDArray[np.float64]) -> float:
+def fit(counts: Radiance, edges: NDArray[np.float64], chances: NDArray[np.float64]) -> float:
     """The p-value of a chi-square test of numbers in classes up to and with each edge."""
     seen = np.bincount(np.searchsorted(edges, counts), minlength=len(edges) + 1)
     return float(stats.chisquare(seen, chances / chances.sum() * len(counts)).pvalue)
 
 
-def poisson_fit(counts: Light, level: float) -> float:
+def poisson_fit(counts: Radiance, level: float) -> float:
     """The p-value of counts against Poisson, in at most 200 classes, the tails of 1e-4 among them."""
     edges = np.unique(
         stats.poisson.ppf(np.concatenate([[1e-4, 1e-3], np.linspace(0.005, 0.995, 199), [0.9999]]), level)
@@ -239,7 +239,7 @@ def test_told_apart_is_twice_the_total_variation() -> None:
     x = np.linspace(-400, 400, 400_001)
     for sd, other in ((20.0, 22.0), (3.0, 40.0)):
         apart = np.trapezoid(np.abs(stats.norm.pdf(x, scale=sd) - stats.norm.pdf(x, scale=other)), x)
-        assert told_apart(sd, other) == told_apart(other, sd) == pytest.approx(apart, rel=1e-4)
-    assert told_apart(20, 20) == 0
-    assert told_apart(0, 20) == 2
-    assert told_apart(0, 0) == 0
+        assert separable(sd, other) == separable(other, sd) == pytest.approx(apart, rel=1e-4)
+    assert separable(20, 20) == 0
+    assert separable(0, 20) == 2
+    assert separable(0, 0) == 0

@@ -35,7 +35,7 @@ from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from tests.pipeline.simulator.made_up_effects import steep_probe
 from tests.pipeline.simulator.small_scenes import image_scene, made_scene
 
-SWEEP = Sweep("strip", "fine", "x", 0.0, -500.0, 1001)
+SWEEP = Sweep("swath", "fine", "x", 0.0, -500.0, 1001)
 RIG = Rig(mirror=replace(MirrorMotion(), repeatability_urad=40.0))
 
 
@@ -72,9 +72,11 @@ def test_bound_holds_and_is_tight():
         wave = rng.normal(0, 0.4, (3, 2))
         place, phase = rng.uniform(-9, 9, (400, 2)), rng.uniform(0, 7, 3)
         slope = np.abs(np.cos(place @ wave.T + phase) @ wave).max(axis=0) * 1.02
-        look = np.sin(place @ wave.T + phase)
+        scan_pass = np.sin(place @ wave.T + phase)
         shift = shifts(seed=seed)
-        measured = max(np.abs((np.sin((place + one) @ wave.T + phase) - look).sum(axis=1)).max() for one in shift[:, 0])
+        measured = max(
+            np.abs((np.sin((place + one) @ wave.T + phase) - scan_pass).sum(axis=1)).max() for one in shift[:, 0]
+        )
         bound = JITTER.bound(steep_probe(tuple(slope), (SWEEP,), 6.0), RIG).value
         assert measured <= bound
         ratios.append(bound / measured)
@@ -90,7 +92,7 @@ def test_more_lines_have_a_worse_worst():
     assert many.value > found
 
 
-HYSTERESIS_SWEEP = Sweep("strip", "fine", "x", 640.0, -700.0, 1401)
+HYSTERESIS_SWEEP = Sweep("swath", "fine", "x", 640.0, -700.0, 1401)
 HYSTERESIS_RIG = Rig(mirror=replace(MirrorMotion(), hysteresis_px=50.0, drift_px_per_min=2.0))
 
 
@@ -159,21 +161,21 @@ def test_centres_move_as_they_are_told_and_ends_turn():
     np.testing.assert_allclose(np.abs(gains[[0, 2], 1, 0]), 0.0338, atol=2e-4)
 
 
-@pytest.mark.parametrize("strip_px", [0.0, 2000.0, -4000.0])
-def test_no_point_of_a_line_moves_farther(strip_px: float):
+@pytest.mark.parametrize("swath_px", [0.0, 2000.0, -4000.0])
+def test_no_point_of_a_line_moves_farther(swath_px: float):
     """Shifts of 5 px in any direction move no point of any line by more than the bound, and some nearly so."""
-    sweep = Sweep("a", "fine", "x", strip_px, -1500.0, 301, step=10)
-    plan = np.stack(points_of_scan(strip_px, CAMERA, sweep.line_px()[:, None], CAMERA.pixel_slopes()))
+    sweep = Sweep("a", "fine", "x", swath_px, -1500.0, 301, step=10)
+    plan = np.stack(points_of_scan(swath_px, CAMERA, sweep.line_px()[:, None], CAMERA.pixel_slopes()))
     bound = np.array(at_line_ends([sweep], CAMERA, 3.0, 4.0))
     most = np.zeros(2)
     for along, scan in ((3, 4), (3, -4), (-3, 4), (-3, -4)):
-        beside = points_of_scan(strip_px + along, CAMERA, sweep.line_px()[:, None] + scan, CAMERA.pixel_slopes())
+        beside = points_of_scan(swath_px + along, CAMERA, sweep.line_px()[:, None] + scan, CAMERA.pixel_slopes())
         most = np.maximum(most, np.abs(np.stack(beside) - plan).max(axis=(1, 2)))
     assert np.all(most <= bound * (1 + 1e-4))
     assert np.all(bound <= 1.1 * most)
 
 
-POINTING_ERRORS_SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-19.5, lines=40)
+POINTING_ERRORS_SWEEP = Sweep("s", "fine", "x", swath_px=0.0, start_px=-19.5, lines=40)
 
 
 def source_of(pointing: PointingErrors | None) -> SimulatedSource:
@@ -210,7 +212,7 @@ def test_mirror_looks_beside_and_reports_the_plan():
     along, scan = errors.offset("s")
     moved = replace(
         POINTING_ERRORS_SWEEP,
-        strip_px=float(along),
+        swath_px=float(along),
         start_px=float(POINTING_ERRORS_SWEEP.start_px + scan),
         name="moved",
     )
@@ -244,8 +246,8 @@ MOTION = replace(
 )
 AIR = Air(distance_m=30.0, relief="step", nearest_m=3.0, wind_amplitude_m=0.005, wind_hz=20.0)
 MIRROR_EFFECTS_RIG = Rig(camera=MIRROR_EFFECTS_CAMERA, mirror=MOTION, air=AIR)
-STRIP = Sweep("strip", "fine", "x", 3.0, -25.0, 40)
-ACROSS = replace(STRIP, along="y")
+SWATH = Sweep("swath", "fine", "x", 3.0, -25.0, 40)
+ACROSS = replace(SWATH, along="y")
 PLAIN: dict[Any, str] = {ROTATION: "rays", SLIT: "3x1"}
 SLOPE = (8.0, 13.0)  # along x and along y [e-/px]
 MOVERS = [STAIRCASE, LAG, JITTER, HYSTERESIS, THERMAL_DRIFT, PARALLAX, WIND]
@@ -259,18 +261,18 @@ def ramp() -> RasterScene:
     return made_scene(plane, electrons, [500.0, 600.0])
 
 
-def look(chosen: dict[Any, str], sweep: Sweep = STRIP, lines: range = range(40), **more: Any) -> np.ndarray:
+def scan_pass(chosen: dict[Any, str], sweep: Sweep = SWATH, lines: range = range(40), **more: Any) -> np.ndarray:
     """Light of some lines of the ramp."""
     scene = ramp()
     block = SweepBlock(MIRROR_EFFECTS_RIG, sweep, lines, scene.wavelength_nm, scene.shape, **more)
     return expected_light(scene, block, {**chosen, **PLAIN})
 
 
-@pytest.mark.parametrize("sweep", [STRIP, ACROSS], ids=["x", "y"])
+@pytest.mark.parametrize("sweep", [SWATH, ACROSS], ids=["x", "y"])
 @pytest.mark.parametrize("effect", MOVERS, ids=lambda effect: effect.name)
 def test_light_changes_by_slope_times_way(effect: Any, sweep: Sweep):
     """On a ramp the light changes by the slope times the stated shift or displacement, in either orientation."""
-    found = look({effect: "exact"}, sweep) - look({}, sweep)
+    found = scan_pass({effect: "exact"}, sweep) - scan_pass({}, sweep)
     block = SweepBlock(MIRROR_EFFECTS_RIG, sweep, range(40), np.array([500.0, 600.0]), (161, 161))
     if hasattr(effect, "aim"):
         along, scan = np.moveaxis(effect.aim(block, "exact").mean(axis=1), -1, 0)[..., None]

@@ -27,7 +27,7 @@ from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.readout import dark_frame, read_out
 from pipeline.simulator.rig_model import Detector, Rig
 
-SWEEP = Sweep("fine", "fine", "x", strip_px=0.0, start_px=-32.0, lines=64)
+SWEEP = Sweep("fine", "fine", "x", swath_px=0.0, start_px=-32.0, lines=64)
 BANDS = 20
 # Read noise of 0 and wells without end where a test says nothing else; 1 e- is 1 DN, so that DN are counts.
 COUNTING = LineCamera(electrons_per_dn=1.0, bits=16, dark_dn=0.0, read_noise_e=0.0)
@@ -108,7 +108,7 @@ def test_all_saturated(chosen: dict[Any, str]) -> None:
 
 def test_a_well_overflows_before_the_amplifier() -> None:
     """Full wells still carry read noise, but no shot noise; with saturation off they never fill."""
-    rig = Rig(detector=Detector(well_e=10_000))
+    rig = Rig(detector=Detector(full_well_e=10_000))
     chosen = {SHOT: "gaussian", READ_NOISE: "exact", SATURATION: "exact"}
     full = (read_out(even(15_000), block_of(rig), chosen).astype(np.float64) - 64) * 5
     assert full.mean() == pytest.approx(10_000, abs=1)
@@ -128,7 +128,7 @@ def test_dark_current_follows_the_temperature_and_has_shot_noise() -> None:
 
 def test_dead_and_hot_elements() -> None:
     """Dead ones show dark current alone, hot ones 5,000 e- more in 100 ms, the others are as they were."""
-    rig = Rig(detector=Detector(dead_share=0.01, hot_share=0.01))
+    rig = Rig(detector=Detector(dead_fraction=0.01, hot_fraction=0.01))
     raw = read_out(even(5000, 1), block_of(rig, range(1)), {DARK_CURRENT: "exact", DEFECTS: "exact"})[0]
     dead, hot = dead_elements(rig, BANDS), hot_electrons(rig, BANDS) > 0
     assert 0.005 < dead.mean() < 0.015
@@ -138,7 +138,7 @@ def test_dead_and_hot_elements() -> None:
 
 def test_the_mean_dark_frame_is_that_of_many_lines() -> None:
     """What a cap on the lens would show: dark level, dark current, hot elements up to full scale."""
-    rig = Rig(camera=LineCamera(exposure_ms=500.0), detector=Detector(hot_share=0.01, dead_share=0.01))
+    rig = Rig(camera=LineCamera(exposure_ms=500.0), detector=Detector(hot_fraction=0.01, dead_fraction=0.01))
     block = block_of(rig, range(64))
     mean = read_out(np.zeros((64, 640, BANDS), np.float32), block, ALL_EXACT).mean(axis=0)
     expected = dark_frame(block, ALL_EXACT)

@@ -25,7 +25,7 @@ def test_all_light_is_kept_in_each_line(variant, halo_px):
     light = random_light(0)[1]
     light[:, :3] = 0
     light[:, :, -1] *= 20
-    made = scattered(light, variant, share=0.3, halo_px=halo_px)
+    made = scattered(light, variant, fraction=0.3, halo_px=halo_px)
     np.testing.assert_allclose(made.sum(axis=(1, 2)), light.sum(axis=(1, 2)), rtol=1e-5)
     assert made.min() > -1e-3
 
@@ -33,18 +33,18 @@ def test_all_light_is_kept_in_each_line(variant, halo_px):
 def test_halo_is_a_gaussian_reflected_at_the_edges():
     """The product with few cosines is the plain convolution, sample by sample and band by band, to 1e-5."""
     light = random_light(1)[1]
-    made = scattered(light, share=0.2, even=0.25, halo_px=6.0)
+    made = scattered(light, fraction=0.2, even=0.25, halo_px=6.0)
     for line, before in zip(made, light.astype(np.float64), strict=True):
         halo = gaussian_filter(before, 6.0, mode="reflect", truncate=8)
         np.testing.assert_allclose(line, 0.8 * before + 0.2 * (0.25 * before.mean() + 0.75 * halo), rtol=2e-5)
 
 
-def test_even_share_by_hand():
+def test_even_fraction_by_hand():
     """One line of one sample and bands 0 and 100, a tenth scattered evenly: 5 and 95."""
     light = np.array([[[0, 100]]], np.float32)
-    np.testing.assert_allclose(scattered(light, share=0.1, even=1.0), [[[5, 95]]], rtol=1e-6)
+    np.testing.assert_allclose(scattered(light, fraction=0.1, even=1.0), [[[5, 95]]], rtol=1e-6)
     alone = np.array([[[70]]], np.float32)
-    np.testing.assert_allclose(scattered(alone, share=0.1), alone, rtol=1e-6)
+    np.testing.assert_allclose(scattered(alone, fraction=0.1), alone, rtol=1e-6)
 
 
 @pytest.mark.parametrize("unit", ["sigma", "dn"])
@@ -53,9 +53,9 @@ def test_bound_is_within_6_times_at_the_median(unit):
     ratios = []
     for seed in range(30):
         wavelength, light = random_light(seed)
-        share = float(10 ** np.random.default_rng(seed).uniform(-3, -2))
-        made = scattered(light, share=share)
-        bound = STRAY_LIGHT.bound(probe_of(light, wavelength, unit), rig_with(stray_share=share))
+        fraction = float(10 ** np.random.default_rng(seed).uniform(-3, -2))
+        made = scattered(light, fraction=fraction)
+        bound = STRAY_LIGHT.bound(probe_of(light, wavelength, unit), rig_with(stray_fraction=fraction))
         ratios.append(bound.value / worst(made, light, unit))
     assert np.median(ratios) < 6
 
@@ -81,7 +81,7 @@ def test_gains_belong_to_the_unit() -> None:
 
 def test_gains_never_fall_below_0() -> None:
     """A spread of 50 % leaves elements without response, none with less."""
-    gains = response_gain(Rig(detector=Detector(response_share=0.5)), 50)
+    gains = response_gain(Rig(detector=Detector(prnu_std=0.5)), 50)
     assert gains.min() == 0
     assert gains.max() > 2
 

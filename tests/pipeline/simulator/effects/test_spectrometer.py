@@ -211,7 +211,7 @@ def test_off_where_there_is_nothing_to_bend():
 def test_through_the_render_after_the_response():
     """On a scene of narrow bands response, smile and stray light together stay within the sum of their bounds."""
     wavelength, scene = small_scene(fwhm_nm=2.0)
-    rig = rig_with(smile_nm=0.8, stray_share=0.01)
+    rig = rig_with(smile_nm=0.8, stray_fraction=0.01)
     block = SweepBlock(rig, SWEEP, range(316, 324), wavelength, scene.shape, fwhm_nm=scene.fwhm_nm)
     plain = expected_light(scene, block, {})
     probe = probe_of(plain, wavelength, fwhm_nm=scene.fwhm_nm)

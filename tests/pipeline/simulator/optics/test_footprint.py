@@ -128,12 +128,12 @@ def test_waves_spread_as_the_inverse_of_the_pupil(tangents: np.ndarray):
 
 
 @given(st.floats(-4000, 4000), st.floats(-5000, 3000), st.integers(1, 2000), st.integers(1, 8))
-def test_ends_of_a_sweep_hold_the_extremes(strip: float, start: float, lines: int, step: int):
+def test_ends_of_a_sweep_hold_the_extremes(swath: float, start: float, lines: int, step: int):
     """No held position between has a wider or narrower pupil than the ends."""
-    sweep = Sweep("s", "fine", "x", strip, start, max(lines // step, 1), step)
+    sweep = Sweep("s", "fine", "x", swath, start, max(lines // step, 1), step)
     probe = replace(PROBE, sweeps=(sweep,))
     held = sweep.held_px().ravel()
-    tangents = np.stack([np.full_like(held, strip), held], axis=-1) * RIG.camera.ifov_rad
+    tangents = np.stack([np.full_like(held, swath), held], axis=-1) * RIG.camera.ifov_rad
     normals = direction_to_normal(scene_to_direction(tangents))
     ends = normals_met(probe.sweeps, RIG.camera)[1:]
     for spread in (spread_of_rays, spread_of_waves):

@@ -28,8 +28,8 @@ from tests.pipeline.simulator.small_scenes import image_scene, seen_at
 CAMERA = LineCamera()
 RIG = Rig(camera=CAMERA, optics=Optics(keystone_px=0.3))
 BLURS: dict[Any, str] = {ABERRATION: "gaussian", KEYSTONE: "linear"}
-CORNER = Sweep("corner", "fine", "x", strip_px=960.0, start_px=-1279.0, lines=2560)
-MIDDLE = Sweep("middle", "fine", "y", strip_px=0.0, start_px=-1279.0, lines=2560)
+CORNER = Sweep("corner", "fine", "x", swath_px=960.0, start_px=-1279.0, lines=2560)
+MIDDLE = Sweep("middle", "fine", "y", swath_px=0.0, start_px=-1279.0, lines=2560)
 
 
 def grain(bands: int = 3) -> RasterScene:
@@ -62,7 +62,7 @@ class Moved:
     @staticmethod
     def to(block: SweepBlock, scene: RasterScene) -> Moved:
         """So that the middle of a block's line falls on the middle of the scene."""
-        return Moved(-float(block.sweep.strip_px), -float(np.rint(block.scan_px.mean())))
+        return Moved(-float(block.sweep.swath_px), -float(np.rint(block.scan_px.mean())))
 
     def displaced(self, block: SweepBlock, along_px: Any, scan_px: Any, variant: str) -> tuple[Any, Any]:
         """Give what to add."""
@@ -86,7 +86,7 @@ def test_closed_form_is_what_thousands_of_rays_give(
     """In the middle of a survey and at its corner, where lines are turned by 9 deg, with blurs and without.
 
     Tables misplace 1e-4 of the light, and grain ranges over 6 of its deviations: .0003 for either axis. A variant of a
-    stated share changes half of that times the range. With blurs, boxes at the corner are moved for the Gaussian's
+    stated fraction changes half of that times the range. With blurs, boxes at the corner are moved for the Gaussian's
     covariance as well as their own, which leaves its fourth moments wrong: .008 of the deviation.
     """
     assert error(sweep, line, variant, {}) < sharp
@@ -98,7 +98,7 @@ def test_keystone_needs_no_slit(variant: str) -> None:
     """Every band is seen from its own place, through the slit and without it."""
     x = np.mgrid[:120, :160][1]
     ramp = image_scene(np.repeat((x + 0.0)[..., None], 3, axis=2), CAMERA, [400.0, 700.0, 1000.0])
-    sweep = Sweep("s", "fine", "x", strip_px=0.0, start_px=-20.0, lines=3)
+    sweep = Sweep("s", "fine", "x", swath_px=0.0, start_px=-20.0, lines=3)
     block = SweepBlock(RIG, sweep, range(3), ramp.wavelength_nm, ramp.shape)
     light = expected_light(ramp, block, {SLIT: variant, KEYSTONE: "linear"})[:, 290:350] / ramp.electrons
     np.testing.assert_allclose(light - light[..., [1]], np.broadcast_to([-0.15, 0.0, 0.15], light.shape), atol=2e-4)
@@ -135,12 +135,12 @@ def test_weights_of_all_pixels_sum_to_one(width: float, held: int, place: float)
 def test_gaussian_is_that_of_many_steps(held: int) -> None:
     """Kernels with Gaussians are means of the sharp one over thousands of even steps."""
     step = np.arange(-8, 8, 0.002)
-    share = np.exp(-(step**2) / 2)
+    fraction = np.exp(-(step**2) / 2)
     variance = np.array([0.0, 0.08, 0.5])
     distance, weight = blurred_weight(2.7, variance, held)
     some = slice(0, len(distance), 37)
     for one, row in zip(variance, weight[:, some], strict=True):
-        wanted = box_weight(distance[some, None] + step * np.sqrt(one), 2.7, held) @ (share / share.sum())
+        wanted = box_weight(distance[some, None] + step * np.sqrt(one), 2.7, held) @ (fraction / fraction.sum())
         np.testing.assert_allclose(row, wanted, atol=1e-7)
 
 

@@ -1,4 +1,4 @@
-"""The farm's land: parcels, lines, discs and rows by their laws, and scenes that are worth a second look."""
+"""The farm's land: parcels, lines, discs and rows by their laws, and scenes that are worth a second pass."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_bands_do_not_move_the_farm() -> None:
     assert many.electrons.shape == (many.planes.shape[2], 31)
 
 
-def test_parcels_share_the_land() -> None:
+def test_parcels_fraction_the_land() -> None:
     """The parcels' coverages sum to 1 in every pixel, and their areas to the land's."""
     parcels, _ = divide_land(stream(4, "land"), (700, 640), 20_000)
     assert sum(polygon_area(parcel.corners) for parcel in parcels) == pytest.approx(700 * 640)

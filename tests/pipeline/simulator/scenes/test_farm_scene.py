@@ -49,7 +49,7 @@ def test_the_law_gives_the_farms_that_it_gave(
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**40), st.integers(1, 70), st.integers(1, 70), st.integers(1, 366))
-def test_abundances_are_shares(seed: int, height: int, width: int, day: int) -> None:
+def test_abundances_are_fractions(seed: int, height: int, width: int, day: int) -> None:
     """Abundances of any seed, size and day are non-negative and sum to 1, and every pixel has a known class."""
     scene = farm_scene(seed, (height, width), bands=2, day=day)
     assert scene.planes.dtype == np.float32
@@ -60,11 +60,11 @@ def test_abundances_are_shares(seed: int, height: int, width: int, day: int) -> 
 
 
 def test_values_are_reflectance() -> None:
-    """Scene values lie between 0 and 1 in every band; the panel is nearly white."""
+    """Scene values lie between 0 and 1 in every band; the white reference is nearly white."""
     scene = farm_scene(2, (120, 160), bands=31, day=205)
     assert scene.values().min() > 0
     assert scene.values().max() < 0.85
-    assert scene.panel.tolist() == [np.float32(0.99)] * 31
+    assert scene.white_reference.tolist() == [np.float32(0.99)] * 31
     assert scene.class_names == CLASSES
     np.testing.assert_array_equal(scene.class_colours, CLASS_COLOURS)
 

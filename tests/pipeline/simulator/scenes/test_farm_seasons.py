@@ -15,19 +15,19 @@ from pipeline.simulator.scenes.farm.seasons import (
     Sun,
     canopy_cover,
     land_on,
-    stage_shares,
+    stage_fractions,
     sun_over_farm,
 )
 from pipeline.simulator.scenes.farm.spectra import FWHM_NM, MATERIALS, band_response, spectral_library
 
 
 @given(st.sampled_from(sorted(CROPS)), st.floats(-50, 350))
-def test_stages_share_the_stand(use: str, age: float) -> None:
+def test_stages_fraction_the_stand(use: str, age: float) -> None:
     """Shares of stages are non-negative, sum to 1, and at most two neighbours mix."""
-    shares = stage_shares(CROPS[use], np.array([age]))
-    assert 1 <= len(shares) <= 2
-    assert sum(float(share[0]) for share in shares.values()) == pytest.approx(1, abs=1e-6)
-    assert all(share[0] >= 0 and name in MATERIALS for name, share in shares.items())
+    fractions = stage_fractions(CROPS[use], np.array([age]))
+    assert 1 <= len(fractions) <= 2
+    assert sum(float(fraction[0]) for fraction in fractions.values()) == pytest.approx(1, abs=1e-6)
+    assert all(fraction[0] >= 0 and name in MATERIALS for name, fraction in fractions.items())
 
 
 def test_cover_by_hand() -> None:
@@ -119,18 +119,18 @@ def test_band_response_keeps_a_line_in_place() -> None:
     np.testing.assert_allclose(weight[0, 103] / weight[0, 100], 0.5, rtol=1e-9)
 
 
-def test_white_panel_never_saturates() -> None:
+def test_white_white_reference_never_saturates() -> None:
     """The panel stays six standard deviations of shot and read noise below the full well, and so in DN."""
     camera = LineCamera()
-    panel = spectral_library(270).panel_electrons(camera)
-    assert (panel + 6 * np.sqrt(panel + camera.read_noise_e**2)).max() < camera.full_well_e
-    assert digitise(panel, camera, np.random.default_rng(0)).max() < camera.full_scale_dn
+    white_reference = spectral_library(270).white_reference_electrons(camera)
+    assert (white_reference + 6 * np.sqrt(white_reference + camera.read_noise_e**2)).max() < camera.full_full_well_e
+    assert digitise(white_reference, camera, np.random.default_rng(0)).max() < camera.full_scale_dn
 
 
-def test_panel_and_materials_share_one_light() -> None:
-    """Electrons over the panel's, times its reflectance, give back every material."""
+def test_white_reference_and_materials_fraction_one_light() -> None:
+    """Electrons over the white reference's, times its reflectance, give back every material."""
     camera, library = LineCamera(), spectral_library(32)
-    back = library.electrons(camera) / library.panel_electrons(camera) * 0.99
+    back = library.electrons(camera) / library.white_reference_electrons(camera) * 0.99
     np.testing.assert_allclose(back, library.reflectance, rtol=1e-5)
 
 

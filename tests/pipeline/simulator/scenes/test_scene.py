@@ -13,7 +13,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.lazy import Once
 from pipeline.simulator.rig_model import Sky
 from pipeline.simulator.scenes.daylight import knots_within, relative_daylight, sun_elevation_deg
-from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster, raster_from_values
+from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster, raster_from_values
 
 BANDS = np.array([400.0, 550.0, 760.0, 1000.0])
 EQUINOX = Sky(started=datetime(2026, 3, 20, 0, 0, tzinfo=UTC), latitude_deg=29.5, longitude_deg=0.0)
@@ -117,12 +117,12 @@ def picture(seed: int = 0, shape: tuple[int, ...] = (20, 30, 2)) -> np.ndarray:
     return (np.random.default_rng(seed).random(shape) * 255).astype(np.uint8)
 
 
-def test_bright_end_fills_the_stated_share_of_the_well() -> None:
+def test_bright_end_fills_the_stated_fraction_of_the_well() -> None:
     """The 99.9th percentile gives 60 % of the full well, whatever the unit of the file."""
     scene = raster_from_values(picture(), CAMERA, name="p", wavelength_nm=WAVELENGTH)
     bright = np.percentile(picture(), 99.9)
-    np.testing.assert_allclose(bright * scene.electrons, 0.6 * CAMERA.full_well_e, rtol=1e-6)
-    np.testing.assert_allclose(scene.panel * scene.electrons, scene.panel_electrons, rtol=1e-6)
+    np.testing.assert_allclose(bright * scene.electrons, 0.6 * CAMERA.full_full_well_e, rtol=1e-6)
+    np.testing.assert_allclose(scene.white_reference * scene.electrons, scene.white_reference_electrons, rtol=1e-6)
 
 
 def test_values_are_those_of_the_file() -> None:
@@ -130,8 +130,10 @@ def test_values_are_those_of_the_file() -> None:
     scene = raster_from_values(picture(), CAMERA, name="p", wavelength_nm=WAVELENGTH)
     np.testing.assert_allclose(scene.values(), picture(), rtol=1e-6)
     planes, electrons = np.ones((4, 5, 3), np.float32), np.full((3, 2), 100, np.float32)
-    panel, white = np.full(2, 0.5, np.float32), np.full(2, 200, np.float32)
-    mixed = RasterScene("m", "k", SceneRaster.of(planes), Once.of(SceneLight(electrons, white)), panel, WAVELENGTH)
+    white_reference, white = np.full(2, 0.5, np.float32), np.full(2, 200, np.float32)
+    mixed = RasterScene(
+        "m", "k", SceneRaster.of(planes), Once.of(SceneRadiance(electrons, white)), white_reference, WAVELENGTH
+    )
     np.testing.assert_allclose(mixed.values(), np.full((4, 5, 2), 300 / 200 * 0.5))
 
 
@@ -150,7 +152,7 @@ def test_gaps_are_filled_and_counted() -> None:
 def test_black_scene_keeps_scale_one() -> None:
     """Without positive light the scale is 1 and everything stays finite."""
     scene = raster_from_values(np.zeros((5, 5, 2)), CAMERA, name="black", wavelength_nm=WAVELENGTH)
-    np.testing.assert_allclose(scene.electrons, 0.6 * CAMERA.full_well_e, rtol=1e-6)
+    np.testing.assert_allclose(scene.electrons, 0.6 * CAMERA.full_full_well_e, rtol=1e-6)
     assert (scene.values() == 0).all()
 
 
@@ -168,7 +170,7 @@ def test_bright_end_of_a_large_scene_is_sampled() -> None:
     row = np.linspace(0, 1, 6_000, dtype=np.float32)
     values = np.broadcast_to(row[:, None, None], (6_000, 3_000, 2))
     scene = raster_from_values(values, CAMERA, name="large", wavelength_nm=WAVELENGTH, key="k")
-    np.testing.assert_allclose(scene.panel * 0.6, 0.999, rtol=1e-3)
+    np.testing.assert_allclose(scene.white_reference * 0.6, 0.999, rtol=1e-3)
 
 
 def test_unusable_scenes_are_refused() -> None:
@@ -192,7 +194,7 @@ def test_a_raster_is_drawn_when_it_is_looked_at() -> None:
         drawn.append(1)
         return np.ones((4, 5, 2), np.float32), np.zeros((4, 5), np.uint8)
 
-    light = Once.of(SceneLight(np.ones(2, np.float32), np.ones(2, np.float32)))
+    light = Once.of(SceneRadiance(np.ones(2, np.float32), np.ones(2, np.float32)))
     scene = RasterScene(
         "s", "k", SceneRaster((4, 5, 2), labelled=True, draw=draw), light, np.ones(2, np.float32), WAVELENGTH
     )

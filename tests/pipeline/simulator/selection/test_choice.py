@@ -168,7 +168,11 @@ def test_totals_of_a_decision():
 
 def test_gains_multiply_the_errors_of_others_but_not_their_own():
     """Light that is brightened by a quarter carries a shift's error a quarter higher; a unit of DN follows no light."""
-    effects = [MadeUp("read", 0.1), Brightening("vignetting", 0.25, share=0.25), Brightening("cloud", 0.5, share=-0.5)]
+    effects = [
+        MadeUp("read", 0.1),
+        Brightening("vignetting", 0.25, fraction=0.25),
+        Brightening("cloud", 0.5, fraction=-0.5),
+    ]
     errors = [menu.off.error for menu in list_options(replace(PROBE, unit="dn"), RIG, effects)]
     assert errors == pytest.approx([0.1 * SAFETY, 0.25 * 1.5 * SAFETY, 0.5 * 1.25 * SAFETY])
 
@@ -189,7 +193,7 @@ def test_of_several_binnings_the_worst_counts():
 
 def test_a_gain_that_only_darkens_does_not_multiply_errors():
     """A shadow states its own range; what it takes, left out, counts by the smaller noise of the shadow."""
-    rig = Rig(sky=Sky(cloud_share=0.5))
+    rig = Rig(sky=Sky(cloud_fraction=0.5))
     slope = even_probe(slope=np.ones((2, 1)), brightest_e=1e4, darkest_e=1e4)
     shift, cloud = (menu.off.error for menu in list_options(slope, rig, [Shift("shift", 0.1), CLOUD]))
     assert shift == pytest.approx(0.1 * SAFETY)
@@ -199,7 +203,7 @@ def test_a_gain_that_only_darkens_does_not_multiply_errors():
 @pytest.mark.parametrize("name", ["rotation", "slit", "smear"])
 def test_later_gains_multiply_errors_of_what_the_renderer_does(name: str):
     """Lines that are not turned, seen in 1.5 times the light, err by 1.5 times; noise that is read out does not."""
-    effects = [MadeUp(name, 0.1), MadeUp("read", 0.1), Brightening("drift", 0.5, share=0.5)]
+    effects = [MadeUp(name, 0.1), MadeUp("read", 0.1), Brightening("drift", 0.5, fraction=0.5)]
     errors = [menu.off.error for menu in list_options(replace(PROBE, unit="dn"), RIG, effects)]
     assert errors[:2] == pytest.approx([0.15 * SAFETY, 0.1 * SAFETY])
 
@@ -231,7 +235,7 @@ def test_kernels_that_two_blurs_need_are_paid_as_both_need_them():
     assert cost - menus[0].exact.cost_ns == pytest.approx(shared.cost_ns)
 
 
-def test_a_draw_that_two_share_is_paid_once():
+def test_a_draw_that_two_fraction_is_paid_once():
     """Read noise costs nothing in the cheap draw of the shot noise, and its own price beside the exact one."""
     decision = decide(PROBE, RIG, [SHOT, READ_NOISE], 1e-3)
     assert decision.cost_ns == pytest.approx(SHOT.cost_ns["gaussian"] + LEAST_COST_NS)

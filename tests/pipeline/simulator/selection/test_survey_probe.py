@@ -25,7 +25,7 @@ from pipeline.simulator.selection.survey_probe import probe_scene, probe_survey
 from tests.pipeline.simulator.small_scenes import image_scene, made_scene
 
 RIG = Rig(camera=LineCamera(samples=96))
-SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-30.0, lines=61)
+SWEEP = Sweep("s", "fine", "x", swath_px=0.0, start_px=-30.0, lines=61)
 BLURS: dict[Any, str] = {DIFFRACTION: "airy", ABERRATION: "gaussian", KEYSTONE: "linear"}
 
 
@@ -85,7 +85,7 @@ def test_wave_has_its_slope_and_curvature(along: str) -> None:
 def test_nothing_in_the_image_exceeds_the_probe(seed: int) -> None:
     """Levels, spans, differences of neighbours and of variants of the slit stay below 1.05 of the probe's."""
     scene = mixed(seed)
-    sweep = replace(SWEEP, strip_px=40.0 * (seed % 3), start_px=-30.0 + seed)
+    sweep = replace(SWEEP, swath_px=40.0 * (seed % 3), start_px=-30.0 + seed)
     probe = probe_scene(scene, RIG, [sweep])
     light = seen(scene, sweep)
     noise = noise_electrons(light, RIG)
@@ -104,11 +104,11 @@ def test_nothing_in_the_image_exceeds_the_probe(seed: int) -> None:
         assert change.max() <= SAFETY * SLIT.bound(probe, RIG, variant).value
 
 
-@pytest.mark.parametrize(("strip", "seed"), [(300.0, 0), (900.0, 1)])
-def test_turned_lines_do_not_exceed_what_the_probe_measured(seed: int, strip: float) -> None:
+@pytest.mark.parametrize(("swath", "seed"), [(300.0, 0), (900.0, 1)])
+def test_turned_lines_do_not_exceed_what_the_probe_measured(seed: int, swath: float) -> None:
     """At strips far from the middle, where lines are turned by 3 and 8 deg, each keeps its bound beside all blurs."""
     scene = mixed(seed, (80, 2000))
-    sweep = replace(SWEEP, strip_px=strip)
+    sweep = replace(SWEEP, swath_px=swath)
     probe = probe_scene(scene, RIG, [sweep])
     light = seen(scene, sweep, "9x3", BLURS)
     noise = noise_electrons(light, RIG)
@@ -122,11 +122,11 @@ def test_turned_lines_do_not_exceed_what_the_probe_measured(seed: int, strip: fl
 def test_places_are_seen_from_the_most_oblique_sweep_that_reaches_them() -> None:
     """Of two sweeps that overlap, the finer one and the one whose lines are turned more."""
     scene = mixed(1, (80, 1000))
-    fine = replace(SWEEP, name="a", strip_px=360.0)
-    coarse = replace(SWEEP, name="b", kind="coarse", strip_px=420.0, lines=15, step=4)
+    fine = replace(SWEEP, name="a", swath_px=360.0)
+    coarse = replace(SWEEP, name="b", kind="coarse", swath_px=420.0, lines=15, step=4)
     found = views_of_places(np.array([[40.0, 890.0]]), scene, RIG.camera, (fine, coarse))
     assert set(found.sweep) == {0, 1}
-    assert set(found.strip_px[found.sweep == 1]) == {420.0}
+    assert set(found.swath_px[found.sweep == 1]) == {420.0}
 
 
 def test_bands_at_the_same_wavelength_have_finite_derivatives() -> None:
@@ -143,7 +143,7 @@ def test_probe_finds_a_single_bright_pixel_in_a_large_scene() -> None:
     values = np.full((600, 600, 2), 1.0)
     values[431, 222] = 5.0
     scene = scene_of(values)
-    sweeps = [replace(SWEEP, name=f"{n}", strip_px=n, start_px=-300, lines=600) for n in (-252.0, -160.0, -64.0, 90.0)]
+    sweeps = [replace(SWEEP, name=f"{n}", swath_px=n, start_px=-300, lines=600) for n in (-252.0, -160.0, -64.0, 90.0)]
     probe = probe_scene(scene, RIG, sweeps)
     assert probe.brightest_e > 1.5 * scene.electrons[0]
     assert probe.slope.min() > 10
@@ -269,6 +269,6 @@ def test_no_lines_are_refused() -> None:
 
 def test_sweep_beside_the_scene_is_flat() -> None:
     """Lines that miss the scene see its repeated edge; the probe is finite."""
-    probe: Probe = probe_scene(mixed(1), RIG, [replace(SWEEP, strip_px=900.0, start_px=800.0)])
+    probe: Probe = probe_scene(mixed(1), RIG, [replace(SWEEP, swath_px=900.0, start_px=800.0)])
     assert np.isfinite(probe.slope).all()
     assert np.isfinite(probe.level).all()

@@ -12,14 +12,14 @@ import pytest
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
-from pipeline.simulator.effects.effect import Light as Light32
+from pipeline.simulator.effects.effect import Radiance as Light32
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.effects.probe import Probe, noise_electrons
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
-from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, SceneRadiance, SceneRaster
 from pipeline.simulator.selection import survey_probe
 from pipeline.simulator.selection.choice import TOTAL, Decision, decide
 from pipeline.simulator.selection.options import SAFETY
@@ -53,13 +53,13 @@ def scene_of(case: Case) -> RasterScene:
     if case.roof_e:
         plane[490:510, 70:90] = case.roof_e
     spectra = np.full((1, 3), DEFAULT_EXPOSURE_MS / case.rig.camera.exposure_ms, np.float32)
-    light = SceneLight(spectra, 2 * case.electrons * spectra[0])  # the scene reflects about half
+    light = SceneRadiance(spectra, 2 * case.electrons * spectra[0])  # the scene reflects about half
     raster = SceneRaster.of(plane[..., None].astype(np.float32))
     return RasterScene("case", "case", raster, Once.of(light), np.ones(3, np.float32), WAVELENGTHS)
 
 
 @pytest.fixture(autouse=True)
-def a_sparse_look(monkeypatch: pytest.MonkeyPatch) -> None:
+def a_sparse_pass(monkeypatch: pytest.MonkeyPatch) -> None:
     """Waves, a roof and flat fields repeat themselves: an eighth of the usual samples sees all that they have."""
     monkeypatch.setattr(survey_probe, "MOST_SAMPLES", 1500)
     monkeypatch.setattr(survey_probe, "FINEST_SAMPLES", 200)
@@ -134,7 +134,7 @@ def test_scene_and_rig_switch_effects(case: Case, on: str, off: str):
 def test_what_is_left_out_keeps_its_bounds_on_the_worst_chips(case: Case):
     """Rendered with everything on and with the choice, effect by effect and all together."""
     scene, rig, decision = scene_of(case), case.rig, decided(case)
-    white = scene.panel_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
+    white = scene.white_reference_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
     ends = (0.0, 0.0 if case.seconds is None else case.seconds - rig.camera.scan_seconds(SWEEPS[1].lines))
     whole = [
         SweepBlock(rig, sweep, range(sweep.lines), WAVELENGTHS, scene.shape, started_s=start, white_e=white)

@@ -31,7 +31,7 @@ from tests.pipeline.simulator.small_scenes import image_scene, made_scene
 from tests.pipeline.simulator.sparse_cases import sparse_case
 
 CAMERA = LineCamera(samples=96)
-SHARP = Rig(camera=CAMERA, optics=Optics(stray_share=0.0, keystone_px=0.0, smile_nm=0.0, aberration_px=0.0))
+SHARP = Rig(camera=CAMERA, optics=Optics(stray_fraction=0.0, keystone_px=0.0, smile_nm=0.0, aberration_px=0.0))
 
 
 def off(case: Case, effect: str) -> list[tuple[float, float, bool]]:
@@ -65,7 +65,7 @@ def test_stray_light_of_few_bright_lines_counts() -> None:
     values = np.full((700, 160, 3), 0.05)
     values[150:170] = 1.0
     values[156:165, 70:74] = 0.0
-    rig = replace(SHARP, optics=replace(SHARP.optics, stray_share=1e-2, stray_even=1.0))
+    rig = replace(SHARP, optics=replace(SHARP.optics, stray_fraction=1e-2, stray_even=1.0))
     scene = image_scene(values, CAMERA, np.linspace(400, 1000, 3))
     case = Case(scene, rig, (Sweep("s", "fine", "x", 0.0, -300.0, 600),), None, 0, range(108, 113))
     ((bound, change, _), *_) = off(case, "stray-light")
@@ -92,7 +92,7 @@ def test_bounds_hold_where_little_is_seen(number: int) -> None:
 )
 def test_bounds_hold_where_bands_differ(number: int, effect: str, lines: range | None) -> None:
     """Each band counts with its own least light, and by what its neighbours bring from beside that it does not."""
-    found = list(trials(replace(sparse_case(number), looked=lines), (1, 2 + number % 7), effect))
+    found = list(trials(replace(sparse_case(number), observation=lines), (1, 2 + number % 7), effect))
     assert found
     assert [one for one in found if one.is_broken] == []
 
@@ -144,10 +144,10 @@ def test_wide_spectra_are_those_of_means(components: int | None) -> None:
     st.sampled_from(["x", "y"]),
 )
 def test_no_pixel_is_nearer_to_a_sweep_than_its_cell(
-    rows: int, columns: int, strip: float, start: float, lines: int, along: str
+    rows: int, columns: int, swath: float, start: float, lines: int, along: str
 ) -> None:
     """What a sweep sees is in cells that are reached; a pixel so many px beside it is in a cell no farther."""
-    sweep = Sweep("s", "fine", along, strip, start, lines)
+    sweep = Sweep("s", "fine", along, swath, start, lines)
     cells = reached_cells((rows, columns), CAMERA, [sweep])
     y, x = np.mgrid[:rows, :columns] - (np.array([rows, columns])[:, None, None] - 1) / 2
     line, sample = np.moveaxis(scene_to_sweep(sweep, CAMERA, *((y, x) if along == "y" else (x, y))), -1, 0)

@@ -26,15 +26,15 @@ RIGS = {
         camera=CAMERA,
         optics=Optics(focus_m=50.0),
         mirror=MirrorMotion(repeatability_urad=40.0, hysteresis_px=2.0, drift_px_per_min=1.0, coating="silver"),
-        detector=Detector(dead_share=0.01, hot_share=0.01),
+        detector=Detector(dead_fraction=0.01, hot_fraction=0.01),
         air=Air(distance_m=40.0, relief="plane", nearest_m=30.0, farthest_m=60.0, wind_amplitude_m=0.02),
-        sky=Sky(started=NOON, cloud_share=0.3),
+        sky=Sky(started=NOON, cloud_fraction=0.3),
     ),
     "ideal": Rig(
         camera=replace(CAMERA, read_noise_e=0.0),
-        optics=Optics(aberration_px=0.0, keystone_px=0.0, smile_nm=0.0, stray_share=0.0),
+        optics=Optics(aberration_px=0.0, keystone_px=0.0, smile_nm=0.0, stray_fraction=0.0),
         mirror=MirrorMotion(coating="ideal"),
-        detector=Detector(noiseless=True, response_share=0.0, stripe_share=0.0),
+        detector=Detector(noiseless=True, prnu_std=0.0, striping_std=0.0),
     ),
 }
 

@@ -13,7 +13,7 @@ from pipeline.errors import BoundError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, sweep_to_scene
 from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
-from pipeline.simulator.effects.effect import Effect, Light, SweepBlock
+from pipeline.simulator.effects.effect import Effect, Radiance, SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
 from pipeline.simulator.optics.kernel_fit import NEGLIGIBLE
 from pipeline.simulator.render import expected_light, tails_apart
@@ -26,8 +26,8 @@ from pipeline.simulator.selection.verification import (
     candidate_blocks,
     contrast_about,
     misplaced_electrons,
+    misplaced_fraction,
     misplaced_in_tails,
-    misplaced_share,
     verify,
     worst_blocks,
 )
@@ -39,7 +39,7 @@ BLOCK = SweepBlock(RIG, SWEEP, range(20, 28), np.array([500.0, 600.0]), (200, 70
 CHIPS = {"steepest": BLOCK, "brightest": replace(BLOCK, lines=range(40, 44))}
 
 
-def render(block: SweepBlock, chosen: Mapping[Effect, str]) -> Light:
+def render(block: SweepBlock, chosen: Mapping[Effect, str]) -> Radiance:
     """Light of 100 e-, brighter from line 40 on, times all gains."""
     light = np.full((len(block.lines), block.rig.camera.samples, 2), 100.0, np.float32)
     light[block.numbers >= 40] += 20
@@ -49,7 +49,7 @@ def render(block: SweepBlock, chosen: Mapping[Effect, str]) -> Light:
     return light
 
 
-def units(light: Light, binning: int) -> Floats:
+def units(light: Radiance, binning: int) -> Floats:
     """100 e- are one unit."""
     return np.full(light.shape, 100.0)
 
@@ -61,8 +61,8 @@ def decided(*effects: MadeUp, tolerance: float = 1.0, asked: str = "auto") -> De
 
 def test_measured_changes_are_those_of_each_effect_and_of_all():
     """Gains of 1 % and 2 % on light of 1.2 units; what is on or of the readout is not measured."""
-    effects = Brightening("drift", 0.01, share=0.01), Brightening("cloud", 0.02, share=0.02)
-    on, read = Brightening("vignetting", 3.0, share=0.5), MadeUp("read", 0.1)
+    effects = Brightening("drift", 0.01, fraction=0.01), Brightening("cloud", 0.02, fraction=0.02)
+    on, read = Brightening("vignetting", 3.0, fraction=0.5), MadeUp("read", 0.1)
     measured = verify(decided(*effects, on, read), render, CHIPS, units)
     assert measured == pytest.approx(
         {"drift": 1.2 * 1.02 * 1.5 * 0.01, "cloud": 1.2 * 1.01 * 1.5 * 0.02, TOTAL: 1.2 * 1.5 * (1.01 * 1.02 - 1)},
@@ -72,19 +72,19 @@ def test_measured_changes_are_those_of_each_effect_and_of_all():
 
 def test_nothing_left_out_measures_nothing():
     """Exact on, all together changes by 0."""
-    assert verify(decided(Brightening("drift", 0.1, share=0.1), tolerance=0.0), render, CHIPS, units) == {TOTAL: 0.0}
+    assert verify(decided(Brightening("drift", 0.1, fraction=0.1), tolerance=0.0), render, CHIPS, units) == {TOTAL: 0.0}
 
 
 def test_nothing_on_is_measured_as_a_whole():
     """Where everything is left out by hand, no effect is measured beside the others; together they are."""
-    effects = Brightening("drift", 0.01, share=0.01), Brightening("cloud", 0.02, share=0.02)
+    effects = Brightening("drift", 0.01, fraction=0.01), Brightening("cloud", 0.02, fraction=0.02)
     measured = verify(decided(*effects, asked="none"), render, CHIPS, units)
     assert measured == pytest.approx({TOTAL: 1.2 * (1.01 * 1.02 - 1)}, rel=1e-4)
 
 
 def test_broken_bound_is_named_with_its_place():
     """Effect, change, bound, place and what to do."""
-    decision = decided(Brightening("drift", 0.01, share=0.1))
+    decision = decided(Brightening("drift", 0.01, fraction=0.1))
     said = (
         r"drift: .* changes light by 0\.12 sigma of the noise at sweep fine-0, line 40, sample 0, band 0 of the "
         r"brightest lines, above its bound of 0\.0145.*--tol 0 or"
@@ -96,23 +96,23 @@ def test_broken_bound_is_named_with_its_place():
 def test_light_that_is_no_number_breaks_every_bound():
     """NaN is not less than a bound."""
 
-    def broken(block: SweepBlock, chosen: Mapping[Effect, str]) -> Light:
+    def broken(block: SweepBlock, chosen: Mapping[Effect, str]) -> Radiance:
         shape = len(block.lines), block.rig.camera.samples, 2
         return render(block, chosen) if chosen else np.full(shape, np.nan, np.float32)
 
     with pytest.raises(BoundError, match="changes light by nan"):
-        verify(decided(Brightening("drift", 0.01, share=0.01)), broken, CHIPS, units)
+        verify(decided(Brightening("drift", 0.01, fraction=0.01)), broken, CHIPS, units)
 
 
 def test_rounding_alone_breaks_no_bound():
     """Sums of float32 in another order differ by some millionths."""
-    decision = decided(Brightening("drift", 1e-9, share=2e-6))
+    decision = decided(Brightening("drift", 1e-9, fraction=2e-6))
     assert verify(decision, render, CHIPS, units)[TOTAL] == pytest.approx(2.4e-6, rel=0.1)
 
 
 def test_what_hardly_changes_anything_is_measured_with_the_others_alone():
     """An effect bounded by less than a thousandth of a unit has no figure of its own, and counts in that of all."""
-    effects = Brightening("drift", 1e-4, share=1e-4), Brightening("cloud", 0.02, share=0.02)
+    effects = Brightening("drift", 1e-4, fraction=1e-4), Brightening("cloud", 0.02, fraction=0.02)
     measured = verify(decided(*effects), render, CHIPS, units)
     assert measured.keys() == {"cloud", TOTAL}
     assert measured[TOTAL] == pytest.approx(1.2 * (1.0001 * 1.02 - 1), rel=1e-3)
@@ -121,9 +121,9 @@ def test_what_hardly_changes_anything_is_measured_with_the_others_alone():
 def test_sums_are_held_against_the_bound_as_they_are_stored():
     """An error that 4 samples share is twice as many sigmas of their sum: one that a sample alone would hide."""
     coarse = replace(BLOCK, sweep=replace(SWEEP, binning=4))
-    shared = Brightening("drift", 0.01, share=0.01)
+    shared = Brightening("drift", 0.01, fraction=0.01)
 
-    def noise(light: Light, binning: int) -> Floats:
+    def noise(light: Radiance, binning: int) -> Floats:
         return np.full(light.shape, 100.0 / np.sqrt(binning))
 
     assert verify(decided(shared), render, {"steepest": BLOCK}, noise)["drift"] == pytest.approx(0.01, rel=1e-3)
@@ -136,7 +136,7 @@ FAR = Sweep("far", "fine", "y", -400.0, -900.0, 50)
 WHOLE = SweepBlock(RIG, FAR, range(50), np.array([500.0]), (1000, 2000))
 
 
-def ones(light: Light, binning: int) -> Light:
+def ones(light: Radiance, binning: int) -> Radiance:
     """Electrons are the unit."""
     return np.ones_like(light)
 
@@ -144,7 +144,7 @@ def ones(light: Light, binning: int) -> Light:
 def test_worst_chips_are_about_the_worst_places():
     """A bright spot, a dark one, an edge, and the line that meets the mirror most obliquely, each its own chip."""
 
-    def light(chip: SweepBlock) -> Light:
+    def light(chip: SweepBlock) -> Radiance:
         seen = np.full((50, 640, 1), 50.0, np.float32)
         seen[10, 100], seen[45, 630], seen[20, 200:400] = 60.0, 41.0, 58.0
         seen[20, 300:] = 43.0
@@ -163,7 +163,7 @@ def test_worst_chips_are_about_the_worst_places():
 def test_each_binning_has_worst_chips_of_its_own():
     """Sums by sums: what is brightest as a sample need not be so in a sum of 4."""
 
-    def light(chip: SweepBlock) -> Light:
+    def light(chip: SweepBlock) -> Radiance:
         seen = np.full((50, 640, 1), 50.0, np.float32)
         seen[10, 100], seen[30, 100:108] = 60.0, 58.0
         return seen[chip.lines.start : chip.lines.stop]
@@ -223,7 +223,7 @@ def test_contrast_is_that_of_the_scene_about_a_sample() -> None:
     scene = image_scene(values, RIG.camera, [550.0])
     block = sweep_block(scene, RIG, SWEEP, range(6, 8))  # looks at rows 24 to 31
 
-    def render(block: SweepBlock, chosen: Any) -> Light:
+    def render(block: SweepBlock, chosen: Any) -> Radiance:
         return expected_light(scene, block, chosen)
 
     contrast = contrast_about(block, render)[0, :, 0]
@@ -236,14 +236,14 @@ def test_contrast_is_that_of_the_scene_about_a_sample() -> None:
 def test_kernels_that_differ_misplace_more() -> None:
     """Another blur, or held positions folded; not the parts of a slit nor an effect without a kernel."""
     block = sweep_block(image_scene(np.ones((48, 64, 1)), RIG.camera, [550.0]), RIG, SWEEP, range(2))
-    same = misplaced_share(block, EXACT, {**EXACT, SLIT: "3x1"})
-    assert same == misplaced_share(block, EXACT, EXACT) < NEGLIGIBLE
+    same = misplaced_fraction(block, EXACT, {**EXACT, SLIT: "3x1"})
+    assert same == misplaced_fraction(block, EXACT, EXACT) < NEGLIGIBLE
     without = {effect: way for effect, way in EXACT.items() if effect is not KEYSTONE}
     boxless = {effect: way for effect, way in EXACT.items() if effect is not SLIT}
     for other in (without, boxless, {**EXACT, SMEAR: "folded"}):
-        assert misplaced_share(block, EXACT, other) == pytest.approx(same + NEGLIGIBLE)
+        assert misplaced_fraction(block, EXACT, other) == pytest.approx(same + NEGLIGIBLE)
     apart = sweep_block(image_scene(np.ones((48, 64, 2)), RIG.camera, [300.0, 2500.0]), RIG, SWEEP, range(2))
-    assert misplaced_share(apart, EXACT, without) > same + 2 * NEGLIGIBLE  # few kernels stand for both, and say so
+    assert misplaced_fraction(apart, EXACT, without) > same + 2 * NEGLIGIBLE  # few kernels stand for both, and say so
 
 
 @pytest.mark.parametrize("nm", [(450.0, 640.0, 980.0), (300.0, 1200.0, 2500.0)], ids=["near", "far apart"])
@@ -259,7 +259,7 @@ def test_two_ways_to_fold_the_same_light_differ_by_no_more(pattern: str, nm: tup
     other = unshifted if pattern == "rows" else {**EXACT, SMEAR: "folded"}
     light, full = (expected_light(scene, block, one) for one in (other, EXACT))
     contrast = contrast_about(block, lambda block, chosen: expected_light(scene, block, chosen))
-    bound = misplaced_electrons(full, contrast, misplaced_share(block, EXACT, other))
+    bound = misplaced_electrons(full, contrast, misplaced_fraction(block, EXACT, other))
     assert (np.abs(light.astype(np.float64) - full) <= bound).all()
 
 
@@ -272,13 +272,13 @@ def test_tails_of_folded_positions_differ_by_no_more(nm: float) -> None:
     block = sweep_block(scene, RIG, SWEEP, range(2))  # looks at rows 0 to 7
     folded = {**EXACT, SMEAR: "folded"}
 
-    def render(block: SweepBlock, chosen: Any) -> Light:
+    def render(block: SweepBlock, chosen: Any) -> Radiance:
         return expected_light(scene, block, chosen)
 
     full = render(block, EXACT)
     change = np.abs(render(block, folded).astype(np.float64) - full)
     assert contrast_about(block, render).max() == 0
-    near = misplaced_electrons(full, np.zeros(change.shape), misplaced_share(block, EXACT, folded))
+    near = misplaced_electrons(full, np.zeros(change.shape), misplaced_fraction(block, EXACT, folded))
     assert (change > near).any()
     assert (change <= near + misplaced_in_tails(block, EXACT, folded, render)).all()
 
@@ -289,9 +289,9 @@ def test_tails_are_alike_where_held_positions_are() -> None:
     without = {effect: way for effect, way in EXACT.items() if effect is not DIFFRACTION}
     assert misplaced_in_tails(block, EXACT, without, render).max() == 0
     folded = {**EXACT, SMEAR: "folded"}
-    shares = [tails_apart(block, EXACT, folded, reach_px) for reach_px in (8, 32, 128)]
-    assert np.all(np.diff(np.concatenate(shares)) < 0)
-    assert 1e-5 < shares[0][0] < 1e-3
+    fractions = [tails_apart(block, EXACT, folded, reach_px) for reach_px in (8, 32, 128)]
+    assert np.all(np.diff(np.concatenate(fractions)) < 0)
+    assert 1e-5 < fractions[0][0] < 1e-3
     assert tails_apart(block, without, {**without, SMEAR: "folded"}, 8).max() < 1e-6
 
 

@@ -1,0 +1,213 @@
+"""The memory of a field that a survey goes on from: which earlier run, and how many days ago that was."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from flows.settings.load import anchor_paths
+from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
+from flows.settings.values import EXTENT_PART, EXTENT_WHOLE
+from pipeline.errors import IncompleteStoreError, SettingsError
+from pipeline.geometry.grid import SceneGrid
+from pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
+from storage.archive.archive import Archive, run_stem
+from storage.archive.keys import StageRef, published_runs
+from storage.archive.manifests import read_table
+from storage.archive.records import Run, read_run
+from storage.arrays.class_maps import ProbabilityStore
+from storage.arrays.mosaics import mosaic_shape
+
+NONE, LATEST, AUTO = "none", "latest", "auto"
+NEWEST_RUNS = 60  # newest runs of a field among which the visit before is looked for
+MOST_EARLIER = 12  # by which a field is known that is looked at in parts
+PROBABILITIES = "class_probabilities"  # a product of runs
+MEMORY = "prior_map.json"  # beside a map that goes on from an earlier one: what became of the memory
+OF_THE_LIGHT = (  # settings that the same light has alike
+    *("scene", "source", "seed", "size", "visit", "day", "hour", "effects", "pointing_px"),
+    *("extent", "scan_step", "scan_exposure_ms", "coarse_exposure_ms", "budget", "policy", "threshold"),
+)
+
+
+@dataclass(frozen=True)
+class EarlierRun:
+    """What a run saw of a field coarsely."""
+
+    mosaic: StageRef
+    factor: int  # fine px to a pixel of it, along either axis
+    shift_px: tuple[int, int] = (0, 0)  # down and to the right, that brings it onto the newest
+
+
+@dataclass(frozen=True)
+class Prior:
+    """The run whose class probabilities is gone on from."""
+
+    run: str
+    probabilities: StageRef  # the store that holds class probabilities.zarr
+    scan_passes: tuple[EarlierRun, ...]  # that run's, then what it had not seen itself, the newest first
+    days: float  # between that look and this one
+    classes: tuple[
+        int, ...
+    ]  # for each class of the weights its number in the class probabilities; -1 where that lacks it
+
+
+def find_prior(
+    archive: Archive, settings: Settings, name: str, grid: SceneGrid, class_names: tuple[str, ...]
+) -> tuple[Prior | None, tuple[str, ...]]:
+    """The run that a survey of ``name`` goes on from, and what to say of it; None where there is none.
+
+    Of the newest runs of the field it is the one looked at last before this visit: one that was taken later, and
+    published earlier, is no memory of it. Raises SettingsError: a run that is named cannot be gone on from.
+    """
+    if settings.prior in (NONE, AUTO):
+        return None, ()
+    if settings.prior != LATEST:
+        folder = archive.root / "runs" / Path(settings.prior).name
+        why = "there is no such run in the archive"
+        if folder.is_dir():
+            found = _usable(archive, read_run(folder, {}), settings, grid, class_names)
+            if isinstance(found, Prior):
+                return found, ()
+            why = found
+        raise SettingsError(f"--prior {settings.prior}: {why}; give another run, latest or none")
+    notes: list[str] = []
+    for run in _before(archive, settings, name):
+        found = _usable(archive, run, settings, grid, class_names)
+        if isinstance(found, Prior):
+            return found, (*notes, f"goes on from what {run.folder.name} left, {found.days:.3g} days earlier")
+        notes.append(f"the memory of {run.folder.name} cannot be used: {found}")
+    return None, (*notes, f"nothing is remembered of {name}: this look is its first")
+
+
+def _before(archive: Archive, settings: Settings, name: str) -> Iterator[Run]:
+    """Newest runs of a field with a class probabilities, those first that were looked at last before this visit."""
+    found: list[tuple[float, int, Run]] = []
+    part = run_stem(name)
+    for number, folder in enumerate(reversed(published_runs(archive.root))):
+        if part not in folder.name:  # no receipt has to be read for that
+            continue
+        run = read_run(folder, {})
+        if run.receipt.get("survey") == name and PROBABILITIES in run.products and not _is_this_visit(run, settings):
+            days = _days_since(run, settings)
+            if days >= 0:
+                found.append((days, number, run))
+            if len(found) >= NEWEST_RUNS:
+                break
+    yield from (run for _, _, run in sorted(found, key=lambda one: one[:2]))
+
+
+def _is_this_visit(run: Run, settings: Settings) -> bool:
+    """Whether a run was made of the very light that a survey asks for: what it saw is no earlier look.
+
+    Of a survey that leaves it to the memory where to look, that choice says nothing.
+    """
+    asked = anchor_paths(settings.to_dict(), Path.cwd())
+    chosen = ("extent", "scan_step", "scan_exposure_ms") if settings.extent == EXTENT_PART else ()
+    before = {"extent": EXTENT_WHOLE, **run.settings}
+    return all(before.get(part) == asked[part] for part in OF_THE_LIGHT if part not in chosen)
+
+
+def _usable(
+    archive: Archive, run: Run, settings: Settings, grid: SceneGrid, class_names: tuple[str, ...]
+) -> Prior | str:
+    """The run as a prior, or why it cannot be one."""
+    if run.problem is not None:
+        return run.problem
+    places = [run.products.get(name, "").split("/") for name in (PROBABILITIES, "mosaic")]
+    if any(len(parts) < 3 for parts in places):
+        return "it left no class probabilities, as runs of earlier versions"
+    try:
+        probabilities, mosaic = (archive.find(parts[1], parts[2]) for parts in places)
+        if probabilities is None or mosaic is None:
+            return "what it left was cleared; reprocess makes it again"
+        store = ProbabilityStore(probabilities.path / "class_probabilities.zarr")
+        names, coarse = store.legend.names, mosaic_shape(mosaic.path / "mosaic.zarr")
+    except IncompleteStoreError as error:
+        return f"{error}"
+    if store.shape != (grid.height, grid.width):
+        return f"it is of {store.shape[1]} x {store.shape[0]} px, this field has {grid.width} x {grid.height}"
+    factor = _factor(coarse, grid)
+    if factor is None:
+        rows, columns = grid.coarse_shape
+        return f"its coarse pass has {coarse[1]} x {coarse[0]} px, these weights read {columns} x {rows}"
+    camera = run.settings.get("camera")
+    same = not isinstance(camera, Mapping) or all(
+        camera.get(part) == getattr(settings.camera, part) for part in ("pitch_um", "focal_length_mm")
+    )
+    if not same:
+        return "its camera had other pixels"
+    classes = tuple(names.index(one) if one in names else -1 for one in class_names)
+    if all(number < 0 for number in classes):
+        return f"it knows none of the classes of these weights, but {', '.join(names)}"
+    scan_passes = (EarlierRun(mosaic, factor), *_earlier_runs(archive, run, grid))
+    return Prior(run.folder.name, probabilities, scan_passes, max(_days_since(run, settings), 0.0), classes)
+
+
+def _factor(coarse: tuple[int, int], grid: SceneGrid) -> int | None:
+    """How many fine px a pixel of an earlier coarse pass (y, x) is wide; None where the field has no such grid."""
+    offered = (factor for factor in range(1, grid.patch + 1) if grid.patch % factor == 0)
+    return next((factor for factor in offered if replace(grid, factor=factor).coarse_shape == coarse), None)
+
+
+def _earlier_runs(archive: Archive, run: Run, grid: SceneGrid) -> Iterator[EarlierRun]:
+    """What earlier runs saw of the rest of a field, where a run looked at a part of it and went on from them."""
+    down, across = 0, 0
+    for _ in range(MOST_EARLIER - 1):
+        memory = run.receipt.get("memory")
+        if (
+            run.settings.get("extent", EXTENT_WHOLE) == EXTENT_WHOLE
+            or memory is None
+            or memory["put_aside"] is not None
+        ):
+            return
+        down, across = (sum(both) for both in zip((down, across), memory["shift_px"], strict=True))
+        run = read_run(archive.root / "runs" / memory["run"], {})
+        parts = run.products.get("mosaic", "").split("/")
+        if run.problem is not None or len(parts) < 3:
+            return
+        try:
+            mosaic = archive.find(parts[1], parts[2])
+            factor = None if mosaic is None else _factor(mosaic_shape(mosaic.path / "mosaic.zarr"), grid)
+        except IncompleteStoreError:
+            return
+        if mosaic is None or factor is None:
+            return
+        yield EarlierRun(mosaic, factor, (down, across))
+
+
+def _days_since(run: Run, settings: Settings) -> float:
+    """Days from a run's look to the one of these settings, below 0 where that came later.
+
+    By the moments that both visits are called by, else by day and hour of a farm, else by the clock, in whole days.
+    """
+    then, now = (_called_moment(visit) for visit in (run.settings.get("visit"), settings.visit))
+    if then is not None and now is not None:
+        return (now - then).total_seconds() / 86400
+    farm = settings.moment
+    if farm is not None and run.settings.get("scene") in BUILT_IN_SCENES:
+        before = [run.settings.get("day"), run.settings.get("hour")]
+        day, hour = (
+            usual if given is None else float(given)
+            for given, usual in zip(before, (USUAL_DAY, USUAL_HOUR), strict=True)
+        )
+        return farm[0] - day + (farm[1] - hour) / 24
+    created = _called_moment(run.created)
+    return 0.0 if created is None else float((datetime.now(UTC).date() - created.date()).days)
+
+
+def prior_map_figures(store: Path) -> dict[str, Any] | None:
+    """What became of the memory that the map of a store goes on from; None of a field's first look."""
+    record = store / MEMORY
+    return dict(read_table(record)) if record.is_file() else None
+
+
+def _called_moment(text: Any) -> datetime | None:
+    """A moment in ISO 8601 that a visit is called by; None where it is called otherwise."""
+    try:
+        found = datetime.fromisoformat(text) if isinstance(text, str) else None
+    except ValueError:
+        return None
+    return None if found is None else found.replace(tzinfo=found.tzinfo or UTC)

@@ -1,0 +1,213 @@
+"""What weights say of what they were trained on, and what is familiar to them: measured as training ends, or later.
+
+`spectralzoom train --familiar` measures it for weights that are there: it looks at the scenes of their training again,
+as their record names them, and adds it to their file. The weights and all that was made with them stay what they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from flows.terminal.progress import one_after_the_other
+from flows.training.data import Report, TrainingData, open_training_data, read_farm_name
+from flows.training.figures import judge_scans
+from flows.training.train_scenes import TrainRequest, as_read, observe_all
+from models.network.spectral import patches_of
+from models.reading.inference import coarse_prediction_of_columns, segment
+from models.training.calibration import JudgedMap, judge_confidence
+from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
+from models.training.examples import Example
+from models.training.ood_fit import fit_ood
+from models.training.train import TrainingSettings
+from models.weights.files import CALIBRATION, Weights, add_ood, load_weights
+from models.weights.parts import MAP_SCORES, TrainedOn
+from pipeline.errors import SceneError, SettingsError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES, FARM_PIXEL_M
+from pipeline.simulator.scenes.farm.seasons import sun_over_farm
+
+
+@dataclass(frozen=True)
+class SeenScenes:
+    """Scenes as training saw them, and those kept from it."""
+
+    train: Sequence[Example]
+    validation: Sequence[Example]
+    wavelength_nm: NDArray[np.float64]
+    darkest_ms: float
+    seed: int
+
+
+def trained_on(data: TrainingData, seen: SeenScenes, classes: tuple[str, ...]) -> TrainedOn:
+    """Ranges of what training saw; season, sun and scale of the farm alone, which states them."""
+    low, high = float(seen.wavelength_nm.min()), float(seen.wavelength_nm.max())
+    exposures = (seen.darkest_ms, max(seen.darkest_ms, data.camera.exposure_ms))
+    trained = TrainedOn(len(seen.wavelength_nm), (low, high), exposures, len(data.train), classes)
+    if data.files is not None:
+        return trained
+    moments = [read_farm_name(name)[1:] for name in data.train]
+    days, heights = [day for day, _ in moments], [sun_over_farm(*moment).elevation_deg for moment in moments]
+    return TrainedOn(
+        trained.bands,
+        trained.wavelength_nm,
+        trained.exposure_ms,
+        trained.scenes,
+        classes,
+        (min(days), max(days)),
+        (min(heights), max(heights)),
+        FARM_PIXEL_M,
+    )
+
+
+def measured_calibration(weights: Weights, frames: Sequence[Example], seed: int) -> dict[str, Any] | None:
+    """How sure of itself the map of a full scan may be, by scenes kept from training; None without one."""
+    maps = []
+    for frame in frames:
+        grid = SceneGrid(*frame.shape, weights.config.patch, weights.config.factor)
+        cells, valid = patches_of(frame.fine, grid.patch).astype(np.float32), grid.valid_patches()
+        drawn = segment(
+            weights, coarse_prediction_of_columns(weights, frame.coarse, grid), cells[valid], valid, every_class=True
+        )
+        assert drawn.log_probability is not None
+        maps.append(JudgedMap.of(drawn.log_probability, frame.labels[: grid.height, : grid.width]))
+    return judge_confidence(maps, seed) if maps else None
+
+
+def measure_and_add(
+    weights: Weights,
+    path: Path,
+    seen: SeenScenes,
+    trained: TrainedOn,
+    record: dict[str, Any],
+    report: Report,
+    *,
+    out: Path | None = None,
+) -> str | None:
+    """Measure what is familiar to the weights of the file ``path``, and add it there, or in a copy at ``out``.
+
+    Returns why there is nothing to add, in words; None where it was added.
+    """
+    try:
+        ood_detector = fit_ood(
+            seen.train,
+            seen.validation,
+            weights.normalisation,
+            darkest_ms=seen.darkest_ms,
+            bands=len(seen.wavelength_nm),
+            seed=seen.seed,
+            report=lambda done: report("measuring what is familiar", done, ""),
+        )
+    except SceneError as error:
+        return f"nothing will be called unknown: {error}"
+    add_ood(path, out or path, ood_detector, trained, record)
+    return None
+
+
+@dataclass(frozen=True)
+class OodRequest:
+    """For which weights, where to, and the data that they were trained on."""
+
+    dataset: str
+    weights: Path
+    out: Path
+    choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths, masks
+    command: str = ""
+
+
+def measure_ood(request: OodRequest, report: Report = lambda what, done, figure: None) -> dict[str, Any]:
+    """Measure what is familiar to some weights and save it; give the record that stands in the file.
+
+    Raises SettingsError: a place that cannot be written to, other data than the weights were trained on, or no scene
+    that was kept for validation; WeightsError: the weights cannot be read.
+    """
+    if not request.out.parent.is_dir() or request.out.is_dir():
+        raise SettingsError(f"-o {request.out}: expected the name of a file in a folder that exists")
+    weights = load_weights(request.weights)
+    data = _data_of(weights, request)
+    seen = _observed(weights, data, request, report)
+    report("drawing maps of validation scenes", 0.0, "")
+    trained = trained_on(data, seen, weights.class_names)
+    scan_passes = (
+        CaptureAugmentation(weights.normalisation, darkest_ms=seen.darkest_ms)
+        if seen.darkest_ms < REFERENCE_MS
+        else None
+    )
+    scans = judge_scans(weights, seen.validation, scan_passes, seen.seed, report)
+    record = {
+        "command": request.command,
+        "scenes": len(seen.train),
+        "validation": len(seen.validation),
+        CALIBRATION: measured_calibration(weights, seen.validation, seen.seed),
+        **({} if scans is None else {MAP_SCORES: scans.scores.as_dict()}),
+    }
+    why = measure_and_add(weights, request.weights, seen, trained, record, report, out=request.out)
+    if why is not None:
+        raise SettingsError(f"--familiar {request.weights}: {why}")
+    return record
+
+
+def _data_of(weights: Weights, request: OodRequest) -> TrainingData:
+    """The scenes of the weights' training. Raises SettingsError: the data set is another."""
+    split = weights.record.get("split") or {}
+    own = [name for name in split.get("train", {}) if ": " not in name]  # others are those of what they began from
+    scenes = len(own) if request.dataset in FARM_NAMES else None
+    camera = LineCamera(**weights.record.get("camera", {}))
+    held_out = {} if scenes else {"hold_out": tuple(split.get("held_out", ()))}
+    data = open_training_data(
+        request.dataset, len(split.get("validation", ())), scenes, camera, **held_out, **request.choices
+    )
+    if list(data.train) != own or list(data.validation) != list(split.get("validation", ())):
+        raise SettingsError(
+            f"--familiar {request.weights}: these weights were trained on {weights.record.get('data', 'other data')},"
+            f" {len(own)} scenes{f', the first {own[0]}' if own else ''}; {request.dataset} has others: give the data"
+            " set of their training"
+        )
+    return data
+
+
+def _observed(weights: Weights, data: TrainingData, request: OodRequest, report: Report) -> SeenScenes:
+    settings, config = weights.record.get("settings", {}), weights.config
+    seed, darkest_ms = int(settings.get("seed", 0)), float(settings.get("darkest_ms", REFERENCE_MS))
+    how = TrainRequest(
+        request.dataset,
+        request.out,
+        patch=config.patch,
+        factor=config.factor,
+        columns=config.columns,
+        choices=request.choices,
+        settings=TrainingSettings(seed=seed),
+        camera=data.camera,
+    )
+    scan_passes: list[list[Example]] = []
+    about = None
+    for what, names in (("looking at scenes", data.train), ("looking at validation scenes", data.validation)):
+        if not names:
+            raise SettingsError(
+                f"--familiar {request.weights}: no scene was kept for validation when these weights were trained, so"
+                " that nobody can say how often a known pixel would be unknown; train them with --validation 1 or more"
+            )
+        found, about = observe_all(how, data, names, what, report, about)
+        scan_passes.append(as_read(found, weights.normalisation))
+        if (about.basis, about.names) != (weights.basis, weights.class_names):
+            raise SettingsError(f"{request.dataset} has other bands or classes than {request.weights} was trained on")
+    assert about is not None
+    return SeenScenes(scan_passes[0], scan_passes[1], about.wavelength_nm, darkest_ms, seed)
+
+
+def run_measure_ood(request: OodRequest, console: Console) -> dict[str, Any]:
+    """Measure with a progress bar on ``console``; give the record kept in the file."""
+    with one_after_the_other(console) as report:
+        record = measure_ood(request, report)
+    words = f"weights with what is familiar to them: {request.out}, of {record['scenes']} scenes"
+    console.print(words, markup=False, soft_wrap=True)
+    error = record[CALIBRATION]["expected_error"]
+    console.print(f"confidence is off by {100 * error:.2f} points on {record['validation']} scenes", soft_wrap=True)
+    return record

@@ -1,0 +1,110 @@
+"""How scenes look in training and where weights are judged: coarsely and finely everywhere, on spectral columns.
+
+Built-in farms are seen through the rig as a survey captures them: effects are chosen for each scene as surveys choose
+them by default, then the coarse pass and the scan of everything are rendered, calibrated and rectified. A camera has
+looked at scene files already: they pass the footprint and the noise alone, by `models.training.examples.observe`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.network.spectral import SpectralBasis, project
+from models.training.capture_augmentation import ColumnNoise
+from models.training.examples import Observation, noise_of, observe
+from pipeline.errors import SceneError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
+from pipeline.geometry.scan import CostModel, Sweep
+from pipeline.planning.coverage import cheapest_full, coarse_sweeps
+from pipeline.rectify.region import mosaic_rows
+from pipeline.simulator.effects.registry import EFFECTS
+from pipeline.simulator.render import Choice
+from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.scenes.farm.farm_scene import law_of_key
+from pipeline.simulator.scenes.scene import RasterScene
+from pipeline.simulator.selection.choice import decide
+from pipeline.simulator.selection.survey_probe import probe_survey
+from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_starts
+from pipeline.source import References
+
+TOLERANCE_SIGMA = 0.1  # of a survey, unless it says otherwise
+_ROWS = 64  # rectified at a time
+
+Columns = NDArray[np.float32]
+
+
+class _Taken(SimulatedSweep):
+    """A sweep whose lines are kept once they are made."""
+
+    @cached_property
+    def raw(self) -> NDArray[np.uint16]:
+        return self.source.render(self.sweep, range(self.sweep.lines))
+
+    @cached_property
+    def references(self) -> References:
+        return self.source.references(self.sweep)
+
+    def read(self, start: int, stop: int) -> NDArray[np.uint16]:
+        return self.raw[start:stop]
+
+
+def observe_scene(
+    scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis, rng: np.random.Generator
+) -> Observation:
+    """Look at a labelled scene on the basis, noise by ``rng``; a farm by all lines. SceneError: no labels, or a gap."""
+    if law_of_key(scene.key) is None:
+        return observe(scene, camera, grid, basis, rng)
+    seed = int(rng.integers(2**31))
+    if scene.labels is None:
+        raise SceneError(f"scene {scene.name} has no labels; training needs them")
+    rig, cost = Rig(camera), CostModel()
+    along, full, _ = cheapest_full(grid, camera, cost)
+    coarse = coarse_sweeps(grid, camera, along)
+    planned = [*coarse, *full]
+    chosen = chosen_effects(scene, rig, planned)
+    source = SimulatedSource(scene, rig, seed, chosen, clock=sweep_starts(planned, camera, cost))
+    matrix, _ = basis.matrix(scene.wavelength_nm)
+    height, width = grid.padded_shape
+    small = (height // grid.factor, width // grid.factor)
+    labels = np.full(grid.padded_shape, UNLABELLED, np.uint8)
+    labels[: grid.height, : grid.width] = scene.labels
+    return Observation(
+        scene.name,
+        np.asarray(pad_by_reflection(_columns(source, full, grid, matrix), grid.padded_shape), np.float32),
+        np.asarray(pad_by_reflection(_columns(source, coarse, grid, matrix), small), np.float32),
+        labels,
+        (grid.height, grid.width),
+        noise_of(scene, matrix, camera),
+    )
+
+
+def observe_finely(
+    scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis, seed: int
+) -> tuple[Columns, ColumnNoise]:
+    """Scan a farm by every line: columns on the basis, (y, x, column), and the noise that they have."""
+    rig, cost = Rig(camera), CostModel()
+    _, full, _ = cheapest_full(grid, camera, cost)
+    clock = sweep_starts(full, camera, cost)
+    source = SimulatedSource(scene, rig, seed, chosen_effects(scene, rig, full), clock=clock)
+    matrix, _ = basis.matrix(scene.wavelength_nm)
+    return _columns(source, full, grid, matrix), noise_of(scene, matrix, camera)
+
+
+def chosen_effects(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep]) -> Choice:
+    """Choose effects as a survey does that takes these sweeps, without its look at the worst lines."""
+    return Choice.of(decide(probe_survey(scene, rig, sweeps, "sigma"), rig, EFFECTS, TOLERANCE_SIGMA).chosen)
+
+
+def _columns(source: SimulatedSource, sweeps: Sequence[Sweep], grid: SceneGrid, matrix: Columns) -> Columns:
+    """The rectified pass on the basis, (y, x, column)."""
+    taken = [_Taken(source, sweep) for sweep in sweeps]
+    rows = [project(part, matrix) for _, part, _ in mosaic_rows(taken, source.camera, grid, rows=_ROWS)]
+    seen = np.concatenate(rows)
+    if not np.isfinite(seen).all():
+        raise SceneError(f"scene {source.scene.name} has pixels that no line reached; training needs all of it")
+    return seen

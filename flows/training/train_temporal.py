@@ -1,0 +1,227 @@
+"""`spectralzoom train --remember`: what reads a field's memory beside today's look, trained on lands through days.
+
+Built-in lands are scanned on several days; by the law of noise each scan is shown as shorter exposures and wider steps
+would have shown it, and read by the weights that the memory is for. Other lands then say what the memory is worth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from flows.terminal.progress import one_after_the_other
+from flows.training.data import Report
+from flows.training.observed_scenes import observe_finely
+from models.evaluation.metrics import confusion, mean_iou
+from models.network.spectral import patches_of
+from models.network.temporal_reader import TemporalReader
+from models.reading.inference import coarse_prediction_of_columns, segment
+from models.reading.prior_map import Observation, PriorMap, first_probabilities, fuse
+from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation, ColumnNoise, drawn_step
+from models.training.temporal import PastPass, TemporalTraining, Visit, train_reader
+from models.training.train import Progress
+from models.weights.files import Weights, add_reader, load_weights
+from pipeline.errors import SettingsError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid, pad_by_reflection
+from pipeline.simulator.scenes.farm.farm_plan import CLASSES
+from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES, farm_scene
+
+SHAPE = (512, 640)  # (y, x) of a land
+LANDS, FIRST_SEED, JUDGED_SEED = 48, 200_000, 300_000
+VISITS = 5  # to each land
+DAYS, LAST_DAY = (95, 290), 318  # of the year: of first visits, and of any
+GAPS = (0, 1, 1, 2, 3, 3, 5, 6, 6, 7, 7, 10, 14)  # days between two
+HOURS = (9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0)
+STEPS = {1: 0.3, 2: 0.5, 4: 0.2}  # how often lines are so many pixels apart
+DARKEST_MS, BRIGHTEST_MS = 3.0, 50.0
+PASSES = 2  # of each visit
+JUDGED_DAY, JUDGED_AFTER, JUDGED_LANDS = 172, (1, 3, 7), 3
+BEFORE, NOW = (1, 25.0), (2, 5.0)  # step and exposure [ms] of the looks that are judged
+
+
+@dataclass(frozen=True)
+class TemporalRequest:
+    """For which weights, where to, and how."""
+
+    dataset: str
+    weights: Path
+    out: Path
+    lands: int = LANDS
+    judged: int = JUDGED_LANDS
+    shape: tuple[int, int] = SHAPE
+    settings: TemporalTraining = field(default_factory=TemporalTraining)
+    command: str = ""
+
+
+def train_temporal(request: TemporalRequest, report: Report = lambda what, done, figure: None) -> dict[str, Any]:
+    """Train a reader for some weights, judge it on other lands and save it; give the record that stands in the file.
+
+    Raises SettingsError: no built-in farm, or a place that cannot be written to; WeightsError: the weights cannot be
+    read; SettingsError: they are not of the farm's classes.
+    """
+    if request.dataset not in FARM_NAMES:
+        raise SettingsError(
+            f"--remember trains on one land at several days, which only the built-in farm gives: expected farm, got"
+            f" {request.dataset}; without a reader surveys go on from a memory by the surer of two looks"
+        )
+    if not request.out.parent.is_dir() or request.out.is_dir():
+        raise SettingsError(f"-o {request.out}: expected the name of a file in a folder that exists")
+    weights = load_weights(request.weights)
+    if weights.class_names != CLASSES:
+        raise SettingsError(
+            f"--remember {request.weights}: expected weights of the farm's classes, {', '.join(CLASSES)}"
+        )
+    scan_passes = CaptureAugmentation(weights.normalisation)
+    lands = []
+    for number in range(request.lands):
+        seed = FIRST_SEED + number
+        report("visiting lands", number / request.lands, f"land {seed}")
+        rng = np.random.default_rng([request.settings.seed, seed])
+        lands.append([_visit(weights, scan_passes, request.shape, seed, *moment, rng) for moment in _moments(rng)])
+
+    def progress(now: Progress) -> None:
+        report("training", now.done, f"step {now.step}, loss {now.loss:.3f}")
+
+    reader, steps = train_reader(lands, request.settings, weights.config.factor, progress)
+    record = {
+        "command": request.command,
+        "lands": [FIRST_SEED + number for number in range(request.lands)],
+        "settings": asdict(request.settings),
+        "steps": steps,
+        "validation": judge_temporal(weights, scan_passes, reader, request, report),
+    }
+    add_reader(request.weights, request.out, reader, record)
+    return record
+
+
+def _moments(rng: np.random.Generator) -> list[tuple[int, float]]:
+    """Days of the year, each later than the one before, and hours."""
+    days = [int(rng.integers(*DAYS))]
+    while len(days) < VISITS:
+        days.append(min(days[-1] + max(int(rng.choice(GAPS)), 0), LAST_DAY))
+    return [(day, float(rng.choice(HOURS))) for day in days]
+
+
+def _visit(
+    weights: Weights,
+    scan_passes: CaptureAugmentation,
+    shape: tuple[int, int],
+    seed: int,
+    day: int,
+    hour: float,
+    rng: np.random.Generator,
+) -> Visit:
+    """A land on a day, as looks drawn by chance show it."""
+    seen = _Land.observed(weights, shape, seed, day, hour)
+    drawn = []
+    for _ in range(PASSES):
+        step = drawn_step(STEPS, weights.config.factor, rng)
+        exposure_ms = float(np.exp(rng.uniform(np.log(DARKEST_MS), np.log(BRIGHTEST_MS))))
+        observation = seen.observe(weights, scan_passes, step, exposure_ms, rng)
+        probability = np.exp(observation.log_probability).astype(np.float16)
+        drawn.append(PastPass(step, observation.light, probability, observation.coarse.astype(np.float16)))
+    return Visit(day + hour / 24, seen.labels, drawn)
+
+
+@dataclass(frozen=True)
+class _Land:
+    """A land as a scan of every line at the reference exposure shows it."""
+
+    columns: NDArray[np.float32]  # normalised, of the padded grid
+    noise: ColumnNoise
+    labels: NDArray[np.uint8]
+    grid: SceneGrid
+
+    @staticmethod
+    def observed(weights: Weights, shape: tuple[int, int], seed: int, day: int, hour: float) -> _Land:
+        camera = LineCamera()
+        scene = farm_scene(seed, shape, camera=camera, day=day, hour=hour)
+        grid = SceneGrid(*shape, weights.config.patch, weights.config.factor)
+        seen, noise = observe_finely(scene, camera, grid, weights.basis, 1000 * seed + day)
+        padded = np.asarray(pad_by_reflection(seen, grid.padded_shape), np.float32)
+        columns = weights.normalisation.apply(padded, np.ones(weights.basis.columns, np.bool_))
+        return _Land(columns, noise, np.asarray(scene.labels, np.uint8), grid)
+
+    def observe(
+        self,
+        weights: Weights,
+        scan_passes: CaptureAugmentation,
+        step: int,
+        exposure_ms: float,
+        rng: np.random.Generator,
+    ) -> Observation:
+        """What a uniform scan would have shown, read by the weights."""
+        grid, light = self.grid, exposure_ms / REFERENCE_MS
+        fine, means = scan_passes.scan(self.columns, self.noise, grid.factor, light=light, step=step, rng=rng)
+        patch_index = grid.valid_patches()
+        coarse_prediction = coarse_prediction_of_columns(weights, means, grid)
+        drawn = segment(
+            weights, coarse_prediction, patches_of(fine, grid.patch)[patch_index], patch_index, every_class=True
+        )
+        assert drawn.log_probability is not None
+        return Observation(drawn.log_probability, np.ones(self.labels.shape, np.bool_), means, light, step)
+
+
+def judge_temporal(
+    weights: Weights, scan_passes: CaptureAugmentation, reader: TemporalReader, request: TemporalRequest, report: Report
+) -> list[dict[str, float]] | None:
+    """What maps score some days after a first visit, mIoU in the mean of lands that training did not see.
+
+    ``kept``: the map of before; ``observe``: today's look alone; ``prior_map``: both by the reader; ``surer``: without
+    it; ``anew``: the field scanned again as it was at first. None without a land to judge on.
+    """
+    rows: dict[int, list[dict[str, float]]] = {days: [] for days in JUDGED_AFTER}
+    for number in range(request.judged):
+        seed = JUDGED_SEED + number
+        rng = np.random.default_rng([request.settings.seed, seed])
+        land = _Land.observed(weights, request.shape, seed, JUDGED_DAY, 11.0)
+        before = land.observe(weights, scan_passes, *BEFORE, rng)
+        for days in JUDGED_AFTER:
+            report(
+                "judging", (number * len(rows) + JUDGED_AFTER.index(days)) / (len(rows) * request.judged), f"{days} d"
+            )
+            later = _Land.observed(weights, request.shape, seed, JUDGED_DAY + days, 11.0)
+            now, anew = (later.observe(weights, scan_passes, *how, rng) for how in (NOW, BEFORE))
+            prior_map = PriorMap(first_probabilities(before), before.coarse, float(days))
+            probabilities = {
+                "kept": first_probabilities(before),
+                "extent": first_probabilities(now),
+                "surer": fuse(prior_map, now, None),
+                "prior_map": fuse(prior_map, now, reader),
+                "anew": first_probabilities(anew),
+            }
+            counts = {
+                name: confusion(later.labels, one.classes()[0], len(CLASSES)) for name, one in probabilities.items()
+            }
+            rows[days].append({name: mean_iou(one) for name, one in counts.items()})
+    if not request.judged:
+        return None
+    return [
+        {"days": float(days), **{name: float(np.mean([row[name] for row in found])) for name in found[0]}}
+        for days, found in rows.items()
+    ]
+
+
+def run_remember(request: TemporalRequest, console: Console) -> dict[str, Any]:
+    """Train with a progress bar on ``console``; give the record kept in the file."""
+    with one_after_the_other(console) as report:
+        record = train_temporal(request, report)
+    console.print(
+        f"weights with a reader of memories: {request.out}, {record['steps']} steps", markup=False, soft_wrap=True
+    )
+    if record["validation"]:
+        rows = record["validation"]
+        title = f"mIoU on {request.judged} lands that training did not see"
+        table = Table("days later", "kept", "look alone", "the surer", "prior_map", "scanned anew", title=title)
+        for row in rows:
+            figures = (f"{row[name]:.1%}" for name in ("kept", "extent", "surer", "prior_map", "anew"))
+            table.add_row(f"{row['days']:g}", *figures)
+        console.print(table)
+    return record

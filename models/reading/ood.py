@@ -1,0 +1,120 @@
+"""How far a pixel's spectrum lies from all that training saw, and from which distance on it is called unknown.
+
+What training saw is a number of components, each a middle and a covariance of normalised spectral columns, and what the
+light of a look adds to their spread. A pixel lies as far away as from the component whose middle is nearest. Columns
+hold brightness and shape alike: a known shape in a brightness that nobody saw is as strange as a shape nobody saw.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float32]
+Exact = NDArray[np.float64]
+PIXELS_AT_ONCE = 1 << 14  # so many lie in the processor's cache with their columns
+RATE = 0.001  # of known pixels that may be called unknown, unless the settings ask for another
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Distances beyond which a fraction of the pixels of validation scenes lay, by the light that they were seen in."""
+
+    rates: Exact  # (rate,) ascending shares
+    light: Exact  # (light,) ascending, exposures as fractions of the reference
+    steps: tuple[int, ...]  # ascending pixels from line to line
+    fine: Exact  # (step, light, rate)
+    coarse: Exact  # (light, rate) of a coarse pass
+
+    def at(self, rate: float, light: float, step: int | None) -> float:
+        """The distance for a rate, even in the logarithms of rate and light; ``step`` None is the coarse pass.
+
+        Light and rates beyond those that were measured count as the nearest that was, other steps as the next wider.
+        """
+        row = min(int(np.searchsorted(self.steps, step or 1)), len(self.steps) - 1)
+        table = self.coarse if step is None else self.fine[row]
+        by_rate = [float(np.interp(np.log(light), np.log(self.light), column)) for column in table.T]
+        return float(np.interp(np.log(rate), np.log(self.rates), by_rate))
+
+
+@dataclass(frozen=True)
+class OodDetector:
+    """The components of what training saw at the reference exposure, and what less light adds."""
+
+    centres: Exact  # (component, column)
+    covariance: Exact  # (component, column, column)
+    shot: Exact  # (component, column, column) what light leaves in a reading of the reference exposure
+    read: Exact  # (column, column) what the reading leaves in it
+    limits: Limits
+    bands: int  # of the camera in training; columns of fewer are noisier
+
+    def lit(self, light: float, readings: float = 1.0) -> LitDetector:
+        """The components as a look shows them whose pixels are means of so many readings of an exposure ``light``."""
+        noise = (self.shot / light + self.read / light**2) / readings
+        spread = self.covariance + noise
+        base = _whitening(spread.mean(axis=0))
+        back = np.linalg.inv(base)
+        columns = len(self.read)
+        parts = np.stack([back @ _whitening(one) for one in spread]) / np.sqrt(columns)
+        return LitDetector(*(one.astype(np.float32) for one in (base, self.centres @ base, parts)))
+
+    def unknown(
+        self, columns: NDArray[np.floating], *, rate: float, light: float, step: int | None, bands: int, factor: int = 1
+    ) -> NDArray[np.bool_]:
+        """Pixels (..., column) that lie farther away than all but a fraction ``rate`` of known ones, (...).
+
+        ``light``: Exposure as a fraction of the reference. ``step``: As of `Limits.at`. ``bands``: Of the camera.
+        ``factor``: Readings that a pixel of a coarse pass is the mean of. A pixel without columns is not unknown.
+        """
+        limit = self.limits.at(rate, light, step)
+        readings = (factor if step is None else 1) * min(1.0, bands / self.bands)  # fewer bands are as fewer readings
+        distance = self.lit(light, readings).distance(columns)
+        with np.errstate(invalid="ignore"):
+            return np.asarray(distance > limit, np.bool_)
+
+
+def _whitening(covariance: Exact) -> Exact:
+    """What rows of this covariance are multiplied with to have the covariance 1."""
+    lower = np.linalg.cholesky(covariance)
+    return np.asarray(scipy.linalg.solve_triangular(lower, np.eye(len(lower)), lower=True).T)
+
+
+@dataclass(frozen=True)
+class LitDetector:
+    """Components in the light of one look."""
+
+    base: Floats  # (column, column) brings columns to where the nearest middle is looked for
+    centres: Floats  # (component, column) there
+    whitening: Floats  # (component, column, column) from there; lengths of products with it are the distance
+
+    def distance(self, columns: NDArray[np.floating]) -> Floats:
+        """Squared distance of pixels (..., column) from the nearest component a column, (...); NaN without columns."""
+        flat = columns.reshape(-1, columns.shape[-1])
+        found = np.empty(len(flat), np.float32)
+        for first in range(0, len(flat), PIXELS_AT_ONCE):
+            part = slice(first, first + PIXELS_AT_ONCE)
+            found[part] = self._distance(np.asarray(flat[part], np.float32))
+        return found.reshape(columns.shape[:-1])
+
+    def _distance(self, pixels: Floats) -> Floats:
+        with np.errstate(invalid="ignore", over="ignore"):
+            known = pixels @ self.base
+            found = self._squares(known)
+        found[~np.isfinite(found)] = np.nan
+        return found
+
+    def _squares(self, known: Floats) -> Floats:
+        near = (known @ self.centres.T - 0.5 * (self.centres**2).sum(axis=1)).argmax(axis=1)
+        order = np.argsort(near.astype(np.uint16), kind="stable")  # sorted by digits, in a tenth of the time
+        ends, in_order = np.searchsorted(near[order], np.arange(len(self.centres) + 1)), known[order]
+        squares = np.empty(len(known), np.float32)
+        for number, (start, stop) in enumerate(pairwise(ends)):
+            apart = (in_order[start:stop] - self.centres[number]) @ self.whitening[number]
+            squares[start:stop] = np.einsum("ij,ij->i", apart, apart)
+        found = np.empty(len(known), np.float32)
+        found[order] = squares
+        return found

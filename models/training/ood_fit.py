@@ -1,0 +1,197 @@
+"""What weights take for familiar: components of the spectra of training scenes, and the limits that others give."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from models.network.spectral import Normalisation
+from models.reading.ood import Exact, Limits, OodDetector
+from models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation, ColumnNoise
+from models.training.examples import Example
+from pipeline.errors import SceneError
+from pipeline.geometry.grid import UNLABELLED
+
+OF_A_CLASS = 6  # components
+SPECTRA = 40_000  # that components are measured on, of all training scenes together and each class
+RATES = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05)
+LIGHT = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0)  # of the reference exposure, from the darkest that was trained on
+GAIN = 0.04  # standard deviation of the brightness of crops in training
+USUAL = 0.98  # of a component's own spectra lie within its unit distance
+LEAST_SPECTRA = 200  # that anything can be measured on
+RIDGE = 1e-6  # of the mean variance, so that columns which repeat each other have a covariance with an inverse
+Report = Callable[[float], None]
+Spectra = NDArray[np.float32]  # (pixel, column)
+Classes = NDArray[np.uint8]  # (pixel,)
+
+
+def fit_ood(
+    train: Sequence[Example],
+    validation: Sequence[Example],
+    normalisation: Normalisation,
+    *,
+    darkest_ms: float,
+    bands: int,
+    seed: int,
+    report: Report = lambda done: None,
+) -> OodDetector:
+    """Measure components on training scenes, and the limits on others, in the light that training showed.
+
+    ``bands``: of the camera. Raises SceneError: no scene to measure the limits on, or too few labelled pixels.
+    """
+    if not validation:
+        raise SceneError("no scene was kept from training, so that nobody can say how often a known pixel is unknown")
+    rng = np.random.default_rng([seed, 0xFA3])
+    scan_passes = CaptureAugmentation(
+        normalisation, darkest_ms=darkest_ms, steps=STEPS if darkest_ms < REFERENCE_MS else {1: 1.0}
+    )
+    gathered = []
+    for number, example in enumerate(train):
+        gathered += _drawn_spectra(example, normalisation, rng, SPECTRA // len(train) + 1)
+        report(0.3 * (number + 1) / len(train))
+    pixels, classes = (np.concatenate(parts) for parts in zip(*gathered, strict=True))
+    centres, covariance = components(pixels, classes, seed)
+    noise = _mean_noise([example.noise for example in train if example.noise is not None], pixels.shape[1])
+    shot, read = _noise_of_columns(noise, centres, normalisation)
+    none = np.zeros((1, 1, 1))
+    draft = OodDetector(centres, covariance, shot, read, Limits(np.ones(1), np.ones(1), (1,), none, none[0]), bands)
+    limits = measured_limits(draft, validation, scan_passes, rng, lambda done: report(0.5 + done / 2))
+    return replace(draft, limits=limits)
+
+
+def _mean_noise(noises: Sequence[ColumnNoise], columns: int) -> ColumnNoise:
+    """What readings of the scenes leave in columns in the mean; nothing where nobody knows."""
+    if not noises:
+        return ColumnNoise(np.zeros(columns), np.zeros((columns, columns)))
+    return ColumnNoise(np.mean([one.shot for one in noises], axis=0), np.mean([one.read for one in noises], axis=0))
+
+
+def _noise_of_columns(noise: ColumnNoise, centres: Exact, normalisation: Normalisation) -> tuple[Exact, Exact]:
+    """What light leaves in normalised columns of each spectrum, (component, column, column), and what readings leave.
+
+    Both are of the reference exposure.
+    """
+    whitening = normalisation.whitening.astype(np.float64)
+    values = centres @ np.linalg.inv(whitening) * normalisation.spread + normalisation.centre
+    mixing = whitening / normalisation.spread[:, None]
+    sizes = np.sqrt(np.maximum(values, 0) * noise.shot)
+    shot = np.stack([mixing.T @ (noise.correlation() * np.outer(one, one)) @ mixing for one in sizes])
+    return shot, mixing.T @ noise.read @ mixing
+
+
+def _drawn_spectra(
+    example: Example, normalisation: Normalisation, rng: np.random.Generator, most: int
+) -> list[tuple[Spectra, Classes]]:
+    """Labelled pixels of a scene in a brightness drawn as for training, at most so many of a class; a fifth coarse."""
+    gain = np.float32(rng.normal(1.0, GAIN))
+    shift = (gain - 1) * normalisation.gain_shift
+    fine, coarse = (np.asarray(image, np.float32) * gain + shift for image in (example.fine, example.coarse))
+    parts = []
+    for image, labels, count in ((fine, example.labels, most), (coarse, _coarse_labels(example), most // 4 + 1)):
+        for number in np.unique(labels[labels != UNLABELLED]):
+            own = image[labels == number]
+            chosen = own[rng.choice(len(own), min(count, len(own)), replace=False)]
+            parts.append((chosen, np.full(len(chosen), number, np.uint8)))
+    return parts
+
+
+def _factor(example: Example) -> int:
+    return int(example.labels.shape[0] // example.coarse.shape[0])
+
+
+def _coarse_labels(example: Example) -> Classes:
+    """The class in the middle of each coarse pixel, (y, x); none where a pixel of it has none."""
+    s, (y, x) = _factor(example), example.coarse.shape[:2]
+    cells = example.labels.reshape(y, s, x, s)
+    whole = (cells != UNLABELLED).all(axis=(1, 3))
+    return np.where(whole, cells[:, s // 2, :, s // 2], UNLABELLED).astype(np.uint8)
+
+
+def components(pixels: Spectra, classes: Classes, seed: int) -> tuple[Exact, Exact]:
+    """Middles and covariances of spectra (pixel, column): k-means of each class, then all go to the nearest middle.
+
+    A component of few spectra has mostly the covariance that all have within theirs. Where `USUAL` of its own spectra
+    lie farther away than one of the normal law has on average, its covariance is widened until they do not. Raises
+    SceneError: too few spectra.
+    """
+    if len(pixels) < LEAST_SPECTRA:
+        raise SceneError(f"{len(pixels)} labelled pixels are too few to say what is familiar; it takes {LEAST_SPECTRA}")
+    exact, columns = pixels.astype(np.float64), pixels.shape[1]
+    middles = []
+    for number in np.unique(classes):
+        own = exact[classes == number]
+        count = min(OF_A_CLASS, 1 + len(own) // (4 * columns))  # fewer of few spectra
+        rng = np.random.default_rng(seed + int(number))
+        middles.append(scipy.cluster.vq.kmeans2(own, count, minit="++", rng=rng)[0])
+    first = np.concatenate(middles)
+    near = (exact @ first.T - 0.5 * (first**2).sum(axis=1)).argmax(axis=1)
+    parts = [exact[near == number] for number in np.unique(near)]
+    centres = [part.mean(axis=0) for part in parts]
+    scatter = [(part - middle).T @ (part - middle) for part, middle in zip(parts, centres, strict=True)]
+    common = np.sum(scatter, axis=0) / len(pixels)
+    common += (RIDGE * float(np.trace(common)) / columns or RIDGE) * np.eye(columns)
+    weight = 2.0 * columns  # as many spectra as the common covariance counts for
+    covariance = []
+    for part, middle, own in zip(parts, centres, scatter, strict=True):
+        mixed = (own + weight * common) / (len(part) + weight)
+        apart = scipy.linalg.solve_triangular(np.linalg.cholesky(mixed), (part - middle).T, lower=True)
+        usual = float(np.quantile((apart**2).sum(axis=0), USUAL))
+        covariance.append(mixed * max(usual / columns, 1.0))
+    return np.stack(centres), np.stack(covariance)
+
+
+def measured_limits(
+    ood_detector: OodDetector,
+    examples: Sequence[Example],
+    scan_passes: CaptureAugmentation,
+    rng: np.random.Generator,
+    report: Report = lambda done: None,
+) -> Limits:
+    """Distances that fractions of labelled pixels of scenes lie beyond, for each step and light of the looks."""
+    noisy = all(example.noise is not None for example in examples)
+    light = [one for one in LIGHT if one * REFERENCE_MS >= scan_passes.darkest_ms] if noisy else [1.0]
+    steps = tuple(sorted(step for step in scan_passes.steps if _factor(examples[0]) % step == 0)) if noisy else (1,)
+    fine, coarse = np.empty((len(steps), len(light), len(RATES))), np.empty((len(light), len(RATES)))
+    for j, fraction in enumerate(light):
+        for i, step in enumerate(steps):
+            fine[i, j] = _beyond(
+                [_scan_distance(ood_detector, one, scan_passes, fraction, step, rng) for one in examples]
+            )
+            report((j * len(steps) + i + 1) / (len(steps) * len(light)))
+        coarse[j] = _beyond([_coarse_distance(ood_detector, one, scan_passes, fraction, rng) for one in examples])
+    return Limits(np.array(RATES), np.array(light), steps, fine, coarse)
+
+
+def _beyond(distances: list[NDArray[np.float32]]) -> NDArray[np.float64]:
+    return np.asarray(np.quantile(np.concatenate(distances).astype(np.float64), 1 - np.array(RATES)))
+
+
+def _scan_distance(
+    ood_detector: OodDetector,
+    example: Example,
+    scan_passes: CaptureAugmentation,
+    light: float,
+    step: int,
+    rng: np.random.Generator,
+) -> NDArray[np.float32]:
+    fine = np.asarray(example.fine, np.float32)
+    if example.noise is not None:
+        fine, _ = scan_passes.scan(fine, example.noise, _factor(example), light=light, step=step, rng=rng)
+    return ood_detector.lit(light).distance(fine[example.labels != UNLABELLED])
+
+
+def _coarse_distance(
+    ood_detector: OodDetector,
+    example: Example,
+    scan_passes: CaptureAugmentation,
+    light: float,
+    rng: np.random.Generator,
+) -> NDArray[np.float32]:
+    coarse = example.coarse
+    if example.noise is not None:
+        coarse = scan_passes.coarse_pass(coarse, example.noise, _factor(example), light=light, rng=rng)
+    return ood_detector.lit(light, _factor(example)).distance(coarse[_coarse_labels(example) != UNLABELLED])

@@ -1,0 +1,226 @@
+"""Training of a reader of memories: visits to one land in a row, each weighed against what those before left.
+
+A memory is what the reader itself made of earlier visits, so that training sees what surveys will give it: class probabilities that
+were brought forward several times. Some visits see a part of the land alone; some memories are of another land, or lie
+beside it, and have to be seen through.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F  # noqa: N812 - its usual name
+from numpy.typing import NDArray
+from torch import Tensor
+
+from models.network.sizes import TemporalSizes
+from models.network.temporal_reader import TemporalReader
+from models.reading.prior_map import FAINTEST, LIGHT_FADES_DAYS
+from models.training.objective import class_weights, map_loss
+from models.training.train import Progress
+from pipeline.geometry.grid import UNLABELLED
+
+FAINT = 1e-5  # least probability of a look
+PARTLY_SEEN = 0.3  # how often a visit after the first sees a part of the land alone
+INCOMPARABLE = 0.1  # how often the coarse passes of two visits cannot be compared
+OTHER_LAND, BESIDE = 0.06, 0.06  # how often some memories of a batch are of another land, or lie beside it
+WRONG = 0.4  # of the batch's memories, then
+BESIDE_CELLS = 6  # at most, in coarse pixels
+WARM_UP = 50  # steps
+
+
+@dataclass(frozen=True)
+class PastPass:
+    """What one look says of a land on a day, by the weights that the reader is for."""
+
+    step: int  # pixels between its lines
+    light: float  # exposure as a fraction of the reference
+    probability: NDArray[np.float16]  # (y, x, class)
+    coarse: NDArray[np.float16]  # (y / s, x / s, column) normalised
+
+
+@dataclass(frozen=True)
+class Visit:
+    """A land on a day, as several looks would show it."""
+
+    moment: float  # days
+    labels: NDArray[np.uint8]
+    scan_passes: Sequence[PastPass]
+
+
+@dataclass(frozen=True)
+class TemporalTraining:
+    """How long and how to train."""
+
+    minutes: float = 32.0
+    steps: int = 4000
+    seed: int = 0
+    batch: int = 16
+    crop: int = 64  # px
+    visits: int = 4  # in a row
+    learning_rate: float = 3e-3
+    weight_decay: float = 0.01
+    average: float = 0.995
+    weight_cap: float = 5.0  # of rare classes
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """One visit of every sequence of a batch."""
+
+    observation: Tensor  # (B, class, y, x) logarithms
+    coarse: Tensor  # (B, column, y / s, x / s)
+    labels: Tensor  # (B, y, x)
+    seen: Tensor  # (B, 1, y, x)
+    days: Tensor  # (B, 1, 1, 1) since the visit before
+    light: Tensor  # (B,)
+    step: Tensor  # (B,)
+    comparable: Tensor  # (B, 1, 1, 1)
+
+
+def train_reader(
+    lands: Sequence[Sequence[Visit]],
+    settings: TemporalTraining,
+    factor: int,
+    report: Callable[[Progress], None] = lambda now: None,
+) -> tuple[TemporalReader, int]:
+    """Train on visits to lands, each land's in the order of its days; give the averaged reader and the steps taken."""
+    first = lands[0][0].scan_passes[0]
+    sizes = TemporalSizes(first.probability.shape[-1], first.coarse.shape[-1], factor)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(settings.seed)
+        reader = TemporalReader(sizes).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    averaged = copy.deepcopy(reader).eval()
+    labels = [visit.labels for land in lands for visit in land]
+    weight = class_weights(labels, sizes.classes, settings.weight_cap)
+    rng = np.random.default_rng([settings.seed, 0x3E3])
+    optimiser = torch.optim.AdamW(reader.parameters(), settings.learning_rate, weight_decay=settings.weight_decay)
+    started, step, loss = time.monotonic(), 0, math.nan
+    while (done := max(step / settings.steps, (time.monotonic() - started) / (60 * settings.minutes))) < 1:
+        rate = min(1, (step + 1) / WARM_UP) * (1 + math.cos(math.pi * done)) / 2
+        for group in optimiser.param_groups:
+            group["lr"] = settings.learning_rate * rate
+        optimiser.zero_grad()
+        value = _learn(reader, _sequences(lands, settings, factor, rng), weight, rng)
+        torch.nn.utils.clip_grad_norm_(reader.parameters(), 1.0)
+        optimiser.step()
+        step += 1
+        keep = min(settings.average, step / (step + 10))
+        with torch.no_grad():
+            for slow, quick in zip(averaged.parameters(), reader.parameters(), strict=True):
+                slow.lerp_(quick, 1 - keep)
+        loss = value if math.isnan(loss) else 0.98 * loss + 0.02 * value
+        report(Progress(step, settings.steps, done, loss))
+    return averaged, step
+
+
+def _learn(reader: TemporalReader, visits: Sequence[_Batch], weight: Tensor, rng: np.random.Generator) -> float:
+    """Bring memories through visits, and learn at each but the first from its labels, as maps do; the mean loss."""
+    start, factor = visits[0], reader.sizes.factor
+    state, coarse = start.observation, start.coarse
+    age = torch.zeros_like(start.seen)
+    rests_on = age + _light_a_pixel(start)
+    total = 0.0
+    for now in visits[1:]:
+        age, rests_on = age + now.days, rests_on * torch.exp(-now.days / LIGHT_FADES_DAYS)
+        small = now.seen[:, :, factor // 2 :: factor, factor // 2 :: factor]
+        disagrees, told_coarse = _wrong(state, coarse, factor, rng)
+        images = disagrees, now.observation, now.seen, age, rests_on
+        found = reader(*images, now.light, now.step, told_coarse, now.coarse, small * now.comparable)
+        losses = F.nll_loss(found, now.labels.where(now.labels != UNLABELLED, 0), reduction="none")
+        loss = map_loss(found, losses, now.labels, weight, soft_dice=True)
+        torch.autograd.backward(loss)
+        total += float(loss.detach()) / (len(visits) - 1)
+        state = found.detach().clamp(min=FAINTEST)
+        state = state - state.logsumexp(dim=1, keepdim=True)
+        age = age.where(now.seen == 0, 0)
+        rests_on = rests_on + now.seen * _light_a_pixel(now)
+        coarse = now.coarse.where(small > 0, coarse)
+    return total
+
+
+def _light_a_pixel(visit: _Batch) -> Tensor:
+    return (visit.light / visit.step**2)[:, None, None, None]
+
+
+def _wrong(state: Tensor, coarse: Tensor, factor: int, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+    """Put the memory of another land, or one that lies beside it, in the place of some, now and then."""
+    drawn = rng.random()
+    if drawn >= OTHER_LAND + BESIDE:
+        return state, coarse
+    those = torch.from_numpy(rng.random(len(state)) < WRONG)[:, None, None, None]
+    if drawn < OTHER_LAND:
+        by = int(rng.integers(1, max(len(state), 2)))
+        return state.roll(by, 0).where(those, state), coarse.roll(by, 0).where(those, coarse)
+    down, across = (int(by) for by in rng.integers(-BESIDE_CELLS, BESIDE_CELLS + 1, 2))
+    moved = state.roll((factor * down, factor * across), (2, 3))
+    return moved.where(those, state), coarse.roll((down, across), (2, 3)).where(those, coarse)
+
+
+def _sequences(
+    lands: Sequence[Sequence[Visit]], settings: TemporalTraining, factor: int, rng: np.random.Generator
+) -> list[_Batch]:
+    """Crops of lands through several visits, turned and mirrored alike."""
+    drawn = [_sequence(lands[int(rng.integers(len(lands)))], settings, factor, rng) for _ in range(settings.batch)]
+    batches = []
+    for number in range(settings.visits):
+        parts = list(zip(*(one[number] for one in drawn), strict=True))
+        observation, coarse, labels, seen = (torch.from_numpy(np.stack(part)) for part in parts[:4])
+        observation = observation - observation.logsumexp(dim=1, keepdim=True)
+        days, light, step, comparable = (torch.tensor(part, dtype=torch.float32) for part in parts[4:])
+        column = days[:, None, None, None], comparable[:, None, None, None]
+        batches.append(_Batch(observation, coarse, labels.long(), seen, column[0], light, step, column[1]))
+    return batches
+
+
+def _sequence(
+    land: Sequence[Visit], settings: TemporalTraining, factor: int, rng: np.random.Generator
+) -> list[tuple[NDArray[np.generic] | float, ...]]:
+    """One crop through visits of a land, the last again where there are too few."""
+    side, shape = settings.crop, land[0].labels.shape
+    first = int(rng.integers(0, max(len(land) - settings.visits, 0) + 1))
+    visits = [land[min(first + number, len(land) - 1)] for number in range(settings.visits)]
+    y, x = (factor * int(rng.integers(0, (size - side) // factor + 1)) for size in shape)
+    fine = np.s_[y : y + side, x : x + side]
+    small = np.s_[y // factor : (y + side) // factor, x // factor : (x + side) // factor]
+    turns, mirrored = int(rng.integers(4)), bool(rng.integers(2))
+    sequence: list[tuple[NDArray[np.generic] | float, ...]] = []
+    before = visits[0].moment
+    for number, visit in enumerate(visits):
+        coarse_pass = visit.scan_passes[int(rng.integers(len(visit.scan_passes)))]
+        if number == 0 and rng.random() < 0.5:  # memories are often of the best look there was
+            coarse_pass = max(visit.scan_passes, key=lambda one: one.light / one.step**2)
+        images = (
+            np.log(np.maximum(coarse_pass.probability[fine].astype(np.float32), FAINT)),
+            coarse_pass.coarse[small].astype(np.float32),
+            visit.labels[fine],
+            _seen(side, number > 0 and rng.random() < PARTLY_SEEN, factor, rng),
+        )
+        turned = [np.rot90(image[::-1] if mirrored else image, turns) for image in images]
+        channels_first = [image.transpose(2, 0, 1) if image.ndim == 3 else image for image in turned]
+        comparable = float(rng.random() >= INCOMPARABLE)
+        days = abs(visit.moment - before)
+        sequence.append(
+            (*map(np.ascontiguousarray, channels_first), days, coarse_pass.light, float(coarse_pass.step), comparable)
+        )
+        before = visit.moment
+    return sequence
+
+
+def _seen(side: int, partly: bool, factor: int, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Where a look went, (y, x, 1): everywhere, in a block of rows, or beside one."""
+    seen = np.ones((side, side, 1), np.float32)
+    if partly:
+        cell = 4 * factor
+        low, high = sorted(cell * int(at) for at in rng.integers(0, side // cell + 1, 2))
+        if rng.random() < 0.5:
+            seen[:low], seen[high:] = 0, 0
+        else:
+            seen[low:high] = 0
+    return seen

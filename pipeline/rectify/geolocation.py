@@ -1,0 +1,244 @@
+"""Lookup: where on a sweep, in lines and samples, each point of the scene was seen. Exact rays.
+
+A straight even track has a closed form, any other is solved by Newton on its knots. For whole grids
+:mod:`pipeline.rectify.placed` keeps the exact answer at every few pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import PoseError, ShapeError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import camera_slope, line_centre
+from pipeline.geometry.scan import Axis
+from pipeline.rectify.scan_paths import ScanPath, line_centres, single_scan_path
+
+NEWTON_ROUNDS = 4
+HALVINGS = 34  # from one knot to 1e-10 of it
+SEARCH_KNOTS = 12
+END_KNOTS = 4  # whose mean step is that beyond the end
+FAR_KNOTS = 1e6  # a step beyond is none that Newton could come back from
+SETTLED_PX = 1e-7
+BLOCK_PX = 16384  # some twenty temporaries of this length stay in cache
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class KnotCurve:
+    """The line's centre as a smooth function of the knot coordinate: what Catmull-Rom makes of a track's knots.
+
+    Values resampled by the Catmull-Rom kernel at the coordinate found here are then those of the point asked for,
+    where the scene is linear, however uneven the lines lie. Beyond the ends the curve goes on straight.
+    """
+
+    scan_path: ScanPath
+
+    @cached_property
+    def even(self) -> bool:
+        """Whether the knot coordinate is a closed form."""
+        return self.scan_path.straight and self.scan_path.uniform
+
+    @cached_property
+    def scan(self) -> Floats:
+        """(4, interval) polynomials of the tangent on the scan axis; interval k + 1 begins at knot k."""
+        return _catmull_rom_pieces(self.scan_path.scan, self.scan_path.width)
+
+    @cached_property
+    def across(self) -> Floats:
+        """(4, interval) polynomials of the tangent along the line."""
+        return _catmull_rom_pieces(self.scan_path.across, 0.0)
+
+    def at(self, knot: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        """Scan tangent, its slope, tangent along the line, and its slope, at (n,) finite knot coordinates."""
+        interval = np.clip(np.floor(knot), -1, len(self.scan_path) - 1)
+        u, number = knot - interval, interval.astype(np.intp) + 1
+        found: list[Floats] = []
+        for pieces in (self.scan, self.across):
+            piece = pieces[:, number]
+            found.append(((piece[3] * u + piece[2]) * u + piece[1]) * u + piece[0])
+            found.append((3 * piece[3] * u + 2 * piece[2]) * u + piece[1])
+        return found[0], found[1], found[2], found[3]
+
+    def rough_knot(self, centre: Floats) -> Floats:
+        """Knot coordinate of (n,) scan tangents by straight lines between the knots."""
+        scan = self.scan_path.scan
+        inside = np.interp(centre, scan, np.arange(len(scan), dtype=np.float64))
+        before, after = np.minimum(centre - scan[0], 0), np.maximum(centre - scan[-1], 0)
+        knot: Floats = inside + before / self.scan[1, 0] + after / self.scan[1, -1]
+        return knot
+
+
+def grid_points(origin_px: tuple[float, float], spacing_px: float, shape: tuple[int, int]) -> Floats:
+    """Centres (y, x, 2) of a grid's pixels [px], of its first centre, their distance and how many."""
+    y = origin_px[0] + spacing_px * np.arange(shape[0])
+    x = origin_px[1] + spacing_px * np.arange(shape[1])
+    return np.stack(np.broadcast_arrays(y[:, None], x[None, :]), axis=-1)
+
+
+def knots_of_points(curve: KnotCurve, camera: LineCamera, points: Floats, along: Axis, binning: int) -> Floats:
+    """Give knot and sample of points (n, 2), y and x [px], continued beyond the track, block by block."""
+    out = np.empty(points.shape, np.float64)
+    for start in range(0, len(points), BLOCK_PX):
+        block = slice(start, start + BLOCK_PX)
+        y, x = points[block].T * camera.ifov_rad
+        out[block] = _knot_and_sample(curve, camera, *((x, y) if along == "x" else (y, x)), binning)
+    return out
+
+
+def drop_unseen(found: Floats, seen: NDArray[np.bool_], samples: int) -> None:
+    """Write NaN where coordinates (..., 2) lie off the track or next to a knot that nothing saw."""
+    knot, sample = found[..., 0], found[..., 1]
+    on = (knot >= -0.5) & (knot <= len(seen) - 0.5) & (sample >= -0.5) & (sample <= samples - 0.5)
+    if not seen.all():
+        nearest = np.floor(np.where(on, knot, 0) + 0.5).astype(np.intp)
+        on &= seen[np.clip(nearest, 0, len(seen) - 1)]
+    if not on.all():
+        found[~on] = np.nan
+
+
+def _knot_and_sample(curve: KnotCurve, camera: LineCamera, a: Floats, b: Floats, binning: int) -> Floats:
+    """Knot coordinate and sample (n, 2) that see points of tangents a (along the line) and b (scan).
+
+    Continued beyond the track's ends and the line's; NaN where no line passes or none was found.
+    """
+    scan_path = curve.scan_path
+    if curve.even:
+        across = np.float64(scan_path.across[len(scan_path) // 2])
+        centre = line_centre(a, b, across)
+        found = np.empty((len(a), 2))
+        np.multiply(centre - scan_path.scan[0], 1 / scan_path.width, out=found[:, 0])
+        found[:, 1] = camera.sample_at(camera_slope(a, b, across, centre), binning)
+        return found
+    found = np.full((len(a), 2), np.nan)
+    knot = _find_knots(curve, a, b, SETTLED_PX * camera.ifov_rad)
+    settled = np.isfinite(knot)
+    centre, _, wandered, _ = curve.at(knot[settled])
+    found[settled, 0] = knot[settled]
+    found[settled, 1] = camera.sample_at(camera_slope(a[settled], b[settled], wandered, centre), binning)
+    return found
+
+
+def _catmull_rom_pieces(knots: Floats, alone: float) -> Floats:
+    """Coefficients of 1, u, u^2, u^3 of all pieces; a straight one before the first knot and one after the last."""
+    reach = min(END_KNOTS, len(knots) - 1)
+    before, after = (alone, alone) if not reach else (knots[reach] - knots[0], knots[-1] - knots[-1 - reach])
+    before, after = before / max(reach, 1), after / max(reach, 1)
+    padded = np.concatenate([[knots[0] - before], knots, [knots[-1] + after]])
+    tangent = np.concatenate([[before], (padded[2:] - padded[:-2]) / 2, [after]])
+    step = np.diff(padded)
+    pieces = np.stack(
+        [padded[:-1], tangent[:-1], 3 * step - 2 * tangent[:-1] - tangent[1:], tangent[:-1] + tangent[1:] - 2 * step]
+    )
+    pieces[2:, [0, -1]] = 0
+    pieces[1, [0, -1]] = before, after
+    return pieces
+
+
+def _find_knots(curve: KnotCurve, a: Floats, b: Floats, tolerance: float) -> Floats:
+    """Knot coordinate (n,) of the line that sees each point: Newton, and where that does not settle, bisection."""
+    scan_path = curve.scan_path
+    middle = np.full_like(a, scan_path.across[len(scan_path) // 2])
+    rough = curve.rough_knot(line_centre(a, b, middle))
+    knot = rough.copy()
+    left = np.flatnonzero(np.isfinite(knot))
+    for turn in range(NEWTON_ROUNDS + 1):
+        miss, slope = _miss(curve, a[left], b[left], knot[left])
+        off = ~(np.abs(miss) <= tolerance)
+        left, miss, slope = left[off], miss[off], slope[off]
+        if not len(left):
+            return knot
+        if turn < NEWTON_ROUNDS:
+            moved = knot[left] - miss / np.where(slope == 0, np.nan, slope)
+            knot[left] = np.where(np.abs(moved) < FAR_KNOTS, moved, rough[left])
+    knot[left] = _bisect(curve, a[left], b[left], rough[left])
+    return knot
+
+
+def _miss(curve: KnotCurve, a: Floats, b: Floats, knot: Floats) -> tuple[Floats, Floats]:
+    """How far the curve lies beyond the centre that the point needs, and the slope of this over the knots."""
+    scan, scan_slope, across, across_slope = curve.at(knot)
+    need, need_slope = _centre_and_slope(a, b, across)
+    return scan - need, scan_slope - need_slope * across_slope
+
+
+def _centre_and_slope(a: Floats, b: Floats, c: Floats) -> tuple[Floats, Floats]:
+    """:func:`pipeline.geometry.mirror.line_centre` and its derivative by c."""
+    reach = 1 + a * a - (a - c) ** 2
+    reach = np.where(reach > 0, reach, np.nan)
+    root = np.sqrt(reach + b * b)
+    product, grown = c * (c - a), (b + root) / reach
+    # d reach = 2 (a - c), d product = 2 c - a
+    slope = (2 * c - a) * grown + product * 2 * (a - c) * (0.5 / root - grown) / reach
+    return b + product * grown, slope
+
+
+def _bisect(curve: KnotCurve, a: Floats, b: Floats, rough: Floats) -> Floats:
+    """Halve the interval between two knots on either side of the centre, the nearest to a rough start; NaN if none."""
+    _, _, across, _ = curve.at(rough)
+    rough = curve.rough_knot(line_centre(a, b, across))
+    known = np.isfinite(rough)
+    found = np.full_like(a, np.nan)
+    a, b, rough = a[known], b[known], rough[known]
+    knots = np.clip(np.floor(rough)[:, None] + np.arange(-SEARCH_KNOTS, SEARCH_KNOTS + 2), -1, len(curve.scan_path))
+    beyond = np.stack([_miss(curve, a, b, column)[0] for column in knots.T], axis=-1)
+    crosses = (beyond[:, :-1] <= 0) & (beyond[:, 1:] >= 0) & (knots[:, 1:] > knots[:, :-1])
+    far = np.where(crosses, np.abs(knots[:, :-1] + 0.5 - rough[:, None]), np.inf)
+    rows, nearest = np.arange(len(a)), np.argmin(far, axis=1)
+    low, size = knots[rows, nearest], 1.0
+    for _ in range(HALVINGS):
+        size /= 2
+        low = np.where(_miss(curve, a, b, low + size)[0] <= 0, low + size, low)
+    found[known] = np.where(crosses.any(axis=1), low, np.nan)
+    return found
+
+
+def geolocation(position: Floats, camera: LineCamera, points_px: Floats, *, along: Axis, binning: int = 1) -> Floats:
+    """Find the line and sample at which a sweep that runs one way saw each of some points (..., 2), y and x [px].
+
+    The sweep, given by mirror X and Y at mid exposure (line, 2), may run either way but must not turn or stand still;
+    such sweeps are split by :func:`pipeline.rectify.scan_paths.make_scan_paths` first.
+
+    (..., 2) float64 line and sample, integers at centres; NaN where the point is off the sweep by more than half a
+    line or half a sample. The line of a one-line sweep is taken to be as wide as its (binned) samples.
+
+    Raises PoseError: the sweep turns or stands still, naming the line; or a position is out of reach.
+    Raises ShapeError: positions or points are not pairs.
+    """
+    if not len(position):
+        raise ShapeError(f"expected mirror positions (line, 2) of at least one line, got {position.shape}")
+    scan, _, _ = line_centres(position, camera)
+    falling = bool(scan[-1] < scan[0])
+    if (still := np.diff(-scan if falling else scan) <= 0).any():
+        at = int(np.argmax(still)) + falling
+        raise PoseError(f"the sweep turns or stands still near line {at}; split it into parts that run one way")
+    found = path_geolocation(
+        single_scan_path(position, camera, binning), camera, points_px, along=along, binning=binning
+    )
+    if falling:
+        found[..., 0] = len(position) - 1 - found[..., 0]
+    return found
+
+
+def path_geolocation(
+    scan_path: ScanPath, camera: LineCamera, points_px: Floats, *, along: Axis, binning: int = 1
+) -> Floats:
+    """Find the knot and sample at which a track saw each of some points (..., 2), y and x from the scene's centre [px].
+
+    (..., 2) float64 knot coordinate and sample, integers at centres. Resampling by Catmull-Rom at it gives the values
+    of a linear scene whatever the knots' distances, to the second order of how a line's image stretches. NaN where
+    the point is off the track by more than half a step or half a sample, where the nearest knot is one that nothing
+    saw, and where no crossing with the path was found.
+
+    Raises ShapeError: points are not pairs.
+    """
+    if points_px.shape[-1] != 2:
+        raise ShapeError(f"expected points (..., 2) of y and x, got {points_px.shape}")
+    found = knots_of_points(KnotCurve(scan_path), camera, points_px.reshape(-1, 2), along, binning)
+    drop_unseen(found, scan_path.seen, camera.samples // binning)
+    return found.reshape(points_px.shape)

@@ -1,0 +1,321 @@
+"""Tracks: where the lines of a sweep lie, as runs that go one way, whatever path the mirror took, and which they are.
+
+Which line of the plan an arriving frame is, its time stamp says.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import PoseError, SettingsError, ShapeError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import RIM_SLACK, direction_to_scene, position_to_direction
+from pipeline.readings import SIGMA_OF_MEDIAN
+
+STANDING_STEPS = 1e-3  # a mirror that moves less than this stands still
+DWELL_STEPS = 0.25  # lines closer than this show the same place
+GAP_STEPS = 1.5  # a wider distance misses a line; a smaller step back is noise
+NOISE_SIGMAS = 6.0  # nor does a path turn that goes back by less than this much of its own noise
+EVEN_STEPS = 1e-7  # a path this straight and even is looked up in closed form
+LATE_FRAMES = 0.25
+LEAST_FRAMES = 3  # below that none can be told to be the late one
+WILD_FRAMES = 1000  # a first or last stamp so far off the others is wrong, if they all lie nearer to each other
+FITS = 2  # the second without the frames that the first finds late
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ScanPath:
+    """One run of a sweep along the scan: knots where lines lie, in ascending order. Tangents of the scene plane.
+
+    A knot is one line, or several that show the same place, whose values are averaged. Where lines are missing the
+    track is filled with knots at even distances that nothing saw (``seen`` False), so that an even track stays even;
+    their one member is the nearest line, and does not count.
+    """
+
+    scan: Floats  # (knot,) of the line centres on the scan axis, ascending
+    across: Floats  # (knot,) of the line centres along the line
+    lines: NDArray[np.intp]  # (member,) numbers of the lines, knot by knot
+    starts: NDArray[np.intp]  # (knot,) first member of each knot in ``lines``
+    seen: NDArray[np.bool_]  # (knot,)
+    width: float  # usual distance of lines, as a tangent
+
+    def __len__(self) -> int:
+        return len(self.scan)
+
+    @property
+    def straight(self) -> bool:
+        """Whether all line centres lie on one parallel to the scan axis."""
+        return bool(np.ptp(self.across) < EVEN_STEPS * self.width)
+
+    @property
+    def uniform(self) -> bool:
+        """Whether all knots are ``width`` apart."""
+        even = self.scan[0] + self.width * np.arange(len(self.scan))
+        return bool(np.abs(self.scan - even).max() < EVEN_STEPS * self.width)
+
+
+def make_scan_paths(
+    position: Floats,
+    camera: LineCamera,
+    *,
+    usable: NDArray[np.bool_] | None = None,
+    shift_px: Floats | None = None,
+    binning: int = 1,
+    step_px: float | None = None,
+) -> tuple[ScanPath, ...]:
+    """Split a sweep into runs that go one way along the scan, and order the lines of each.
+
+    A path turns where it goes back by more than 1.5 steps, and by more than six times the noise that its own second
+    differences show; what goes back less is put in order. Lines closer than a quarter step are one knot (a dwell).
+    Lines that are not usable say nothing of the path; where one is missing, or was lost, knots that nothing saw stand
+    in its place. Resampling then counts their values nothing, and fails where what is left weighs less than a half.
+
+    ``position`` is (line, 2) mirror X and Y at mid exposure, ``shift_px`` (line, 2) pointing corrections along the line
+    and along the scan, added to the line centres. ``step_px`` is the planned distance of the lines; None takes the
+    median of the path's own steps, or where the path does not say the width of a sample of ``binning`` px.
+
+    Tracks in the order in which they were taken; none where no line is usable.
+
+    Raises PoseError: the position of a usable line is not finite or beyond the mirror's disk; names the first.
+    Raises ShapeError: arrays do not fit the lines.
+    """
+    scan, across, lines = line_centres(position, camera, usable, shift_px)
+    if not len(lines):
+        return ()
+    apart = camera.ifov_rad * binning
+    step = _usual_step(scan, lines, apart) if step_px is None else step_px * camera.ifov_rad
+    bends = np.abs(np.diff(scan, 2))  # of a position's own noise: sqrt 6 times its standard deviation
+    noise = float(np.median(bends)) * SIGMA_OF_MEDIAN / 6**0.5 if len(bends) else 0.0
+    runs = _runs(scan, max(GAP_STEPS * step, NOISE_SIGMAS * noise), DWELL_STEPS * step)
+    return tuple(_scan_path(scan[run], across[run], lines[run], step) for run in runs)
+
+
+def line_centres(
+    position: Floats, camera: LineCamera, usable: NDArray[np.bool_] | None = None, shift_px: Floats | None = None
+) -> tuple[Floats, Floats, NDArray[np.intp]]:
+    """Give where the usable lines of a sweep have their centres, in order of capture; raises as :func:`make_scan_paths`.
+
+    Tangents on the scan axis and along the line, (usable line,) each, and the numbers of these lines.
+    """
+    if position.ndim != 2 or position.shape[1] != 2:
+        raise ShapeError(f"expected mirror positions (line, 2), got {position.shape}")
+    if usable is not None and usable.shape != position.shape[:1]:
+        raise ShapeError(f"usable has shape {usable.shape}, expected one flag for each of {len(position)} lines")
+    if shift_px is not None and shift_px.shape != position.shape:
+        raise ShapeError(f"shift_px has shape {shift_px.shape}, expected {position.shape}: along and scan of each line")
+    lines = np.arange(len(position)) if usable is None else np.flatnonzero(usable)
+    place = np.asarray(position[lines], np.float64)
+    out = ~(np.hypot(place[:, 0], place[:, 1]) <= 1 + RIM_SLACK["float64"])
+    if out.any():
+        first = int(np.argmax(out))
+        x, y = place[first]
+        raise PoseError(
+            f"line {lines[first]} is at mirror position ({x:.15g}, {y:.15g}), expected finite numbers in the unit"
+            " disk; mark the line as not usable, or keep the field within the mirror's range"
+        )
+    tangent = direction_to_scene(position_to_direction(place))
+    if shift_px is not None:
+        tangent = tangent + shift_px[lines] * camera.ifov_rad
+    return tangent[:, 1], tangent[:, 0], lines
+
+
+def single_scan_path(position: Floats, camera: LineCamera, binning: int = 1) -> ScanPath:
+    """Make one track of lines that run one way, a knot for each line whatever their distances."""
+    scan, across, lines = line_centres(position, camera)
+    step = _usual_step(scan, lines, camera.ifov_rad * binning)
+    order = np.argsort(scan, kind="stable")
+    scan = scan[order]
+    return ScanPath(
+        scan, across[order], lines[order], np.arange(len(lines)), np.ones(len(lines), np.bool_), _width(scan, step)
+    )
+
+
+def _usual_step(scan: Floats, lines: NDArray[np.intp], apart: float) -> float:
+    """Median distance of lines that follow each other, standing ones left out; ``apart`` where none move."""
+    steps = np.abs(np.diff(scan)) / np.diff(lines)
+    steps = steps[steps > STANDING_STEPS * apart]
+    if not len(steps):
+        return apart
+    return float(np.percentile(steps, 50, method="lower"))  # of one step and one gap, the step
+
+
+def _runs(scan: Floats, most_back: float, still: float) -> list[slice]:
+    """Parts of the path that go one way, up to steps back of ``most_back``.
+
+    The first line within ``still`` of the turn ends its part; those that stand there longer begin the next.
+    """
+    runs = []
+    up = scan - np.minimum.accumulate(scan) > most_back
+    down = np.maximum.accumulate(scan) - scan > most_back
+    first, rising = 0, bool(up.any() and (not down.any() or np.argmax(up) < np.argmax(down)))
+    while first < len(scan):
+        way = scan[first:] if rising else -scan[first:]
+        back = np.maximum.accumulate(way) - way > most_back
+        rise = way[: np.argmax(back)] if back.any() else way[:0]
+        stop = first + int(np.argmax(rise > rise.max() - still)) + 1 if len(rise) else len(scan)
+        runs.append(slice(first, stop))
+        first, rising = stop, not rising
+    return runs
+
+
+def _scan_path(scan: Floats, across: Floats, lines: NDArray[np.intp], step: float) -> ScanPath:
+    """Order one run, average its dwells and fill its gaps."""
+    order = np.argsort(scan, kind="stable")
+    scan, across, lines = scan[order], across[order], lines[order]
+    starts = _dwell_starts(scan, DWELL_STEPS * step)
+    counts = np.diff(starts, append=len(lines))
+    if len(starts) < len(lines):
+        lines = lines[np.lexsort((lines, np.repeat(np.arange(len(starts)), counts)))]
+        scan, across = (np.add.reduceat(values, starts) / counts for values in (scan, across))
+    missing = np.where(np.diff(scan) > GAP_STEPS * step, np.rint(np.diff(scan) / step) - 1, 0).astype(np.intp)
+    at = np.concatenate([[0], np.cumsum(missing + 1)])
+    seen = np.zeros(at[-1] + 1, np.bool_)
+    seen[at] = True
+    lines, starts = _with_stand_ins(lines, counts, at, seen)
+    knot = np.arange(len(seen))
+    scan, across = np.interp(knot, at, scan), np.interp(knot, at, across)
+    return ScanPath(scan, across, lines, starts, seen, _width(scan, step))
+
+
+def _dwell_starts(scan: Floats, reach: float) -> NDArray[np.intp]:
+    """First members of the groups of lines that lie less than ``reach`` beyond the first of their group."""
+    if (np.diff(scan) >= reach).all():
+        return np.arange(len(scan))
+    starts = [0]
+    following = np.searchsorted(scan, scan + reach)
+    while (start := int(following[starts[-1]])) < len(scan):
+        starts.append(start)
+    return np.array(starts, np.intp)
+
+
+def _with_stand_ins(
+    lines: NDArray[np.intp], counts: NDArray[np.intp], at: NDArray[np.intp], seen: NDArray[np.bool_]
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Members and first members of all knots: those that nothing saw get the nearest knot's first line."""
+    sizes = np.ones(len(seen), np.intp)
+    sizes[at] = counts
+    empty = np.flatnonzero(~seen)
+    before = np.searchsorted(at, empty) - 1
+    nearest = np.where(empty - at[before] <= at[np.minimum(before + 1, len(at) - 1)] - empty, before, before + 1)
+    members = np.empty(sizes.sum(), np.intp)
+    real = np.repeat(seen, sizes)
+    members[real] = lines
+    members[~real] = lines[(np.cumsum(counts) - counts)[nearest]]
+    return members, np.cumsum(sizes) - sizes
+
+
+def _width(scan: Floats, step: float) -> float:
+    """The mean step where all are equal up to rounding, else the usual one."""
+    if len(scan) == 1:
+        return step
+    mean = float(scan[-1] - scan[0]) / (len(scan) - 1)
+    even = np.abs(scan - scan[0] - mean * np.arange(len(scan))).max() < EVEN_STEPS * mean
+    return mean if even else step
+
+
+@dataclass(frozen=True)
+class LineNumbers:
+    """What the time stamps of a sweep's frames say of its lines."""
+
+    number: NDArray[np.intp]  # (frame,) line of the plan, counted from the first believed frame; of that line's
+    # first frame where a frame came again; of the line before where the stamp is not believed
+    usable: NDArray[np.bool_]  # (frame,)
+    lost: int  # lines between the first and the last for which no frame came
+    repeated: int  # frames that came again under the same stamp
+    backward: int  # frames whose stamp goes back, lies far off all others, or is no number
+    late: int  # usable frames more than a quarter period from their place
+
+
+def number_lines(time_s: Floats, frame_s: float) -> LineNumbers:
+    """Tell from time stamps (frame,), of mid exposure in the order of arrival [s], which line each frame is.
+
+    A gap of more than 1.5 periods leaves numbers out. Of frames with equal stamps the first is kept. A stamp that goes
+    back is not believed: the longest ascending row of stamps is, and of equally long ones that with the earlier frames,
+    so that one wild stamp costs one line; so does a wild one that comes first or last. A late frame is used: its
+    position is that of its own time. ``frame_s`` is the planned frame period; its true value is taken from the stamps,
+    so that a slow clock makes no frame late.
+
+    Raises SettingsError: the period is not above 0.
+    Raises ShapeError: the stamps are not one row.
+    """
+    if not frame_s > 0:
+        raise SettingsError(f"the frame period must be above 0 s, got {frame_s}")
+    if time_s.ndim != 1:
+        raise ShapeError(f"expected time stamps (frame,), got {time_s.shape}")
+    known = np.isfinite(time_s)
+    first = np.zeros(len(time_s), np.bool_)
+    first[np.unique(time_s, return_index=True)[1]] = True
+    repeated = int((known & ~first).sum())
+    fresh = np.flatnonzero(known & first)
+    usable = np.zeros(len(time_s), np.bool_)
+    row = fresh[_longest_ascent(time_s[fresh])]
+    usable[row[_without_wild_ends(time_s[row], frame_s)]] = True
+    count = _numbers(time_s[usable], frame_s)
+    number = np.zeros(len(time_s), np.intp)
+    if len(count):
+        same = np.minimum(np.searchsorted(time_s[usable], time_s), len(count) - 1)
+        before = count[np.maximum(np.cumsum(usable) - 1, 0)]
+        number = np.where(time_s[usable][same] == time_s, count[same], before)
+    return LineNumbers(
+        number=number,
+        usable=usable,
+        lost=int(count[-1]) + 1 - len(count) if len(count) else 0,
+        repeated=repeated,
+        backward=int((~usable).sum()) - repeated,
+        late=_count_late(time_s[usable], count, frame_s),
+    )
+
+
+def _longest_ascent(values: Floats) -> NDArray[np.intp]:
+    """Indices of the longest ascending row (patience sorting, from the back so that earlier frames are preferred)."""
+    tops: list[float] = []
+    piles: list[int] = []
+    below = np.full(len(values), -1, np.intp)
+    for index in range(len(values) - 1, -1, -1):
+        pile = bisect_left(tops, -values[index])
+        if pile:
+            below[index] = piles[pile - 1]
+        tops[pile : pile + 1] = [-values[index]]
+        piles[pile : pile + 1] = [index]
+    row = []
+    index = piles[-1] if piles else -1
+    while index >= 0:
+        row.append(index)
+        index = int(below[index])
+    return np.array(row, np.intp)
+
+
+def _without_wild_ends(time_s: Floats, frame_s: float) -> slice:
+    """Ascending stamps but for a first and a last one that lie farther off than the others from each other."""
+    if len(time_s) < LEAST_FRAMES:
+        return slice(None)
+    far = max(WILD_FRAMES * frame_s, float(time_s[-2] - time_s[1]))
+    wild_first, wild_last = time_s[1] - time_s[0] > far, time_s[-1] - time_s[-2] > far
+    return slice(int(wild_first), len(time_s) - int(wild_last))
+
+
+def _numbers(time_s: Floats, frame_s: float) -> NDArray[np.intp]:
+    """Line numbers of ascending stamps, the first being 0."""
+    steps = np.ceil(np.diff(time_s) / frame_s - 0.5).astype(np.intp)  # half a period rounds down: 1.5 lose nothing
+    count = np.concatenate([np.zeros(min(len(time_s), 1), np.intp), np.cumsum(steps)])
+    # A frame that comes late by more than half a period looks like the next line; the one after shows that it is not.
+    order = np.arange(len(count))
+    count = order + np.minimum.accumulate((count - order)[::-1])[::-1]
+    return count - count[:1]
+
+
+def _count_late(time_s: Floats, count: NDArray[np.intp], frame_s: float) -> int:
+    """Frames more than a quarter period from the even clock that fits them best."""
+    near = np.ones(len(time_s), np.bool_)
+    for _ in range(FITS):
+        if near.sum() < LEAST_FRAMES:
+            break
+        period, start = np.polyfit(count[near], time_s[near], 1)
+        near = np.abs(time_s - start - period * count) <= LATE_FRAMES * frame_s
+    return int((~near).sum())

@@ -1,0 +1,114 @@
+"""Lookup tables as a stored artefact: one group a sweep, in it one a track, so that a second run makes none again."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from pipeline.errors import IncompleteStoreError, ShapeError
+from pipeline.rectify.placed import TieTable
+from pipeline.rectify.scan_paths import ScanPath
+from storage.archive.keys import KEY_LENGTH
+from storage.arrays.layout import create_group, damage_named, open_group, read_array, write_image, write_small
+
+Tables = Mapping[str, Sequence[tuple[ScanPath, TieTable]]]
+
+_TANGENT = "tangent of the undeflected direction's plane"
+
+
+def path_digest(
+    position: NDArray[np.floating], usable: NDArray[np.bool_] | None = None, shift: NDArray[np.floating] | None = None
+) -> str:
+    """Name a sweep's path, in 20 hex digits, by all that its scan paths depend on: which lines are usable, where they lie.
+
+    Positions and their corrections ``shift`` are (line, 2), as of :func:`pipeline.rectify.scan_paths.make_scan_paths`. What a
+    line that is not usable reports does not count, nor whether a correction is zero or none. Camera, binning, step and
+    grid are the stage's own parameters. Raises ShapeError: arrays do not fit the lines.
+    """
+    lines = np.asarray(position, np.float64)
+    flags = np.ones(len(lines), np.bool_) if usable is None else np.asarray(usable, np.bool_)
+    moved = np.zeros_like(lines) if shift is None else np.asarray(shift, np.float64)
+    if lines.ndim != 2 or lines.shape[1] != 2 or flags.shape != lines.shape[:1] or moved.shape != lines.shape:
+        raise ShapeError(
+            f"expected positions (line, 2), flags (line,) and shifts (line, 2), got {lines.shape}, {flags.shape} and"
+            f" {moved.shape}"
+        )
+    digest = hashlib.sha256(flags.tobytes())
+    for values in (lines, moved):
+        digest.update(np.ascontiguousarray(values[flags] + 0.0, "<f8").tobytes())  # + 0.0: -0 and 0 are one place
+    return digest.hexdigest()[:KEY_LENGTH]
+
+
+def write_geolocation(path: Path, tables: Tables, facts: Mapping[str, Any] | None = None) -> None:
+    """Store the scan paths and tie tables of sweeps, by name; ``facts`` are attributes: camera, grid, tolerance."""
+    root = create_group(path, "lookup", {**(facts or {}), "sweeps": list(tables)})
+    for number, (name, scan_paths) in enumerate(tables.items()):
+        sweep = root.create_group(f"sweep_{number}", attributes={"sweep": name, "scan_paths": len(scan_paths)})
+        for at, (scan_path, table) in enumerate(scan_paths):
+            _write_scan_path(sweep, f"scan_path_{at}", scan_path, table)
+
+
+def open_geolocation(path: Path) -> dict[str, tuple[tuple[ScanPath, TieTable], ...]]:
+    """Read the scan paths and tie tables of all sweeps, by name (IncompleteStoreError: the store is missing or damaged)."""
+    root = open_group(path)
+    with damage_named(str(path)):
+        names = [str(name) for name in root.attrs["sweeps"]]  # type: ignore[union-attr]
+    tables = {}
+    for number, name in enumerate(names):
+        sweep = _member(root, f"sweep_{number}")
+        with damage_named(str(sweep.store_path)):
+            count = int(sweep.attrs["scan_paths"])  # type: ignore[arg-type]
+        tables[name] = tuple(_read_scan_path(_member(sweep, f"scan_path_{at}")) for at in range(count))
+    return tables
+
+
+def _write_scan_path(sweep: zarr.Group, name: str, scan_path: ScanPath, table: TieTable) -> None:
+    group = sweep.create_group(
+        name,
+        attributes={
+            "width": scan_path.width,
+            "spacing": table.spacing,
+            "shape": list(table.shape),
+            "corner": list(table.corner),
+            "kept": list(table.kept),
+            "bound_px": table.bound_px,
+            "samples": table.samples,
+        },
+    )
+    about = {"long_name": "line centre on the scan axis", "units": "1", "comment": _TANGENT}
+    write_small(group, "scan", ("knot",), scan_path.scan, about)
+    about = {"long_name": "line centre along the line", "units": "1", "comment": _TANGENT}
+    write_small(group, "across", ("knot",), scan_path.across, about)
+    write_small(group, "lines", ("member",), scan_path.lines.astype(np.int64), {"long_name": "line of each member"})
+    write_small(
+        group, "starts", ("knot",), scan_path.starts.astype(np.int64), {"long_name": "first member of each knot"}
+    )
+    write_small(group, "seen", ("knot",), scan_path.seen, {"long_name": "whether any line saw the knot"})
+    about = {"long_name": "knot coordinate and sample of every spacing-th pixel", "units": "1"}
+    write_image(group, "tie_points", ("tie_y", "tie_x", "coordinate"), table.tie_points, about)
+
+
+def _read_scan_path(group: zarr.Group) -> tuple[ScanPath, TieTable]:
+    with damage_named(str(group.store_path)):
+        about: dict[str, Any] = dict(group.attrs)
+        width, bound = float(about["width"]), float(about["bound_px"])
+        spacing, samples = int(about["spacing"]), int(about["samples"])
+        shape, corner, kept = ((int(about[name][0]), int(about[name][1])) for name in ("shape", "corner", "kept"))
+    seen = read_array(group, "seen")
+    lines, starts = (read_array(group, name).astype(np.intp) for name in ("lines", "starts"))
+    scan_path = ScanPath(read_array(group, "scan"), read_array(group, "across"), lines, starts, seen, width)
+    return scan_path, TieTable(read_array(group, "tie_points"), spacing, shape, bound, seen, samples, corner, kept)
+
+
+def _member(group: zarr.Group, name: str) -> zarr.Group:
+    with damage_named(f"{group.store_path}/{name}"):
+        found = group[name]
+    if not isinstance(found, zarr.Group):
+        raise IncompleteStoreError(f"{group.store_path}/{name} is no group; run verify on the archive")
+    return found

@@ -1,0 +1,413 @@
+"""One task a block, on threads of this process, on processes beside it, or on a cluster that a dask scheduler leads.
+
+All three are executors as Python's `concurrent.futures` has them, and blocks are sent to each in the same way. A block
+is a whole shard (or reads whole shards): no two tasks ever touch one file, so nothing has to be locked. For the same
+bytes to come out, code, threads of arithmetic and files have to be the same wherever blocks are made.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import multiprocessing
+import os
+import platform
+import re
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from multiprocessing import resource_tracker
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from pipeline.errors import SettingsError, WorkerError
+from pipeline.lazy import deferred
+from storage.archive.staging import PART_SUFFIX
+
+if TYPE_CHECKING:
+    import dask.distributed as dask_distributed
+else:
+    dask_distributed = deferred("dask.distributed")
+
+ANSWER_S = 5.0  # a scheduler that is there answers at once
+AHEAD = 2  # blocks sent to a worker: one in the making, one waiting
+TRIES = 3  # of a block whose worker dies
+ROOMS = ("pipeline", "models", "storage", "flows")  # blocks of regions are made in flows
+LIBRARIES = ("numpy", "zarr", "numcodecs", "torch", "distributed")
+THREADS_OF = "OMP_NUM_THREADS"
+# one thread of arithmetic a worker, and freed memory kept: large arrays cost more page faults than arithmetic
+_ENVIRONMENT = {
+    **dict.fromkeys((THREADS_OF, "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"),
+    "MALLOC_MMAP_THRESHOLD_": f"{2**30}",
+    "MALLOC_TRIM_THRESHOLD_": f"{2**31 - 1}",
+    "MALLOC_TOP_PAD_": f"{2**26}",
+}
+_ADDRESS = re.compile(r"(tcp|tls)://[^\s/:]+:\d+|(tcp|tls)://\[[0-9a-fA-F:]+\]:\d+")
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+Report = Callable[[float], None]  # share done, 0..1, from the thread that asked
+
+
+@dataclass(frozen=True)
+class WorkerPool:
+    """Who makes blocks: ``threads``, ``processes``, or the workers of a dask scheduler at ``tcp://host:port``."""
+
+    scheduler: str = "threads"
+    workers: int | None = None  # at a time; None is one a core. A scheduler elsewhere has workers of its own
+
+    def __post_init__(self) -> None:
+        if self.scheduler not in ("threads", "processes") and not _ADDRESS.fullmatch(self.scheduler):
+            raise SettingsError(
+                f"scheduler must be threads, processes, or the address of a dask scheduler such as "
+                f"tcp://192.168.1.5:8786; got {self.scheduler!r}"
+            )
+        if self.workers is not None and self.workers < 1:
+            raise SettingsError(f"workers must be at least 1, got {self.workers}")
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether the workers belong to a scheduler that somebody else started."""
+        return "://" in self.scheduler
+
+    @property
+    def shares_memory(self) -> bool:
+        """Whether work may hold open files and arrays; otherwise it holds paths and is pickled."""
+        return self.scheduler == "threads"
+
+    @property
+    def count(self) -> int:
+        """Blocks at a time on this machine."""
+        if self.workers is not None:
+            return self.workers
+        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+    @contextmanager
+    def open(self) -> Iterator[WorkerPool]:
+        """Keep this worker pool's workers from one `run_blocks` to the next until the block ends.
+
+        Costs nothing by itself: they are started by the first `run_blocks` that needs them. May be nested.
+        """
+        with _guard:
+            held = _open.setdefault(self, _Open())
+            held.users += 1
+        try:
+            yield self
+        except Exception:
+            raise
+        except BaseException:  # nobody waits for blocks that are being made
+            held.dismiss()
+            raise
+        finally:
+            with _guard:
+                held.users -= 1
+                last = held.users == 0
+                if last:
+                    del _open[self]
+            if last and held.team is not None:
+                held.team.shutdown()
+
+
+THREADS = WorkerPool()
+
+
+@dataclass
+class _Open:
+    """The workers of an open worker pool, once somebody needs them."""
+
+    users: int = 0
+    team: Executor | None = None
+
+    def dismiss(self) -> None:
+        """Let workers go at once: whoever needs them next gets others."""
+        team, self.team = self.team, None
+        if isinstance(team, ProcessPoolExecutor):
+            for process in list((team._processes or {}).values()):
+                process.kill()
+        if team is not None:
+            team.shutdown(wait=False, cancel_futures=True)
+
+
+_guard = threading.RLock()
+_open: dict[WorkerPool, _Open] = {}
+
+
+def run_blocks(
+    make: Callable[[Item], Result],
+    items: Sequence[Item],
+    pool: WorkerPool = THREADS,
+    *,
+    keep: bool = True,
+    report: Report = lambda done: None,
+    each: Callable[[Item, Result], None] | None = None,
+    paths: Sequence[Path] = (),
+) -> list[Result]:
+    """Call ``make`` with every item, each in a task of its own.
+
+    They are begun in order, none more than a few before the oldest unfinished one: neighbours share what they read.
+    The first error is raised once no block is being made any more: none writes after that.
+
+    On threads ``make`` is anything that may be called from several at once. Otherwise it and the items are pickled:
+    they hold absolute paths, never arrays or open files, and writing a block twice must give the same bytes.
+    ``each`` is called with an item and its result, one at a time, in the order in which they end, ``report`` with the
+    share done after each. Workers elsewhere are asked whether they see the same in ``paths``, the folders that the work
+    reads or writes; from those in a staged store (``*.part``) goes what a killed worker left of a file that another
+    wrote again. Gives the results in the order of the items; none without ``keep``. Raises SettingsError: no scheduler
+    answers, or its workers see other files or run other versions. WorkerError: workers died, more often than a block is
+    tried again.
+    """
+    results: dict[int, Any] = {}
+
+    def ended(number: int, result: Any) -> None:
+        if each is not None:
+            each(items[number], result)
+        results[number] = result if keep else None
+        report(len(results) / len(items))
+
+    workers = min(pool.count, len(items))
+    if pool.shares_memory and workers < 2:
+        for number, item in enumerate(items):
+            ended(number, make(item))
+    elif pool.shares_memory:
+        with ThreadPoolExecutor(workers) as team:
+            _send(team, make, items, range(len(items)), workers, ended)
+    elif items:
+        with pool.open():
+            _send_away(pool, make, items, paths, ended)
+        for folder in paths:
+            if any(part.endswith(PART_SUFFIX) for part in folder.parts):
+                for file in folder.rglob("*.partial"):  # zarr gives a shard its name when it is whole
+                    file.unlink(missing_ok=True)
+    return [results[number] for number in range(len(items))] if keep else []
+
+
+def _send_away(
+    pool: WorkerPool,
+    make: Callable[[Any], Any],
+    items: Sequence[Any],
+    paths: Sequence[Path],
+    ended: Callable[[int, Any], None],
+) -> None:
+    """Have blocks made by processes; those whose worker died are made again by others."""
+    left, held, deaths = dict.fromkeys(range(len(items))), _open[pool], 0
+
+    def tick(number: int, result: Any) -> None:
+        nonlocal deaths
+        del left[number]
+        deaths = 0
+        ended(number, result)
+
+    while left:
+        with _guard:
+            if held.team is None:
+                held.team = Cluster(pool.scheduler) if pool.elsewhere else start(pool.count)
+        team = held.team
+        try:
+            workers = team.check(paths) if isinstance(team, Cluster) else pool.count
+            _send(team, make, items, list(left), AHEAD * workers, tick)
+        except (BrokenExecutor, WorkerError, CancelledError) as error:
+            held.dismiss()
+            deaths += 1
+            if pool.elsewhere and isinstance(error, CancelledError):
+                gone = f"--scheduler {pool.scheduler}: the scheduler is gone"
+                raise WorkerError(f"{gone}; the same command goes on once it is there again") from None
+            if not isinstance(error, BrokenExecutor):
+                raise
+            if deaths == TRIES or pool.elsewhere:
+                who = f"--scheduler {pool.scheduler}" if pool.elsewhere else f"{pool.count} worker processes"
+                raise WorkerError(
+                    f"{who}: workers died several times in the same block; were they out of memory? use fewer "
+                    "--workers, or --scheduler threads"
+                ) from None
+
+
+def _send(
+    team: Executor,
+    make: Callable[[Any], Any],
+    items: Sequence[Any],
+    numbers: Sequence[int],
+    window: int,
+    ended: Callable[[int, Any], None],
+) -> None:
+    """Send blocks in order, none ``window`` or more behind the oldest unfinished one; ``ended`` takes each result.
+
+    What is on its way is waited for before an error is raised.
+    """
+    running: dict[Future[Any], int] = {}
+    sent = 0
+    try:
+        while running or sent < len(numbers):
+            while sent < len(numbers) and sent - min(running.values(), default=sent) < window:
+                running[team.submit(make, items[numbers[sent]])] = sent
+                sent += 1
+            done = wait(running, timeout=ANSWER_S, return_when=FIRST_COMPLETED).done
+            if not done and isinstance(team, Cluster):
+                team.count()  # one without workers ends no block
+            for future in sorted(done, key=running.__getitem__):
+                ended(numbers[running[future]], future.result())
+                del running[future]
+    except Exception:
+        wait(running)
+        raise
+
+
+# --- processes of this machine ----------------------------------------------------------------------------------------
+
+
+def start(workers: int) -> ProcessPoolExecutor:
+    """Start processes of one thread each (WorkerError: they do not start)."""
+    try:
+        with _inherited():
+            team = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _end_with_parent)
+            for _ in range(workers):
+                team.submit(time.monotonic)  # a process begins with the first task that finds none idle
+    except (OSError, RuntimeError) as error:
+        raise WorkerError(f"{workers} worker processes do not start: {error}; use --scheduler threads") from error
+    return team
+
+
+def _end_with_parent() -> None:
+    """End this process once the one that started it has ended, however that came."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+@contextmanager
+def _inherited() -> Iterator[None]:
+    """Let processes and threads that begin meanwhile have the environment of workers, and never see Ctrl-C."""
+    before = {name: os.environ.get(name) for name in _ENVIRONMENT}
+    resource_tracker.ensure_running()  # where it starts later it lets signals through again
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    os.environ.update(_ENVIRONMENT)
+    try:
+        yield
+    finally:
+        for name in _ENVIRONMENT:
+            del os.environ[name]
+        os.environ.update({name: value for name, value in before.items() if value is not None})
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+
+# --- workers elsewhere ------------------------------------------------------------------------------------------------
+
+
+class Cluster(Executor):
+    """The workers of a dask scheduler as an executor (SettingsError: none answers at the address)."""
+
+    def __init__(self, scheduler: str) -> None:
+        self.name = f"--scheduler {scheduler}"
+        for name in ("distributed", "distributed.client"):  # lost connections are told once, by an error
+            logging.getLogger(name).setLevel(logging.CRITICAL)
+        try:
+            self.client: Any = dask_distributed.Client(scheduler, timeout=ANSWER_S, set_as_default=False)  # type: ignore[no-untyped-call]
+        except (OSError, TimeoutError, ValueError) as error:
+            raise SettingsError(
+                f"{self.name}: expected a dask scheduler there, none answered within {ANSWER_S:g} s "
+                f"({type(error).__name__}); start `dask scheduler`, or use --scheduler processes"
+            ) from None
+
+    def submit(self, make: Callable[..., Any], /, *given: Any, **named: Any) -> Future[Any]:
+        """Send one block."""
+        future, task = Future[Any](), self.client.submit(make, *given, **named, pure=False)
+
+        def end(task: Any) -> None:
+            if task.cancelled():
+                future.set_exception(CancelledError())
+            elif (error := task.exception()) is not None:
+                dead = isinstance(error, dask_distributed.KilledWorker)
+                future.set_exception(BrokenExecutor(str(error)) if dead else error)
+            else:
+                future.set_result(task.result())
+
+        task.add_done_callback(end)
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Let the workers go, which go on living."""
+        self.client.close()
+
+    def count(self) -> int:
+        """Blocks that can be made at a time (WorkerError: there are no workers)."""
+        try:
+            self.client.wait_for_workers(1, timeout=ANSWER_S)
+        except TimeoutError:
+            raise WorkerError(
+                f"{self.name} has no workers: expected at least one; start `dask worker "
+                f"{self.client.scheduler.address}`"
+            ) from None
+        return max(1, sum(int(threads) for threads in self.client.nthreads().values()))
+
+    def check(self, paths: Sequence[Path]) -> int:
+        """Ask every worker for its versions and threads, and what it sees in some folders; gives `count`.
+
+        Raises SettingsError: one differs from this process; names it, both values and what to do. WorkerError: there is
+        none, or one was lost meanwhile.
+        """
+        folders = [str(path.absolute()) for path in paths]
+        expected, count = {**about_here(folders), THREADS_OF: "1"}, self.count()
+        try:
+            theirs = self.client.run(about_here, folders)
+        except OSError as error:
+            raise WorkerError(f"{self.name}: a worker was lost ({error}); the same command goes on") from None
+        except Exception as error:  # of any type: what cannot be unpickled there comes back as text
+            raise SettingsError(
+                f"{self.name}: a worker cannot import SpectralZoom ({error}); install the same version there, or use "
+                "--scheduler processes"
+            ) from None
+        for worker, facts in theirs.items():
+            for what, value in expected.items():
+                if facts.get(what) != value:
+                    raise SettingsError(
+                        f"{self.name}: worker {worker} has {what} {facts.get(what)}, expected {value} as here; install "
+                        f"the same there, mount the archive under the same path and set {THREADS_OF}=1"
+                    )
+        return count
+
+
+def about_here(folders: Sequence[str]) -> dict[str, str]:
+    """What this process runs, on how many threads, and what it sees in some folders, by name."""
+    threads = {THREADS_OF: os.environ.get(THREADS_OF, "not set")}
+    return versions_here() | threads | {folder: _seen(folder) for folder in folders}
+
+
+@cache
+def versions_here() -> dict[str, str]:
+    """What this process runs, by name, as it was when first asked: so it runs whatever changes on the disk."""
+    root, found = Path(__file__).parents[2], hashlib.sha256()
+    for path in sorted(path for room in ROOMS for path in (root / room).rglob("*.py")):
+        found.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    facts = {"python": platform.python_version(), "spectralzoom": f"of code {found.hexdigest()[:12]}"}
+    for name in LIBRARIES:
+        try:
+            facts[name] = version(name)
+        except PackageNotFoundError:
+            facts[name] = "missing"
+    return facts
+
+
+def _seen(folder: str) -> str:
+    if not Path(folder).is_dir():
+        return "not there"
+    names = sorted(path.name for path in Path(folder).iterdir())
+    return f"with {len(names)} names ({hashlib.sha256(repr(names).encode()).hexdigest()[:8]})"

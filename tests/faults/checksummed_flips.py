@@ -1,0 +1,162 @@
+"""One bit flipped in what is checksummed: ``python tests/faults flips checksummed_flips``.
+
+Of an archive each flip must be found by verify, with the store's or run's address. A reader of weights or of the state
+of a training run may refuse the file, in one message, or give what was written, bit by bit: never other numbers.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import torch
+
+from models.training.start_weights import StartFile
+from models.weights.checksummed_files import load_checkpoint, save_checkpoint
+from models.weights.files import content_key, load_weights, save_weights
+from pipeline.errors import WeightsError
+from storage.archive.archive import Archive
+from tests.conftest import RGB_NM, random_weights
+from tests.faults.fault_table import Clock, Row, reported_wrong
+from tests.faults.nursery import ROOT
+from tests.faults.small_survey import problems
+
+RUN = "the run's identity"
+Content = tuple[Any, Mapping[str, torch.Tensor]]  # everything beside the tensors, and the tensors
+Read = Callable[[Path], Content]
+
+
+def _weights(path: Path) -> Content:
+    found = load_weights(path)
+    normal = {name: torch.from_numpy(value) for name, value in vars(found.normalisation).items()}
+    tensors = {**found.segmenter.state_dict(), **normal, "colours": torch.from_numpy(found.class_colours)}
+    return (found.config, found.basis, found.class_names, found.record, content_key(path)), tensors
+
+
+def _start(path: Path) -> Content:
+    start = StartFile(path)
+    return (start.kind, start.sizes, start.earlier), start.state
+
+
+def _state(path: Path) -> Content:
+    found = load_checkpoint(path, RUN)
+    assert found is not None, "a checkpoint that is there counts as none"
+    return found
+
+
+READERS: dict[str, Read] = {"weights": _weights, "start": _start, "checkpoint": _state}
+
+
+@dataclass
+class Flips:
+    """How readings of flipped files ended."""
+
+    tried: int = 0
+    refused: int = 0
+    same: int = 0  # what was written, bit by bit: the flip changed a space, or nothing that is read
+    wrong: list[str] = field(default_factory=list)
+
+
+def flip_bits(count: int, folder: Path, seed: int = 0) -> Flips:
+    """Flip ``count`` single bits, half of them among the numbers, each in a fresh copy of a file, and read it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    written, rng, found = _written(folder), Random(seed), Flips()
+    before = {name: read(written[name]) for name, read in READERS.items()}
+    for number in range(count):
+        name = list(READERS)[number % len(READERS)]
+        raw = bytearray(written[name].read_bytes())
+        data = 8 + int.from_bytes(raw[:8], "little")
+        first, stop = rng.choice(((0, data), (data, len(raw)))) if number % 50 else (0, 8)  # the header's size as well
+        place, bit = rng.randrange(first, stop), rng.randrange(8)
+        raw[place] ^= 1 << bit
+        path = folder / "flipped.safetensors"
+        path.write_bytes(raw)
+        _try(name, path, before[name], f"{name}, byte {place}, bit {bit}", found)
+    return found
+
+
+def _try(name: str, path: Path, before: Content, called: str, found: Flips) -> None:
+    found.tried += 1
+    try:
+        after = READERS[name](path)
+    except WeightsError as error:
+        found.refused += 1
+        if str(path) not in str(error) or "\n" in str(error):
+            found.wrong.append(f"{called}: refused with {str(error)[:200]!r}")
+    except Exception as error:  # whatever else a reader may raise is the defect that is looked for
+        found.wrong.append(f"{called}: {type(error).__name__}: {str(error)[:200]}")
+    else:
+        found.same += 1
+        if not _alike(before, after):
+            found.wrong.append(f"{called}: other numbers, without a word")
+
+
+def _alike(one: Content, other: Content) -> bool:
+    if one[0] != other[0] or one[1].keys() != other[1].keys():
+        return False
+    return all(_bits(value) == _bits(other[1][name]) for name, value in one[1].items())
+
+
+def _bits(tensor: torch.Tensor) -> tuple[object, ...]:
+    return tensor.dtype, tuple(tensor.shape), tensor.detach().contiguous().numpy().tobytes()
+
+
+def _written(folder: Path) -> dict[str, Path]:
+    weights, state = folder / "weights.safetensors", folder / "weights.safetensors.checkpoint"
+    save_weights(random_weights(RGB_NM), weights)
+    numbers = torch.Generator().manual_seed(0)
+    tensors = {f"model.{name}": torch.randn(7, 5, generator=numbers) for name in "abc"}
+    tensors["optimiser.0.step"] = torch.tensor(12.0)
+    save_checkpoint(state, RUN, {"course": {"step": 12, "seconds": 3.5}, "rng": {"state": 2**100}}, tensors)
+    return {"weights": weights, "start": weights, "checkpoint": state}
+
+
+def weight_rows(quick: bool) -> Sequence[Row]:
+    clock, count = Clock(), 60 if quick else 2000
+    with tempfile.TemporaryDirectory() as place:
+        found = flip_bits(count, Path(place))
+    words = f"{found.refused} refused in one message, {found.same} as written, {reported_wrong(found.wrong)}"
+    injected = "one bit of weights or of a training run's state"
+    demanded = "refused in one message, or the numbers that were written"
+    met = not found.wrong and found.tried == count
+    return [Row("a bit flips in weights", injected, count, demanded, words, met, clock.seconds)]
+
+
+# --- an archive -------------------------------------------------------------------------------------------------------
+
+
+def flip_archive(root: Path, flips: int, seed: int = 0) -> list[str]:
+    """Flip one bit at random places, one at a time, and put it back; gives those that verify does not name."""
+    archive = Archive.open(root, create=False, write=False)
+    folders = [ref.path for ref in archive.refs()] + archive.runs()
+    files = sorted(path for folder in folders for path in folder.rglob("*") if path.is_file() and path.stat().st_size)
+    rng, wrong = Random(seed), list[str]()
+    for path in rng.choices(files, [path.stat().st_size for path in files], k=flips):
+        whole = path.read_bytes()
+        place, bit = rng.randrange(len(whole)), rng.randrange(8)
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << bit]) + whole[place + 1 :])
+        inside = path.relative_to(root)
+        try:
+            found = problems(root)
+        finally:
+            path.write_bytes(whole)
+        if not any(inside.is_relative_to(problem.split()[0]) for problem in found):
+            wrong.append(f"{inside}, byte {place}, bit {bit}: {found or 'not found'}")
+    return wrong + problems(root)
+
+
+def archive_rows(quick: bool) -> Sequence[Row]:
+    clock, count = Clock(), 20 if quick else 200
+    survey = "survey --scene farm --size 256x256 --no-controls --engine plain --out"
+    with tempfile.TemporaryDirectory(prefix="flips-") as place:
+        command = [sys.executable, "-m", "flows.cli.main", *survey.split(), place]
+        subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+        wrong = flip_archive(Path(place), count)
+    injected, demanded = "one bit of a random file of an archive", "each found by verify, and named"
+    return [Row("a bit flips", injected, count, demanded, reported_wrong(wrong), not wrong, clock.seconds)]

@@ -1,0 +1,245 @@
+"""A visit that looks at a part of a field: at the lines that promise most, the rest is as it is remembered."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from PIL import Image
+from rich.console import Console
+
+from flows.archive.plan_command import forecast
+from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
+from flows.settings.load import load_settings
+from flows.tasks.extent_choice import ExtentGains
+from models.reading.expected_errors import PatchExpectedErrors
+from pipeline.errors import BudgetError, NothingToMend, PipelineError, SettingsError
+from pipeline.geometry.grid import SceneGrid
+from pipeline.planning.uniform_scans import ScanPerformance
+from storage.archive.records import read_run
+from tests.conftest import Survey, WeightsMaker, patchy_scene
+from tests.flows.conftest import CommandLine
+from tests.prior_work import without_effects
+
+pytestmark = pytest.mark.usefixtures("no_effects")
+
+RECORD = {
+    "scenes": 3,
+    "steps": [1, 2, 4],
+    "exposures_ms": [25.0, 6.0],
+    "miou": [[0.99, 0.98], [0.97, 0.95], [0.9, 0.8]],
+    "per_class_iou": {"class_1": [[0.99, 0.97], [0.96, 0.94], [0.9, 0.8]]},
+}
+WHOLE: dict[str, Any] = {"budget": None, "scan_step": "2", "scan_exposure_ms": "25", "name": "north"}
+PART: dict[str, Any] = {"budget": None, "extent": "part", "prior": "latest", "name": "north", "seconds": "1.98"}
+FIRST, LATER, LAST = "2026-06-01T10:00:00Z", "2026-06-04T10:00:00Z", "2026-06-07T10:00:00Z"
+
+
+@pytest.fixture(scope="module")
+def recorded(make_weights: WeightsMaker) -> Path:
+    """Tiny weights with a record of uniform scans."""
+    return make_weights(scans=RECORD)
+
+
+@pytest.fixture(scope="module")
+def visits(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey, recorded: Path) -> tuple[Path, Any, Any]:
+    """A whole look at a field, and one at a part of it three days later; not to be changed."""
+    out = tmp_path_factory.mktemp("visits") / "archive"
+    with without_effects():
+        first = survey_png(out, **WHOLE, visit=FIRST, weights=str(recorded))
+        return out, first, survey_png(out, **PART, visit=LATER, weights=str(recorded))
+
+
+@pytest.fixture
+def visited(visits: tuple[Path, Any, Any], tmp_path: Path) -> Path:
+    """A copy of that archive."""
+    return Path(shutil.copytree(visits[0], tmp_path / "archive"))
+
+
+def product(out: Path, published: Any, name: str) -> xr.Dataset:
+    """A store of a run."""
+    return xr.open_zarr(out / published.receipt["products"][name], consolidated=False)
+
+
+def test_a_part_is_looked_at_and_the_rest_remembered(visits: tuple[Path, Any, Any]) -> None:
+    """In its seconds; where lines went the map is of today, elsewhere three days old, and it is whole."""
+    out, first, part = visits
+    scan_pass, age = part.receipt["extent"], product(out, part, "class_probabilities").age.values
+    assert 0.1 < scan_pass["fraction"] < 0.9
+    assert part.receipt["settings"]["scan_step"] < 4  # lines that are cheaper, and poorer than what is remembered
+    assert part.receipt["savings"]["capture_s"]["done"] == pytest.approx(scan_pass["seconds"])
+    assert scan_pass["seconds"] <= 2.1
+    assert sorted(np.unique(age)) == [0.0, 3.0]
+    assert (age == 0).mean() == pytest.approx(scan_pass["fraction"], abs=0.15)
+    patches, reached = product(out, part, "patches"), np.zeros(age.shape, bool)
+    for patch_number, valid in zip(patches.patch_number.values, patches.valid.values, strict=True):
+        top, left = (valid.shape[0] * int(at) for at in divmod(patch_number, age.shape[1] // valid.shape[1]))
+        reached[top : top + valid.shape[0], left : left + valid.shape[1]] = valid
+    assert reached[age == 0].all()  # what is filled in at the edge of the part is no look
+    before, now = (product(out, one, "class_map").classes.values for one in (first, part))
+    assert (now != 255).all()
+    assert (now == before)[age > 0].mean() > 0.95  # what fades may tip where two classes were nearly as likely
+    assert part.receipt["memory"]["put_aside"] is None
+
+
+def test_receipt_and_page_say_what_was_looked_at(visits: tuple[Path, Any, Any]) -> None:
+    """Lines, share, and what was expected of them; beside a plan that names the part."""
+    _, _, part = visits
+    scan_pass = part.receipt["extent"]
+    assert part.receipt["settings"]["extent"] == scan_pass["lines"]
+    assert scan_pass["expected_gain"] >= 0
+    page = (part.folder / "report.html").read_text(encoding="utf-8")
+    assert f"lines {scan_pass['lines']}, " in page
+    assert "a part of the field was scanned once: every" in part.receipt["plan"]["reason"]
+    assert "this one: " not in page  # the record tells of scans of all, which remember nothing
+    assert any(
+        "where most is to be mended" in note and "is expected to be wrong" in note
+        for note in part.receipt["settings"]["notes"]
+    )
+
+
+def test_the_same_visit_finds_its_own_lines(visited: Path, visits: Any, survey_png: Survey, recorded: Path) -> None:
+    """Asked again it goes on from the visit before it, as it did, and captures nothing."""
+    again = survey_png(visited, **PART, visit=LATER, weights=str(recorded))
+    assert again.receipt["settings"]["extent"] == visits[2].receipt["settings"]["extent"]
+    assert again.receipt["memory"]["run"] == visits[1].folder.name
+    states = {stage["name"]: stage["state"] for stage in again.receipt["stages"]}
+    assert states["capture_coarse"] == states["segment"] == "cached"
+
+
+def test_better_weights_read_the_lines_that_were_taken(visited: Path, visits: Any, make_weights: WeightsMaker) -> None:
+    """Reprocessing makes both visits again, of the light that there is, whatever these weights would have looked at."""
+    run_reprocess(ReprocessRequest(visited, weights=make_weights(scans=RECORD, width=4)), Console(quiet=True))
+    runs = [read_run(path, {}) for path in sorted(visited.glob("runs/*"))]
+    before, again = (run for run in runs if run.settings["extent"] == visits[2].receipt["settings"]["extent"])
+    assert again.receipt["products"]["class_map"] != before.receipt["products"]["class_map"]
+    assert again.receipt["products"]["raw_coarse"] == before.receipt["products"]["raw_coarse"]
+
+
+def test_of_a_field_that_nobody_knows_all_is_looked_at(survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
+    """Said, and the seconds buy a uniform scan of it."""
+    text = io.StringIO()
+    flags = {**PART, "seconds": "5", "weights": str(recorded), "max_age": "14d", "skip_below_error": "2%"}
+    first = survey_png(tmp_path / "archive", console=Console(file=text, width=300), **flags)
+    assert "nothing is remembered: the whole field is looked at" in text.getvalue()
+    assert "extent" not in first.receipt
+    assert first.receipt["settings"]["extent"] == "whole"
+    again = ReprocessRequest(tmp_path / "archive", weights=Path(shutil.copy(recorded, tmp_path / "same.safetensors")))
+    assert run_reprocess(again, Console(quiet=True)) == 0
+
+
+def test_what_is_due_is_looked_at_first(visited: Path, visits: Any, survey_png: Survey, recorded: Path) -> None:
+    """With --max-age the lines that the visit before left out, and the notes count them."""
+    flags = {**PART, "seconds": "1.95", "max_age": "8d", "weights": str(recorded)}
+    part = survey_png(visited, **flags, visit=LAST)
+    due, scan_pass = product(visited, visits[2], "class_probabilities").age.values == 3.0, part.receipt["extent"]
+    assert (product(visited, part, "class_probabilities").age.values[due] < 1).any()
+    assert 0 < scan_pass["due"] - scan_pass["due_left"] < scan_pass["due"]
+    notes = " ".join(part.receipt["settings"]["notes"])
+    assert (
+        f"{scan_pass['due'] - scan_pass['due_left']} of the {scan_pass['due']} patches that were due are among them"
+        in notes
+    )
+    page = " ".join((part.folder / "report.html").read_text(encoding="utf-8").split())
+    assert f"{scan_pass['due_left']} of {scan_pass['due']} places that were due had to wait" in page
+
+
+def test_of_what_is_sure_enough_nothing_is_looked_at(
+    visited: Path, survey_png: Survey, recorded: Path, scene_files: Path, command_line: CommandLine
+) -> None:
+    """Said with the run whose map stands; nothing is captured or published, and a look is planned nevertheless."""
+    runs = sorted(visited.glob("runs/*"))
+    flags = {**PART, "visit": LAST, "weights": str(recorded)}
+    asked = {
+        **{name: value for name, value in flags.items() if value is not None},
+        **{
+            "scene": str(scene_files / "scene.png"),
+            "source": "sim",
+            "out": str(visited),
+            "engine": "plain",
+            "skip_below_error": "50%",
+        },
+    }
+    with pytest.raises(NothingToMend, match=f"the map of {runs[-1].name} stands"):
+        survey_png(visited, **{**flags, "skip_below_error": "50%"})
+    assert sorted(visited.glob("runs/*")) == runs
+    words = [word for name, value in asked.items() for word in (f"--{name.replace('_', '-')}", str(value))]
+    told = command_line("survey", *words, "--json")
+    assert told.code == 0
+    assert json.loads(told.out) == {"looked": False, "run": runs[-1].name, "why": told.err.strip().splitlines()[-1]}
+    assert forecast(load_settings(None, asked)).scans is not None
+    assert survey_png(visited, **{**flags, "skip_below_error": "0.1%"}).receipt["settings"]["skip_below_error"] == 0.001
+
+
+def test_nothing_is_worth_more_than_what_is_due() -> None:
+    """A patch that is due counts more than all that the others gain; without gains the oldest counts most."""
+    grid = SceneGrid(4, 16, 4, 1)
+    probabilities, age = (
+        np.log([0.6, 0.4]) * np.ones((4, 16, 1)),
+        np.repeat([[1.0, 2.0, 3.0, 4.0]], 4, axis=0).repeat(4, axis=1),
+    )
+    expected_errors = PatchExpectedErrors.of([(probabilities, age)], grid, 2)
+    record, all_patches = ScanPerformance.read(RECORD), np.ones(4, bool)
+    wanted = ExtentGains(
+        record, ("class_0", "class_1"), expected_errors, np.array([False, True, False, False]), all_patches
+    )
+    gains = wanted.gains(1, 25.0)
+    assert (gains > 0).all()
+    assert wanted.expected_gain(gains)[1] > 10 * wanted.expected_gain(gains)[[0, 2, 3]].sum()
+    nobody = replace(wanted, due=np.zeros(4, bool))
+    assert np.array_equal(nobody.expected_gain(gains), gains)
+    assert np.argsort(nobody.expected_gain(np.zeros(4))).tolist() == [0, 1, 2, 3]
+
+
+def test_what_is_beyond_another_fields_part_has_no_class(
+    visited: Path, survey_png: Survey, recorded: Path, tmp_path: Path
+) -> None:
+    """A memory of another field is put aside, and where nobody looked nothing is said of this one."""
+    values, labels = patchy_scene((96, 128), 3, seed=77)
+    Image.fromarray(values.astype(np.uint8)).save(tmp_path / "other.png")
+    Image.fromarray(labels).save(tmp_path / "labels.png")
+    scene = {"scene": str(tmp_path / "other.png"), "labels": str(tmp_path / "labels.png")}
+    other = survey_png(visited, **PART, **scene, visit=LAST, weights=str(recorded))
+    assert other.receipt["memory"]["put_aside"] == "another field"
+    assert "of the rest nothing is known" in (other.folder / "report.html").read_text(encoding="utf-8")
+    classes = product(visited, other, "class_map").classes.values
+    assert 1 - other.receipt["extent"]["fraction"] <= (classes == 255).mean() < 1
+
+
+@pytest.mark.parametrize(
+    ("flags", "error", "told"),
+    [
+        ({"seconds": None, "scan_step": "2"}, SettingsError, "'part' looks where the seconds are worth most: give"),
+        (
+            {"extent": "0:5-9", "seconds": None},
+            SettingsError,
+            "names lines of a uniform scan: give its --scan-step too",
+        ),
+        ({"extent": "0:9-5"}, SettingsError, "must be whole, part, or runs of lines as receipts tell them"),
+        ({"extent": "somewhere"}, SettingsError, "must be whole, part, or runs of lines"),
+        (
+            {"extent": "7:0-5", "seconds": None, "scan_step": "2"},
+            SettingsError,
+            "at sweep 7, the scan has sweeps 0 to 0",
+        ),
+        ({"pointing_px": "4"}, SettingsError, "ties its sweeps by what they share"),
+        ({"extent": None, "max_age": "14d"}, SettingsError, "--max-age says how old a place may become"),
+        ({"max_age": "a while"}, SettingsError, "must be a time of 1h to 3660d, such as 14d"),
+        ({"seconds": "1"}, BudgetError, r"no look at any part of the field ends in time; the least takes 1\.\d s"),
+    ],
+)
+def test_what_cannot_be_looked_at_is_refused_in_a_sentence(
+    visits: Any, survey_png: Survey, recorded: Path, flags: dict[str, Any], error: type[PipelineError], told: str
+) -> None:
+    """Before anything is captured, with what to do."""
+    before = sorted(visits[0].rglob("*"))
+    with pytest.raises(error, match=told):
+        survey_png(visits[0], **{**PART, "visit": LAST, "weights": str(recorded), **flags})
+    assert sorted(visits[0].rglob("*")) == before

@@ -1,0 +1,219 @@
+"""Budgets of multiply-adds and bytes for a uniform scan: which patches they buy, what that takes, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from flows.archive.plan_command import format_kept, plan_content
+from flows.settings.load import load_settings, parse_settings
+from flows.tasks.patch_budget import PatchBudget
+from flows.tasks.reading_costs import ReadingCosts
+from models.network.sizes import SegmenterConfig
+from models.weights.files import save_weights
+from pipeline.errors import BudgetError, SettingsError
+from pipeline.geometry.grid import SceneGrid
+from tests.conftest import RGB_NM, Survey, random_weights
+
+COSTS = ReadingCosts(SegmenterConfig(classes=5), SceneGrid(192, 256, 16, 4), 30)
+PATCHES = 12 * 16
+SCAN: dict[str, Any] = {"budget": None, "scan_step": "2", "scan_exposure_ms": "25"}
+fractions = st.floats(5, 100).map(lambda percent: f"{percent!r}%")
+scores = st.integers(0, 2**32 - 1).map(lambda seed: np.random.default_rng(seed).normal(0.1, 0.1, PATCHES))
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Tiny weights."""
+    path = tmp_path_factory.mktemp("weights") / "weights.safetensors"
+    save_weights(random_weights(RGB_NM), path)
+    return path
+
+
+def _asked(shown: NDArray[np.bool_] | None = None, **limits: object) -> PatchBudget | None:
+    return PatchBudget.asked(parse_settings({"scan_step": 1, **limits}), COSTS, shown)
+
+
+def _budget(**limits: object) -> PatchBudget:
+    found = _asked(**limits)
+    assert found is not None
+    return found
+
+
+@given(scores, st.floats(12, 99), st.floats(10, 99), st.sampled_from(["gain", "sobel"]))
+def test_no_budget_is_exceeded_and_no_patch_more_is_paid_for(
+    given_scores: NDArray[np.float64], macs: float, kept: float, policy: str
+) -> None:
+    """Multiply-adds with the scores and bytes with the means are within their shares; one patch more breaks one."""
+    budget = _budget(macs=f"{macs}%", bytes_kept=f"{kept}%", policy=policy)
+    bought, promising = budget.choose(given_scores), np.argsort(-given_scores)[: np.count_nonzero(given_scores > 0)]
+
+    def pays(patch_index: NDArray[np.intp]) -> bool:
+        read = budget.operations_of(patch_index) <= macs / 100 * budget.everything
+        return read and budget.bytes_of(len(patch_index)) <= kept / 100 * budget.every_byte
+
+    assert pays(bought)
+    assert len(bought) == len(promising) or not pays(promising[: len(bought) + 1])
+    np.testing.assert_array_equal(bought, promising[: len(bought)])
+
+
+@given(scores, st.floats(12, 99), st.floats(12, 99))
+def test_a_larger_budget_buys_what_a_smaller_one_does_and_more(
+    given_scores: NDArray[np.float64], one: float, other: float
+) -> None:
+    """Choices are nested."""
+    less, more = (_budget(macs=f"{percent}%").choose(given_scores) for percent in sorted((one, other)))
+    np.testing.assert_array_equal(less, more[: len(less)])
+
+
+@given(scores, st.floats(0.001, 0.5))
+def test_a_least_gain_buys_by_price_whatever_the_number(given_scores: NDArray[np.float64], least: float) -> None:
+    """All patches that promise as much are bought, and none that promises less."""
+    bought = _budget(least_gain=least).choose(given_scores)
+    assert sorted(bought) == np.flatnonzero(given_scores >= least).tolist()
+
+
+@pytest.mark.parametrize("worthless", [0.0, -1.0, np.nan, -np.inf])
+def test_what_promises_nothing_is_not_bought(worthless: float) -> None:
+    """Whatever the budget pays for: a field of which all is known is read from its means alone; inf comes first."""
+    given_scores = np.full(PATCHES, worthless)
+    assert len(_budget(macs="90%").choose(given_scores)) == 0
+    given_scores[[3, 7]] = 0.5, np.inf
+    assert _budget(macs="90%").choose(given_scores).tolist() == [7, 3]
+
+
+def test_zones_leave_fewer_patches_to_fraction() -> None:
+    """Only patches of which zones leave something are chosen, and shares are of reading those."""
+    shown = np.arange(PATCHES) < PATCHES // 2
+    budget = _asked(shown, macs="60%")
+    assert budget is not None
+    assert budget.everything < _budget(macs="60%").everything
+    assert max(budget.choose(np.ones(PATCHES))) < PATCHES // 2
+
+
+@pytest.mark.parametrize("limits", [{}, {"macs": "100%"}, {"bytes_kept": "100%"}, {"macs": "1e12"}])
+def test_who_pays_for_everything_chooses_nothing(limits: dict[str, str]) -> None:
+    """Then no patch is scored either: the scan is read whole, as without a budget."""
+    assert _asked(**limits) is None
+
+
+@pytest.mark.parametrize("name", ["macs", "bytes_kept"])
+def test_the_least_that_a_refusal_names_is_the_least(name: str) -> None:
+    """What it names is enough, and a little less is refused again."""
+    with pytest.raises(BudgetError, match=f"--{name.replace('_', '-')} 0.5% .*the least is") as refused:
+        _asked(**{name: "0.5%"})
+    least = str(refused.value).split()[-1]
+    assert _asked(**{name: least}) is not None
+    with pytest.raises(BudgetError, match="the least is"):
+        _asked(**{name: f"{float(least.removesuffix('%')) - 0.01:.2f}%"})
+
+
+@pytest.mark.parametrize("name", ["macs", "bytes_kept"])
+def test_numbers_are_limits_too(name: str) -> None:
+    """Half of everything, given as a number, buys what 50 % does; a number that is too small is told the least."""
+    half = _budget(**{name: "50%"})
+    whole = half.everything if name == "macs" else half.every_byte
+    one = np.linspace(1, 2, PATCHES)
+    np.testing.assert_array_equal(_budget(**{name: str(whole // 2)}).choose(one), half.choose(one))
+    with pytest.raises(BudgetError, match=r"the least is --\S+ \d+$"):
+        _asked(**{name: "10"})
+
+
+@pytest.mark.parametrize(
+    ("limits", "error", "words"),
+    [
+        ({"macs": "0%"}, BudgetError, "above 0% and at most 100%"),
+        ({"macs": "101%"}, BudgetError, "above 0% and at most 100%"),
+        ({"macs": "0.25"}, BudgetError, "for 25 % write 25%"),
+        ({"macs": "nan"}, BudgetError, "such as 25%"),
+        ({"macs": "a lot"}, BudgetError, "such as 25%"),
+        ({"macs": True}, BudgetError, "such as 25%"),
+        ({"bytes_kept": "-3%"}, BudgetError, "such as 40%"),
+        ({"bytes_kept": "inf%"}, BudgetError, "such as 40%"),
+        ({"bytes_kept": "some"}, BudgetError, "such as 40%"),
+        ({"least_gain": -1}, SettingsError, "from 0 to 100"),
+        ({"least_gain": 0.1, "policy": "sobel"}, SettingsError, "scores in a unit of its own"),
+        ({"macs": "50%", "scan_step": None}, SettingsError, "is for a raster or a uniform scan.*give --seconds"),
+        ({"macs": "50%", "extent": "0:1-9"}, SettingsError, "a whole field, and 'look' looks at a part"),
+    ],
+)
+def test_what_is_no_budget_is_refused_in_a_sentence(
+    limits: dict[str, object], error: type[Exception], words: str
+) -> None:
+    """The message says what it must be, or what to leave out."""
+    with pytest.raises(error, match=words):
+        _asked(**limits)
+
+
+def test_a_part_of_the_scan_is_kept_and_read(survey_png: Survey, tmp_path: Path) -> None:
+    """Patches are those of the best patches, receipt and page tell what they take, and what everything would have."""
+    published = survey_png(tmp_path, **SCAN, macs="40%", policy="sobel", controls=True)
+    (patches,) = tmp_path.glob("**/patches.zarr")
+    (attention,) = tmp_path.glob("**/attention.zarr")
+    patch_index = xr.open_zarr(patches, consolidated=False)["patch"].values
+    seen = xr.open_zarr(attention, consolidated=False)
+    best = np.argsort(-seen["score"].values.ravel(), kind="stable")[: len(patch_index)]
+    assert sorted(patch_index) == sorted(best)
+    kept, costs = published.receipt["kept"], published.receipt["savings"]["multiply_adds"]
+    assert (kept["patches"], kept["of_patches"]) == (len(patch_index), 12 * 16)
+    assert 0.3 < costs["ratio"] <= 0.4
+    assert kept["multiply_adds"] == {"done": costs["done"], "everything": costs["full"]}
+    assert kept["asked"]["macs"] == "40%"
+    accuracy = published.receipt["accuracy"]
+    assert accuracy["controls_fraction"] == len(patch_index) / 192
+    assert accuracy["controls"]["sobel"]["miou"] == pytest.approx(accuracy["miou"], abs=0.02)
+    page = (published.folder / "report.html").read_text(encoding="utf-8")
+    assert "kept in detail" in page
+    assert "of the multiply-adds of reading everything" in page
+    assert "captured again" not in page
+
+
+def test_a_budget_is_refused_before_anything_is_captured(survey_png: Survey, tmp_path: Path) -> None:
+    """No archive is begun for what cannot be paid for."""
+    with pytest.raises(BudgetError, match=r"--macs 1% does not pay for the coarse pass"):
+        survey_png(tmp_path / "out", **SCAN, macs="1%")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_plan_tells_what_the_budgets_pay_for(scene_files: Path, tiny: Path, tmp_path: Path) -> None:
+    """Before the first line: the most patches, and what they take."""
+    given_settings = {
+        "scene": str(scene_files / "scene.png"),
+        "source": "sim",
+        "weights": str(tiny),
+        "out": str(tmp_path),
+    }
+    content = plan_content(load_settings(None, {**given_settings, "scan_step": "1", "bytes_kept": "50%"}))
+    assert 0.49 < content["kept"]["bytes"]["done"] / content["kept"]["bytes"]["everything"] <= 0.5
+    assert f"detail: at most {content['kept']['patches']} of 192 patches" in format_kept(content["kept"])
+
+
+@pytest.mark.parametrize(
+    ("asked", "policy"),
+    [
+        ({}, "gain"),
+        ({"macs": "25%"}, "sobel"),
+        ({"macs": "25%", "policy": "entropy"}, "entropy"),
+        ({"macs": "25%", "least_gain": "0.1"}, "gain"),
+        ({"bytes_kept": "40%"}, "gain"),
+    ],
+)
+def test_scores_are_cheap_where_multiply_adds_are_short(asked: dict[str, str], policy: str) -> None:
+    """By default; who names a policy gets it, and a least gain is asked of scores that are gains."""
+    assert load_settings(None, {"seconds": "5", **asked}).policy == policy
+
+
+def test_scores_without_a_coarse_prediction_cost_no_coarse_prediction() -> None:
+    """Edges of the coarse image ask nothing of the network, which then reads the coarse pass for the map alone."""
+    patch_index = np.arange(9)
+    assert COSTS.with_scores(patch_index, "sobel").coarse_prediction == COSTS.of_map(patch_index).coarse_prediction
+    assert COSTS.with_scores(patch_index, "gain").coarse_prediction == 2 * COSTS.of_map(patch_index).coarse_prediction
+    assert replace(COSTS.with_scores(patch_index, "sobel"), score=0) == COSTS.of_map(patch_index)

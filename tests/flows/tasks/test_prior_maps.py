@@ -1,0 +1,329 @@
+"""A field that is remembered: what later visits go on from, what becomes of a wrong memory, and who keeps it."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import xarray as xr
+from PIL import Image
+from rich.console import Console
+from scipy.ndimage import gaussian_filter, rotate
+
+import flows.tasks.prior_maps as memory
+from flows.archive.plan_command import plan_content
+from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
+from flows.settings.load import load_settings
+from models.network.sizes import TemporalSizes
+from models.network.temporal_reader import TemporalReader
+from models.weights.files import add_reader, load_weights
+from pipeline.errors import SettingsError, WeightsError
+from pipeline.geometry.grid import SceneGrid
+from storage.archive.archive import Archive
+from storage.archive.records import read_run
+from storage.maintenance.garbage import clear_up
+from tests.conftest import CLASSES, Survey, WeightsMaker, patchy_scene
+from tests.flows.conftest import problems
+from tests.prior_work import without_effects
+
+pytestmark = pytest.mark.usefixtures("no_effects")
+
+QUIET = Console(quiet=True)
+UNIFORM: dict[str, Any] = {"budget": None, "scan_step": "2", "name": "north"}
+FIRST, LATER, BETWEEN = "2026-06-01T10:00:00Z", "2026-06-04T10:00:00Z", "2026-06-02T22:00:00Z"
+
+
+@pytest.fixture(scope="module")
+def twice(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> tuple[Path, Any, Any]:
+    """Two visits to one field, three days apart; not to be changed."""
+    out = tmp_path_factory.mktemp("twice") / "archive"
+    with without_effects():
+        first = survey_png(out, **UNIFORM, visit=FIRST, prior="latest")
+        return out, first, survey_png(out, **UNIFORM, visit=LATER, prior="latest")
+
+
+@pytest.fixture
+def visited(twice: tuple[Path, Any, Any], tmp_path: Path) -> Path:
+    """A copy of that archive."""
+    return Path(shutil.copytree(twice[0], tmp_path / "archive"))
+
+
+def class_map(out: Path, published: Any) -> np.ndarray:
+    """Classes of a run's map."""
+    return np.asarray(xr.open_zarr(out / published.receipt["products"]["class_map"], consolidated=False).classes.values)
+
+
+def words_of(out: Path, survey_png: Survey, **flags: Any) -> tuple[str, Any]:
+    """What a survey says on the terminal, in one line, and the run."""
+    text = io.StringIO()
+    published = survey_png(out, console=Console(file=text, width=400), **{**UNIFORM, **flags})
+    return " ".join(text.getvalue().split()), published
+
+
+def test_a_first_look_has_nothing_to_go_on_from(twice: tuple[Path, Any, Any]) -> None:
+    """Asked for the latest it says none, keeps what it believes, and all of that is new."""
+    out, first, _ = twice
+    assert "memory" not in first.receipt
+    assert first.receipt["settings"]["prior"] == "none"
+    assert "nothing is remembered of north: this look is its first" in first.receipt["settings"]["notes"]
+    probabilities = xr.open_zarr(out / first.receipt["products"]["class_probabilities"], consolidated=False)
+    assert float(probabilities.age.max()) == 0.0
+    assert "changed" not in probabilities
+    agree = np.nan_to_num(probabilities.log_probability.values, nan=-9).argmax(axis=-1) == class_map(out, first)
+    assert agree.mean() > 0.95  # but for classes less than a step apart, which these weights often are
+
+
+def test_a_later_look_goes_on_from_the_one_before(twice: tuple[Path, Any, Any]) -> None:
+    """Receipt, page and manifest name it; the days between are those of the visits."""
+    out, first, later = twice
+    memory = later.receipt["memory"]
+    assert (memory["run"], memory["days"], memory["put_aside"]) == (first.folder.name, 3.0, None)
+    assert later.receipt["settings"]["prior"] == first.folder.name
+    assert memory["agreement"] > 0.9  # it is the same picture with other noise
+    page = (later.folder / "report.html").read_text(encoding="utf-8")
+    assert f"{first.folder.name}, 3.0 days earlier: today&#39;s capture agrees with" in page
+    assert "Changed since" in page
+    store = out / later.receipt["products"]["class_probabilities"]
+    manifest = json.loads((store.parent / "manifest.json").read_text())
+    assert Path(first.receipt["products"]["class_probabilities"]).parent.name in manifest["inputs"]
+    probabilities = xr.open_zarr(store, consolidated=False)
+    assert probabilities.changed.shape == (12, 16)
+    there = (probabilities.changed_from.values != 255).reshape(12, 8, 16, 8).mean(axis=(1, 3), dtype=np.float32)
+    np.testing.assert_array_equal(probabilities.changed.values, there)
+
+
+def test_by_hand_nothing_is_remembered_unless_asked(visited: Path, survey_png: Survey) -> None:
+    """The default of a survey is none, and its map that of a first look, found and not made again."""
+    published = survey_png(visited, **UNIFORM, visit=LATER)
+    assert "memory" not in published.receipt
+    fresh = survey_png(visited, **UNIFORM, visit=FIRST)
+    (row,) = (stage for stage in fresh.receipt["stages"] if stage["name"] == "segment")
+    assert row["state"] == "cached"
+
+
+def test_a_look_of_before_does_not_go_on_from_a_later_one(visited: Path, twice: Any, survey_png: Survey) -> None:
+    """A visit that is taken in late goes on from what was looked at before it."""
+    between = survey_png(visited, **UNIFORM, visit=BETWEEN, prior="latest")
+    assert between.receipt["memory"]["run"] == twice[1].folder.name
+    assert between.receipt["memory"]["days"] == 1.5
+
+
+def test_a_run_can_be_named(visited: Path, twice: Any, survey_png: Survey) -> None:
+    """Whichever it is; one that is not there, or of another size, ends in one message."""
+    named = survey_png(visited, **UNIFORM, visit="2026-06-09T10:00:00Z", prior=twice[1].folder.name)
+    assert (named.receipt["memory"]["run"], named.receipt["memory"]["days"]) == (twice[1].folder.name, 8.0)
+    with pytest.raises(SettingsError, match=r"--prior nobody: there is no such run in the archive; give another run"):
+        survey_png(visited, **UNIFORM, prior="nobody")
+
+
+def test_a_field_of_another_size_is_no_memory(visited: Path, survey_png: Survey, tmp_path: Path) -> None:
+    """Under the same name: said, and looked at as for the first time."""
+    Image.fromarray(patchy_scene((64, 96), 3, seed=1)[0].astype(np.uint8)).save(tmp_path / "small.png")
+    flags = {"scene": str(tmp_path / "small.png"), "labels": None, "visit": "2026-06-07T10:00:00Z", "prior": "latest"}
+    words, published = words_of(visited, survey_png, **flags)
+    assert "cannot be used: it is of 128 x 96 px, this field has 96 x 64" in words
+    assert "nothing is remembered of north" in words
+    assert "memory" not in published.receipt
+
+
+def test_another_field_under_the_same_name_is_put_aside(visited: Path, survey_png: Survey, tmp_path: Path) -> None:
+    """Its map is the one of a survey without memory, and receipt and page say why."""
+    values, labels = patchy_scene((96, 128), 3, seed=77)
+    Image.fromarray(values.astype(np.uint8)).save(tmp_path / "other.png")
+    Image.fromarray(labels).save(tmp_path / "labels.png")
+    flags = {
+        "scene": str(tmp_path / "other.png"),
+        "labels": str(tmp_path / "labels.png"),
+        "visit": "2026-06-07T10:00:00Z",
+    }
+    words, wrong = words_of(visited, survey_png, **flags, prior="latest")
+    alone = survey_png(tmp_path / "alone", **{**UNIFORM, **flags})
+    assert wrong.receipt["memory"]["put_aside"] == "another field"
+    assert "put aside, today's capture agrees with" in words
+    np.testing.assert_array_equal(class_map(visited, wrong), class_map(tmp_path / "alone", alone))
+    probabilities = xr.open_zarr(visited / wrong.receipt["products"]["class_probabilities"], consolidated=False)
+    assert float(probabilities.age.max()) == 0.0
+    assert not {"changed", "changed_from"} & set(probabilities)
+
+
+def test_what_was_cleared_is_gone_on_without(visited: Path, twice: Any, survey_png: Survey) -> None:
+    """The visit before that is taken, and where none is left the look is a first one; both are said."""
+    _, first, later = twice
+    shutil.rmtree((visited / later.receipt["products"]["class_probabilities"]).parent)
+    words, published = words_of(visited, survey_png, visit="2026-06-07T10:00:00Z", prior="latest")
+    assert f"the memory of {later.folder.name} cannot be used: what it left was cleared" in words
+    assert published.receipt["memory"]["run"] == first.folder.name
+    shutil.rmtree((visited / first.receipt["products"]["class_probabilities"]).parent)
+    shutil.rmtree((visited / published.receipt["products"]["class_probabilities"]).parent)
+    words, published = words_of(visited, survey_png, visit="2026-06-08T10:00:00Z", prior="latest")
+    assert "nothing is remembered of north: this look is its first" in words
+
+
+def test_other_classes_are_found_by_their_names(visited: Path, survey_png: Survey, make_weights: WeightsMaker) -> None:
+    """Weights that call classes in another order, and know one more, go on from the memory of the others."""
+    other = make_weights(names=("class_2", "class_0", "class_1", "more"))
+    flags = {"weights": str(other), "labels": None, "visit": "2026-06-07T10:00:00Z", "prior": "latest"}
+    published = survey_png(visited, **{**UNIFORM, **flags})
+    assert published.receipt["memory"]["days"] == 3.0
+    strangers = make_weights(names=("a", "b", "c"))
+    words, published = words_of(
+        visited, survey_png, **{**flags, "weights": str(strangers), "visit": "2026-06-06T10:00:00Z"}
+    )
+    assert "it knows none of the classes of these weights, but class_0, class_1, class_2" in words
+
+
+def test_what_runs_rest_on_is_kept(visited: Path, twice: Any) -> None:
+    """Clearing up takes nothing of a visit that a later one goes on from, and a check finds nothing wrong."""
+    before = sorted(path.name for path in visited.glob("stages/*/*"))
+    assert clear_up(Archive.open(visited), keep_days=0).removals == ()
+    assert sorted(path.name for path in visited.glob("stages/*/*")) == before
+    assert problems(visited) == []
+
+
+def test_visits_are_reprocessed_in_order(visited: Path, twice: Any, make_weights: WeightsMaker) -> None:
+    """With other weights the second visit goes on from the first as it was made again, not as it was."""
+    weights = make_weights(width=4)
+    told = io.StringIO()
+    run_reprocess(ReprocessRequest(visited, weights=weights), Console(file=told, width=300))
+    runs = [read_run(path, {}) for path in sorted(visited.glob("runs/*"))]
+    again = [run for run in runs if run.folder.name not in (twice[1].folder.name, twice[2].folder.name)]
+    assert [run.settings["prior"] for run in again] == ["none", again[0].folder.name]
+    assert again[1].receipt["memory"]["run"] == again[0].folder.name
+    content = io.StringIO()
+    run_reprocess(ReprocessRequest(visited, weights=weights), Console(file=content, width=300))
+    assert len(list(visited.glob("runs/*"))) == 4  # nothing is left to be done
+
+
+def test_a_plan_knows_what_is_remembered(visited: Path, scene_files: Path, weights: Path) -> None:
+    """It is what the survey would do, and writes nothing."""
+    given = {
+        "scene": str(scene_files / "scene.png"),
+        "source": "sim",
+        "weights": str(weights),
+        "out": str(visited),
+        "scan_step": "2",
+    }
+    before = sorted(visited.rglob("*"))
+    content = plan_content(load_settings(None, {**given, "name": "north", "visit": LATER, "prior": "latest"}))
+    rows = {row["stage"]: row for row in content["stages"]}
+    assert rows["segment"]["state"] in ("to run", "cached", "blocked")
+    assert sorted(visited.rglob("*")) == before
+
+
+def test_a_reader_in_the_weights_is_used(visited: Path, survey_png: Survey, weights: Path, tmp_path: Path) -> None:
+    """Its key stands in the receipt and its multiply-adds count; one for others ends the survey before it begins."""
+    own = Path(shutil.copy(weights, tmp_path / "own.safetensors"))
+    config = load_weights(own).config
+    reader = TemporalReader(TemporalSizes(config.classes, config.columns, config.factor, 8, 4))
+    torch.nn.init.normal_(reader.leave.weight, std=0.2)
+    add_reader(own, own, reader, {})
+    flags = {**UNIFORM, "visit": "2026-06-07T10:00:00Z", "prior": "latest", "weights": str(own)}
+    published = survey_png(visited, **flags)
+    assert len(published.receipt["memory"]["reader"]) == 20
+    first = survey_png(tmp_path / "alone", **{**flags, "prior": "none"})
+    decode = [one.receipt["savings"]["multiply_adds"]["decode"] for one in (published, first)]
+    assert decode[0] - decode[1] == reader.sizes.multiply_adds(96 * 128)
+    add_reader(own, own, TemporalReader(TemporalSizes(3, 7, 4)), {})
+    with pytest.raises(WeightsError, match=r"own\.safetensors.* reader of prior maps is for another network"):
+        survey_png(visited, **flags)
+
+
+def test_a_survey_in_two_passes_remembers_where_it_did_not_look(survey_png: Survey, tmp_path: Path) -> None:
+    """Patches without fine lines keep their memory, and grow older."""
+    out, two = tmp_path / "archive", {"name": "north", "budget": "0.75", "prior": "latest"}
+    survey_png(out, **two, visit=FIRST)
+    later = survey_png(out, **two, visit=LATER)
+    probabilities = xr.open_zarr(out / later.receipt["products"]["class_probabilities"], consolidated=False)
+    assert set(np.unique(probabilities.age.values).tolist()) == {0.0, 3.0}
+
+
+def test_a_rig_that_was_moved_finds_its_memory(survey_png: Survey, tmp_path: Path) -> None:
+    """A field that lies 12 px lower and 20 px further left than it did: its memory is brought there, edges are new."""
+    values, labels = patchy_scene((160, 192), 3, seed=5)
+    places = {"before": np.s_[12:140, 0:160], "now": np.s_[0:128, 20:180]}
+    flags = {}
+    for name, part in places.items():
+        Image.fromarray(values[part].astype(np.uint8)).save(tmp_path / f"{name}.png")
+        Image.fromarray(labels[part]).save(tmp_path / f"{name}-labels.png")
+        flags[name] = {"scene": str(tmp_path / f"{name}.png"), "labels": str(tmp_path / f"{name}-labels.png")}
+    out = tmp_path / "archive"
+    survey_png(out, **UNIFORM, **flags["before"], visit=FIRST)
+    words, later = words_of(out, survey_png, **flags["now"], visit=LATER, prior="latest")
+    assert later.receipt["memory"]["shift_px"] == [12, -20]
+    assert "which lay 23 px beside it" in words
+    probabilities = xr.open_zarr(out / later.receipt["products"]["class_probabilities"], consolidated=False)
+    assert np.isfinite(probabilities.age.values).all()
+
+
+def test_a_rig_that_was_moved_between_two_parts_is_noticed(survey_png: Survey, tmp_path: Path) -> None:
+    """Where they share nothing today's lines are laid onto those of the visit before the last."""
+    values, _ = patchy_scene((160, 192), 3, seed=5)
+    for name, part in {"before": np.s_[12:140, 0:160], "now": np.s_[0:128, 20:180]}.items():
+        Image.fromarray(values[part].astype(np.uint8)).save(tmp_path / f"{name}.png")
+    out, given = tmp_path / "archive", {**UNIFORM, "labels": None, "name": "north", "prior": "latest"}
+    before, now = ({**given, "scene": str(tmp_path / f"{name}.png")} for name in ("before", "now"))
+    survey_png(out, **before, visit=FIRST)
+    middle = survey_png(out, **before, visit=LATER, extent="0:0-20")
+    later = survey_png(out, **now, visit="2026-06-07T10:00:00Z", extent="0:40-64")
+    assert later.receipt["memory"]["run"] == middle.folder.name
+    assert later.receipt["memory"]["shift_px"] == [12, -20]
+    back = survey_png(out, **before, visit="2026-06-08T10:00:00Z", extent="0:16-46")  # the first visit alone knows most
+    assert back.receipt["memory"]["run"] == later.folder.name
+    assert back.receipt["memory"]["shift_px"] == pytest.approx([-12, 20], abs=1)
+
+
+def test_a_rig_that_was_turned_is_noticed(survey_png: Survey, tmp_path: Path) -> None:
+    """By four degrees: its memory is put aside, and receipt and page say by how much."""
+    values, _ = patchy_scene((300, 320), 3, seed=6)
+    soft = gaussian_filter(values, (1.5, 1.5, 0))
+    there = np.s_[2:290, 8:312]
+    images = {"before": soft[there], "now": rotate(soft, 4.0, reshape=False, order=1, mode="nearest")[there]}
+    for name, image in images.items():
+        Image.fromarray(np.clip(image, 0, 255).astype(np.uint8)).save(tmp_path / f"{name}.png")
+    flags = {**UNIFORM, "labels": None}
+    survey_png(tmp_path / "a", **flags, scene=str(tmp_path / "before.png"), visit=FIRST)
+    now = {"labels": None, "scene": str(tmp_path / "now.png"), "visit": LATER, "prior": "latest"}
+    words, later = words_of(tmp_path / "a", survey_png, **now)
+    assert later.receipt["memory"]["put_aside"] == "turned"
+    assert abs(later.receipt["memory"]["turned_deg"]) == pytest.approx(4.0, abs=0.3)
+    assert "put aside, the rig was turned since by 4.0 degrees" in words.replace("3.9", "4.0").replace("4.1", "4.0")
+
+
+def test_a_thousand_visits_cost_as_much_as_sixty(visited: Path, twice: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many runs a field has, the newest alone are read; those of other fields not at all."""
+    _, first, later = twice
+    for number in range(200):
+        for name, source in (("north", later), ("south", first)):
+            copy = visited / "runs" / f"20270101T{number:06d}-{name}"
+            shutil.copytree(visited / "runs" / source.folder.name, copy)
+    read: list[str] = []
+
+    def counted(folder: Path, stores: Any) -> Any:
+        read.append(folder.name)
+        return read_run(folder, stores)
+
+    monkeypatch.setattr(memory, "read_run", counted)
+    settings = load_settings(None, {"prior": "latest", "visit": "2026-06-20T10:00:00Z"})
+    found, _ = memory.find_prior(Archive.open(visited), settings, "north", SceneGrid(96, 128, 8, 4), CLASSES)
+    assert found is not None
+    assert found.days == 16.0
+    assert len(read) == memory.NEWEST_RUNS
+    assert {name.rpartition("-")[2] for name in read} == {"north"}
+
+
+def test_two_visits_at_once_are_both_kept(visited: Path, twice: Any, survey_png: Survey) -> None:
+    """Neither waits for the other or goes on from it half made: both are published, and rest on finished runs."""
+    at = ["2026-06-09T10:00:00Z", "2026-06-09T11:00:00Z"]
+    with ThreadPoolExecutor(2) as pool:
+        both = list(pool.map(lambda visit: survey_png(visited, **UNIFORM, visit=visit, prior="latest"), at))
+    assert both[0].folder != both[1].folder
+    assert both[0].receipt["memory"]["run"] == twice[2].folder.name
+    assert both[1].receipt["memory"]["run"] in {twice[2].folder.name, both[0].folder.name}
+    assert not problems(visited)

@@ -1,0 +1,216 @@
+"""A survey of one uniform scan: what is captured, stored, read and told, and how the scan is chosen."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from rich.console import Console
+
+from flows.archive.plan_command import plan_content
+from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
+from flows.settings.load import load_settings
+from pipeline.errors import BudgetError, SettingsError, WeightsError
+from pipeline.rectify.tiles import block_means
+from tests.conftest import Survey, WeightsMaker
+
+RECORD = {
+    "scenes": 3,
+    "steps": [1, 2, 4],
+    "exposures_ms": [100.0, 25.0, 6.0],
+    "miou": [[0.94, 0.93, 0.89], [0.92, 0.91, 0.85], [0.83, 0.81, 0.74]],
+    "spread": [[0.02] * 3, [0.03] * 3, [0.04] * 3],
+    "per_class_iou": {"class_1": [[0.8, 0.7, 0.6], [0.7, 0.65, 0.5], [0.5, 0.4, 0.3]]},
+}
+QUIET = Console(quiet=True)
+
+
+@pytest.fixture(scope="module")
+def recorded(make_weights: WeightsMaker) -> Path:
+    """Tiny weights with a record of uniform scans."""
+    return make_weights(scans=RECORD)
+
+
+@pytest.fixture(scope="module")
+def scanned(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey, recorded: Path) -> tuple[Path, Any]:
+    """One survey by hand of every second line, 25 ms."""
+    out = tmp_path_factory.mktemp("scanned")
+    flags = {"budget": None, "scan_step": "2", "scan_exposure_ms": "25", "weights": str(recorded)}
+    return out, survey_png(out, **flags)
+
+
+def _store(out: Path, name: str) -> xr.Dataset:
+    (path,) = out.glob(f"**/{name}.zarr")
+    return xr.open_zarr(path, consolidated=False)
+
+
+def test_the_field_is_seen_once_and_whole(scanned: tuple[Path, Any]) -> None:
+    """One pass of unbinned lines 2 px apart, a patch of every patch, and seconds that are those of these lines."""
+    out, published = scanned
+    cubes = [xr.open_zarr(path, consolidated=False) for path in out.glob("**/capture/**/*.zarr")]
+    assert {value for cube in cubes for value in cube["exposure_ms"].values.tolist()} == {25.0}
+    assert {cube.sizes["sample"] for cube in cubes} == {640}
+    lines = sum(cube.sizes["line"] for cube in cubes)
+    assert 96 / 2 <= lines <= 96 / 2 + 4
+    seconds = published.receipt["savings"]["capture_s"]
+    assert seconds["done"] == pytest.approx(0.025 * (lines + 2) + 0.25 + 1.6)
+    assert _store(out, "patches").sizes["patch"] == 12 * 16
+    assert published.receipt["savings"]["tokens"]["ratio"] == 1
+
+
+def test_the_coarse_look_is_the_mean_of_the_scan(scanned: tuple[Path, Any]) -> None:
+    """Pixels of the stored mosaic are means of 4 x 4 pixels of the patches, which rectify the same lines."""
+    out, _ = scanned
+    patches, mosaic = _store(out, "patches"), _store(out, "mosaic")
+    whole = np.full((96, 128, 3), np.nan, np.float32)
+    for patch, patch_number in zip(patches["values"].values, patches["patch"].values.tolist(), strict=True):
+        y, x = 8 * (patch_number // 16), 8 * (patch_number % 16)
+        whole[y : y + 8, x : x + 8] = patch
+    means, _ = block_means(whole, np.ones((96, 128), np.intp), 4)
+    np.testing.assert_allclose(mosaic["values"].values, means, rtol=2e-3, atol=0.2)  # tables of ties beside rays
+
+
+def test_receipt_and_pages_tell_a_scan(scanned: tuple[Path, Any]) -> None:
+    """What was taken and expected, the best in the same seconds, and no word of looking twice."""
+    _, published = scanned
+    receipt, page = published.receipt, (published.folder / "report.html").read_text(encoding="utf-8")
+    assert receipt["plan"]["kind"] == "scan"
+    taken = receipt["scans"]["taken"]
+    assert (taken["step"], taken["exposure_ms"], taken["expected_miou"]) == (2, 25.0, pytest.approx(0.91))
+    assert taken["seconds"] == pytest.approx(receipt["savings"]["capture_s"]["done"])
+    assert receipt["scans"]["best_in_time"]["expected_miou"] >= taken["expected_miou"] - 1e-3
+    assert "captured again" not in page
+    capture, reference = receipt["savings"]["capture_s"], receipt["scans"]["reference"]
+    assert capture["full"] == reference["seconds"] < receipt["field"]["camera_s"]["full_scan"]
+    assert "the coarse pass alone" not in page.partition("What it cost")[0]
+    assert "the field was scanned once: every 2nd line, 25 ms" in page
+    assert "about 91.0 ± 3.0" in page
+
+
+def test_what_is_read_in_part_is_not_promised_what_reading_everything_scores(
+    survey_png: Survey, recorded: Path, tmp_path: Path
+):
+    """The record tells of scans that are read whole, and the sentence says so."""
+    published = survey_png(tmp_path, weights=str(recorded), budget=None, scan_step="2", macs="40%", policy="sobel")
+    page = (published.folder / "report.html").read_text(encoding="utf-8")
+    assert "this one, read whole: " in page
+    assert "this one: " not in page
+
+
+def test_a_survey_in_two_passes_stands_beside_the_best_plain_scan(
+    survey_png: Survey, recorded: Path, tmp_path: Path
+) -> None:
+    """Its receipt and its page name the scan that the record promises most of in the same seconds."""
+    published = survey_png(tmp_path, weights=str(recorded))
+    best, done = published.receipt["scans"]["best_in_time"], published.receipt["savings"]["capture_s"]["done"]
+    assert best["seconds"] <= done
+    assert best["expected_miou"] > 0.9
+    page = (published.folder / "report.html").read_text(encoding="utf-8")
+    told = f"{100 * best['expected_miou']:.1f} ± {100 * best['expected_spread']:.1f}"
+    assert f"{best['seconds']:.1f} s, about {told}" in page
+    assert "taken" not in published.receipt["scans"]
+
+
+def test_seconds_choose_the_scan_and_are_kept(
+    survey_png: Survey, recorded: Path, make_weights: WeightsMaker, tmp_path: Path
+) -> None:
+    """It ends in time, the settings say what was chosen, and read again by other weights the light is found."""
+    published = survey_png(tmp_path, budget=None, seconds="4", weights=str(recorded))
+    settings, done = published.receipt["settings"], published.receipt["savings"]["capture_s"]["done"]
+    assert 3.5 < done <= 4
+    assert settings["seconds"] == 4
+    assert settings["scan_step"] in (1, 2, 4)
+    flat = {**RECORD, "miou": [[0.5] * 3, [0.5] * 3, [0.9, 0.5, 0.5]]}  # these would have taken every fourth line
+    captured = {path.parent.name for path in tmp_path.glob("**/capture/**/*.zarr")}
+    assert run_reprocess(ReprocessRequest(tmp_path, weights=make_weights(scans=flat)), QUIET) == 0
+    assert {path.parent.name for path in tmp_path.glob("**/capture/**/*.zarr")} == captured
+    newest = max(tmp_path.glob("runs/*/receipt.json"), key=lambda path: path.stat().st_mtime)
+    again = json.loads(newest.read_text())
+    assert {name: again["settings"][name] for name in ("scan_step", "scan_exposure_ms")} == {
+        name: settings[name] for name in ("scan_step", "scan_exposure_ms")
+    }
+    assert {one["name"]: one["state"] for one in again["stages"]}["capture_coarse"] == "cached"
+
+
+def test_a_mirror_off_the_plan_is_put_right_in_a_scan_too(survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
+    """Sweeps overlap and are registered by what neighbours show twice; every patch is seen, and in the seconds asked."""
+    flags = {"budget": None, "seconds": "12", "pointing_px": "3", "weights": str(recorded)}
+    published = survey_png(tmp_path, **flags)
+    assert published.receipt["savings"]["capture_s"]["done"] <= 12
+    states = {one["name"]: one["state"] for one in published.receipt["stages"]}
+    assert states["register_coarse"] == "ran"
+    seen = _store(tmp_path, "patches")["valid"].values
+    assert seen.mean() > 0.95
+
+
+def test_plan_shows_what_seconds_buy(scene_files: Path, recorded: Path, tmp_path: Path) -> None:
+    """The frontier rises in seconds and expected mIoU; the scan that would be taken stands beside it."""
+    given = {
+        "scene": str(scene_files / "scene.png"),
+        "source": "sim",
+        "weights": str(recorded),
+        "goal": "88",
+        "out": str(tmp_path),
+    }
+    told = plan_content(load_settings(None, given))["scans"]
+    seconds = [scan["seconds"] for scan in told["frontier"]]
+    expected = [scan["expected_miou"] for scan in told["frontier"]]
+    assert seconds == sorted(seconds)
+    assert expected == sorted(expected)
+    assert told["taken"]["expected_miou"] >= 0.88
+    assert told["reference"]["expected_miou"] >= max(expected) - 0.005
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "words"),
+    [
+        ({"seconds": "0.5"}, BudgetError, r"--seconds 0\.5; the least is \d"),
+        ({"bytes_raw": "1kB"}, BudgetError, r"--bytes-raw 1000; the least is"),
+        ({"goal": "99"}, BudgetError, r"--goal 99: the most that these weights' scans reached is 94\.0"),
+        ({"goal": "weed=50"}, SettingsError, r"--goal weed=50: the weights tell apart class_1"),
+        ({"goal": "many"}, SettingsError, r"--goal must be the least mIoU of the map in percent"),
+        ({"goal": "0"}, SettingsError, r"above 0 and at most 100"),
+        ({"seconds": "nan"}, SettingsError, r"--seconds must be a number from 0\.1"),
+        ({"seconds": "5", "budget": "0.5"}, SettingsError, r"--seconds asks for one uniform scan .* --budget is for"),
+        ({"seconds": "5", "scan_step": "2"}, SettingsError, r"--scan-step makes it: leave one out"),
+        ({"seconds": "5", "camera.exposure_ms": "5"}, SettingsError, r"tells of exposures from 6 ms.*--scan-step"),
+        ({"scan_exposure_ms": "25"}, SettingsError, r"give --scan-step too"),
+        ({"scan_step": "0"}, SettingsError, r"--scan-step must be a whole number from 1 to 8"),
+    ],
+)
+def test_what_no_scan_can_do_is_refused_in_a_sentence(
+    survey_png: Survey, recorded: Path, tmp_path: Path, given: dict[str, str], error: type[Exception], words: str
+) -> None:
+    """One message says what was asked, what there is, and what to do; nothing is left in the archive."""
+    with pytest.raises(error, match=words):
+        survey_png(tmp_path / "out", **{"budget": None, "weights": str(recorded)} | given)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("exposure_ms", "told"), [("6", True), ("5", False), ("100", True), ("101", False)])
+def test_nothing_is_expected_of_a_scan_beyond_the_record(
+    scene_files: Path, recorded: Path, tmp_path: Path, exposure_ms: str, told: bool
+) -> None:
+    """By hand any exposure may be taken; one beside those that were judged has no expectation."""
+    given = {"scene": str(scene_files / "scene.png"), "source": "sim", "weights": str(recorded), "out": str(tmp_path)}
+    scan = {"scan_step": "2", "scan_exposure_ms": exposure_ms}
+    assert (plan_content(load_settings(None, given | scan))["scans"]["taken"] is not None) == told
+
+
+def test_weights_without_a_record_scan_by_hand_alone(survey_png: Survey, tmp_path: Path) -> None:
+    """Old weights: seconds are refused with what to do instead, and a scan by hand has no expectation."""
+    with pytest.raises(
+        WeightsError, match=r"no record of uniform scans.*--scan-step and --scan-exposure-ms.*for validation"
+    ):
+        survey_png(tmp_path / "none", budget=None, seconds="5")
+    published = survey_png(tmp_path / "by hand", budget=None, scan_step="4")
+    assert "scans" not in published.receipt
+    assert "full_scan" not in published.receipt["savings"]["capture_s"]
+    page = (published.folder / "report.html").read_text(encoding="utf-8")
+    assert "instead of" in page
+    assert "the weights have no scan performance table, so that seconds stand beside every line" in page
+    assert published.receipt["plan"]["reason"] == "the field was scanned once: every 4th line, 100 ms"

@@ -1,0 +1,114 @@
+"""Training of a reader of memories: what it is trained on, what it says of itself, and what it refuses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+import flows.training.train_temporal as remember
+from flows.tasks.survey_model import shipped_weights
+from flows.training.train_temporal import TemporalRequest, _moments, run_remember, train_temporal
+from models.evaluation.metrics import confusion, mean_iou
+from models.network.sizes import TemporalSizes
+from models.reading.prior_map import Observation, PriorMap, first_probabilities, fuse
+from models.training.temporal import PastPass, TemporalTraining, Visit, train_reader
+from models.weights.files import content_key, describe_weights, load_reader
+from pipeline.errors import SettingsError
+
+QUICK = TemporalTraining(minutes=0.5, steps=2, batch=2, crop=64, visits=2)
+
+
+def test_a_reader_learns_whom_to_believe() -> None:
+    """Looks that are right in 95 of 100 pixels on one side of a band and wrong on the other, memories the other way."""
+    rng, classes, columns = np.random.default_rng(0), 3, 4
+    lands = []
+    for _ in range(4):
+        labels = rng.integers(0, classes, (64, 64), dtype=np.uint8)
+        coarse = np.zeros((16, 16, columns), np.float16)
+
+        def scan_pass(right: float, step: int, truth: np.ndarray = labels, still: np.ndarray = coarse) -> PastPass:
+            said = np.where(rng.random(truth.shape) < right, truth, rng.integers(0, classes, truth.shape))
+            probability = np.full((*truth.shape, classes), 0.1, np.float16)
+            np.put_along_axis(probability, said[..., None], np.float16(0.8), axis=-1)
+            return PastPass(step, 0.25, probability, still)
+
+        lands.append([Visit(1.0, labels, [scan_pass(0.95, 1)]), Visit(4.0, labels, [scan_pass(0.3, 4)])])
+    reader, steps = train_reader(lands, TemporalTraining(steps=60, batch=4, crop=64, visits=2), 4)
+    assert steps == 60
+    first, later = lands[0]
+    images = [np.log(visit.scan_passes[0].probability.astype(np.float32)) for visit in (first, later)]
+    seen, coarse = np.ones((64, 64), np.bool_), np.zeros((16, 16, columns), np.float32)
+    before, now = (Observation(image, seen, coarse, 0.25, step) for image, step in zip(images, (1, 4), strict=True))
+    after = fuse(PriorMap(first_probabilities(before), coarse, 3.0), now, reader)
+    scores = [
+        mean_iou(confusion(first.labels, one.classes()[0], classes))
+        for one in (first_probabilities(before), first_probabilities(now), after)
+    ]
+    assert scores[2] > scores[0] - 0.01
+    assert scores[2] > scores[1] + 0.3
+
+
+def test_lands_are_visited_in_the_order_of_their_days() -> None:
+    """Five visits, none before the one before it, all within the farm's year."""
+    for seed in range(40):
+        days = [day for day, _ in _moments(np.random.default_rng(seed))]
+        assert days == sorted(days)
+        assert len(days) == 5
+        assert 95 <= days[0] < 290
+        assert days[-1] <= 318
+
+
+@pytest.mark.parametrize("plain", [False, True])
+def test_the_command_trains_judges_and_says_how(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, plain: bool) -> None:
+    """A file for the weights that it was trained for, with seeds, settings and what it is worth on another land."""
+    monkeypatch.setattr(remember, "VISITS", 2)
+    monkeypatch.setattr(remember, "JUDGED_AFTER", (3,))
+    monkeypatch.setattr(remember, "STEPS", {4: 0.7, 1: 0.3})  # of which weights with coarse pixels of 2 px read one
+    out, weights = tmp_path / "farm.safetensors", shipped_weights(plain=plain)
+    request = TemporalRequest("farm", weights, out, 1, 1, (128, 192), QUICK, "spectralzoom train")
+    record = run_remember(request, Console(quiet=True))
+    found = describe_weights(out).reader
+    assert found is not None
+    assert content_key(out) == content_key(weights)
+    assert load_reader(out).sizes.factor == (2 if plain else 4)
+    assert dict(found.record) == record
+    assert (record["lands"], record["steps"], record["command"]) == ([200_000], 2, "spectralzoom train")
+    assert [row["days"] for row in record["validation"]] == [3.0]
+    for row in record["validation"]:
+        assert row["prior_map"] > row["extent"] - 0.05  # hardly trained, it keeps to the memory
+
+
+@pytest.mark.parametrize(
+    ("dataset", "out", "why"),
+    [
+        (
+            "frames",
+            "x.safetensors",
+            "--remember trains on one land at several days, which only the built-in farm gives",
+        ),
+        ("farm", "no/x.safetensors", "expected the name of a file in a folder that exists"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused(tmp_path: Path, dataset: str, out: str, why: str) -> None:
+    """Other data than the farm, and a place that is not there, before anything is looked at."""
+    with pytest.raises(SettingsError, match=why):
+        train_temporal(TemporalRequest(dataset, shipped_weights(), tmp_path / out))
+
+
+def test_weights_of_other_classes_are_refused(tmp_path: Path, weights: Path) -> None:
+    """The farm has its own."""
+    with pytest.raises(SettingsError, match="expected weights of the farm's classes, soil, maize"):
+        train_temporal(TemporalRequest("farm", weights, tmp_path / "x.safetensors"))
+
+
+@pytest.mark.parametrize(("plain", "factor"), [(False, 4), (True, 2)])
+def test_the_shipped_weights_have_a_reader(plain: bool, factor: int) -> None:
+    """It fits them, was trained for them, and tells the lands that it has seen."""
+    weights = shipped_weights(plain=plain)
+    found = describe_weights(weights).reader
+    assert found is not None
+    assert min(found.record["lands"]) >= 200_000
+    assert found.sizes == load_reader(weights).sizes == TemporalSizes(11, 24, factor)

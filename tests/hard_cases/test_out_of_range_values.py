@@ -1,0 +1,223 @@
+"""Hard cases of values: numbers that no sensor gives, from the bound to the end of float32, infinite or none."""
+
+from __future__ import annotations
+
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from flows.tasks.field_work import patch_features
+from models.network.spectral import MOST_COLUMN
+from models.policies.policies import score_patches
+from models.reading.inference import (
+    CoarsePrediction,
+    DrawnMap,
+    coarse_prediction,
+    coarse_prediction_of_columns,
+    decide,
+    read_coarse_pass,
+    segment,
+)
+from models.reading.regions import whole_field
+from models.weights.files import Weights
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import UNLABELLED, SceneGrid
+from pipeline.geometry.scan import CostModel
+from pipeline.planning.fine_pass import FinePlan, plan_fine
+from pipeline.readings import MOST_VALUE, beyond_range, find_beyond, readings_alone
+from tests.models.conftest import make_weights
+
+WEIGHTS = make_weights(0)
+GRID, NM = SceneGrid(48, 64, 8, 2), np.linspace(420, 980, 7)
+MOST = WEIGHTS.normalisation.most_value
+COARSE = np.random.default_rng(0).uniform(0.1, 0.5, (*GRID.coarse_shape, 7)).astype(np.float32)
+PATCHES = np.array([3, 9, 20, 21])
+FINE = np.random.default_rng(1).uniform(0.1, 0.5, (len(PATCHES), 8, 8, 7)).astype(np.float32)
+FAR = np.float32(np.finfo(np.float32).max)
+
+sizes = st.floats(float(np.log10(MOST * 1.001)), 38.5).map(lambda power: np.float32(min(10.0**power, float(FAR))))
+OUT_OF_RANGE = st.one_of(
+    sizes, sizes.map(lambda size: -size), st.sampled_from([np.inf, -np.inf, np.nan, 1e9, 1e18, 1e30, FAR])
+)
+
+
+def _drawn(coarse: NDArray[np.float32], fine: NDArray[np.float32]) -> tuple[CoarsePrediction, DrawnMap]:
+    seen = coarse_prediction(WEIGHTS, coarse, NM, GRID)
+    store: Any = SimpleNamespace(patch_index=PATCHES, pick=lambda entries: fine[entries])
+    patch_index, columns = patch_features(WEIGHTS, store, NM, seen, whole_field(GRID))
+    return seen, segment(WEIGHTS, seen, columns, patch_index)
+
+
+def _alike(one: tuple[CoarsePrediction, DrawnMap], other: tuple[CoarsePrediction, DrawnMap]) -> bool:
+    parts = [
+        (a.columns, a.probability, a.gain, score_patches("entropy", a), b.classes, b.confidence)
+        for a, b in (one, other)
+    ]
+    return all(np.asarray(a).tobytes() == np.asarray(b).tobytes() for a, b in zip(*parts, strict=True))
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    value=OUT_OF_RANGE,
+    y=st.integers(0, 23),
+    x=st.integers(0, 31),
+    bands=st.sets(st.integers(0, 6), min_size=1),
+    at=st.booleans(),
+)
+@example(value=np.float32(1e30), y=3, x=3, bands=set(range(7)), at=True)
+@example(value=np.float32(1e18), y=3, x=3, bands=set(range(7)), at=True)
+@example(value=np.float32(1e30), y=3, x=3, bands=set(range(7)), at=False)
+def test_a_out_of_range_value_is_as_if_it_had_not_been_captured(
+    value: float, y: int, x: int, bands: set[int], at: bool
+) -> None:
+    """A pixel of the coarse or of the fine pass, in some bands or all: every bit is as with NaN in its place."""
+    out_of_range, hole = (COARSE if at else FINE).copy(), (COARSE if at else FINE).copy()
+    place = (y, x, sorted(bands)) if at else (y % len(PATCHES), y % 8, x % 8, sorted(bands))
+    out_of_range[place], hole[place] = value, np.nan
+    with np.errstate(all="raise", under="ignore"):
+        one, other = (_drawn(*((cube, FINE) if at else (COARSE, cube))) for cube in (out_of_range, hole))
+    assert _alike(one, other)
+    assert np.isfinite(one[0].probability).all()
+    assert (one[1].classes < len(WEIGHTS.class_names)).all()
+
+
+def test_out_of_range_pixels_are_counted() -> None:
+    """By the pixel, whatever the number of bands; NaN is none of them."""
+    coarse, fine = COARSE.copy(), FINE.copy()
+    coarse[2, 5], coarse[7, 1, 3], coarse[0, 0] = 1e30, -1e20, np.nan
+    fine[1, 2, 3], fine[1, 2, 4, 0], fine[3, 0, 0], fine[0, 0, 0] = 1e18, np.inf, FAR, np.nan
+    scan_pass = read_coarse_pass(WEIGHTS, [coarse[:10], coarse[10:]], NM, GRID)
+    assert scan_pass.out_of_range is not None
+    assert np.argwhere(scan_pass.out_of_range).tolist() == [[2, 5], [7, 1]]
+    store: Any = SimpleNamespace(patch_index=PATCHES, pick=lambda entries: fine[entries])
+    counts = np.zeros(GRID.patch_shape, np.int64).ravel()
+    patch_features(WEIGHTS, store, NM, scan_pass, whole_field(GRID), out_of_range=counts)
+    assert counts[PATCHES].tolist() == [0, 2, 0, 1]
+    assert read_coarse_pass(WEIGHTS, [COARSE], NM, GRID).out_of_range is None
+
+
+@pytest.mark.parametrize("fraction", [0.2, 1.0])
+def test_a_field_of_out_of_range_values_still_ends(fraction: float) -> None:
+    """A fifth of the pixels, and all of them: as with NaN there, without a warning."""
+    where = np.random.default_rng(2).random(GRID.coarse_shape) < fraction
+    out_of_range, hole = COARSE.copy(), COARSE.copy()
+    out_of_range[where], hole[where] = 1e30, np.nan
+    assert _alike(_drawn(out_of_range, FINE), _drawn(hole, FINE))
+
+
+@pytest.mark.parametrize("value", [10 * MOST_COLUMN, 1e18, 1e30, FAR, np.inf, -np.inf])
+def test_columns_that_no_reading_gives_are_dead(value: float) -> None:
+    """Given normalised already, to the coarse prediction or to the map, they count as NaN does."""
+    columns = np.random.default_rng(3).normal(0, 1, (*GRID.coarse_shape, 4)).astype(np.float32)
+    patches = np.random.default_rng(4).normal(0, 1, (2, 8, 8, 4)).astype(np.float32)
+    found = []
+    for one in (value, np.nan):
+        coarse, fine = columns.copy(), patches.copy()
+        coarse[4, 6, 2], fine[1, 3, 5, 0] = one, one
+        seen = coarse_prediction_of_columns(WEIGHTS, coarse, GRID)
+        found.append((seen, segment(WEIGHTS, seen, fine, np.array([4, 30]))))
+    assert _alike(*found)
+    assert np.isfinite(found[0][0].probability).all()
+
+
+def test_a_logit_that_is_no_number_is_no_class() -> None:
+    """NaN and +inf are 255 with a confidence of NaN, and nothing beside them changes; -inf is a class ruled out."""
+    logits = torch.tensor([[1.0, np.nan, np.inf, -np.inf, 3.0], [2.0, 0.0, 0.0, 1.0, 4.0]])
+    confidence, classes = decide(logits, dim=0)
+    assert classes.tolist() == [1, UNLABELLED, UNLABELLED, 1, 1]
+    assert torch.isnan(confidence).tolist() == [False, True, True, False, False]
+    assert classes.dtype == torch.uint8
+
+
+def test_weights_that_overflow_draw_no_class() -> None:
+    """Finite weights whose logits are not: the map says nothing there, instead of class 0."""
+    weights: Weights = make_weights(0)
+    with torch.no_grad():
+        weights.segmenter.coarse_classes.weight.fill_(3e38)
+        weights.segmenter.fine_classes.weight.fill_(3e38)
+    seen = coarse_prediction(weights, COARSE, NM, GRID)
+    drawn = segment(weights, seen, weights.columns(FINE, NM), PATCHES)
+    lost = np.isnan(drawn.confidence)
+    assert lost.mean() > 0.5
+    assert (drawn.classes[lost] == UNLABELLED).all()
+    assert (drawn.classes[~lost] != UNLABELLED).all()
+
+
+# --- scores -----------------------------------------------------------------------------------------------------------
+
+FIELD, CAMERA, COST = SceneGrid(200, 900, 32, 4), LineCamera(), CostModel()
+SCORES = np.random.default_rng(3).exponential(size=int(np.prod(FIELD.patch_shape))) ** 3
+
+
+@cache
+def _usual(threshold: float | None) -> FinePlan:
+    return _plan(SCORES, threshold)
+
+
+def _plan(scores: NDArray[np.float64], threshold: float | None = None) -> FinePlan:
+    return plan_fine(FIELD, CAMERA, COST, "x", scores, budget_s=15.0, threshold=threshold)
+
+
+@settings(max_examples=6, deadline=None)
+@given(power=st.integers(-1000, 1010), limited=st.booleans())
+@example(power=1010, limited=True)
+@example(power=997, limited=False)  # about 1e300
+def test_the_unit_of_scores_does_not_matter(power: int, limited: bool) -> None:
+    """Scores times any power of two buy the same lines and share, with or without a threshold."""
+    usual = _usual(0.5 if limited else None)
+    scaled = _plan(np.ldexp(SCORES, power), float(np.ldexp(0.5, power)) if limited else None)
+    assert scaled.sweeps == usual.sweeps
+    assert scaled.expected_gain == np.ldexp(usual.expected_gain, power)
+    assert scaled.wanted_gain == np.ldexp(usual.wanted_gain, power)
+
+
+@pytest.mark.parametrize("value", [1e300, 1.7e308, np.finfo(np.float64).max])
+def test_sums_beyond_all_numbers_are_told_in_a_larger_unit(value: float) -> None:
+    """Every patch of nearly the largest score there is: the plan of equal ones, and its fraction of the score."""
+    plan, usual = _plan(np.full(SCORES.shape, value)), _plan(np.ones(SCORES.shape))
+    assert plan.sweeps == usual.sweeps
+    assert plan.seconds <= 15.0
+    assert plan.expected_gain / plan.wanted_gain == pytest.approx(usual.expected_gain / usual.wanted_gain)
+    assert np.isfinite([plan.expected_gain, plan.wanted_gain]).all()
+
+
+def test_infinite_scores_lead_huge_ones() -> None:
+    """+inf is worth more than all of 1e300 together; NaN and below 0 are worth nothing beside them."""
+    scores = 1e300 * SCORES
+    scores[7], scores[40:60], scores[60:80] = np.inf, np.nan, -1e300
+    plan, bare = _plan(scores), _plan(np.where(np.arange(len(scores)) == 7, 1.0, 0.0))
+    assert set(bare.patch_index) & {7} <= set(plan.patch_index)
+    assert np.isfinite(plan.expected_gain)
+    zeroed = np.where(np.isnan(scores) | (scores < 0), 0.0, scores)
+    assert _plan(zeroed).sweeps == plan.sweeps
+
+
+# --- the rule itself --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64, np.int64, np.uint32, np.uint16, np.uint8, bool])
+def test_the_bound_is_inclusive_and_knows_every_kind(kind: Any) -> None:
+    """Values up to 1e9 are readings in any type; short whole numbers cannot be larger."""
+    values = np.ones((2, 3, 4), kind)
+    assert beyond_range(values) is None
+    if np.dtype(kind).itemsize > 2:
+        values[1, 2, 3] = MOST_VALUE
+        assert find_beyond(values) is None
+        values[1, 2, 3] = 2 * MOST_VALUE
+        found = find_beyond(values)
+        assert found is not None
+        assert (found.count, found.place, float(found.value)) == (1, (1, 2, 3), 2 * MOST_VALUE)
+
+
+def test_readings_stay_the_same_array() -> None:
+    """No copy is made where there is nothing to take out, and NaN stays NaN where there is."""
+    values = np.array([[1.0, np.nan, -5.0]], np.float32)
+    assert readings_alone(values, 10.0) is values
+    np.testing.assert_array_equal(readings_alone(values, 2.0), [[1.0, np.nan, np.nan]])

@@ -1,0 +1,64 @@
+"""How doubtful what is remembered is: hand-worked numbers, strips, and pixels of which nothing is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from models.reading.expected_errors import PatchExpectedErrors, expected_error_of
+from pipeline.geometry.grid import SceneGrid
+
+GRID = SceneGrid(8, 12, 4, 1)
+
+
+def believed(sure: float, classes: int = 3, shape: tuple[int, int] = (8, 12), kind: int = 0) -> np.ndarray:
+    """Log-probabilities of a field that is believed to be of one class, so surely."""
+    probabilities = np.full((*shape, classes), np.log((1 - sure) / (classes - 1)), np.float32)
+    probabilities[..., kind] = np.log(sure)
+    return probabilities
+
+
+def test_a_expected_error_is_what_certainty_leaves() -> None:
+    """Sure by 0.9, it is 0.1; of what is not known any class is as likely, two in three wrong of three classes."""
+    probabilities = believed(0.9)
+    probabilities[0, 0] = np.nan
+    expected_error = expected_error_of(probabilities)
+    assert expected_error[3, 3] == pytest.approx(0.1, rel=1e-5)
+    assert expected_error[0, 0] == pytest.approx(2 / 3)
+
+
+def test_a_look_is_worth_what_it_mends_of_each_class() -> None:
+    """Half of a class of 48 px is wrong by 0.4 and a look by 0.1: 0.5 x 0.3 of one class of two, over two patches."""
+    probabilities = believed(0.999)
+    probabilities[:4, :6], probabilities[4:] = believed(0.6, shape=(4, 6)), believed(0.999, shape=(4, 12), kind=1)
+    expected_errors = PatchExpectedErrors.of([(probabilities, np.zeros((8, 12)))], GRID, 3)
+    expected_gain = expected_errors.expected_gain(np.array([0.1, 0.1, 0.1]))
+    step = expected_errors.expected_error[
+        np.searchsorted(expected_errors.expected_error, 0.4)
+    ]  # expected errors are kept in steps, no less than they are
+    assert expected_gain.sum() == pytest.approx(0.5 * (step - 0.1) / 2)
+    assert np.flatnonzero(expected_gain).tolist() == [0, 1]
+    assert expected_gain[0] == pytest.approx(2 * expected_gain[1])
+
+
+def test_a_look_that_sees_worse_than_is_remembered_is_worth_nothing() -> None:
+    """However much of the field it shows."""
+    expected_errors = PatchExpectedErrors.of([(believed(0.95), np.zeros((8, 12)))], GRID, 3)
+    assert not expected_errors.expected_gain(np.full(3, 0.2)).any()
+
+
+@given(st.integers(1, 2), st.integers(0, 2**32 - 1))
+def test_swaths_say_what_the_whole_says(high: int, seed: int) -> None:
+    """Read some rows of patches at a time, counts, ages and expected errors are those of the field at once."""
+    rng = np.random.default_rng(seed)
+    probabilities = np.log(rng.dirichlet(np.ones(3), (8, 12))).astype(np.float32)
+    age = np.where(rng.random((8, 12)) < 0.1, np.nan, rng.random((8, 12)) * 30)
+    rows = 4 * high
+    swaths = [(probabilities[top : top + rows], age[top : top + rows]) for top in range(0, 8, rows)]
+    whole, parts = (PatchExpectedErrors.of(one, GRID, 3) for one in ([(probabilities, age)], swaths))
+    assert np.array_equal(whole.pixels, parts.pixels)
+    assert np.array_equal(whole.age_days, parts.age_days)
+    assert whole.pixels.sum() == 8 * 12
+    assert 0 < whole.expected_wrong() <= 2 / 3 * whole.expected_error[1] / whole.expected_error[0]

@@ -1,0 +1,77 @@
+"""What is measured as familiar: known rates on scenes of Gaussian spectra, and what cannot be measured."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from models.network.spectral import Normalisation
+from models.training.calibration import JudgedMap, fitted_temperature, judge_confidence
+from models.training.capture_augmentation import ColumnNoise
+from models.training.examples import Example
+from models.training.ood_fit import components, fit_ood
+from pipeline.errors import SceneError
+
+COLUMNS = 3
+PLAIN = Normalisation(*(np.zeros(COLUMNS, np.float32), np.ones(COLUMNS, np.float32), np.eye(COLUMNS, dtype=np.float32)))
+
+
+def scene(seed: int, side: int = 48) -> Example:
+    """Two classes of Gaussian spectra in halves, one of them rare, with the noise of a camera."""
+    rng = np.random.default_rng(seed)
+    labels = np.zeros((side, side), np.uint8)
+    labels[:, -side // 8 :] = 1
+    labels[:2, :2] = 255
+    middles = np.array([[1.0, 2.0, 3.0], [3.0, 2.0, 1.0], [50.0, 50.0, 50.0]])
+    fine = middles[np.minimum(labels, 2)] + 0.1 * rng.standard_normal((side, side, COLUMNS))
+    coarse = fine.reshape(side // 4, 4, side // 4, 4, COLUMNS).mean(axis=(1, 3))
+    noise = ColumnNoise(np.full(COLUMNS, 1e-5), 1e-6 * np.eye(COLUMNS))
+    return Example(f"{seed}", fine.astype(np.float16), coarse.astype(np.float32), labels, labels.shape, noise)
+
+
+def test_known_spectra_are_unknown_at_the_rate_that_is_stated() -> None:
+    """On scenes that nothing was measured on, bright or dark; others are, and so is what had no label."""
+    ood_detector = fit_ood(
+        [scene(i) for i in range(4)], [scene(i) for i in range(10, 13)], PLAIN, darkest_ms=3.0, bands=9, seed=0
+    )
+    fresh = np.concatenate([scene(i).fine[4:].reshape(-1, COLUMNS) for i in range(20, 26)])
+    fraction = ood_detector.unknown(fresh, rate=0.01, light=1.0, step=1, bands=9).mean()
+    assert 0.004 < fraction < 0.02
+    out_of_range = np.array([[2.0, 0.0, 2.0], [3.0, 3.0, 3.0], [50.0, 50.0, 50.0], [1.0, 4.0, 3.0]])
+    assert ood_detector.unknown(out_of_range, rate=0.01, light=1.0, step=1, bands=9).all()
+
+
+def test_a_scene_to_measure_the_rate_on_is_needed() -> None:
+    """Nobody could say otherwise how often a known pixel is called unknown."""
+    with pytest.raises(SceneError, match="no scene was kept"):
+        fit_ood([scene(0)], [], PLAIN, darkest_ms=3.0, bands=9, seed=0)
+
+
+def test_columns_that_repeat_each_other_have_a_covariance() -> None:
+    """One that can be inverted, and the middles are those of the data; a class of one pixel is no obstacle."""
+    rng = np.random.default_rng(0)
+    one = rng.normal(0, 1, (400, 1))
+    pixels = np.concatenate([one, one, np.ones((400, 1))], axis=1).astype(np.float32)
+    classes = np.zeros(400, np.uint8)
+    classes[-1] = 1
+    centres, covariance = components(pixels, classes, 0)
+    assert np.isfinite(np.linalg.cholesky(covariance)).all()
+    np.testing.assert_allclose(centres[:, 2], 1)
+
+
+def judged(sharpness: float, seed: int = 0) -> JudgedMap:
+    """Maps whose labels are drawn from the probabilities, told ``sharpness`` times as sure as they are."""
+    rng = np.random.default_rng(seed)
+    logits = rng.normal(0, 2, (6000, 4))
+    odds = np.exp(logits) / np.exp(logits).sum(axis=1, keepdims=True)
+    labels = (rng.random((6000, 1)) > odds.cumsum(axis=1)).sum(axis=1).astype(np.uint8)
+    told = sharpness * logits
+    return JudgedMap((told - np.log(np.exp(told).sum(axis=1, keepdims=True))).astype(np.float32), labels)
+
+
+def test_a_map_too_sure_of_itself_gets_the_temperature_that_it_lacks() -> None:
+    """About the factor that it was too sure by, and its error falls; which class is likeliest stays."""
+    told = judge_confidence([judged(2.5)], seed=0)
+    assert told["temperature"] == pytest.approx(2.5, rel=0.1)
+    assert told["expected_error"] < 0.02 < told["expected_error_before"]
+    assert fitted_temperature([judged(0.5, 1)], 0) == pytest.approx(0.5, rel=0.1)

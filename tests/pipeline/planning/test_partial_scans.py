@@ -1,0 +1,178 @@
+"""Looks at a part of a field: every patch has its line, and no run of lines in the same seconds is worth more."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.errors import SettingsError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Axis, CostModel, exposing
+from pipeline.planning.coverage import patches_shown, uniform_sweeps
+from pipeline.planning.partial_scans import PatchRows, cheapest_row_seconds, partial_scan, sweeps_of_runs
+
+GRID, CAMERA, COST = SceneGrid(320, 416, 16, 4), LineCamera(samples=160), CostModel()
+WIDER = LineCamera(samples=240)
+EXPOSURE_MS = 5.0
+
+
+def rows_of(along: Axis = "x", step: int = 2) -> PatchRows:
+    """Rows of patches in the sweeps of a scan, three strips of them."""
+    return PatchRows.of(uniform_sweeps(GRID, CAMERA, along, step=step, exposure_ms=EXPOSURE_MS), GRID, CAMERA)
+
+
+ROWS = rows_of()
+WHOLE_S = COST.seconds(list(ROWS.sweeps), CAMERA)
+worths = st.integers(0, 2**32 - 1).map(lambda seed: _patchy(np.random.default_rng(seed)))
+
+
+def _patchy(rng: np.random.Generator) -> np.ndarray:
+    """Worth of the patches, much of it in a few places."""
+    expected_gain = rng.random(GRID.patch_shape) * 0.1
+    top, left = rng.integers(0, GRID.patch_shape[0] - 4), rng.integers(0, GRID.patch_shape[1] - 4)
+    expected_gain[top : top + 4, left : left + 4] += 5 * rng.random()
+    return np.asarray(expected_gain.ravel())
+
+
+@pytest.mark.parametrize("along", ["x", "y"])
+@pytest.mark.parametrize("step", [1, 2, 4])
+def test_every_patch_is_in_a_row_whose_lines_show_it(along: Axis, step: int) -> None:
+    """The lines of a row show the patches of that row, and all rows together the field."""
+    rows = rows_of(along, step)
+    assert (rows.row[GRID.valid_patches()] >= 0).all()
+    for number, place in np.argwhere(rows.there)[:: 7 if step > 1 else 3]:
+        run = (int(number), int(rows.first[number, place]), int(rows.stop[number, place]))
+        shown = patches_shown(sweeps_of_runs(rows.sweeps, [run]), GRID, CAMERA)
+        assert shown[rows.row == number * rows.first.shape[1] + place].all()
+
+
+@given(worths, st.floats(0.02, 1.2))
+def test_no_run_of_the_same_sweep_is_worth_more_in_its_seconds(expected_gain: np.ndarray, fraction: float) -> None:
+    """Each chosen run is worth most of all runs of its sweep that have as many lines or fewer."""
+    scan_pass = partial_scan(ROWS, expected_gain, CAMERA, COST, exposure_ms=EXPOSURE_MS, seconds=fraction * WHOLE_S)
+    sums = ROWS.sums(expected_gain)
+    for number, first, stop in () if scan_pass is None else scan_pass.runs:
+        firsts, stops, values = ROWS.first[number], ROWS.stop[number], sums[number]
+        taken = values[(firsts >= first) & (stops <= stop)].sum()
+        for begin, end in combinations(range(len(values) + 1), 2):
+            if stops[end - 1] - firsts[begin] <= stop - first:
+                assert values[begin:end].sum() <= taken * (1 + 1e-9)
+
+
+@given(worths, st.floats(0.1, 1.0), st.floats(0.1, 4.0))
+def test_no_run_of_one_swath_that_ends_in_time_is_worth_more(
+    expected_gain: np.ndarray, fraction: float, power: float
+) -> None:
+    """Whatever the strip: also where rows are worth the same, and no price of a second divides them."""
+    seconds = fraction * WHOLE_S
+    scan_pass = partial_scan(ROWS, expected_gain**power, CAMERA, COST, exposure_ms=EXPOSURE_MS, seconds=seconds)
+    found = 0.0 if scan_pass is None else scan_pass.expected_gain
+    for number, values in enumerate(ROWS.sums(expected_gain**power)):
+        for begin, end in combinations(range(len(values) + 1), 2):
+            run = (number, int(ROWS.first[number, begin]), int(ROWS.stop[number, end - 1]))
+            if COST.seconds(sweeps_of_runs(ROWS.sweeps, [run]), CAMERA) <= seconds:
+                assert values[begin:end].sum() <= found * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("fraction", [0.66, 0.8, 0.95])
+def test_hardly_any_runs_of_two_swaths_are_worth_more(seed: int, fraction: float) -> None:
+    """In the same seconds, set-ups included, where one load of the mirror's memory holds all lines."""
+    cost, expected_gain = (
+        CostModel(vector_pairs=100_000, capture_start_s=0.3),
+        _patchy(np.random.default_rng(seed)) ** 4,
+    )
+    rows = PatchRows.of(uniform_sweeps(GRID, WIDER, "x", step=4, exposure_ms=EXPOSURE_MS), GRID, WIDER)
+    assert len(rows.sweeps) == 2
+    given_s = fraction * cost.seconds(list(rows.sweeps), WIDER)
+    scan_pass = partial_scan(rows, expected_gain, WIDER, cost, exposure_ms=EXPOSURE_MS, seconds=given_s)
+    assert scan_pass is not None
+    sums, setup_s = rows.sums(expected_gain), cost.setup_seconds(exposing(WIDER, rows.sweeps[0]))
+    line_s = exposing(WIDER, rows.sweeps[0]).frame_ms * 1e-3
+    options = []
+    for values, first, stop in zip(sums, rows.first, rows.stop, strict=True):
+        pairs = [(begin, end - 1) for begin, end in combinations(range(len(values) + 1), 2)]
+        runs = [(setup_s + line_s * (stop[end] - first[begin]), values[begin : end + 1].sum()) for begin, end in pairs]
+        options.append(np.array([(0.0, 0.0), *runs]))
+    seconds, values = (np.add.outer(options[0][:, one], options[1][:, one]) for one in (0, 1))
+    best = values[seconds + cost.reload_s <= given_s + 1e-9].max()
+    assert 0.98 * best <= scan_pass.expected_gain <= best * (1 + 1e-9)
+
+
+def test_rows_worth_the_same_are_looked_at_as_far_as_time_goes() -> None:
+    """Of a block that the seconds do not pay for as much as they do, and no lines beside it."""
+    expected_gain = np.zeros(GRID.patch_shape)
+    expected_gain[4:16, 3:6] = 1.0
+    scan_pass = partial_scan(ROWS, expected_gain.ravel(), CAMERA, COST, exposure_ms=EXPOSURE_MS, seconds=2.2)
+    assert scan_pass is not None
+    shown = patches_shown(sweeps_of_runs(ROWS.sweeps, scan_pass.runs), GRID, CAMERA).reshape(GRID.patch_shape)
+    assert np.count_nonzero(shown[4:16, 3:6].all(axis=1)) >= 4
+    assert not shown[:3].any()
+    assert not shown[17:].any()
+
+
+@pytest.mark.parametrize("along", ["x", "y"])
+def test_a_patch_that_two_swaths_show_is_of_the_nearer(along: Axis) -> None:
+    """By how far its middle lies from the middle of their lines."""
+    rows = rows_of(along)
+    patch_index = GRID.valid_patches()
+    across = (GRID.patch_origin(patch_index) + GRID.patch / 2 - np.array([GRID.height, GRID.width]) / 2)[
+        :, "yx".index(along)
+    ]
+    off = np.abs(across[:, None] - np.array([sweep.swath_px for sweep in rows.sweeps]))
+    own = off[np.arange(len(patch_index)), rows.row[patch_index] // rows.first.shape[1]]
+    assert (own <= off.min(axis=1) + 1).all()  # lines are turned by a pixel at most
+
+
+@given(worths, st.floats(0.02, 1.2))
+def test_looks_end_in_time_and_are_worth_what_they_show(expected_gain: np.ndarray, fraction: float) -> None:
+    """Seconds are those of the cost model, at most those given; the worth is that of the rows the lines show."""
+    scan_pass = partial_scan(ROWS, expected_gain, CAMERA, COST, exposure_ms=EXPOSURE_MS, seconds=fraction * WHOLE_S)
+    if scan_pass is None:
+        assert cheapest_row_seconds(ROWS, CAMERA, COST, EXPOSURE_MS) > fraction * WHOLE_S
+        return
+    sweeps = sweeps_of_runs(ROWS.sweeps, scan_pass.runs)
+    assert scan_pass.seconds == COST.seconds(sweeps, CAMERA) <= fraction * WHOLE_S
+    assert scan_pass.expected_gain <= expected_gain[patches_shown(sweeps, GRID, CAMERA)].sum() * (1 + 1e-9)
+
+
+@given(worths)
+def test_more_seconds_are_worth_no_less(expected_gain: np.ndarray) -> None:
+    """And all the seconds of the whole scan buy all that a scan is worth."""
+    fractions = (0.3, 0.5, 0.7, 0.9, 1.0)
+    scan_passes = [
+        partial_scan(ROWS, expected_gain, CAMERA, COST, exposure_ms=EXPOSURE_MS, seconds=one * WHOLE_S)
+        for one in fractions
+    ]
+    found = [0.0 if scan_pass is None else scan_pass.expected_gain for scan_pass in scan_passes]
+    assert found == sorted(found)
+    assert found[-1] == pytest.approx(ROWS.sums(expected_gain).sum())
+
+
+def test_what_is_worth_much_is_looked_at_first() -> None:
+    """Of a field known but for one block, a look of few seconds is at the lines that show that block."""
+    expected_gain = np.zeros(GRID.patch_shape)
+    expected_gain[5:8, 3:6] = 1.0
+    scan_pass = partial_scan(ROWS, expected_gain.ravel(), CAMERA, COST, exposure_ms=EXPOSURE_MS, seconds=2.5)
+    assert scan_pass is not None
+    assert patches_shown(sweeps_of_runs(ROWS.sweeps, scan_pass.runs), GRID, CAMERA)[expected_gain.ravel() > 0].all()
+    assert len(scan_pass.runs) == 1
+
+
+@pytest.mark.parametrize(
+    ("runs", "told"),
+    [
+        ([(3, 0, 5)], "look is at sweep 3, the scan has sweeps 0 to 2"),
+        ([(0, 0, 100_000)], "lines 0 to 100000 of sweep 0, which has lines 0 to"),
+        ([(1, 0, 5), (1, 9, 12)], "names sweep 1 twice"),
+    ],
+)
+def test_lines_that_a_scan_does_not_have_are_refused(runs: list[tuple[int, int, int]], told: str) -> None:
+    """With what it has."""
+    with pytest.raises(SettingsError, match=told):
+        sweeps_of_runs(ROWS.sweeps, runs)

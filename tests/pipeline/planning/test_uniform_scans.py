@@ -1,0 +1,153 @@
+"""Uniform scans: what they cost, what a record expects of them, and the choice within limits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.errors import BudgetError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import CostModel
+from pipeline.planning.coverage import full_sweeps, on_scene, uniform_sweeps
+from pipeline.planning.uniform_scans import (
+    LOSS,
+    MIOU,
+    REFERENCE_LOSS,
+    ScanLimits,
+    ScanPerformance,
+    UniformScan,
+    choose_scan,
+    frontier,
+    priced_scan,
+    reference_scan,
+    uniform_scans,
+)
+
+CAMERA, COST, GRID = LineCamera(), CostModel(), SceneGrid(256, 320, 16, 4)
+SWEEPS = {step: uniform_sweeps(GRID, CAMERA, "x", step=step) for step in (1, 2, 4)}
+RECORD = ScanPerformance.read(
+    {
+        "scenes": 3,
+        "steps": [1, 2, 4],
+        "exposures_ms": [100.0, 25.0, 6.25],
+        "miou": [[0.94, 0.93, 0.89], [0.92, 0.91, 0.85], [0.83, 0.81, 0.74]],
+        "per_class_iou": {"weed": [[0.8, 0.7, 0.6], [0.7, 0.65, 0.5], [0.5, 0.4, 0.3]]},
+    }
+)
+
+
+def _scan(step: int, exposure_ms: float, camera: LineCamera = CAMERA) -> UniformScan:
+    return priced_scan(RECORD, SWEEPS[step], camera, COST, 270, exposure_ms)
+
+
+SCANS = uniform_scans(RECORD, SWEEPS, CAMERA, COST, 270)
+CHEAPEST = min(scan.seconds for scan in SCANS)
+
+
+def test_lines_of_a_scan_are_not_binned_and_cover_the_field() -> None:
+    """Every pixel across is seen by half or a quarter of the lines; with step 1 they are those of the full scan."""
+    full = full_sweeps(GRID, CAMERA, "x")
+    assert [replace(one, name="", kind="fine") for one in SWEEPS[1]] == [replace(one, name="") for one in full]
+    for step, sweeps in SWEEPS.items():
+        assert {(one.binning, one.step, one.kind) for one in sweeps} == {(1, step, "coarse")}
+        seen = sum(int(on_scene((256, 320), CAMERA, one).sum()) for one in sweeps)
+        assert seen == 256 * 320 / step
+
+
+def test_a_record_is_read_between_its_exposures_by_their_logarithm() -> None:
+    """At an exposure of the table its own figure, half-way by the logarithm the mean, for maps and classes alike."""
+    assert RECORD.expected(2, 25.0) == pytest.approx({MIOU: 0.91, "weed": 0.65})
+    assert RECORD.expected(1, 12.5) == pytest.approx({MIOU: 0.91, "weed": 0.65})
+    assert RECORD.expected(1, 400.0) == RECORD.expected(1, 100.0)
+
+
+@given(seconds=st.floats(0.1, 60.0))
+def test_a_scan_ends_in_time_and_no_longer_exposure_would(seconds: float) -> None:
+    """The longest exposure that ends in time is offered, to a tenth of a millisecond; more seconds never give less."""
+    offered = uniform_scans(RECORD, SWEEPS, CAMERA, COST, 270, seconds=seconds)
+    assert all(6.2 <= scan.exposure_ms <= 100 for scan in offered)
+    for step in (1, 2, 4):
+        within = [scan.exposure_ms for scan in offered if scan.step == step and scan.seconds <= seconds]
+        if within and max(within) < 100:
+            longer = priced_scan(RECORD, SWEEPS[step], CAMERA, COST, 270, max(within) + 0.1)
+            assert longer.seconds > seconds
+    if seconds < CHEAPEST:
+        with pytest.raises(BudgetError, match=rf"--seconds .*the least is {CHEAPEST:.1f} s"):
+            choose_scan(offered, ScanLimits(seconds))
+        return
+    chosen = choose_scan(offered, ScanLimits(seconds))
+    assert chosen.seconds <= seconds
+    more = uniform_scans(RECORD, SWEEPS, CAMERA, COST, 270, seconds=2 * seconds)
+    assert choose_scan(more, ScanLimits(2 * seconds)).expected[MIOU] >= chosen.expected[MIOU] - LOSS
+
+
+def test_nothing_is_spent_that_does_not_pay() -> None:
+    """Where a record no longer grows with the exposure, the shortest of those as good is taken."""
+    flat = replace(RECORD, scores={MIOU: np.array([[0.9, 0.94, 0.9405], [0.8, 0.8, 0.8], [0.7, 0.7, 0.7]])})
+    chosen = choose_scan(uniform_scans(flat, SWEEPS, CAMERA, COST, 270), ScanLimits())
+    assert (chosen.step, chosen.exposure_ms) == (1, 25.0)
+
+
+def test_the_camera_bounds_exposures_and_its_rate_the_seconds() -> None:
+    """No exposure beyond the camera's own; below its shortest frame less light saves no time, and is not taken."""
+    short = replace(CAMERA, exposure_ms=50.0)
+    assert max(scan.exposure_ms for scan in uniform_scans(RECORD, SWEEPS, short, COST, 270)) == 50.0
+    assert uniform_scans(RECORD, SWEEPS, replace(CAMERA, exposure_ms=5.0), COST, 270) == []
+    slow = replace(CAMERA, max_rate_hz=20.0)  # frames of 50 ms at least
+    scans = uniform_scans(RECORD, SWEEPS, slow, COST, 270)
+    fastest = min(scan.seconds for scan in scans if scan.step == 1)
+    assert choose_scan(scans, ScanLimits(fastest)).exposure_ms > 45
+
+
+def test_raw_bytes_bound_the_lines_and_not_the_exposure() -> None:
+    """Half of the bytes is every second line, exposed as long as it pays."""
+    chosen = choose_scan(SCANS, ScanLimits(bytes_raw=0.6 * max(scan.bytes_raw for scan in SCANS)))
+    assert chosen.step == 2
+    assert chosen.expected[MIOU] >= 0.92 - LOSS
+    with pytest.raises(BudgetError, match=r"--bytes-raw 1000; the least is .* bytes \(every 4th line"):
+        choose_scan(SCANS, ScanLimits(bytes_raw=1000))
+
+
+@pytest.mark.parametrize("goals", [{MIOU: 0.85}, {"weed": 0.55}, {MIOU: 0.9, "weed": 0.7}])
+def test_a_goal_is_reached_as_cheaply_as_it_can_be(goals: dict[str, float]) -> None:
+    """The choice reaches it, and no cheaper scan does."""
+    chosen = choose_scan(SCANS, ScanLimits(goals=goals))
+    assert all(chosen.expected[name] >= least for name, least in goals.items())
+    cheaper = [scan for scan in SCANS if scan.seconds < chosen.seconds]
+    assert all(any(scan.expected[name] < least for name, least in goals.items()) for scan in cheaper)
+
+
+def test_goals_out_of_reach_name_the_best_there_is() -> None:
+    """Beyond the record: its best; beyond what is paid for: what it takes; of two goals that no one scan has: so."""
+    with pytest.raises(BudgetError, match=r"--goal 95: the most that these weights' scans reached is 94\.0"):
+        choose_scan(SCANS, ScanLimits(goals={MIOU: 0.95}))
+    with pytest.raises(BudgetError, match=r"--goal 93 is not reached within --seconds .* takes \d+\.\d s"):
+        choose_scan(SCANS, ScanLimits(CHEAPEST, goals={MIOU: 0.93}))
+    scores = {MIOU: RECORD.scores[MIOU], "weed": RECORD.scores[MIOU][::-1]}
+    torn = uniform_scans(replace(RECORD, scores=scores), SWEEPS, CAMERA, COST, 270)
+    with pytest.raises(BudgetError, match="no one scan of these weights reaches all of them"):
+        choose_scan(torn, ScanLimits(goals={MIOU: 0.93, "weed": 0.93}))
+
+
+def test_the_frontier_holds_every_best_scan_of_its_seconds() -> None:
+    """It rises, and whatever the seconds, nothing off it beats the last of it that they pay for."""
+    best = frontier(SCANS)
+    for before, after in pairwise(best):
+        assert before.seconds < after.seconds
+        assert before.expected[MIOU] < after.expected[MIOU]
+    for scan in SCANS:
+        assert max(one.expected[MIOU] for one in best if one.seconds <= scan.seconds) >= scan.expected[MIOU]
+
+
+def test_the_reference_is_the_cheapest_scan_that_is_nearly_as_good_as_any() -> None:
+    """Half a point of mIoU below the best at most, and dearer than no other such scan."""
+    reference = reference_scan(SCANS)
+    assert reference.expected[MIOU] >= 0.94 - REFERENCE_LOSS
+    assert all(one.expected[MIOU] < 0.94 - REFERENCE_LOSS for one in SCANS if one.seconds < reference.seconds)
+    assert reference.seconds < _scan(1, 100.0).seconds

@@ -1,0 +1,264 @@
+"""Lookup: the inverse of the exact rays over the whole disk for any path; of a grid within the bound that it states."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.errors import PoseError
+from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
+from pipeline.geometry.scan import Sweep, line_positions, points_of_scan, scene_to_sweep
+from pipeline.rectify.geolocation import KnotCurve, geolocation, path_geolocation
+from pipeline.rectify.placed import tie_table
+from pipeline.rectify.resample import resample
+from pipeline.rectify.scan_paths import ScanPath, make_scan_paths
+from tests.pipeline.rectify.aiming import CAMERA, aim
+
+places = st.floats(-4500, 4500)
+GRID: dict[str, Any] = {"origin_px": (-20.0, 2250.0), "spacing_px": 1.0, "shape": (170, 700)}
+EVERYTHING = (slice(None), slice(None))
+
+
+def see(position: np.ndarray, sample: np.ndarray, binning: int = 1) -> np.ndarray:
+    """Scene points (n, 2), y and x in px, that samples see from positions, by reflecting the camera's rays."""
+    slope = ((sample + 0.5) * binning - CAMERA.samples / 2) * CAMERA.ifov_rad
+    ray = np.stack([np.zeros_like(slope), slope, np.ones_like(slope)], axis=-1)
+    return direction_to_scene(reflect(ray, position_to_normal(position)))[:, ::-1] / CAMERA.ifov_rad
+
+
+@given(st.floats(-5000, 5000), st.floats(-5000, 4600), st.sampled_from([1, 2, 4]), st.integers(0, 99))
+@settings(max_examples=60, deadline=None)
+def test_lookup_undoes_the_rays(swath: float, start: float, binning: int, seed: int) -> None:
+    """What a sample between lines saw is found at that line and sample to 1e-7 px, anywhere in the disk."""
+    rng = np.random.default_rng(seed)
+    lines, samples = 60, CAMERA.samples // binning
+    at = np.stack([rng.uniform(0, lines - 1, 30), rng.uniform(0, samples - 1, 30)], axis=-1)
+    points = see(aim(swath, start + at[:, 0]), at[:, 1], binning)
+    found = geolocation(aim(swath, start + np.arange(float(lines))), CAMERA, points, along="x", binning=binning)
+    np.testing.assert_allclose(found, at, atol=1e-7)
+
+
+@given(places, places, st.sampled_from(["x", "y"]), st.sampled_from([1, 4]), st.integers(0, 99))
+@settings(max_examples=40, deadline=None)
+def test_lookup_agrees_with_the_plan(swath: float, start: float, along: str, step: int, seed: int) -> None:
+    """Where a planned sweep expects a point, the geolocation grid finds it from the mirror's positions alone."""
+    sweep = Sweep("a", "coarse", along, swath, start, lines=30, step=step, binning=step)  # type: ignore[arg-type]
+    rng = np.random.default_rng(seed)
+    slopes, centres = rng.uniform(-0.033, 0.033, 40), start + rng.uniform(1, 29 * step, 40)
+    on_line, on_scan = points_of_scan(swath, CAMERA, centres, slopes)
+    planned = scene_to_sweep(sweep, CAMERA, on_line, on_scan)
+    points = np.stack([on_scan, on_line] if along == "x" else [on_line, on_scan], axis=-1)
+    found = geolocation(line_positions(sweep, CAMERA), CAMERA, points, along=sweep.along, binning=step)
+    outer = (
+        np.abs(planned[:, 0] - 14.5) > 14.5
+    )  # beyond the outermost centres the geolocation grid goes on in equal steps
+    np.testing.assert_allclose(found[~outer], planned[~outer], atol=1e-7)
+    np.testing.assert_allclose(found[outer], planned[outer], atol=1e-3)
+
+
+def test_backward_sweep_counts_from_its_own_start() -> None:
+    """A sweep run the other way gives the same samples and mirrored line numbers."""
+    position = aim(-200.0, np.arange(50.0))
+    points = np.random.default_rng(2).uniform((10, -400), (40, 0), (30, 2))
+    forward, backward = (geolocation(p, CAMERA, points, along="x") for p in (position, position[::-1]))
+    np.testing.assert_allclose(backward, [49, 0] + forward * [-1, 1], atol=1e-7)
+
+
+def test_points_off_the_sweep_are_nan() -> None:
+    """A sweep reaches half a line and half a sample beyond its outermost centres; all else, however far, is NaN."""
+    position = aim(0.0, np.arange(10.0))
+    inside = np.array([[-0.49, 0], [9.49, 0], [4, 319.9], [4, -319.9]])
+    outside = np.array([[-0.6, 0], [9.6, 0], [4, 321], [4, -321], [9000, 9000], [4, 11_000], [-9000, -11_000]])
+    assert np.isfinite(geolocation(position, CAMERA, inside, along="x")).all()
+    assert np.isnan(geolocation(position, CAMERA, outside, along="x")).all()
+
+
+@given(st.floats(-5000, 5000), st.integers(0, 99))
+@settings(max_examples=30, deadline=None)
+def test_what_is_found_was_seen(swath: float, seed: int) -> None:
+    """No point of a field wider than the mirror's disk is found where its ray did not pass."""
+    scan = np.linspace(-5000, 4500, 300)
+    position = aim(swath, scan)
+    points = np.random.default_rng(seed).uniform(-20_000, 20_000, (20_000, 2))
+    found = geolocation(position, CAMERA, points, along="x")
+    hit = np.isfinite(found[:, 0])
+    centre = np.interp(found[hit, 0], np.arange(300), scan)
+    inner = (found[hit, 0] >= 0) & (found[hit, 0] <= 299)
+    seen = see(aim(swath, centre[inner]), found[hit, 1][inner])
+    np.testing.assert_allclose(seen, points[hit][inner], atol=1e-5)
+    assert inner.sum() > 20
+
+
+def test_sweeps_that_turn_or_dwell_are_refused() -> None:
+    """The message names the line where the sweep stops running one way."""
+    turning = aim(0.0, np.array([0.0, 1, 2, 3, 2, 5]))
+    with pytest.raises(PoseError, match="turns or stands still near line 3"):
+        geolocation(turning, CAMERA, np.zeros((1, 2)), along="x")
+    with pytest.raises(PoseError, match="near line 1"):
+        geolocation(aim(0.0, np.array([0.0, 1, 1, 2])), CAMERA, np.zeros((1, 2)), along="x")
+
+
+def wandering_scan_path(seed: int, amount_px: float, swath: float = 2600.0) -> ScanPath:
+    """A track of 120 lines about 1 px apart, each off its place by up to ``amount_px`` both ways."""
+    off = np.random.default_rng(seed).uniform(-amount_px, amount_px, (2, 120))
+    (scan_path,) = make_scan_paths(aim(swath + off[0], np.arange(120.0) + off[1]), CAMERA, step_px=1.0)
+    return scan_path
+
+
+def seen_by(scan_path: ScanPath) -> tuple[np.ndarray, np.ndarray]:
+    """Scene points (y, x) [px] of all samples of a track's knots, (knot, sample) each."""
+    centre = scan_path.across / CAMERA.ifov_rad, scan_path.scan / CAMERA.ifov_rad
+    rows = [points_of_scan(c, CAMERA, e, CAMERA.pixel_slopes()) for c, e in zip(*centre, strict=True)]
+    return np.array([scan for _, scan in rows]), np.array([along for along, _ in rows])
+
+
+@given(st.integers(0, 999), st.floats(0, 0.4), st.sampled_from([0.0, 2600.0, -4000.0]))
+@settings(max_examples=15, deadline=None)
+def test_linear_scene_comes_back_from_any_path(seed: int, amount: float, swath: float) -> None:
+    """What lines that lie unevenly and beside their strip saw of y and x is resampled to y and x, to float32."""
+    scan_path = wandering_scan_path(seed, amount, swath)
+    y, x = seen_by(scan_path)
+    points = np.random.default_rng(seed).uniform((5, swath - 310), (115, swath + 310), (4000, 2))
+    at = path_geolocation(scan_path, CAMERA, points, along="x")
+    taps = np.floor(np.nan_to_num(at)).astype(int)[:, :, None] + np.arange(-1, 3)
+    whole = np.isfinite(at[:, 0]) & (taps >= 0).all(axis=(1, 2)) & (taps[:, 0] < len(scan_path)).all(axis=1)
+    whole &= (taps[:, 1] < 640).all(axis=1) & scan_path.seen[np.minimum(taps[:, 0], len(scan_path) - 1)].all(axis=1)
+    values = np.stack([y - 60, x - swath], axis=-1).astype(np.float32)
+    found, _ = resample(values, np.ones(y.shape, np.bool_), at[whole])
+    np.testing.assert_allclose(found, points[whole] - [60, swath], atol=2e-4)
+    assert whole.sum() > 500
+
+
+@given(st.integers(0, 999), st.floats(0, 0.45))
+@settings(max_examples=25, deadline=None)
+def test_knots_are_found_at_their_own_points(seed: int, amount: float) -> None:
+    """A point that a line itself saw is found at this line or at another that saw it as well, on any path."""
+    scan_path = wandering_scan_path(seed, amount)
+    rng = np.random.default_rng(seed)
+    knot, sample = rng.integers(3, len(scan_path) - 3, 300), rng.integers(5, 635, 300)
+    y, x = seen_by(scan_path)
+    at = path_geolocation(scan_path, CAMERA, np.stack([y, x], axis=-1)[knot, sample], along="x")
+    on = np.isfinite(at[:, 0])
+    scan, _, across, _ = KnotCurve(scan_path).at(at[on, 0])
+    slope = (at[on, 1] + 0.5 - CAMERA.samples / 2) * CAMERA.ifov_rad
+    along, down = points_of_scan(across / CAMERA.ifov_rad, CAMERA, scan / CAMERA.ifov_rad, slope)
+    np.testing.assert_allclose(np.stack([down, along], axis=-1), np.stack([y, x], -1)[knot, sample][on], atol=1e-6)
+    assert (on | ~scan_path.seen[knot]).all()
+
+
+def test_evenness_changes_nothing_but_the_way() -> None:
+    """The closed form and Newton agree: lines 1e-6 px out of even give the same coordinates to 1e-5."""
+    points = np.random.default_rng(5).uniform((0, 2300), (119, 2900), (500, 2))
+    (even,) = make_scan_paths(aim(2600.0, np.arange(120.0)), CAMERA)
+    uneven = wandering_scan_path(1, 1e-6)
+    assert even.uniform
+    assert not uneven.uniform
+    first, second = (path_geolocation(scan_path, CAMERA, points, along="x") for scan_path in (even, uneven))
+    np.testing.assert_allclose(first, second, atol=1e-5)
+
+
+def scan_path_of(along_px: np.ndarray | float, scan_px: np.ndarray) -> ScanPath:
+    """The one track of lines that look at points given in px along the line and the scan."""
+    (scan_path,) = make_scan_paths(aim(along_px, scan_px), CAMERA)
+    return scan_path
+
+
+def exact(scan_path: ScanPath, along: str = "x", **grid: Any) -> np.ndarray:
+    """The grid's coordinates looked up one by one."""
+    grid = GRID | grid
+    y, x = (grid["origin_px"][axis] + grid["spacing_px"] * np.arange(grid["shape"][axis]) for axis in (0, 1))
+    points = np.stack(np.broadcast_arrays(y[:, None], x[None, :]), axis=-1)
+    return path_geolocation(scan_path, CAMERA, points, along=along)  # type: ignore[arg-type]
+
+
+LINES = np.arange(130.0)
+PATHS = {
+    "even": (2600.0, LINES),
+    "drifting": (2600 + 0.02 * LINES, 1.0007 * LINES),
+    "faster and faster": (2600.0, LINES + 2e-4 * LINES**2),
+    "curved": (2600 + 5 * np.sin(LINES / 60), LINES),
+    "one line out of place": (2600.0, LINES + 0.01 * (LINES == 71)),
+    "jittered": (2600 + np.sin(7 * LINES**2) / 4, LINES + np.sin(5 * LINES**2) / 4),
+}
+
+
+@pytest.mark.parametrize("name", PATHS)
+@pytest.mark.parametrize("tie", [16, 7])
+def test_error_is_within_the_bound(name: str, tie: int) -> None:
+    """On every kind of path no pixel is farther from the exact geolocation grid than the bound, nor that from the tolerance."""
+    scan_path = scan_path_of(*PATHS[name])
+    table = tie_table(scan_path, CAMERA, along="x", tie=tie, **GRID)
+    error = np.abs(table.coordinates(*EVERYTHING) - exact(scan_path))
+    assert np.nanmax(error) <= table.bound_px + 1e-12 <= 2e-3
+    assert np.isfinite(error).mean() > 0.4
+
+
+def test_spacing_follows_the_path() -> None:
+    """Ties stay 16 px apart on even and drifting paths, and come down to every pixel where one line is out of place."""
+    spacing = {name: tie_table(scan_path_of(*path), CAMERA, along="x", **GRID).spacing for name, path in PATHS.items()}
+    assert spacing["even"] == spacing["drifting"] == 16
+    assert spacing["one line out of place"] == spacing["jittered"] == 1
+    assert 1 < spacing["faster and faster"] < 16
+
+
+@given(st.floats(-4500, 4500), st.floats(-4500, 4000), st.sampled_from(["x", "y"]), st.sampled_from([1.0, 3.0]))
+@settings(max_examples=25, deadline=None)
+def test_bound_holds_over_the_field(swath: float, start: float, along: str, spacing: float) -> None:
+    """Anywhere in the field, in both orientations, the table keeps to its bound, and loses no pixel well inside."""
+    scan_path = scan_path_of(swath, start + LINES)
+    corner = (start - 9.3, swath - 330.7) if along == "x" else (swath - 330.7, start - 9.3)
+    size = (int(150 / spacing), int(660 / spacing))
+    grid = {"origin_px": corner, "spacing_px": spacing, "shape": size if along == "x" else size[::-1]}
+    table = tie_table(scan_path, CAMERA, along=along, **grid)  # type: ignore[arg-type]
+    found, truth = table.coordinates(*EVERYTHING), exact(scan_path, along, **grid)
+    assert np.nanmax(np.abs(found - truth), initial=0) <= table.bound_px + 1e-12 <= 2e-3
+    inside = (np.abs(truth - [64.5, 319.5]) < np.array([65, 320]) - 0.01).all(axis=-1)
+    assert np.isfinite(found[inside]).all()
+
+
+@pytest.mark.parametrize("tie", [16, 1])
+def test_parts_are_those_of_the_whole(tie: int) -> None:
+    """Any part of the grid is, bit by bit, what the whole grid gives there; empty parts are empty."""
+    table = tie_table(scan_path_of(*PATHS["even"]), CAMERA, along="x", tie=tie, **GRID)
+    whole = table.coordinates(*EVERYTHING)
+    for rows, columns in (
+        (slice(0, 1), slice(0, 1)),
+        (slice(31, 33), slice(15, 700)),
+        (slice(169, 170), slice(64, 81)),
+    ):
+        np.testing.assert_array_equal(table.coordinates(rows, columns), whole[rows, columns])
+    assert table.coordinates(slice(5, 5), slice(0, 9)).shape == (0, 9, 2)
+
+
+def test_knots_that_nothing_saw_are_left_out() -> None:
+    """Around lost lines the table is NaN where the geolocation grid is."""
+    scan_path = scan_path_of(2600.0, LINES[(LINES < 40) | (LINES > 44)])
+    table = tie_table(scan_path, CAMERA, along="x", **GRID)
+    assert table.spacing == 16
+    differs = np.isnan(table.coordinates(*EVERYTHING)) != np.isnan(exact(scan_path))
+    assert differs.mean() < 1e-4
+
+
+def test_scan_path_smaller_than_a_cell_is_not_lost() -> None:
+    """A single line between two rows of ties is found, and its cells count for the bound."""
+    scan_path = scan_path_of(2600.0, np.array([24.0]))
+    table = tie_table(scan_path, CAMERA, along="x", **GRID)
+    found = table.coordinates(*EVERYTHING)
+    assert np.isfinite(found[..., 0]).sum() > 450
+    assert np.nanmax(np.abs(found - exact(scan_path))) <= table.bound_px
+
+
+@pytest.mark.parametrize("tie", [16, 1])
+def test_only_what_the_scan_path_can_have_seen_is_kept(tie: int) -> None:
+    """Of a large grid the table keeps the part around the track, and answers for the rest with NaN."""
+    scan_path = scan_path_of(*PATHS["even"])
+    grid = GRID | {"origin_px": (-400.0, 1900.0), "shape": (1000, 1500)}
+    table = tie_table(scan_path, CAMERA, along="x", tie=tie, **grid)
+    assert table.kept[0] * table.kept[1] < 0.25 * 1000 * 1500
+    truth = exact(scan_path, **grid)
+    for rows, columns in (EVERYTHING, (slice(0, 90), slice(0, 80)), (slice(300, 320), slice(0, 1500))):
+        np.testing.assert_allclose(table.coordinates(rows, columns), truth[rows, columns], atol=2e-3)

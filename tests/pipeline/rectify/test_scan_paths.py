@@ -1,0 +1,212 @@
+"""Tracks: every line in one place, in order, whatever path the mirror took; and what time stamps say of lines."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.errors import PoseError
+from pipeline.rectify.scan_paths import ScanPath, line_centres, make_scan_paths, number_lines, single_scan_path
+from tests.pipeline.rectify.aiming import CAMERA, aim
+
+STEPS = st.lists(st.sampled_from([-3.0, -1.0, 0.0, 0.1, 1.0, 1.0, 1.2, 4.0]), min_size=0, max_size=60)
+
+
+def members(scan_path: ScanPath) -> list[np.ndarray]:
+    """Lines of each knot."""
+    return np.split(scan_path.lines, scan_path.starts[1:])
+
+
+@given(STEPS, st.integers(0, 99))
+@settings(max_examples=120, deadline=None)
+def test_every_usable_line_is_on_one_knot(steps: list[float], seed: int) -> None:
+    """On any path each usable line is a member of one seen knot, at the mean of its members, and knots ascend."""
+    position = aim(30.0, np.concatenate([[0.0], np.cumsum(steps)]))
+    usable = np.random.default_rng(seed).random(len(position)) < 0.8
+    scan, across, _ = line_centres(position, CAMERA)
+    held = []
+    for scan_path in make_scan_paths(position, CAMERA, usable=usable, step_px=1.0):
+        assert (np.diff(scan_path.scan) > 0).all()
+        for knot, lines in enumerate(members(scan_path)):
+            assert len(lines) > 0
+            if scan_path.seen[knot]:
+                held += lines.tolist()
+                np.testing.assert_allclose(scan_path.scan[knot], scan[lines].mean(), atol=1e-15)
+                np.testing.assert_allclose(scan_path.across[knot], across[lines].mean(), atol=1e-15)
+    assert sorted(held) == np.flatnonzero(usable).tolist()
+
+
+@given(STEPS)
+@settings(max_examples=60, deadline=None)
+def test_no_gap_wider_than_a_step_and_a_half_is_left(steps: list[float]) -> None:
+    """Neighbouring knots are at most 1.5 steps apart: where lines are missing knots that nothing saw stand in."""
+    for scan_path in make_scan_paths(aim(0.0, np.concatenate([[0.0], np.cumsum(steps)])), CAMERA, step_px=1.0):
+        assert np.diff(scan_path.scan).max(initial=0) <= 1.5 * CAMERA.ifov_rad * (1 + 1e-9)
+        assert scan_path.seen[[0, -1]].all()
+
+
+def test_even_sweep_is_one_even_scan_path() -> None:
+    """A planned sweep gives a knot a line, straight and even, in either direction."""
+    position = aim(-700.0, 12.0 + 4 * np.arange(50.0))
+    (scan_path,), (back,) = make_scan_paths(position, CAMERA), make_scan_paths(position[::-1], CAMERA)
+    assert scan_path.straight
+    assert scan_path.uniform
+    assert len(scan_path) == 50
+    assert scan_path.seen.all()
+    np.testing.assert_allclose(scan_path.width, 4 * CAMERA.ifov_rad, rtol=1e-12)
+    np.testing.assert_array_equal(scan_path.lines, np.arange(50))
+    np.testing.assert_array_equal(back.lines, np.arange(50)[::-1])
+    np.testing.assert_allclose(back.scan, scan_path.scan, atol=1e-15)
+
+
+def test_lost_and_unusable_lines_keep_a_scan_path_even() -> None:
+    """Where lines 3, 4 and 7 are lost or not usable the track has unseen knots at their places, and stays even."""
+    usable = np.ones(8, np.bool_)
+    usable[5] = False
+    (scan_path,) = make_scan_paths(aim(0.0, np.array([0.0, 1, 2, 5, 6, 7, 8, 9])), CAMERA, usable=usable)
+    assert scan_path.uniform
+    np.testing.assert_array_equal(scan_path.seen, [True, True, True, False, False, True, True, False, True, True])
+    np.testing.assert_array_equal(scan_path.lines, [0, 1, 2, 2, 3, 3, 4, 4, 6, 7])  # stand-ins are the nearest lines
+
+
+def test_corrections_move_the_line_centres() -> None:
+    """A shift in scene px is added along the line and along the scan."""
+    position = aim(100.0, np.arange(5.0))
+    shift = np.stack([np.full(5, 7.0), 0.5 * np.arange(5)], axis=-1)
+    (scan_path,) = make_scan_paths(position, CAMERA, shift_px=shift)
+    np.testing.assert_allclose(scan_path.across / CAMERA.ifov_rad, 107.0, atol=1e-9)
+    np.testing.assert_allclose(scan_path.scan / CAMERA.ifov_rad, 1.5 * np.arange(5), atol=1e-9)
+
+
+def test_noise_of_the_position_is_no_turn() -> None:
+    """A path of 1 px steps stays one track under 0.8 px of noise, although lines change places."""
+    rng = np.random.default_rng(4)
+    scan_paths = make_scan_paths(aim(0.0, np.arange(400.0) + rng.normal(0, 0.8, 400)), CAMERA, step_px=1.0)
+    assert len(scan_paths) == 1
+    assert (np.diff(scan_paths[0].lines) < 0).any()
+
+
+def test_turn_beyond_the_noise_is_a_turn() -> None:
+    """Under 0.3 px of noise a path that goes back by 3.5 px turns twice."""
+    scan = np.concatenate([np.arange(60.0), 59 - 0.5 * np.arange(1, 8), 55.5 + np.arange(1, 60)])
+    noise = np.random.default_rng(2).normal(0, 0.3, len(scan))
+    assert len(make_scan_paths(aim(0.0, scan + noise), CAMERA, step_px=1.0)) == 3
+
+
+def test_lines_nearer_than_a_quarter_step_are_one_knot() -> None:
+    """Pairs of lines 0.2 steps apart are a knot each, pairs 0.3 apart are not."""
+    pairs = np.repeat(np.arange(10.0), 2)
+    for apart, knots in ((0.2, 10), (0.3, 20)):
+        (scan_path,) = make_scan_paths(aim(0.0, pairs + np.tile([0, apart], 10)), CAMERA, step_px=1.0)
+        assert len(scan_path) == knots
+
+
+@pytest.mark.parametrize(
+    ("scan", "lines"),
+    [
+        (np.repeat(np.arange(6.0), 9) + 1e-6 * np.arange(54), np.arange(54)),  # stands, and creeps while it does
+        (np.array([0.0, 1.0, 4.0]), np.arange(3)),  # as many gaps as steps
+        (np.arange(5.0), np.arange(0, 5, 2)),  # every other line not usable
+    ],
+)
+def test_the_step_is_taken_from_the_path(scan: np.ndarray, lines: np.ndarray) -> None:
+    """Without a planned step it is that of a moving mirror from one line to the next: knots are 1 px apart."""
+    (scan_path,) = make_scan_paths(aim(0.0, scan), CAMERA, usable=np.isin(np.arange(len(scan)), lines))
+    np.testing.assert_allclose(np.diff(scan_path.scan) / CAMERA.ifov_rad, 1, atol=1e-4)
+
+
+def test_a_pace_off_the_plan_is_still_even() -> None:
+    """An even path at a pace a thousandth off the planned one is looked up in closed form, at its own pace."""
+    (scan_path,) = make_scan_paths(aim(0.0, 1.001 * np.arange(50.0)), CAMERA, step_px=1.0)
+    assert scan_path.uniform
+    np.testing.assert_allclose(scan_path.width, 1.001 * CAMERA.ifov_rad, rtol=1e-9)
+    (uneven,) = make_scan_paths(aim(0.0, np.array([0, 1, 2, 3.4, 4.8])), CAMERA, step_px=1.0)
+    np.testing.assert_allclose(uneven.width, CAMERA.ifov_rad, rtol=1e-9)
+
+
+def test_single_scan_path_has_a_knot_for_every_line() -> None:
+    """Lines however near each other stay knots of their own, and gaps stay gaps."""
+    scan_path = single_scan_path(aim(0.0, np.array([0.0, 1, 1.1, 5])), CAMERA)
+    assert scan_path.seen.all()
+    np.testing.assert_array_equal(scan_path.lines, np.arange(4))
+
+
+def test_line_out_of_reach_is_named() -> None:
+    """A usable line beyond the disk or without a position raises with its number; one that is not usable does not."""
+    position = aim(0.0, np.arange(6.0))
+    position[4] = np.nan
+    with pytest.raises(PoseError, match="line 4 is at mirror position"):
+        make_scan_paths(position, CAMERA)
+    usable = np.arange(6) != 4
+    position[5] = 0.8, 0.8
+    with pytest.raises(PoseError, match=r"line 5 is at mirror position \(0.8, 0.8\)"):
+        make_scan_paths(position, CAMERA, usable=usable)
+    (scan_path,) = make_scan_paths(position, CAMERA, usable=np.arange(6) < 4)
+    assert len(scan_path) == 4
+
+
+@given(st.lists(st.integers(0, 400), min_size=2, max_size=60, unique=True), st.floats(0.97, 1.03), st.integers(0, 99))
+@settings(max_examples=80, deadline=None)
+def test_numbers_are_those_of_the_lines_that_came(lines: list[int], pace: float, seed: int) -> None:
+    """Whatever frames are lost, with a clock off by 3 % and jitter of a tenth, short gaps are counted exactly."""
+    came = np.sort(lines)
+    came = came[np.concatenate([[True], np.cumprod(np.diff(came) < 9).astype(bool)])]  # a longer gap may miscount
+    time = 5.0 + 0.1 * (pace * came + np.random.default_rng(seed).uniform(-0.1, 0.1, len(came)))
+    found = number_lines(time, 0.1)
+    np.testing.assert_array_equal(found.number, came - came[0])
+    assert found.usable.all()
+    assert (found.lost, found.repeated, found.backward) == (came[-1] - came[0] + 1 - len(came), 0, 0)
+
+
+@given(st.integers(0, 99), st.integers(3, 40))
+@settings(max_examples=40, deadline=None)
+def test_copies_and_wild_stamps_change_no_other_line(seed: int, lines: int) -> None:
+    """A frame sent again and a single wild stamp are marked; the others keep the numbers that they had."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(float(lines))
+    again = rng.integers(0, lines)
+    sent = np.insert(time, again + 1, time[again])
+    sent = np.insert(sent, rng.integers(1, lines - 1), rng.choice([-50.0, 1e6]))
+    found = number_lines(sent, 1.0)
+    np.testing.assert_array_equal(found.number[found.usable], np.arange(lines))
+    assert (found.repeated, found.backward, found.lost, found.late) == (1, 1, 0, 0)
+
+
+@pytest.mark.parametrize("ends", [[1e6], [1e300], [-1e6], [-1e300, 1e300]])
+def test_wild_stamps_at_the_ends_are_not_believed(ends: list[float]) -> None:
+    """A first or last stamp far off all others goes neither back nor loses a million lines: it costs its own line."""
+    found = number_lines(np.sort([*ends, *np.arange(20.0)]), 1.0)
+    assert found.usable.sum() == 20
+    assert (found.backward, found.lost, found.late) == (len(ends), 0, 0)
+    assert number_lines(np.array([0.0, 1, 900]), 1.0).lost == 898
+
+
+@pytest.mark.parametrize(
+    ("stamps", "number", "unusable", "late"),
+    [
+        ([0, 1, 2, 3, 2.5, 4], [0, 1, 2, 3, 3, 4], [4], 0),  # of two that contradict each other the later one goes
+        ([0, 1, 2, 1, 3], [0, 1, 2, 1, 3], [3], 0),  # a copy is the line that its stamp says
+        ([0, 1, 2.6, 3, 4, 5], [0, 1, 2, 3, 4, 5], [], 1),  # late by 0.6 periods, and none was lost
+        ([0, 1, 2, 3.8, 4], [0, 1, 2, 3, 4], [], 1),  # tilts the clock fitted to all, but not the one without it
+    ],
+)
+def test_stamps_by_hand(stamps: list[float], number: list[int], unusable: list[int], late: int) -> None:
+    """Numbers, what is believed and what is late, frame by frame."""
+    found = number_lines(np.array(stamps, float), 1.0)
+    assert (found.number.tolist(), np.flatnonzero(~found.usable).tolist()) == (number, unusable)
+    assert (found.late, found.lost) == (late, 0)
+
+
+@pytest.mark.parametrize(("gap", "lost"), [(1.45, 0), (1.5, 0), (1.55, 1), (2.45, 1), (2.55, 2)])
+def test_a_gap_of_more_than_one_and_a_half_periods_loses_a_line(gap: float, lost: int) -> None:
+    """Gaps are counted to the nearest line, halves to fewer."""
+    assert number_lines(np.concatenate([np.arange(4.0), 3 + gap + np.arange(4)]), 1.0).lost == lost
+
+
+def test_slow_clock_makes_no_frame_late() -> None:
+    """At a period 0.1 % longer than planned 3000 frames drift by three periods, and none is late or lost."""
+    found = number_lines(np.arange(3000) * 0.1001, 0.1)
+    np.testing.assert_array_equal(found.number, np.arange(3000))
+    assert (found.late, found.lost) == (0, 0)

@@ -1,0 +1,176 @@
+"""Light of a scene at samples: the same bits whoever else is looked for, within the scene's memory, mixed rightly."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.simulator.optics.kernel_fit import Footprint, Moments, fold
+from pipeline.simulator.optics.rays import RayViews
+from pipeline.simulator.optics.scene_radiance import Looker, _Mixing
+from pipeline.simulator.scenes.scene import RasterScene
+from tests.pipeline.simulator.small_scenes import made_scene
+
+ROOT = Path(__file__).parents[4]
+BOTH = (False, True)
+SHAPE = (23, 37)
+COUNT = 150  # samples: some blocks, and a part of one
+KINDS = {"one": 1, "few": 3, "materials": 27, "own plane": 2, "own planes": 40}
+
+
+def scene_of(kind: str, bands: int = 40) -> RasterScene:
+    """Pixels that know nothing of their neighbours, mixed to bands or with a plane for each."""
+    rng, components = np.random.default_rng(5), KINDS[kind]
+    planes = rng.uniform(0, 1, (*SHAPE, components))
+    if kind == "materials":  # a pixel has few of many
+        planes *= rng.random((6, 7, components)).repeat(4, axis=0).repeat(6, axis=1)[: SHAPE[0], : SHAPE[1]] < 0.15
+    if kind.startswith("own"):
+        return made_scene(planes, rng.uniform(1e3, 9e3, components), np.linspace(400, 1000, components))
+    return made_scene(planes, rng.uniform(1e3, 9e3, (components, bands)), np.linspace(400, 1000, bands))
+
+
+def footprint_of(scene: RasterScene) -> Footprint:
+    """Slit and pixel in three boxes, with diffraction whose tails look at thinned pixels."""
+    waves = np.linspace(0.4, 1.0, len(scene.wavelength_nm)) * np.ones((2, 1))
+    shift = np.linspace(-0.2, 0.2, waves.shape[1]) * np.ones((2, 1))
+    return fold((2.7, 1.0), (3, 1), 1, Moments(shift, np.full(waves.shape, 0.04), waves))
+
+
+def views_of(count: int, far: float = 6.0) -> RayViews:
+    """Samples all over the scene and around it, whose footprints lie turned."""
+    rng = np.random.default_rng(8)
+    along, scan = rng.uniform(-far, max(SHAPE) + far, (2, count))
+    turn = rng.uniform(-0.1, 0.1, count)
+    return RayViews(along, scan, np.ones(count), turn, -turn, np.ones(count))
+
+
+def scan_pass(scene: RasterScene, views: RayViews, *, along_y: bool = False) -> np.ndarray:
+    """Light (n, band) of one exposure."""
+    return Looker(footprint_of(scene), views_of(COUNT)).scan_pass(scene, [views], along_y=along_y, exposures=1.0)
+
+
+@pytest.mark.parametrize("along_y", BOTH)
+@pytest.mark.parametrize("kind", KINDS)
+def test_light_of_a_sample_does_not_depend_on_the_others(kind: str, along_y: bool) -> None:
+    """However samples are ordered and divided among calls and threads, each has the same bits."""
+    scene, views = scene_of(kind), views_of(COUNT)
+    whole, order = scan_pass(scene, views, along_y=along_y), np.random.default_rng(1).permutation(COUNT)
+    np.testing.assert_array_equal(scan_pass(scene, views[order], along_y=along_y), whole[order])
+    parts = [slice(first, first + 37) for first in range(0, COUNT, 37)]
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda part: scan_pass(scene, views[part], along_y=along_y), parts))
+    np.testing.assert_array_equal(np.concatenate(found), whole)
+
+
+@pytest.mark.parametrize("kind", ["materials", "own planes"])
+def test_kernels_alike_whatever_the_boxes_are_looked_through_once(kind: str) -> None:
+    """Kernels of parted boxes and of pixels left out give all of the light; the latter do not ask how many boxes."""
+    scene, views = scene_of(kind), views_of(COUNT)
+    three = footprint_of(scene)
+    one = replace(three, parts=(1, 1))
+    parted, alike = three.by_parts()
+    assert alike is not None
+    assert set(parted.level.tolist()) == {1}
+
+    def seen(footprint: Footprint) -> np.ndarray:
+        return Looker(footprint, views).scan_pass(scene, [views], along_y=False, exposures=1.0)
+
+    np.testing.assert_allclose(seen(parted) + seen(alike), seen(three), rtol=2e-6)
+    np.testing.assert_array_equal(seen(alike), seen(one.by_parts()[1]))
+    assert np.abs(seen(one) - seen(three)).max() > 1.0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_lines_along_y_see_the_turned_scene(kind: str) -> None:
+    """A line along y over a scene is one along x over its transpose."""
+    scene, views = scene_of(kind), views_of(COUNT)
+    turned = made_scene(scene.planes.swapaxes(0, 1), scene.electrons, scene.wavelength_nm)
+    np.testing.assert_allclose(scan_pass(scene, views, along_y=True), scan_pass(turned, views), rtol=2e-6)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_last_pixels_are_seen_as_any(kind: str) -> None:
+    """What lies behind a scene's last pixel in memory adds nothing: a wider scene has the same bits there."""
+    scene = scene_of(kind)
+    wide = np.pad(scene.planes, ((0, 9), (0, 9), (0, 0)), mode="edge")
+    corner = views_of(COUNT, 0.0)
+    corner = replace(corner, along=SHAPE[1] - 2 + corner.along / 40, scan=SHAPE[0] - 2 + corner.scan / 40)
+    sharp = fold((2.7, 1.0), (3, 1), 1, Moments(np.zeros((2, 1)), np.zeros((2, 1))))
+    sharp = replace(sharp, between=np.ones((1, len(scene.wavelength_nm))))
+    one, other = (
+        Looker(sharp, corner).scan_pass(some, [corner], along_y=False, exposures=1.0)
+        for some in (scene, made_scene(wide, scene.electrons, scene.wavelength_nm))
+    )
+    np.testing.assert_array_equal(one, other)
+
+
+def far_and_near() -> np.ndarray:
+    """Light of samples in small scenes, far beside them and nowhere, of all kinds."""
+    views = views_of(COUNT, 60.0)
+    views = replace(views, scan=np.where(np.arange(COUNT) % 5, views.scan, np.nan))
+    return np.concatenate(
+        [scan_pass(scene_of(kind), views, along_y=along_y).ravel() for kind in KINDS for along_y in BOTH]
+    )
+
+
+CHECKED = """
+import sys
+import numpy
+from tests.pipeline.simulator.optics.test_scene_radiance import far_and_near
+numpy.save(sys.argv[1], far_and_near())
+"""
+
+
+def test_no_index_leaves_its_array(tmp_path: Path) -> None:
+    """With every index checked loops end well, and give what they give without."""
+    place = {"PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path / "numba")}
+    checks = {"NUMBA_BOUNDSCHECK": "1", "NUMBA_OPT": "0"}  # quick to compile
+    command = [sys.executable, "-c", CHECKED, str(tmp_path / "light.npy")]
+    subprocess.run(command, env={**os.environ, **place, **checks}, cwd=ROOT, check=True)
+    np.testing.assert_allclose(np.load(tmp_path / "light.npy"), far_and_near(), rtol=1e-5)
+
+
+@pytest.mark.parametrize("place", [-1e300, 1e300, np.inf, -np.inf])
+@pytest.mark.parametrize("kind", ["few", "materials", "own planes"])
+def test_places_far_out_read_the_scene_s_edge(kind: str, place: float) -> None:
+    """However far beside the scene a sample looks, no other memory is read."""
+    scene, views = scene_of(kind), views_of(4)
+    far = scan_pass(scene, replace(views, along=np.full(4, place), scan=np.full(4, 3.0)))
+    near = scan_pass(scene, replace(views, along=np.full(4, np.copysign(1e6, place)), scan=np.full(4, 3.0)))
+    seen = np.isfinite(far)  # how far a place that is not finite lies beside its pixel is no number
+    assert seen.all() or np.isinf(place)
+    np.testing.assert_allclose(far[seen], near[seen], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("nodes", "bands"), [(1, 2), (1, 270), (3, 17), (5, 70), (5, 270), (9, 33)])
+def test_rows_are_mixed_alike_wherever_they_stand(nodes: int, bands: int) -> None:
+    """The same components give the same bits in any row, and those are the product of the matrices."""
+    rng, kernels, components = np.random.default_rng(bands), nodes + 2, 6
+    place = np.linspace(0, nodes - 1, bands)
+    between = np.stack([np.interp(place, np.arange(nodes), one) for one in np.eye(nodes)])
+    fractions, spectra = (
+        rng.uniform(0, 1, shape).astype(np.float32) for shape in ((nodes, kernels), (components, bands))
+    )
+    mixing = _Mixing.of(fractions, between, spectra)
+    one = rng.uniform(0, 1, (kernels, 1, components)).astype(np.float32)
+    light = np.full((1031, bands), np.nan, np.float32)
+    mixing.write(np.repeat(one, len(light), axis=1), light)
+    np.testing.assert_array_equal(light, np.broadcast_to(light[:1], light.shape))
+    wanted = np.einsum("jk,kc,jb,cb->b", fractions, one[:, 0], between, spectra)
+    np.testing.assert_allclose(light[0], wanted, rtol=1e-5)
+
+
+def test_bands_between_other_nodes_are_left_out_of_products() -> None:
+    """Where bands follow their nodes each product takes two of these, and no band is made twice."""
+    place = np.linspace(0, 4, 200)
+    between = np.stack([np.interp(place, np.arange(5), one) for one in np.eye(5)])
+    products = _Mixing.of(np.eye(5, dtype=np.float32), between, np.ones((3, 200), np.float32)).products
+    assert [one.nodes for one in products] == [slice(first, first + 2) for first in range(4)]
+    assert [one.bands.stop for one in products] == [*(one.bands.start for one in products[1:]), 200]

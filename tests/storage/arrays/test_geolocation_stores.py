@@ -1,0 +1,97 @@
+"""Stored lookups: what is written comes back bit by bit, and names of paths change with what the tracks depend on."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.errors import IncompleteStoreError, ShapeError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import direction_to_position, scene_to_direction
+from pipeline.rectify.placed import TieTable, tie_table
+from pipeline.rectify.scan_paths import ScanPath, make_scan_paths
+from storage.arrays.geolocation import open_geolocation, path_digest, write_geolocation
+
+CAMERA = LineCamera()
+
+
+def tabulated(scan_px: np.ndarray) -> list[tuple[ScanPath, TieTable]]:
+    """Tracks and tables of a sweep whose lines look at these places."""
+    tangents = np.stack([np.full_like(scan_px, 100.0), scan_px], axis=-1) * CAMERA.ifov_rad
+    scan_paths = make_scan_paths(direction_to_position(scene_to_direction(tangents)), CAMERA)
+    grid = {"origin_px": (-5.0, -250.0), "spacing_px": 1.0, "shape": (60, 700)}
+    return [(scan_path, tie_table(scan_path, CAMERA, along="x", **grid)) for scan_path in scan_paths]  # type: ignore[arg-type]
+
+
+def test_tables_come_back(tmp_path: Path) -> None:
+    """Tracks that turn, dwell and have gaps, and their tables, are read as they were written."""
+    there = np.concatenate([np.arange(20.0), np.arange(25.0, 50), [49.0, 49.0], np.arange(48.0, 0, -1)])
+    tables = {"coarse 0": tabulated(np.arange(50.0)), "fine/1": tabulated(there), "dark": []}
+    write_geolocation(tmp_path / "geolocation.zarr", tables, {"ifov_rad": CAMERA.ifov_rad})
+    found = open_geolocation(tmp_path / "geolocation.zarr")
+    assert list(found) == list(tables)
+    for name, scan_paths in tables.items():
+        assert len(found[name]) == len(scan_paths)
+        for pair, again in zip(scan_paths, found[name], strict=True):
+            for value, other in zip(pair, again, strict=True):
+                for field in dataclasses.fields(value):
+                    np.testing.assert_array_equal(getattr(other, field.name), getattr(value, field.name))
+                    assert type(getattr(other, field.name)) is type(getattr(value, field.name))
+    root = zarr.open_group(tmp_path / "geolocation.zarr", mode="r")
+    assert (root.attrs["ifov_rad"], root["sweep_0"].attrs["sweep"]) == (CAMERA.ifov_rad, "coarse 0")
+    assert root["sweep_0/scan_path_0"].attrs["spacing"] == 16
+    assert 0 < root["sweep_0/scan_path_0"].attrs["bound_px"] <= 2e-3
+
+
+def test_damage_is_named(tmp_path: Path) -> None:
+    """A store that is not there, lacks a track, or has changed bytes is refused with its place."""
+    path = tmp_path / "geolocation.zarr"
+    with pytest.raises(IncompleteStoreError, match=r"geolocation\.zarr is no readable"):
+        open_geolocation(path)
+    write_geolocation(path, {"a": tabulated(np.arange(50.0))})
+    chunk = next((path / "sweep_0" / "scan_path_0" / "scan" / "c").iterdir())
+    chunk.write_bytes(chunk.read_bytes()[:-1] + b"!")
+    with pytest.raises(IncompleteStoreError, match="scan cannot be read"):
+        open_geolocation(path)
+    (path / "sweep_0" / "scan_path_0" / "zarr.json").unlink()
+    with pytest.raises(IncompleteStoreError, match="scan_path_0"):
+        open_geolocation(path)
+
+
+@given(st.integers(0, 4), st.floats(1e-12, 1e-3))
+def test_digest_follows_what_counts(line: int, change: float) -> None:
+    """A usable line's position or correction changes the name, and so does which lines are usable."""
+    position, shift, usable = np.linspace(0.1, 0.5, 10).reshape(5, 2), np.zeros((5, 2)), np.ones(5, np.bool_)
+    moved, off = position.copy(), usable.copy()
+    moved[line, 1] += change
+    off[line] = False
+    names = {
+        path_digest(position, usable, shift),
+        path_digest(moved, usable, shift),
+        path_digest(position, off, shift),
+        path_digest(position, usable, shift + change),
+        path_digest(position[:4], usable[:4], shift[:4]),
+    }
+    assert len(names) == 5
+    assert path_digest(moved, off, shift) == path_digest(position, off, shift)
+
+
+def test_digest_leaves_out_what_does_not() -> None:
+    """No flags, all flags; no correction, a correction of 0; NaN at a line that is not usable: one name."""
+    position = np.linspace(0.1, 0.5, 10).reshape(5, 2)
+    plain = path_digest(position)
+    assert len(plain) == 20
+    assert plain == path_digest(position, np.ones(5, np.bool_), -np.zeros((5, 2)))
+    assert plain == path_digest(np.asfortranarray(position))
+    usable = np.arange(5) != 2
+    lost = position.copy()
+    lost[2] = np.nan
+    assert path_digest(lost, usable) == path_digest(position, usable)
+    with pytest.raises(ShapeError, match=r"flags \(line,\)"):
+        path_digest(position, usable[:3])

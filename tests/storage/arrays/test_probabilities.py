@@ -1,0 +1,175 @@
+"""What is believed of a field, stored in bytes and read back, by this project and by xarray."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given
+from hypothesis import strategies as st
+
+from models.reading.prior_map import FAINTEST as FAINTEST_BELIEVED
+from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError
+from storage.arrays.class_maps import (
+    DAY_STEP,
+    FAINTEST,
+    NOTHING,
+    STEP,
+    ClassNames,
+    ProbabilityStore,
+    create_probabilities,
+    drop_changes,
+    write_changes,
+    write_changes_tile,
+    write_probabilities_tile,
+)
+
+LEGEND = ClassNames(("soil", "maize", "weed"), np.arange(9, dtype=np.uint8).reshape(3, 3))
+SHAPE = (70, 50)
+
+
+def drawn(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Probabilities of three classes and ages, some of them unknown, and light, some of it none."""
+    rng = np.random.default_rng(seed)
+    logits = rng.normal(0, 2, (*SHAPE, 3))
+    values = (logits - np.log(np.exp(logits).sum(axis=-1, keepdims=True))).astype(np.float32)
+    ages = rng.uniform(0, 400, SHAPE).astype(np.float32)
+    values[:3], ages[:3] = np.nan, np.nan
+    return values, ages, np.where(rng.random(SHAPE) < 0.1, 0, 2 ** rng.uniform(-8, 4, SHAPE)).astype(np.float32)
+
+
+def stored(path: Path, seed: int = 0) -> Path:
+    """A class probabilities of two tiles."""
+    values, ages, light = drawn(seed)
+    create_probabilities(path, SHAPE, LEGEND)
+    for top, bottom in ((0, 64), (64, 70)):
+        write_probabilities_tile(path, (top, 0), values[top:bottom], ages[top:bottom], light[top:bottom])
+    return path
+
+
+@given(seed=st.integers(0, 2**16))
+def test_what_is_read_is_what_was_written_within_half_a_step(
+    tmp_path_factory: pytest.TempPathFactory, seed: int
+) -> None:
+    """The likeliest class stays where no other is within a step, ages to a sixteenth of a day, NaN where unknown."""
+    path = stored(tmp_path_factory.mktemp("class_probabilities") / "class_probabilities.zarr", seed)
+    values, ages, light = drawn(seed)
+    found, days, shown = ProbabilityStore(path).read()
+    known = slice(3, None)
+    assert np.isnan(found[:3]).all()
+    assert np.isnan(days[:3]).all()
+    np.testing.assert_allclose(days[known], ages[known], atol=DAY_STEP / 2 + 1e-4)
+    np.testing.assert_allclose(shown, light, rtol=0.023)  # half of a sixteenth of an octave
+    np.testing.assert_allclose(np.exp(found[known]).sum(axis=-1), 1, atol=1e-5)
+    first, second = np.sort(values[known], axis=-1)[..., -1], np.sort(values[known], axis=-1)[..., -2]
+    clear = first - second > STEP
+    np.testing.assert_array_equal(found[known].argmax(axis=-1)[clear], values[known].argmax(axis=-1)[clear])
+    assert np.abs(found[known] - values[known])[values[known] > -12].max() < 1.5 * STEP
+
+
+def test_the_faintest_probabilities_is_the_faintest_that_is_stored() -> None:
+    """Models and stores import nothing of each other, and mean the same least probability."""
+    assert FAINTEST == FAINTEST_BELIEVED
+
+
+def test_a_part_is_read_alone(tmp_path: Path) -> None:
+    """Some rows and columns are those of the whole."""
+    store = ProbabilityStore(stored(tmp_path / "class_probabilities.zarr"))
+    whole, part = store.read(), store.read(slice(10, 66), slice(7, 9))
+    for one, other in zip(whole, part, strict=True):
+        np.testing.assert_array_equal(one[10:66, 7:9], other)
+    assert store.shape == SHAPE
+    assert store.legend.names == LEGEND.names
+
+
+def test_xarray_unpacks_it(tmp_path: Path) -> None:
+    """Probabilities and days come as numbers by CF's packing, with a missing value where nothing is known."""
+    path = stored(tmp_path / "class_probabilities.zarr")
+    opened = xr.open_zarr(path, consolidated=False)
+    values, ages, light = drawn(0)
+    np.testing.assert_allclose(2 ** opened.log2_light.values[light > 0], light[light > 0], rtol=0.023)
+    assert np.isnan(opened.log2_light.values[light == 0]).all()
+    assert opened.log_probability.dims == ("y", "x", "class")
+    assert opened.age.attrs["units"] == "days"
+    assert np.isnan(opened.log_probability.values[:3]).all()
+    np.testing.assert_allclose(opened.log_probability.values[3:], np.maximum(values[3:], -12.7), atol=STEP / 2 + 1e-4)
+    np.testing.assert_allclose(opened.age.values[3:].astype(float), ages[3:], atol=DAY_STEP / 2 + 1e-4)
+
+
+def test_changes_are_there_once_written(tmp_path: Path) -> None:
+    """A first look has none."""
+    path = stored(tmp_path / "class_probabilities.zarr")
+    assert ProbabilityStore(path).changed() is None
+    write_changes(path, np.array([[0.0, 0.5]], np.float32), 16)
+    assert ProbabilityStore(path).patch_px == 16
+    found = ProbabilityStore(path).changed()
+    assert found is not None
+    assert found.tolist() == [[0.0, 0.5]]
+
+
+def gone_on(path: Path) -> tuple[Path, np.ndarray]:
+    """A class probabilities that goes on from an earlier one, and what some of its pixels were."""
+    old = np.random.default_rng(1).choice(np.array([0, 2, 255], np.uint8), SHAPE)
+    create_probabilities(path, SHAPE, LEGEND, goes_on=True)
+    for top, bottom in ((0, 64), (64, 70)):
+        write_changes_tile(path, (top, 0), old[top:bottom])
+    return path, old
+
+
+def test_what_pixels_were_is_kept_with_its_names(tmp_path: Path) -> None:
+    """Written in tiles; plain xarray reads whole numbers and CF flags, 255 where nothing changed."""
+    path, old = gone_on(tmp_path / "class_probabilities.zarr")
+    np.testing.assert_array_equal(ProbabilityStore(path).old_class(), old)
+    with xr.open_zarr(path, consolidated=False) as opened:
+        found = opened["changed_from"]
+        np.testing.assert_array_equal(found.values, old)
+        assert found.dtype == np.uint8
+        assert found.attrs["flag_meanings"].split() == list(LEGEND.names)
+        assert found.attrs["nodata"] == 255
+
+
+def test_a_first_probabilities_has_nothing_that_pixels_were(tmp_path: Path) -> None:
+    """Nor has one that goes on from none after all; tiles of either are refused."""
+    first, (dropped, old) = stored(tmp_path / "first.zarr"), gone_on(tmp_path / "dropped.zarr")
+    drop_changes(dropped)
+    for path in (first, dropped):
+        assert ProbabilityStore(path).old_class() is None
+        with pytest.raises(IncompleteStoreError, match="changed_from"):
+            write_changes_tile(path, (0, 0), old[:64])
+    assert not list(dropped.rglob("*changed_from*"))
+
+
+def test_tiles_of_changes_that_split_a_shard_are_refused(tmp_path: Path) -> None:
+    """As those of probabilities."""
+    path, old = gone_on(tmp_path / "class_probabilities.zarr")
+    with pytest.raises(ChunkError, match="split the class probabilities's shards"):
+        write_changes_tile(path, (8, 0), old[:8])
+
+
+def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
+    """Tiles that split a shard or differ in size, and a store that is not there."""
+    path = stored(tmp_path / "class_probabilities.zarr")
+    values, ages, light = drawn(0)
+    with pytest.raises(ChunkError, match="split the class probabilities's shards"):
+        write_probabilities_tile(path, (8, 0), values[:8], ages[:8], light[:8])
+    with pytest.raises(ShapeError, match="not of one tile"):
+        write_probabilities_tile(path, (0, 0), values[:64], ages[:8], light[:64])
+    with pytest.raises(IncompleteStoreError, match="no readable Zarr store"):
+        ProbabilityStore(tmp_path / "none.zarr")
+
+
+def test_certainty_is_not_mistaken_for_nothing(tmp_path: Path) -> None:
+    """A probability of 1 is stored below the byte that stands for nothing known."""
+    path = tmp_path / "class_probabilities.zarr"
+    create_probabilities(path, (4, 4), LEGEND)
+    sure = np.full((4, 4, 3), -50.0, np.float32)
+    sure[..., 1] = 0.0
+    write_probabilities_tile(path, (0, 0), sure, *np.full((2, 4, 4), 1e9, np.float32))
+    found, days, light = ProbabilityStore(path).read()
+    assert (found.argmax(axis=-1) == 1).all()
+    assert np.exp(found[..., 1]).min() > 0.99
+    assert np.isfinite(days).all()
+    assert light.min() > 30
+    assert NOTHING == 255
