@@ -18,7 +18,7 @@ from flows.tasks.field_prior_map import FieldPriorMap
 from flows.tasks.field_work import FieldWork, WeightsFile, coarse_region, patch_features
 from models.reading.inference import CoarsePass, segment
 from models.reading.ood import OodDetector
-from models.reading.prior_map import Observation, TemporalAgreement, changed_from, compare, first_probabilities, fuse
+from models.reading.prior_map import CurrentVisit, TemporalAgreement, changed_from, compare, first_probabilities, fuse
 from models.reading.regions import Region
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.class_maps import write_changes_tile, write_class_tile, write_probabilities_tile
@@ -104,10 +104,10 @@ class Drawing:
 
     def _observation(
         self, log_probability: NDArray[np.float32], shown: NDArray[np.bool_], seen: CoarsePass
-    ) -> Observation:
+    ) -> CurrentVisit:
         if self.part:
             log_probability = np.where(shown[..., None], log_probability, np.float32(np.nan))
-        return Observation(log_probability, shown, seen.seen_columns, self.light, self.step)
+        return CurrentVisit(log_probability, shown, seen.seen_columns, self.light, self.step)
 
     def _shown(self, region: Region, store: PatchStore, patch_index: NDArray[np.int64]) -> NDArray[np.bool_]:
         """(y, x) pixels of a region that were looked at in detail.

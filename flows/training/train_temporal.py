@@ -22,7 +22,7 @@ from models.evaluation.metrics import confusion, mean_iou
 from models.network.spectral import patches_of
 from models.network.temporal_reader import TemporalReader
 from models.reading.inference import coarse_prediction_of_columns, segment
-from models.reading.prior_map import Observation, PriorMap, first_probabilities, fuse
+from models.reading.prior_map import CurrentVisit, PriorMap, first_probabilities, fuse
 from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation, ColumnNoise, drawn_step
 from models.training.temporal import PastPass, TemporalTraining, Visit, train_reader
 from models.training.train import Progress
@@ -156,7 +156,7 @@ class _Land:
         step: int,
         exposure_ms: float,
         rng: np.random.Generator,
-    ) -> Observation:
+    ) -> CurrentVisit:
         """What a uniform scan would have shown, read by the weights."""
         grid, light = self.grid, exposure_ms / REFERENCE_MS
         fine, means = scan_passes.scan(self.columns, self.noise, grid.factor, light=light, step=step, rng=rng)
@@ -166,7 +166,7 @@ class _Land:
             weights, coarse_prediction, patches_of(fine, grid.patch)[patch_index], patch_index, every_class=True
         )
         assert drawn.log_probability is not None
-        return Observation(drawn.log_probability, np.ones(self.labels.shape, np.bool_), means, light, step)
+        return CurrentVisit(drawn.log_probability, np.ones(self.labels.shape, np.bool_), means, light, step)
 
 
 def judge_temporal(

@@ -56,7 +56,7 @@ class ClassProbabilities:
 
 
 @dataclass(frozen=True)
-class Observation:
+class CurrentVisit:
     """Today's look, as far as a memory has to know it."""
 
     log_probability: Floats  # (y, x, class); NaN where nothing can be said
@@ -71,18 +71,18 @@ class PriorMap:
     """A memory as it was left, and how many days ago."""
 
     probabilities: ClassProbabilities
-    coarse: Floats | None  # as `Observation`'s, of the last look; None where it cannot be compared
+    coarse: Floats | None  # as `CurrentVisit`'s, of the last look; None where it cannot be compared
     days: float
 
 
-def first_probabilities(observation: Observation) -> ClassProbabilities:
+def first_probabilities(observation: CurrentVisit) -> ClassProbabilities:
     """What is known of a field that nobody looked at before: what was seen today, be it coarsely."""
     kept = np.maximum(observation.log_probability, np.float32(FAINTEST))  # NaN stays
     light = np.where(observation.seen, observation.light / observation.step**2, 0).astype(np.float32)
     return ClassProbabilities(kept, _ages(kept, np.zeros(observation.seen.shape, np.float32)), light)
 
 
-def fuse(memory: PriorMap, observation: Observation, reader: TemporalReader | None) -> ClassProbabilities:
+def fuse(memory: PriorMap, observation: CurrentVisit, reader: TemporalReader | None) -> ClassProbabilities:
     """Bring a memory to today by what was seen.
 
     A pixel of which the memory knows nothing takes today's look, and one that nothing can be said of today keeps its
@@ -113,7 +113,7 @@ def carried(memory: PriorMap, reader: TemporalReader | None) -> ClassProbabiliti
     shape = memory.probabilities.log_probability.shape
     s, columns = (1, 1) if reader is None else (reader.sizes.factor, reader.sizes.columns)
     unseen, coarse = np.zeros(shape[:2], np.bool_), (-(-shape[0] // s), -(-shape[1] // s), columns)
-    nothing = Observation(_nothing(shape), unseen, _nothing(coarse), *CARRIED_AS_BY)
+    nothing = CurrentVisit(_nothing(shape), unseen, _nothing(coarse), *CARRIED_AS_BY)
     return fuse(memory, nothing, reader)
 
 
@@ -122,7 +122,7 @@ def _nothing(shape: tuple[int, ...]) -> Floats:
 
 
 def _recalled(
-    memory: PriorMap, observation: Observation, reader: TemporalReader | None, rows: slice
+    memory: PriorMap, observation: CurrentVisit, reader: TemporalReader | None, rows: slice
 ) -> ClassProbabilities:
     """What is believed of some rows; the outermost of them see less than there is."""
     before, today = memory.probabilities.log_probability[rows], observation.log_probability[rows]
@@ -203,7 +203,7 @@ def _the_surer(before: Floats, today: Floats, seen: NDArray[np.bool_], age: Floa
 def _read(
     reader: TemporalReader,
     memory: PriorMap,
-    observation: Observation,
+    observation: CurrentVisit,
     images: Sequence[NDArray[np.generic]],
     rows: slice,
 ) -> Floats:
@@ -261,7 +261,7 @@ class TemporalAgreement:
 
 
 def compare(
-    memory: PriorMap, observation: Observation, after: ClassProbabilities, part: tuple[slice, slice]
+    memory: PriorMap, observation: CurrentVisit, after: ClassProbabilities, part: tuple[slice, slice]
 ) -> TemporalAgreement:
     """Compare what was remembered of some rows and columns with today's look and with what is believed now."""
     classes = after.log_probability.shape[-1]

@@ -189,13 +189,13 @@ class PatchWriter:
         group = create_group(path, "fine patches", {} if grid is None else {"angular_grid": grid.record()})
         names = write_bands(group, wavelength_nm, fwhm_nm)
         for name, values, meaning in (
-            ("patch", patch_index, "number of the patch on the padded grid"),
+            ("patch_index", patch_index, "number of the patch on the padded grid"),
             ("patch_y", origin_px[:, 0], "row of the patch's first pixel"),
             ("patch_x", origin_px[:, 1], "column of the patch's first pixel"),
         ):
             write_small(group, name, ("patch",), np.asarray(values, np.int64), {"long_name": meaning, "units": "1"})
         write_counts(group, patch=count, y=patch_px, x=patch_px)
-        coordinates = " ".join(["patch seat_y seat_x", *write_corners(group, grid, origin_px)])
+        coordinates = " ".join(["patch_index patch_y patch_x", *write_corners(group, grid, origin_px)])
         self._count = count
         shape = (count, patch_px, patch_px)
         about = {"long_name": "scene value", "units": "1", "coordinates": f"{names} {coordinates}"}
@@ -270,7 +270,7 @@ class PatchStore:
 def open_patches(path: Path) -> PatchStore:
     """Open stored patches. Raises IncompleteStoreError where they are missing or damaged."""
     group = open_group(path)
-    return PatchStore(read_array(group, "patch"), group)
+    return PatchStore(read_array(group, "patch_index"), group)
 
 
 @dataclass(frozen=True)

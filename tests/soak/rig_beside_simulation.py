@@ -154,7 +154,7 @@ def side_by_side(one: Surveyed, other: Surveyed) -> str:
 
 def _patches(surveyed: Surveyed) -> str:
     plan = json.loads((surveyed.archive / surveyed.receipt["products"]["plan"]).read_text())
-    return format_count(len(plan["patches"]))
+    return format_count(len(plan["patch_index"]))
 
 
 def _size(folder: Path) -> int:

@@ -28,7 +28,7 @@ from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table, write_table
 from storage.arrays.mosaics import Attention, write_attention
 
-ATTENTION = Product("score", version=7, files=("attention.zarr", "plan.json"), by_weights=True)
+ATTENTION = Product("score", version=8, files=("attention.zarr", "plan.json"), by_weights=True)
 
 
 @stage("score", "attention and plan", ATTENTION)
@@ -47,7 +47,7 @@ def score(run: SurveyRun, mosaic: StageRef) -> Wanted:
         rank[plan.patch_index[np.argsort(-scores[plan.patch_index], kind="stable")]] = np.arange(len(plan.patch_index))
         shape = run.grid.patch_shape
         write_attention(path / "attention.zarr", Attention(scores.reshape(shape), rank.reshape(shape), settings.policy))
-        content = asdict(plan) | {"patches": plan.patch_index.tolist()}
+        content = asdict(plan) | {"patch_index": plan.patch_index.tolist()}
         absent = [name for name in ("threshold", "spared_s") if content[name] is None]
         write_table(path / "plan.json", {name: value for name, value in content.items() if name not in absent})
 
@@ -192,5 +192,5 @@ def _scores_of_patches(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> NDA
 def load_plan(attention: StageRef) -> FinePlan:
     """Read the plan of an attention store."""
     plan = read_table(attention.path / "plan.json")
-    kept = {"sweeps": [Sweep(**sweep) for sweep in plan["sweeps"]], "patches": np.array(plan["patches"], np.intp)}
+    kept = {"sweeps": [Sweep(**sweep) for sweep in plan["sweeps"]], "patch_index": np.array(plan["patch_index"], np.intp)}
     return FinePlan(**(plan | kept))

@@ -22,7 +22,7 @@ from storage.arrays.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_c
 from storage.arrays.spool import Spool
 from storage.parallel.pool import WorkerPool, run_blocks
 
-RAW = Product("capture", version=9)
+RAW = Product("capture", version=10)
 RIG_RECORD = "rig.json"  # beside the cubes: what a rig's captures were like
 
 

@@ -29,7 +29,7 @@ from storage.archive.manifests import read_table
 from storage.archive.whole_files import to_json
 
 RECORD = "effects.json"
-MANIFEST = Product("effects", version=8, files=(RECORD,))
+MANIFEST = Product("effects", version=9, files=(RECORD,))
 FOOTPRINT = {
     ROTATION: ROTATION.variants[0],
     SLIT: SLIT.variants[-1],

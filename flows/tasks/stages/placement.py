@@ -135,9 +135,9 @@ def load_registration(registration: StageRef) -> dict[str, Any]:
     return read_table(registration.path / RECORD)
 
 
-GEOLOCATION = Product("locate", version=2, files=("geolocation.zarr",))
+GEOLOCATION = Product("locate", version=3, files=("geolocation.zarr",))
 MOSAIC = Product("rectify", version=4, files=("mosaic.zarr",))
-PATCHES = Product("patches", version=4, files=("patches.zarr",), made_again=True)
+PATCHES = Product("patches", version=5, files=("patches.zarr",), made_again=True)
 QUICKLOOK_PX = 512
 PATCHES_AT_ONCE = 64
 CACHE_FRACTION = 8  # raw lines kept for the next patches may take this part of the memory

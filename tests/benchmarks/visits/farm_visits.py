@@ -15,7 +15,7 @@ from flows.training.observed_scenes import chosen_effects
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.temporal_reader import TemporalReader
 from models.reading.inference import segment
-from models.reading.prior_map import ClassProbabilities, Observation, PriorMap, first_probabilities, fuse
+from models.reading.prior_map import ClassProbabilities, CurrentVisit, PriorMap, first_probabilities, fuse
 from models.training.capture_augmentation import REFERENCE_MS
 from models.weights.files import Weights, load_reader, load_weights
 from pipeline.geometry.camera import LineCamera
@@ -41,7 +41,7 @@ Mask = NDArray[np.bool_]
 class Seen:
     """A look at a farm: what it says, its true classes and the camera's seconds."""
 
-    observation: Observation
+    observation: CurrentVisit
     labels: Classes
     seconds: float
 
@@ -82,7 +82,7 @@ def seen_by(scene: RasterScene, seed: int, how: tuple[int, float]) -> Seen:
     drawn = segment(weights, scan_pass.seen, scan_pass.columns, scan_pass.patch_index, every_class=True)
     assert drawn.log_probability is not None
     seen = np.ones(SHAPE, np.bool_)
-    observation = Observation(drawn.log_probability, seen, scan_pass.seen.columns, exposure_ms / REFERENCE_MS, step)
+    observation = CurrentVisit(drawn.log_probability, seen, scan_pass.seen.columns, exposure_ms / REFERENCE_MS, step)
     return Seen(observation, np.asarray(scene.labels, np.uint8), scan_pass.seconds)
 
 

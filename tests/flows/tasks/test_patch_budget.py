@@ -158,7 +158,7 @@ def test_a_part_of_the_scan_is_kept_and_read(survey_png: Survey, tmp_path: Path)
     published = survey_png(tmp_path, **SCAN, macs="40%", policy="sobel", controls=True)
     (patches,) = tmp_path.glob("**/patches.zarr")
     (attention,) = tmp_path.glob("**/attention.zarr")
-    patch_index = xr.open_zarr(patches, consolidated=False)["patch"].values
+    patch_index = xr.open_zarr(patches, consolidated=False)["patch_index"].values
     seen = xr.open_zarr(attention, consolidated=False)
     best = np.argsort(-seen["score"].values.ravel(), kind="stable")[: len(patch_index)]
     assert sorted(patch_index) == sorted(best)

@@ -130,7 +130,7 @@ def test_savings_add_up_and_ranks_follow_the_scores(farm: Done) -> None:
     attention, patches = farm.open("attention"), farm.open("patches")
     score, rank = attention["score"].values.ravel(), attention["rank"].values.ravel()
     chosen = np.flatnonzero(rank >= 0)
-    assert set(chosen) == set(patches["patch"].values.tolist())
+    assert set(chosen) == set(patches["patch_index"].values.tolist())
     ordered = chosen[np.argsort(rank[chosen])]
     assert (np.sort(rank[chosen]) == np.arange(len(chosen))).all()
     assert (np.diff(score[ordered]) <= 0).all()
@@ -180,7 +180,7 @@ def test_products_open_with_plain_xarray(farm: Done) -> None:
     assert patches["values"].dims == ("patch", "y", "x", "band")
     assert attention["rank"].dims == ("patch_y", "patch_x")
     across = attention.sizes["patch_x"]
-    np.testing.assert_array_equal(patches["patch_y"].values, patches["patch"].values // across * patches.sizes["y"])
+    np.testing.assert_array_equal(patches["patch_y"].values, patches["patch_index"].values // across * patches.sizes["y"])
     assert np.isfinite(patches["values"].values[patches["valid"].values]).all()
     names = found.attrs["class_names"]
     assert (found["classes"].dims, (found.sizes["y"], found.sizes["x"])) == (("y", "x"), FARM)

@@ -67,7 +67,7 @@ def test_the_coarse_look_is_the_mean_of_the_scan(scanned: tuple[Path, Any]) -> N
     out, _ = scanned
     patches, mosaic = _store(out, "patches"), _store(out, "mosaic")
     whole = np.full((96, 128, 3), np.nan, np.float32)
-    for patch, patch_number in zip(patches["values"].values, patches["patch"].values.tolist(), strict=True):
+    for patch, patch_number in zip(patches["values"].values, patches["patch_index"].values.tolist(), strict=True):
         y, x = 8 * (patch_number // 16), 8 * (patch_number % 16)
         whole[y : y + 8, x : x + 8] = patch
     means, _ = block_means(whole, np.ones((96, 128), np.intp), 4)

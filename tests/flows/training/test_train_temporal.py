@@ -13,7 +13,7 @@ from flows.tasks.survey_model import shipped_weights
 from flows.training.train_temporal import TemporalRequest, _moments, run_remember, train_temporal
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.sizes import TemporalSizes
-from models.reading.prior_map import Observation, PriorMap, first_probabilities, fuse
+from models.reading.prior_map import CurrentVisit, PriorMap, first_probabilities, fuse
 from models.training.temporal import PastPass, TemporalTraining, Visit, train_reader
 from models.weights.files import content_key, describe_weights, load_reader
 from pipeline.errors import SettingsError
@@ -41,7 +41,7 @@ def test_a_reader_learns_whom_to_believe() -> None:
     first, later = lands[0]
     images = [np.log(visit.scan_passes[0].probability.astype(np.float32)) for visit in (first, later)]
     seen, coarse = np.ones((64, 64), np.bool_), np.zeros((16, 16, columns), np.float32)
-    before, now = (Observation(image, seen, coarse, 0.25, step) for image, step in zip(images, (1, 4), strict=True))
+    before, now = (CurrentVisit(image, seen, coarse, 0.25, step) for image, step in zip(images, (1, 4), strict=True))
     after = fuse(PriorMap(first_probabilities(before), coarse, 3.0), now, reader)
     scores = [
         mean_iou(confusion(first.labels, one.classes()[0], classes))

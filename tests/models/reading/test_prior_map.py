@@ -18,7 +18,7 @@ from models.network.temporal_reader import TemporalReader
 from models.reading.prior_map import (
     FAINTEST,
     ClassProbabilities,
-    Observation,
+    CurrentVisit,
     PriorMap,
     carried,
     changed_fractions,
@@ -41,10 +41,10 @@ def log_probabilities(rng: np.random.Generator, shape: tuple[int, int] = SHAPE) 
     return np.asarray(logits - np.log(np.exp(logits).sum(axis=-1, keepdims=True)), np.float32)
 
 
-def an_observation(rng: np.random.Generator, shape: tuple[int, int] = SHAPE) -> Observation:
+def an_observation(rng: np.random.Generator, shape: tuple[int, int] = SHAPE) -> CurrentVisit:
     """A look in detail at all of a field."""
     coarse = rng.normal(size=(shape[0] // FACTOR, -(-shape[1] // FACTOR), COLUMNS)).astype(np.float32)
-    return Observation(log_probabilities(rng, shape), np.ones(shape, np.bool_), coarse, 0.05, 2)
+    return CurrentVisit(log_probabilities(rng, shape), np.ones(shape, np.bool_), coarse, 0.05, 2)
 
 
 def a_prior_map(rng: np.random.Generator, shape: tuple[int, int] = SHAPE, days: float = 3.0) -> PriorMap:
@@ -155,7 +155,7 @@ def test_a_surer_look_speaks_against_a_memory_and_a_doubtful_one_does_not() -> N
     before = np.log(np.array([[[0.9, 0.05, 0.05]] * 3], np.float32))
     today = np.log(np.array([[[0.005, 0.99, 0.005], [0.2, 0.6, 0.2], [0.8, 0.1, 0.1]]], np.float32))
     coarse = np.zeros((1, 1, COLUMNS), np.float32)
-    coarse_pass = Observation(today, np.ones((1, 3), np.bool_), coarse, 1.0, 1)
+    coarse_pass = CurrentVisit(today, np.ones((1, 3), np.bool_), coarse, 1.0, 1)
     after = fuse(
         PriorMap(first_probabilities(replace(coarse_pass, log_probability=before)), None, 0.0), coarse_pass, None
     )
@@ -228,7 +228,7 @@ def test_another_field_is_known_by_its_agreement() -> None:
     """The same field agrees with itself; one with its classes drawn anew is another; nothing in common says nothing."""
     rng = np.random.default_rng(11)
     memory = a_prior_map(rng)
-    same = Observation(memory.probabilities.log_probability, np.ones(SHAPE, np.bool_), memory.coarse, 1.0, 1)  # type: ignore[arg-type]
+    same = CurrentVisit(memory.probabilities.log_probability, np.ones(SHAPE, np.bool_), memory.coarse, 1.0, 1)  # type: ignore[arg-type]
     whole = np.s_[:, :]
     found = compare(memory, same, memory.probabilities, whole)
     assert found.agreement == 1.0
@@ -242,17 +242,17 @@ def test_another_field_is_known_by_its_agreement() -> None:
 def test_a_field_of_one_class_is_no_other_field() -> None:
     """Where everything is one class in memory and look alike chance would agree as well: they agree."""
     told = np.log(np.tile(np.array([0.98, 0.01, 0.01], np.float32), (*SHAPE, 1)))
-    coarse_pass = Observation(told, np.ones(SHAPE, np.bool_), np.zeros((6, 5, COLUMNS), np.float32), 1.0, 1)
+    coarse_pass = CurrentVisit(told, np.ones(SHAPE, np.bool_), np.zeros((6, 5, COLUMNS), np.float32), 1.0, 1)
     memory = PriorMap(first_probabilities(coarse_pass), None, 1.0)
     assert not compare(memory, coarse_pass, memory.probabilities, np.s_[:, :]).is_of_another_field
 
 
-def sure_of(classes: NDArray[np.integer], how: float) -> Observation:
+def sure_of(classes: NDArray[np.integer], how: float) -> CurrentVisit:
     """A look in detail that gives every pixel of (y, x) its class with the same probability."""
     told = np.full((*classes.shape, CLASSES), (1 - how) / (CLASSES - 1), np.float32)
     np.put_along_axis(told, np.asarray(classes, np.intp)[..., None], how, axis=-1)
     coarse = np.zeros((classes.shape[0] // FACTOR, classes.shape[1] // FACTOR, COLUMNS), np.float32)
-    return Observation(np.log(told), np.ones(classes.shape, np.bool_), coarse, 0.05, 2)
+    return CurrentVisit(np.log(told), np.ones(classes.shape, np.bool_), coarse, 0.05, 2)
 
 
 def test_a_harvest_overnight_is_seen() -> None:

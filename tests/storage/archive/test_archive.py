@@ -346,7 +346,7 @@ def table(tmp_path: Path) -> Path:
     """A table in a store."""
 
     def build(path: Path) -> None:
-        (path / "plan.json").write_text('{"patches": [1, 2], "share": 0.25}')
+        (path / "plan.json").write_text('{"patch_index": [1, 2], "fraction": 0.25}')
 
     return Archive.open(tmp_path).produce("score", build, version=1, params={})[0].path / "plan.json"
 

@@ -220,7 +220,7 @@ def test_patches_round_trip(tmp_path: Path, count: int, at_once: int) -> None:
     np.testing.assert_array_equal(found.read(1, 3), round_bits(values)[1:3])
     with xr.open_zarr(tmp_path / "p.zarr", consolidated=False) as data:
         assert data["values"].dims == ("patch", "y", "x", "band")
-        assert {"patch", "patch_y", "patch_x", "wavelength", "fwhm"} <= set(data.coords)
+        assert {"patch_index", "patch_y", "patch_x", "wavelength", "fwhm"} <= set(data.coords)
         np.testing.assert_array_equal(data["valid"].values, valid)
         np.testing.assert_array_equal(np.stack([data["patch_y"], data["patch_x"]], axis=-1), origin)
 
