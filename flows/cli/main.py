@@ -9,7 +9,8 @@ import traceback
 
 from cyclopts import CycloptsError, UnknownOptionError
 
-from flows.cli.app import GOES_ON, VERBS, build_app, removed, say, stderr
+from flows.cli.app import GOES_ON, VERBS, build_app, say, stderr
+from flows.settings.renamed import FLAGS
 from flows.terminal.processes import TERMINATED, Terminated, format_refusal, place_caches, terminable
 from pipeline.errors import PipelineError, SettingsError
 
@@ -58,8 +59,8 @@ def _usage(error: CycloptsError) -> str:
     verb = " ".join(("spectralzoom", *(error.command_chain or ())))
     if isinstance(error, UnknownOptionError):
         word = (error.token.keyword or error.token.value).partition("=")[0]
-        gone = removed.get(word.removeprefix("--"))
-        what = what if gone is None else f"Unknown option: {word}; {gone}"
+        now = FLAGS.get(word.removeprefix("--"))
+        what = what if now is None else f"Unknown option: {word}; it is called --{now} now"
     return f"{what.rstrip('.')}; see {verb} --help"
 
 

@@ -69,15 +69,15 @@ def train(
     columns: int = 24,
     positions: Literal["2d", "paper"] = "2d",
     init: Path | None = None,
-    remember: Path | None = None,
-    ood_detector: Path | None = None,
+    train_temporal: Path | None = None,
+    fit_ood: Path | None = None,
     dim: int = 128,
     layers: int = 4,
     heads: int = 4,
     mlp_ratio: int = 3,
     crop: int | None = None,
     batch: int = 4,
-    darkest_ms: float = 100.0,
+    min_exposure_ms: float = 100.0,
     device: Device = PROCESSOR,
     labels: str | None = None,
     bands: str | None = None,
@@ -121,12 +121,12 @@ def train(
     init
         Weights to begin from: a vision transformer of timm or DeiT, a Segmenter checkpoint with its variant.yml beside
         it, or weights that this command made. What is taken is said, and kept in the weights.
-    remember
+    train_temporal
         Weights to train a reader of prior maps for, and nothing else: it weighs what earlier visits left against a
         later one. OUT has the weights with it, and surveys with --prior use it. It takes --scenes, --steps, --minutes,
         --seed and --validation, and continues where it was stopped. It needs 4 GB; reading the training scenes takes
         half an hour on top of --minutes.
-    familiar
+    fit_ood
         Weights to fit the detector of unknown pixels for, and nothing else: it reads the scenes of their training
         again, which DATASET has to be. OUT has the weights with it; surveys call pixels unknown that are unlike all of
         them. New weights have it from their training, if scenes were kept for validation.
@@ -143,7 +143,7 @@ def train(
     batch
         Crops a step; half as many in the last 30 % of the run, where crops have twice the area if scenes are large
         enough.
-    darkest_ms
+    min_exposure_ms
         Shortest exposure that the weights are to read: crops are shown with exposures from here to 100 ms, and lines 1,
         2 or 4 px apart; where scenes are kept for validation the file then has a record of uniform scans on them, by
         which `survey --seconds` plans.
@@ -163,10 +163,10 @@ def train(
         commas.
     """
 
-    if remember is not None:
+    if train_temporal is not None:
         how = TemporalTraining(minutes, steps, seed)
         lands, judged = LANDS if scenes is None else scenes, JUDGED_LANDS if validation is None else validation
-        asked = TemporalRequest(dataset, remember, out, lands, judged, settings=how, command=asked_command())
+        asked = TemporalRequest(dataset, train_temporal, out, lands, judged, settings=how, command=asked_command())
         record = run_remember(asked, stderr)
         if as_json:
             print_json(record)
@@ -178,8 +178,8 @@ def train(
         "train_mask": train_mask,
         "mask_classes": parse_wholes(mask_classes, "--mask-classes"),
     }
-    if ood_detector is not None:
-        known = run_measure_ood(OodRequest(dataset, ood_detector, out, choices, asked_command()), stderr)
+    if fit_ood is not None:
+        known = run_measure_ood(OodRequest(dataset, fit_ood, out, choices, asked_command()), stderr)
         if as_json:
             print_json(known)
         return 0
@@ -198,7 +198,7 @@ def train(
         init=init,
         choices=choices,
         settings=TrainingSettings(
-            steps=steps, minutes=minutes, seed=seed, crop=size, batch=batch, darkest_ms=darkest_ms
+            steps=steps, minutes=minutes, seed=seed, crop=size, batch=batch, darkest_ms=min_exposure_ms
         ),
         device=device,
     )

@@ -128,7 +128,7 @@ def finding_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
     ]
     if "scans" not in found and found.get("plan", {}).get("kind", "raster") != "raster":
         words = "the weights have no scan performance table, so that seconds stand beside every line at full exposure"
-        rows.append(("uniform scans", f"{words}; train --darkest-ms 3 makes one, by scenes kept for validation"))
+        rows.append(("uniform scans", f"{words}; train --min-exposure-ms 3 makes one, by scenes kept for validation"))
     return [(label, words) for label, words in rows if words]
 
 

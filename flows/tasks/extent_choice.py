@@ -101,7 +101,7 @@ def choose_extent(
     if content is None:
         raise WeightsError(
             f"the weights {path.name} have no record of uniform scans, by which a part of a field is chosen: leave --extent"
-            " out, or train weights with --darkest-ms 3, some scenes kept for validation"
+            " out, or train weights with --min-exposure-ms 3, some scenes kept for validation"
         )
     there = grid.valid_fraction().ravel() > 0 if shown is None else shown
     swaths, classes = _swaths(prior, grid, weights, path), len(weights.class_names)

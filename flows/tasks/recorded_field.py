@@ -74,7 +74,7 @@ class OpenedRecording:
             light=Once.of(
                 SceneRadiance(
                     np.zeros((1, len(wavelength_nm)), np.float32),
-                    np.full(len(wavelength_nm), self.settings.camera.full_full_well_e, np.float32),
+                    np.full(len(wavelength_nm), self.settings.camera.full_scale_e, np.float32),
                 )
             ),
             white_reference=self.recording.sweeps[0].references.white_reference,

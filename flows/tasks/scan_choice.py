@@ -80,7 +80,7 @@ def choose_uniform_scan(
         if settings.scan_step is None and settings.plain:
             raise WeightsError(
                 f"the weights {path.name} have no record of uniform scans, by which one would be chosen: give the scan "
-                "with --scan-step and --scan-exposure-ms, or train weights with --darkest-ms 3, some scenes kept for"
+                "with --scan-step and --scan-exposure-ms, or train weights with --min-exposure-ms 3, some scenes kept for"
                 " validation"
             )
         return settings, ScanChoice()

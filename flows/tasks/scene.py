@@ -148,9 +148,7 @@ def _field_before_rig(settings: Settings) -> RasterScene:
         key=f"{RIG_FIELD}/{settings.name or ''}/{width}x{height}",
         raster=SceneRaster.of(nothing),
         light=Once.of(
-            SceneRadiance(
-                np.zeros((1, bands), np.float32), np.full(bands, settings.camera.full_full_well_e, np.float32)
-            )
+            SceneRadiance(np.zeros((1, bands), np.float32), np.full(bands, settings.camera.full_scale_e, np.float32))
         ),
         white_reference=np.full(bands, settings.rig.white_reference, np.float32),
         wavelength_nm=np.array(settings.wavelengths, np.float64),

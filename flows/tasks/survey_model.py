@@ -83,7 +83,7 @@ class SurveyModel:
         if settings.unknown not in (UNKNOWN_AUTO, UNKNOWN_OFF) and self.described.ood_detector is None:
             raise WeightsError(
                 f"--unknown {settings.unknown}: nobody measured what is familiar to {self.path.name}; do so with: "
-                f"spectralzoom train DATASET --familiar {self.path} -o {self.path}, or leave --unknown out"
+                f"spectralzoom train DATASET --fit-ood {self.path} -o {self.path}, or leave --unknown out"
             )
         return None if settings.unknown == UNKNOWN_OFF else self.described.ood_detector
 

@@ -115,7 +115,7 @@ def scatter_points(seed: int) -> Scattered:
 
 def noise_level(camera: LineCamera) -> tuple[str, float]:
     """Return a tenth of the noise over the scene's standard deviation."""
-    electrons = camera.full_full_well_e / 2
+    electrons = camera.full_scale_e / 2
     noise = float(np.sqrt(electrons + camera.read_noise_e**2))
     return "0.1 σ of noise", 0.1 * noise / (CONTRAST * electrons)  # noqa: RUF001
 

@@ -1,6 +1,6 @@
 """What weights say of what they were trained on, and what is familiar to them: measured as training ends, or later.
 
-`spectralzoom train --familiar` measures it for weights that are there: it looks at the scenes of their training again,
+`spectralzoom train --fit-ood` measures it for weights that are there: it looks at the scenes of their training again,
 as their record names them, and adds it to their file. The weights and all that was made with them stay what they are.
 """
 
@@ -150,7 +150,7 @@ def measure_ood(request: OodRequest, report: Report = lambda what, done, figure:
     }
     why = measure_and_add(weights, request.weights, seen, trained, record, report, out=request.out)
     if why is not None:
-        raise SettingsError(f"--familiar {request.weights}: {why}")
+        raise SettingsError(f"--fit-ood {request.weights}: {why}")
     return record
 
 
@@ -166,7 +166,7 @@ def _data_of(weights: Weights, request: OodRequest) -> TrainingData:
     )
     if list(data.train) != own or list(data.validation) != list(split.get("validation", ())):
         raise SettingsError(
-            f"--familiar {request.weights}: these weights were trained on {weights.record.get('data', 'other data')},"
+            f"--fit-ood {request.weights}: these weights were trained on {weights.record.get('data', 'other data')},"
             f" {len(own)} scenes{f', the first {own[0]}' if own else ''}; {request.dataset} has others: give the data"
             " set of their training"
         )
@@ -191,7 +191,7 @@ def _observed(weights: Weights, data: TrainingData, request: OodRequest, report:
     for what, names in (("looking at scenes", data.train), ("looking at validation scenes", data.validation)):
         if not names:
             raise SettingsError(
-                f"--familiar {request.weights}: no scene was kept for validation when these weights were trained, so"
+                f"--fit-ood {request.weights}: no scene was kept for validation when these weights were trained, so"
                 " that nobody can say how often a known pixel would be unknown; train them with --validation 1 or more"
             )
         found, about = observe_all(how, data, names, what, report, about)

@@ -1,4 +1,4 @@
-"""`spectralzoom train --remember`: what reads a field's memory beside today's look, trained on lands through days.
+"""`spectralzoom train --train-temporal`: what reads a field's memory beside today's look, trained on lands through days.
 
 Built-in lands are scanned on several days; by the law of noise each scan is shown as shorter exposures and wider steps
 would have shown it, and read by the weights that the memory is for. Other lands then say what the memory is worth.
@@ -68,7 +68,7 @@ def train_temporal(request: TemporalRequest, report: Report = lambda what, done,
     """
     if request.dataset not in FARM_NAMES:
         raise SettingsError(
-            f"--remember trains on one land at several days, which only the built-in farm gives: expected farm, got"
+            f"--train-temporal trains on one land at several days, which only the built-in farm gives: expected farm, got"
             f" {request.dataset}; without a reader surveys go on from a memory by the surer of two looks"
         )
     if not request.out.parent.is_dir() or request.out.is_dir():
@@ -76,7 +76,7 @@ def train_temporal(request: TemporalRequest, report: Report = lambda what, done,
     weights = load_weights(request.weights)
     if weights.class_names != CLASSES:
         raise SettingsError(
-            f"--remember {request.weights}: expected weights of the farm's classes, {', '.join(CLASSES)}"
+            f"--train-temporal {request.weights}: expected weights of the farm's classes, {', '.join(CLASSES)}"
         )
     scan_passes = CaptureAugmentation(weights.normalisation)
     lands = []

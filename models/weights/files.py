@@ -180,7 +180,7 @@ def load_ood(weights: Path) -> OodDetector:
     if described.ood_detector is None:
         raise WeightsError(
             f"{weights} does not say what is familiar to it; measure it with: spectralzoom train DATASET"
-            f" --familiar {weights} -o {weights}"
+            f" --fit-ood {weights} -o {weights}"
         )
     tensors, about = _read_part(weights, described, OOD, spreads=("light", "rates")), described.ood_detector
     try:
@@ -198,7 +198,7 @@ def load_reader(weights: Path) -> TemporalReader:
     described = describe_weights(weights)
     if described.reader is None:
         raise WeightsError(
-            f"{weights} has no reader of prior maps; train one with: spectralzoom train DATASET --remember {weights}"
+            f"{weights} has no reader of prior maps; train one with: spectralzoom train DATASET --train-temporal {weights}"
             f" -o {weights}"
         )
     tensors = _read_part(weights, described, READER)

@@ -54,7 +54,7 @@ class LineCamera:
         return (1 << self.bits) - 1
 
     @property
-    def full_full_well_e(self) -> float:
+    def full_scale_e(self) -> float:
         """Electrons at which a sample saturates (dark level taken off)."""
         return (self.full_scale_dn - self.dark_dn) * self.electrons_per_dn
 

@@ -192,5 +192,8 @@ def _scores_of_patches(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> NDA
 def load_plan(attention: StageRef) -> FinePlan:
     """Read the plan of an attention store."""
     plan = read_table(attention.path / "plan.json")
-    kept = {"sweeps": [Sweep(**sweep) for sweep in plan["sweeps"]], "patch_index": np.array(plan["patch_index"], np.intp)}
+    kept = {
+        "sweeps": [Sweep(**sweep) for sweep in plan["sweeps"]],
+        "patch_index": np.array(plan["patch_index"], np.intp),
+    }
     return FinePlan(**(plan | kept))

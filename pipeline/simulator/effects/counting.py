@@ -102,7 +102,7 @@ class Defects(Effect):
             return Bound(0.0, "no element is dead or hot")
         lost = probe.scaled(dead.any(axis=0).astype(np.float64))
         electrons = float(hot.max())
-        gained = min(electrons, rig.camera.full_full_well_e)  # the converter's end
+        gained = min(electrons, rig.camera.full_scale_e)  # the converter's end
         why = f"{dead.sum()} dead and {(hot > 0).sum()} hot elements of {dead.size}, these with {electrons:.3g} e- more"
         added = probe.added(gained, rig.camera.electrons_per_dn) if gained else 0.0
         return Bound(max(lost, added), why)
@@ -148,7 +148,7 @@ class Saturation(Effect):
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it by how far the brightest sample, 6 deviations up, reaches above the lower of both limits."""
-        limit = min(rig.camera.full_full_well_e, rig.detector.full_well_e)
+        limit = min(rig.camera.full_scale_e, rig.detector.full_well_e)
         camera, brightest = rig.camera, max(probe.brightest_e, 0.0)
         expected = brightest + dark_electrons(rig) + most_hot_electrons(rig)
         sd = 0.0 if rig.detector.noiseless else float(np.hypot(np.sqrt(expected), camera.read_noise_e))

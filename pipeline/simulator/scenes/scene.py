@@ -255,8 +255,8 @@ def raster_from_values(
         raster=SceneRaster.of(planes, labels),
         light=Once.of(
             SceneRadiance(
-                np.full(bands, WELL_FRACTION * camera.full_full_well_e / bright, np.float32),
-                np.full(bands, camera.full_full_well_e, np.float32),
+                np.full(bands, WELL_FRACTION * camera.full_scale_e / bright, np.float32),
+                np.full(bands, camera.full_scale_e, np.float32),
             )
         ),
         white_reference=np.full(bands, bright / WELL_FRACTION, np.float32),

@@ -357,7 +357,7 @@ def _unseen(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit) -
         curvature=both,
         spectral_slope=one,
         spectral_curvature=one,
-        brightest_e=camera.full_full_well_e,
+        brightest_e=camera.full_scale_e,
         darkest_e=0.0,
         unit_least_dn=1.0,
         lines=sum(sweep.lines for sweep in sweeps),

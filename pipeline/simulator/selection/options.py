@@ -187,7 +187,7 @@ def _cost_ns(costs: Mapping[str, float], variant: str) -> float:
 
 
 def _is_present(effect: Effect, probe: Probe, rig: Rig) -> bool:
-    bright = max(probe.brightest_e, rig.camera.full_full_well_e)
+    bright = max(probe.brightest_e, rig.camera.full_scale_e)
     loud = replace(_even_probe(probe, 1.0), brightest_e=bright, slit_errors={})
     shown = max(effect.bound(loud, rig, OFF).value, effect.bound(probe, rig, OFF).value)
     return effect.name in ALWAYS_ON or shown > 0

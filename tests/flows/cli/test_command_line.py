@@ -71,10 +71,18 @@ def test_every_flag_says_what_it_is(verb: str) -> None:
     assert [name for name, words in _flags(verb).items() if not words] == []
 
 
+DARKEST = "Unknown option: --darkest-ms; it is called --min-exposure-ms now"
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (["survy"], 'Unknown command "survy". Did you mean "survey"?; see spectralzoom --help'),
+        (
+            ["survey", "--compute", "25%"],
+            "Unknown option: --compute; it is called --macs now; see spectralzoom survey --help",
+        ),
+        (["train", "farm", "-o", "a.safetensors", "--darkest-ms", "3"], f"{DARKEST}; see spectralzoom train --help"),
         (["survey", "--budgt", "1"], "Unknown option: --budgt. Did you mean --budget?; see spectralzoom survey --help"),
     ],
 )

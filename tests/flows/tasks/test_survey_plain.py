@@ -180,7 +180,9 @@ def test_products_open_with_plain_xarray(farm: Done) -> None:
     assert patches["values"].dims == ("patch", "y", "x", "band")
     assert attention["rank"].dims == ("patch_y", "patch_x")
     across = attention.sizes["patch_x"]
-    np.testing.assert_array_equal(patches["patch_y"].values, patches["patch_index"].values // across * patches.sizes["y"])
+    np.testing.assert_array_equal(
+        patches["patch_y"].values, patches["patch_index"].values // across * patches.sizes["y"]
+    )
     assert np.isfinite(patches["values"].values[patches["valid"].values]).all()
     names = found.attrs["class_names"]
     assert (found["classes"].dims, (found.sizes["y"], found.sizes["x"])) == (("y", "x"), FARM)

@@ -154,7 +154,7 @@ def test_pixels_without_a_value_have_no_class_rather_than_an_unknown_one(
 
 def test_a_rate_needs_weights_that_were_measured(survey_png: Survey, weights: Path, tmp_path: Path) -> None:
     """With the command that measures them; nothing is left behind."""
-    with pytest.raises(WeightsError, match=r"--unknown 1%: nobody measured .* --familiar"):
+    with pytest.raises(WeightsError, match=r"--unknown 1%: nobody measured .* --fit-ood"):
         survey_png(tmp_path / "out", weights=str(weights), unknown="1%")
     assert not (tmp_path / "out").exists()
 

@@ -343,5 +343,5 @@ def test_whitening_knows_the_noise_of_short_exposures(folder: Path, out: Path):
 @pytest.mark.parametrize("darkest_ms", [0.0, -1.0, 200.0, float("nan")])
 def test_exposures_that_no_look_has_are_refused(folder: Path, out: Path, darkest_ms: float):
     """Above the exposure that scenes are looked at with, or none at all: one message with the limits."""
-    with pytest.raises(SettingsError, match=r"--darkest-ms must be above 0 and at most 100"):
+    with pytest.raises(SettingsError, match=r"--min-exposure-ms must be above 0 and at most 100"):
         run_train(_request(folder, out, settings=replace(SETTINGS, darkest_ms=darkest_ms)), Console(quiet=True))

@@ -87,7 +87,7 @@ def test_the_command_trains_judges_and_says_how(tmp_path: Path, monkeypatch: pyt
         (
             "frames",
             "x.safetensors",
-            "--remember trains on one land at several days, which only the built-in farm gives",
+            "--train-temporal trains on one land at several days, which only the built-in farm gives",
         ),
         ("farm", "no/x.safetensors", "expected the name of a file in a folder that exists"),
     ],

@@ -79,7 +79,7 @@ def test_what_is_added_is_read_and_leaves_the_weights_as_they_were(path: Path) -
         torch.testing.assert_close(weights.segmenter.state_dict()[name], tensor, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize(("load", "words"), [(load_ood, "--familiar"), (load_reader, "--remember")])
+@pytest.mark.parametrize(("load", "words"), [(load_ood, "--fit-ood"), (load_reader, "--train-temporal")])
 def test_a_part_that_is_not_there_says_how_it_is_made(path: Path, load: Callable[[Path], object], words: str) -> None:
     """The message names the file and the command."""
     with pytest.raises(WeightsError, match=rf"own\.safetensors.*spectralzoom train DATASET {words}"):

@@ -28,7 +28,7 @@ def test_defaults_describe_the_rig():
     assert CAMERA.ifov_rad == pytest.approx(105.714e-6, rel=1e-5)
     assert CAMERA.slit_px == pytest.approx(2.70, abs=0.005)
     assert CAMERA.full_scale_dn == 4095
-    assert CAMERA.full_full_well_e == (4095 - 64) * 5
+    assert CAMERA.full_scale_e == (4095 - 64) * 5
 
 
 @given(st.floats(0.01, 500), st.floats(0, 50), st.floats(1, 400))
@@ -91,7 +91,7 @@ def test_noise_has_the_moments_of_shot_and_read_noise(read_noise: float, expecte
 
 def test_without_noise_rounding_is_to_even_and_ends_clip():
     """Half DN goes to even, light beyond the full well stays at full scale, negative light at the dark level."""
-    electrons = np.array([2.5, 7.5, 1e9, -50.0, CAMERA.full_full_well_e])
+    electrons = np.array([2.5, 7.5, 1e9, -50.0, CAMERA.full_scale_e])
     assert digitise(electrons, CAMERA, None).tolist() == [64, 66, 4095, 64, 4095]
 
 

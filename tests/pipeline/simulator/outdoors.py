@@ -35,7 +35,7 @@ def white_e(exposure_ms: float = 100.0) -> Floats:
     """Electrons of the white reference in an exposure, (band,): near the farm's."""
     knots = [400, 450, 550, 600, 700, 760, 800, 900, 940, 1000]
     light = np.interp(WAVELENGTH, knots, [0.25, 0.58, 0.95, 1.0, 0.83, 0.6, 0.6, 0.3, 0.1, 0.1])
-    return 0.94 * CAMERA.full_full_well_e * exposure_ms / 100 * light
+    return 0.94 * CAMERA.full_scale_e * exposure_ms / 100 * light
 
 
 def materials(exposure_ms: float = 100.0) -> NDArray[np.float32]:

@@ -124,7 +124,7 @@ def test_references_give_back_scene_values(binning: int, exposure_ms: float) -> 
     )
     if valid.any():
         np.testing.assert_allclose(out[valid], np.broadcast_to(values[0, 0], out.shape)[valid], atol=0.51 * step)
-    assert valid.all() == (values.max() * source.scene.electrons[0] * exposure_ms / 100 < CAMERA.full_full_well_e)
+    assert valid.all() == (values.max() * source.scene.electrons[0] * exposure_ms / 100 < CAMERA.full_scale_e)
 
 
 def test_black_scene_reads_dark() -> None:

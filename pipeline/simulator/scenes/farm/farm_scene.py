@@ -113,7 +113,7 @@ def farm_scene(
         name="farm",
         key=(
             f"{FARM_LAW}/seed={seed}/day={plan.day}/shape={size}/hour={plan.hour:g}/bands={bands}"
-            f"/full_well={seen_by.full_full_well_e:g}"
+            f"/full_well={seen_by.full_scale_e:g}"
         ),
         raster=SceneRaster((*shape, len(plan.materials)), labelled=True, draw=lambda: _draw(plan)),
         light=Once(light),

@@ -117,11 +117,11 @@ class SpectralLibrary:
 
         Exposure and aperture are such that a perfect white fills 95 % of the full well in the brightest band.
         """
-        return (self.reflectance * self.light * FILL * camera.full_full_well_e).astype(np.float32)
+        return (self.reflectance * self.light * FILL * camera.full_scale_e).astype(np.float32)
 
     def white_reference_electrons(self, camera: LineCamera) -> NDArray[np.float32]:
         """Expected electrons of the white reference panel, (band,) [e-]."""
-        return (WHITE_REFERENCE_REFLECTANCE * self.light * FILL * camera.full_full_well_e).astype(np.float32)
+        return (WHITE_REFERENCE_REFLECTANCE * self.light * FILL * camera.full_scale_e).astype(np.float32)
 
 
 def band_centres(bands: int) -> tuple[Spectrum, Spectrum]:

@@ -114,7 +114,7 @@ def test_more_defects_keep_those_there_were() -> None:
 @pytest.mark.parametrize("unit", ["sigma", "dn"])
 def test_a_bright_roof_saturates(unit: Unit) -> None:
     """Six deviations below full scale the bound is 0; above it is what is clipped."""
-    well = LineCamera().full_full_well_e
+    well = LineCamera().full_scale_e
     assert SATURATION.bound(probe(100, well - 6.2 * np.sqrt(well + 400) - 20, unit), RIG).value == 0
     bound = SATURATION.bound(probe(100, 30_000, unit), RIG)
     lost = 30_000 + 20 - well

@@ -123,7 +123,7 @@ def test_white_white_reference_never_saturates() -> None:
     """The panel stays six standard deviations of shot and read noise below the full well, and so in DN."""
     camera = LineCamera()
     white_reference = spectral_library(270).white_reference_electrons(camera)
-    assert (white_reference + 6 * np.sqrt(white_reference + camera.read_noise_e**2)).max() < camera.full_full_well_e
+    assert (white_reference + 6 * np.sqrt(white_reference + camera.read_noise_e**2)).max() < camera.full_scale_e
     assert digitise(white_reference, camera, np.random.default_rng(0)).max() < camera.full_scale_dn
 
 

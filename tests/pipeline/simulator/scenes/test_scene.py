@@ -121,7 +121,7 @@ def test_bright_end_fills_the_stated_fraction_of_the_well() -> None:
     """The 99.9th percentile gives 60 % of the full well, whatever the unit of the file."""
     scene = raster_from_values(picture(), CAMERA, name="p", wavelength_nm=WAVELENGTH)
     bright = np.percentile(picture(), 99.9)
-    np.testing.assert_allclose(bright * scene.electrons, 0.6 * CAMERA.full_full_well_e, rtol=1e-6)
+    np.testing.assert_allclose(bright * scene.electrons, 0.6 * CAMERA.full_scale_e, rtol=1e-6)
     np.testing.assert_allclose(scene.white_reference * scene.electrons, scene.white_reference_electrons, rtol=1e-6)
 
 
@@ -152,7 +152,7 @@ def test_gaps_are_filled_and_counted() -> None:
 def test_black_scene_keeps_scale_one() -> None:
     """Without positive light the scale is 1 and everything stays finite."""
     scene = raster_from_values(np.zeros((5, 5, 2)), CAMERA, name="black", wavelength_nm=WAVELENGTH)
-    np.testing.assert_allclose(scene.electrons, 0.6 * CAMERA.full_full_well_e, rtol=1e-6)
+    np.testing.assert_allclose(scene.electrons, 0.6 * CAMERA.full_scale_e, rtol=1e-6)
     assert (scene.values() == 0).all()
 
 
