@@ -60,7 +60,7 @@ def _usage(error: CycloptsError) -> str:
     if isinstance(error, UnknownOptionError):
         word = (error.token.keyword or error.token.value).partition("=")[0]
         now = FLAGS.get(word.removeprefix("--"))
-        what = what if now is None else f"Unknown option: {word}; it is called --{now} now"
+        what = what if now is None else f"Unknown option: {word}; {now}"
     return f"{what.rstrip('.')}; see {verb} --help"
 
 

@@ -1,4 +1,4 @@
-"""Names that settings and flags had before, with those that they have now: a message says them."""
+"""Settings and flags of former names: messages say what they are called now, or what took their place."""
 
 SETTINGS = {
     "look": "extent",
@@ -17,4 +17,9 @@ SETTINGS = {
     "sky.cloud_share": "sky.cloud_fraction",
 }
 OF_TRAINING = {"darkest-ms": "min-exposure-ms", "familiar": "fit-ood", "remember": "train-temporal"}
-FLAGS = {old.replace("_", "-"): new.replace("_", "-") for old, new in SETTINGS.items()} | OF_TRAINING
+FLAGS = {  # and what to say of each
+    **{old.replace("_", "-"): f"it is called --{new.replace('_', '-')} now" for old, new in SETTINGS.items()},
+    **{old: f"it is called --{new} now" for old, new in OF_TRAINING.items()},
+    "late": "Prefect begins a run late rather than never, and cancels one that is due while the field's last still runs",
+    "notify": "Prefect sends notices of failed runs by an automation: prefect automation create --from-file automation.yaml",
+}
