@@ -161,7 +161,7 @@ def _row(run: Run, shown: ClassMap | None) -> Row:
         "run": run.uri,
         "created": run.created,
         "visit": run.settings.get("visit"),
-        "looked": None if (at := time_of_visit(run)) is None else at.isoformat().replace("+00:00", "Z"),
+        "visited": None if (at := time_of_visit(run)) is None else at.isoformat().replace("+00:00", "Z"),
         "capture_seconds": {name: known_number(entries["capture_s"].get(name)) for name in ("done", "full")},
         **score_of(run.receipt),
         "savings": {name: known_number(entry.get("ratio")) for name, entry in entries.items()},
@@ -213,7 +213,7 @@ def _visit(archive: Archive, run: Run, row: Row, shown: ClassMap) -> dict[str, s
             kept = patch_index[: shown.classes.shape[0], : shown.classes.shape[1]][thin, thin]
             table = np.concatenate([palette, pale])
             changes = pictures.png_address(numbers + np.where(kept, 0, MOST_CLASSES).astype(np.uint8), table)
-    when = _short(str(row["looked"] or row["created"]))
+    when = _short(str(row["visited"] or row["created"]))
     visit = str(row["visit"] or "")
     when = when if not visit or read_moment(visit) is not None else f"{visit}, {when}"
     return {
@@ -239,7 +239,7 @@ def _format_row(receipt: Mapping[str, Any]) -> str:
 
 def render_history(history: FieldHistory, runs_at: str) -> str:
     """Return the page; ``runs_at`` is the way from it to the archive's folder, empty where there is none."""
-    moments = ((read_moment(row.get("looked") or row["created"]), row) for row in history.runs)
+    moments = ((read_moment(row.get("visited") or row["created"]), row) for row in history.runs)
     dated = [(moment, row) for moment, row in moments if moment is not None and moment.year in DRAWN_YEARS]
 
     def series(labels: Mapping[str, str], of: str | None = None) -> Points:
@@ -319,7 +319,7 @@ def _shown(row: Row, runs_at: str) -> dict[str, Any]:
     show = format_area if row["unit"] == "ha" else format_percent
     name = quote(str(row["run"]).removeprefix("runs/"), errors="surrogateescape")
     return {
-        "looked": _short(str(row.get("looked") or "")) or DASH,
+        "visited": _short(str(row.get("visited") or "")) or DASH,
         "published": _short(str(row["created"])),
         "report": f"{runs_at}/runs/{name}/report.html" if runs_at else "",
         "capture_s": row["savings"]["capture_s"],

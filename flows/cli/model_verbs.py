@@ -285,7 +285,7 @@ def evaluate(
         "bands": parse_wholes(bands, "--bands"),
         "wavelengths": parse_numbers(wavelengths, "--wavelengths"),
     }
-    given = parse_numbers(fractions, "--shares")
+    given = parse_numbers(fractions, "--fractions")
     request = EvaluateRequest(
         dataset,
         weights,

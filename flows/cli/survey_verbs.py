@@ -86,7 +86,7 @@ def survey(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_js
         published = survey_command.run_survey(asked, stderr)
     except NothingToMend as said:
         if as_json:
-            print_json({"looked": False, "run": said.run, "why": str(said)})
+            print_json({"captured": False, "run": said.run, "why": str(said)})
         stderr.print(f"{said}", markup=False, soft_wrap=True)
         return 0
     if as_json:

@@ -60,7 +60,7 @@ def checked_request(request: EvaluateRequest) -> EvaluateRequest:
     """Put shares in order, drop what is there anyway, and refuse what cannot be judged (SettingsError, its flag)."""
     for fraction in request.fractions:
         if not 0 <= fraction <= 1:
-            raise SettingsError(f"--shares are fractions of the patches from 0 to 1 (0.1 is 10 %), got {fraction:g}")
+            raise SettingsError(f"--fractions are fractions of the patches from 0 to 1 (0.1 is 10 %), got {fraction:g}")
     for policy in request.policies:
         if policy not in JUDGED and policy != "oracle":
             raise SettingsError(

@@ -94,7 +94,7 @@ def test_new_weights_and_hectares_are_told(
         survey_png(tmp_path / "archive", weights=str(make_weights(names=names)), **small)
     content = _compared(capsys, tmp_path / "archive", "previous", "latest", tmp_path)
     made = {row["name"] for row in content["made"]}
-    assert "stage.draw_map" in made
+    assert "stage.segment" in made
     assert "stage.rectify" not in made
     assert sum(row["ha"][1] for row in content["classes"]) > 0
     compare(tmp_path / "archive", "previous", "latest", out=tmp_path)

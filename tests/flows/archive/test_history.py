@@ -39,12 +39,12 @@ def test_runs_are_one_history(archive: Path) -> None:
     north, south = read_histories(Archive.open(archive))
     assert (north.field, south.field) == ("north", "south")
     assert [row["visit"] for row in north.runs] == ["2026-06-01T10:00:00Z", f"b {BAD}"]
-    assert north.runs[0]["looked"] == "2026-06-01T10:00:00Z"
+    assert north.runs[0]["visited"] == "2026-06-01T10:00:00Z"
     assert sum(north.runs[0]["areas"].values()) == pytest.approx(1.0)
     assert north.runs[0]["miou"] is not None
     assert [one["when"] for one in north.visits] == [
         "2026-06-01 10:00",
-        f"b {BAD}, {north.runs[1]['looked'][:16].replace('T', ' ')}",
+        f"b {BAD}, {north.runs[1]['visited'][:16].replace('T', ' ')}",
     ]
     receipt = json.loads((archive / north.runs[0]["run"] / "receipt.json").read_text())
     shown = load_class_map(archive / receipt["products"]["class_map"])
@@ -105,7 +105,7 @@ def test_pages_of_little(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("observation", "fractions", "drawn"),
+    ("moment", "fractions", "drawn"),
     [
         ("2026-05-10T00:00:00Z", [0.5], 1),
         ("2026-05-10T00:00:00Z", [0.0, 0.0], 0),
@@ -115,10 +115,10 @@ def test_pages_of_little(tmp_path: Path) -> None:
         ("9999-12-31T23:59:59Z", [0.5], 0),
     ],
 )
-def test_whatever_a_receipt_claims_is_drawn_or_left_out(observation: str, fractions: list[float], drawn: int) -> None:
+def test_whatever_a_receipt_claims_is_drawn_or_left_out(moment: str, fractions: list[float], drawn: int) -> None:
     """Dates of any year and numbers of any size make no chart that fails or warns; equal rows give equal pages."""
     rows = [
-        {"run": "runs/x", "created": observation, "looked": observation, "unit": "fraction", "areas": {"so$il": fraction},
+        {"run": "runs/x", "created": moment, "visited": moment, "unit": "fraction", "areas": {"so$il": fraction},
          "savings": dict.fromkeys(("capture_s", "lines", "bytes_stored", "multiply_adds")), "miou": None,
          "overall_accuracy": None}
         for fraction in fractions

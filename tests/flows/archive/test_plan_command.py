@@ -103,8 +103,8 @@ def test_the_reason_is_what_differs(
 ) -> None:
     """A parameter with both values, where it began, weights as such, and the version of a stage."""
     planned = _plan(settings, archive, resampling="nearest")
-    assert planned["rectify"].why == "kernel: catmull-rom before, nearest now"
-    assert planned["score"].why == "kernel of rectify: catmull-rom before, nearest now"
+    assert planned["rectify"].why == "resampling: catmull-rom before, nearest now"
+    assert planned["score"].why == "resampling of rectify: catmull-rom before, nearest now"
     effects = _plan(settings, archive, effects="none")["capture_coarse"].why
     assert effects == "asked of effects: auto before, none now"
     assert {(change.where, change.kind) for change in planned["score"].changes} == {

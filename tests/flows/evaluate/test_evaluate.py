@@ -329,7 +329,7 @@ def test_the_farm_is_judged_on_seeds_of_its_own(tmp_path: Path, monkeypatch: pyt
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"fractions": (10.0,)}, "--shares are fractions of the patches from 0 to 1"),
+        ({"fractions": (10.0,)}, "--fractions are fractions of the patches from 0 to 1"),
         ({"policies": ("mask",)}, "'mask' is none that can be judged"),
         ({"draws": 0}, "--draws must be at least 1"),
         ({"seed": -1}, "--seed must be at least 0"),
@@ -352,7 +352,7 @@ def test_figures_are_printed(judged: Judged, data: Path, capsys: pytest.CaptureF
         assert words in shown.out
     assert "evaluation.json" in shown.err
     weights = write_weights(tmp_path / "w.safetensors")
-    words = ["evaluate", str(data), "--weights", str(weights), "--shares", "0.5", "--policies", "entropy", "--json"]
+    words = ["evaluate", str(data), "--weights", str(weights), "--fractions", "0.5", "--policies", "entropy", "--json"]
     with pytest.raises(SystemExit) as left:
         main([*words, "--frames", "001", "--draws", "5"])
     assert left.value.code == 0

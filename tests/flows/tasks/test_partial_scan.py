@@ -173,7 +173,7 @@ def test_of_what_is_sure_enough_nothing_is_looked_at(
     words = [word for name, value in asked.items() for word in (f"--{name.replace('_', '-')}", str(value))]
     told = command_line("survey", *words, "--json")
     assert told.code == 0
-    assert json.loads(told.out) == {"looked": False, "run": runs[-1].name, "why": told.err.strip().splitlines()[-1]}
+    assert json.loads(told.out) == {"captured": False, "run": runs[-1].name, "why": told.err.strip().splitlines()[-1]}
     assert forecast(load_settings(None, asked)).scans is not None
     assert survey_png(visited, **{**flags, "skip_below_error": "0.1%"}).receipt["settings"]["skip_below_error"] == 0.001
 
