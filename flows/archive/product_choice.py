@@ -106,7 +106,7 @@ def _prescription(flags: ProductFlags, doses: Mapping[str, float]) -> Prescripti
     if not 0 < flags.cell < float("inf"):
         raise SettingsError(f"--cell expects metres above 0, got {flags.cell:g}")
     if not 0 <= flags.least_fraction < 1:
-        raise SettingsError(f"--least-share expects a fraction from 0 to below 1, got {flags.least_fraction:g}")
+        raise SettingsError(f"--least-fraction expects a fraction from 0 to below 1, got {flags.least_fraction:g}")
     try:
         heading = None if flags.heading == ROWS else float(flags.heading) % 360
     except ValueError:

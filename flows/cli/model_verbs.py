@@ -246,8 +246,8 @@ def evaluate(
         those that never saw it.
     out
         Folder for evaluation.json and its plot, evaluation.png.
-    shares
-        Shares of the patches (patches to look at finely) to try, with commas; 0.05,0.1,0.15,0.2,0.35 by default. No patch
+    fractions
+        Fractions of the patches to read in detail, with commas; 0.05,0.1,0.15,0.2,0.35 by default. No patch
         (none) and every patch (all) are always tried.
     policies
         Ways to choose the patches, with commas; gain,entropy,sobel,random by default. The oracle, which chooses by the

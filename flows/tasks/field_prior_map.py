@@ -31,7 +31,7 @@ class FieldPriorMap:
     probabilities: Path
     mosaic: Path | None  # of the last look alone, whose days these are; None where its pixels have another size
     days: float
-    classes: tuple[int, ...]  # see `flows.tasks.memory.Prior`
+    classes: tuple[int, ...]  # see `flows.tasks.prior_maps.Prior`
     shift_px: tuple[int, int] = (0, 0)  # down and to the right, that brings it onto today's look
 
     def of(self, region: Region, weights: Weights) -> PriorMap:

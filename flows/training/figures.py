@@ -51,7 +51,7 @@ def validate(weights: Weights, examples: Iterable[Example], seed: int, show: Sho
     )
     return {
         "scenes": len(rows),
-        "fraction_of_patches": whole.fraction,
+        "share_of_seats": whole.fraction,
         "none": agreement(whole.none),
         "all": agreement(whole.every),
         **whole.as_dict(),

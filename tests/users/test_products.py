@@ -260,7 +260,7 @@ def test_the_catalogue_names_every_product(posed: Products) -> None:
         ({"prescription": "weed=-1"}, "got 'weed=-1'"),
         ({"prescription": "weed=1", "dose_unit": "gal/ac"}, "--dose-unit expects l/ha or kg/ha, got 'gal/ac'"),
         ({"prescription": "weed=1", "cell": 0.0}, "--cell expects metres above 0, got 0"),
-        ({"prescription": "weed=1", "least_fraction": 1.0}, "--least-share expects a fraction"),
+        ({"prescription": "weed=1", "least_fraction": 1.0}, "--least-fraction expects a fraction"),
         ({"prescription": "weed=1", "heading": "north"}, "--heading expects degrees from north, or rows"),
         ({"prescription": "thistle=1"}, "no class 'thistle'; its classes are soil, maize"),
         ({"polygons": True, "buffer": "thistle=1"}, "--buffer: the run has no class 'thistle'"),
