@@ -62,10 +62,11 @@ def remember(folder: Path, put: Callable[[object, str, Any], None] = setattr) ->
             decisions[question] = WORKED_OUT["decide"][1](probes, rig, effects, *given)
         return decisions[question]
 
-    def verified(run: Any, decision: Any, probes: Any) -> Any:
-        told = run.settings
-        question = run.scene.key, run.planned, told.simulated_rig, told.seed, told.cost, told.effects, told.tol
-        return known(question, lambda: WORKED_OUT["_verified"][1](run, decision, probes))
+    def verified(scene: Any, rig: Any, decision: Any, probes: Any, whole: Any, report: Any) -> Any:
+        sweeps = [(block.sweep, block.seed, block.started_s) for block in whole]
+        asked = decision.asked, decision.tolerance, decision.unit
+        question = scene.key, rig, sweeps, *asked
+        return known(question, lambda: WORKED_OUT["_verified"][1](scene, rig, decision, probes, whole, report))
 
     def drawn(path: Path, panels: Any) -> None:
         fresh: list[bytes] = []

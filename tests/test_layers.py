@@ -107,6 +107,33 @@ def test_imports_go_one_way() -> None:
     assert wrong == []
 
 
+def test_storage_stores() -> None:
+    """It rectifies and calibrates nothing: of `rectify` it knows what it writes down, of `signal` what files need."""
+    known = {
+        "storage/arrays/lookups.py": {"pipeline.rectify.placed", "pipeline.rectify.scan_paths"},
+        "storage/readers/cube_sources.py": {"pipeline.signal.calibrate"},
+        "storage/readers/recorded_cubes.py": {"pipeline.signal.detector"},
+    }
+    found = {
+        path.as_posix(): names
+        for path, tree in source().items()
+        if path.parts[0] == "storage"
+        and (names := {name for name in imported(tree) if name.startswith(("pipeline.rectify", "pipeline.signal"))})
+    }
+    assert found == known
+
+
+def test_a_survey_calibrates_in_one_place() -> None:
+    """What is rectified and registered is never a raw number: `pipeline.signal.lines` has read and calibrated it."""
+    wrong = [
+        f"{path} imports {name}"
+        for path, tree in source().items()
+        for name in imported(tree)
+        if name.startswith("pipeline.signal.calibrate") and path.parts[:2] == ("pipeline", "rectify")
+    ]
+    assert wrong == []
+
+
 def test_heavy_packages_stay_with_their_owner() -> None:
     """A heavy package is imported in its owner's folder alone."""
     wrong = [

@@ -23,7 +23,6 @@ from flows.publish.receipt import AccuracyIs, Receipt, build_receipt, check_rece
 from flows.publish.report import Picture, render_report
 from flows.settings.load import anchor_paths
 from flows.settings.values import EXTENT_WHOLE
-from flows.tasks.extent import work_done, work_of_map
 from flows.tasks.open_survey import STAGES, OpenSurvey, Products
 from flows.tasks.patch_budget import BYTES_A_VALUE
 from flows.tasks.prior_maps import prior_map_figures
@@ -31,7 +30,6 @@ from flows.tasks.run import SurveyRun, now
 from flows.tasks.scan_choice import as_figures
 from flows.tasks.stages.accuracy import load_accuracy
 from flows.tasks.stages.attention import load_plan
-from flows.tasks.stages.capture import captured
 from flows.tasks.stages.effects import load_manifest
 from flows.tasks.stages.on_ground import STORE
 from flows.tasks.stages.placement import PATCHES_AT_ONCE, line_facts, load_registration, seen_fractions
@@ -41,13 +39,13 @@ from pipeline.planning.coverage import on_scene
 from pipeline.planning.fine_pass import FinePlan
 from pipeline.planning.prices import SavingEntry, capture_savings
 from pipeline.planning.uniform_scans import format_scan
-from pipeline.rectify.calibrate import of_bands, reflectance
+from pipeline.signal.calibrate import of_bands, reflectance
 from storage.archive.keys import StageRef
 from storage.archive.records import read_run
 from storage.archive.run_folders import RunDraft
 from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import ProbabilityStore, load_class_map
-from storage.arrays.cubes import RawCube
+from storage.arrays.cubes import RawCube, open_raw_cubes
 from storage.arrays.ground_maps import load_ground_map, open_image
 from storage.arrays.mosaics import load_attention, open_patches
 from storage.arrays.quicklooks import choose_bands
@@ -104,7 +102,9 @@ def load_receipt(folder: Path) -> Receipt:
 
 def _publish(run: SurveyRun, draft: RunDraft, products: Products, plan: FinePlan, receipt: Receipt) -> Published:
     again = (
-        None if run.plan.plain else float(seen_fractions(run, products.patches).sum()) / len(run.grid.valid_patches())
+        None
+        if run.plan.plain
+        else float(seen_fractions(run.frame, products.patches).sum()) / len(run.grid.valid_patches())
     )
     coarse_prediction = quicklook_data(run, products, plan, receipt)
     draw_quicklook(draft.folder / "quicklook.png", coarse_prediction)
@@ -194,7 +194,7 @@ def _bytes_saved(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str
 
 def _model_savings(run: SurveyRun, plan: FinePlan) -> dict[str, Any]:
     """Tokens and multiply-adds of the map beside those of reading every patch."""
-    did, scan = work_done(run, plan.patch_index), work_of_map(run, run.grid.valid_patches())
+    did, scan = run.work_done(plan.patch_index), run.costs.of_map(run.grid.valid_patches())
     config, valid = run.weights.config, len(run.grid.valid_patches())
     cells, each = int(np.prod(run.grid.padded_shape)) // (config.patch * config.factor) ** 2, config.token_side**2
     return {
@@ -225,7 +225,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
     notes = [] if moment is None else [f"day {moment[0]}, {moment[1]:g} h"]
     if accuracy is not None and accuracy["miou"] is not None:
         notes.append(f"mIoU {100 * accuracy['miou']:.1f} %")
-    sweeps = [cube for ref in products.there("capture_coarse") for cube in captured(ref)]  # of a raster none
+    sweeps = [cube for ref in products.there("capture_coarse") for cube in open_raw_cubes(ref.path)]  # of a raster none
     strips = sorted(sweeps, key=lambda cube: cube.sweep.swath_px)  # as they lie there
     return QuicklookData(
         survey=run.name,
@@ -338,7 +338,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     passes = {"coarse": products.get("register_coarse"), "fine": products.get("register_fine")}
     pointing = {name: _pointing(ref) for name, ref in passes.items() if ref is not None}
     if "fine" in pointing:
-        pointing["fine"]["partly_seen"] = int(np.count_nonzero(seen_fractions(run, products.patches) < 1))
+        pointing["fine"]["partly_seen"] = int(np.count_nonzero(seen_fractions(run.frame, products.patches) < 1))
     if pointing:
         found["pointing"] = {"prior_px": run.settings.pointing_px, **pointing}
     class_map = products["segment"]

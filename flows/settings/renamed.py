@@ -16,7 +16,13 @@ SETTINGS = {
     "air.airlight_share": "air.airlight_fraction",
     "sky.cloud_share": "sky.cloud_fraction",
 }
-OF_TRAINING = {"darkest-ms": "min-exposure-ms", "familiar": "fit-ood", "remember": "train-temporal", "shares": "fractions", "least-share": "least-fraction"}
+OF_TRAINING = {
+    "darkest-ms": "min-exposure-ms",
+    "familiar": "fit-ood",
+    "remember": "train-temporal",
+    "shares": "fractions",
+    "least-share": "least-fraction",
+}
 FLAGS = {  # and what to say of each
     **{old.replace("_", "-"): f"it is called --{new.replace('_', '-')} now" for old, new in SETTINGS.items()},
     **{old: f"it is called --{new} now" for old, new in OF_TRAINING.items()},

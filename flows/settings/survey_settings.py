@@ -361,11 +361,6 @@ class Settings:
         return self.source == RASTER
 
     @property
-    def sparing(self) -> bool:
-        """Whether a part of a uniform scan alone is kept and read in detail."""
-        return any(getattr(self, name) is not None for name in SPARING)
-
-    @property
     def unknown_rate(self) -> float | None:
         """Fraction of known pixels that may be called unknown; None where none is to be."""
         usual = {UNKNOWN_AUTO: RATE, UNKNOWN_OFF: None}

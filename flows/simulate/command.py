@@ -15,11 +15,11 @@ from rich.markup import escape
 from flows.publish.effects_table import print_effects
 from flows.settings.survey_settings import Settings
 from flows.simulate.effect_comparison import Comparison, compare_with_everything
-from flows.tasks.capture_plan import lay_out_sweeps
+from flows.tasks.capture_plan import PassLayout
 from flows.tasks.run import CaptureRun, make_source
 from flows.tasks.scene import SimulatedField, farm_refusal, open_scene
 from flows.tasks.stage import Stage, Wanted
-from flows.tasks.stages.capture import capture_coarse, sweeps_wanted
+from flows.tasks.stages.capture import capture_coarse
 from flows.tasks.stages.effects import choose_effects, load_manifest
 from flows.terminal.figures import format_bytes, format_seconds
 from flows.terminal.processes import writing
@@ -87,7 +87,7 @@ def run_simulate(
         make = _Maker(run, progress)
         wanted = choose_effects.wants(make.watching("effects"))
         effects = make("effects", choose_effects, _drawn_first(run.scene, wanted, make.spent))
-        raw = make("capture", capture_coarse, sweeps_wanted(make.watching("capture"), sweeps, [effects]))
+        raw = make("capture", capture_coarse, run.recorder.wanted(sweeps, [effects], make.watching("capture").report))
         record = _record(run, sweeps, effects, raw, make.spent)
         found = None
         if picture is not None:
@@ -155,7 +155,7 @@ def open_simulation(settings: Settings, *, coarse: bool = False) -> tuple[Captur
             f" {int(missing.any(axis=2).sum())}), and a simulation invents no light; fill or crop it, or choose other"
             " --bands"
         )
-    _, coarse_pass, full = lay_out_sweeps(settings, SceneGrid(*scene.shape, PATCH, FACTOR))
+    _, coarse_pass, full = PassLayout.of(settings, SceneGrid(*scene.shape, PATCH, FACTOR)).sweeps()
     simulated = make_source(scene, settings)
     run = CaptureRun(
         settings=settings,

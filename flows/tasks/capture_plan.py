@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +11,9 @@ from flows.settings.survey_settings import RECORDED, Settings
 from flows.settings.values import EXTENT_WHOLE, parse_extent_runs
 from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.errors import SettingsError
+from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import Axis, Sweep
+from pipeline.geometry.scan import Axis, CostModel, Sweep
 from pipeline.planning.coverage import cheapest_full, coarse_sweeps, sweeps_over, uniform_sweeps, with_margin
 from pipeline.planning.partial_scans import sweeps_of_runs
 from pipeline.planning.prices import check_budget
@@ -42,71 +43,106 @@ class CapturePlan:
         return CapturePlan("x", [], [], 0.0, 0.0, 0.0, 0.0, 0.0, plain=True)
 
 
-def plan_capture(
-    settings: Settings, grid: SceneGrid, shown: NDArray[np.bool_] | None = None, recorded: RecordedPasses | None = None
-) -> CapturePlan:
-    """Lay out coarse and full sweeps; where the mirror may look beside the plan, with overlaps and margins.
+@dataclass(frozen=True)
+class PassLayout:
+    """Lays out the passes over a field: its grid, the camera, and what was asked of their lines."""
 
-    Either pass overlaps by what its own registration needs. Its map lies as the sweep that is held does, which another
-    may lie beside by twice the mirror's error: so much earlier sweeps begin, and later they end. Lines show the
-    ``shown`` (patch,) patches, all of them where it is None. Of a recording they are ``recorded`` ones. Raises
-    SettingsError: the mirror may be so far off that overlaps take whole lines; BudgetError: the budget does not pay for
-    the coarse pass; PoseError: the field is beyond the mirror's range; NotRecordedError: a line was never taken.
-    """
-    camera, cost = settings.camera, settings.cost
-    along, coarse, full = lay_out_sweeps(settings, grid, shown, recorded)
-    full_s, coarse_s = cost.seconds(full, camera), cost.seconds(coarse, camera)
-    fine_s = 0.0 if settings.plain else check_budget(settings.budget, coarse_s, full_s)
-    overlap = _overlap(settings, settings.scan_step or grid.factor)
-    return CapturePlan(along, coarse, full, coarse_s, full_s, fine_s, overlap, 2 * settings.pointing_px, settings.plain)
+    grid: SceneGrid
+    camera: LineCamera
+    cost: CostModel
+    pointing_px: float = 0.0  # by which the mirror may look beside the plan
+    step: int | None = None  # pixels from line to line of a uniform scan; None: two passes
+    exposure_ms: float | None = None  # of a uniform scan; None: the camera's
+    coarse_exposure_ms: float | None = None
+    extent: str = EXTENT_WHOLE  # the lines of a uniform scan that are looked at
+    as_taken: bool = False  # the uniform scan that a recording is
+    shown: NDArray[np.bool_] | None = None  # (patch,) that lines show; None: all
+    recorded: RecordedPasses | None = None  # whose lines the passes take
 
-
-def lay_out_sweeps(
-    settings: Settings, grid: SceneGrid, shown: NDArray[np.bool_] | None = None, recorded: RecordedPasses | None = None
-) -> tuple[Axis, list[Sweep], list[Sweep]]:
-    """Give the axis that lines lie along, the coarse sweeps or those of a uniform scan, and those of the full scan.
-
-    Lines that show none of the ``shown`` (patch,) patches are left out, but for a mirror that may look beside the plan:
-    its sweeps are tied together by what they share. Of the looks those lines are left that the settings name. Of a
-    recording they are ``recorded`` lines. Raises SettingsError: the mirror may be so far off that overlaps take whole
-    lines, or lines are named that the scan does not have; PoseError: the field is beyond the mirror's range;
-    NotRecordedError: a line of a recording was never taken.
-    """
-    camera, cost, apart = settings.camera, settings.cost, 2 * settings.pointing_px
-
-    def cut(sweeps: list[Sweep]) -> list[Sweep]:
-        return sweeps if shown is None or apart else sweeps_over(sweeps, grid, camera, shown)
-
-    axes: tuple[Axis, ...] = ("x", "y") if recorded is None else recorded.axes
-    along, full, _ = cheapest_full(grid, camera, cost, overlap_px=_overlap(settings, 1), cut=cut, axes=axes)
-    if settings.scan_step is not None:
-        step, overlap = settings.scan_step, _overlap(settings, settings.scan_step)
-        exposure_ms = settings.scan_exposure_ms
-        scan_passes = uniform_sweeps(grid, camera, along, step=step, exposure_ms=exposure_ms, overlap_px=overlap)
-    else:
-        overlap, exposure_ms = _overlap(settings, grid.factor), settings.coarse_exposure_ms
-        scan_passes = coarse_sweeps(grid, camera, along, overlap_px=overlap, exposure_ms=exposure_ms)
-    scan_passes = cut(scan_passes)
-    if settings.extent != EXTENT_WHOLE:
-        scan_passes = sweeps_of_runs(scan_passes, parse_extent_runs(settings.extent))
-    scan_passes, full = with_margin(scan_passes, camera, apart), with_margin(full, camera, apart)
-    if recorded is None:
-        return along, scan_passes, full
-    own = settings.scan == RECORDED
-    return along, recorded.uniform_scan() if own else recorded.first_pass(scan_passes), recorded.full_scan(full)
-
-
-def _overlap(settings: Settings, step: int) -> float:
-    """What neighbouring sweeps of a pass have to share, so that 64 of its pixels are left when they lie apart [px]."""
-    off, samples = settings.pointing_px, settings.camera.samples
-    if not off:
-        return 0.0
-    rest, line = LEAST_OVERLAP_PX * step, samples // step * step
-    overlap = 2 * off + rest
-    if overlap >= line:
-        raise SettingsError(
-            f"--pointing-px {off:g}: sweeps would have to overlap by {overlap:g} px (twice that, and "
-            f"{LEAST_OVERLAP_PX:.0f} pixels of {step} px), all of a line of {line} px; "
-            f"give less than {(line - rest) / 2:g}"
+    @classmethod
+    def of(
+        cls,
+        settings: Settings,
+        grid: SceneGrid,
+        shown: NDArray[np.bool_] | None = None,
+        recorded: RecordedPasses | None = None,
+    ) -> PassLayout:
+        """Take from the settings what they ask of the passes."""
+        return cls(
+            grid,
+            settings.camera,
+            settings.cost,
+            settings.pointing_px,
+            settings.scan_step,
+            settings.scan_exposure_ms,
+            settings.coarse_exposure_ms,
+            settings.extent,
+            settings.scan == RECORDED,
+            shown,
+            recorded,
         )
-    return overlap
+
+    def uniform(self, step: int, exposure_ms: float | None = None) -> PassLayout:
+        """Return the layout of a uniform scan of the whole field."""
+        return replace(self, step=step, exposure_ms=exposure_ms, extent=EXTENT_WHOLE, as_taken=False)
+
+    def plan(self, budget: float | None) -> CapturePlan:
+        """Lay out coarse and full sweeps; where the mirror may look beside the plan, with overlaps and margins.
+
+        ``budget`` is the fraction of the full scan's seconds that two passes may take, None of a uniform scan. Either pass
+        overlaps by what its own registration needs. Its map lies as the sweep that is held does, which another may lie
+        beside by twice the mirror's error: so much earlier sweeps begin, and later they end. Raises as `sweeps`;
+        BudgetError: the budget does not pay for the coarse pass.
+        """
+        along, coarse, full = self.sweeps()
+        full_s, coarse_s = self.cost.seconds(full, self.camera), self.cost.seconds(coarse, self.camera)
+        fine_s = 0.0 if budget is None else check_budget(budget, coarse_s, full_s)
+        overlap = self._overlap(self.step or self.grid.factor)
+        margin = 2 * self.pointing_px
+        return CapturePlan(along, coarse, full, coarse_s, full_s, fine_s, overlap, margin, plain=budget is None)
+
+    def sweeps(self) -> tuple[Axis, list[Sweep], list[Sweep]]:
+        """Give the axis that lines lie along, the coarse sweeps or those of a uniform scan, and those of the full scan.
+
+        Lines that show none of the ``shown`` patches are left out, but for a mirror that may look beside the plan: its
+        sweeps are tied together by what they share. Raises SettingsError: the mirror may be so far off that overlaps
+        take whole lines, or lines are named that the scan does not have; PoseError: the field is beyond the mirror's
+        range; NotRecordedError: a line of a recording was never taken.
+        """
+        grid, camera, cost, apart = self.grid, self.camera, self.cost, 2 * self.pointing_px
+        shown, recorded = self.shown, self.recorded
+
+        def cut(sweeps: list[Sweep]) -> list[Sweep]:
+            return sweeps if shown is None or apart else sweeps_over(sweeps, grid, camera, shown)
+
+        axes: tuple[Axis, ...] = ("x", "y") if recorded is None else recorded.axes
+        along, full, _ = cheapest_full(grid, camera, cost, overlap_px=self._overlap(1), cut=cut, axes=axes)
+        if self.step is not None:
+            step, overlap, exposure_ms = self.step, self._overlap(self.step), self.exposure_ms
+            scan_passes = uniform_sweeps(grid, camera, along, step=step, exposure_ms=exposure_ms, overlap_px=overlap)
+        else:
+            overlap, exposure_ms = self._overlap(grid.factor), self.coarse_exposure_ms
+            scan_passes = coarse_sweeps(grid, camera, along, overlap_px=overlap, exposure_ms=exposure_ms)
+        scan_passes = cut(scan_passes)
+        if self.extent != EXTENT_WHOLE:
+            scan_passes = sweeps_of_runs(scan_passes, parse_extent_runs(self.extent))
+        scan_passes, full = with_margin(scan_passes, camera, apart), with_margin(full, camera, apart)
+        if recorded is None:
+            return along, scan_passes, full
+        taken = recorded.uniform_scan() if self.as_taken else recorded.first_pass(scan_passes)
+        return along, taken, recorded.full_scan(full)
+
+    def _overlap(self, step: int) -> float:
+        """Return what neighbouring sweeps have to share, so that 64 pixels are left when they lie apart [px]."""
+        off, samples = self.pointing_px, self.camera.samples
+        if not off:
+            return 0.0
+        rest, line = LEAST_OVERLAP_PX * step, samples // step * step
+        overlap = 2 * off + rest
+        if overlap >= line:
+            raise SettingsError(
+                f"--pointing-px {off:g}: sweeps would have to overlap by {overlap:g} px (twice that, and "
+                f"{LEAST_OVERLAP_PX:.0f} pixels of {step} px), all of a line of {line} px; "
+                f"give less than {(line - rest) / 2:g}"
+            )
+        return overlap

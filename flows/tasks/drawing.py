@@ -21,10 +21,10 @@ from models.reading.ood import OodDetector
 from models.reading.prior_map import CurrentVisit, TemporalAgreement, changed_from, compare, first_probabilities, fuse
 from models.reading.regions import Region
 from pipeline.geometry.grid import UNLABELLED
+from pipeline.rectify.tiles import let_tiles_go
 from storage.arrays.class_maps import write_changes_tile, write_class_tile, write_probabilities_tile
 from storage.arrays.layout import read_array
 from storage.arrays.mosaics import PatchStore, open_patches
-from storage.arrays.tile_work import let_tiles_go
 from storage.parallel.pool import run_blocks
 
 ENOUGH_SEEN = 0.5  # of a patch at the edge of a look at a part, so that what it shows is read

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.survey_settings import Settings
-from flows.settings.values import EXTENT_PART, EXTENT_WHOLE, format_extent
-from flows.tasks.capture_plan import lay_out_sweeps
+from flows.settings.values import format_extent
+from flows.tasks.capture_plan import PassLayout
 from flows.tasks.prior_maps import Prior
 from models.reading.expected_errors import PatchExpectedErrors
 from models.reading.prior_map import COME_TRUE, ClassProbabilities, PriorMap, carried, in_classes
@@ -76,59 +75,46 @@ class ExtentGains:
 
 
 def choose_extent(
-    settings: Settings,
-    prior: Prior | None,
+    layout: PassLayout,
+    prior: Prior,
     weights: Description,
     path: Path,
-    grid: SceneGrid,
-    shown: Mask | None = None,
-) -> tuple[Settings, ExtentChoice | None, tuple[str, ...]]:
-    """Settings with the lines that a visit takes of a field that is remembered, the choice, and what to say of it.
+    *,
+    seconds: float,
+    max_age: float | None,
+    skip_below_error: float | None,
+) -> tuple[PassLayout, ExtentChoice, str]:
+    """Choose the lines that a visit takes of a field that is remembered, in so many seconds; say why.
 
-    Lines are wanted of the ``shown`` (patch,) patches, of all where it is None. Without a memory the whole field is looked
-    at. Raises NothingToMend: it is remembered as surely as was asked for, and nothing is due; WeightsError: the weights
-    have no record of scans; BudgetError: no line of any scan ends in time, with the least that does; PoseError: the
-    field is beyond the mirror's range.
+    Gives the layout of these lines, the choice, and a sentence. Patches that would be older than ``max_age`` days come
+    first. Raises NothingToMend: less than ``skip_below_error`` of what is remembered is expected to be wrong, and nothing is due;
+    WeightsError: the weights have no record of scans; BudgetError: no line of any scan ends in time, with the least
+    that does; PoseError: the field is beyond the mirror's range.
     """
-    if settings.extent != EXTENT_PART:
-        return settings, None, ()
-    if prior is None:
-        whole = replace(
-            settings, extent=EXTENT_WHOLE, max_age=None, skip_below_error=None
-        )  # as it can be asked for again
-        return whole, None, ("nothing is remembered: the whole field is looked at",)
-    content = weights.record.get("scans")
+    content, grid = weights.record.get("scans"), layout.grid
     if content is None:
         raise WeightsError(
             f"the weights {path.name} have no record of uniform scans, by which a part of a field is chosen: leave --extent"
             " out, or train weights with --min-exposure-ms 3, some scenes kept for validation"
         )
-    there = grid.valid_fraction().ravel() > 0 if shown is None else shown
+    there = grid.valid_fraction().ravel() > 0 if layout.shown is None else layout.shown
     swaths, classes = _swaths(prior, grid, weights, path), len(weights.class_names)
     expected_errors = PatchExpectedErrors.of(
         swaths, grid, classes, come_true=1.0 if weights.reader is None else COME_TRUE
     )
-    wanted = ExtentGains(
-        ScanPerformance.read(content),
-        weights.class_names,
-        expected_errors,
-        there & _is_due(settings, prior, expected_errors),
-        there,
-    )
-    if (
-        settings.skip_below_error is not None
-        and expected_errors.expected_wrong() < settings.skip_below_error
-        and not wanted.due.any()
-    ):
+    due = np.zeros(len(expected_errors.age_days), np.bool_)
+    if max_age is not None:  # older than allowed if this visit did not look, nor the next as long after it
+        due = np.asarray(expected_errors.age_days + prior.days > max_age)
+    wanted = ExtentGains(ScanPerformance.read(content), weights.class_names, expected_errors, there & due, there)
+    if skip_below_error is not None and expected_errors.expected_wrong() < skip_below_error and not wanted.due.any():
         raise NothingToMend(
             prior.run,
             f"nothing is looked at: {expected_errors.expected_wrong():.1%} of what is remembered is expected to be wrong, and a "
-            f"look is asked for from {settings.skip_below_error:.1%} on; the map of {prior.run} stands",
+            f"look is asked for from {skip_below_error:.1%} on; the map of {prior.run} stands",
         )
-    step, exposure_ms, extent = _best_extent(settings, grid, wanted, shown)
-    chosen = replace(settings, extent=format_extent(extent.runs), scan_step=step, scan_exposure_ms=exposure_ms)
-    sweeps = sweeps_of_runs(lay_out_sweeps(replace(chosen, extent=EXTENT_WHOLE), grid, shown)[1], extent.runs)
-    seen = patches_shown(sweeps, grid, settings.camera)
+    free = replace(layout, recorded=None)
+    step, exposure_ms, extent = _best_extent(free, wanted, seconds)
+    seen = patches_shown(sweeps_of_runs(free.uniform(step, exposure_ms).sweeps()[1], extent.runs), grid, layout.camera)
     choice = ExtentChoice(
         seconds=extent.seconds,
         expected_gain=float(wanted.gains(step, exposure_ms)[seen].sum()),
@@ -136,22 +122,19 @@ def choose_extent(
         due=int(np.count_nonzero(wanted.due)),
         due_left=int(np.count_nonzero(wanted.due & ~seen)),
     )
-    return chosen, choice, (f"{choice.sentence} ({format_scan(step, exposure_ms)})",)
+    chosen = replace(layout, extent=format_extent(extent.runs), step=step, exposure_ms=exposure_ms)
+    return chosen, choice, f"{choice.sentence} ({format_scan(step, exposure_ms)})"
 
 
-def _best_extent(
-    settings: Settings, grid: SceneGrid, wanted: ExtentGains, shown: Mask | None
-) -> tuple[int, float, PartialScan]:
+def _best_extent(layout: PassLayout, wanted: ExtentGains, seconds: float) -> tuple[int, float, PartialScan]:
     """Step, exposure and lines of the look worth most, the cheapest of those that are as good but for `LOSS`."""
-    record, camera, cost, seconds = wanted.record, settings.camera, settings.cost, settings.seconds
-    assert seconds is not None  # checked with the settings
+    record, camera, cost = wanted.record, layout.camera, layout.cost
     found: list[tuple[int, float, PartialScan]] = []
     least: list[float] = []
     enough = float(record.scores[MIOU].max()) - POORER
     shortest, longest = record.exposures_ms[0], min(camera.exposure_ms, record.exposures_ms[-1])
     for step in record.steps:
-        whole = replace(settings, extent=EXTENT_WHOLE, scan_step=step, scan_exposure_ms=None)
-        rows = PatchRows.of(lay_out_sweeps(whole, grid, shown)[1], grid, camera)
+        rows = PatchRows.of(layout.uniform(step).sweeps()[1], layout.grid, camera)
         for exposure_ms in exposures_between(shortest, longest):
             if record.expected(step, exposure_ms)[MIOU] < enough:
                 continue
@@ -171,13 +154,6 @@ def _best_extent(
     best = max(extent.expected_gain for _, _, extent in found)
     near = [one for one in found if one[2].expected_gain >= best - LOSS]
     return min(near, key=lambda one: (one[2].seconds, -one[2].expected_gain))
-
-
-def _is_due(settings: Settings, prior: Prior, expected_errors: PatchExpectedErrors) -> Mask:
-    """(patch,) that would be older than `--max-age` allows if this visit did not look, nor the next as long after it."""
-    if settings.max_age is None:
-        return np.zeros(len(expected_errors.age_days), np.bool_)
-    return np.asarray(expected_errors.age_days + prior.days > settings.max_age)
 
 
 def _swaths(

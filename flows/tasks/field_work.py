@@ -15,8 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.tasks.reading_costs import SHARD
-from flows.tasks.run import SurveyRun
-from flows.tasks.survey_model import weights_path
 from models.network.machine import PROCESSOR
 from models.network.sizes import saliency_bytes
 from models.policies.policies import GLANCING_POLICIES, IMAGE_POLICIES, score_patches
@@ -26,12 +24,12 @@ from models.reading.ood import OodDetector
 from models.reading.regions import HALO_CELLS, REGION_PX, Region, most_bytes, plan_regions, whole_field
 from models.weights.checksummed_files import SEAL
 from models.weights.files import Weights, describe_weights, load_ood, load_reader, load_weights
-from pipeline.errors import SettingsError, WeightsError
+from pipeline.errors import WeightsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.readings import beyond_range, readings_alone
+from pipeline.rectify.tiles import let_tiles_go
 from storage.arrays.mosaics import PATCHES_A_SHARD, PatchStore, mosaic_rows, mosaic_wavelengths
-from storage.arrays.tile_work import RESERVED_BYTES, let_tiles_go
-from storage.parallel.pool import WorkerPool, run_blocks
+from storage.parallel.pool import RESERVED_BYTES, WorkerPool, memory_refusal, mib, run_blocks
 
 if TYPE_CHECKING:
     from models.network.temporal_reader import TemporalReader
@@ -158,12 +156,6 @@ class FieldWork:
     memory: int  # of this process and those that it starts, together [bytes]
     vgg: VggFile | None = None  # for the policies vgg-static and vgg-trained
 
-    @staticmethod
-    def of(run: SurveyRun) -> FieldWork:
-        """Take from a survey what the regions of its field need."""
-        file = WeightsFile(weights_path(run.settings).resolve(), run.described.about[SEAL], run.device)
-        return FieldWork(file, plan_regions(run.grid, SHARD), run.settings.pool, run.settings.memory, run.vgg)
-
     def score(self, policy: str, mosaic: Path, report: Callable[[float], None]) -> NDArray[np.float64]:
         """Score every patch of the padded grid by the coarse mosaic alone, (seat_y, seat_x).
 
@@ -190,11 +182,8 @@ class FieldWork:
         image = (2 * 4 * self.weights.load().config.columns + IMAGE_BYTES) * (y * x // grid.factor**2)
         least = RESERVED_BYTES * (1 if pool.shares_memory else 2) + image
         if least > self.memory and not pool.elsewhere:
-            raise SettingsError(
-                f"projected memory {_mib(least)} exceeds --memory {_mib(self.memory)}: the policy {policy!r} sees the "
-                f"coarse image of the field as a whole, which takes {_mib(image)}; give at least --memory "
-                f"{_mib(least)}, or choose a policy that does not, such as entropy"
-            )
+            why = f"the policy {policy!r} sees the coarse image of the field as a whole, which takes {mib(image)}"
+            raise memory_refusal(least, self.memory, why, ", or choose a policy that does not, such as entropy")
         work = Scoring(self.weights, mosaic, policy)
         (scores,) = run_blocks(work, [whole_field(grid)], pool, report=report, paths=[mosaic])
         return np.asarray(scores, np.float64)
@@ -213,15 +202,11 @@ class FieldWork:
         least = RESERVED_BYTES + each
         if least > self.memory:
             y, x = (max(one.read.shape[axis] for one in self.regions) for axis in (0, 1))
-            raise SettingsError(
-                f"projected memory {_mib(least)} exceeds --memory {_mib(self.memory)}: reading a region of {y} x {x} "
-                f"px and {bands} bands with the fine patches that lie there takes {_mib(region)}, "
-                f"{'each of two processes' if apart else 'the process itself'} {_mib(RESERVED_BYTES)}; give at least "
-                f"--memory {_mib(least)}"
+            raise memory_refusal(
+                least,
+                self.memory,
+                f"reading a region of {y} x {x} px and {bands} bands with the fine patches that lie there takes "
+                f"{mib(region)}, {'each of two processes' if apart else 'the process itself'} {mib(RESERVED_BYTES)}",
             )
         fits = (self.memory - RESERVED_BYTES) // each
         return self.pool if fits >= self.pool.count else WorkerPool(self.pool.scheduler, fits)
-
-
-def _mib(size: int) -> str:
-    return f"{-(-size // 2**20)} MiB"

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.survey_settings import Settings
 from flows.settings.values import limit_of
 from flows.tasks.reading_costs import ReadingCosts
 from pipeline.errors import BudgetError
@@ -38,18 +37,24 @@ class PatchBudget:
     least_gain: float | None = None
 
     @staticmethod
-    def asked(settings: Settings, costs: ReadingCosts, shown: NDArray[np.bool_] | None) -> PatchBudget | None:
-        """Take from the settings what may be spent; None where all of the scan is kept and read.
+    def asked(
+        costs: ReadingCosts,
+        shown: NDArray[np.bool_] | None,
+        policy: str,
+        macs: str | None = None,
+        bytes_kept: str | None = None,
+        least_gain: float | None = None,
+    ) -> PatchBudget | None:
+        """Say what may be spent; None where all of the scan is kept and read.
 
         ``shown`` (patch,) are the patches that zones leave; None: all. Raises BudgetError: not even the coarse pass
         is paid for; names the least that is.
         """
-        if not settings.sparing:
+        if macs is None and bytes_kept is None and least_gain is None:
             return None
         patch_index = costs.grid.valid_patches()
         kept = patch_index if shown is None else patch_index[shown[patch_index]]
-        limits = settings.macs, settings.bytes_kept, settings.least_gain
-        budget = PatchBudget(costs, kept, settings.policy, *limits)
+        budget = PatchBudget(costs, kept, policy, macs, bytes_kept, least_gain)
         for wrong in budget._too_little():
             raise BudgetError(wrong)
         return None if budget._pays_for_all else budget

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -13,13 +13,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.survey_settings import RECORDED, RIG, Settings
-from flows.settings.values import EXTENT_PART
-from flows.tasks.capture_plan import CapturePlan, plan_capture
+from flows.settings.survey_settings import RECORDED, RIG, MapChoice, Settings
+from flows.settings.values import EXTENT_PART, EXTENT_WHOLE
+from flows.tasks.capture_plan import CapturePlan, PassLayout
+from flows.tasks.drawing import UnknownRule
 from flows.tasks.extent_choice import ExtentChoice, choose_extent
+from flows.tasks.field_work import FieldWork, WeightsFile
+from flows.tasks.mosaic_work import tile_budget
 from flows.tasks.patch_budget import PatchBudget
 from flows.tasks.prior_maps import AUTO, NONE, Prior, find_prior
-from flows.tasks.reading_costs import ReadingCosts
+from flows.tasks.reading_costs import SHARD, ReadingCosts
 from flows.tasks.recorded_field import OpenedRecording, open_recorded
 from flows.tasks.scan_choice import ScanChoice, choose_uniform_scan
 from flows.tasks.scene import (
@@ -34,11 +37,16 @@ from flows.tasks.scene import (
     open_map,
     open_scene,
 )
-from flows.tasks.survey_model import SurveyModel, beyond_training, vgg_file, weights_offered
+from flows.tasks.stage import FieldFrame, Report
+from flows.tasks.stages.capture import SweepRecorder
+from flows.tasks.survey_model import SurveyModel, beyond_training, vgg_file, weights_offered, weights_path
 from flows.tasks.zones import SurveyZones, open_zones, place_of_field
 from models.evaluation.expected_scores import MapScores
 from models.network.machine import PROCESSOR, choose_device
+from models.network.sizes import MultiplyAdds
 from models.policies.vgg_file import VggFile
+from models.reading.regions import plan_regions
+from models.weights.checksummed_files import SEAL
 from models.weights.files import Description, Weights
 from models.weights.parts import OodPart, ReaderPart
 from pipeline.capture.recorded_passes import RecordedPasses
@@ -46,19 +54,19 @@ from pipeline.errors import NoScanPaidFor, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
-from pipeline.ground.georeference import georeference_record
+from pipeline.ground.field_places import PosedField
+from pipeline.ground.map_grid import GroundGrid
 from pipeline.lazy import Once, deferred
+from pipeline.planning.uniform_scans import ScanLimits
 from pipeline.rectify.placed import PixelGrid, place
 from pipeline.rectify.region import plan_tiles
 from pipeline.rectify.tiles import MosaicWork
 from pipeline.simulator.effects.pointing import PointingErrors
-from pipeline.simulator.scenes.scene import RasterScene
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from pipeline.source import References
 from storage.archive.archive import Archive
-from storage.archive.keys import array_digest
-from storage.arrays.layout import AngularGrid, image_spec
-from storage.arrays.tile_work import tile_budget
+from storage.arrays.layout import image_spec
 from storage.readers.open_cubes import load_labels_array
 from storage.readers.raster_work import RasterPixels
 from storage.readers.scene_files import OpenScene
@@ -90,9 +98,6 @@ class _PlannedSweep(SimulatedSweep):
         return References(dark=np.zeros_like(white), white=white, white_reference=white[0])
 
 
-Report = Callable[[float], None]  # how far a stage is, 0..1
-
-
 @dataclass(frozen=True, kw_only=True)
 class CaptureRun:
     """What deciding on effects and capturing need to know."""
@@ -112,10 +117,16 @@ class CaptureRun:
         return self.settings.camera
 
     @property
+    def scene_key(self) -> str:
+        """Names what the scene holds."""
+        return self.scene.key
+
+    @property
     def name(self) -> str:
         """What the survey is called: its field, or its scene."""
         return self.settings.name or Path(self.scene.name).stem
 
+    @property
     def source_key(self) -> dict[str, Any]:
         """What the captured light depends on, beside the sweeps and the effects."""
         return {
@@ -128,6 +139,15 @@ class CaptureRun:
             **self.source.key(self.name),
         }
 
+    @property
+    def recorder(self) -> SweepRecorder:
+        """What takes the sweeps into the archive."""
+        scene, settings = self.scene, self.settings
+        bands = scene.wavelength_nm, scene.fwhm_nm
+        return SweepRecorder(
+            self.archive, self.source, self.source_key, *bands, self.camera, settings.cost, settings.pool
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
 class SurveyRun(CaptureRun):
@@ -136,6 +156,7 @@ class SurveyRun(CaptureRun):
     described: Description  # what the weights say of themselves
     load: Once[Weights]
     grid: SceneGrid
+    costs: ReadingCosts  # multiply-adds of reading the field
     plan: CapturePlan
     scans: ScanChoice
     zones: SurveyZones  # what the survey keeps to, and plots
@@ -204,15 +225,63 @@ class SurveyRun(CaptureRun):
         return vgg_file(self.settings)
 
     @property
-    def place_key(self) -> dict[str, Any]:
-        """What images on the scene's pixels depend on beside what was seen: where they lie, and what is no scene."""
-        missing = self.scene.missing
-        gaps = {} if missing is None else {"missing": array_digest(missing)}
-        return {**georeference_record(self.scene.geobox), **gaps}
+    def frame(self) -> FieldFrame:
+        """The frame of all images of the survey."""
+        scene = self.scene
+        bands = scene.wavelength_nm, scene.fwhm_nm
+        return FieldFrame(self.grid, self.camera.ifov_rad, *bands, scene.missing, scene.geobox)
 
-    def angular_grid(self, factor: int = 1) -> AngularGrid:
-        """Where pixels of ``factor`` fine px lie."""
-        return AngularGrid(self.camera.ifov_rad, self.scene.shape, factor, self.scene.geobox)
+    @property
+    def factor(self) -> int:
+        """Fine px that a coarse pixel has a side."""
+        return self.grid.factor
+
+    @property
+    def work(self) -> FieldWork:
+        """The model over the field, region by region."""
+        file = WeightsFile(weights_path(self.settings).resolve(), self.described.about[SEAL], self.device)
+        return FieldWork(file, plan_regions(self.grid, SHARD), self.settings.pool, self.settings.memory, self.vgg)
+
+    @property
+    def part(self) -> bool:
+        """Whether a part of the field alone is looked at."""
+        return self.settings.extent != EXTENT_WHOLE
+
+    @property
+    def light(self) -> tuple[float, int]:
+        """Exposure of a line that is read in detail as a fraction of the reference, and pixels to the next."""
+        exposure_ms = self.settings.scan_exposure_ms if self.plan.plain else None
+        return (exposure_ms or self.camera.exposure_ms) / DEFAULT_EXPOSURE_MS, self.settings.scan_step or 1
+
+    @property
+    def unknown(self) -> UnknownRule | None:
+        """Which pixels are called unknown; None where the weights do not know what is familiar, or nobody asks."""
+        settings, rate = self.settings, self.settings.unknown_rate
+        if self.ood_detector is None or rate is None:
+            return None
+        coarse_ms = settings.scan_exposure_ms if self.plan.plain else settings.coarse_exposure_ms
+        coarse_light = (coarse_ms or self.camera.exposure_ms) / DEFAULT_EXPOSURE_MS
+        light, step = self.light
+        return UnknownRule(self.described.config.classes, rate, light, coarse_light, step)
+
+    @property
+    def ground_grid(self) -> GroundGrid:
+        """The grid of the map on the ground, of a survey with a pose."""
+        assert isinstance(self.zones.place, PosedField)
+        return self.zones.place.grid
+
+    @property
+    def map_choice(self) -> MapChoice:
+        """What map to draw on the ground."""
+        return self.settings.map
+
+    def work_done(self, patch_index: NDArray[np.integer]) -> MultiplyAdds:
+        """Count the scores of the field, unless all is seen and read, and the map with fine patches at these patches."""
+        costs = self.costs
+        done = costs.with_scores(patch_index, self.settings.policy) if self.chooses else costs.of_map(patch_index)
+        if self.prior is None or self.reader is None:
+            return done
+        return replace(done, decode=done.decode + self.reader.sizes.multiply_adds(self.grid.height * self.grid.width))
 
 
 def open_run(settings: Settings, *, planning: bool = False, archive: Archive | None = None) -> SurveyRun:
@@ -245,7 +314,7 @@ def _run_by(
         raise SettingsError(refused)
     pixels, scene, notes, label_notes = _scene_for(model, settings, recorded, planning=planning)
     grid = SceneGrid(*scene.shape, described.config.patch, described.config.factor)
-    zones = open_zones(settings, place_of_field(settings, scene), grid)
+    zones = open_zones(settings.zones, place_of_field(settings, scene), grid)
     outside = beyond_training(settings, scene, described, model.trained_on, path)
     ood_detector = model.asked_ood(settings)
     name, found = settings.name or Path(scene.name).stem, None
@@ -255,17 +324,39 @@ def _run_by(
         archive = open_archive(settings.out) if archive is None and is_archive(settings.out) else archive
         found = (None, ()) if archive is None else find_prior(archive, settings, name, grid, described.class_names)
     prior = None if found is None else found[0]
-    settings, extent, extent_notes = choose_extent(settings, prior, described, path, grid, zones.shown)
+    extent, extent_notes = None, tuple[str, ...]()
+    if settings.extent == EXTENT_PART and prior is None:  # as it can be asked for again
+        settings = replace(settings, extent=EXTENT_WHOLE, max_age=None, skip_below_error=None)
+        extent_notes = ("nothing is remembered: the whole field is looked at",)
     plan, scans, raster = CapturePlan.of_map(), ScanChoice(), None
     passes, bands = None if recorded is None else recorded.passes, len(scene.wavelength_nm)
+    layout = PassLayout.of(settings, grid, zones.shown, passes)
+    if settings.extent == EXTENT_PART and prior is not None:
+        assert settings.seconds is not None  # checked with the settings
+        layout, extent, words = choose_extent(
+            layout,
+            prior,
+            described,
+            path,
+            seconds=settings.seconds,
+            max_age=settings.max_age,
+            skip_below_error=settings.skip_below_error,
+        )
+        extent_notes = (words,)
     if pixels is None:
-        settings, scans = choose_uniform_scan(settings, described, path, grid, bands, zones.shown, passes)
-        plan = plan_capture(settings, grid, zones.shown, passes)
+        limits = ScanLimits(settings.seconds, settings.bytes_raw)
+        plain, goal = settings.plain, settings.goal
+        scans = choose_uniform_scan(layout, described, path.name, bands, plain=plain, goal=goal, limits=limits)
+        if scans.chosen is not None and plain and layout.step is None:
+            layout = replace(layout, step=scans.chosen.step, exposure_ms=scans.chosen.exposure_ms)
+        plan = layout.plan(None if plain else settings.budget)
     else:
         raster = RasterPixels(pixels.read, pixels.missing, bands, grid)
+    settings = replace(settings, extent=layout.extent, scan_step=layout.step, scan_exposure_ms=layout.exposure_ms)
     channels = 3 if model.vgg is None else model.vgg.channels
     costs = ReadingCosts(described.config, grid, bands, channels)
-    budget = PatchBudget.asked(settings, costs, None if zones.fractions is None else zones.fractions > 0)
+    spending = settings.policy, settings.macs, settings.bytes_kept, settings.least_gain
+    budget = PatchBudget.asked(costs, None if zones.fractions is None else zones.fractions > 0, *spending)
     simulated, planned = make_source(scene, settings), (*plan.coarse, *plan.full)
     source = field_source(scene, settings, simulated, planned) if recorded is None else recorded.field
     if raster is None:
@@ -287,6 +378,7 @@ def _run_by(
         described=described,
         load=model.load,
         grid=grid,
+        costs=costs,
         plan=plan,
         recorded=passes,
         scans=scans,

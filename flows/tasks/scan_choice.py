@@ -5,19 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import nullcontext, suppress
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from flows.settings.survey_settings import Settings
 from flows.settings.values import EXTENT_WHOLE, parse_goals
-from flows.tasks.capture_plan import lay_out_sweeps
+from flows.tasks.capture_plan import PassLayout
 from models.weights.files import Description
-from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.errors import BudgetError, NotRecordedError, SettingsError, WeightsError
-from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
 from pipeline.planning.uniform_scans import (
     MIOU,
@@ -58,72 +51,59 @@ class ScanChoice:
 
 
 def choose_uniform_scan(
-    settings: Settings,
+    layout: PassLayout,
     weights: Description,
-    path: Path,
-    grid: SceneGrid,
+    file: str,
     bands: int,
-    shown: NDArray[np.bool_] | None = None,
-    recorded: RecordedPasses | None = None,
-) -> tuple[Settings, ScanChoice]:
-    """Settings with step and exposure of the uniform scan that is asked for, and the choice that there was.
+    *,
+    plain: bool,
+    goal: str | None,
+    limits: ScanLimits,
+) -> ScanChoice:
+    """Choose step and exposure of the uniform scan that is asked for, and say which choice there was.
 
-    Lines show the ``shown`` (patch,) patches, all of them where it is None. Of a ``recorded`` field the scans are those
-    that its lines serve, as they were exposed. What was chosen once stands in the settings,
-    and is kept when an archive is read again with other weights. Raises WeightsError: the choice is left to weights
-    without a record of scans; BudgetError: no scan costs as little, or reaches the goals; SettingsError: a goal of a
-    class that the weights lack, or a camera that exposes shorter than the record knows; PoseError: the field is beyond
-    the mirror's range.
+    Where a ``plain`` scan is asked for without a step, the choice is `chosen`, within the ``limits`` and by the
+    ``goal``. Of a recorded field the scans are those that its lines serve, as they were exposed. What was chosen once
+    stands in the layout, and is kept when an archive is read again with other weights, of which ``file`` is the name.
+    Raises WeightsError: the choice is left to weights without a record of scans; BudgetError: no scan costs as little,
+    or reaches the goals; SettingsError: a goal of a class that the weights lack, or a camera that exposes shorter than
+    the record knows; PoseError: the field is beyond the mirror's range.
     """
     content = weights.record.get("scans")
     if content is None:
-        if settings.scan_step is None and settings.plain:
+        if layout.step is None and plain:
             raise WeightsError(
-                f"the weights {path.name} have no record of uniform scans, by which one would be chosen: give the scan "
+                f"the weights {file} have no record of uniform scans, by which one would be chosen: give the scan "
                 "with --scan-step and --scan-exposure-ms, or train weights with --min-exposure-ms 3, some scenes kept for"
                 " validation"
             )
-        return settings, ScanChoice()
+        return ScanChoice()
     record = ScanPerformance.read(content)
-    goals = {} if settings.goal is None else parse_goals(settings.goal)
+    goals = {} if goal is None else parse_goals(goal)
     for name in goals:
         if name not in record.scores:
             known = ", ".join(one for one in record.scores if one != MIOU)
             raise SettingsError(f"--goal {name}={100 * goals[name]:g}: the weights tell apart {known}")
-    camera, cost, whole = settings.camera, settings.cost, replace(settings, extent=EXTENT_WHOLE)
-    sweeps = _scans_of_steps(record, whole, grid, shown, recorded)
-    taken_ms = None if recorded is None else [camera.exposure_ms]
-    scans = uniform_scans(record, sweeps, camera, cost, bands, seconds=settings.seconds, exposures_ms=taken_ms)
-    chosen, exposure_ms = None, settings.scan_exposure_ms or camera.exposure_ms
-    if settings != whole:  # of a part of a field the record says nothing
-        chosen = None
-    elif settings.scan_step in sweeps and record.knows(exposure_ms):
-        chosen = priced_scan(record, sweeps[settings.scan_step], camera, cost, bands, exposure_ms)
-    elif settings.plain and settings.scan_step is None:
+    camera, cost = layout.camera, layout.cost
+    sweeps: dict[int, list[Sweep]] = {}  # of the uniform scans of every step; of a recording those that its lines serve
+    for step in record.steps:
+        with nullcontext() if layout.recorded is None else suppress(NotRecordedError):
+            sweeps[step] = layout.uniform(step, layout.exposure_ms).sweeps()[1]
+    taken_ms = None if layout.recorded is None else [camera.exposure_ms]
+    scans = uniform_scans(record, sweeps, camera, cost, bands, seconds=limits.seconds, exposures_ms=taken_ms)
+    chosen, exposure_ms = None, layout.exposure_ms or camera.exposure_ms
+    if layout.extent != EXTENT_WHOLE:  # of a part of a field the record says nothing
+        pass
+    elif layout.step in sweeps and record.knows(exposure_ms):
+        chosen = priced_scan(record, sweeps[layout.step], camera, cost, bands, exposure_ms)
+    elif plain and layout.step is None:
         if not scans:
             raise SettingsError(
                 f"camera.exposure_ms = {camera.exposure_ms:g}: the weights' record tells of exposures from "
                 f"{record.exposures_ms[0]:g} ms, so that it can choose no scan; take one by hand with --scan-step"
             )
-        chosen = choose_scan(scans, ScanLimits(settings.seconds, settings.bytes_raw, goals))
-        settings = replace(settings, scan_step=chosen.step, scan_exposure_ms=chosen.exposure_ms)
-    return settings, ScanChoice(tuple(scans), chosen)
-
-
-def _scans_of_steps(
-    record: ScanPerformance,
-    settings: Settings,
-    grid: SceneGrid,
-    shown: NDArray[np.bool_] | None,
-    recorded: RecordedPasses | None,
-) -> dict[int, list[Sweep]]:
-    """Sweeps of the uniform scans of every step of a record; of a recording those that its lines serve."""
-    found = {}
-    for step in record.steps:
-        with nullcontext() if recorded is None else suppress(NotRecordedError):
-            asked = replace(settings, scan_step=step, scan=None)
-            found[step] = lay_out_sweeps(asked, grid, shown, recorded)[1]
-    return found
+        chosen = choose_scan(scans, replace(limits, goals=goals))
+    return ScanChoice(tuple(scans), chosen)
 
 
 def as_figures(scan: UniformScan | None) -> dict[str, Any] | None:

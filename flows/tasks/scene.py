@@ -20,6 +20,7 @@ from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import Once
 from pipeline.simulator.effects.effect import Effect
+from pipeline.simulator.rig_model import Sky
 from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, farm_scene, law_of_key
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
 from pipeline.simulator.simulated import SimulatedSource
@@ -61,7 +62,9 @@ def open_scene(settings: Settings, known: Sequence[str] | None = None) -> tuple[
                 raise SettingsError(f"--{name} is for scene files; the scene '{settings.scene}' brings its own")
         shape = settings.shape or FARM_SHAPE
         farm = farm_scene(settings.seed, shape, camera=settings.camera, day=settings.day, hour=settings.hour)
-        return farm if settings.bands is None else _some_bands(farm, settings.bands), _notes_of_moment(settings)
+        return farm if settings.bands is None else _some_bands(farm, settings.bands), _notes_of_moment(
+            settings.sky, settings.moment
+        )
     file = load_scene_file(
         settings.scene,
         labels=settings.labels,
@@ -70,7 +73,7 @@ def open_scene(settings: Settings, known: Sequence[str] | None = None) -> tuple[
         labels_needed=False,
     )
     file = _judged_by_known(file, known)
-    scene, notes = _placed_once(scene_of_file(file, settings.camera), file.provenance, settings)
+    scene, notes = _placed_once(scene_of_file(file, settings.camera), file.provenance, posed=settings.pose is not None)
     return scene, (*notes, *_gap_note(scene, "were given their band's median"))
 
 
@@ -99,7 +102,7 @@ def open_map(settings: Settings, known: Sequence[str] | None = None) -> tuple[Op
         missing=missing,
         geobox=file.geobox,
     )
-    scene, notes = _placed_once(scene, file.provenance, settings)
+    scene, notes = _placed_once(scene, file.provenance, posed=settings.pose is not None)
     return file, scene, (*notes, *_gap_note(scene, "are as they are in the other bands"))
 
 
@@ -115,9 +118,9 @@ def _judged_by_known(file: Facts, known: Sequence[str] | None) -> Facts:
     return file.without_labels(f"the labels beside the scene are left out: they are {hint} by them")
 
 
-def _placed_once(scene: RasterScene, notes: tuple[str, ...], settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
+def _placed_once(scene: RasterScene, notes: tuple[str, ...], *, posed: bool) -> tuple[RasterScene, tuple[str, ...]]:
     """Set the scene's own place aside where a pose says another, and say so."""
-    if scene.geobox is None or settings.pose is None:
+    if scene.geobox is None or not posed:
         return scene, notes
     return replace(scene, geobox=None), (*notes, POSE_WINS)
 
@@ -155,12 +158,12 @@ def _field_before_rig(settings: Settings) -> RasterScene:
     )
 
 
-def _notes_of_moment(settings: Settings) -> tuple[str, ...]:
+def _notes_of_moment(sky: Sky, moment: tuple[int, float] | None) -> tuple[str, ...]:
     """Say where plants and shadows are not those of the moment at which the sky's light begins."""
-    started, moment = settings.sky.started, settings.moment
+    started = sky.started
     if started is None or moment is None:
         return ()
-    sun = started.astimezone(UTC) + timedelta(hours=settings.sky.longitude_deg / 15)
+    sun = started.astimezone(UTC) + timedelta(hours=sky.longitude_deg / 15)
     day, hour = moment
     at = sun.hour + sun.minute / 60
     if day == sun.timetuple().tm_yday and abs(hour - at) < SAME_HOUR:

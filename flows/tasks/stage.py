@@ -4,24 +4,59 @@ A stage says which store it wants; the archive makes the key, finds the store, o
 stage. The record is made where the function is, in a module of `flows.tasks.stages`:
 
     @stage("rectify", "mosaic", MOSAIC)
-    def rectify(run, raw, geolocation grid): ...
+    def rectify(raw, geolocation grid, *, frame, camera, kernel): ...
 
-The order of the stages stands in `flows.survey`, which calls them with the opened survey and with the stores that
-they are made of.
+The function takes the stores that it is made of, and behind the star by name what it needs of the opened survey: an
+attribute of the run, or a setting. The order of the stages stands in `flows.survey`, which calls them with the opened
+survey and the stores.
 """
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import wraps
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from flows.tasks.prefect_tasks import as_task
+from pipeline.geometry.grid import SceneGrid
+from pipeline.ground.georeference import georeference_record
 from storage.archive.archive import Archive
-from storage.archive.keys import StageRef, stage_key
+from storage.archive.keys import StageRef, array_digest, stage_key
+from storage.arrays.layout import AngularGrid
 
+if TYPE_CHECKING:
+    from odc.geo.geobox import GeoBox
+
+Report = Callable[[float], None]  # how far a stage is, 0..1
 Build = Callable[[Path], None]
+
+
+@dataclass(frozen=True)
+class FieldFrame:
+    """The frame of a survey's images: their pixels and bands, where they lie, and which pixels are no scene."""
+
+    grid: SceneGrid
+    ifov_rad: float
+    wavelength_nm: NDArray[np.float64]  # (band,)
+    fwhm_nm: NDArray[np.float64] | None
+    missing: NDArray[np.bool_] | None  # (y, x) of which the scene has no value; None: of all it has
+    geobox: GeoBox | None  # of the fine grid, where the scene's file says it
+
+    @property
+    def key(self) -> dict[str, Any]:
+        """Return what images depend on beside what was seen: where they lie, and what is no scene."""
+        gaps = {} if self.missing is None else {"missing": array_digest(self.missing)}
+        return {**georeference_record(self.geobox), **gaps}
+
+    def angular_grid(self, factor: int = 1) -> AngularGrid:
+        """Return where pixels of ``factor`` fine px lie."""
+        return AngularGrid(self.ifov_rad, (self.grid.height, self.grid.width), factor, self.geobox)
 
 
 @dataclass(frozen=True)
@@ -54,7 +89,10 @@ class Survey(Protocol):
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage. ``wants`` takes the run and the stores that it is made of, and returns what is to be stored."""
+    """One stage. ``wants`` takes the run and the stores that it is made of, and returns what is to be stored.
+
+    What the stage needs is taken from the run once the keys of all its stores are known.
+    """
 
     name: str
     title: str  # on terminals and pages
@@ -109,7 +147,26 @@ def stage(
 ) -> Callable[[Callable[..., Wanted]], Stage]:
     """Make a function a stage; see `Stage` for the parameters. Its module lies in `flows.tasks.stages`."""
 
-    def record(wants: Callable[..., Wanted]) -> Stage:
+    def record(function: Callable[..., Wanted]) -> Stage:
+        """Make the record of one function."""
+        needs = needs_of(function)
+
+        @wraps(function)
+        def wants(run: Any, *given: StageRef) -> Wanted:
+            for ref in given:
+                _ = ref.key  # where one is not known yet nothing is opened
+            return function(*given, **{name: needed(run, name) for name in needs})
+
         return Stage(name, title, product, wants, inputs, retries, named)
 
     return record
+
+
+def needs_of(function: Callable[..., Any]) -> list[str]:
+    """Return the names behind the star of a stage's function."""
+    return [one.name for one in inspect.signature(function).parameters.values() if one.kind is one.KEYWORD_ONLY]
+
+
+def needed(run: Any, name: str) -> Any:
+    """Return what a stage needs: the run's own attribute of that name, else the setting."""
+    return getattr(run if hasattr(type(run), name) or name in vars(run) else run.settings, name)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.survey_settings import Settings
+from flows.settings.survey_settings import Settings, ZoneChoice
 from pipeline.errors import ZoneError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.ground.field_places import FieldPlace, NoPlace, PlacedPicture, PosedField
@@ -78,12 +78,11 @@ def place_of_field(settings: Settings, scene: RasterScene) -> FieldPlace:
     return PosedField(ground_grid(view, scene.shape, epsg=settings.map.epsg, resolution_m=settings.map.resolution_m))
 
 
-def open_zones(settings: Settings, place: FieldPlace, grid: SceneGrid) -> SurveyZones:
-    """Read the files that the settings name, and bring their polygons onto the field.
+def open_zones(files: ZoneChoice, place: FieldPlace, grid: SceneGrid) -> SurveyZones:
+    """Read the ``files`` that the settings name, and bring their polygons onto the field.
 
     Raises ZoneError: a file cannot be used, its area or its plots do not lie on the field, or zones leave nothing.
     """
-    files = settings.zones
     if files.area is None and files.no_go is None and files.plots is None:
         return SurveyZones(place, grid)
     notes: list[str] = []

@@ -83,3 +83,26 @@ def pad_by_reflection(image: NDArray[np.generic], shape: tuple[int, int]) -> NDA
             pad[axis] = (0, size - have if have < 2 else min(size - have, have - 1))
             grown = np.pad(grown, pad, mode="edge" if have < 2 else "reflect")
     return grown
+
+
+def block_means(
+    values: NDArray[np.float32], coverage: NDArray[np.intp], times: int
+) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+    """Mean of every ``times`` x ``times`` pixels that are no NaN, (y, x, band), and the most sweeps that saw one.
+
+    Sides that ``times`` does not divide end in a smaller block. NaN where nothing of a block was seen.
+    """
+    beyond = [(0, -size % times) for size in coverage.shape]
+    if any(more for _, more in beyond):
+        values = np.pad(values, (*beyond, (0, 0)), constant_values=np.nan)
+        coverage = np.pad(coverage, beyond)
+    blocks = values.reshape(values.shape[0] // times, times, values.shape[1] // times, times, -1)
+    covered = coverage.reshape(*blocks.shape[:4]).max(axis=(1, 3))
+    with np.errstate(over="ignore", invalid="ignore"):
+        total = blocks.sum(axis=(1, 3), dtype=np.float32)
+    if np.isfinite(total).all():  # the rule: all was seen
+        return total / np.float32(times**2), covered
+    seen = np.isfinite(blocks)
+    count = seen.sum(axis=(1, 3), dtype=np.float32)
+    total = np.where(seen, blocks, np.float32(0)).sum(axis=(1, 3), dtype=np.float32)
+    return np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0), covered

@@ -12,11 +12,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import PoseError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import camera_slope, line_centre
 from pipeline.geometry.scan import Axis
-from pipeline.rectify.scan_paths import ScanPath, line_centres, single_scan_path
+from pipeline.rectify.scan_paths import ScanPath
 
 NEWTON_ROUNDS = 4
 HALVINGS = 34  # from one knot to 1e-10 of it
@@ -198,33 +197,6 @@ def _bisect(curve: KnotCurve, a: Floats, b: Floats, rough: Floats) -> Floats:
     return found
 
 
-def geolocation(position: Floats, camera: LineCamera, points_px: Floats, *, along: Axis, binning: int = 1) -> Floats:
-    """Find the line and sample at which a sweep that runs one way saw each of some points (..., 2), y and x [px].
-
-    The sweep, given by mirror X and Y at mid exposure (line, 2), may run either way but must not turn or stand still;
-    such sweeps are split by :func:`pipeline.rectify.scan_paths.make_scan_paths` first.
-
-    (..., 2) float64 line and sample, integers at centres; NaN where the point is off the sweep by more than half a
-    line or half a sample. The line of a one-line sweep is taken to be as wide as its (binned) samples.
-
-    Raises PoseError: the sweep turns or stands still, naming the line; or a position is out of reach.
-    Raises ShapeError: positions or points are not pairs.
-    """
-    if not len(position):
-        raise ShapeError(f"expected mirror positions (line, 2) of at least one line, got {position.shape}")
-    scan, _, _ = line_centres(position, camera)
-    falling = bool(scan[-1] < scan[0])
-    if (still := np.diff(-scan if falling else scan) <= 0).any():
-        at = int(np.argmax(still)) + falling
-        raise PoseError(f"the sweep turns or stands still near line {at}; split it into parts that run one way")
-    found = path_geolocation(
-        single_scan_path(position, camera, binning), camera, points_px, along=along, binning=binning
-    )
-    if falling:
-        found[..., 0] = len(position) - 1 - found[..., 0]
-    return found
-
-
 def path_geolocation(
     scan_path: ScanPath, camera: LineCamera, points_px: Floats, *, along: Axis, binning: int = 1
 ) -> Floats:
@@ -234,11 +206,7 @@ def path_geolocation(
     of a linear scene whatever the knots' distances, to the second order of how a line's image stretches. NaN where
     the point is off the track by more than half a step or half a sample, where the nearest knot is one that nothing
     saw, and where no crossing with the path was found.
-
-    Raises ShapeError: points are not pairs.
     """
-    if points_px.shape[-1] != 2:
-        raise ShapeError(f"expected points (..., 2) of y and x, got {points_px.shape}")
     found = knots_of_points(KnotCurve(scan_path), camera, points_px.reshape(-1, 2), along, binning)
     drop_unseen(found, scan_path.seen, camera.samples // binning)
     return found.reshape(points_px.shape)

@@ -138,17 +138,7 @@ def weighted_rows(
         out[part if at is None else at[part]] = bags[0].numpy()
 
 
-def outer_index(row: NDArray[np.int64], column: NDArray[np.int64], columns: int) -> NDArray[np.int64]:
-    """(n, tap * tap) places in an image's ravelled pixels, from (n, tap) rows and columns."""
-    return np.repeat(row * columns, column.shape[1], axis=1) + np.tile(column, (1, row.shape[1]))
-
-
-def tensor_rows(array: NDArray[np.float32]) -> torch.Tensor:
-    """View (row, column) float32 as a tensor; read-only memory is fine, for nothing here writes to it."""
-    return torch.from_numpy(array if array.flags.writeable else np.asarray(_Unlocked(array)))
-
-
-class _Unlocked:
+class Unlocked:
     """Memory of a read-only array as if it were not: torch warns of it, and warnings cannot be held off per thread."""
 
     def __init__(self, array: NDArray[np.float32]) -> None:

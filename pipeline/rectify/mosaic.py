@@ -1,120 +1,24 @@
-"""One track's values at points, from no more raw lines and samples than they need, and their blend with others'.
-
-Raw lines are kept while neighbouring tiles still need them: blocks of whole shards, least recently used out first.
-"""
+"""One track's values at points, from no more lines and samples than they need, and their blend with others'."""
 
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import reduce
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
-from pipeline.rectify.calibrate import calibrate
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.placed import TAPS, Placed, member_lines
 from pipeline.rectify.resample import merge_lines, resample
 from pipeline.rectify.scan_paths import ScanPath
-from pipeline.source import SweepLines
+from pipeline.signal.lines import ReadWindow
 
-BLOCK_LINES = 64  # a shard of a stored sweep: reading one line of it costs as much as reading all
-CHUNK_SAMPLES = 32  # likewise across
-
-_Key = tuple[int, int, int, int]  # sweep, block, samples held
-Raw = NDArray[np.uint16]
-ReadWindow = Callable[[slice, slice], Raw]  # (lines, samples) -> (line, sample, band)
 LEAST_EDGE_PX = 1e-3  # the very edge of a sweep counts where nothing else reaches
 RUN_ELEMENTS = 250_000  # what one more window costs, in elements (sample and band of a line) calibrated
 BLOCK_POINTS = 1024  # what is mixed at once stays in cache
-
-
-@runtime_checkable
-class WindowedLines(Protocol):
-    """A sweep that can be read a part of its samples at a time."""
-
-    def read_window(self, lines: slice, samples: slice) -> Raw:
-        """Raw numbers of some lines and samples, (line, sample, band)."""
-
-
-@dataclass
-class _Block:
-    """One block of one sweep: its raw numbers once read, None before, and what threads wait on for them."""
-
-    lines: SweepLines  # held so that its id stays its own
-    raw: Raw | None = None
-    reading: threading.Lock = field(default_factory=threading.Lock)
-
-
-class LineCache:
-    """Blocks of 64 raw lines of any number of sweeps, at most ``most_bytes`` of them. Threads may share it.
-
-    Two threads that want the same block wait for one read. ``reads`` counts blocks read, ``bytes_held`` what is kept.
-    """
-
-    def __init__(self, most_bytes: int) -> None:
-        self.most_bytes = most_bytes
-        self.reads = 0
-        self.bytes_held = 0
-        self._blocks: OrderedDict[_Key, _Block] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def window(self, lines: SweepLines, wanted: slice, samples: slice, *, likely: slice | None = None) -> Raw:
-        """Give raw numbers (line, sample, band) of some lines and samples, read before or now; not to be written to.
-
-        ``likely`` are samples that later calls will want of the same lines: they are read together, and only calls that
-        name the same ones share what was read.
-        """
-        held = held_samples(lines, samples, likely)
-        within = slice(samples.start - held.start, samples.stop - held.start)
-        parts = []
-        for number in line_blocks(wanted):
-            origin = number * BLOCK_LINES
-            rows = slice(max(wanted.start - origin, 0), min(wanted.stop - origin, BLOCK_LINES))
-            parts.append(self._block(lines, number, held)[rows, within])
-        return parts[0] if len(parts) == 1 else np.concatenate(parts)
-
-    def _block(self, lines: SweepLines, number: int, samples: slice) -> Raw:
-        key = (id(lines), number, samples.start, samples.stop)
-        with self._lock:
-            block = self._blocks.setdefault(key, _Block(lines))
-            self._blocks.move_to_end(key)
-        with block.reading:
-            if block.raw is None:
-                rows = slice(number * BLOCK_LINES, min((number + 1) * BLOCK_LINES, len(lines.valid_line)))
-                if isinstance(lines, WindowedLines):
-                    raw = lines.read_window(rows, samples)
-                else:
-                    raw = lines.read(rows.start, rows.stop)
-                with self._lock:
-                    block.raw = raw
-                    self.reads += 1
-                    self.bytes_held += raw.nbytes
-                    for old, held in list(self._blocks.items()):  # the newest and those still being read stay
-                        if self.bytes_held > self.most_bytes and old != key and held.raw is not None:
-                            self.bytes_held -= held.raw.nbytes
-                            del self._blocks[old]
-            return block.raw
-
-
-def line_blocks(lines: slice) -> range:
-    """Numbers of the blocks that hold some lines."""
-    return range(lines.start // BLOCK_LINES, -(-lines.stop // BLOCK_LINES))
-
-
-def held_samples(lines: SweepLines, samples: slice, likely: slice | None = None) -> slice:
-    """Samples to read and hold: those wanted and likely, in whole chunks; all of a sweep read by whole lines."""
-    count = lines.references.dark.shape[0]
-    if not isinstance(lines, WindowedLines):
-        return slice(0, count)
-    other = samples if likely is None else likely
-    first, stop = min(samples.start, other.start), max(samples.stop, other.stop)
-    return slice(first // CHUNK_SAMPLES * CHUNK_SAMPLES, min(-(-stop // CHUNK_SAMPLES) * CHUNK_SAMPLES, count))
 
 
 @dataclass(frozen=True)
@@ -205,7 +109,7 @@ class LocatedSweep:
 def read_part(
     observation: LocatedSweep, coordinates: NDArray[np.float64], camera: LineCamera, kernel: Kernel
 ) -> MosaicPart | None:
-    """Calibrate and resample one track at geolocation grid coordinates (n, 2); None where it reaches none of them.
+    """Resample one track at geolocation grid coordinates (n, 2); None where it reaches none of them.
 
     Lines that are not valid or that nothing saw, saturated and uncalibrated elements count nothing; where they leave
     less than half of a kernel's weight the point is NaN with weight 0. The result at a point does not depend on the
@@ -214,21 +118,15 @@ def read_part(
     box = _boxes(coordinates[None])[0]
     if np.isnan(box[0]):
         return None
-    lines, scan_path = observation.placed.lines, observation.scan_path
-    count = lines.references.dark.shape[0]
-    elements = observation.placed.elements
-    knots, samples = _span(box[0], box[1], len(scan_path)), elements.alone(_span(box[2], box[3], count))
+    signal, scan_path = observation.placed.signal, observation.scan_path
+    count = signal.samples
+    knots, samples = _span(box[0], box[1], len(scan_path)), signal.elements.alone(_span(box[2], box[3], count))
     members = member_lines(scan_path, knots)
-    values, valid = calibrate(
-        _raw_of(observation.read, members, samples),
-        elements.part(samples),
-        saturated_dn=camera.full_scale_dn * lines.sweep.binning,
-        position=lines.position[members],
-    )
+    values, valid = signal.values(observation.read, members, samples, camera.full_scale_dn)
     starts = scan_path.starts[knots] - scan_path.starts[knots.start]
-    usable = lines.valid_line[members] & np.repeat(scan_path.seen[knots], np.diff(starts, append=len(members)))
-    if not usable.all():
-        valid = valid & usable.reshape(-1, *[1] * (valid.ndim - 1))
+    seen = np.repeat(scan_path.seen[knots], np.diff(starts, append=len(members)))
+    if not seen.all():
+        valid = valid & seen.reshape(-1, *[1] * (valid.ndim - 1))
     if len(starts) < len(members):
         values, valid = merge_lines(values, valid, starts)
     values_at, weight = resample(values, valid, coordinates - np.array([knots.start, samples.start]), kernel)
@@ -277,15 +175,3 @@ def _boxes(coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
 def _span(low: float, high: float, size: int) -> slice:
     """Whole pixels from low to high with the kernel's taps, within 0..size."""
     return slice(max(int(np.floor(low)) - TAPS, 0), min(int(np.ceil(high)) + TAPS + 1, size))
-
-
-def _raw_of(read: ReadWindow, members: NDArray[np.intp], samples: slice) -> Raw:
-    """Raw numbers of the lines ``members``, in their order."""
-    first, last = int(members.min()), int(members.max()) + 1
-    raw = read(slice(first, last), samples)
-    if last - first == len(members):
-        if (np.diff(members) == 1).all():
-            return raw
-        if (np.diff(members) == -1).all():
-            return raw[::-1]
-    return raw[members - first]

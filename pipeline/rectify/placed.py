@@ -5,19 +5,18 @@ A grid's geolocation grid is kept as ties at every few of its pixels, bilinear b
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import SettingsError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, points_of_scan
-from pipeline.rectify.calibrate import Elements, judge_elements
 from pipeline.rectify.geolocation import KnotCurve, drop_unseen, grid_points, knots_of_points, path_geolocation
 from pipeline.rectify.scan_paths import ScanPath, make_scan_paths
+from pipeline.signal.lines import Signal
 from pipeline.source import SweepLines
 
 SAFETY = 1.05  # on the bound of ties, which holds to the second order
@@ -110,11 +109,7 @@ def tie_table(
     samples, is bound by ``tolerance_px`` [px of the sweep]. The bound is an eighth of the ties' second differences (of
     both axes together) and how far the knots lie off straight lines of a tie's length, which shows a single line out of
     place that no tie may meet; or the error found half-way between ties, if that is more.
-
-    Raises SettingsError: the distance of ties is below 1, or the tolerance below 0.
     """
-    if tie < 1 or not tolerance_px >= 0:
-        raise SettingsError(f"expected ties at least 1 px apart and a tolerance from 0, got {tie} and {tolerance_px}")
     curve, samples = KnotCurve(scan_path), camera.samples // binning
     corner, kept = _within_reach(curve, camera, along, (binning, origin_px, spacing_px, shape))
 
@@ -221,16 +216,9 @@ class Placed:
     gain: NDArray[np.float32] | None = None  # (band,) what the sweep's values are multiplied by
 
     @cached_property
-    def elements(self) -> Elements:
-        """The detector's elements, judged by all of the references; the gain is in the white reference's values."""
-        plain = self.lines.references
-        if self.gain is None:
-            return judge_elements(plain)
-        if self.gain.shape != plain.white_reference.shape:
-            raise ShapeError(
-                f"sweep {self.lines.sweep.name} has {len(plain.white_reference)} bands, its gain has shape {self.gain.shape}"
-            )
-        return judge_elements(replace(plain, white_reference=(plain.white_reference * self.gain).astype(np.float32)))
+    def signal(self) -> Signal:
+        """Return its lines in scene values."""
+        return Signal(self.lines, self.gain)
 
     def coordinates(
         self, number: int, camera: LineCamera, grid: PixelGrid, rows: slice, columns: slice
@@ -266,7 +254,6 @@ def place(
     sweep.
 
     Raises PoseError: a line's position is beyond the mirror's disk, or its path has no direction.
-    Raises ShapeError: arrays that do not fit the lines.
     """
     sweep = lines.sweep
     scan_paths = make_scan_paths(
@@ -332,7 +319,7 @@ class ScanPathReach:
         return ColumnReach(
             top=np.where(hit, self._top, np.inf).min(axis=1),
             bottom=np.where(hit, self._bottom, -np.inf).max(axis=1),
-            samples=self._placed.elements.alone(slice(max(first - TAPS, 0), min(last + TAPS, self._count))),
+            samples=self._placed.signal.elements.alone(slice(max(first - TAPS, 0), min(last + TAPS, self._count))),
         )
 
 

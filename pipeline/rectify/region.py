@@ -11,20 +11,10 @@ from numpy.typing import NDArray
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.rectify.kernels import Kernel
-from pipeline.rectify.mosaic import (
-    BLOCK_LINES,
-    LineCache,
-    LocatedSweep,
-    Raw,
-    ReadWindow,
-    cut_runs,
-    held_samples,
-    line_blocks,
-    mosaic,
-    read_part,
-)
+from pipeline.rectify.mosaic import LocatedSweep, cut_runs, mosaic, read_part
 from pipeline.rectify.placed import TAPS, ColumnReach, PixelGrid, Placed, ScanPathReach, member_lines, place
 from pipeline.rectify.scan_paths import ScanPath
+from pipeline.signal.lines import BLOCK_LINES, LineCache, Raw, ReadWindow, held_samples, line_blocks
 from pipeline.source import SweepLines
 
 COPIES = 5  # of a tile in memory at once: values, parts and calibrated lines, rounded, chunks and shard

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import reduce
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -10,9 +9,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ShapeError
 from pipeline.lazy import deferred
-from pipeline.rectify.kernels import Kernel, Rows, Windows, outer_index, taps_of, tensor_rows, weighted_rows, windows
+from pipeline.rectify.kernels import Kernel, Rows, Unlocked, Windows, taps_of, weighted_rows, windows
 
 if TYPE_CHECKING:
     import torch
@@ -137,7 +135,8 @@ class LineTable:
         for along, index, size in ((weight[0], line, self.shape[0]), (weight[1], sample, self.shape[1])):
             along *= ((index >= 0) & (index < size)).T
             index.clip(0, max(size - 1, 0), out=index)
-        flat, joint = outer_index(line, sample, self.shape[1]), Windows(placed.corner, weight).joint_weight().numpy()
+        flat = np.repeat(line * self.shape[1], placed.taps, axis=1) + np.tile(sample, (1, placed.taps))
+        joint = Windows(placed.corner, weight).joint_weight().numpy()
         if self.usable is not None:
             usable = self.usable[flat]
             joint *= usable
@@ -158,7 +157,9 @@ def table_for(values: Values, valid: NDArray[np.bool_], kernel: Kernel) -> LineT
     whole, usable = None, None
     if not valid.all():
         whole, usable = _windows_all(valid, taps), np.ascontiguousarray(valid).ravel()
-    terms = tensor_rows(rows) if taps > 1 else torch.empty(0)
+    terms = torch.empty(0)
+    if taps > 1:  # read-only memory is fine: nothing here writes to it
+        terms = torch.from_numpy(rows if rows.flags.writeable else np.asarray(Unlocked(rows)))
     return LineTable((lines, samples), rows, terms, usable, whole, damage)
 
 
@@ -249,14 +250,7 @@ def resample(
     (n, band) float32, NaN where the point failed in that band; ``nearest`` gives uint16 back as the same uint16, 0
     where the point failed (float32 with NaN if single elements are invalid). And (n,) float32, the fraction of the
     kernel's weight that lay on samples with a valid band (0..1): 0 where the point failed in every band.
-
-    Raises
-    ------
-    ShapeError : the mask does not fit the values, the coordinates are not pairs, or ``out`` does not fit.
     """
-    _check_mask(values, valid)
-    if coordinates.ndim != 2 or coordinates.shape[1] != 2:
-        raise ShapeError(f"expected coordinates (n, 2) of line and sample, got {coordinates.shape}; flatten the grid")
     coordinates = np.asarray(coordinates, np.float64)
     low, high = (
         extreme.reduce(coordinates[:, 0], initial=away) for extreme, away in ((np.fmin, np.inf), (np.fmax, -np.inf))
@@ -267,10 +261,9 @@ def resample(
     table = table_for(values[first:stop], valid[first:stop], kernel)
     shape, kind = (len(coordinates), values.shape[2]), table.rows.dtype
     out = np.empty(shape, kind) if out is None else out
-    if out.shape != shape or out.dtype != kind or not out.flags.c_contiguous:
-        raise ShapeError(f"expected out {shape} of {kind}, rows next to each other, got {out.shape} of {out.dtype}")
     fraction = np.zeros(len(coordinates), np.float32)
-    for block in _blocks(len(out)):
+    for start in range(0, len(out), BLOCK_PX):
+        block = slice(start, start + BLOCK_PX)
         placed = windows(coordinates[block], kernel)
         placed.corner[0] -= first
         table.read(placed, out[block], fraction[block])
@@ -287,13 +280,8 @@ def merge_lines(
 
     (dwell, sample, band) float32 mean of the valid lines, NaN where there is none (a line alone as it was; the input
     itself, uint16 too, where every line is alone); and whether there is any, with the dimensions of ``valid``.
-
-    Raises ShapeError: ``starts`` does not part the lines, or the mask does not fit the values.
     """
-    _check_mask(values, valid)
     counts = np.diff(starts, append=len(values))
-    if (counts < 1).any() or (starts[:1] != 0).any() or len(starts) == 0 < len(values):
-        raise ShapeError(f"expected ascending first lines from 0 on, below {len(values)}, got {starts.tolist()[:8]}")
     if len(starts) == len(values):
         return values, valid
     merged, known = values[starts].astype(np.float32), valid[starts]
@@ -310,16 +298,3 @@ def merge_lines(
     merged[several] = np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
     known[several] = (number > 0).reshape(len(starts), *valid.shape[1:])
     return merged, known
-
-
-def _blocks(count: int) -> Iterator[slice]:
-    for start in range(0, count, BLOCK_PX):
-        yield slice(start, min(start + BLOCK_PX, count))
-
-
-def _check_mask(values: Values, valid: NDArray[np.bool_]) -> None:
-    if values.ndim != 3 or valid.shape not in (values.shape[:2], values.shape):
-        raise ShapeError(
-            "expected values (line, sample, band) with a mask (line, sample) or (line, sample, band), "
-            f"got {values.shape} and {valid.shape}"
-        )

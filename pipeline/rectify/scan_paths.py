@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import PoseError, SettingsError, ShapeError
+from pipeline.errors import PoseError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import RIM_SLACK, direction_to_scene, position_to_direction
 from pipeline.readings import SIGMA_OF_MEDIAN
@@ -83,7 +83,6 @@ def make_scan_paths(
     Tracks in the order in which they were taken; none where no line is usable.
 
     Raises PoseError: the position of a usable line is not finite or beyond the mirror's disk; names the first.
-    Raises ShapeError: arrays do not fit the lines.
     """
     scan, across, lines = line_centres(position, camera, usable, shift_px)
     if not len(lines):
@@ -103,12 +102,6 @@ def line_centres(
 
     Tangents on the scan axis and along the line, (usable line,) each, and the numbers of these lines.
     """
-    if position.ndim != 2 or position.shape[1] != 2:
-        raise ShapeError(f"expected mirror positions (line, 2), got {position.shape}")
-    if usable is not None and usable.shape != position.shape[:1]:
-        raise ShapeError(f"usable has shape {usable.shape}, expected one flag for each of {len(position)} lines")
-    if shift_px is not None and shift_px.shape != position.shape:
-        raise ShapeError(f"shift_px has shape {shift_px.shape}, expected {position.shape}: along and scan of each line")
     lines = np.arange(len(position)) if usable is None else np.flatnonzero(usable)
     place = np.asarray(position[lines], np.float64)
     out = ~(np.hypot(place[:, 0], place[:, 1]) <= 1 + RIM_SLACK["float64"])
@@ -123,17 +116,6 @@ def line_centres(
     if shift_px is not None:
         tangent = tangent + shift_px[lines] * camera.ifov_rad
     return tangent[:, 1], tangent[:, 0], lines
-
-
-def single_scan_path(position: Floats, camera: LineCamera, binning: int = 1) -> ScanPath:
-    """Make one track of lines that run one way, a knot for each line whatever their distances."""
-    scan, across, lines = line_centres(position, camera)
-    step = _usual_step(scan, lines, camera.ifov_rad * binning)
-    order = np.argsort(scan, kind="stable")
-    scan = scan[order]
-    return ScanPath(
-        scan, across[order], lines[order], np.arange(len(lines)), np.ones(len(lines), np.bool_), _width(scan, step)
-    )
 
 
 def _usual_step(scan: Floats, lines: NDArray[np.intp], apart: float) -> float:
@@ -240,14 +222,7 @@ def number_lines(time_s: Floats, frame_s: float) -> LineNumbers:
     so that one wild stamp costs one line; so does a wild one that comes first or last. A late frame is used: its
     position is that of its own time. ``frame_s`` is the planned frame period; its true value is taken from the stamps,
     so that a slow clock makes no frame late.
-
-    Raises SettingsError: the period is not above 0.
-    Raises ShapeError: the stamps are not one row.
     """
-    if not frame_s > 0:
-        raise SettingsError(f"the frame period must be above 0 s, got {frame_s}")
-    if time_s.ndim != 1:
-        raise ShapeError(f"expected time stamps (frame,), got {time_s.shape}")
     known = np.isfinite(time_s)
     first = np.zeros(len(time_s), np.bool_)
     first[np.unique(time_s, return_index=True)[1]] = True

@@ -1,18 +1,23 @@
-"""Tiles of a mosaic from placed sweeps: what is in one, as a function of arrays, and the memory that tiles take."""
+"""Tiles of a mosaic from placed sweeps: what is in one, as a function of arrays, and the memory that tiles take.
+
+A maker of tiles opens its sweeps once in every process, and keeps their raw lines from tile to tile.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import block_means
 from pipeline.rectify.kernels import Kernel
-from pipeline.rectify.mosaic import LineCache
 from pipeline.rectify.placed import PixelGrid, Placed
 from pipeline.rectify.region import Reaches, Tile, cache_bytes, column_reach, mosaic_tile, plan_tiles, tile_bytes
+from pipeline.signal.lines import LineCache
 
 ROWS_OF_MEANS = 8  # of a mosaic whose pixels are means, rectified at once
 
@@ -79,24 +84,47 @@ class MosaicWork:
         return one + tile_bytes(part_shape, bands), at_once * parts
 
 
-def block_means(
-    values: NDArray[np.float32], coverage: NDArray[np.intp], times: int
-) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
-    """Mean of every ``times`` x ``times`` pixels that are no NaN, (y, x, band), and the most sweeps that saw one.
+OpenWork = Callable[[], MosaicWork]  # hashable, and where several processes make tiles pickled: it holds paths
 
-    Sides that ``times`` does not divide end in a smaller block. NaN where nothing of a block was seen.
-    """
-    beyond = [(0, -size % times) for size in coverage.shape]
-    if any(more for _, more in beyond):
-        values = np.pad(values, (*beyond, (0, 0)), constant_values=np.nan)
-        coverage = np.pad(coverage, beyond)
-    blocks = values.reshape(values.shape[0] // times, times, values.shape[1] // times, times, -1)
-    covered = coverage.reshape(*blocks.shape[:4]).max(axis=(1, 3))
-    with np.errstate(over="ignore", invalid="ignore"):
-        total = blocks.sum(axis=(1, 3), dtype=np.float32)
-    if np.isfinite(total).all():  # the rule: all was seen
-        return total / np.float32(times**2), covered
-    seen = np.isfinite(blocks)
-    count = seen.sum(axis=(1, 3), dtype=np.float32)
-    total = np.where(seen, blocks, np.float32(0)).sum(axis=(1, 3), dtype=np.float32)
-    return np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0), covered
+
+@dataclass(frozen=True)
+class TileMaker:
+    """Makes tiles in any process, with ``cache`` bytes of raw lines kept from tile to tile."""
+
+    open: OpenWork
+    cache: int
+
+    def __call__(self, rows: slice, columns: slice) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+        """Return values and coverage as `MosaicWork.make_tile` does."""
+        opened = opened_tiles(self)
+        return opened.work.make_tile(rows, columns, opened.reach(columns.start, columns.stop), opened.lines)
+
+
+@dataclass(frozen=True)
+class OpenedTiles:
+    """What makes tiles in one process."""
+
+    work: MosaicWork
+    lines: LineCache
+    reach: Callable[[int, int], Reaches]  # of some columns: tiles go down them
+
+
+@lru_cache(maxsize=1)
+def opened_work(open_work: OpenWork) -> MosaicWork:
+    """Open work once in this process."""
+    return open_work()
+
+
+@lru_cache(maxsize=1)
+def opened_tiles(maker: TileMaker) -> OpenedTiles:
+    """Open what a maker needs once in this process; the one before it is let go."""
+    work = opened_work(maker.open)
+    return OpenedTiles(
+        work, LineCache(maker.cache), lru_cache(maxsize=2)(lambda start, stop: work.reach(slice(start, stop)))
+    )
+
+
+def let_tiles_go() -> None:
+    """Give back the memory of the last mosaic's raw lines in this process, whose work goes on with something else."""
+    opened_tiles.cache_clear()
+    opened_work.cache_clear()

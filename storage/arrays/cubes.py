@@ -244,3 +244,8 @@ def open_raw_cube(path: Path) -> RawCube:
         started=None if "started" not in group.attrs else str(group.attrs["started"]),
         group=group,
     )
+
+
+def open_raw_cubes(folder: Path) -> list[RawCube]:
+    """Open the sweeps of a capture, in the order of their names; raises as `open_raw_cube`."""
+    return [open_raw_cube(path) for path in sorted(folder.glob("*.zarr"))]

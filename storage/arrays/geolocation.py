@@ -11,7 +11,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from pipeline.errors import IncompleteStoreError, ShapeError
+from pipeline.errors import IncompleteStoreError
 from pipeline.rectify.placed import TieTable
 from pipeline.rectify.scan_paths import ScanPath
 from storage.archive.keys import KEY_LENGTH
@@ -29,16 +29,11 @@ def path_digest(
 
     Positions and their corrections ``shift`` are (line, 2), as of :func:`pipeline.rectify.scan_paths.make_scan_paths`. What a
     line that is not usable reports does not count, nor whether a correction is zero or none. Camera, binning, step and
-    grid are the stage's own parameters. Raises ShapeError: arrays do not fit the lines.
+    grid are the stage's own parameters.
     """
     lines = np.asarray(position, np.float64)
     flags = np.ones(len(lines), np.bool_) if usable is None else np.asarray(usable, np.bool_)
     moved = np.zeros_like(lines) if shift is None else np.asarray(shift, np.float64)
-    if lines.ndim != 2 or lines.shape[1] != 2 or flags.shape != lines.shape[:1] or moved.shape != lines.shape:
-        raise ShapeError(
-            f"expected positions (line, 2), flags (line,) and shifts (line, 2), got {lines.shape}, {flags.shape} and"
-            f" {moved.shape}"
-        )
     digest = hashlib.sha256(flags.tobytes())
     for values in (lines, moved):
         digest.update(np.ascontiguousarray(values[flags] + 0.0, "<f8").tobytes())  # + 0.0: -0 and 0 are one place

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,8 @@ from storage.arrays.layout import (
     write_image,
     write_small,
 )
-from storage.arrays.quicklooks import Quicklook, write_quicklook
+from storage.arrays.quicklooks import Quicklook, Thumbnail, ThumbnailCut, write_quicklook
+from storage.parallel.pool import WorkerPool, run_blocks
 
 
 @dataclass(frozen=True)
@@ -120,6 +122,60 @@ class MosaicWriter:
     def write_quicklook(self, image: NDArray[np.uint8]) -> None:
         """Store a small colour picture, (y, x, 3) uint8, beside the mosaic."""
         write_quicklook(self.group, Quicklook(image))
+
+
+MakeTile = Callable[[slice, slice], tuple[NDArray[np.float32], NDArray[np.generic]]]  # (rows, columns) of a mosaic
+
+
+def write_tiles(
+    writer: MosaicWriter,
+    make: MakeTile,
+    places: Sequence[tuple[slice, slice]],
+    pool: WorkerPool,
+    *,
+    paths: Sequence[Path] = (),
+    seen: Thumbnail | None = None,
+    report: Callable[[float], None] = lambda done: None,
+) -> None:
+    """Store what ``make`` gives for the rows and columns of ``places``, each in a task of its own.
+
+    Whoever makes the tiles, the same bytes come out. ``seen`` is filled with the pixels that it shows; see `run_blocks`
+    for the others and for what is raised.
+    """
+    task = _TileTask(make, writer.path.absolute(), None if seen is None else seen.cut)
+    if pool.shares_memory:
+        _reopened(task.out)  # before several threads ask for it
+    run_blocks(
+        task,
+        places,
+        pool,
+        keep=False,
+        report=report,
+        paths=[*paths, task.out],
+        each=lambda place, part: None if seen is None or part is None else seen.put(*place, part),
+    )
+    _reopened.cache_clear()
+
+
+@dataclass(frozen=True)
+class _TileTask:
+    """Makes and stores a tile in any process: a shard of its own, whose files nothing else touches."""
+
+    make: MakeTile
+    out: Path  # the mosaic, begun
+    cut: ThumbnailCut | None
+
+    def __call__(self, place: tuple[slice, slice]) -> NDArray[np.float32] | None:
+        """Make and write the tile of some rows and columns; return what a thumbnail shows of it."""
+        (rows, columns), (values, coverage) = place, self.make(*place)
+        part = None if self.cut is None else self.cut(rows, columns, values).copy()
+        _reopened(self.out).write_tile(rows.start, columns.start, values, coverage)
+        return part
+
+
+@lru_cache(maxsize=1)
+def _reopened(path: Path) -> MosaicWriter:
+    return MosaicWriter.reopen(path)
 
 
 def load_mosaic(path: Path) -> Mosaic:

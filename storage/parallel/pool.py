@@ -59,9 +59,22 @@ _ENVIRONMENT = {
 }
 _ADDRESS = re.compile(r"(tcp|tls)://[^\s/:]+:\d+|(tcp|tls)://\[[0-9a-fA-F:]+\]:\d+")
 
+RESERVED_BYTES = 512 * 2**20  # a process before its first block: interpreter, torch, zarr
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 Report = Callable[[float], None]  # share done, 0..1, from the thread that asked
+
+
+def mib(size: int) -> str:
+    """Return bytes in whole MiB, rounded up, as the setting ``memory`` takes them."""
+    return f"{-(-size // 2**20)} MiB"
+
+
+def memory_refusal(least: int, memory: int, why: str, instead: str = "") -> SettingsError:
+    """Return the error of work that takes more than the setting ``memory`` [bytes]: why, the least, what else helps."""
+    over = f"projected memory {mib(least)} exceeds --memory {mib(memory)}"
+    return SettingsError(f"{over}: {why}; give at least --memory {mib(least)}{instead}")
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.rectify.calibrate import calibrate
+from pipeline.signal.calibrate import calibrate
 from pipeline.source import References
 
 if TYPE_CHECKING:

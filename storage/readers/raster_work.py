@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import SettingsError
-from pipeline.geometry.grid import SceneGrid
-from pipeline.rectify.tiles import block_means
+from pipeline.geometry.grid import SceneGrid, block_means
 from storage.arrays.layout import SHARD_ROWS
 from storage.arrays.mosaics import PATCHES_A_SHARD, MosaicWriter, PatchWriter
-from storage.arrays.tile_work import RESERVED_BYTES, Thumbnail
+from storage.arrays.quicklooks import Thumbnail
+from storage.parallel.pool import RESERVED_BYTES, memory_refusal
 
 COPIES = 6  # of a block while it is read: the file's numbers, their float32, and what is made of them
 FRACTION = 4  # of the memory beside what the process takes anyway: more at once is read no faster
@@ -43,10 +42,8 @@ class RasterPixels:
         patches = PATCHES_A_SHARD * grid.patch**2 * self.bands * 4
         least = RESERVED_BYTES + max(means, patches) + deep * row
         if least > memory:
-            raise SettingsError(
-                f"projected memory {_mib(least)} exceeds --memory {_mib(memory)}: {deep} rows of a raster of "
-                f"{grid.width} px and {self.bands} bands are read at a time; give at least --memory {_mib(least)}"
-            )
+            why = f"{deep} rows of a raster of {grid.width} px and {self.bands} bands are read at a time"
+            raise memory_refusal(least, memory, why)
         return deep * max(1, (memory - RESERVED_BYTES) // FRACTION // (deep * row))
 
 
@@ -116,7 +113,3 @@ def patches_of(
         cut = pixels.reshape(-1, p, across, p, raster.bands).swapaxes(1, 2)
         place = row[here] - first, column[here]
         yield cut[place], valid.reshape(-1, p, across, p).swapaxes(1, 2)[place]
-
-
-def _mib(size: int) -> str:
-    return f"{-(-size // 2**20)} MiB"

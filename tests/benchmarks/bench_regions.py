@@ -33,8 +33,7 @@ from pipeline.simulator.scenes.farm.spectra import MATERIALS, spectral_library
 from storage.arrays.class_maps import ClassMap, ClassNames, create_class_map, load_class_map
 from storage.arrays.layout import SHARD_ROWS
 from storage.arrays.mosaics import PATCHES_A_SHARD, MosaicWriter, PatchWriter, open_patches
-from storage.arrays.tile_work import RESERVED_BYTES
-from storage.parallel.pool import WorkerPool
+from storage.parallel.pool import RESERVED_BYTES, WorkerPool
 
 SEEDS, HALOS = (1, 2, 3), (0, 1, 2, 4)
 MOST_PX = (512, 640)  # of 1024 x 1280 px: four regions
@@ -103,7 +102,7 @@ Read = tuple[list[Region], ClassMap, NDArray[np.float64]]
 
 def _read(run: SurveyRun, mosaic: Path, patches: Path, halo: int) -> Read:
     """Regions, maps and scores for one halo, -1 for the field as one region."""
-    whole = FieldWork.of(run)
+    whole = run.work
     regions = whole.regions if halo < 0 else plan_regions(run.grid, SHARD, most_px=MOST_PX, halo=halo)
     work = FieldWork(whole.weights, regions, WorkerPool(workers=1), MEMORY)
     out = mosaic.parents[3] / f"halo{halo}.zarr"

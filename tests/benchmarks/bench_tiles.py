@@ -23,18 +23,18 @@ import numpy as np
 from measure import Row, peak_bytes, ratio, time_in_turn
 from numpy.typing import NDArray
 
+from flows.tasks.mosaic_work import MosaicRecipe, write_mosaic
 from models.network.machine import keep_freed_memory, use_one_thread
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.planning.coverage import full_sweeps
-from pipeline.rectify.mosaic import BLOCK_LINES
 from pipeline.rectify.placed import PixelGrid
+from pipeline.signal.lines import BLOCK_LINES
 from pipeline.source import Line, References
 from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
 from storage.arrays.layout import ArraySpec, create_array, create_group, image_spec
 from storage.arrays.mosaics import MosaicWriter, load_mosaic
-from storage.arrays.tile_work import MosaicRecipe, write_mosaic
 from storage.parallel.pool import WorkerPool
 
 CAMERA = LineCamera()

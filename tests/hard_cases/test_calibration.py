@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.rectify.calibrate import calibrate
-from pipeline.rectify.detector import find_bad_elements
+from pipeline.signal.calibrate import calibrate
+from pipeline.signal.detector import find_bad_elements
 from pipeline.source import References
 
 FULL = 4095

@@ -7,19 +7,22 @@ reads it as one region however large it is.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.tasks.run import SurveyRun
-from flows.tasks.stage import Product, Wanted, stage
+from flows.tasks.capture_plan import CapturePlan
+from flows.tasks.field_work import coarse_region
+from flows.tasks.patch_budget import PatchBudget
+from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
 from flows.tasks.stages.effects import source_with
-from flows.tasks.stages.maps import coarse_prediction_at
 from flows.tasks.stages.placement import load_registration
+from flows.tasks.zones import SurveyZones
 from models.evaluation.metrics import (
     agreement,
     average_accuracy,
@@ -30,10 +33,12 @@ from models.evaluation.metrics import (
     kappa,
 )
 from models.evaluation.placement import CONTROL_FRACTION, run_controls
-from models.reading.inference import CoarsePrediction, segment
+from models.reading.inference import read_coarse_prediction, segment
+from models.reading.regions import whole_field
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
-from pipeline.geometry.scan import Sweep
+from pipeline.geometry.scan import Axis, Sweep
+from pipeline.lazy import Once
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.region import read_patches
 from pipeline.simulator.effects.pointing import CommonOffset, PointingErrors
@@ -50,131 +55,111 @@ ACCURACY = Product("evaluate", version=10, files=(RECORD,), by_weights=True)
 
 
 @stage("evaluate", "accuracy (not part of the survey)", ACCURACY)
-def evaluate(run: SurveyRun, mosaic: StageRef, patches: StageRef, class_map: StageRef, *captures: StageRef) -> Wanted:
+def evaluate(
+    mosaic: StageRef,
+    patches: StageRef,
+    class_map: StageRef,
+    *captures: StageRef,
+    frame: FieldFrame,
+    plan: CapturePlan,
+    zones: SurveyZones,
+    budget: PatchBudget | None,
+    raster: RasterPixels | None,
+    simulated: SimulatedSource,
+    source_key: Mapping[str, Any],
+    labels: NDArray[np.uint8],
+    load: Once[Weights],
+    model_key: Mapping[str, Any],
+    controls: bool,
+    kernel: Kernel,
+    memory: int,
+    seed: int,
+    report: Report,
+) -> Wanted:
     """Judge the map by the labels, and other placements, with the survey's effects; no part of the survey's cost.
 
     ``captures`` are the effects of what was captured and where its sweeps lie; a raster has neither.
     """
-    inputs, pointing = [mosaic, patches, class_map, *captures], captures[1:]
-    for ref in inputs:
-        _ = ref.key  # a plan stops here where one is not known yet: for its own key the labels have to be drawn
-    off = _map_offset(run, pointing)
-    labels = _moved(run, off)
+    off = map_offset(simulated, captures[1:])
+    labels = moved_labels(labels, off, plan.along)
 
     def build(path: Path) -> None:
         """Write the figures of the map, of the coarse pass alone and, where asked for, of other placements."""
-        drawn = load_class_map(class_map.path / "class_map.zarr")
-        classes = drawn.classes
+        weights, grid, drawn = load(), frame.grid, load_class_map(class_map.path / "class_map.zarr")
+        names, classes = weights.class_names, drawn.classes
         judged = np.where(classes == UNLABELLED, np.uint8(UNLABELLED), labels)  # what has no class is not
-        seen = coarse_prediction_at(run, mosaic)
+        seen = read_coarse_prediction(weights, coarse_region(weights, mosaic.path / "mosaic.zarr", whole_field(grid)))
         counts = confusion(judged, classes, len(drawn.names))  # with the class unknown, which no label has
-        result: dict[str, Any] = _figures(run, counts) | {"confusion": counts.tolist()}
-        empty = np.empty((0, run.grid.patch, run.grid.patch, run.weights.basis.columns), np.float32)
-        none = segment(run.weights, seen, empty, np.empty(0, np.int64))
-        result["none"] = _figures(run, confusion(judged, none.classes, run.weights.config.classes))
+        result: dict[str, Any] = map_figures(names, counts) | {"confusion": counts.tolist()}
+        empty = np.empty((0, grid.patch, grid.patch, weights.basis.columns), np.float32)
+        none = segment(weights, seen, empty, np.empty(0, np.int64))
+        result["none"] = map_figures(names, confusion(judged, none.classes, weights.config.classes))
         result |= {"all": {"miou": None, "per_class_iou": {}}, "gap_closed": None, "controls": {}}
-        if run.controls:
-            captured = run
-            if run.raster is None:
-                captured = replace(run, simulated=source_with(_sure_source(run, off), captures[0]))
-            result |= _controls(captured, seen, patches, judged, result)
+        if controls:
+            if raster is not None:
+                columns = columns_of_raster(raster, weights, frame.wavelength_nm, memory=memory, report=first_part)
+            else:
+                source = source_with(sure_source(simulated, off), captures[0])
+                sweeps = plan.coarse if plan.plain else plan.full
+                columns = columns_of_all_patches(
+                    source, sweeps, grid, weights, memory=memory, kernel=kernel, report=first_part
+                )
+            fraction = CONTROL_FRACTION
+            if budget is not None:  # as many as were kept of a uniform scan
+                fraction = len(open_patches(patches.path / "patches.zarr").patch_index) / len(budget.patch_index)
+            rows, among = count(1), None if zones.fractions is None else zones.fractions > 0
+            found = run_controls(
+                weights,
+                seen,
+                columns,
+                judged,
+                fraction=fraction,
+                seed=seed,
+                among=among,
+                report=lambda row: report(0.6 + 0.035 * next(rows)),
+            )
+            figures = map_figures(names, found.every)
+            gap = gap_closed(result["miou"], result["none"]["miou"], figures["miou"])
+            shown = {"controls": found.as_dict(), "controls_fraction": found.fraction}
+            result |= {"all": figures, "gap_closed": gap, **shown}
         (path / RECORD).write_text(to_json(result), encoding="utf-8")  # no NaN, which JSON does not know
 
-    params = {
-        **run.model_key,
-        "labels": array_digest(labels),
-        "controls": run.controls,
-        "resampling": run.settings.resampling,
-        **run.source_key(),
-    }
-    return Wanted(build, params, inputs)
+    def first_part(done: float) -> None:
+        report(0.6 * done)
+
+    params = {**model_key, "labels": array_digest(labels), "controls": controls, "resampling": kernel, **source_key}
+    return Wanted(build, params, [mosaic, patches, class_map, *captures])
 
 
-def _map_offset(run: SurveyRun, pointing: Sequence[StageRef]) -> NDArray[np.float64]:
-    """How far the whole map lies beside the scene, (along, scan) px: what the sweep that registration held is off by.
+def map_offset(simulated: SimulatedSource, pointing: Sequence[StageRef]) -> NDArray[np.float64]:
+    """Return how far the map lies beside the scene, (along, scan) px: what the sweep that registration held is off by.
 
     Overlaps tie sweeps to each other and not to the ground. Only the simulator knows the rest.
     """
-    errors = run.simulated.pointing
+    errors = simulated.pointing
     if not isinstance(errors, PointingErrors) or not pointing:
         return np.zeros(2)
     return errors.offset(load_registration(pointing[0])["reference"])
 
 
-def _moved(run: SurveyRun, off: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """The labels as the map shows the scene, to the nearest pixel; what it shows beyond them is unlabelled."""
-    labels = run.labels
-    assert labels is not None
-    down, across = np.rint(off[::-1] if run.plan.along == "x" else off).astype(int)
+def moved_labels(labels: NDArray[np.uint8], off: NDArray[np.float64], along: Axis) -> NDArray[np.uint8]:
+    """Return labels as the map shows the scene, to the nearest pixel; what it shows beyond them is unlabelled."""
+    down, across = np.rint(off[::-1] if along == "x" else off).astype(int)
     rows, columns = (np.arange(size) + by for size, by in zip(labels.shape, (down, across), strict=True))
     inside = ((rows >= 0) & (rows < labels.shape[0]))[:, None] & ((columns >= 0) & (columns < labels.shape[1]))
     moved = labels[np.clip(rows, 0, labels.shape[0] - 1)[:, None], np.clip(columns, 0, labels.shape[1] - 1)]
     return np.where(inside, moved, np.uint8(UNLABELLED))
 
 
-def _sure_source(run: SurveyRun, off: NDArray[np.float64]) -> SimulatedSource:
-    """A mirror that looks as far beside the scene as the map lies, everywhere: controls share the map's pixels."""
-    if run.simulated.pointing is None:
-        return run.simulated
-    return replace(run.simulated, pointing=CommonOffset((float(off[0]), float(off[1]))))
+def sure_source(simulated: SimulatedSource, off: NDArray[np.float64]) -> SimulatedSource:
+    """Return a mirror that looks as far beside the scene as the map lies: controls share the map's pixels."""
+    if simulated.pointing is None:
+        return simulated
+    return replace(simulated, pointing=CommonOffset((float(off[0]), float(off[1]))))
 
 
-def _controls(
-    run: SurveyRun, seen: CoarsePrediction, patches: StageRef, labels: NDArray[np.uint8], result: dict[str, Any]
-) -> dict[str, Any]:
-    columns = _columns(run)
-    rows = 0
-
-    def report(row: str) -> None:
-        nonlocal rows
-        rows += 1
-        run.report(0.6 + 0.035 * rows)
-
-    among = None if run.zones.fractions is None else run.zones.fractions > 0
-    controls = run_controls(
-        run.weights,
-        seen,
-        columns,
-        labels,
-        fraction=_control_fraction(run, patches),
-        seed=run.settings.seed,
-        among=among,
-        report=report,
-    )
-    figures = _figures(run, controls.every)
-    return {
-        "all": figures,
-        "gap_closed": gap_closed(result["miou"], result["none"]["miou"], figures["miou"]),
-        "controls": controls.as_dict(),
-        "controls_fraction": controls.fraction,
-    }
-
-
-def _columns(run: SurveyRun) -> NDArray[np.float32]:
-    """Columns of all patches, (patch, p, p, column), from a full scan, or from the raster itself."""
-
-    def report(done: float) -> None:
-        run.report(0.6 * done)
-
-    memory = run.settings.memory
-    if run.raster is not None:
-        return columns_of_raster(run.raster, run.weights, run.scene.wavelength_nm, memory=memory, report=report)
-    sweeps = run.plan.coarse if run.plan.plain else run.plan.full
-    return columns_of_all_patches(
-        run.simulated, sweeps, run.grid, run.weights, memory=memory, kernel=run.settings.resampling, report=report
-    )
-
-
-def _control_fraction(run: SurveyRun, patches: StageRef) -> float:
-    """Fraction of the valid patches that other placements get; of a uniform scan as many as were kept of it."""
-    if run.budget is None:
-        return CONTROL_FRACTION
-    return len(open_patches(patches.path / "patches.zarr").patch_index) / len(run.budget.patch_index)
-
-
-def _figures(run: SurveyRun, counts: NDArray[np.int64]) -> dict[str, Any]:
+def map_figures(names: Sequence[str], counts: NDArray[np.int64]) -> dict[str, Any]:
     """Return what is said of a map; every map of a run is judged by the same labels, so over the same classes."""
-    names = run.weights.class_names
     known = len(names)
     false = zip(names, false_pixels(counts)[:known].tolist(), strict=True)
     unknown = {} if len(counts) == known else {"unknown_px": int(counts[:, known].sum())}
@@ -200,7 +185,7 @@ def columns_of_raster(
     wavelength_nm: NDArray[np.floating],
     *,
     memory: int,
-    report: Callable[[float], None] = lambda done: None,
+    report: Report = lambda done: None,
 ) -> NDArray[np.float32]:
     """Read all pixels of a raster some rows at a time, and keep the normalised columns only.
 
@@ -228,7 +213,7 @@ def columns_of_all_patches(
     *,
     memory: int,
     kernel: Kernel,
-    report: Callable[[float], None] = lambda done: None,
+    report: Report = lambda done: None,
 ) -> NDArray[np.float32]:
     """Scan the scene in full, a band of patches at a time, and keep the normalised columns only.
 

@@ -1,192 +1,185 @@
-"""The stages of attention: a score for every patch, and the sweeps that show most of it."""
+"""The stage of attention: a score for every patch, and the sweeps that show most of it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flows.settings.survey_settings import SPARING
-from flows.settings.values import EXTENT_WHOLE
+from flows.tasks.capture_plan import CapturePlan
 from flows.tasks.field_work import FieldWork, region_params
 from flows.tasks.patch_budget import PatchBudget
-from flows.tasks.run import SurveyRun
-from flows.tasks.stage import Product, Wanted, stage
+from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
+from flows.tasks.zones import SurveyZones
 from models.policies.policies import IMAGE_POLICIES, SEEDED_POLICIES, SEEING_POLICIES, score_patches
 from models.reading.inference import CoarsePrediction
 from pipeline.capture.recorded_passes import RecordedPasses
-from pipeline.geometry.grid import patch_pixels
-from pipeline.geometry.scan import Sweep, exposing
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid, patch_pixels
+from pipeline.geometry.scan import CostModel, Sweep, exposing
 from pipeline.planning.coverage import field_px, patches_shown
 from pipeline.planning.fine_pass import FinePlan, plan_fine
 from pipeline.planning.uniform_scans import format_scan
 from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table, write_table
 from storage.arrays.mosaics import Attention, write_attention
+from storage.readers.raster_work import RasterPixels
 
 ATTENTION = Product("score", version=8, files=("attention.zarr", "plan.json"), by_weights=True)
+Scores = NDArray[np.float64]
 
 
 @stage("score", "attention and plan", ATTENTION)
-def score(run: SurveyRun, mosaic: StageRef) -> Wanted:
+def score(
+    mosaic: StageRef,
+    *,
+    frame: FieldFrame,
+    plan: CapturePlan,
+    work: FieldWork,
+    zones: SurveyZones,
+    budget: PatchBudget | None,
+    raster: RasterPixels | None,
+    recorded: RecordedPasses | None,
+    camera: LineCamera,
+    cost: CostModel,
+    policy: str,
+    threshold: float | None,
+    seed: int,
+    mask: NDArray[np.generic] | None,
+    part: bool,
+    model_key: dict[str, Any],
+    report: Report,
+) -> Wanted:
     """Score every patch by the coarse mosaic, and plan the sweeps that show the most score in the time left."""
-    settings = run.settings
+    grid, fractions = frame.grid, zones.fractions
+
+    def expected_gain() -> Scores:
+        """Return the (patch,) worth of a fine look at each patch, by the fraction of it that zones leave."""
+        if policy in SEEING_POLICIES + IMAGE_POLICIES:
+            scores = work.score(policy, mosaic.path / "mosaic.zarr", lambda done: report(0.5 * done)).ravel()
+        else:
+            nothing = np.empty((0, 0, 0), np.float32)
+            scores = score_patches(policy, CoarsePrediction(grid, nothing, nothing), seed=seed, mask=mask)
+        if frame.missing is not None:  # a patch without any pixel of the scene is worth no look
+            void = patch_pixels(grid, frame.missing).mean(axis=(1, 2)) >= grid.valid_fraction().ravel()
+            scores = np.where(void, 0.0, scores)
+        return scores if fractions is None else np.where(fractions > 0, scores, 0.0) * fractions
+
+    def planned() -> tuple[Scores, FinePlan]:
+        """Return the scores where patches are chosen, and what is seen of the field in detail."""
+        if not plan.plain:
+            scores = expected_gain()
+            return scores, plan_detail(grid, plan, camera, cost, scores, threshold, recorded)
+        seen = all_seen(grid, () if raster is not None else plan.coarse, camera, part=part)
+        if budget is None:
+            return np.zeros(int(np.prod(grid.patch_shape))), seen
+        scores = expected_gain()
+        return scores, kept_within(budget, scores, seen)
 
     def build(path: Path) -> None:
         """Write every patch's score and rank, and the plan of sweeps; refuse a map that does not fit."""
-        work = FieldWork.of(run)
-        scores, plan = _planned(run, work, mosaic)
-        work.pool_for(
-            plan.patch_index, len(run.scene.wavelength_nm)
-        )  # refuses what does not fit before the rig goes back
+        scores, found = planned()
+        if fractions is not None:  # patches of which zones leave something
+            found = replace(found, patch_index=found.patch_index[fractions[found.patch_index] > 0])
+        work.pool_for(found.patch_index, len(frame.wavelength_nm))  # refuses what does not fit before the rig goes back
         rank = np.full(scores.shape, -1, np.int32)
-        rank[plan.patch_index[np.argsort(-scores[plan.patch_index], kind="stable")]] = np.arange(len(plan.patch_index))
-        shape = run.grid.patch_shape
-        write_attention(path / "attention.zarr", Attention(scores.reshape(shape), rank.reshape(shape), settings.policy))
-        content = asdict(plan) | {"patch_index": plan.patch_index.tolist()}
+        rank[found.patch_index[np.argsort(-scores[found.patch_index], kind="stable")]] = np.arange(
+            len(found.patch_index)
+        )
+        shape = grid.patch_shape
+        write_attention(path / "attention.zarr", Attention(scores.reshape(shape), rank.reshape(shape), policy))
+        content = asdict(found) | {"patch_index": found.patch_index.tolist()}
         absent = [name for name in ("threshold", "spared_s") if content[name] is None]
         write_table(path / "plan.json", {name: value for name, value in content.items() if name not in absent})
 
     captures = {
-        "fine_s": run.plan.fine_s,
-        "overlap_px": run.plan.overlap_px,
-        "margin_px": run.plan.margin_px,
-        "along": run.plan.along,
-        "camera": asdict(run.camera),
-        "cost": asdict(settings.cost),
+        "fine_s": plan.fine_s,
+        "overlap_px": plan.overlap_px,
+        "margin_px": plan.margin_px,
+        "along": plan.along,
+        "camera": asdict(camera),
+        "cost": asdict(cost),
     }
     params = {
-        **run.model_key,
-        "grid": asdict(run.grid),
-        "policy": settings.policy,
-        "seed": settings.seed if settings.policy in SEEDED_POLICIES else None,
-        "mask": None if run.mask is None else array_digest(run.mask),
-        **(captures if run.raster is None else {}),
-        **(region_params(run.grid) if settings.policy in SEEING_POLICIES else {}),
-        **({} if run.vgg is None else {"vgg": run.vgg.key}),
-        **({} if settings.threshold is None else {"threshold": settings.threshold}),
-        **({"plain": True} if run.plan.plain else {}),
-        **({} if run.budget is None else {"patches": {name: getattr(settings, name) for name in SPARING}}),
-        **run.zones.key,
+        **model_key,
+        "grid": asdict(grid),
+        "policy": policy,
+        "seed": seed if policy in SEEDED_POLICIES else None,
+        "mask": None if mask is None else array_digest(mask),
+        **(captures if raster is None else {}),
+        **(region_params(grid) if policy in SEEING_POLICIES else {}),
+        **({} if work.vgg is None else {"vgg": work.vgg.key}),
+        **({} if threshold is None else {"threshold": threshold}),
+        **({"plain": True} if plan.plain else {}),
+        **({} if budget is None else {"patches": {name: getattr(budget, name) for name in SPARING}}),
+        **zones.key,
     }
     return Wanted(build, params, [mosaic])
 
 
-def _planned(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> tuple[NDArray[np.float64], FinePlan]:
-    """Scores of the patches where some are chosen, and what is seen of the field in detail."""
-    if not run.plan.plain:
-        return _scored(run, work, mosaic)
-    return _whole_field(run) if run.budget is None else _part_of_scan(run, run.budget, work, mosaic)
+def plan_detail(
+    grid: SceneGrid,
+    plan: CapturePlan,
+    camera: LineCamera,
+    cost: CostModel,
+    scores: Scores,
+    threshold: float | None,
+    recorded: RecordedPasses | None,
+) -> FinePlan:
+    """Plan the runs of lines that show most of the (patch,) scores in the time left.
 
-
-def _scored(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> tuple[NDArray[np.float64], FinePlan]:
-    """Scores of the patches, and the runs of lines that show most of them in the time left."""
-    scores = _scores_within_zones(run, work, mosaic)
+    Of a recording it is the plan of free strips where that has its lines, else the one on the strips that it has.
+    """
     plan_on = partial(
         plan_fine,
-        run.grid,
-        run.camera,
-        run.settings.cost,
-        run.plan.along,
+        grid,
+        camera,
+        cost,
+        plan.along,
         scores,
-        budget_s=run.plan.fine_s,
-        margin_px=run.plan.margin_px,
-        full=run.plan.full,
-        threshold=run.settings.threshold,
+        budget_s=plan.fine_s,
+        margin_px=plan.margin_px,
+        full=plan.full,
+        threshold=threshold,
     )
-    plan = plan_on()
-    if run.recorded is not None:
-        plan = _recorded_plan(run, run.recorded, plan, plan_on)
-    return scores, _kept_patches(run, plan)
+    found = plan_on()
+    if recorded is None:
+        return found
+    taken = recorded.served(found.sweeps)
+    if taken is None and (swaths := recorded.swaths(-(field_px(grid, plan.along)[1] - 1) / 2)):
+        found = plan_on(swaths=swaths)
+    sweeps = recorded.fine_pass(found.sweeps) if taken is None else taken
+    return replace(found, sweeps=sweeps, seconds=cost.seconds(sweeps, camera))
 
 
-def _recorded_plan(
-    run: SurveyRun, recorded: RecordedPasses, plan: FinePlan, plan_on: Callable[..., FinePlan]
-) -> FinePlan:
-    """The plan of free strips where a recording has its lines, else the one on the strips that it has."""
-    taken = recorded.served(plan.sweeps)
-    if taken is None and (swaths := recorded.swaths(-(field_px(run.grid, run.plan.along)[1] - 1) / 2)):
-        plan = plan_on(swaths=swaths)
-    sweeps = recorded.fine_pass(plan.sweeps) if taken is None else taken
-    return replace(plan, sweeps=sweeps, seconds=run.settings.cost.seconds(sweeps, run.camera))
+def all_seen(grid: SceneGrid, sweeps: Sequence[Sweep], camera: LineCamera, *, part: bool) -> FinePlan:
+    """Return the plan of a uniform scan, or of a raster without sweeps: patches that are seen, nothing to go back for."""
+    patch_index = grid.valid_patches()
+    if not sweeps:
+        return FinePlan([], patch_index, 0.0, 0.0, "raster", "the pixels of the raster were taken as they are")
+    words = format_scan(sweeps[0].step, exposing(camera, sweeps[0]).exposure_ms)
+    if part:
+        patch_index = np.flatnonzero(patches_shown(list(sweeps), grid, camera))
+    what = "a part of the field was" if part else "the field was"
+    return FinePlan([], patch_index, 0.0, 0.0, "scan", f"{what} scanned once: {words}")
 
 
-def _kept_patches(run: SurveyRun, plan: FinePlan) -> FinePlan:
-    """The plan with the patches alone of which zones leave something."""
-    fractions = run.zones.fractions
-    return plan if fractions is None else replace(plan, patch_index=plan.patch_index[fractions[plan.patch_index] > 0])
-
-
-def _part_of_scan(
-    run: SurveyRun, budget: PatchBudget, work: FieldWork, mosaic: StageRef
-) -> tuple[NDArray[np.float64], FinePlan]:
-    """Scores of the patches, and those of a uniform scan that the budget pays for: all were seen, some are kept."""
-    scores, every = _scores_within_zones(run, work, mosaic), _whole_field(run)[1]
-    bought = budget.choose(scores)
-    s = run.grid.factor
+def kept_within(budget: PatchBudget, scores: Scores, seen: FinePlan) -> FinePlan:
+    """Return the plan of a uniform scan with the patches that the budget pays for: all were seen, some are kept."""
+    bought, s = budget.choose(scores), budget.grid.factor
     reason = (
-        f"{every.reason}; {len(bought)} of {len(budget.patch_index)} patches are kept and read in detail, the others as means "
+        f"{seen.reason}; {len(bought)} of {len(budget.patch_index)} patches are kept and read in detail, the others as means "
         f"of {s} x {s} px"
     )
     finite = np.where(np.isfinite(scores), scores, 0.0)
     expected_gain, wanted = float(finite[bought].sum()), float(np.maximum(finite, 0.0).sum())
-    return scores, replace(
-        every, patch_index=np.sort(bought), reason=reason, expected_gain=expected_gain, wanted_gain=wanted
-    )
-
-
-def _scores_within_zones(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> NDArray[np.float64]:
-    """(patch,) worth of a fine look at each patch, by the fraction of it that zones leave.
-
-    What is seen of the others beside it is not asked for.
-    """
-    scores, fractions = _scores(run, work, mosaic), run.zones.fractions
-    return scores if fractions is None else np.where(fractions > 0, scores, 0.0) * fractions
-
-
-def _whole_field(run: SurveyRun) -> tuple[NDArray[np.float64], FinePlan]:
-    """No scores, and the plan of a uniform scan or a raster: every patch is seen, and nothing to go back for."""
-    nothing = np.zeros(int(np.prod(run.grid.patch_shape)))
-    if run.raster is not None:
-        reason = "the pixels of the raster were taken as they are"
-        return nothing, _kept_patches(run, FinePlan([], run.grid.valid_patches(), 0.0, 0.0, "raster", reason))
-    sweep = run.plan.coarse[0]
-    words = format_scan(sweep.step, exposing(run.camera, sweep).exposure_ms)
-    patch_index, what = run.grid.valid_patches(), "the field was"
-    if run.settings.extent != EXTENT_WHOLE:
-        patch_index, what = (
-            np.flatnonzero(patches_shown(run.plan.coarse, run.grid, run.camera)),
-            "a part of the field was",
-        )
-    plan = FinePlan([], patch_index, 0.0, 0.0, "scan", f"{what} scanned once: {words}")
-    return nothing, _kept_patches(run, plan)
-
-
-def _scores(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> NDArray[np.float64]:
-    """(patch,) worth of a fine look at each patch of the padded grid."""
-    scores = _scores_of_patches(run, work, mosaic)
-    if run.scene.missing is not None:  # a patch without any pixel of the scene is worth no look
-        scores = np.where(_on_no_scene(run), 0.0, scores)
-    return scores
-
-
-def _on_no_scene(run: SurveyRun) -> NDArray[np.bool_]:
-    """(patch,) of whose pixels the scene has none."""
-    grid, missing = run.grid, run.scene.missing
-    assert missing is not None
-    return np.asarray(patch_pixels(grid, missing).mean(axis=(1, 2)) >= grid.valid_fraction().ravel())
-
-
-def _scores_of_patches(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> NDArray[np.float64]:
-    policy = run.settings.policy
-    if policy in SEEING_POLICIES + IMAGE_POLICIES:
-        return work.score(policy, mosaic.path / "mosaic.zarr", lambda done: run.report(0.5 * done)).ravel()
-    nothing = np.empty((0, 0, 0), np.float32)
-    return score_patches(policy, CoarsePrediction(run.grid, nothing, nothing), seed=run.settings.seed, mask=run.mask)
+    return replace(seen, patch_index=np.sort(bought), reason=reason, expected_gain=expected_gain, wanted_gain=wanted)
 
 
 def load_plan(attention: StageRef) -> FinePlan:

@@ -12,14 +12,18 @@ from pathlib import Path
 from typing import Any
 
 from flows.settings.survey_settings import plain_value
-from flows.tasks.run import CaptureRun
-from flows.tasks.stage import Product, Wanted, stage
+from flows.settings.values import Tolerance
+from flows.tasks.scene import FieldSource
+from flows.tasks.stage import Product, Report, Wanted, stage
 from pipeline.errors import IncompleteStoreError
+from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.simulator.effects.effect import Effect, Radiance, SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.effects.probe import Probe, unit_at
 from pipeline.simulator.effects.registry import BY_NAME, EFFECTS
 from pipeline.simulator.render import expected_light
+from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.selection.choice import TOTAL, Decision, decide, everything, list_effects, pays, sum_up
 from pipeline.simulator.selection.survey_probe import probe_survey
 from pipeline.simulator.selection.verification import candidate_blocks, verify, worst_blocks
@@ -38,58 +42,67 @@ DRAFT, VERIFIED = 0.3, 1.0
 
 
 @stage("choose_effects", "effects that matter", MANIFEST)
-def choose_effects(run: CaptureRun) -> Wanted:
+def choose_effects(
+    *,
+    source: FieldSource,
+    scene: RasterScene,
+    simulated_rig: Rig,
+    planned: Sequence[Sweep],
+    cost: CostModel,
+    seed: int,
+    effects: str,
+    tol: Tolerance,
+    weighs_small: bool,
+    report: Report,
+) -> Wanted:
     """Decide for scene and rig which effects to simulate, and check it on the worst lines of the scene.
 
-    Where a rig takes the lines there is nothing to decide. Raises BoundError: what would be left out changes light by
-    more than its bound says; SceneError: the scene holds a number that is not finite.
+    Where a rig takes the lines there is nothing to decide, and all effects are on where choosing takes longer than it
+    can save, unless the run ``weighs_small``. Raises BoundError: what would be left out changes light by more than its
+    bound says; SceneError: the scene holds a number that is not finite.
     """
-    tolerance, asked = run.settings.tol, run.settings.effects
 
     def write(path: Path, manifest: dict[str, Any]) -> None:
         (path / RECORD).write_text(to_json(manifest), encoding="utf-8")
 
-    if not run.source.simulates:
-        return Wanted(lambda path: write(path, {"effects": [], "total": None}), {"source": run.source.name})
+    if not source.simulates:
+        return Wanted(lambda path: write(path, {"effects": [], "total": None}), {"source": source.name})
 
-    small = _everything_where_small(run)
+    rig, small = simulated_rig, None
+    if not weighs_small and effects == "auto" and tol.value != 0:
+        found = everything(scene, rig, planned, EFFECTS, tol.value, tol.unit)
+        small = None if pays(found, len(scene.wavelength_nm)) else found
 
     def build(path: Path) -> None:
         """Look at the scene, choose and check; or take all without a look."""
         if small is not None:
             write(path, {"effects": list_effects(small), "total": sum_up(small)})
             return
-        rig = run.settings.simulated_rig
-        probes = probe_survey(run.scene, rig, run.planned, tolerance.unit)
-        decision = decide(probes, rig, EFFECTS, tolerance.value, asked)
-        run.report(DRAFT)
-        measured = _verified(run, decision, probes)
+        probes = probe_survey(scene, rig, planned, tol.unit)
+        decision = decide(probes, rig, EFFECTS, tol.value, effects)
+        report(DRAFT)
+        measured = {TOTAL: 0.0}  # of everything nothing is left out
+        if decision.chosen != decision.exact:
+            clock = sweep_starts(planned, rig.camera, cost)
+            whole = [  # every sweep as one block, each after those before it
+                sweep_block(scene, rig, sweep, range(sweep.lines), seed=seed, started_s=clock[sweep.name])
+                for sweep in planned
+            ]
+            measured = _verified(scene, rig, decision, probes, whole, report)
         write(path, {"effects": list_effects(decision, measured), "total": sum_up(decision, measured)})
-        run.report(VERIFIED)
+        report(VERIFIED)
 
     params = {
-        "scene": run.scene.key,
-        "seed": run.settings.seed,  # of what is drawn for the lines
-        "asked": asked,
-        "tol": str(tolerance),
-        "camera": asdict(run.camera),
-        "rig": {
-            name: plain_value(part) for name, part in asdict(run.settings.simulated_rig).items() if name != "camera"
-        },
-        "sweeps": [asdict(sweep) for sweep in run.planned],
+        "scene": scene.key,
+        "seed": seed,  # of what is drawn for the lines
+        "asked": effects,
+        "tol": str(tol),
+        "camera": asdict(rig.camera),
+        "rig": {name: plain_value(part) for name, part in asdict(rig).items() if name != "camera"},
+        "sweeps": [asdict(sweep) for sweep in planned],
         **({} if small is None else {"weighed": False}),
     }
     return Wanted(build, params)
-
-
-def _everything_where_small(run: CaptureRun) -> Decision | None:
-    """All effects where choosing takes longer than it can save, and the run leaves it then; None where it chooses."""
-    tolerance = run.settings.tol
-    if run.weighs_small or run.settings.effects != "auto" or tolerance.value == 0:
-        return None
-    rig, bands = run.settings.simulated_rig, len(run.scene.wavelength_nm)
-    found = everything(run.scene, rig, run.planned, EFFECTS, tolerance.value, tolerance.unit)
-    return None if pays(found, bands) else found
 
 
 def load_manifest(effects: StageRef) -> dict[str, Any]:
@@ -119,11 +132,15 @@ def source_with(
     return replace(source, chosen=chosen_effects(effects), clock=clock)
 
 
-def _verified(run: CaptureRun, decision: Decision, probes: Sequence[Probe]) -> dict[str, float]:
-    """Measure what is left out on the worst lines of the scene, in the unit of the tolerance; nothing of everything."""
-    if decision.chosen == decision.exact:
-        return {TOTAL: 0.0}
-    scene, rig = run.scene, run.settings.simulated_rig
+def _verified(
+    scene: RasterScene,
+    rig: Rig,
+    decision: Decision,
+    probes: Sequence[Probe],
+    whole: Sequence[SweepBlock],
+    report: Report,
+) -> dict[str, float]:
+    """Measure what is left out on the worst lines of the ``whole`` sweeps, in the unit of the tolerance."""
 
     def units(light: Radiance, binning: int) -> Radiance:
         return unit_at(light, rig, decision.unit, binning)
@@ -133,14 +150,9 @@ def _verified(run: CaptureRun, decision: Decision, probes: Sequence[Probe]) -> d
     def render(block: SweepBlock, chosen: Mapping[Effect, str]) -> Radiance:
         nonlocal renders
         renders += 1
-        run.report(DRAFT + (VERIFIED - DRAFT) * renders / (renders + len(EFFECTS)))  # how many there will be is open
+        report(DRAFT + (VERIFIED - DRAFT) * renders / (renders + len(EFFECTS)))  # how many there will be is open
         return expected_light(scene, block, chosen)
 
-    clock = sweep_starts(run.planned, run.camera, run.settings.cost)
-    whole = [  # every sweep as one block, each after those before it
-        sweep_block(scene, rig, sweep, range(sweep.lines), seed=run.settings.seed, started_s=clock[sweep.name])
-        for sweep in run.planned
-    ]
     candidates = [
         block
         for probe in probes

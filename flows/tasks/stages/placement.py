@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -10,64 +10,76 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.tasks.run import SurveyRun
-from flows.tasks.stage import Product, Wanted, stage
+from flows.tasks.capture_plan import CapturePlan
+from flows.tasks.mosaic_work import MosaicRecipe, open_sweeps, write_mosaic
+from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
 from flows.tasks.stages.attention import load_plan
-from flows.tasks.stages.capture import captured
+from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import patch_pixels
-from pipeline.rectify.mosaic import LineCache
+from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.placed import PixelGrid, Placed, TieTable
 from pipeline.rectify.region import read_every_patch, read_patches
 from pipeline.rectify.registration.alignment import SweepShift
 from pipeline.rectify.registration.illumination import overlap_light, solve_lights
-from pipeline.rectify.registration.overlaps import BroadSweep, broad_bands
+from pipeline.rectify.registration.overlaps import BroadSweep
 from pipeline.rectify.registration.seams import Anchor, Registration, SeamWindow, anchor_sweep, register_sweeps
 from pipeline.rectify.scan_paths import ScanPath
+from pipeline.rectify.sweep_paths import SweepPath
+from pipeline.signal.lines import LineCache, broad_bands
 from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table, write_table
+from storage.arrays.cubes import open_raw_cubes
 from storage.arrays.geolocation import path_digest, write_geolocation
 from storage.arrays.layout import NO_VALUE, blank_coarse, blank_pixels, read_array
 from storage.arrays.mosaics import MosaicWriter, PatchWriter, load_mosaic, open_patches
-from storage.arrays.quicklooks import choose_bands, stretched
-from storage.arrays.tile_work import MosaicRecipe, Sighted, Thumbnail, sight_sweeps, write_mosaic
+from storage.arrays.quicklooks import Thumbnail, choose_bands, stretched
+from storage.parallel.pool import WorkerPool
 
+Values = NDArray[np.float32]
+Valid = NDArray[np.bool_]
 RECORD = "registration.json"
 POINTING = Product("register", version=2, files=(RECORD,))
 
 
-def sighted(run: SurveyRun, raw: StageRef, registration: StageRef | None) -> list[Sighted]:
-    """Open the sweeps of a capture with what registration found of them."""
-    return sight_sweeps(captured(raw), record_of(registration), run.camera)
+GEOLOCATION = Product("locate", version=3, files=("geolocation.zarr",))
+MOSAIC = Product("rectify", version=4, files=("mosaic.zarr",))
+PATCHES = Product("patches", version=5, files=("patches.zarr",), made_again=True)
+QUICKLOOK_PX = 512
+PATCHES_AT_ONCE = 64
+CACHE_FRACTION = 8  # raw lines kept for the next patches may take this part of the memory
 
 
 def record_of(registration: StageRef | None) -> Path | None:
-    """Where a registration wrote what it found."""
+    """Return where a registration wrote what it found."""
     return None if registration is None else registration.path / RECORD
 
 
 @stage("register_coarse", "seams of the coarse sweeps", POINTING, inputs=1, named="coarse_pointing")
-def register_coarse(run: SurveyRun, raw: StageRef) -> Wanted:
+def register_coarse(
+    raw: StageRef, *, camera: LineCamera, pointing_px: float, frame: FieldFrame, report: Report
+) -> Wanted:
     """Find pointing and light of the coarse sweeps from what neighbours show twice."""
-    prior = run.settings.pointing_px
 
     def build(path: Path) -> None:
-        sweeps = sighted(run, raw, None)
-        broad = [BroadSweep.read(one.cube, run.camera, usable=one.usable) for one in sweeps]
-        run.report(0.4)
-        found = register_sweeps(broad, run.camera, prior_px=prior)
-        run.report(0.8)
-        placed = [replace(one, shift=found.of(one.cube.sweep.name)).placed(run.camera) for one in sweeps]
-        write_table(path / RECORD, _seams_record(found, _gains(run, found, placed)))
+        sweeps = open_sweeps(raw.path, None, camera)
+        broad = [BroadSweep.read(one.lines, camera, usable=one.usable) for one in sweeps]
+        report(0.4)
+        found = register_sweeps(broad, camera, prior_px=pointing_px)
+        report(0.8)
+        placed = [replace(one, shift=found.of(one.lines.sweep.name)).placed(camera) for one in sweeps]
+        write_table(path / RECORD, _seams_record(found, light_gains(found, placed, camera, frame.wavelength_nm)))
 
-    return Wanted(build, {"prior_px": prior, "pass": "coarse"}, [raw])
+    return Wanted(build, {"prior_px": pointing_px, "pass": "coarse"}, [raw])
 
 
-def _gains(run: SurveyRun, found: Registration, placed: Sequence[Placed]) -> dict[str, list[float]]:
-    """What each sweep's values are to be multiplied by, band by band, so that neighbours agree."""
+def light_gains(
+    found: Registration, placed: Sequence[Placed], camera: LineCamera, wavelength_nm: NDArray[np.float64]
+) -> dict[str, list[float]]:
+    """Return what each sweep's values are to be multiplied by, band by band, so that neighbours agree."""
     windows = [seen.window for seen in found.windows if seen.measured is not None]
     if not windows:
         return {}
-    lights = solve_lights(overlap_light(placed, run.camera, windows), len(placed), run.scene.wavelength_nm)
+    lights = solve_lights(overlap_light(placed, camera, windows), len(placed), wavelength_nm)
     tied = [number for number in range(len(placed)) if number not in lights.untied]
     return {placed[number].lines.sweep.name: lights.gain(number).tolist() for number in tied}
 
@@ -103,20 +115,21 @@ def _window_record(seen: SeamWindow, names: Sequence[str]) -> dict[str, Any]:
 
 
 @stage("register_fine", "fine sweeps on the mosaic", POINTING, inputs=2, named="fine_pointing")
-def register_fine(run: SurveyRun, raw: StageRef, mosaic: StageRef) -> Wanted:
+def register_fine(
+    raw: StageRef, mosaic: StageRef, *, camera: LineCamera, pointing_px: float, frame: FieldFrame, report: Report
+) -> Wanted:
     """Find where each fine sweep lies on the coarse mosaic, which itself may be off by as much."""
-    prior = run.settings.pointing_px
 
     def build(path: Path) -> None:
         """Lay each sweep onto the mean of the mosaic's bands, and write where it lies."""
-        sweeps = sighted(run, raw, None)
+        sweeps = open_sweeps(raw.path, None, camera)
         anchors: list[Anchor] = []
         values = load_mosaic(mosaic.path / "mosaic.zarr").values if sweeps else np.empty((0, 0, 0), np.float32)
         for number, one in enumerate(sweeps):
-            under = np.asarray(values[..., broad_bands(one.cube.references)].mean(axis=-1), np.float32)
-            broad = BroadSweep.read(one.cube, run.camera, usable=one.usable)
-            anchors.append(anchor_sweep(broad, run.camera, run.grid, under, prior_px=2 * prior))
-            run.report((number + 1) / len(sweeps))
+            under = np.asarray(values[..., broad_bands(one.lines.references)].mean(axis=-1), np.float32)
+            broad = BroadSweep.read(one.lines, camera, usable=one.usable)
+            anchors.append(anchor_sweep(broad, camera, frame.grid, under, prior_px=2 * pointing_px))
+            report((number + 1) / len(sweeps))
         record = {
             "method": "mosaic",
             "reference": "the coarse mosaic",
@@ -127,7 +140,7 @@ def register_fine(run: SurveyRun, raw: StageRef, mosaic: StageRef) -> Wanted:
         }
         write_table(path / RECORD, record)
 
-    return Wanted(build, {"prior_px": prior, "pass": "fine", "grid": asdict(run.grid)}, [raw, mosaic])
+    return Wanted(build, {"prior_px": pointing_px, "pass": "fine", "grid": asdict(frame.grid)}, [raw, mosaic])
 
 
 def load_registration(registration: StageRef) -> dict[str, Any]:
@@ -135,27 +148,26 @@ def load_registration(registration: StageRef) -> dict[str, Any]:
     return read_table(registration.path / RECORD)
 
 
-GEOLOCATION = Product("locate", version=3, files=("geolocation.zarr",))
-MOSAIC = Product("rectify", version=4, files=("mosaic.zarr",))
-PATCHES = Product("patches", version=5, files=("patches.zarr",), made_again=True)
-QUICKLOOK_PX = 512
-PATCHES_AT_ONCE = 64
-CACHE_FRACTION = 8  # raw lines kept for the next patches may take this part of the memory
-
-
 @stage("locate", "lookup", GEOLOCATION)
-def locate(run: SurveyRun, raw: StageRef, registration: StageRef | None = None) -> Wanted:
+def locate(
+    raw: StageRef,
+    registration: StageRef | None = None,
+    *,
+    camera: LineCamera,
+    frame: FieldFrame,
+    plan: CapturePlan,
+    report: Report,
+) -> Wanted:
     """Look up where each coarse pixel was seen: a table that every survey along the same path shares."""
-    grid = PixelGrid.of_scene(run.grid, 1 if run.plan.plain else run.grid.factor)
-    sweeps = sighted(run, raw, registration)
-    camera = {name: getattr(run.camera, name) for name in ("samples", "pitch_um", "focal_length_mm")}
+    grid = PixelGrid.of_scene(frame.grid, 1 if plan.plain else frame.grid.factor)
+    sweeps = open_sweeps(raw.path, record_of(registration), camera)
     params = {
-        "camera": camera,
+        "camera": {name: getattr(camera, name) for name in ("samples", "pitch_um", "focal_length_mm")},
         "grid": asdict(grid),
         "paths": {
-            one.cube.sweep.name: {
-                "path": path_digest(one.cube.position, one.usable, one.shift_px),
-                **{name: getattr(one.cube.sweep, name) for name in ("along", "step", "binning")},
+            one.lines.sweep.name: {
+                "path": path_digest(one.lines.position, one.usable, one.shift_px),
+                **{name: getattr(one.lines.sweep, name) for name in ("along", "step", "binning")},
             }
             for one in sweeps
         },
@@ -165,127 +177,147 @@ def locate(run: SurveyRun, raw: StageRef, registration: StageRef | None = None) 
         """Write the tie tables of each sweep; of one that ties cannot follow, none."""
         tables: dict[str, list[tuple[ScanPath, TieTable]]] = {}
         for number, one in enumerate(sweeps):
-            made = one.placed(run.camera, grid).scan_paths
+            made = one.placed(camera, grid).scan_paths
             whole = [(scan_path, table) for scan_path, table in made if table is not None]
             # Where lines lie too unevenly for ties there is nothing to keep: such a sweep is looked up directly.
-            tables[one.cube.sweep.name] = whole if len(whole) == len(made) else []
-            run.report((number + 1) / len(sweeps))
+            tables[one.lines.sweep.name] = whole if len(whole) == len(made) else []
+            report((number + 1) / len(sweeps))
         write_geolocation(path / "geolocation.zarr", tables, params)
 
     return Wanted(build, params)  # keyed by the paths, not by what was seen along them
 
 
 @stage("rectify", "mosaic", MOSAIC)
-def rectify(run: SurveyRun, raw: StageRef, geolocation: StageRef, registration: StageRef | None = None) -> Wanted:
+def rectify(
+    raw: StageRef,
+    geolocation: StageRef,
+    registration: StageRef | None = None,
+    *,
+    camera: LineCamera,
+    frame: FieldFrame,
+    plan: CapturePlan,
+    kernel: Kernel,
+    memory: int,
+    pool: WorkerPool,
+    report: Report,
+) -> Wanted:
     """Bring the coarse sweeps onto the scene grid and blend them into one mosaic, tile by tile."""
 
     def build(path: Path) -> None:
         """Write mosaic and quicklook tile by tile, and what became of each sweep's lines."""
-        grid = PixelGrid.of_scene(run.grid, run.grid.factor)
         recipe = MosaicRecipe(
             raw.path,
-            run.camera,
-            grid,
-            run.settings.resampling,
+            camera,
+            PixelGrid.of_scene(frame.grid, frame.grid.factor),
+            kernel,
             geolocation=geolocation.path / "geolocation.zarr",
             registration=record_of(registration),
-            finer=PixelGrid.of_scene(run.grid, 1) if run.plan.plain else None,
+            finer=PixelGrid.of_scene(frame.grid, 1) if plan.plain else None,
         )
         writer = MosaicWriter(
             path / "mosaic.zarr",
-            grid.shape,
-            run.scene.wavelength_nm,
-            fwhm_nm=run.scene.fwhm_nm,
-            grid=run.angular_grid(run.grid.factor),
-            simulation=captured(raw)[0].simulation,
+            frame.grid.coarse_shape,
+            frame.wavelength_nm,
+            fwhm_nm=frame.fwhm_nm,
+            grid=frame.angular_grid(frame.grid.factor),
+            simulation=open_raw_cubes(raw.path)[0].simulation,
         )
-        colours, _ = choose_bands(run.scene.wavelength_nm)
-        settings, picture = run.settings, Thumbnail(grid.shape, colours, QUICKLOOK_PX)
-        write_mosaic(recipe, writer, memory=settings.memory, pool=settings.pool, seen=picture, report=run.report)
-        if run.scene.missing is not None:
-            gaps = blank_coarse(run.scene.missing, run.grid.factor)
-            blank_pixels(path / "mosaic.zarr", gaps, NO_VALUE)
-            picture.blank(gaps)
-        writer.write_quicklook(stretched(picture.image).image)
-        write_table(path / "lines.json", {one.cube.sweep.name: one.facts() for one in recipe.sweeps()})
+        picture = thumbnail_of(frame)
+        write_mosaic(recipe, writer, memory=memory, pool=pool, seen=picture, report=report)
+        finish_mosaic(writer, picture, frame)
+        write_table(path / "lines.json", {one.lines.sweep.name: one.facts() for one in recipe.sweeps()})
 
-    params = {"grid": asdict(run.grid), "resampling": run.settings.resampling, **run.place_key}
+    params = {"grid": asdict(frame.grid), "resampling": kernel, **frame.key}
     return Wanted(build, params, [raw, geolocation, *_there(registration)])
 
 
+def thumbnail_of(frame: FieldFrame) -> Thumbnail:
+    """Return an empty picture of a mosaic on the coarse pixels."""
+    return Thumbnail(frame.grid.coarse_shape, choose_bands(frame.wavelength_nm)[0], QUICKLOOK_PX)
+
+
+def finish_mosaic(writer: MosaicWriter, picture: Thumbnail, frame: FieldFrame) -> None:
+    """Take out what is no scene, and store the picture of the rest."""
+    if frame.missing is not None:
+        gaps = blank_coarse(frame.missing, frame.grid.factor)
+        blank_pixels(writer.path, gaps, NO_VALUE)
+        picture.blank(gaps)
+    writer.write_quicklook(stretched(picture.image).image)
+
+
+def patch_writer(path: Path, frame: FieldFrame, patch_index: NDArray[np.integer]) -> PatchWriter:
+    """Begin the store of these patches, in their order."""
+    return PatchWriter(
+        path / "patches.zarr",
+        patch_index,
+        frame.grid.patch_origin(patch_index),
+        frame.grid.patch,
+        frame.wavelength_nm,
+        fwhm_nm=frame.fwhm_nm,
+        grid=frame.angular_grid(),
+    )
+
+
 @stage("extract_patches", "fine patches", PATCHES)
-def extract_patches(run: SurveyRun, attention: StageRef, raw: StageRef, registration: StageRef | None = None) -> Wanted:
+def extract_patches(
+    attention: StageRef,
+    raw: StageRef,
+    registration: StageRef | None = None,
+    *,
+    camera: LineCamera,
+    frame: FieldFrame,
+    plan: CapturePlan,
+    kernel: Kernel,
+    memory: int,
+    report: Report,
+) -> Wanted:
     """Bring every chosen patch onto the scene grid, one patch a patch; NaN where nothing was seen, or is no scene.
 
     ``raw`` are the fine sweeps, or those of a uniform scan.
     """
+    grid, most_bytes = frame.grid, memory // CACHE_FRACTION
+
+    def in_order(patch_index: NDArray[np.integer]) -> NDArray[np.integer]:
+        """Return patches as the sweeps pass them, so that a few of them need few lines at a time."""
+        row, column = np.divmod(patch_index, grid.patch_shape[1])
+        return patch_index[np.lexsort((column, row) if plan.along == "x" else (row, column))]
+
+    def everything(sweeps: Sequence[SweepPath], wanted: NDArray[np.integer]) -> Iterator[tuple[Values, Valid]]:
+        """Yield the wanted patches of a uniform scan by tables of its pixels: far faster than looking each of them up."""
+        placed = [one.placed(camera, PixelGrid.of_scene(grid, 1)) for one in sweeps]
+        among, first = np.isin(in_order(grid.valid_patches()), wanted), 0
+        for values, seen in read_every_patch(placed, camera, grid, kernel, most_bytes=most_bytes):
+            kept = among[first : (first := first + len(values))]
+            yield (values, seen) if kept.all() else (values[kept], seen[kept])
+
+    def some(sweeps: Sequence[SweepPath], wanted: NDArray[np.integer]) -> Iterator[tuple[Values, Valid]]:
+        placed, cache = [one.placed(camera) for one in sweeps], LineCache(most_bytes)
+        for first in range(0, len(wanted), PATCHES_AT_ONCE):
+            yield read_patches(placed, camera, grid, wanted[first : first + PATCHES_AT_ONCE], kernel, cache=cache)
 
     def build(path: Path) -> None:
         """Write the patches in the order in which sweeps pass them, a batch of patches at a time."""
-        patch_index = load_plan(attention).patch_index
-        row, column = np.divmod(patch_index, run.grid.patch_shape[1])
-        # as the sweeps pass them, so that a few of them need few lines at a time
-        ordered = patch_index[np.lexsort((column, row) if run.plan.along == "x" else (row, column))]
-        writer = PatchWriter(
-            path / "patches.zarr",
-            ordered,
-            run.grid.patch_origin(ordered),
-            run.grid.patch,
-            run.scene.wavelength_nm,
-            fwhm_nm=run.scene.fwhm_nm,
-            grid=run.angular_grid(),
-        )
-        if run.plan.plain and len(ordered):
-            _cut_everything(run, sighted(run, raw, registration), writer, ordered)
-            return
-        cache = LineCache(run.settings.memory // CACHE_FRACTION)
-        sweeps = [one.placed(run.camera) for one in sighted(run, raw, registration)]
-        for first in range(0, len(ordered), PATCHES_AT_ONCE):
-            patch_index = ordered[first : first + PATCHES_AT_ONCE]
-            seen = read_patches(sweeps, run.camera, run.grid, patch_index, run.settings.resampling, cache=cache)
-            writer.write(*_on_scene(run, patch_index, *seen))
-            run.report((first + len(patch_index)) / len(ordered))
+        patch_index, done = in_order(load_plan(attention).patch_index), 0
+        writer, sweeps = patch_writer(path, frame, patch_index), open_sweeps(raw.path, record_of(registration), camera)
+        for values, seen in (everything if plan.plain and len(patch_index) else some)(sweeps, patch_index):
+            here = patch_index[done : (done := done + len(values))]
+            if frame.missing is not None:  # no value, and no validity, where the scene has none
+                gaps = patch_pixels(grid, frame.missing)[here]
+                values, seen = np.where(gaps[..., None], np.float32(np.nan), values), seen & ~gaps
+            writer.write(values, seen)
+            report(done / len(patch_index))
 
-    params = {"grid": asdict(run.grid), "resampling": run.settings.resampling, **run.place_key}
+    params = {"grid": asdict(grid), "resampling": kernel, **frame.key}
     return Wanted(build, params, [attention, raw, *_there(registration)])
 
 
-def _on_scene(
-    run: SurveyRun, patch_index: NDArray[np.integer], values: NDArray[np.float32], valid: NDArray[np.bool_]
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """The same patches (patch, y, x, band) with NaN, and no validity, where the scene has no value."""
-    if run.scene.missing is None:
-        return values, valid
-    gaps = patch_pixels(run.grid, run.scene.missing)[patch_index]
-    return np.where(gaps[..., None], np.float32(np.nan), values), valid & ~gaps
-
-
-def _cut_everything(
-    run: SurveyRun, sweeps: Sequence[Sighted], writer: PatchWriter, patch_index: NDArray[np.integer]
-) -> None:
-    """Cut the wanted patches of a uniform scan, by tables of its pixels: many times as fast as looking each of them up."""
-    placed = [one.placed(run.camera, PixelGrid.of_scene(run.grid, 1)) for one in sweeps]
-    done, first, every = 0, 0, run.grid.valid_patches()
-    row, column = np.divmod(every, run.grid.patch_shape[1])
-    wanted = np.isin(every[np.lexsort((column, row) if run.plan.along == "x" else (row, column))], patch_index)
-    most_bytes = run.settings.memory // CACHE_FRACTION
-    for values, seen in read_every_patch(placed, run.camera, run.grid, run.settings.resampling, most_bytes=most_bytes):
-        kept = wanted[first : first + len(values)]
-        first += len(values)
-        if not kept.all():
-            values, seen = values[kept], seen[kept]
-        writer.write(*_on_scene(run, patch_index[done : done + len(values)], values, seen))
-        done += len(values)
-        run.report(done / len(patch_index))
-
-
-def seen_fractions(run: SurveyRun, patches: StageRef) -> NDArray[np.float64]:
+def seen_fractions(frame: FieldFrame, patches: StageRef) -> NDArray[np.float64]:
     """How much of each patch was seen, (patch,) 0..1 of its pixels on the scene; 1 where it has none there."""
     store = open_patches(patches.path / "patches.zarr")
     seen: NDArray[np.float64] = read_array(store.group, "valid").mean(axis=(1, 2))
-    there = run.grid.valid_fraction().ravel()[store.patch_index]
-    if run.scene.missing is not None:
-        there = there - patch_pixels(run.grid, run.scene.missing)[store.patch_index].mean(axis=(1, 2))
+    there = frame.grid.valid_fraction().ravel()[store.patch_index]
+    if frame.missing is not None:
+        there = there - patch_pixels(frame.grid, frame.missing)[store.patch_index].mean(axis=(1, 2))
     return np.divide(seen, there, out=np.ones_like(seen), where=there > 0)
 
 

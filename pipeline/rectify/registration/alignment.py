@@ -17,7 +17,6 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from pipeline.errors import SettingsError, ShapeError
 from pipeline.lazy import deferred
 from pipeline.rectify.registration.shifts import pair_shift
 
@@ -105,22 +104,12 @@ def solve_sweeps(
     differences only: the ``reference`` sweep is held, by default the middle one of those with the most windows. Sweeps
     in no window stay at 0; those joined to each other but not to the reference stay at 0 on average. Both are named as
     untied.
-
-    Raises SettingsError: the reference is no sweep.
-    Raises ShapeError: a window names a sweep that is not there.
     """
-    if len(names) != len(lines):
-        raise ShapeError(f"expected a number of lines for each of {len(names)} sweeps, got {len(lines)}")
-    for window in windows:
-        if not {window.reference, window.moving} <= set(range(len(names))):
-            raise ShapeError(f"a window joins sweeps {window.reference} and {window.moving}; there are {len(names)}")
     held = reference
     if held is None:  # the first of the largest groups that windows join, and of it the middle one
         groups = [sorted(tied_to(windows, sweep, len(names))) for sweep in range(len(names))]
         largest = max(groups, key=len, default=[0])
         held = largest[len(largest) // 2]
-    if names and not 0 <= held < len(names):
-        raise SettingsError(f"the reference must be one of the sweeps 0 to {len(names) - 1}, got {held}")
     joined = tied_to(windows, held, len(names))
     untied = tuple(number for number in range(len(names)) if number not in joined)
     if not windows:
@@ -199,7 +188,7 @@ def field_shift(now: NDArray[np.floating], before: NDArray[np.floating], *, reac
     """Find how ``before`` lies beside ``now``, two (y, x) broad-band images of one field with NaN where nothing is.
 
     No more than ``reach_px`` is looked for. Nothing is said where no two looks agree on it: fields that changed all
-    over, or that show nothing. Raises ShapeError as `pair_shift`.
+    over, or that show nothing.
     """
     whole = pair_shift(now, before, prior_px=reach_px)
     start = np.rint(whole.shift) if whole.status == "found" else np.zeros(2)

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.readings import SIGMA_OF_MEDIAN
 from pipeline.rectify.placed import PixelGrid, Placed
@@ -40,7 +39,6 @@ class SweepLights:
     """Light of every sweep relative to the geometric mean of those that overlaps join."""
 
     light: NDArray[np.float32]  # (sweep, band), 1 on average
-    residual: Floats  # (ratio, band) measured less modelled log ratio
     untied: tuple[int, ...]  # sweeps in no ratio: left at 1
 
     def gain(self, sweep: int) -> NDArray[np.float32]:
@@ -56,14 +54,7 @@ def light_ratio(
 
     The points come in groups (squares of pixels). The ratio is the median over groups of the ratio of their sums: sums
     first, so that noise has no say in the sign of a pixel; the median, so that what moved between the sweeps has none.
-
-    Raises ShapeError: the two differ in shape or are not (group, point, band).
     """
-    if reference_values.ndim != 3 or reference_values.shape != moving_values.shape:
-        raise ShapeError(
-            f"expected two arrays (group, point, band) of the same points, got {reference_values.shape} and "
-            f"{moving_values.shape}"
-        )
     both = np.isfinite(reference_values) & np.isfinite(moving_values)
     sums = [np.where(both, values, 0).sum(axis=1, dtype=np.float64) for values in (reference_values, moving_values)]
     usable = (sums[0] > 0) & (sums[1] > 0)
@@ -84,16 +75,7 @@ def solve_lights(ratios: Sequence[LightRatio], sweeps: int, wavelength_nm: Float
 
     Least squares of log ratios, each weighted by its error, with the log light of a sweep a polynomial in wavelength.
     Overlaps see ratios only: the mean log light of sweeps that they join is 0 at every wavelength.
-
-    Raises ShapeError: a ratio has another number of bands, or names a sweep that is not there.
     """
-    bands = len(wavelength_nm)
-    for ratio in ratios:
-        if ratio.log_ratio.shape != (bands,) or not {ratio.reference, ratio.moving} <= set(range(sweeps)):
-            raise ShapeError(
-                f"a ratio of sweeps {ratio.reference} and {ratio.moving} has {len(ratio.log_ratio)} bands; "
-                f"there are {sweeps} sweeps of {bands} bands"
-            )
     known = [ratio for ratio in ratios if np.isfinite(ratio.log_ratio).any()]
     low, high = float(np.min(wavelength_nm)), float(np.max(wavelength_nm))
     span = (2 * np.asarray(wavelength_nm, np.float64) - low - high) / max(high - low, 1e-9)
@@ -106,13 +88,9 @@ def solve_lights(ratios: Sequence[LightRatio], sweeps: int, wavelength_nm: Float
         solved, *_ = np.linalg.lstsq(np.vstack(rows), np.concatenate(wanted), rcond=1e-10)
         answer = solved.reshape(sweeps, -1)
     log_light = answer @ basis.T
-    residual = [r.log_ratio - log_light[r.moving] + log_light[r.reference] for r in ratios]
     seen = {number for ratio in known for number in (ratio.reference, ratio.moving)}
-    return SweepLights(
-        np.exp(log_light).astype(np.float32),
-        np.array(residual).reshape(len(ratios), bands),
-        tuple(number for number in range(sweeps) if number not in seen),
-    )
+    untied = tuple(number for number in range(sweeps) if number not in seen)
+    return SweepLights(np.exp(log_light).astype(np.float32), untied)
 
 
 def overlap_light(placed: Sequence[Placed], camera: LineCamera, windows: Sequence[Window]) -> list[LightRatio]:

@@ -16,17 +16,15 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import Sweep, shifted_position
-from pipeline.rectify.calibrate import calibrate, of_bands
 from pipeline.rectify.geolocation import path_geolocation
 from pipeline.rectify.resample import resample
 from pipeline.rectify.scan_paths import ScanPath, make_scan_paths
-from pipeline.source import References, SweepLines
+from pipeline.signal.lines import BROAD_BANDS, Signal
+from pipeline.source import SweepLines
 
 Floats = NDArray[np.float64]
 
 LEAST_OVERLAP_PX = 64.0  # of the smaller side of a window, after the largest shift; below it errors grow fast
-BROAD_BANDS = 16
-BLOCK_LINES = 64
 EDGE_LINES = 16  # every how many lines a sweep's edges are taken; they bend by 1e-3 px between
 
 
@@ -47,21 +45,9 @@ class BroadSweep:
 
         ``usable`` (line,) are lines whose position may be believed; None takes ``lines.valid_line``.
         """
-        chosen = broad_bands(lines.references, bands)
-        references = of_bands(lines.references, chosen.tolist())
-        total = len(lines.valid_line)
-        image = np.full((total, references.dark.shape[0]), np.nan, np.float32)
-        saturated = camera.full_scale_dn * lines.sweep.binning
         position = np.asarray(lines.position, np.float64)
         usable = (lines.valid_line if usable is None else usable) & np.isfinite(position).all(axis=1)
-        for first in range(0, total, BLOCK_LINES):
-            part = slice(first, min(first + BLOCK_LINES, total))
-            raw = np.ascontiguousarray(lines.read(part.start, part.stop)[..., chosen])
-            at = np.where(usable[part, None], position[part], np.nan)
-            values, valid = calibrate(raw, references, saturated_dn=saturated, position=at)
-            whole = valid if valid.ndim == 2 else valid.all(axis=2)
-            image[part] = np.where(whole & usable[part, None], values.mean(axis=2), np.nan)
-        return cls(lines.sweep, position, usable, image)
+        return cls(lines.sweep, position, usable, Signal(lines).broad_image(usable, camera.full_scale_dn, bands))
 
 
 @dataclass(frozen=True)
@@ -202,14 +188,3 @@ def _pair_windows(images: Sequence[PlacedImage], one: int, other: int, window_px
         right = min(float(ends[1].min()) for ends in reach)
         if right > left:
             yield Window(one, other, (left, right), (start, stop))
-
-
-def broad_bands(references: References, bands: int = BROAD_BANDS) -> NDArray[np.intp]:
-    """Choose the bands of a broad-band image: spread over those that nine samples in ten are calibrated in."""
-    good = references.white > references.dark
-    if references.bad is not None:
-        good = good & ~references.bad
-    known = np.flatnonzero(good.mean(axis=0) >= 0.9)
-    if not len(known):
-        known = np.arange(len(references.white_reference))
-    return known[np.unique(np.linspace(0, len(known) - 1, max(bands, 1)).round().astype(np.intp))]

@@ -10,7 +10,6 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.coverage import field_px
@@ -80,11 +79,9 @@ def register_sweeps(
     ``prior_px`` is how far any sweep may look beside the position that it reports, in either axis; a pair may be apart
     by twice that. Overlaps need 64 px beyond.
 
-    Raises SettingsError: the prior is negative or not finite, or windows that are too short.
+    Raises SettingsError: windows that are too short.
     Raises PoseError: a corrected position is beyond the mirror's rim.
     """
-    if not (np.isfinite(prior_px) and prior_px >= 0):
-        raise SettingsError(f"expected a finite prior >= 0 px, got {prior_px} px")
     shifts, among = no_shifts([one.sweep.name for one in sweeps]), frozenset(range(len(sweeps)))
     names, lines = [one.sweep.name for one in sweeps], [len(one.position) for one in sweeps]
     made: list[tuple[list[SeamWindow], SweepShifts]] = []
@@ -193,11 +190,8 @@ def anchor_sweep(
     interpolated there, up to ``prior_px`` beside its reported positions in either axis [px]. One offset for the whole
     sweep: runs of the fine pass are short.
 
-    Raises SettingsError: the prior is negative or not finite.
     Raises PoseError: a corrected position is beyond the mirror's rim.
     """
-    if not (np.isfinite(prior_px) and prior_px >= 0):
-        raise SettingsError(f"expected a finite prior >= 0 px, got {prior_px}")
     (shift,) = no_shifts([sweep.sweep.name])
     lines = len(sweep.position)
     if not sweep.usable.any():

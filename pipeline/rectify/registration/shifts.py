@@ -11,7 +11,6 @@ import scipy
 import skimage
 from numpy.typing import NDArray
 
-from pipeline.errors import SettingsError, ShapeError
 from pipeline.rectify.kernels import kernel_taps
 
 Status = Literal["found", "undecidable", "flat", "empty"]
@@ -36,7 +35,6 @@ SMOOTHING = np.array([1, 4, 6, 4, 1]) / 16
 SMOOTHED_NOISE = float(SMOOTHING @ SMOOTHING) ** 2  # fraction of white noise's variance that smoothing leaves
 BORDER_PX = 5  # pixels that smoothing (2), the step (1) and interpolation (2) take from every side
 SINGULAR = 1e-12
-LEAST_MISFIT = 1e-9
 TINY = 1e-30
 
 
@@ -53,8 +51,6 @@ class PairShift:
     shift: Floats  # (2,) rows and columns to add to places in ``moving``; NaN unless found [px]
     error_px: Floats  # (2,) standard error that the noise leaves
     peak: float = np.nan  # correlation at the shift
-    peak_ratio: float = np.nan  # variance left unexplained by the next best shift over that left by this one
-    snr: float = np.nan  # amplitude, of one image, if noise is all in which they differ
     pixels: int = 0
 
 
@@ -80,9 +76,6 @@ def pair_shift(reference: NDArray[np.floating], moving: NDArray[np.floating], *,
     Both are (row, column) broad-band images on the same grid, NaN where nothing was seen; gain and offset may differ.
     ``prior_px`` is the largest shift possible in either direction.
 
-    Raises ShapeError: not two images of one size.
-    Raises SettingsError: the prior is negative or not finite.
-
     References
     ----------
     .. [1] D. Padfield, "Masked object registration in the Fourier domain", IEEE Trans. Image Process., 2012.
@@ -90,13 +83,6 @@ def pair_shift(reference: NDArray[np.floating], moving: NDArray[np.floating], *,
     .. [2] M. Guizar-Sicairos, S. T. Thurman, J. R. Fienup, "Efficient subpixel image registration algorithms",
        Opt. Lett., 2008. doi:10.1364/OL.33.000156
     """
-    if reference.ndim != 2 or reference.shape != moving.shape or not reference.size:
-        raise ShapeError(
-            f"expected two images (row, column) of one grid, got {reference.shape} and {moving.shape}; "
-            "cut both from the same window"
-        )
-    if not (np.isfinite(prior_px) and prior_px >= 0):
-        raise SettingsError(f"the prior of a shift must be finite and not negative, got {prior_px} px")
     first, second = _standardised(reference), _standardised(moving)
     if first is None or second is None:
         none_seen = not (np.isfinite(reference).any() and np.isfinite(moving).any())
@@ -122,14 +108,11 @@ def _judge(fits: list[_Fit], prior_px: float) -> PairShift:
         and best.error.max() < MOST_ERROR_PX
         and np.abs(best.shift).max() <= prior_px + 0.5
     )
-    noise = max(best.misfit, LEAST_MISFIT) / SMOOTHED_NOISE / 2
     return PairShift(
         status="found" if sure else "undecidable",
         shift=best.shift if sure else np.full(2, np.nan),
         error_px=best.error,
         peak=float(np.sqrt(1 - best.misfit)),
-        peak_ratio=float(ratio),
-        snr=float(np.sqrt((1 - best.misfit) / noise)),
         pixels=best.pixels,
     )
 

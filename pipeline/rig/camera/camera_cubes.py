@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import RigError, SceneError, ShapeError
 from pipeline.readings import SIGMA_OF_MEDIAN
-from pipeline.rectify.detector import find_bad_elements
 from pipeline.rig.camera.camera_texts import FRAME_INDEX, LineTimes, parse_frame_index, split_header, times_of_lines
+from pipeline.signal.detector import find_bad_elements
 from pipeline.source import References
 
 _PART = re.compile(r"raw_(\d{1,12})", re.IGNORECASE)
@@ -273,7 +273,7 @@ def as_references(
     """Join dark and white into the references of a sweep, and say what was found.
 
     An element is bad where its dark frame is stuck, where either jumps amid its frames, or where
-    :func:`pipeline.rectify.detector.find_bad_elements` says so.
+    :func:`pipeline.signal.detector.find_bad_elements` says so.
 
     ``white_reference`` is the value of the white reference, one or (band,). RigError where the frames are of two sizes, swapped,
     without light, do not show the same throughout, or too many elements would be bad.

@@ -52,14 +52,16 @@ def _store(stages: Path, name: str) -> Path:
 
 
 def _work(run: SurveyRun, pool: WorkerPool, halo: int) -> FieldWork:
-    return replace(FieldWork.of(run), regions=plan_regions(run.grid, SHARD, most_px=MOST_PX, halo=halo), pool=pool)
+    return replace(run.work, regions=plan_regions(run.grid, SHARD, most_px=MOST_PX, halo=halo), pool=pool)
 
 
 def _draw(work: FieldWork, run: SurveyRun, stages: Path, out: Path) -> dict[str, bytes]:
     """The bytes of the map that this work draws."""
     legend = ClassNames(run.weights.class_names, run.weights.class_colours)
-    create_class_map(out, run.scene.shape, legend, grid=run.angular_grid())
-    create_probabilities(out.with_suffix(".class_probabilities"), run.scene.shape, legend, grid=run.angular_grid())
+    create_class_map(out, run.scene.shape, legend, grid=run.frame.angular_grid())
+    create_probabilities(
+        out.with_suffix(".class_probabilities"), run.scene.shape, legend, grid=run.frame.angular_grid()
+    )
     mosaic, patches = _store(stages, "rectify/*/mosaic.zarr"), _store(stages, "patches/*/patches.zarr")
     drawing = Drawing(work.weights, mosaic, patches, out, out.with_suffix(".class_probabilities"), 1.0, 1)
     draw_field(work, drawing, lambda done: None)
@@ -80,7 +82,7 @@ def test_regions_that_see_the_field_draw_the_map_of_the_field(
     stored = _contents(_store(stages, "segment/*/class_map.zarr"))
     assert len(_work(run, pool, ALL_CELLS).regions) == 2
     assert _draw(_work(run, pool, ALL_CELLS), run, stages, tmp_path / "m.zarr") == stored
-    assert _draw(FieldWork.of(run), run, stages, tmp_path / "one.zarr") == stored
+    assert _draw(run.work, run, stages, tmp_path / "one.zarr") == stored
 
 
 @pytest.mark.parametrize("halo", [0, 1])
@@ -99,7 +101,7 @@ def test_scores_of_regions_make_those_of_the_field(surveyed: tuple[SurveyRun, Pa
     """With a halo over everything they are equal, patch by patch, and the stage's own where it used that policy."""
     run, stages = surveyed
     mosaic = _store(stages, "rectify/*/mosaic.zarr")
-    whole = FieldWork.of(run).score(policy, mosaic, lambda done: None)
+    whole = run.work.score(policy, mosaic, lambda done: None)
     assert (_work(run, WorkerPool(workers=2), ALL_CELLS).score(policy, mosaic, lambda done: None) == whole).all()
     if policy == run.settings.policy:
         assert (load_attention(_store(stages, "score/*/attention.zarr")).score == whole).all()
@@ -109,10 +111,10 @@ def test_edges_need_one_patch_of_halo_and_work_travels_as_paths(surveyed: tuple[
     """With one coarse patch regions give the field's own edges; what another process gets is small."""
     run, stages = surveyed
     mosaic = _store(stages, "rectify/*/mosaic.zarr")
-    whole = FieldWork.of(run).score("sobel", mosaic, lambda done: None)
+    whole = run.work.score("sobel", mosaic, lambda done: None)
     np.testing.assert_allclose(_work(run, WorkerPool(), 1).score("sobel", mosaic, lambda done: None), whole, rtol=1e-5)
     run, stages = surveyed
-    work = FieldWork.of(run)
+    work = run.work
     scoring = Scoring(work.weights, _store(stages, "rectify/*/mosaic.zarr"), "entropy")
     sent = pickle.dumps((scoring, work.regions[0]))
     there, region = pickle.loads(sent)
@@ -149,7 +151,7 @@ def test_too_little_memory_is_refused_before_the_work(
     surveyed: tuple[SurveyRun, Path], tmp_path: Path, pool: WorkerPool, words: str
 ) -> None:
     """The message says what a region takes and the least memory that does, and that much is enough."""
-    work = replace(FieldWork.of(surveyed[0]), pool=pool, memory=300 * 2**20)
+    work = replace(surveyed[0].work, pool=pool, memory=300 * 2**20)
     with pytest.raises(SettingsError, match=rf"exceeds --memory 300 MiB: .*96 x 128 px.*{words}") as refused:
         work.pool_for(np.arange(192), 3)
     least = int(str(refused.value).split("--memory")[-1].split()[0])
@@ -158,7 +160,7 @@ def test_too_little_memory_is_refused_before_the_work(
 
 def test_no_more_regions_at_a_time_than_memory_holds(surveyed: tuple[SurveyRun, Path]) -> None:
     """A worker pool shrinks to what fits, and stays as it is where all of it does."""
-    work = replace(FieldWork.of(surveyed[0]), pool=WorkerPool(workers=7))
+    work = replace(surveyed[0].work, pool=WorkerPool(workers=7))
     assert work.pool_for(np.arange(9), 3) is work.pool
     pools = [replace(work, memory=size * 2**20).pool_for(np.arange(9), 3).workers for size in (513, 514, 600)]
     assert pools == sorted(pools, key=int)

@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, cast
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
 
 from flows.settings.survey_settings import MapChoice, Settings
-from flows.tasks.run import SurveyRun
-from flows.tasks.stages.on_ground import STORE, coarse_colours, ground, survey_grid
+from flows.tasks.stages.on_ground import STORE, coarse_colours, ground
+from flows.tasks.zones import place_of_field
 from pipeline.errors import PoseError
-from pipeline.geometry.grid import UNLABELLED, SceneGrid
+from pipeline.geometry.grid import UNLABELLED
+from pipeline.ground.field_places import PosedField
 from pipeline.ground.map_grid import GroundGrid
 from pipeline.ground.view import RigPose, pixel_places
 from storage.archive.archive import Archive
@@ -37,30 +39,30 @@ from storage.arrays.mosaics import MosaicWriter
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, height_m=14.0)
 SHAPE = (120, 160)
+FIELD: Any = SimpleNamespace(shape=SHAPE, geobox=None, pixel_m=None)
 LEGEND = ClassNames(("weed", "crop"), np.array([[255, 0, 0], [0, 255, 0]], np.uint8))
 
 
 @dataclass(frozen=True)
-class Scene:
-    """As much of a scene as the stage looks at."""
-
-    shape: tuple[int, int] = SHAPE
-
-
-@dataclass(frozen=True)
 class Run:
-    """As much of a survey as the stage looks at."""
+    """As much of a survey as the stage needs."""
 
     archive: Archive
     settings: Settings = field(default_factory=lambda: Settings(pose=POSE))
-    scene: Scene = field(default_factory=Scene)
-    grid: SceneGrid = field(default_factory=lambda: SceneGrid(*SHAPE, 8, 4))
+    factor: int = 4
     report: Callable[[float], None] = lambda done: None
 
     @property
-    def camera(self) -> Any:
-        """The settings' camera."""
-        return self.settings.camera
+    def ground_grid(self) -> GroundGrid:
+        """The grid that the settings ask for."""
+        place = place_of_field(self.settings, FIELD)
+        assert isinstance(place, PosedField)
+        return place.grid
+
+    @property
+    def map_choice(self) -> MapChoice:
+        """The map of the settings."""
+        return self.settings.map
 
 
 def believe(folder: Path, age_days: np.ndarray, old_class: np.ndarray | None = None) -> None:
@@ -116,13 +118,6 @@ def draw(run: Run, stores: tuple[StageRef, StageRef]) -> StageRef:
     return ground.produce(run.archive, ground.wants(run, *stores))[0]
 
 
-def grid_of(run: Run) -> GroundGrid:
-    """The map's grid."""
-    grid = survey_grid(cast("SurveyRun", run))
-    assert grid is not None
-    return grid
-
-
 def test_what_is_unknown_has_no_confidence_on_the_map_either(
     run: Run, stores: tuple[StageRef, StageRef], tmp_path: Path
 ) -> None:
@@ -151,7 +146,7 @@ def test_map_and_picture_lie_where_the_rays_end(run: Run, stores: tuple[StageRef
     """Each scene pixel's class is found where its ray meets the ground; the mosaic's ramp rises towards the rig."""
     ref = draw(run, stores)
     found = load_ground_map(ref.path / STORE)
-    grid = grid_of(run)
+    grid = run.ground_grid
     y, x = pixel_places(SHAPE)
     points = np.stack(np.meshgrid(y[10:-10:9], x[10:-10:9], indexing="ij"), axis=-1).reshape(-1, 2)
     places = grid.frame.ground_to_map(grid.frame.view.scene_to_ground(points))
@@ -176,7 +171,7 @@ def test_map_and_picture_lie_where_the_rays_end(run: Run, stores: tuple[StageRef
 
 def field_pixels(run: Run, found: GroundMap) -> tuple[np.ndarray, np.ndarray]:
     """Whether each pixel of a map is in the field, and the row and column of the field's pixel that it shows."""
-    places = grid_of(run).scene_pixels(*(slice(0, size) for size in found.classes.shape))
+    places = run.ground_grid.scene_pixels(*(slice(0, size) for size in found.classes.shape))
     seen = np.isfinite(places[..., 0])
     return seen, np.floor(places[seen] + 0.5).astype(int).T
 
@@ -220,7 +215,7 @@ def test_the_store_has_hectares_and_where_it_was_seen_from(run: Run, stores: tup
     """Areas are sums of footprints at any resolution; plain xarray reads pose, counts of pixels and CRS."""
     ref = draw(replace(run, settings=Settings(pose=POSE, map=MapChoice(resolution_m=0.02))), stores)
     areas = load_ground_map(ref.path / STORE).areas
-    grid = grid_of(run)
+    grid = run.ground_grid
     exact = grid.frame.view.area_m2(np.stack(np.meshgrid(*pixel_places(SHAPE), indexing="ij"), axis=-1))
     assert areas["weed"]["m2"] == pytest.approx(exact[:, :80].sum(), rel=1e-12)
     assert areas["crop"]["m2"] == pytest.approx(exact[30:, 80:].sum(), rel=1e-12)

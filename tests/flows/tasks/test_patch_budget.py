@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,9 @@ from flows.archive.plan_command import format_kept, plan_content
 from flows.settings.load import load_settings, parse_settings
 from flows.tasks.patch_budget import PatchBudget
 from flows.tasks.reading_costs import ReadingCosts
-from models.network.sizes import SegmenterConfig
+from flows.tasks.run import SurveyRun
+from models.network.sizes import SegmenterConfig, multiply_adds
+from models.policies.policies import score_multiply_adds
 from models.weights.files import save_weights
 from pipeline.errors import BudgetError, SettingsError
 from pipeline.geometry.grid import SceneGrid
@@ -39,7 +42,8 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _asked(shown: NDArray[np.bool_] | None = None, **limits: object) -> PatchBudget | None:
-    return PatchBudget.asked(parse_settings({"scan_step": 1, **limits}), COSTS, shown)
+    found = parse_settings({"scan_step": 1, **limits})
+    return PatchBudget.asked(COSTS, shown, found.policy, found.macs, found.bytes_kept, found.least_gain)
 
 
 def _budget(**limits: object) -> PatchBudget:
@@ -217,3 +221,34 @@ def test_scores_without_a_coarse_prediction_cost_no_coarse_prediction() -> None:
     assert COSTS.with_scores(patch_index, "sobel").coarse_prediction == COSTS.of_map(patch_index).coarse_prediction
     assert COSTS.with_scores(patch_index, "gain").coarse_prediction == 2 * COSTS.of_map(patch_index).coarse_prediction
     assert replace(COSTS.with_scores(patch_index, "sobel"), score=0) == COSTS.of_map(patch_index)
+
+
+def test_a_large_field_is_counted_region_by_region() -> None:
+    """Sixteen times the field takes as many fields and their halos."""
+    small, large = (
+        costs.of_map(costs.grid.valid_patches())
+        for costs in (replace(COSTS, grid=SceneGrid(side, side, 16, 4)) for side in (2560, 10240))
+    )
+    assert 16 * small.decode < large.decode < 16 * 1.3 * small.decode
+    assert 16 * small.total < large.total < 16 * 1.3 * small.total
+
+
+@pytest.mark.parametrize(
+    ("policy", "scan_passes"),
+    [("gain", 2), ("entropy", 2), ("sobel", 1), ("random", 1), ("saliency", 1), ("vgg-static", 1)],
+)
+def test_a_policy_that_asks_the_coarse_prediction_reads_the_coarse_look_once_more(
+    policy: str, scan_passes: int
+) -> None:
+    """The map reads it anyway, from what is stored; scores of the coarse prediction read it before that."""
+    score = score_multiply_adds(policy, COSTS.config, COSTS.grid)
+    done = COSTS.with_scores(np.array([3, 8]), policy)
+    closed = multiply_adds(COSTS.config, COSTS.grid, 2, COSTS.bands, score=score)
+    assert done.coarse_prediction == scan_passes * closed.coarse_prediction
+    assert (done.score, done.encode, done.decode) == (closed.score, closed.encode, closed.decode)
+
+
+def test_a_plain_scan_is_read_and_nothing_scored() -> None:
+    """What its map takes, whatever the policy of the settings is."""
+    run: Any = SimpleNamespace(costs=COSTS, chooses=False, prior=None)
+    assert SurveyRun.work_done(run, np.arange(PATCHES)) == COSTS.of_map(np.arange(PATCHES))

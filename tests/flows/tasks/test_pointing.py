@@ -15,7 +15,7 @@ from rich.console import Console
 from flows.publish.receipt_table import finding_rows
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings, parse_settings
-from flows.tasks.capture_plan import plan_capture
+from flows.tasks.capture_plan import PassLayout
 from flows.tasks.field_work import patch_features
 from models.network.spectral import SpectralBasis
 from models.reading.inference import CoarsePrediction
@@ -159,7 +159,7 @@ def shared_px(sweeps: list[Sweep]) -> float:
 
 def test_either_pass_overlaps_and_reaches_by_what_it_needs() -> None:
     """Neighbours that look as far apart as they can share 64 px, and both ends of the field are seen."""
-    plan = plan_capture(parse_settings({"pointing_px": OFF, "budget": 1.0}), GRID)
+    plan = PassLayout.of(parse_settings({"pointing_px": OFF, "budget": 1.0}), GRID).plan(1.0)
     assert plan.along == "x"
     assert (plan.overlap_px, plan.margin_px) == (2 * OFF + 64 * 4, 2 * OFF)
     assert shared_px(plan.coarse) >= plan.overlap_px - 1e-3
@@ -174,10 +174,10 @@ def test_either_pass_overlaps_and_reaches_by_what_it_needs() -> None:
 def test_a_mirror_that_is_believed_costs_nothing() -> None:
     """Neither overlaps nor margins nor words; overlaps of a whole line are refused with what could be put right."""
     settings = parse_settings({"budget": 1.0})
-    plan = plan_capture(settings, GRID)
+    plan = PassLayout.of(settings, GRID).plan(None if settings.plain else settings.budget)
     assert plan.overlap_px == 0
     assert plan.full == full_sweeps(GRID, settings.camera, plan.along)
     assert plan.coarse == coarse_sweeps(GRID, settings.camera, plan.along)
     with pytest.raises(SettingsError, match=r"^--pointing-px 192: .* overlap by 640 px .* give less than 192$"):
-        plan_capture(parse_settings({"pointing_px": 192.0}), GRID)
+        PassLayout.of(parse_settings({"pointing_px": 192.0}), GRID).plan(1.0)
     assert finding_rows(found_of(held="the mosaic", sweeps={})) == []

@@ -22,7 +22,11 @@ ROOT = Path(__file__).parents[3]
 sys.path[:0] = [str(ROOT)] if __name__ == "__main__" else []
 
 from flows.archive import ingest_command  # noqa: E402
+from flows.settings.survey_settings import Settings  # noqa: E402
 from flows.tasks.open_survey import STAGES, versions  # noqa: E402
+from flows.tasks.run import SurveyRun  # noqa: E402
+from flows.tasks.stage import needs_of  # noqa: E402
+from storage.archive.keys import StageRef  # noqa: E402
 from tests.flows.tasks.stage_closure import Sources, Target, read_packages  # noqa: E402
 
 VERSIONS = {**versions(), ingest_command.STAGE: ingest_command.VERSION}
@@ -37,8 +41,6 @@ OF_RUNS = ("LineCamera", "SceneGrid", "AngularGrid", "CapturePlan")  # roots of 
 BARRIERS = {
     "Product": "the numbers that this test compares with",
     "Settings": "values, which stand in the keys; what acts on them is reached where it does",
-    "CaptureRun": "what stages are given; what of it they do not name themselves is in OF_RUNS, LIGHT or their roots",
-    "SurveyRun": "as CaptureRun",
     "Archive": "where stores are kept, and under which key; not what is in them",
     "StageRef": "where a store lies",
     "WorkerPool": "who does the work: blocks are the same by threads, by processes and on a cluster",
@@ -140,6 +142,22 @@ def test_words_beside_the_code_concern_no_stage() -> None:
     assert {stage: digest_of(stage, reworded) for stage in ROOTS} == {
         stage: digest_of(stage, sources()) for stage in ROOTS
     }
+
+
+@pytest.mark.parametrize("absent", [("average_raster", "take_patches"), ("rectify", "extract_patches")])
+def test_every_stage_says_once_what_receipts_call_its_store(absent: tuple[str, str]) -> None:
+    """No two stages of a survey, of a capture or of a raster, share a name in receipts; each has one at least."""
+    ran = [one for name, one in STAGES.items() if name not in absent]
+    named = [one.addresses(StageRef(one.product.name, "abc", Path())) for one in ran]
+    assert all(named)
+    assert len({name for one in named for name in one}) == sum(map(len, named))
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_a_survey_has_what_its_stages_need(name: str) -> None:
+    """Each name behind the star of a stage is an attribute of a run, or a setting."""
+    run, settings = ({*dir(kind), *kind.__dataclass_fields__} for kind in (SurveyRun, Settings))
+    assert set(needs_of(STAGES[name].wants)) <= run | settings
 
 
 if __name__ == "__main__":

@@ -16,7 +16,6 @@ from flows.publish.receipt_table import finding_rows
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings, parse_settings
-from flows.tasks.field_work import FieldWork
 from flows.tasks.reading_costs import SHARD
 from flows.tasks.run import open_run
 from flows.tasks.stages.attention import score
@@ -73,7 +72,7 @@ def test_every_policy_scores_the_field(archive: Path, policy: str) -> None:
 def test_saliency_sees_a_cut_field_as_a_whole(archive: Path, policy: str) -> None:
     """A field that is read in regions is scored as one image: the scores are those of the field that is not cut."""
     run = open_run(load_settings(None, _flags(archive, policy)))
-    whole = FieldWork.of(run)
+    whole = run.work
     cut = replace(whole, regions=plan_regions(run.grid, SHARD, most_px=(64, 640), halo=0))
     assert len(cut.regions) == 2
     found = [work.score(policy, _mosaic(archive), lambda done: None) for work in (whole, cut)]
@@ -83,7 +82,7 @@ def test_saliency_sees_a_cut_field_as_a_whole(archive: Path, policy: str) -> Non
 def test_what_a_policy_needs_is_told(archive: Path, tmp_path: Path) -> None:
     """Memory for the whole image; a file for VGG19 and its policy, one not without the other."""
     run = open_run(load_settings(None, _flags(archive, "saliency")))
-    work = replace(FieldWork.of(run), memory=2**20)
+    work = replace(run.work, memory=2**20)
     with pytest.raises(SettingsError, match=r"exceeds --memory 1 MiB: the policy 'saliency' sees .* as a whole"):
         work.score("saliency", _mosaic(archive), lambda done: None)
     with pytest.raises(

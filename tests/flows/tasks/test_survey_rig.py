@@ -201,6 +201,13 @@ def test_a_mirror_mounted_otherwise_gives_the_same_survey_once_it_is_told(
     assert (other[coarse] != expected[coarse]).mean() > 0.5
 
 
+@pytest.fixture(scope="module")
+def simulated_map(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray[Any, Any]:
+    """The map of the simulated rig without effects."""
+    out = tmp_path_factory.mktemp("sim")
+    return class_map_of(run_survey(small_settings(out, effects="none"), QUIET), out)
+
+
 def test_a_mounting_that_does_not_reach_the_field_is_refused_first(tmp_path: Path) -> None:
     """Before anything moves: the mirror's rest lies where its range ends before the field does."""
     beside = {"rig.mirror_offset_x": 0.5, "rig.mirror_offset_y": 0.5, "size": "6400x6400"}
@@ -209,7 +216,7 @@ def test_a_mounting_that_does_not_reach_the_field_is_refused_first(tmp_path: Pat
 
 
 @pytest.mark.usefixtures("no_effects")
-def test_pulses_of_frames_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_pulses_of_frames_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, simulated_map: np.ndarray):
     """One pulse a frame, as cameras give: fine lines are stepped by it, coarse ones lie where the mirror's log says."""
     settings = small_settings(tmp_path, source="rig", visit="first", **{"rig.pulses": "frame", "effects": "none"})
     with emulated(settings, {}, monkeypatch):
@@ -221,14 +228,13 @@ def test_pulses_of_frames_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert {one["method"] for one in told["raw_coarse"]} == {"log"}
     assert {one["method"] for one in told["raw_fine"]} == {"trigger"}
     assert max(one["residual_px"] for one in told["raw_coarse"]) < 16  # a coarse line
-    truth = run_survey(small_settings(tmp_path / "sim", effects="none"), QUIET)
-    alike = class_map_of(published, tmp_path) == class_map_of(truth, tmp_path / "sim")
+    alike = class_map_of(published, tmp_path) == simulated_map
     assert alike.mean() > 0.9
     assert {finding.kind for finding in verify_archive(Archive.open(tmp_path))} == {"whole"}
 
 
 @pytest.mark.usefixtures("no_effects")
-def test_a_rig_as_the_defaults_have_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_rig_as_the_defaults_have_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, simulated_map: np.ndarray):
     """No pulses and no CRC: every line lies where the mirror's log measured it, and the map is nearly the simulated."""
     usual = SurveyRig()
     told = {"rig.pulses": usual.pulses, "rig.with_crc": usual.with_crc, "effects": "none"}
@@ -239,8 +245,7 @@ def test_a_rig_as_the_defaults_have_it(tmp_path: Path, monkeypatch: pytest.Monke
     for name in ("raw_coarse", "raw_fine"):
         record = json.loads((tmp_path / published.receipt["products"][name] / "rig.json").read_text())
         assert {one["method"] for one in record["captures"]} == {"log"}
-    truth = run_survey(small_settings(tmp_path / "sim", effects="none"), QUIET)
-    alike = class_map_of(published, tmp_path) == class_map_of(truth, tmp_path / "sim")
+    alike = class_map_of(published, tmp_path) == simulated_map
     assert alike.mean() > 0.9, alike.mean()
 
 

@@ -11,15 +11,16 @@ from numpy.typing import NDArray
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Axis, Sweep
 from pipeline.planning.coverage import on_scene
-from pipeline.rectify.calibrate import calibrate
-from pipeline.rectify.geolocation import geolocation, grid_points
+from pipeline.rectify.geolocation import grid_points
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
 from pipeline.rectify.resample import resample
+from pipeline.signal.calibrate import calibrate
 from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource
+from tests.pipeline.rectify.aiming import geolocation
 from tests.pipeline.simulator.small_scenes import made_scene
 
 CAMERA = LineCamera(

@@ -9,14 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import PoseError
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import Sweep, line_positions, points_of_scan, scene_to_sweep
-from pipeline.rectify.geolocation import KnotCurve, geolocation, path_geolocation
+from pipeline.rectify.geolocation import KnotCurve, path_geolocation
 from pipeline.rectify.placed import tie_table
 from pipeline.rectify.resample import resample
 from pipeline.rectify.scan_paths import ScanPath, make_scan_paths
-from tests.pipeline.rectify.aiming import CAMERA, aim
+from tests.pipeline.rectify.aiming import CAMERA, aim, geolocation
 
 places = st.floats(-4500, 4500)
 GRID: dict[str, Any] = {"origin_px": (-20.0, 2250.0), "spacing_px": 1.0, "shape": (170, 700)}
@@ -91,15 +90,6 @@ def test_what_is_found_was_seen(swath: float, seed: int) -> None:
     seen = see(aim(swath, centre[inner]), found[hit, 1][inner])
     np.testing.assert_allclose(seen, points[hit][inner], atol=1e-5)
     assert inner.sum() > 20
-
-
-def test_sweeps_that_turn_or_dwell_are_refused() -> None:
-    """The message names the line where the sweep stops running one way."""
-    turning = aim(0.0, np.array([0.0, 1, 2, 3, 2, 5]))
-    with pytest.raises(PoseError, match="turns or stands still near line 3"):
-        geolocation(turning, CAMERA, np.zeros((1, 2)), along="x")
-    with pytest.raises(PoseError, match="near line 1"):
-        geolocation(aim(0.0, np.array([0.0, 1, 1, 2])), CAMERA, np.zeros((1, 2)), along="x")
 
 
 def wandering_scan_path(seed: int, amount_px: float, swath: float = 2600.0) -> ScanPath:

@@ -17,9 +17,10 @@ from pipeline.geometry.camera import LineCamera, footprint
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
 from pipeline.planning.coverage import full_sweeps
-from pipeline.rectify.mosaic import LineCache, MosaicPart, edge_distance, mosaic
+from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
 from pipeline.rectify.placed import place
 from pipeline.rectify.region import mosaic_rows, patch_pixels, read_every_patch, read_patches
+from pipeline.signal.lines import LineCache
 from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import RasterScene, raster_from_values

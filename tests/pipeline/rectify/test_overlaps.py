@@ -17,8 +17,9 @@ from pipeline.geometry.scan import Axis, Sweep, line_positions, points_of_scan, 
 from pipeline.lazy import Once
 from pipeline.planning.coverage import coarse_sweeps, full_sweeps
 from pipeline.rectify.registration.alignment import no_shifts
-from pipeline.rectify.registration.overlaps import BroadSweep, PlacedImage, broad_bands, overlap_windows, places_seen
+from pipeline.rectify.registration.overlaps import BroadSweep, PlacedImage, overlap_windows, places_seen
 from pipeline.rectify.registration.seams import Registration, place_images, register_sweeps
+from pipeline.signal.lines import broad_bands
 from pipeline.simulator.effects.pointing import PointingErrors
 from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import PoseError
-from pipeline.rectify.scan_paths import ScanPath, line_centres, make_scan_paths, number_lines, single_scan_path
+from pipeline.rectify.scan_paths import ScanPath, line_centres, make_scan_paths, number_lines
 from tests.pipeline.rectify.aiming import CAMERA, aim
 
 STEPS = st.lists(st.sampled_from([-3.0, -1.0, 0.0, 0.1, 1.0, 1.0, 1.2, 4.0]), min_size=0, max_size=60)
@@ -124,13 +124,6 @@ def test_a_pace_off_the_plan_is_still_even() -> None:
     np.testing.assert_allclose(scan_path.width, 1.001 * CAMERA.ifov_rad, rtol=1e-9)
     (uneven,) = make_scan_paths(aim(0.0, np.array([0, 1, 2, 3.4, 4.8])), CAMERA, step_px=1.0)
     np.testing.assert_allclose(uneven.width, CAMERA.ifov_rad, rtol=1e-9)
-
-
-def test_single_scan_path_has_a_knot_for_every_line() -> None:
-    """Lines however near each other stay knots of their own, and gaps stay gaps."""
-    scan_path = single_scan_path(aim(0.0, np.array([0.0, 1, 1.1, 5])), CAMERA)
-    assert scan_path.seen.all()
-    np.testing.assert_array_equal(scan_path.lines, np.arange(4))
 
 
 def test_line_out_of_reach_is_named() -> None:

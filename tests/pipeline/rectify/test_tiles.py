@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.rectify.kernels import kernel_taps
-from pipeline.rectify.mosaic import LineCache, cut_runs
+from pipeline.rectify.mosaic import cut_runs
 from pipeline.rectify.placed import PixelGrid, Placed, ScanPathReach, place
 from pipeline.rectify.region import cache_bytes, mosaic_tile, plan_tiles
+from pipeline.signal.lines import LineCache
 from pipeline.source import References
 
 CAMERA = LineCamera(samples=160)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, Sweep
@@ -110,10 +109,3 @@ def test_sweep_that_shows_nothing_of_the_mosaic_is_empty() -> None:
     assert anchor_sweep(broad, CAMERA, GRID, np.full_like(mosaic, np.nan), prior_px=8).found.status == "empty"
     beside = BroadSweep.read(SimulatedSweep(source, sweep_of(swath=400.0)), CAMERA)
     assert anchor_sweep(beside, CAMERA, GRID, mosaic, prior_px=8).found.status == "empty"
-
-
-@pytest.mark.parametrize("prior_px", [-1.0, float("nan"), float("inf")])
-def test_prior_that_is_none_is_refused(prior_px: float) -> None:
-    """A negative or endless prior is named."""
-    with pytest.raises(SettingsError, match="finite prior >= 0 px, got"):
-        anchored(sweep_of(), (0.0, 0.0), prior_px=prior_px)

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from pipeline.errors import SettingsError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel, Sweep, line_positions
-from pipeline.rectify.calibrate import calibrate
+from pipeline.signal.calibrate import calibrate
 from pipeline.simulator.effects.counting import SHOT, dark_electrons, dead_elements, hot_electrons
 from pipeline.simulator.effects.registry import BY_NAME, EFFECTS, USUAL, effects_on
 from pipeline.simulator.effects.sensor import response_gain, stripe_gain

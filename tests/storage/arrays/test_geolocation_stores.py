@@ -11,7 +11,7 @@ import zarr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import IncompleteStoreError, ShapeError
+from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_position, scene_to_direction
 from pipeline.rectify.placed import TieTable, tie_table
@@ -93,5 +93,3 @@ def test_digest_leaves_out_what_does_not() -> None:
     lost = position.copy()
     lost[2] = np.nan
     assert path_digest(lost, usable) == path_digest(position, usable)
-    with pytest.raises(ShapeError, match=r"flags \(line,\)"):
-        path_digest(position, usable[:3])

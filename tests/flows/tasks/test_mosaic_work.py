@@ -13,18 +13,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flows.tasks.mosaic_work import MosaicRecipe, tile_budget, write_mosaic
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import block_means
 from pipeline.geometry.scan import Sweep, line_positions
-from pipeline.rectify.mosaic import LineCache, line_blocks
 from pipeline.rectify.placed import PixelGrid, place
 from pipeline.rectify.region import cache_bytes, plan_tiles
-from pipeline.rectify.tiles import MosaicWork, block_means
+from pipeline.rectify.tiles import MosaicWork, TileMaker, let_tiles_go, opened_tiles
+from pipeline.signal.lines import LineCache, line_blocks
 from pipeline.source import Line, References
-from storage.arrays import tile_work
 from storage.arrays.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
 from storage.arrays.mosaics import MosaicWriter, load_mosaic
-from storage.arrays.tile_work import MosaicRecipe, Thumbnail, ThumbnailCut, TileMaker, tile_budget, write_mosaic
+from storage.arrays.quicklooks import Thumbnail, ThumbnailCut
 from storage.parallel.pool import WorkerPool
 
 CAMERA = LineCamera()
@@ -175,7 +176,7 @@ def test_a_worker_killed_between_tiles_changes_nothing(
     folder = tmp_path / "key.part"
     write_mosaic(recipe_of(cubes), mosaic_at(tmp_path / "a.zarr"), memory=PLENTY, pool=ONE)
     kill = KillOnce((1, 1), (0,), str(folder))
-    monkeypatch.setattr("storage.arrays.tile_work.ThumbnailCut", lambda *about: kill)
+    monkeypatch.setattr("storage.arrays.quicklooks.ThumbnailCut", lambda *about: kill)
     writer = mosaic_at(folder / "m.zarr")
     write_mosaic(recipe_of(cubes), writer, memory=PLENTY, pool=processes, seen=Thumbnail(GRID.shape, [0], 900))
     assert (folder / "killed").exists()
@@ -206,14 +207,13 @@ def test_means_keep_the_lines_of_two_parts_of_a_tile(cubes: list[RawCube], tmp_p
     assert kept.reads == sum(len(line_blocks(slice(0, len(cube.valid_line)))) for cube in cubes)
 
 
-def test_a_worker_lets_tiles_go(tmp_path: Path, cubes: list[RawCube]) -> None:
+def test_a_worker_lets_tiles_go(cubes: list[RawCube]) -> None:
     """Raw lines are kept from tile to tile of a mosaic, and no longer than the process is at tiles."""
-    writer = mosaic_at(tmp_path / "m.zarr")
-    maker = TileMaker(recipe_of(cubes), writer.path, 2**24)
-    maker((slice(0, 64), slice(0, 640)))
-    lines = weakref.ref(tile_work._opened(maker).lines)
+    maker = TileMaker(recipe_of(cubes).open, 2**24)
+    maker(slice(0, 64), slice(0, 640))
+    lines = weakref.ref(opened_tiles(maker).lines)
     assert lines() is not None
-    tile_work.let_tiles_go()
+    let_tiles_go()
     assert lines() is None
 
 
@@ -233,44 +233,16 @@ def test_every_process_counts_against_the_memory(tmp_path: Path, cubes: list[Raw
         write_mosaic(recipe_of(cubes), writer, memory=2**30, pool=processes)
 
 
-@pytest.mark.parametrize("shape", [(8, 12), (9, 13), (3, 2)])
-def test_block_means_are_those_of_what_was_seen(shape: tuple[int, int]) -> None:
-    """Mean over the pixels of a block that are no NaN, smaller blocks at the border; NaN where none was seen."""
-    rng = np.random.default_rng(4)
-    values = rng.normal(size=(*shape, 2)).astype(np.float32)
-    values[0, 0], values[: min(4, shape[0]), : min(4, shape[1]), 1] = np.nan, np.nan
-    coverage = rng.integers(0, 3, shape)
-    means, covered = block_means(values, coverage, 4)
-    for y in range(means.shape[0]):
-        for x in range(means.shape[1]):
-            block = values[4 * y : 4 * y + 4, 4 * x : 4 * x + 4]
-            for band in range(2):
-                seen = block[..., band][np.isfinite(block[..., band])]
-                expected = seen.mean() if seen.size else np.nan
-                np.testing.assert_allclose(means[y, x, band], expected, rtol=1e-5, atol=1e-6)
-            assert covered[y, x] == coverage[4 * y : 4 * y + 4, 4 * x : 4 * x + 4].max()
-
-
-def test_means_of_a_block_do_not_depend_on_holes_in_others() -> None:
-    """However a mosaic is cut into parts, with or without holes in them, the same bits come out."""
-    values = np.random.default_rng(5).lognormal(size=(8, 12, 3)).astype(np.float32)
-    coverage = np.ones((8, 12), np.intp)
-    whole, _ = block_means(values, coverage, 4)
-    values[0, 0, 1], values[7, 11] = np.nan, np.inf
-    torn, _ = block_means(values, coverage, 4)
-    apart = torn != whole
-    assert set(zip(*np.nonzero(apart), strict=True)) == {(0, 0, 1), (1, 2, 0), (1, 2, 1), (1, 2, 2)}
-    assert np.isfinite(torn).all()
-
-
-@pytest.mark.parametrize("pool", [ONE, WorkerPool("processes", 2)])
-def test_a_mosaic_of_means_is_the_mean_of_the_finer_one(cubes: list[RawCube], tmp_path: Path, pool: WorkerPool) -> None:
+@pytest.mark.parametrize("apart", [False, True], ids=["here", "processes"])
+def test_a_mosaic_of_means_is_the_mean_of_the_finer_one(
+    cubes: list[RawCube], tmp_path: Path, processes: WorkerPool, apart: bool
+) -> None:
     """Whoever makes its tiles: 4 x 4 finer pixels a pixel, those that no line reached left out."""
     fine, coarse = recipe_of(cubes), PixelGrid((-68.5, -418.5), 4, (35, 225))
     made = []
     for name, recipe in {"fine": fine, "means": replace(fine, grid=coarse, finer=GRID)}.items():
         writer = MosaicWriter(tmp_path / f"{name}.zarr", recipe.grid.shape, BANDS)
-        write_mosaic(recipe, writer, memory=PLENTY, pool=pool)
+        write_mosaic(recipe, writer, memory=PLENTY, pool=processes if apart else ONE)
         made.append(load_mosaic(tmp_path / f"{name}.zarr"))
     means, covered = block_means(made[0].values, made[0].coverage.astype(np.intp), 4)
     np.testing.assert_allclose(made[1].values, means, rtol=5e-4, atol=1e-6)  # both are stored rounded

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from pipeline.errors import PoseError, RigError, ShapeError
 from pipeline.geometry.mirror import mirror_throughput
-from pipeline.rectify.calibrate import calibrate, judge_elements, reflectance
-from pipeline.rectify.detector import BadElementCriteria, find_bad_elements
+from pipeline.signal.calibrate import calibrate, judge_elements, reflectance
+from pipeline.signal.detector import BadElementCriteria, find_bad_elements
 from pipeline.source import References
 
 

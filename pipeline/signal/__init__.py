@@ -1,0 +1,1 @@
+"""Signal: raw numbers of the camera to scene values, by what its references say of each element."""

@@ -1,0 +1,196 @@
+"""Lines of a sweep as scene values, from no more raw numbers than are asked for.
+
+Raw lines are kept while neighbouring tiles still need them: blocks of whole shards, least recently used out first.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import ShapeError
+from pipeline.signal.calibrate import Elements, calibrate, judge_elements, of_bands
+from pipeline.source import References, SweepLines
+
+BLOCK_LINES = 64  # a shard of a stored sweep: reading one line of it costs as much as reading all
+CHUNK_SAMPLES = 32  # likewise across
+BROAD_BANDS = 16
+
+_Key = tuple[int, int, int, int]  # sweep, block, samples held
+Raw = NDArray[np.uint16]
+ReadWindow = Callable[[slice, slice], Raw]  # (lines, samples) -> (line, sample, band)
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A sweep's lines in scene values: the one place where a survey calibrates."""
+
+    lines: SweepLines
+    gain: NDArray[np.float32] | None = None  # (band,) what the sweep's values are multiplied by
+
+    @property
+    def samples(self) -> int:
+        """Return the samples of a line."""
+        return len(self.lines.references.dark)
+
+    @property
+    def bands(self) -> int:
+        """Return the bands of a line."""
+        return len(self.lines.references.white_reference)
+
+    @cached_property
+    def elements(self) -> Elements:
+        """Judge the detector's elements by all of the references; the gain is in the white reference's values."""
+        plain = self.lines.references
+        if self.gain is None:
+            return judge_elements(plain)
+        if self.gain.shape != plain.white_reference.shape:
+            raise ShapeError(
+                f"sweep {self.lines.sweep.name} has {len(plain.white_reference)} bands, its gain has shape {self.gain.shape}"
+            )
+        return judge_elements(replace(plain, white_reference=(plain.white_reference * self.gain).astype(np.float32)))
+
+    def values(
+        self, read: ReadWindow, numbers: NDArray[np.intp], samples: slice, full_scale_dn: float
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Read and calibrate some lines and samples; return what `calibrate` does, lines that are not valid put out.
+
+        ``samples`` is a run of whole neighbours, `Elements.alone`; ``full_scale_dn`` the camera's, of one sample.
+        """
+        raw, position = _raw_of(read, numbers, samples), self.lines.position[numbers]
+        saturated = full_scale_dn * self.lines.sweep.binning
+        values, valid = calibrate(raw, self.elements.part(samples), saturated_dn=saturated, position=position)
+        usable = self.lines.valid_line[numbers]
+        return values, valid if usable.all() else valid & usable.reshape(-1, *[1] * (valid.ndim - 1))
+
+    def broad_image(
+        self, usable: NDArray[np.bool_], full_scale_dn: float, bands: int = BROAD_BANDS
+    ) -> NDArray[np.float32]:
+        """Return the mean of ``bands`` bands spread over all, (line, sample); NaN where one is not valid.
+
+        Lines are read 64 at a time. ``usable`` (line,) are those whose position may be believed.
+        """
+        lines, chosen = self.lines, broad_bands(self.lines.references, bands)
+        references, saturated = of_bands(lines.references, chosen.tolist()), full_scale_dn * lines.sweep.binning
+        image = np.full((len(usable), self.samples), np.nan, np.float32)
+        for first in range(0, len(usable), BLOCK_LINES):
+            part = slice(first, min(first + BLOCK_LINES, len(usable)))
+            raw = np.ascontiguousarray(lines.read(part.start, part.stop)[..., chosen])
+            at = np.where(usable[part, None], lines.position[part], np.nan)
+            values, valid = calibrate(raw, references, saturated_dn=saturated, position=at)
+            whole = valid if valid.ndim == 2 else valid.all(axis=2)
+            image[part] = np.where(whole & usable[part, None], values.mean(axis=2), np.nan)
+        return image
+
+
+def broad_bands(references: References, bands: int = BROAD_BANDS) -> NDArray[np.intp]:
+    """Choose the bands of a broad-band image: spread over those that nine samples in ten are calibrated in."""
+    good = references.white > references.dark
+    if references.bad is not None:
+        good = good & ~references.bad
+    known = np.flatnonzero(good.mean(axis=0) >= 0.9)
+    if not len(known):
+        known = np.arange(len(references.white_reference))
+    return known[np.unique(np.linspace(0, len(known) - 1, max(bands, 1)).round().astype(np.intp))]
+
+
+@runtime_checkable
+class WindowedLines(Protocol):
+    """A sweep that can be read a part of its samples at a time."""
+
+    def read_window(self, lines: slice, samples: slice) -> Raw:
+        """Raw numbers of some lines and samples, (line, sample, band)."""
+
+
+@dataclass
+class _Block:
+    """One block of one sweep: its raw numbers once read, None before, and what threads wait on for them."""
+
+    lines: SweepLines  # held so that its id stays its own
+    raw: Raw | None = None
+    reading: threading.Lock = field(default_factory=threading.Lock)
+
+
+class LineCache:
+    """Blocks of 64 raw lines of any number of sweeps, at most ``most_bytes`` of them. Threads may share it.
+
+    Two threads that want the same block wait for one read. ``reads`` counts blocks read, ``bytes_held`` what is kept.
+    """
+
+    def __init__(self, most_bytes: int) -> None:
+        self.most_bytes = most_bytes
+        self.reads = 0
+        self.bytes_held = 0
+        self._blocks: OrderedDict[_Key, _Block] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def window(self, lines: SweepLines, wanted: slice, samples: slice, *, likely: slice | None = None) -> Raw:
+        """Give raw numbers (line, sample, band) of some lines and samples, read before or now; not to be written to.
+
+        ``likely`` are samples that later calls will want of the same lines: they are read together, and only calls that
+        name the same ones share what was read.
+        """
+        held = held_samples(lines, samples, likely)
+        within = slice(samples.start - held.start, samples.stop - held.start)
+        parts = []
+        for number in line_blocks(wanted):
+            origin = number * BLOCK_LINES
+            rows = slice(max(wanted.start - origin, 0), min(wanted.stop - origin, BLOCK_LINES))
+            parts.append(self._block(lines, number, held)[rows, within])
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    def _block(self, lines: SweepLines, number: int, samples: slice) -> Raw:
+        key = (id(lines), number, samples.start, samples.stop)
+        with self._lock:
+            block = self._blocks.setdefault(key, _Block(lines))
+            self._blocks.move_to_end(key)
+        with block.reading:
+            if block.raw is None:
+                rows = slice(number * BLOCK_LINES, min((number + 1) * BLOCK_LINES, len(lines.valid_line)))
+                if isinstance(lines, WindowedLines):
+                    raw = lines.read_window(rows, samples)
+                else:
+                    raw = lines.read(rows.start, rows.stop)
+                with self._lock:
+                    block.raw = raw
+                    self.reads += 1
+                    self.bytes_held += raw.nbytes
+                    for old, held in list(self._blocks.items()):  # the newest and those still being read stay
+                        if self.bytes_held > self.most_bytes and old != key and held.raw is not None:
+                            self.bytes_held -= held.raw.nbytes
+                            del self._blocks[old]
+            return block.raw
+
+
+def line_blocks(lines: slice) -> range:
+    """Numbers of the blocks that hold some lines."""
+    return range(lines.start // BLOCK_LINES, -(-lines.stop // BLOCK_LINES))
+
+
+def held_samples(lines: SweepLines, samples: slice, likely: slice | None = None) -> slice:
+    """Samples to read and hold: those wanted and likely, in whole chunks; all of a sweep read by whole lines."""
+    count = lines.references.dark.shape[0]
+    if not isinstance(lines, WindowedLines):
+        return slice(0, count)
+    other = samples if likely is None else likely
+    first, stop = min(samples.start, other.start), max(samples.stop, other.stop)
+    return slice(first // CHUNK_SAMPLES * CHUNK_SAMPLES, min(-(-stop // CHUNK_SAMPLES) * CHUNK_SAMPLES, count))
+
+
+def _raw_of(read: ReadWindow, members: NDArray[np.intp], samples: slice) -> Raw:
+    """Raw numbers of the lines ``members``, in their order."""
+    first, last = int(members.min()), int(members.max()) + 1
+    raw = read(slice(first, last), samples)
+    if last - first == len(members):
+        if (np.diff(members) == 1).all():
+            return raw
+        if (np.diff(members) == -1).all():
+            return raw[::-1]
+    return raw[members - first]
