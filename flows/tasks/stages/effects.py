@@ -18,9 +18,8 @@ from pipeline.errors import IncompleteStoreError
 from pipeline.simulator.effects.effect import Effect, Radiance, SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.effects.probe import Probe, unit_at
-from pipeline.simulator.effects.registry import BY_NAME, EFFECTS
-from pipeline.simulator.render import expected_light
-from pipeline.simulator.selection.choice import TOTAL, Decision, decide, everything, list_effects, pays, sum_up
+from pipeline.simulator.render import BY_NAME, EFFECTS, expected_light
+from pipeline.simulator.selection.choice import TOTAL, Decision, decide, list_effects, sum_up
 from pipeline.simulator.selection.survey_probe import probe_survey
 from pipeline.simulator.selection.verification import candidate_blocks, verify, worst_blocks
 from pipeline.simulator.simulated import SimulatedSource, sweep_block, sweep_starts
@@ -52,13 +51,8 @@ def choose_effects(run: CaptureRun) -> Wanted:
     if not run.source.simulates:
         return Wanted(lambda path: write(path, {"effects": [], "total": None}), {"source": run.source.name})
 
-    small = _everything_where_small(run)
-
     def build(path: Path) -> None:
-        """Look at the scene, choose and check; or take all without a look."""
-        if small is not None:
-            write(path, {"effects": list_effects(small), "total": sum_up(small)})
-            return
+        """Look at the scene, choose and check."""
         rig = run.settings.simulated_rig
         probes = probe_survey(run.scene, rig, run.planned, tolerance.unit)
         decision = decide(probes, rig, EFFECTS, tolerance.value, asked)
@@ -77,19 +71,8 @@ def choose_effects(run: CaptureRun) -> Wanted:
             name: plain_value(part) for name, part in asdict(run.settings.simulated_rig).items() if name != "camera"
         },
         "sweeps": [asdict(sweep) for sweep in run.planned],
-        **({} if small is None else {"weighed": False}),
     }
     return Wanted(build, params)
-
-
-def _everything_where_small(run: CaptureRun) -> Decision | None:
-    """All effects where choosing takes longer than it can save, and the run leaves it then; None where it chooses."""
-    tolerance = run.settings.tol
-    if run.weighs_small or run.settings.effects != "auto" or tolerance.value == 0:
-        return None
-    rig, bands = run.settings.simulated_rig, len(run.scene.wavelength_nm)
-    found = everything(run.scene, rig, run.planned, EFFECTS, tolerance.value, tolerance.unit)
-    return None if pays(found, bands) else found
 
 
 def load_manifest(effects: StageRef) -> dict[str, Any]:

@@ -16,11 +16,10 @@ from pipeline.rectify.geolocation import geolocation, grid_points
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
 from pipeline.rectify.resample import resample
-from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource
-from tests.pipeline.simulator.small_scenes import made_scene
+from tests.pipeline.simulator.small_scenes import effects_on, made_scene
 
 CAMERA = LineCamera(
     bits=14, electrons_per_dn=1.0
