@@ -101,7 +101,6 @@ def simulate(
     coarse: Switch = False,
     settings: Path | None = None,
     flags: SimulationFlags = NO_SIMULATION_FLAGS,
-    compare: Path | None = None,
     as_json: AsJson = False,
 ) -> int:
     """Simulate a scan of all of SCENE with the effects that matter to it, and tell which were left out and why.
@@ -120,12 +119,9 @@ def simulate(
     settings
         A survey's TOML file, for what the rig, the air and the light are like: [camera], [optics], [mirror],
         [detector], [air], [sky]. Flags win over it.
-    compare
-        A PNG to write: lines with everything on and exact, the same as simulated, and where they differ, with the times
-        of both. Takes all lines once more both ways, or as many as about a minute allows.
     """
     given = {"scene": scene, "out": out, "source": "sim", **by_setting(flags)}
-    record = simulate_command.run_simulate(load_settings(settings, given), stderr, coarse=coarse, picture=compare)
+    record = simulate_command.run_simulate(load_settings(settings, given), stderr, coarse=coarse)
     if as_json:
         print_json(record)
     return 0
@@ -155,9 +151,7 @@ def check(
         Also send the mirror round a small square, within 0.05 of the middle of its range, and read back where it went.
         It ends at 0; 0.
     """
-    return rig_commands.run_check(
-        rig_commands.check_request(settings, port, camera, move=move), stderr, as_json=as_json
-    )
+    return rig_commands.run_check(settings, port, camera, stderr, move=move, as_json=as_json)
 
 
 def emulate(
@@ -193,5 +187,4 @@ def emulate(
     """
     given = {"scene": scene, "size": size, **by_setting(flags)}
     asked = rig_commands.emulated_settings(settings, given)
-    request = rig_commands.EmulateRequest(asked, baud, speed, out)
-    return rig_commands.run_emulate(request, stderr, as_json=as_json)
+    return rig_commands.run_emulate(asked, stderr, baud=baud, speed=speed, out=out, as_json=as_json)

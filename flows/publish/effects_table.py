@@ -35,7 +35,7 @@ def print_effects(effects: Iterable[Row], total: Row, console: Console) -> None:
         table.add_row(*_figures(row, total), *([escape(_format_row(row))] if wide else []))
     console.print(table)
     console.print(escape(_KEY.format(unit=UNIT_NAMES[total["unit"]])), style="dim")
-    if not wide and not total.get("unweighed"):
+    if not wide:
         for row in there:
             console.print(f"[bold]{escape(row['name'])}[/]: {escape(_format_row(row))}")
     absent = [f"{row['name']} ({row['magnitude']})" for row in rows if row["reason"] == "absent"]
@@ -53,7 +53,7 @@ def _figures(row: Row, total: Row) -> list[str]:
     return [
         escape(row["name"]),
         f"[{colour}]{escape(row['variant'] or 'off')}[/]",
-        DASH if total.get("unweighed") else format_change(row["left_out"], endless=True),
+        format_change(row["left_out"], endless=True),
         format_change(row["bound"], endless=True),
         "" if row["measured"] is None else format_change(row["measured"]),
         "" if not row["cost_s"] else "< 0.01 s" if row["cost_s"] < 0.01 else format_seconds(row["cost_s"]),
@@ -70,7 +70,6 @@ def _format_row(row: Row) -> str:
         "spent": "the tolerance is spent where it saves more: ",
         "asked": "asked for: ",
         "unasked": "not asked for: ",
-        "unweighed": "",
         "always": "always there: ",
     }[row["reason"]]
     magnitude: str = row["magnitude"]
@@ -98,11 +97,6 @@ def format_total(total: Mapping[str, Any]) -> Sequence[str]:
         words.append(
             f"What is left out or cheapened changes a stored number by at most {total['bound']:.2g} {unit}{measured}."
         )
-    if total.get("unweighed"):
-        return [*words[:1], "On a scene so small choosing takes longer than it can save: nothing was looked at."]
-    exact, cheap = (format_seconds(max(total[name], 0.0)) for name in ("saved_s", "saved_cheap_s"))
-    words.append(
-        f"That saves about {exact} of CPU in all sweeps decided on against all effects in full, "
-        f"{cheap} against all as cheap as a tenth of the tolerance lets them be."
-    )
+    exact = format_seconds(max(total["saved_s"], 0.0))
+    words.append(f"That saves about {exact} of CPU in all sweeps decided on against all effects in full.")
     return words

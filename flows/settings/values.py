@@ -19,7 +19,7 @@ from pipeline.planning.partial_scans import LineRun
 from pipeline.planning.uniform_scans import MIOU
 from pipeline.setting_fields import format_number, numbers_of
 from pipeline.simulator.effects.probe import Unit
-from pipeline.simulator.effects.registry import BY_NAME
+from pipeline.simulator.render import BY_NAME
 from pipeline.simulator.scenes.farm.farm_scene import refuse_removed
 from pipeline.simulator.selection.choice import named_effects
 from storage.archive.staging import is_name

@@ -9,7 +9,7 @@ import tempfile
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import cast
@@ -26,64 +26,54 @@ from flows.tasks.stages.effects import choose_effects, source_with
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from flows.terminal.progress import on_stdout, print_json
 from pipeline.errors import SettingsError
-from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import STRAIGHT
-from pipeline.geometry.scan import CostModel
 from pipeline.rig.device_settings import CameraLimits, SurveyRig
-from pipeline.rig.devices import SYSTEM_CLOCK
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock, ServedRig
 from pipeline.rig.opening import open_camera_driver, open_devices, open_mirror_driver
 from pipeline.rig.rig_check import TRIGGERS, CheckRow, Device, check_camera, check_mirror, check_triggers, works
+from pipeline.rig.transports import SYSTEM_CLOCK
 from pipeline.simulator.simulated import SimulatedSource
 
 _COLOURS = {"ok": "green", "warn": "yellow", "fail": "bold red"}
 
 
-@dataclass(frozen=True)
-class CheckRequest:
-    """Which devices to check; None leaves one out."""
+def run_check(
+    settings: Path | None,
+    port: str | None,
+    camera: str | None,
+    console: Console,
+    *,
+    move: bool = False,
+    as_json: bool = False,
+) -> int:
+    """Check both devices of the settings, or those that are named, with a table on stdout.
 
-    rig: SurveyRig
-    mirror: bool = True
-    camera: bool = True
-    move: bool = False
-    vector_pairs: int = CostModel.vector_pairs
-    exposed: LineCamera = field(default_factory=LineCamera)  # times of a capture whose edges are counted
-
-
-def check_request(settings: Path | None, port: str | None, camera: str | None, *, move: bool = False) -> CheckRequest:
-    """What to check: both devices of the settings, or those that are named (SettingsError: they cannot be used)."""
+    Returns 0 where nothing failed, 3 where one of two works, 1 otherwise. Raises SettingsError: they cannot be used.
+    """
     wanted = load_settings(settings)
-    rig = wanted.rig
-    if port is not None:
-        rig = replace(rig, port=port)
-    if camera is not None:
-        rig = _at(rig, camera)
+    rig = replace(wanted.rig, park_at_close=False)  # the square ends at 0; 0 by itself
+    rig = rig if port is None else replace(rig, port=port)
+    rig = rig if camera is None else _at(rig, camera)
     both = settings is not None or port is camera is None
     mirror_asked, camera_asked = both or port is not None, both or camera is not None
-    return CheckRequest(rig, mirror_asked, camera_asked, move, wanted.cost.vector_pairs, wanted.camera)
-
-
-def run_check(request: CheckRequest, console: Console, *, as_json: bool = False) -> int:
-    """Check the devices, with a table on stdout; 0 where nothing failed, 3 where one of two works, 1 otherwise."""
-    rig = replace(request.rig, park_at_close=False)  # the square ends at 0; 0 by itself
-    limits = CameraLimits(most_rate_hz=request.exposed.max_rate_hz)
-    asked: dict[Device, bool] = {"mirror": request.mirror, "camera": request.camera}
+    pairs, limits = wanted.cost.vector_pairs, CameraLimits(most_rate_hz=wanted.camera.max_rate_hz)
     rows: list[CheckRow] = []
-    if request.mirror:
+    if mirror_asked:
         with console.status(f"asking the mirror at {rig.port}"):
-            open_mirror = partial(open_mirror_driver, rig, request.vector_pairs)
-            rows += check_mirror(open_mirror, SYSTEM_CLOCK, move=request.move)
-    if request.camera:
+            rows += check_mirror(partial(open_mirror_driver, rig, pairs), SYSTEM_CLOCK, move=move)
+    if camera_asked:
         with console.status(f"asking the camera at {rig.host}"):
             rows += check_camera(partial(open_camera_driver, rig, limits))
-    why_not = _why_no_triggers(request, rows)
-    if request.mirror and why_not:
+    if not move or not camera_asked:
+        why_not = "without --move" if not move else "without a camera"
+    else:
+        why_not = "" if all(row.verdict == "ok" for row in rows) else "as not all of the above is in order"
+    if mirror_asked and why_not:
         rows.append(CheckRow("mirror", TRIGGERS, f'not tried {why_not}; pulses = "{rig.pulses}" is taken on trust'))
-    elif request.mirror:
+    elif mirror_asked:
         with console.status("asking what steps a path"):
-            connect = partial(open_devices, rig, request.vector_pairs, limits)
-            rows += check_triggers(connect, SYSTEM_CLOCK, rig.pulses, request.exposed)
+            rows += check_triggers(partial(open_devices, rig, pairs, limits), SYSTEM_CLOCK, rig.pulses, wanted.camera)
+    asked: dict[Device, bool] = {"mirror": mirror_asked, "camera": camera_asked}
     good = [works(rows, device) for device, is_asked in asked.items() if is_asked]
     code = DONE if all(good) else PARTLY if any(good) else FAILED
     if not as_json:
@@ -91,25 +81,16 @@ def run_check(request: CheckRequest, console: Console, *, as_json: bool = False)
         return code
     print_json(
         {
-            "port": rig.port if request.mirror else None,
-            "camera": f"{rig.host}:{rig.control_port}" if request.camera else None,
-            "move": request.move,
-            "rows": [row.record() for row in rows],
+            "port": rig.port if mirror_asked else None,
+            "camera": f"{rig.host}:{rig.control_port}" if camera_asked else None,
+            "move": move,
+            "rows": [asdict(row) for row in rows],
             "failed": sum(row.verdict == "fail" for row in rows),
             "warned": sum(row.verdict == "warn" for row in rows),
             "exit_code": code,
         }
     )
     return code
-
-
-def _why_no_triggers(request: CheckRequest, rows: Sequence[CheckRow]) -> str:
-    """Return why no path is played; "" where one is."""
-    if not request.move:
-        return "without --move"
-    if not request.camera:
-        return "without a camera"
-    return "" if all(row.verdict == "ok" for row in rows) else "as not all of the above is in order"
 
 
 def _print(rows: Sequence[CheckRow], console: Console) -> None:
@@ -141,24 +122,6 @@ EMULATED = ("camera", "optics", "mirror", "detector", "air", "sky")  # tables th
 USUAL_SIZE = (256, 256)  # of a built-in scene [px]
 
 
-@dataclass(frozen=True)
-class EmulateRequest:
-    """What to emulate, and how."""
-
-    settings: Settings
-    baud: int = SurveyRig.baud
-    speed: float = 1.0
-    out: Path | None = None  # a survey's TOML to write
-
-    def check(self) -> None:
-        """Refuse a speed or a file that cannot be (SettingsError), before minutes are spent on the scene."""
-        FastClock(self.speed)
-        if self.baud < 0:
-            raise SettingsError(f"--baud expects bits a second, or 0 for no pace, got {self.baud}")
-        if self.out is not None and not self.out.parent.is_dir():
-            raise SettingsError(f"--out {self.out}: there is no folder {self.out.parent}; make it, or choose another")
-
-
 def emulated_settings(path: Path | None, flags: Mapping[str, object]) -> Settings:
     """Settings of what is emulated (SettingsError: one cannot be used); a built-in scene is small unless told."""
     wanted = load_settings(path, flags, usual={"source": "sim"})
@@ -167,47 +130,61 @@ def emulated_settings(path: Path | None, flags: Mapping[str, object]) -> Setting
 
 
 def run_emulate(
-    request: EmulateRequest, console: Console, *, as_json: bool = False, ended: threading.Event | None = None
+    settings: Settings,
+    console: Console,
+    *,
+    baud: int = SurveyRig.baud,
+    speed: float = 1.0,
+    out: Path | None = None,
+    as_json: bool = False,
+    ended: threading.Event | None = None,
 ) -> int:
-    """Emulate a rig until Ctrl-C, SIGTERM or ``ended``; how to connect goes to stdout, its state to ``console``."""
-    request.check()
+    """Emulate a rig until Ctrl-C, SIGTERM or ``ended``; how to connect goes to stdout, its state to ``console``.
+
+    ``out`` is a survey's TOML to write. Raises SettingsError, before minutes are spent on the scene: speed, baud or
+    file cannot be.
+    """
+    FastClock(speed)  # refuses a speed that cannot be
+    if baud < 0:
+        raise SettingsError(f"--baud expects bits a second, or 0 for no pace, got {baud}")
+    if out is not None and not out.parent.is_dir():
+        raise SettingsError(f"--out {out}: there is no folder {out.parent}; make it, or choose another")
     with console.status("drawing the scene"):
-        source, notes = emulated_source(request.settings)
+        source, notes = emulated_source(settings)
     for note in notes:
         console.print(f"[dim]note: {escape(note)}[/]")
-    clock = FastClock(request.speed)
-    rig = EmulatedRig(source, clock, kept=KEPT_CAPTURES, mounting=request.settings.rig.mounting)
-    with _ending(ended or threading.Event()) as end, rig.serve(baud=request.baud) as served:
-        _tell(request, served, console, as_json=as_json)
-        with console.status(_state(rig)) as line:
+    rig = EmulatedRig(source, FastClock(speed), kept=KEPT_CAPTURES, mounting=settings.rig.mounting)
+    with _ending(ended or threading.Event()) as end, rig.serve(baud=baud) as served:
+        table = _rig_table(served, settings.rig)
+        if out is not None:
+            _write_survey(out, settings, table)
+            console.print(f"survey it with: spectralzoom survey {escape(str(out))}")
+        if as_json:
+            print_json({"rig": table, "speed": speed, "toml": out and str(out)})
+        else:
+            sys.stdout.write(f"{_toml_table('rig', table)}\n")
+        sys.stdout.flush()
+        console.print("emulating a rig; Ctrl-C ends it")
+        with console.status(escape(rig.state)) as line:
             while not end.wait(EVERY_S):
-                line.update(_state(rig))
-        console.print(f"closed: {_state(rig)}", soft_wrap=True)
+                line.update(escape(rig.state))
+        console.print(f"closed: {escape(rig.state)}", soft_wrap=True)
     return 0
 
 
-def _tell(request: EmulateRequest, served: ServedRig, console: Console, *, as_json: bool) -> None:
-    table = _rig_table(served, request.settings.rig)
-    if request.out is not None:
-        try:
-            settings = request.settings
-            size = None if settings.size is None else f"{settings.size[0]}x{settings.size[1]}"
-            names = ("scene", "size", "day", "hour", "bands", "wavelengths", "seed", "effects", "tol", "source")
-            wanted = {name: getattr(settings, name) for name in names}
-            wanted |= {"size": size, "tol": str(settings.tol), "source": "rig"}
-            given = [f"{key} = {_toml_value(value)}" for key, value in wanted.items() if value is not None]
-            tables = [_toml_table(name, values) for name, values in {**_tables_changed(settings), "rig": table}.items()]
-            lines = ["# A survey of an emulated rig, for as long as that runs.", *given, "", *tables]
-            request.out.write_text("\n".join(lines), encoding="utf-8")
-        except OSError as error:
-            raise SettingsError(f"cannot write {request.out}: {error.strerror}; choose another --out") from error
-        console.print(f"survey it with: spectralzoom survey {escape(str(request.out))}")
-    if as_json:
-        print_json({"rig": table, "speed": request.speed, "toml": request.out and str(request.out)})
-    else:
-        sys.stdout.write(f"{_toml_table('rig', table)}\n")
-    sys.stdout.flush()
-    console.print("emulating a rig; Ctrl-C ends it")
+def _write_survey(out: Path, settings: Settings, table: dict[str, object]) -> None:
+    """Write the settings of a survey of the emulated rig, whose table [rig] this is."""
+    size = None if settings.size is None else f"{settings.size[0]}x{settings.size[1]}"
+    names = ("scene", "size", "day", "hour", "bands", "wavelengths", "seed", "effects", "tol", "source")
+    wanted = {name: getattr(settings, name) for name in names}
+    wanted |= {"size": size, "tol": str(settings.tol), "source": "rig"}
+    given = [f"{key} = {_toml_value(value)}" for key, value in wanted.items() if value is not None]
+    tables = [_toml_table(name, values) for name, values in {**_tables_changed(settings), "rig": table}.items()]
+    text = "\n".join(["# A survey of an emulated rig, for as long as that runs.", *given, "", *tables])
+    try:
+        out.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise SettingsError(f"cannot write {out}: {error.strerror}; choose another --out") from error
 
 
 def _rig_table(served: ServedRig, rig: SurveyRig) -> dict[str, object]:
@@ -246,14 +223,6 @@ def _toml_value(value: object) -> str:
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return f"[{', '.join(map(_toml_value, value))}]" if isinstance(value, tuple) else str(value)
-
-
-def _state(rig: EmulatedRig) -> str:
-    seen = rig.seen()
-    x, y = seen.position
-    last = f", last: {seen.last}" if seen.last else ""
-    camera = "capturing" if seen.capturing else "idle"
-    return escape(f"mirror {x:+.4f}; {y:+.4f}, {seen.mode}{last} | camera {camera}, {seen.captures} captures")
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from pipeline.rig.camera.camera_files import KeptInMemory
 from pipeline.rig.capture.capture_runner import RigDevices
 from pipeline.rig.capture.rig_source import RigSource
 from pipeline.rig.device_settings import CameraLimits, check_times
-from pipeline.rig.devices import SYSTEM_CLOCK, Clock
+from pipeline.rig.transports import SYSTEM_CLOCK, Clock
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.source import Source
 from storage.arrays.fetched_files import FetchedFiles

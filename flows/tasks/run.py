@@ -109,7 +109,6 @@ class CaptureRun:
     scene: RasterScene
     planned: tuple[Sweep, ...]  # that stand for all the rig may take: the coarse pass and the scan of everything
     report: Report = field(default=lambda done: None)
-    weighs_small: bool = True  # chooses effects even where that takes longer than it can save
 
     @property
     def camera(self) -> LineCamera:

@@ -21,7 +21,7 @@ from pipeline.ground.map_grid import median_footprint_m
 from pipeline.ground.view import GroundView
 from pipeline.lazy import Once
 from pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
-from pipeline.simulator.scenes.farm.seasons import sun_over_farm
+from pipeline.simulator.scenes.farm.land import sun_over_farm
 from pipeline.simulator.scenes.scene import RasterScene
 
 UNIFORM_STEPS = (1, 2)  # pixels from line to line of what the weights for uniform scans read

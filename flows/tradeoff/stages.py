@@ -47,9 +47,8 @@ from pipeline.rectify.region import mosaic_rows
 from pipeline.rectify.resample import resample
 from pipeline.simulator.effects.effect import Effect, SweepBlock
 from pipeline.simulator.effects.probe import noise_electrons
-from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.readout import dark_frame, read_out
-from pipeline.simulator.render import expected_light
+from pipeline.simulator.render import EFFECTS, expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import RasterScene

@@ -32,7 +32,7 @@ from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES, FARM_PIXEL_M
-from pipeline.simulator.scenes.farm.seasons import sun_over_farm
+from pipeline.simulator.scenes.farm.land import sun_over_farm
 
 
 @dataclass(frozen=True)

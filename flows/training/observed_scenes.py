@@ -22,8 +22,7 @@ from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
 from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.planning.coverage import cheapest_full, coarse_sweeps
 from pipeline.rectify.region import mosaic_rows
-from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.render import Choice
+from pipeline.simulator.render import EFFECTS, Choice
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_scene import law_of_key
 from pipeline.simulator.scenes.scene import RasterScene

@@ -146,7 +146,6 @@ class RecordedSource:
             field_shape,
         )
         self.name, self.notes = name, tuple(notes)
-        self._read = [np.zeros(one.sweep.lines, np.bool_) for one in self.sweeps]
         for one in self.sweeps:
             wanted = (camera.samples // one.sweep.binning, len(wavelength_nm))
             if one.references.dark.shape != wanted:
@@ -155,11 +154,6 @@ class RecordedSource:
                     f"{camera.samples} samples and {len(wavelength_nm)} wavelengths gives {wanted} with binning "
                     f"{one.sweep.binning}; set camera.samples and the wavelengths to what was recorded"
                 )
-
-    @property
-    def lines_read(self) -> int:
-        """Recorded lines that were read so far, each counted once."""
-        return sum(int(np.count_nonzero(read)) for read in self._read)
 
     @property
     def lines_recorded(self) -> int:
@@ -329,7 +323,6 @@ class RecordedSource:
             here = numbers[picked.place[numbers] == place]
             wanted, back = np.unique(picked.line[here], return_inverse=True)
             one = self.sweeps[place]
-            self._read[place][wanted] = True
             block = bin_samples(one.read_lines(wanted), sweep.binning // one.sweep.binning)
             data |= {int(number): block[at] for number, at in zip(here, back, strict=True)}
         for number in numbers.tolist():

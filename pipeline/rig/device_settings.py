@@ -214,9 +214,6 @@ class SurveyRig(MirrorLink):
         "At the mirror's trigger input: one a held position (a pulse generator between camera and mirror), one a frame "
         "(steps fine sweeps only), or none: the path then goes by the mirror's clock",
     )
-    log_pulses: bool = stated(
-        False, "Read the mirror's log with pulses too: lines lie where it measured, tied by edges"
-    )
     settle_s: float = stated(2.0, "Most that the mirror may take to come to rest", "s", 0.01, 60)
     white_reference: float = stated(1.0, "Value of the white reference", "", 1e-6, 1e6)
     white_at_rest: bool = stated(True, "The white frame was taken through the mirror at 0; 0")

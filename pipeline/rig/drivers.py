@@ -1,7 +1,7 @@
 """Protocols of a rig's two devices: all that a survey asks of a mirror and of a camera, whoever makes them.
 
 `MirrorController` and `HeadwallCamera` implement them. Times are those of the clock that a driver was opened with.
-Methods raise `RigError` or one of its kinds in :mod:`pipeline.rig.devices`; besides those every method may raise
+Methods raise `RigError` or one of its kinds in :mod:`pipeline.rig.transports`; besides those every method may raise
 `DeviceGone` and `DeadlinePassed`.
 """
 
@@ -79,8 +79,8 @@ class MirrorDriver(Protocol):
     def index(self) -> int:
         """Return the loaded position that plays now, or played last, counted from 0."""
 
-    def start_log(self, rate_hz: float | None = None, *, with_index: bool = False) -> None:
-        """Begin to log measured positions ``rate_hz`` times a second, with the path's index where asked."""
+    def start_log(self, rate_hz: float) -> None:
+        """Begin to log measured positions ``rate_hz`` times a second."""
 
     def read_log(self) -> MotionLog:
         """End the log and return it: positions (sample, 2), their rate, and when the first was taken.

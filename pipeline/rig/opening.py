@@ -12,9 +12,9 @@ from pipeline.errors import SettingsError
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.capture.capture_runner import RigDevices
 from pipeline.rig.device_settings import CameraLimits, SurveyRig
-from pipeline.rig.devices import SYSTEM_CLOCK, Clock
 from pipeline.rig.drivers import CameraDriver, MirrorDriver
 from pipeline.rig.mirror.mirror_controller import open_mirror
+from pipeline.rig.transports import SYSTEM_CLOCK, Clock
 
 Setting = Literal["mirror_driver", "camera_driver"]
 Factory = Callable[[SurveyRig, Clock], Any]

@@ -10,7 +10,7 @@ import logging
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
@@ -24,10 +24,10 @@ from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.capture.capture_paths import capture_prefix
 from pipeline.rig.capture.capture_runner import POLL_S, SLACK_S, RigDevices
 from pipeline.rig.device_settings import Pulses
-from pipeline.rig.devices import Clock
 from pipeline.rig.drivers import CameraDriver, MirrorDriver
 from pipeline.rig.mirror.mirror_controller import MirrorController, check_model
 from pipeline.rig.mirror.pro_mode import Status, Trigger
+from pipeline.rig.transports import Clock
 
 Verdict = Literal["ok", "warn", "fail"]
 Device = Literal["mirror", "camera"]
@@ -54,10 +54,6 @@ class CheckRow:
     came: str
     verdict: Verdict = "ok"
     mend: str = ""
-
-    def record(self) -> dict[str, str]:
-        """As plain values."""
-        return asdict(self)
 
 
 def failed(device: Device, asked: str, error: PipelineError) -> CheckRow:

@@ -17,22 +17,20 @@ from pipeline.simulator.effects.counting import (
     DARK_CURRENT,
     DEFECTS,
     EXACT,
+    LEAST_MERGED_READ_E,
     READ_NOISE,
     SATURATION,
     SHOT,
     dark_electrons,
     dead_elements,
     hot_electrons,
-    well_reached,
-)
-from pipeline.simulator.effects.effect import OFF, SweepBlock
-from pipeline.simulator.effects.noise import (
-    LEAST_MERGED_READ_E,
     least_expected,
     normal_deviates,
     photon_counts,
     rounded_counts,
+    well_reached,
 )
+from pipeline.simulator.effects.effect import OFF, SweepBlock
 from pipeline.simulator.render import Choice
 
 if TYPE_CHECKING:

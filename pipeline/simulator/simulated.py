@@ -21,11 +21,9 @@ from pipeline.simulator.effects.counting import DEFECTS, dead_elements, hot_elec
 from pipeline.simulator.effects.effect import OFF, SweepBlock
 from pipeline.simulator.effects.mirror_throughput import VIGNETTING
 from pipeline.simulator.effects.pointing import Pointing
-from pipeline.simulator.effects.registry import USUAL
-from pipeline.simulator.effects.sensor import PRNU, STRIPING
-from pipeline.simulator.effects.spectrometer import RESPONSE, SMILE
+from pipeline.simulator.effects.spectrometer import PRNU, RESPONSE, SMILE, STRIPING
 from pipeline.simulator.readout import dark_frame, read_out
-from pipeline.simulator.render import Choice, expected_light
+from pipeline.simulator.render import USUAL, Choice, expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.source import AT_REST, Line, References
@@ -78,10 +76,7 @@ class SimulatedSource:
     def started_s(self, sweep: Sweep) -> float:
         return 0.0 if self.clock is None else float(self.clock.get(sweep.name, 0.0))
 
-    def block(self, sweep: Sweep, lines: range) -> SweepBlock:
-        return sweep_block(self.scene, self.rig, sweep, lines, seed=self.seed, started_s=self.started_s(sweep))
-
-    def render(self, sweep: Sweep, lines: range) -> NDArray[np.uint16]:
+    def render(self, sweep: Sweep, lines: range) -> Raw:
         started_s = self.started_s(sweep)
         return render_lines(self.scene, self.rig, self.choice, sweep, lines, seed=self.seed, started_s=started_s)
 

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
-from pipeline.rig.devices import NotKept
+from pipeline.rig.transports import NotKept
 from storage.archive.staging import format_disk_error, open_plain, plain_reader, plain_size, read_plain, sync_path
 
 SYNC_BYTES = 1 << 24

@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.capture.pointing import PlayedVector, angles_to_positions, split_vector
+from pipeline.capture.straight_scans import PlayedVector, angles_to_positions, split_vector
 from pipeline.errors import PoseError, SceneError
 from pipeline.geometry.mirror import RIM_SLACK, STRAIGHT, Mounting, check_reach
 from pipeline.lazy import deferred

@@ -14,11 +14,10 @@ import numpy as np
 from measure import Row
 
 from pipeline.rig.device_settings import MirrorSettings, ReadBack
-from pipeline.rig.devices import SYSTEM_CLOCK
 from pipeline.rig.emulator.emulated_rig import EmulatedPort
 from pipeline.rig.emulator.mirror_device import MirrorDevice
 from pipeline.rig.mirror.mirror_controller import open_mirror
-from pipeline.rig.transports import BITS_PER_BYTE
+from pipeline.rig.transports import BITS_PER_BYTE, SYSTEM_CLOCK
 
 PAIRS = 1500
 BAUDS = (115200, 256000)

@@ -21,11 +21,11 @@ from pipeline.rig.capture.capture_paths import REFERENCES, capture_prefix
 from pipeline.rig.capture.capture_runner import RigDevices
 from pipeline.rig.capture.rig_source import RigSource
 from pipeline.rig.device_settings import CameraLimits, SurveyRig
-from pipeline.rig.devices import StateUnknown
 from pipeline.rig.drivers import CameraDriver
 from pipeline.rig.emulator.emulated_rig import EmulatedRig
 from pipeline.rig.opening import open_camera_driver, open_mirror_driver
 from pipeline.rig.rig_check import check_camera
+from pipeline.rig.transports import StateUnknown
 from tests.docs.pages import DOCS, ROOT, blocks_of
 from tests.pipeline.rig.in_process import InProcessRig, ManualClock
 from tests.pipeline.rig.small_rig import CAMERA, FINE, small_source

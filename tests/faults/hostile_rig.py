@@ -22,9 +22,9 @@ from pipeline.errors import PipelineError
 from pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_files
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.device_settings import CameraAddress, ControlPatience, FileServer, MirrorSettings
-from pipeline.rig.devices import SYSTEM_CLOCK
 from pipeline.rig.mirror.mirror_controller import open_mirror
 from pipeline.rig.rig_check import CheckRow, check_camera, check_mirror
+from pipeline.rig.transports import SYSTEM_CLOCK
 from tests.faults.fault_table import Clock, Row, reported_wrong
 from tests.pipeline.rig.camera.hostile_camera import (
     REPLIES,

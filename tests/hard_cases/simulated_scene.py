@@ -16,8 +16,7 @@ from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
 from pipeline.simulator.effects.effect import Effect, SweepBlock
 from pipeline.simulator.effects.probe import Probe, noise_electrons
-from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.render import expected_light
+from pipeline.simulator.render import EFFECTS, expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig, Sky
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
 from pipeline.simulator.selection import survey_probe

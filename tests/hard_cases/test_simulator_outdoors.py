@@ -12,19 +12,17 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.simulator.effects.air import PARALLAX, TURBULENCE, turbulence_px
+from pipeline.simulator.effects.air import PARALLAX, PATH_RADIANCE, TURBULENCE, turbulence_px
 from pipeline.simulator.effects.blurs import DEFOCUS
-from pipeline.simulator.effects.haze import PATH_RADIANCE
 from pipeline.simulator.effects.lighting import DRIFT
 from pipeline.simulator.effects.line import ROTATION
-from pipeline.simulator.effects.mirror_path import LAG
-from pipeline.simulator.effects.registry import EFFECTS
+from pipeline.simulator.effects.pointing import LAG
 from pipeline.simulator.readout import read_out
-from pipeline.simulator.render import expected_light
+from pipeline.simulator.render import EFFECTS, expected_light
 from pipeline.simulator.rig_model import Air, MirrorMotion, Optics, Rig, Sky
 from pipeline.simulator.scenes.daylight import sun_elevation_deg
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
-from pipeline.simulator.scenes.farm.seasons import LOWEST_SUN_DEG, sun_over_farm
+from pipeline.simulator.scenes.farm.land import LOWEST_SUN_DEG, sun_over_farm
 from pipeline.simulator.selection.choice import Decision, decide
 from tests.hard_cases.simulated_scene import CAMERA, RIG, block_of, decided, left_out, probed, scene_of
 

@@ -18,8 +18,7 @@ from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.effect import Effect, Radiance
 from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.effects.probe import Unit, noise_electrons, stored_mean, unit_at
-from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.render import expected_light
+from pipeline.simulator.render import EFFECTS, expected_light
 from pipeline.simulator.rig_model import Air, Detector, Rig
 from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
 from pipeline.simulator.selection.choice import TOTAL, decide

@@ -19,9 +19,8 @@ from typing import Any, Literal
 
 from flows.settings.load import load_settings
 from flows.simulate.rig_commands import emulated_source
-from pipeline.rig.emulator.camera_server import CameraServer
-from pipeline.rig.emulator.emulated_rig import EmulatedPort, EmulatedRig, FastClock
-from pipeline.rig.emulator.scene_camera import SceneView
+from pipeline.rig.emulator.camera_device import CameraServer
+from pipeline.rig.emulator.emulated_rig import EmulatedPort, EmulatedRig, FastClock, SceneView
 from pipeline.simulator.simulated import SimulatedSource
 from tests.faults.nursery import ROOT
 

@@ -14,7 +14,7 @@ import numpy as np
 from flows.cli.main import main
 from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera.camera_cubes import as_references, mean_frame
-from pipeline.rig.emulator.scene_camera import REFERENCE_FRAMES, SceneView
+from pipeline.rig.emulator.emulated_rig import REFERENCE_FRAMES, SceneView
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import AT_REST, Line, References
 

@@ -20,11 +20,10 @@ from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.simulator.effects.effect import Effect, Radiance, SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.effects.probe import Probe, unit_at
-from pipeline.simulator.effects.registry import BY_NAME, EFFECTS
-from pipeline.simulator.render import expected_light
+from pipeline.simulator.render import BY_NAME, EFFECTS, expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import RasterScene
-from pipeline.simulator.selection.choice import TOTAL, Decision, decide, everything, list_effects, pays, sum_up
+from pipeline.simulator.selection.choice import TOTAL, Decision, decide, list_effects, sum_up
 from pipeline.simulator.selection.survey_probe import probe_survey
 from pipeline.simulator.selection.verification import candidate_blocks, verify, worst_blocks
 from pipeline.simulator.simulated import SimulatedSource, sweep_block, sweep_starts
@@ -52,13 +51,11 @@ def choose_effects(
     seed: int,
     effects: str,
     tol: Tolerance,
-    weighs_small: bool,
     report: Report,
 ) -> Wanted:
     """Decide for scene and rig which effects to simulate, and check it on the worst lines of the scene.
 
-    Where a rig takes the lines there is nothing to decide, and all effects are on where choosing takes longer than it
-    can save, unless the run ``weighs_small``. Raises BoundError: what would be left out changes light by more than its
+    Where a rig takes the lines there is nothing to decide. Raises BoundError: what would be left out changes light by more than its
     bound says; SceneError: the scene holds a number that is not finite.
     """
 
@@ -68,16 +65,10 @@ def choose_effects(
     if not source.simulates:
         return Wanted(lambda path: write(path, {"effects": [], "total": None}), {"source": source.name})
 
-    rig, small = simulated_rig, None
-    if not weighs_small and effects == "auto" and tol.value != 0:
-        found = everything(scene, rig, planned, EFFECTS, tol.value, tol.unit)
-        small = None if pays(found, len(scene.wavelength_nm)) else found
+    rig = simulated_rig
 
     def build(path: Path) -> None:
-        """Look at the scene, choose and check; or take all without a look."""
-        if small is not None:
-            write(path, {"effects": list_effects(small), "total": sum_up(small)})
-            return
+        """Look at the scene, choose and check."""
         probes = probe_survey(scene, rig, planned, tol.unit)
         decision = decide(probes, rig, EFFECTS, tol.value, effects)
         report(DRAFT)
@@ -100,7 +91,6 @@ def choose_effects(
         "camera": asdict(rig.camera),
         "rig": {name: plain_value(part) for name, part in asdict(rig).items() if name != "camera"},
         "sweeps": [asdict(sweep) for sweep in planned],
-        **({} if small is None else {"weighed": False}),
     }
     return Wanted(build, params)
 

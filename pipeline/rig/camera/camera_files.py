@@ -18,7 +18,7 @@ from typing import Protocol
 
 from pipeline.errors import PipelineError, RigError
 from pipeline.rig.device_settings import FileServer
-from pipeline.rig.devices import SYSTEM_CLOCK, Clock, DeadlinePassed, DeviceGone, DeviceRefused
+from pipeline.rig.transports import SYSTEM_CLOCK, Clock, DeadlinePassed, DeviceGone, DeviceRefused
 
 MOST_REPLY = 1 << 16  # bytes
 _SYNTAX = (500, 501)  # of FTP: the server did not understand the words, which may have been damaged on the way

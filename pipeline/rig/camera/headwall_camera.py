@@ -32,9 +32,16 @@ from pipeline.rig.device_settings import (
     check_capture,
     check_times,
 )
-from pipeline.rig.devices import SYSTEM_CLOCK, Clock, DeadlinePassed, DeviceRefused, StateUnknown
 from pipeline.rig.drivers import Capture, FrameClaim
-from pipeline.rig.transports import SocketTransport, Transport
+from pipeline.rig.transports import (
+    SYSTEM_CLOCK,
+    Clock,
+    DeadlinePassed,
+    DeviceRefused,
+    SocketTransport,
+    StateUnknown,
+    Transport,
+)
 
 LOG = logging.getLogger(__name__)
 LONGEST_GREETING = 1 << 16  # bytes

@@ -14,7 +14,7 @@ from typing import Any
 
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_files import RemoteFile, check_remote_name
-from pipeline.rig.devices import DeviceRefused
+from pipeline.rig.transports import DeviceRefused
 
 PROMPT = b"hpi> "
 COMMANDS = ("configure", "capture", "isCapturing", "stopCapture", "listFiles", "exit")

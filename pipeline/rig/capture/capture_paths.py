@@ -1,5 +1,8 @@
 """Captures of a sweep: what each is called, what the vector memory holds during it, and where its lines lie then.
 
+Which of them it was, and how far it may be off, is recorded with the positions. Times of lines are the mirror's; the
+camera stamps its frames in whole microseconds of its own clock.
+
 A capture's prefix says which lines of which sweep it takes, so that a folder tells what it holds.
 ``coarse-0_cy-31p5_0p5_96x16x16_0`` is the sweep ``coarse-0``, a coarse one whose lines lie along y, on strip -31.5 px,
 from scan coordinate 0.5 px on, of 96 lines of 16 held positions, binned by 16; the capture begins at its line 0. ``p``
@@ -11,6 +14,7 @@ from __future__ import annotations
 import re
 import struct
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -18,20 +22,180 @@ from numpy.typing import NDArray
 
 from pipeline.errors import RigError, SettingsError
 from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import direction_to_scene, position_to_direction
 from pipeline.geometry.scan import Axis, Sweep, exposing, line_positions, memory_loads, sweep_positions
 from pipeline.rig.camera.camera_cubes import CapturedLines
-from pipeline.rig.capture.line_positions import (
-    CommandTimes,
-    FrameTimes,
-    LinePositions,
-    MirrorScanPath,
-    PlayedPath,
-    lines_by_commands,
-    lines_by_log,
-    lines_by_trigger,
-)
 from pipeline.rig.device_settings import Pulses, check_capture
 from pipeline.rig.mirror.mirror_controller import wire_positions
+
+Floats = NDArray[Any]  # float64
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+Span = tuple[float, float]  # moments between which a command took effect: sent and acknowledged [s]
+
+_WINDOW = 7  # neighbours that say whether a stamp strayed: up to three strays in a row are seen
+
+
+@dataclass(frozen=True)
+class FrameTimes:
+    """What the camera says of its lines; -1 where it says nothing. Lines are in the order in which they were taken."""
+
+    number: Ints  # (line,) frame numbers, the capture's first frame 0
+    stamp_us: Ints  # (line,) by the camera's clock, taken for the exposure's start: its papers do not say which moment
+    exposure_ms: float
+    period_ms: float
+
+
+def mend_times(frames: FrameTimes) -> tuple[Ints, Ints, list[str]]:
+    """Give every line a stamp and a number, and say what was done.
+
+    Frames come at a steady rate or later, never sooner: a stamp off its neighbours' by half a period strayed, and
+    where all after one are early the clock was set back. Both follow their neighbours then; so do lines without a
+    stamp. A later stamp is believed, since a frame may have been dropped.
+    """
+    number, notes = whole_numbers(frames.number)
+    if (number < 0).all():
+        number = np.arange(len(number))
+        notes.append("no line has a frame number: lines are taken for frames in order")
+    line = np.arange(len(number))
+    number = np.rint(np.interp(line, line[number >= 0], number[number >= 0])).astype(np.int64)
+    period_us = frames.period_ms * 1e3
+    good = frames.stamp_us >= 0
+    if not good.any():
+        notes.append("no line has a time stamp: frames are taken to follow their period")
+        return np.rint(number * period_us).astype(np.int64), number, notes
+    origin = int(frames.stamp_us[good][0])
+    late = (frames.stamp_us - origin) - number * period_us  # of frames at the rate that was set
+    good[good] = ~_strayed(late[good], period_us)
+    if not good.all():
+        notes.append(f"{np.count_nonzero(~good)} time stamps are missing or stray, and follow their neighbours")
+    back = np.minimum(np.diff(late[good]) + period_us / 2, 0)
+    back = np.where(back < 0, back - period_us / 2, 0)
+    if back.any():
+        notes.append(f"the camera's clock was set back {np.count_nonzero(back)} times, by {-back.sum() / 1e6:.6g} s")
+    mended = late[good] - np.concatenate([[0.0], np.cumsum(back)])
+    whole = np.interp(line, line[good], mended) + number * period_us
+    return origin + np.rint(whole).astype(np.int64), number, notes
+
+
+def whole_numbers(number: Ints) -> tuple[Ints, list[str]]:
+    """Frame numbers, gaps filled where the lines around them leave no doubt, and what was found."""
+    filled, notes = number.copy(), []
+    known = np.flatnonzero(number >= 0)
+    for left, right in pairwise(known.tolist()):
+        if right - left > 1 and number[right] - number[left] == right - left:
+            filled[left:right] = number[left] + np.arange(right - left)
+    steps = np.diff(filled[filled >= 0])
+    if lost := int(np.sum(steps[steps > 1] - 1)):
+        notes.append(f"{lost} frames are missing between the lines")
+    if twice := int(np.count_nonzero(steps <= 0)):
+        notes.append(f"{twice} frames are there twice or out of order")
+    return filled, notes
+
+
+def _strayed(late: Floats, period_us: float) -> Bools:
+    """Stamps off the median of their neighbours by half a period."""
+    if len(late) < 3:
+        return np.zeros(len(late), np.bool_)
+    window = min(_WINDOW, len(late) - 1 + len(late) % 2)  # odd
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(late, window // 2, mode="edge"), window)
+    strayed: Bools = np.abs(late - np.median(around, axis=1)) > period_us / 2
+    return strayed
+
+
+@dataclass(frozen=True)
+class MirrorScanPath:
+    """Where the mirror was, by its clock: positions that its log measured, or those of a path that it played."""
+
+    time_s: Floats  # (sample,) in order
+    position: Floats  # (sample, 2) device X and Y
+
+
+def played_scan_path(position: Floats, rate_hz: float) -> MirrorScanPath:
+    """Return the track of a path: each of the positions (held, 2) held for 1 / ``rate_hz``, one after the other."""
+    ends = np.repeat(np.arange(len(position) + 1), 2)[1:-1] / rate_hz
+    return MirrorScanPath(ends, np.repeat(position, 2, axis=0))
+
+
+@dataclass(frozen=True)
+class LinePositions:
+    """Mirror positions of lines, and how they were found. NaN where ``valid`` is False."""
+
+    position: Floats  # (line, 2) device X and Y at mid exposure
+    valid: Bools  # (line,)
+    method: Literal["trigger", "log", "command"]
+    residual_us: float | None  # half of what is not known of the commands' times; None where nothing measures it
+    residual_px: float | None  # the same on the scene, at the mirror's speed
+    offset_s: float | None = None  # of the first frame on the track
+    notes: tuple[str, ...] = ()
+
+
+def lines_by_trigger(frames: FrameTimes, positions: Floats, *, index_at_end: int | None = None) -> LinePositions:
+    """Take the position that each frame's trigger played: one vector index a frame, whatever the clocks say.
+
+    ``positions`` (held, 2) are those of the path. ``index_at_end``, the vector index read after the capture, shows
+    whether frames were lost without a trace. RigError where the mirror counted other triggers than the camera frames,
+    or the camera numbers no frame.
+    """
+    number, notes = whole_numbers(frames.number)
+    if not (number >= 0).any():
+        raise RigError("no line has a frame number, so which trigger each belongs to is not known; fetch frameIndex")
+    if index_at_end is not None and index_at_end != number.max():
+        raise RigError(
+            f"the mirror counted {index_at_end + 1} triggers, the camera's last frame is number "
+            f"{number.max()}: a frame or an edge was lost, and lines after it would be off; look at the trigger's cable"
+        )
+    valid = (number >= 0) & (number < len(positions))
+    if beyond := int(np.count_nonzero(number >= len(positions))):
+        notes.append(f"{beyond} lines are beyond the {len(positions)} positions of the path")
+    counted = index_at_end is not None
+    notes.append("positions are those sent, not measured" + ("" if counted else "; triggers were not counted"))
+    found = np.full((len(number), 2), np.nan)
+    found[valid] = positions[number[valid]]
+    residual = 0.0 if counted else None
+    return LinePositions(found, valid, "trigger", residual, residual, notes=tuple(notes))
+
+
+def lines_by_time(
+    frames: FrameTimes,
+    camera: LineCamera,
+    scan_path: MirrorScanPath,
+    began_s: Span,
+    capture_s: Span,
+    method: Literal["log", "command"],
+) -> LinePositions:
+    """Take the track's position at mid exposure of each line, counted from the commands' times.
+
+    ``began_s`` is when the log or the path began, ``capture_s`` when the capture did, by one clock. What passes between
+    a command and the first frame is not known, so a constant offset of the lines stays, for whoever registers sweeps
+    that go both ways. A stamp that goes back or is missing is made up from its neighbours.
+    """
+    stamp, number, notes = mend_times(frames)
+    first_s = float(np.mean(capture_s) - np.mean(began_s)) + float(scan_path.time_s[0])
+    exposed_s = first_s + number[0] * frames.period_ms * 1e-3 + (stamp - stamp[0]) * 1e-6
+    middle_s = exposed_s + frames.exposure_ms * 1e-3 / 2
+    valid = (middle_s >= scan_path.time_s[0]) & (middle_s <= scan_path.time_s[-1])
+    if not valid.all():
+        notes.append(f"{np.count_nonzero(~valid)} of {len(valid)} lines lie outside of the {method}'s time")
+    found = np.where(valid[:, None], _at(scan_path, middle_s), np.nan)
+    unknown_s = float(np.ptp(began_s) + np.ptp(capture_s)) / 2
+    px = _apart_px(scan_path, camera, (middle_s[valid], middle_s[valid] + unknown_s))
+    notes.append(f"software timing: a constant line offset of about {px:.2g} px stays")
+    return LinePositions(found, valid, method, unknown_s * 1e6, px, first_s, tuple(notes))
+
+
+def _at(scan_path: MirrorScanPath, time_s: Floats) -> Floats:
+    """Logged positions between samples, (time, 2)."""
+    return np.stack([np.interp(time_s, scan_path.time_s, scan_path.position[:, axis]) for axis in (0, 1)], axis=-1)
+
+
+def _apart_px(scan_path: MirrorScanPath, camera: LineCamera, times: tuple[Floats, Floats]) -> float:
+    """Root mean square of how far the view moves between two times of each line. [px]"""
+    if not len(times[0]):
+        return 0.0
+    one, other = (direction_to_scene(position_to_direction(_at(scan_path, time_s))) for time_s in times)
+    return float(np.sqrt(np.mean(np.sum((one - other) ** 2, axis=-1))) / camera.ifov_rad)
+
 
 LEAD = 1  # cells before the first line's: a unit that waits for edges takes its first cell at the run command, assumed
 REFERENCES = "references"  # prefix of a capture that is made for the dark and white frames in its folder
@@ -163,17 +327,13 @@ class CaptureRecord:
 
 @dataclass(frozen=True)
 class LoggedPath:
-    """A log of measured positions that is kept beside the files: (sample, 2) big-endian float32.
-
-    ``index_name`` is where the cells that were played are, (sample,) big-endian int32; empty where nobody asked.
-    """
+    """A log of measured positions that is kept beside the files: (sample, 2) big-endian float32."""
 
     name: str
     rate_hz: float
     started_s: float
     start_error_s: float
-    index_name: str = ""
-    crc32: int | None = None  # of both files, one after the other; None by an earlier version
+    crc32: int
 
 
 class UntiedError(RigError):
@@ -232,11 +392,7 @@ def _tied(
     *,
     total: int,
 ) -> LinePositions:
-    """Positions by edges in the mirror's log, else by the edges that stepped it, by its log, by the commands' times."""
-    commands = CommandTimes(taken.run_s, taken.capture_s)
-    if taken.log is not None:  # then it, and not the path, was begun before the capture
-        began = (taken.log.started_s - taken.log.start_error_s, taken.log.started_s)
-        commands = CommandTimes(began, taken.capture_s)
+    """Positions by the edges that stepped the mirror, else by its log, else by the commands' times."""
     if taken.triggered:
         counted = None if taken.index_at_end is None else path.frames_at(taken.index_at_end)
         taken_in_all = max(total, int(frames.number.max()) + 1)
@@ -246,13 +402,12 @@ def _tied(
                 f"{taken_in_all * path.sweep.step} was expected: edges were lost, or are not one a position (see "
                 f"pulses in [rig])"
             )
-        if scan_path is not None and scan_path.edge_s is not None and len(scan_path.edge_s):
-            return lines_by_log(frames, camera, scan_path, commands=commands)
-        sent = PlayedPath(path.middle.astype(np.float64), path.rate_hz)
         last = None if counted is None else int(frames.number.max())
-        return lines_by_trigger(frames, camera, sent, index_at_end=last)
-    if scan_path is not None and taken.log is not None and len(scan_path.position) > 1:
-        return lines_by_log(frames, camera, scan_path, commands=commands)
-    commands = CommandTimes(taken.run_s, taken.capture_s)
-    played = PlayedPath(path.cells.astype(np.float64), path.rate_hz)  # by its own clock
-    return lines_by_commands(frames, camera, played, commands)
+        return lines_by_trigger(frames, path.middle.astype(np.float64), index_at_end=last)
+    if (
+        scan_path is not None and taken.log is not None and len(scan_path.position) > 1
+    ):  # then it was begun before the capture
+        began_s = (taken.log.started_s - taken.log.start_error_s, taken.log.started_s)
+        return lines_by_time(frames, camera, scan_path, began_s, taken.capture_s, "log")
+    played = played_scan_path(path.cells.astype(np.float64), path.rate_hz)
+    return lines_by_time(frames, camera, played, taken.run_s, taken.capture_s, "command")

@@ -26,21 +26,28 @@ from pipeline.geometry.scan import Sweep, exposing
 from pipeline.json_lines import read_checked, with_check
 from pipeline.rig.camera.camera_files import Kept
 from pipeline.rig.capture import JOURNAL
-from pipeline.rig.capture.capture_paths import LEAD, CapturePath, CaptureRecord, LoggedPath, UntiedError, capture_prefix
-from pipeline.rig.capture.line_positions import LinePositions, MirrorScanPath, line_edges
+from pipeline.rig.capture.capture_paths import (
+    CapturePath,
+    CaptureRecord,
+    LinePositions,
+    LoggedPath,
+    MirrorScanPath,
+    UntiedError,
+    capture_prefix,
+)
 from pipeline.rig.device_settings import SurveyRig
-from pipeline.rig.devices import Clock
 from pipeline.rig.drivers import CameraDriver, MirrorDriver
 from pipeline.rig.mirror.mirror_controller import MotionLog
 from pipeline.rig.mirror.pro_mode import Trigger
+from pipeline.rig.transports import Clock
 from pipeline.source import AT_REST
 
 LOG = logging.getLogger(__name__)
-_TIE_POINTS = ("method", "residual_us", "residual_px", "offset_s", "drift_ppm")
+_TIE_POINTS = ("method", "residual_us", "residual_px", "offset_s")
 SLACK_S = 5.0  # by which a capture may take longer than its frames
 WRITING_S = 120.0  # that a camera may go on writing what it has, once it was told to stop
 POLL_S = 0.05
-_CELL, _INDEX = np.dtype(">f4"), np.dtype(">i4")
+_CELL = np.dtype(">f4")
 
 Say = Callable[[str], None]  # what the rig is at, in a few words
 
@@ -213,12 +220,11 @@ class CaptureRunner:
         steering.settle(self._rig.settle_s)
         with self._stopped_on_error():
             if path.triggered:
-                if self._rig.log_pulses:
-                    steering.start_log(self._log_rate_hz(path.lines, exposed), with_index=True)
                 run_s = self._run(path)
                 capture = self.devices.camera.capture(path.lines, prefix=prefix)
             else:
-                steering.start_log(self._log_rate_hz(path.lines, exposed))
+                most_hz = (self._rig.log_samples - 1) / (exposed.scan_seconds(path.lines) + SLACK_S)
+                steering.start_log(min(self._rig.log_rate_hz, most_hz))  # so that it holds the whole capture
                 capture = self.devices.camera.capture(path.lines, prefix=prefix)
                 run_s = self._run(path)
             at_s = (capture.sent_s, capture.acknowledged_s)
@@ -227,7 +233,7 @@ class CaptureRunner:
             self.wait(taken)
         if taken.triggered:
             taken = replace(taken, index_at_end=steering.index())
-        if self._rig.log_pulses or not taken.triggered:
+        else:
             taken = replace(taken, log=self._keep_log(taken.folder, steering.read_log()))
         steering.halt()
         return self._journal.ended(taken)
@@ -280,16 +286,11 @@ class CaptureRunner:
         """Read the mirror's log of a capture; None where there is none, UntiedError where it has changed."""
         if taken.log is None:
             return None
-        names = (taken.log.name, taken.log.index_name)
-        files = [self._kept.read(name, 0, self._kept.size(name)) if name else b"" for name in names]
-        if taken.log.crc32 not in (None, zlib.crc32(b"".join(files))):
+        log = self._kept.read(taken.log.name, 0, self._kept.size(taken.log.name))
+        if zlib.crc32(log) != taken.log.crc32:
             raise UntiedError(f"the mirror's log that is kept as {taken.log.name} has changed (its CRC-32 differs)")
-        position = np.frombuffer(files[0][: len(files[0]) // 8 * 8], _CELL).reshape(-1, 2).astype(np.float64)
-        time_s = np.arange(len(position)) / taken.log.rate_hz
-        if not taken.log.index_name:
-            return MirrorScanPath(time_s, position)
-        index = np.frombuffer(files[1][: len(files[1]) // 4 * 4], _INDEX).astype(np.int64)
-        return MirrorScanPath(time_s, position, line_edges(index, time_s[: len(index)], LEAD, taken.sweep.step))
+        position = np.frombuffer(log, _CELL).reshape(-1, 2).astype(np.float64)
+        return MirrorScanPath(np.arange(len(position)) / taken.log.rate_hz, position)
 
     def _configure(self, camera: LineCamera) -> None:
         times_ms = camera.exposure_ms, camera.frame_ms
@@ -305,23 +306,12 @@ class CaptureRunner:
         return sent, clock.now()
 
     def _keep_log(self, folder: str, log: MotionLog) -> LoggedPath:
-        name, position = self._new_name(f"{folder}/mirror_log"), log.position.astype(_CELL).tobytes()
+        """Keep a log by a name of its own: a camera that was emptied gives its folders' names again."""
+        names = (f"{folder}/mirror_log" + (f"-{number}" if number > 1 else "") for number in itertools.count(1))
+        name = next(one for one in names if not self._kept.size(one))
+        position = log.position.astype(_CELL).tobytes()
         self._kept.append(name, position)
-        index_name = "" if log.index is None else self._new_name(f"{folder}/mirror_index")
-        index = b"" if log.index is None else log.index.astype(_INDEX).tobytes()
-        if index_name:
-            self._kept.append(index_name, index)
-        crc32 = zlib.crc32(position + index)
-        return LoggedPath(name, log.rate_hz, log.started_s, log.start_error_s, index_name, crc32)
-
-    def _new_name(self, name: str) -> str:
-        """A name of which nothing is kept: a camera that was emptied gives its folders' names again."""
-        names = (name if number == 1 else f"{name}-{number}" for number in itertools.count(1))
-        return next(one for one in names if not self._kept.size(one))
-
-    def _log_rate_hz(self, lines: int, camera: LineCamera) -> float:
-        """As fast as the logger goes, or so that it holds the whole capture."""
-        return min(self._rig.log_rate_hz, (self._rig.log_samples - 1) / (camera.scan_seconds(lines) + SLACK_S))
+        return LoggedPath(name, log.rate_hz, log.started_s, log.start_error_s, zlib.crc32(position))
 
     @contextmanager
     def _stopped_on_error(self) -> Iterator[None]:

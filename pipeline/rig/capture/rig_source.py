@@ -44,8 +44,8 @@ from pipeline.rig.capture.capture_paths import (
 )
 from pipeline.rig.capture.capture_runner import CaptureJournal, CaptureRunner, RigDevices, Say, say_nothing
 from pipeline.rig.device_settings import SurveyRig
-from pipeline.rig.devices import DeviceRefused, StateUnknown
 from pipeline.rig.drivers import FrameClaim
+from pipeline.rig.transports import DeviceRefused, StateUnknown
 from pipeline.simulator.simulated import check_binning
 from pipeline.source import Line, References
 
@@ -99,8 +99,7 @@ class RigSource:
     def record(self) -> dict[str, Any]:
         """What captures with this ``kept`` were like: how lines were tied to the mirror, by which settings."""
         told: dict[str, Any] = {
-            name: getattr(self.rig, name)
-            for name in ("pulses", "log_pulses", "ends", "read_back", "strict_crc", "provenance")
+            name: getattr(self.rig, name) for name in ("pulses", "ends", "read_back", "strict_crc", "provenance")
         }
         if self.rig.mounting != STRAIGHT:
             told["mounting"] = asdict(self.rig.mounting)

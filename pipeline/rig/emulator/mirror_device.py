@@ -1,10 +1,9 @@
-"""The emulated mirror controller: bytes in, bytes out. No transport, and time only by the clock that it is given.
+"""The emulated mirror controller: bytes in, bytes out, and its registers; time only by the clock that it is given.
 
-Both modes of the documented protocol. Assumed, as the documents leave it open: an empty line has no answer; NO answers
-a line that is not known, ERROR one that is known and cannot be read; a position beyond the rim is pulled in to it, and
-the answer says to which side it lay; a reset is answered by OK, and what comes while the controller boots is lost; in
-pro mode bytes that are no frame are answered by error 0001 at the next boundary, requests are checked by their CRC
-after GOPROCRC alone, and replies always carry it. Two other firmwares are emulated, too: one that checks the CRC of
+What drivers ask for in both modes of the documented protocol. Assumed, as the documents leave it open: an empty line
+has no answer; NO answers a line that is not known, ERROR one that is too long; what comes while the controller boots is
+lost; in pro mode bytes that are no frame are answered by error 0001 at the next boundary, requests are checked by their
+CRC after GOPROCRC alone, and replies always carry it. Two other firmwares are emulated, too: one that checks the CRC of
 requests after GOPRO as well (``crc="required"``), and one that knows no GOPROCRC and sends 00 00 in the CRC's place
 (``crc="absent"``).
 """
@@ -12,40 +11,290 @@ requests after GOPRO as well (``crc="required"``), and one that knows no GOPROCR
 from __future__ import annotations
 
 import math
-import re
+import operator
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.rig.devices import Clock
+from pipeline.errors import ShapeError
 from pipeline.rig.emulator import Chunk
-from pipeline.rig.emulator.mirror_registers import RegisterFile
-from pipeline.rig.emulator.mirror_state import MirrorState, MirrorUnit
+from pipeline.rig.emulator.mirror_state import MirrorState, MirrorUnit, PositionLogger
 from pipeline.rig.mirror import mirror_requests as simple
 from pipeline.rig.mirror.mirror_requests import END, MOST_LINE, Reply
 from pipeline.rig.mirror.pro_mode import (
     BOUNDARY,
+    CELL,
     ERROR_FLAG,
+    FEEDBACK_X,
+    LOG_RATE,
+    LOG_RUN,
+    LOG_SLOTS,
+    MOST_PAYLOAD,
+    VECTOR_MEMORY,
     ChannelRegisters,
     Command,
     Damaged,
     ErrorCode,
     Frame,
     FrameReader,
+    Trigger,
     Unit,
+    VectorRegister,
+    cell_float,
+    cell_int,
     encode,
+    float_cell,
+    int_cell,
+    log_slot,
+    read_register,
+    read_registers,
+    read_vector,
     refuse,
+    values_reply,
 )
+from pipeline.rig.transports import Clock
+
+LOWEST_HZ, HIGHEST_HZ = 0.0, 10_000.0
+_CURRENT_A = 0.7
+_LOGGED = range(log_slot(0), log_slot(LOG_SLOTS))  # vectors of the logger
+
+
+class RefusedError(Exception):
+    """The controller answers with an error code."""
+
+    def __init__(self, code: ErrorCode) -> None:
+        super().__init__(code.name)
+        self.code = code
+
+
+@dataclass(frozen=True)
+class Register:
+    """One register: how it is read and written, and the range of what it takes."""
+
+    read: Callable[[], float | int]
+    write: Callable[[Any], object] | None = None
+    least: float = -math.inf
+    most: float = math.inf
+    whole: bool = False
+    signed: bool = False
+
+    def check(self, cell: bytes) -> float | int:
+        """Read a cell that is to be written; RefusedError where it may not be, or is out of range."""
+        if self.write is None:
+            raise RefusedError(ErrorCode.READ_ONLY)
+        value: float | int = cell_int(cell) if self.whole else cell_float(cell)
+        if self.signed and value >= 2**31:
+            value -= 2**32
+        if not self.least <= value <= self.most:  # NaN is in no range
+            raise RefusedError(ErrorCode.OUT_OF_RANGE)
+        return value
+
+
+class RegisterFile:
+    """All registers of a controller, by id."""
+
+    def __init__(self, state: MirrorState) -> None:
+        self._state = state
+        self.logger = PositionLogger(state)
+        self._registers = {**_feedback(state), **_logger(self.logger), **_channel(state, 0), **_channel(state, 1)}
+
+    def answer(self, frame: Frame) -> Frame:
+        """Carry out a frame of pro mode and give the reply, which may say why not."""
+        command = frame.command & ~ERROR_FLAG
+        try:
+            return self._carry_out(frame.command, frame.payload)
+        except RefusedError as refused:
+            return refuse(command, refused.code)
+        except ShapeError:
+            return refuse(command, ErrorCode.LENGTH_MISMATCH)
+
+    def _carry_out(self, command: int, payload: bytes) -> Frame:
+        match command:
+            case Command.FIRMWARE_ID | Command.STATUS:
+                _expect(payload in (b"", b"\x00\x00"))
+                asked_id = command == Command.FIRMWARE_ID
+                return Frame(command, int_cell(self._state.unit.firmware_id if asked_id else int(self._state.status())))
+            case Command.SET_MODE:  # which is the device's own affair
+                _expect(len(payload) == 2)
+                if any(payload):
+                    raise RefusedError(ErrorCode.OUT_OF_RANGE)
+            case Command.GET_VALUE:
+                register, cell = read_register(payload)
+                _expect(not cell)
+                return Frame(command, self.get(register))
+            case Command.SET_VALUE:
+                register, cell = read_register(payload)
+                _expect(bool(cell))
+                self.put({register: cell})
+            case Command.GET_VALUES:
+                asked = read_registers(payload, with_cells=False)
+                _expect(bool(asked))
+                return values_reply([self.get(number) for number, _ in asked])
+            case Command.SET_VALUES:
+                given = read_registers(payload, with_cells=True)
+                _expect(bool(given))
+                self.put(dict(given))
+            case Command.GET_VECTOR:
+                register, offset, length, cells = read_vector(payload)
+                _expect(not cells)
+                return Frame(command, self.get_cells(register, offset, length))
+            case Command.SET_VECTOR:
+                register, offset, length, cells = read_vector(payload)
+                _expect(len(cells) == length)
+                self.put_cells(register, offset, cells)
+            case _:
+                raise RefusedError(ErrorCode.COMMAND_UNKNOWN)
+        return Frame(command)
+
+    def get(self, number: int) -> bytes:
+        """Give a register's cell; RefusedError where there is no such register."""
+        self._state.advance()
+        register = self._find(number)
+        value = register.read()
+        return int_cell(int(value)) if register.whole else float_cell(float(value))
+
+    def put(self, cells: Mapping[int, bytes]) -> None:
+        """Write registers at one moment; held positions go out together.
+
+        RefusedError where a register is missing, read only or out of range, and then none is written; or one does not
+        take its value as things stand, and then those before it are.
+        """
+        values = {number: self._find(number).check(cell) for number, cell in cells.items()}
+        self._state.advance()
+        for number, value in values.items():
+            write = self._find(number).write
+            assert write is not None
+            write(value)
+        self._state.aim()
+
+    def get_cells(self, number: int, offset: int, length: int) -> bytes:
+        """Give whole cells of the vector memory or of a log's slot (else RefusedError); offset and length in bytes."""
+        start, stop = _cells(offset, length)
+        if number == VECTOR_MEMORY:
+            _within(stop, self._state.memory.size)
+            return self._state.memory[start:stop].astype(">f4").tobytes()
+        if number not in _LOGGED:
+            raise RefusedError(ErrorCode.NO_REGISTER)
+        _within(stop, self.logger.rows)
+        return self.logger.cells(number - log_slot(0), start, stop)
+
+    def put_cells(self, number: int, offset: int, data: bytes) -> None:
+        """Write whole cells of the vector memory (else RefusedError)."""
+        start, stop = _cells(offset, len(data))
+        if number != VECTOR_MEMORY:
+            raise RefusedError(ErrorCode.READ_ONLY if number in _LOGGED else ErrorCode.NO_REGISTER)
+        _within(stop, self._state.memory.size)
+        self._state.advance()
+        self._state.memory[start:stop] = np.frombuffer(data, ">f4")
+
+    def _find(self, number: int) -> Register:
+        found = self._registers.get(number)
+        if found is None:
+            raise RefusedError(ErrorCode.NO_REGISTER)
+        return found
+
+
+def _expect(fits: bool) -> None:
+    if not fits:
+        raise ShapeError("a payload whose length does not fit the command")
+
+
+def _cells(offset: int, length: int) -> tuple[int, int]:
+    if offset % CELL or length % CELL:
+        raise RefusedError(ErrorCode.VECTOR_ALIGNMENT)
+    if not 0 < length <= MOST_PAYLOAD:
+        raise RefusedError(ErrorCode.LENGTH_MISMATCH)
+    return offset // CELL, (offset + length) // CELL
+
+
+def _within(stop: int, size: int) -> None:
+    if stop > size:
+        raise RefusedError(ErrorCode.VECTOR_INDEX)
+
+
+def _feedback(state: MirrorState) -> dict[int, Register]:
+    """Return the registers of the optical feedback, and of the vector memory."""
+
+    def place(channel: int) -> float:
+        return state.axes[channel].place(state.moment)
+
+    table = {FEEDBACK_X + channel: Register(partial(place, channel)) for channel in (0, 1)}
+    table[VECTOR_MEMORY] = Register(lambda: 0, whole=True)  # whether the head's own copy is valid
+    return table
+
+
+def _logger(logger: PositionLogger) -> dict[int, Register]:
+    table = {log_slot(slot): Register(*_item(logger.slots, slot), 0, 0xFFFF, whole=True) for slot in range(LOG_SLOTS)}
+    table[LOG_RUN] = Register(lambda: logger.running, lambda on: logger.run(bool(on)), 0, 1, whole=True)
+    table[LOG_RATE] = Register(*_attribute(logger, "rate_hz", float), 1.0, HIGHEST_HZ)
+    return table
+
+
+def _channel(state: MirrorState, channel: int) -> dict[int, Register]:
+    """Return the inputs of a channel, and which of them it follows."""
+    registers = ChannelRegisters(channel)
+    inputs = {registers.static_system, registers.vector_system}
+
+    def choose(system: int) -> None:
+        if system not in inputs:
+            raise RefusedError(ErrorCode.SYSTEM_NOT_SELECTABLE)
+        state.inputs[channel] = system
+
+    table = {
+        registers.input: Register(lambda: state.inputs[channel], choose, 0, 0xFF, whole=True),
+        registers.control: Register(*_item(state.controls, channel), 0, 0xFF, whole=True),
+    }
+    for unit in Unit:
+        most = _CURRENT_A if unit is Unit.CURRENT else 1.0
+        table[registers.static_system << 8 | unit] = Register(*_item(state.static[channel], unit), -most, most)
+    return {**table, **_vector_unit(state, channel)}
+
+
+def _vector_unit(state: MirrorState, channel: int) -> dict[int, Register]:
+    player, most = state.players[channel], state.memory.size
+
+    def run(on: int) -> None:
+        if not on:
+            player.stop()
+        elif player.length < 1 or player.start + player.length > most:
+            raise RefusedError(ErrorCode.VECTOR_INDEX)
+        else:
+            player.run(state.moment)
+
+    rows = {
+        VectorRegister.UNIT: Register(*_attribute(player, "unit", Unit), 0, 2, whole=True),
+        VectorRegister.RUN: Register(lambda: player.running, run, 0, 1, whole=True),
+        VectorRegister.START: Register(*_attribute(player, "start"), 0, most, whole=True),
+        VectorRegister.END: Register(*_attribute(player, "end"), 0, most, whole=True),
+        VectorRegister.FREQUENCY: Register(*_attribute(player, "frequency_hz", float), 1e-3, HIGHEST_HZ),
+        VectorRegister.LOWEST: Register(lambda: LOWEST_HZ),
+        VectorRegister.HIGHEST: Register(lambda: HIGHEST_HZ),
+        VectorRegister.CYCLES: Register(*_attribute(player, "cycles"), -1, 2**31 - 1, whole=True, signed=True),
+        VectorRegister.TRIGGER: Register(*_attribute(player, "external", Trigger), 0, 2, whole=True),
+        VectorRegister.OUTPUT: Register(lambda: state.played[channel]),
+        VectorRegister.INDEX: Register(lambda: player.index, whole=True),
+    }
+    return {ChannelRegisters(channel).vector(name): register for name, register in rows.items()}
+
+
+def _item(holder: Any, key: int) -> tuple[Callable[[], Any], Callable[[Any], object]]:
+    """How an item of a list or of a dictionary is read and written."""
+    return partial(operator.getitem, holder, key), partial(operator.setitem, holder, key)
+
+
+def _attribute(holder: object, name: str, kind: type = int) -> tuple[Callable[[], Any], Callable[[Any], object]]:
+    """How an attribute is read and written."""
+    return partial(getattr, holder, name), lambda value: setattr(holder, name, kind(value))
+
 
 KEPT_ACTS = 5_000
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:E[-+]?\d+)?"
-_PLACE = re.compile(rf"(X|Y|XY)=({_NUMBER})(?:;({_NUMBER}))?")
-
 Floats = NDArray[np.float64]
 Pulses = Callable[[float, float], Floats]  # (pulse, 2) rises and falls of pulses that rise within a span of time
 
@@ -140,15 +389,14 @@ class MirrorDevice:
             self.state.advance()
             return np.stack([axis.commands(times_s) for axis in self.state.axes], axis=-1)
 
-    def restart(self, *, boot_s: float | None = None) -> None:
-        """Lose everything and be in simple mode, deaf for a while: a reset, or a loss of power."""
+    def restart(self, *, boot_s: float) -> None:
+        """Lose everything and be in simple mode, deaf for ``boot_s``: a reset, or a loss of power."""
         with self._lock:
             now = self.clock.now()
             self.state.restart(now)
             self.registers = RegisterFile(self.state)
             self.mode = Mode.SIMPLE
             self._line, self._reader = b"", FrameReader()
-            boot_s = self.unit.boot_s if boot_s is None else boot_s
             self._boots_until = now + boot_s if boot_s > 0 else -math.inf
 
     def set_mode(self, mode: Mode) -> None:
@@ -209,37 +457,12 @@ class MirrorDevice:
                 return self.unit.serial_number
             case simple.TEMPERATURE:
                 return f"{self.unit.temperature_c:.2f}"
-            case simple.STATUS:
-                return f"{int(self.state.status()):08X}"
-            case simple.ACKNOWLEDGE:
-                self.state.acknowledge()
             case simple.GO_PRO:
                 self.set_mode(Mode.PRO_CRC if self.unit.crc == "required" else Mode.PRO)
             case simple.GO_PRO_CRC if self.unit.crc != "absent":
                 self.set_mode(Mode.PRO_CRC)
-            case simple.RESET:
-                self.restart()
             case simple.START:
                 pass
             case _:
-                return self._go(line)
+                return Reply.NO
         return Reply.OK
-
-    def _go(self, line: str) -> Reply:
-        name, equals, _ = line.partition("=")
-        if not equals or name not in ("X", "Y", "XY"):
-            return Reply.NO
-        found = _PLACE.fullmatch(line)
-        if found is None or (name == "XY") != (found[3] is not None):
-            return Reply.ERROR
-        state, places = self.state, [float(number) for number in found.groups()[1:] if number is not None]
-        x, y = (axis[Unit.XY] for axis in state.static)
-        x, y = {"X": (places[0], y), "Y": (x, places[0]), "XY": (places[0], places[-1])}[name]
-        for channel, place in enumerate((x, y)):
-            registers = ChannelRegisters(channel)
-            state.inputs[channel], state.controls[channel] = registers.static_system, registers.xy_system
-            state.static[channel][Unit.XY] = place
-        state.aim()
-        if not state.trimmed:
-            return Reply.OK
-        return Reply.BELOW if -min(places) > max(places) else Reply.ABOVE

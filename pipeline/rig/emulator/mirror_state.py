@@ -21,18 +21,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.geometry.scan import Ends
-from pipeline.rig.devices import Clock
-from pipeline.rig.mirror.pro_mode import (
-    CHANNELS,
-    FEEDBACK_X,
-    LOG_SLOTS,
-    ChannelRegisters,
-    Status,
-    Trigger,
-    Unit,
-    VectorRegister,
-)
-from pipeline.simulator.effects.mirror_path import responses
+from pipeline.rig.mirror.pro_mode import CHANNELS, FEEDBACK_X, LOG_SLOTS, ChannelRegisters, Status, Trigger, Unit
+from pipeline.rig.transports import Clock
+from pipeline.simulator.effects.pointing import responses
 
 Floats = NDArray[np.float64]
 KEPT_STEPS = 20_000  # commands that an axis remembers; older times are given as the oldest state that is known
@@ -152,7 +143,6 @@ class VectorPlayer:
     _began_s: float = 0.0
     _played: int = 0
     _edges: deque[float] = field(default_factory=deque)
-    _steps: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=MOST_STEPS))
 
     @property
     def length(self) -> int:
@@ -191,16 +181,7 @@ class VectorPlayer:
                 return
             cell = self.start + self._played % self.length
             self._played += 1
-            self._steps.append((time_s, cell))
             yield time_s, cell
-
-    def indices(self, times_s: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Give the cell that was played at past times; the first cell before the first step that is remembered."""
-        if not self._steps:
-            return np.full(np.shape(times_s), self.start, np.int64)
-        known, cells = (np.array(column) for column in zip(*self._steps, strict=True))
-        at = np.clip(np.searchsorted(known, times_s, side="right") - 1, 0, None)
-        return np.asarray(cells, np.int64)[at]
 
     def _by_clock(self, now_s: float, total: float) -> Iterator[float]:
         if self.frequency_hz <= 0:
@@ -220,15 +201,6 @@ class VectorPlayer:
 
 RIM_SLACK = 1e-6  # of float32 cells
 STABLE_WITHIN = 1e-4  # of the disk's radius; about 1 px of the view
-_LATCHED = {
-    Status.DISCONNECTED: Status.WAS_DISCONNECTED,
-    Status.ELECTRONICS_WARM: Status.WAS_ELECTRONICS_WARM,
-    Status.MIRROR_WARM: Status.WAS_MIRROR_WARM,
-    Status.OUTPUT_LIMIT: Status.WAS_OUTPUT_LIMIT,
-    Status.AVERAGE_LIMIT: Status.WAS_AVERAGE_LIMIT,
-    Status.TRIMMED: Status.WAS_TRIMMED,
-}
-_COPIES = Status(sum(_LATCHED.values()))
 
 
 @dataclass(frozen=True)
@@ -244,7 +216,6 @@ class MirrorUnit:
     ends: Ends = "exclusive"  # what the device takes the end of a range for; not settled (erratum E14)
     crc: Literal["either", "required", "absent"] = "either"  # of requests, see `mirror_device`
     log_rows: int = 16_000  # of the logger; more could not be addressed
-    boot_s: float = 1.0  # silence after a reset
     turnaround_s: float = 2e-4  # from a request's last byte to the reply
     stiffness: Stiffness = field(default_factory=Stiffness)
 
@@ -267,7 +238,7 @@ class MirrorState:
         self.inputs = [ChannelRegisters(channel).static_system for channel in range(CHANNELS)]
         self.controls = [ChannelRegisters(channel).xy_system for channel in range(CHANNELS)]
         self.played = [0.0] * CHANNELS
-        self.latched, self.trimmed = Status(0), False
+        self.trimmed = False
         self.moment = now_s
         for axis in self.axes:
             axis.rest(now_s)
@@ -282,13 +253,11 @@ class MirrorState:
             for _, channel, cell in together:
                 self.played[channel] = float(self.memory[cell]) if cell < self.memory.size else 0.0
             self._aim(time_s)
-        self.latched |= self._present(now) & _COPIES
         return now
 
     def aim(self) -> None:
         """Send the axes where the systems that they follow say, now."""
         self._aim(self.advance())
-        self.latched |= self._present(self.moment) & _COPIES
 
     def trigger(self, rises_s: NDArray[np.float64], falls_s: NDArray[np.float64]) -> None:
         """Take pulses at the trigger input."""
@@ -302,14 +271,14 @@ class MirrorState:
         return np.stack([axis.places(times_s) for axis in self.axes], axis=-1)
 
     def status(self) -> Status:
-        """Give the status bits, latched ones included."""
+        """Return the status bits of now; none of what was."""
         self.advance()
-        return self._present(self.moment) | self.latched
-
-    def acknowledge(self) -> None:
-        """Forget what was; what still is, is latched again."""
-        self.latched = Status(0)
-        self.advance()
+        flags = self.flags
+        if self.trimmed:
+            flags |= Status.TRIMMED
+        if any(axis.unsettled(self.moment) > STABLE_WITHIN for axis in self.axes):
+            flags |= Status.NOT_STABLE
+        return flags
 
     def _aim(self, time_s: float) -> None:
         if Status.DISCONNECTED in self.flags:
@@ -319,7 +288,6 @@ class MirrorState:
         self.trimmed = reach > 1 + RIM_SLACK
         if self.trimmed:
             x, y = x / reach, y / reach
-            self.latched |= Status.WAS_TRIMMED
         for axis, place in zip(self.axes, (x, y), strict=True):
             axis.command(time_s, place)
 
@@ -332,17 +300,6 @@ class MirrorState:
             if followed == registers.vector_system and self.players[channel].unit is Unit.XY:
                 return self.played[channel]
         return self.axes[channel].commanded
-
-    def _present(self, now_s: float) -> Status:
-        flags = self.flags
-        if self.trimmed:
-            flags |= Status.TRIMMED
-        if any(axis.unsettled(now_s) > STABLE_WITHIN for axis in self.axes):
-            flags |= Status.NOT_STABLE
-        was = Status(0)
-        for bit, copy in _LATCHED.items():
-            was |= copy if bit in flags else Status(0)
-        return flags | was
 
 
 class PositionLogger:
@@ -376,19 +333,9 @@ class PositionLogger:
             self._stopped_s = self._state.clock.now()
 
     def cells(self, slot: int, start: int, stop: int) -> bytes:
-        """Give the cells of some rows of a slot; registers that do not change with time have their rest value 0."""
+        """Give the cells of some rows of a slot; of registers that are no feedback, 0."""
         times = (self._began_s or 0.0) + np.arange(start, stop) / self.rate_hz
-        register, state = self.slots[slot], self._state
-        for channel in range(CHANNELS):
-            registers, player = ChannelRegisters(channel), state.players[channel]
-            if register == FEEDBACK_X + channel:
-                return state.positions(times)[:, channel].astype(">f4").tobytes()
-            if register == registers.vector(VectorRegister.INDEX):
-                state.advance()
-                return player.indices(times).astype(">u4").tobytes()
-            if register == registers.vector(VectorRegister.OUTPUT):
-                state.advance()
-                return state.memory[player.indices(times)].astype(">f4").tobytes()
-            if register == registers.static_xy:
-                return np.full(times.size, state.static[channel][Unit.XY], ">f4").tobytes()
-        return np.zeros(times.size, ">f4").tobytes()
+        channel = self.slots[slot] - FEEDBACK_X
+        if channel not in range(CHANNELS):
+            return np.zeros(times.size, ">f4").tobytes()
+        return self._state.positions(times)[:, channel].astype(">f4").tobytes()

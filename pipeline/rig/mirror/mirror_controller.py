@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
@@ -18,7 +18,6 @@ from pipeline.errors import RigError, SettingsError, ShapeError
 from pipeline.geometry.mirror import STRAIGHT, Mounting, check_reach
 from pipeline.geometry.scan import device_range
 from pipeline.rig.device_settings import MirrorSettings, ReadBack
-from pipeline.rig.devices import SYSTEM_CLOCK, Clock, Closing, DeviceRefused
 from pipeline.rig.mirror.mirror_requests import Identity, Modes, ProLink
 from pipeline.rig.mirror.pro_mode import (
     CELL,
@@ -48,11 +47,10 @@ from pipeline.rig.mirror.pro_mode import (
     set_vector,
     split_cells,
 )
-from pipeline.rig.transports import SerialTransport, Transport, Wire
+from pipeline.rig.transports import SYSTEM_CLOCK, Clock, Closing, DeviceRefused, SerialTransport, Transport, Wire
 
 LOG = logging.getLogger(__name__)
 SAMPLED_EVERY = 10  # frames: the fraction that "sampled" reads back, besides the ends of both channels
-_KINDS = (">f4", ">f4", ">u4")  # of the cells in the log's slots
 Progress = Callable[[int, int], None]  # cells done, cells in all
 
 
@@ -143,12 +141,6 @@ def check_play(first: int, stop: int, rate_hz: float, cycles: int, loaded: int) 
         )
 
 
-def run_values() -> dict[int, Value]:
-    """Registers that make both channels play, in one frame so that they begin together."""
-    follow = {**X.followed(X.vector_system), **Y.followed(Y.vector_system)}
-    return {**follow, X.vector(VectorRegister.RUN): 1, Y.vector(VectorRegister.RUN): 1}
-
-
 def hold_values(x: float, y: float) -> dict[int, Value]:
     """Registers that send both channels to a position, hold it and end any path, in one frame, which they fill."""
     follow = {**X.followed(X.static_system), **Y.followed(Y.static_system)}
@@ -169,63 +161,6 @@ class MotionLog:
     rate_hz: float
     started_s: float
     start_error_s: float
-    index: NDArray[np.int64] | None = None  # (sample,) cell of the path that X played, where it was asked for
-
-
-class Logger:
-    """The logger of one controller. It takes down X in slot 0, Y in slot 1 and the cell that X plays in slot 2."""
-
-    def __init__(self, link: ProLink, most_samples: int) -> None:
-        self._link = link
-        self._most = most_samples
-        self._rate_hz = 0.0
-        self._with_index = False
-        self._started: tuple[float, float] | None = None  # before the request and after its acknowledgement
-
-    def start(self, rate_hz: float, *, with_index: bool = False) -> None:
-        """Say what to log, positions and the path's index with them or not, and begin."""
-        clock = self._link.wire.clock
-        self._started = None
-        self._link.tell(set_values({LOG_RUN: 0}), "stopping the log")
-        slots = {log_slot(0): FEEDBACK_X, log_slot(1): FEEDBACK_Y}
-        slots |= {log_slot(2): X.vector(VectorRegister.INDEX)} if with_index else {}
-        self._link.tell(set_values({**slots, LOG_RATE: float(rate_hz)}), "setting up the log")
-        self._with_index = with_index
-        before = clock.now()
-        self._link.tell(set_values({LOG_RUN: 1}), "starting the log")
-        self._rate_hz, self._started = float(rate_hz), (before, clock.now())
-
-    def read(self, samples: int | None = None) -> MotionLog:
-        """End the log and fetch ``samples`` of it, or as many as the time since the start has.
-
-        Never more than the logger holds. Where it holds fewer than expected, the device says so and the log ends there.
-        RigError where no log was started.
-        """
-        if self._started is None:
-            raise RigError(f"no log was started on {self._link.wire.port}; start one before the path runs")
-        before, after = self._started
-        elapsed = self._link.wire.clock.now() - after
-        self._link.tell(set_values({LOG_RUN: 0}), "stopping the log")
-        self._started = None
-        wanted = min(int(elapsed * self._rate_hz) if samples is None else samples, self._most)
-        columns = [self._column(slot, wanted) for slot in range(2 + self._with_index)]
-        held = min(map(len, columns)) // CELL
-        x, y, *rest = (np.frombuffer(column, kind, held) for column, kind in zip(columns, _KINDS, strict=False))
-        index = rest[0].astype(np.int64) if rest else None
-        position = np.stack([x, y], axis=-1).astype(np.float32)
-        return MotionLog(position, self._rate_hz, after, after - before, index)
-
-    def _column(self, slot: int, samples: int) -> bytes:
-        cells = b""
-        for start in range(0, samples, VECTOR_CELLS):
-            try:
-                cells += read_cells(self._link, log_slot(slot), start, min(VECTOR_CELLS, samples - start))
-            except DeviceRefused as error:
-                if error.code != ErrorCode.VECTOR_INDEX:
-                    raise
-                LOG.warning("the log on %s ends at %d of %d samples", self._link.wire.port, start, samples)
-                break
-        return cells
 
 
 _POLL_S = 0.01
@@ -247,7 +182,7 @@ class MirrorController(Closing):
         self.wire = Wire(transport, clock, self.settings.patience)
         self._link = ProLink(self.wire, self.settings.with_crc, self.settings.strict_crc)
         self._modes = Modes(self._link)
-        self._log = Logger(self._link, self.settings.log_samples)
+        self._logging: tuple[float, float, float] | None = None  # rate; before the request and after its answer
         self._identity: Identity | None = None
         self._pairs = 0  # that the vector memory holds
 
@@ -362,7 +297,9 @@ class MirrorController(Closing):
                 }
                 frame = set_values({channel.vector(register): value for register, value in values.items()})
                 self._link.tell(frame, f"setting up the path's {name}")
-            self._move(run_values(), f"running positions {first}:{stop}")
+            follow: dict[int, Value] = {**X.followed(X.vector_system), **Y.followed(Y.vector_system)}
+            both = {channel.vector(VectorRegister.RUN): 1 for channel in (X, Y)}  # in one frame: they begin together
+            self._move(follow | both, f"running positions {first}:{stop}")
 
     def halt(self) -> None:
         """Stop playing; the mirror stays where it is. Works where motions are frozen, too."""
@@ -380,15 +317,35 @@ class MirrorController(Closing):
         self._check_connected()
         return self._link.ask(get_value(X.vector(VectorRegister.INDEX)), "the place in the path", cell_int)
 
-    def start_log(self, rate_hz: float | None = None, *, with_index: bool = False) -> None:
-        """Begin to log measured positions, and the cells that are played, at the settings' rate if none is given."""
+    def start_log(self, rate_hz: float) -> None:
+        """Begin to log measured positions ``rate_hz`` times a second: X in slot 0, Y in slot 1."""
         self._check_connected()
-        self._log.start(self.settings.log_rate_hz if rate_hz is None else rate_hz, with_index=with_index)
+        self._logging = None
+        self._link.tell(set_values({LOG_RUN: 0}), "stopping the log")
+        slots = {log_slot(0): FEEDBACK_X, log_slot(1): FEEDBACK_Y}
+        self._link.tell(set_values({**slots, LOG_RATE: float(rate_hz)}), "setting up the log")
+        before = self.wire.clock.now()
+        self._link.tell(set_values({LOG_RUN: 1}), "starting the log")
+        self._logging = float(rate_hz), before, self.wire.clock.now()
 
     def read_log(self, samples: int | None = None) -> MotionLog:
-        """End the log and fetch ``samples`` of it, or as many as the time since its start has."""
-        log = self._log.read(samples)
-        return replace(log, position=self.settings.mounting.to_model(log.position).astype(np.float32, copy=False))
+        """End the log and fetch ``samples`` of it, or as many as the time since the start has.
+
+        Never more than the logger holds. Where it holds fewer than expected, the device says so and the log ends there.
+        RigError where no log was started.
+        """
+        if self._logging is None:
+            raise RigError(f"no log was started on {self.wire.port}; start one before the path runs")
+        rate_hz, before, after = self._logging
+        elapsed = self.wire.clock.now() - after
+        self._link.tell(set_values({LOG_RUN: 0}), "stopping the log")
+        self._logging = None
+        wanted = min(int(elapsed * rate_hz) if samples is None else samples, self.settings.log_samples)
+        columns = [self._logged(slot, wanted) for slot in (0, 1)]
+        held = min(map(len, columns)) // CELL
+        measured = np.stack([np.frombuffer(column, ">f4", held) for column in columns], axis=-1).astype(np.float32)
+        position = self.settings.mounting.to_model(measured).astype(np.float32, copy=False)
+        return MotionLog(position, rate_hz, after, after - before)
 
     def park(self) -> None:
         """Send the mirror to 0; 0, as :meth:`goto` does."""
@@ -411,6 +368,18 @@ class MirrorController(Closing):
         if self.settings.check_status and (status := self.status()).stops_motion:
             raise RigError(f"{name} is refused on {self.wire.port}; {status.sentence}; mend that first")
         self._link.move(set_values(values), name)
+
+    def _logged(self, slot: int, samples: int) -> bytes:
+        cells = b""
+        for start in range(0, samples, VECTOR_CELLS):
+            try:
+                cells += read_cells(self._link, log_slot(slot), start, min(VECTOR_CELLS, samples - start))
+            except DeviceRefused as error:
+                if error.code != ErrorCode.VECTOR_INDEX:
+                    raise
+                LOG.warning("the log on %s ends at %d of %d samples", self.wire.port, start, samples)
+                break
+        return cells
 
     def _check_idle(self, purpose: str) -> None:
         if self.is_playing():

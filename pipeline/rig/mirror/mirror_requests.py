@@ -14,7 +14,6 @@ from enum import StrEnum
 from typing import TypeVar
 
 from pipeline.errors import RigError, ShapeError
-from pipeline.rig.devices import DeadlinePassed, DeviceRefused
 from pipeline.rig.mirror.pro_mode import (
     ERROR_FLAG,
     Command,
@@ -28,14 +27,14 @@ from pipeline.rig.mirror.pro_mode import (
     format_error,
     go_simple,
 )
-from pipeline.rig.transports import Kind, Receiver, Wire
+from pipeline.rig.transports import DeadlinePassed, DeviceRefused, Kind, Receiver, Wire
 
 LOG = logging.getLogger(__name__)
 
 END = b"\r\n"
 MOST_LINE = 64  # bytes, with the end
 
-START, STATUS, ACKNOWLEDGE, RESET = "START", "STATUS", "ACKNOWLEDGE", "RESET"
+START = "START"
 TEMPERATURE, ID, VERSION, SERIAL = "GETTEMP", "GETID", "GETVERSION", "GETSN"
 GO_PRO, GO_PRO_CRC = "GOPRO", "GOPROCRC"
 

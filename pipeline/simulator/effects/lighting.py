@@ -48,7 +48,8 @@ class Drift(Gain):
             change = relative_daylight(rig.sky, probe.wavelength_nm, some) - 1
             worst = np.maximum(worst, np.abs(change).max(axis=0))
         low, high = sun_elevation_deg(rig.sky, np.array([0.0, seconds]))
-        course = f"with the sun from {low:.1f} to {high:.1f} deg in {_spoken(seconds)}"
+        spoken = f"{seconds / 3600:.1f} h" if seconds >= 3600 else f"{seconds:.0f} s"
+        course = f"with the sun from {low:.1f} to {high:.1f} deg in {spoken}"
         return Bound(probe.scaled(worst), f"light changes by at most {100 * worst.max(initial=0.0):.3g} % {course}")
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
@@ -64,10 +65,6 @@ class Drift(Gain):
         if sky.started is None:
             return np.ones((1, 1, 1), np.float32)
         return relative_daylight(sky, block.wavelength_nm, block.time_s)[:, None].astype(np.float32)
-
-
-def _spoken(seconds: float) -> str:
-    return f"{seconds / 3600:.1f} h" if seconds >= 3600 else f"{seconds:.0f} s"
 
 
 @dataclass(frozen=True)

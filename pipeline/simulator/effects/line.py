@@ -14,12 +14,11 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, points_of_scan
 from pipeline.simulator.effects.air import PARALLAX, greatest_fraction, sway_gradient, turbulence_px
 from pipeline.simulator.effects.effect import OFF, Bound, Effect, SweepBlock
-from pipeline.simulator.effects.mirror_path import beside_plan, greatest_lag_px, transient
-from pipeline.simulator.effects.pointing import at_line_ends, end_gains
+from pipeline.simulator.effects.pointing import at_line_ends, beside_plan, end_gains, greatest_lag_px, transient
 from pipeline.simulator.effects.probe import Probe
+from pipeline.simulator.optics.kernel_fit import BETWEEN_ROWS, SCALE_STEP
 from pipeline.simulator.optics.rays import RayViews
 from pipeline.simulator.optics.tap_sums import TABULATED, Parts, fewest_parts
-from pipeline.simulator.optics.tap_tables import BETWEEN_ROWS, SCALE_STEP
 from pipeline.simulator.rig_model import Rig
 
 MARGIN = 1.5  # over what the probe measured at the roughest places found

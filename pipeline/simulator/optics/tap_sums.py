@@ -16,14 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.lazy import deferred
-from pipeline.simulator.optics.kernel_fit import Footprint, Moments, disc_points, fold
+from pipeline.simulator.optics.kernel_fit import TAIL, Footprint, Moments, TapTable, box_weight, disc_points, fold
 from pipeline.simulator.optics.rays import RayViews
-from pipeline.simulator.optics.tap_tables import TAIL, TapTable, box_weight
 
 if TYPE_CHECKING:  # numba takes half a second to import: a plan of a survey never needs it
-    from pipeline.simulator.optics import window_sums
+    from pipeline.simulator import compiled_loops as window_sums
 else:
-    window_sums = deferred("pipeline.simulator.optics.window_sums")
+    window_sums = deferred("pipeline.simulator.compiled_loops")
 
 Floats = NDArray[np.float64]
 Radiance = NDArray[np.float32]

@@ -17,18 +17,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-import numpy as np
-
 from pipeline.errors import SettingsError
-from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.simulator.effects.effect import OFF, Effect
 from pipeline.simulator.effects.probe import Probe, Unit
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.scene import RasterScene
-from pipeline.simulator.selection.options import ALWAYS_ON, Menu, Option, cost_of, list_options, unbounded_menu
+from pipeline.simulator.selection.options import ALWAYS_ON, Menu, Option, cost_of, list_options
 
-Reason = Literal["absent", "unseen", "small", "needed", "spent", "exact", "asked", "unasked", "unweighed", "always"]
-CHEAP_FRACTION = 0.1  # of the tolerance: what a variant may err by itself in the reference "everything on, cheap"
+Reason = Literal["absent", "unseen", "small", "needed", "spent", "exact", "asked", "unasked", "always"]
 UNIT_NAMES: dict[Unit, str] = {"sigma": "sigma of the noise", "dn": "DN"}
 TOTAL = "all effects"
 
@@ -38,7 +33,7 @@ class Treatment:
     """What was decided for one effect, and why.
 
     ``small``: off, within the tolerance. ``needed``: leaving it out exceeds the tolerance alone; ``spent``: with the
-    others. ``unweighed``: on, for choosing takes longer than leaving out anything saves.
+    others.
     """
 
     menu: Menu
@@ -95,18 +90,6 @@ class Decision:
         """Per px and band, of everything that the rig has, exact [ns]."""
         menus = [one.menu for one in self.taken if one.menu.present]
         return cost_of(menus, {menu.name: menu.exact for menu in menus})
-
-    @property
-    def cheap_cost_ns(self) -> float:
-        """Per px and band, of everything that the rig has, each as cheap as a tenth of the tolerance lets it be."""
-        menus = [one.menu for one in self.taken if one.menu.present]
-        return cost_of(menus, {menu.name: menu.cheapest_within(CHEAP_FRACTION * self.tolerance) for menu in menus})
-
-    @property
-    def cheap(self) -> dict[Effect, str]:
-        """Everything that the rig has, each in its cheapest variant that errs by no more than a tenth."""
-        within = CHEAP_FRACTION * self.tolerance
-        return {one.menu.effect: one.menu.cheapest_within(within).variant for one in self.taken if one.menu.present}
 
 
 def decide(
@@ -253,14 +236,11 @@ def list_effects(decision: Decision, measured: Mapping[str, float] | None = None
 
 
 def sum_up(decision: Decision, measured: Mapping[str, float] | None = None) -> dict[str, Any]:
-    """Give the totals: bound beside tolerance, and the CPU seconds that were saved against everything on.
+    """Return the totals: bound beside tolerance, and the CPU seconds that were saved against everything exact.
 
-    ``saved_s`` is against everything exact, ``saved_cheap_s`` against each effect in its cheapest variant that errs by
-    no more than a tenth of the tolerance; without the rays through the footprint that every simulation takes.
+    Without the rays through the footprint that every simulation takes.
     """
-    cost, exact, cheap = (
-        _seconds(ns, decision) for ns in (decision.cost_ns, decision.exact_cost_ns, decision.cheap_cost_ns)
-    )
+    cost, exact = (_seconds(ns, decision) for ns in (decision.cost_ns, decision.exact_cost_ns))
     return {
         "asked": decision.asked,
         "tolerance": _finite(decision.tolerance),
@@ -272,10 +252,7 @@ def sum_up(decision: Decision, measured: Mapping[str, float] | None = None) -> d
         "off": sum(not one.is_on for one in decision.taken),
         "cost_s": cost,
         "exact_cost_s": exact,
-        "cheap_cost_s": cheap,
-        "unweighed": any(one.reason == "unweighed" for one in decision.taken),
         "saved_s": exact - cost,
-        "saved_cheap_s": cheap - cost,
     }
 
 
@@ -302,7 +279,6 @@ def _said_reason(one: Treatment, decision: Decision) -> str:
         "exact": "the tolerance is 0, so everything is computed",
         "asked": "asked for",
         "unasked": f"not asked for; {left_out}",
-        "unweighed": "on a scene so small choosing takes longer than it can save, so everything is computed",
         "always": "always there, for raw lines are whole numbers of limited size",
     }[one.reason]
 
@@ -317,49 +293,3 @@ def _finite(value: float) -> float | None:
 
 def _seconds(cost_ns: float, decision: Decision) -> float:
     return cost_ns * 1e-9 * decision.px_bands
-
-
-CHOOSING_S = 0.9  # CPU seconds of a choice beside those of libraries, measured on scenes of any size
-FEWEST_BANDS = 200  # a sample of fewer takes as long: most of it goes into the weights of its pixels
-
-
-def everything(
-    scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], effects: Sequence[Effect], tolerance: float, unit: Unit
-) -> Decision:
-    """Take all that the rig has, exact, without a look at the scene: nothing has a bound, and nothing needs one."""
-    probe, taken = _unseen(scene, rig, sweeps, unit), []
-    for effect in effects:
-        menu = unbounded_menu(effect, probe, rig)
-        reason: Reason = "absent" if not menu.present else "always" if menu.name in ALWAYS_ON else "unweighed"
-        taken.append(Treatment(menu, menu.exact if menu.present else menu.off, reason))
-    px_bands = sum(sweep.lines for sweep in sweeps) * rig.camera.samples * len(scene.wavelength_nm)
-    return Decision(tuple(taken), tolerance, unit, "auto", px_bands)
-
-
-def pays(decision: Decision, bands: int) -> bool:
-    """Whether choosing may save more than it takes, given everything: by what effects cost with `FEWEST_BANDS`."""
-    return decision.exact_cost_ns * 1e-9 * decision.px_bands * max(FEWEST_BANDS / bands, 1.0) > CHOOSING_S
-
-
-def _unseen(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit) -> Probe:
-    """The probe of a scene that may be anything: every effect that the rig has shows in it."""
-    nm, camera = scene.wavelength_nm, rig.camera
-    one, both = np.ones(len(nm)), np.ones((2, len(nm)))
-    return Probe(
-        unit=unit,
-        sweeps=tuple(sweeps),
-        wavelength_nm=nm,
-        fwhm_nm=scene.fwhm_nm,
-        level=one,
-        spread=one,
-        span=one,
-        slope=both,
-        curvature=both,
-        spectral_slope=one,
-        spectral_curvature=one,
-        brightest_e=camera.full_scale_e,
-        darkest_e=0.0,
-        unit_least_dn=1.0,
-        lines=sum(sweep.lines for sweep in sweeps),
-        seconds=CostModel().seconds(list(sweeps), camera),
-    )

@@ -85,11 +85,6 @@ class Menu:
             return option.cost_ns
         return max(one.cost_ns, LEAST_COST_NS)
 
-    def cheapest_within(self, error: float) -> Option:
-        """Give the cheapest variant, never off, whose own error is no more than this."""
-        within = (option for option in self.variants if option.error <= error)
-        return min(within, key=lambda option: (option.cost_ns, option.error, option.variant), default=self.exact)
-
 
 def acts_on_light(effect: Effect) -> bool:
     """Whether it comes before the readout: what it changes, later gains multiply."""
@@ -170,16 +165,6 @@ def _menu(effect: Effect, probe: Probe, rig: Rig, present: bool, gain: float) ->
     exact = Option(effect.variants[0], 0.0, _cost_ns(costs, effect.variants[0]), "exact")
     merged: Merged | None = effect.merged(rig) if hasattr(effect, "merged") else None
     return Menu(effect, (exact, *map(option, effect.variants[1:])), option(OFF), present, merged)
-
-
-def unbounded_menu(effect: Effect, probe: Probe, rig: Rig) -> Menu:
-    """Give the exact variant alone, and off without a bound: of a scene that nobody has looked at."""
-    costs = effect.cost_at(probe, rig) if hasattr(effect, "cost_at") else effect.cost_ns
-    exact = Option(effect.variants[0], 0.0, _cost_ns(costs, effect.variants[0]), "exact")
-    merged: Merged | None = effect.merged(rig) if hasattr(effect, "merged") else None
-    if not _is_present(effect, probe, rig):
-        return Menu(effect, (exact,), Option(OFF, 0.0, 0.0, effect.bound(probe, rig, OFF).why), False, merged)
-    return Menu(effect, (exact,), Option(OFF, math.inf, 0.0, "not looked at"), True, merged)
 
 
 def _cost_ns(costs: Mapping[str, float], variant: str) -> float:

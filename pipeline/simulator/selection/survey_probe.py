@@ -26,11 +26,10 @@ from pipeline.simulator.effects.probe import (
     stored_mean,
     unit_at,
 )
-from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.optics.kernel_fit import Footprint, Moments, fold
 from pipeline.simulator.optics.rays import middle_normal
 from pipeline.simulator.optics.tap_sums import LADDER
-from pipeline.simulator.render import views_all_over
+from pipeline.simulator.render import EFFECTS, views_all_over
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.simulator.selection.adjacency import REACHES, greatest_way_px, reached_cells, seen_widely

@@ -16,15 +16,15 @@ from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.effect import Effect, Radiance, SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.effects.probe import Probe, noise_electrons
-from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.readout import read_out
-from pipeline.simulator.render import expected_light
+from pipeline.simulator.render import EFFECTS, expected_light
 from pipeline.simulator.rig_model import Air, Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.simulator.selection.choice import Decision, decide
 from pipeline.simulator.selection.survey_probe import probe_scene
 from pipeline.simulator.selection.verification import candidate_blocks, verify, worst_blocks
+from tests.benchmarks.effects.bench_simulator import cheap_effects
 from tests.pipeline.simulator.bound_trials import DRAWN, Trial, trials
 from tests.pipeline.simulator.pupil_reference import distances, random_tile
 from tests.pipeline.simulator.random_cases import Case, random_case
@@ -117,7 +117,7 @@ def _of_rig(scene: RasterScene, name: str, rig: Rig, sweeps: tuple[Sweep, ...]) 
     decision = decide(probe, rig, EFFECTS, TOLERANCE)
     decided = time.process_time() - clock - probed
     blocks = [_block(scene, rig, sweep, LINES) for sweep in sweeps]
-    ways = {"auto": decision.chosen, "exact": decision.exact, "cheap": decision.cheap}
+    ways = {"auto": decision.chosen, "exact": decision.exact, "cheap": cheap_effects(decision)}
     light = {way: [expected_light(scene, block, chosen) for block in blocks] for way, chosen in ways.items()}
     apart = {way: _apart(light[way], light["exact"], rig) for way in ("auto", "cheap")}
     clocks = time_in_turn({way: partial(_image, scene, blocks[0], chosen) for way, chosen in ways.items()}, rounds=3)

@@ -17,13 +17,12 @@ from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import Effect, SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.effects.probe import noise_electrons
-from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.readout import read_out
-from pipeline.simulator.render import expected_light
+from pipeline.simulator.render import EFFECTS, expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
-from pipeline.simulator.selection.choice import CHEAP_FRACTION, Decision, decide
+from pipeline.simulator.selection.choice import Decision, decide
 from pipeline.simulator.selection.survey_probe import probe_scene
 
 SIZE = 2560  # px of the scene
@@ -63,7 +62,7 @@ def rows() -> list[Row]:
     """Rate, fraction of a copy, savings, memory; and what the footprint's variants cost and miss."""
     survey = _survey()
     decision, blocks = survey.decision, survey.blocks()
-    cheap = _cheap(decision)
+    cheap = cheap_effects(decision)
     calls: dict[str, Callable[[], object]] = {
         "auto": partial(_simulated, survey, decision.chosen, blocks),
         "cheap": partial(_simulated, survey, cheap, blocks[:4]),
@@ -119,11 +118,14 @@ def _simulated(survey: Survey, chosen: dict[Effect, str], blocks: list[SweepBloc
         read_out(expected_light(survey.scene, block, chosen), block, chosen)
 
 
-def _cheap(decision: Decision) -> dict[Effect, str]:
+def cheap_effects(decision: Decision) -> dict[Effect, str]:
     """Everything that the rig has, each in the cheapest variant whose own error is a tenth of the tolerance at most."""
-    within = CHEAP_FRACTION * decision.tolerance
-    menus = [one.menu for one in decision.taken if one.menu.present]
-    return {menu.effect: menu.cheapest_within(within).variant for menu in menus}
+    found: dict[Effect, str] = {}
+    for menu in (one.menu for one in decision.taken if one.menu.present):
+        within = [option for option in menu.variants if option.error <= 0.1 * decision.tolerance]
+        least = min(within, key=lambda option: (option.cost_ns, option.error, option.variant), default=menu.exact)
+        found[menu.effect] = least.variant
+    return found
 
 
 def _take(survey: Survey) -> Callable[[], None]:

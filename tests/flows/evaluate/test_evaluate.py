@@ -25,7 +25,7 @@ from models.training.train import TrainingSettings
 from models.weights.files import load_weights, save_weights
 from pipeline.errors import SceneError, SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
-from pipeline.simulator.effects.registry import USUAL
+from pipeline.simulator.render import USUAL
 from pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from tests.flows.evaluate.conftest import Judged
 from tests.flows.small_fields import FRAMES, QUICK, observed_passes, scene_at, write_field, write_weights

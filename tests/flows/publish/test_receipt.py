@@ -74,9 +74,7 @@ def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
         "off": 0,
         "cost_s": 1.5,
         "exact_cost_s": 9.0,
-        "cheap_cost_s": 4.0,
         "saved_s": 7.5,
-        "saved_cheap_s": 2.5,
     }
     stages = [
         StageRecord("capture", "ab12", "ran", wall, wall, 10**9, 0, 10**8, f"{wall:064}"),  # a manifest holds times

@@ -21,7 +21,7 @@ from pipeline.errors import BudgetError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel
 from pipeline.ground.view import RigPose
-from pipeline.simulator.effects.registry import EFFECTS
+from pipeline.simulator.render import EFFECTS
 from pipeline.simulator.rig_model import Air, Detector, Optics, Rig, Sky
 from storage.archive.whole_files import to_json
 

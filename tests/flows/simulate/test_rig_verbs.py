@@ -20,7 +20,7 @@ import serial
 from rich.console import Console
 
 from flows.settings.load import load_settings
-from flows.simulate.rig_commands import EmulateRequest, emulated_settings, run_emulate
+from flows.simulate.rig_commands import emulated_settings, run_emulate
 from pipeline.rig.emulator.emulated_rig import FastClock, ServedRig
 from pipeline.rig.mirror.pro_mode import Command
 from tests.flows.conftest import CommandLine
@@ -178,10 +178,14 @@ def test_emulated_rig_is_checked_by_the_file_that_it_writes(command_line: Comman
     wanted: dict[str, object] = {"size": "64x48", "bands": "40,90", "effects": "all", "seed": "3"}
     wanted |= {"rig.mirror_axes": "y,-x", "camera.samples": "320", "detector.noiseless": True, "optics.focus_m": 40.0}
     settings = emulated_settings(None, wanted)
-    request = EmulateRequest(settings, 0, 20.0, file)
     ended, codes = threading.Event(), []
-    console = Console(quiet=True)
-    thread = threading.Thread(target=lambda: codes.append(run_emulate(request, console, as_json=True, ended=ended)))
+
+    def emulate() -> None:
+        codes.append(
+            run_emulate(settings, Console(quiet=True), baud=0, speed=20.0, out=file, as_json=True, ended=ended)
+        )
+
+    thread = threading.Thread(target=emulate)
     thread.start()
     try:
         while thread.is_alive() and not file.exists():

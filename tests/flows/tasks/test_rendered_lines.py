@@ -15,13 +15,14 @@ from pipeline.errors import RigError, SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator import render, simulated
-from pipeline.simulator.effects.registry import BY_NAME, effects_on
+from pipeline.simulator.render import BY_NAME
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Line
 from storage.arrays.spool import Spool
 from storage.parallel.pool import WorkerPool
+from tests.pipeline.simulator.small_scenes import effects_on
 
 CAMERA = LineCamera(samples=48)
 SWEEP = Sweep("s", "fine", "x", swath_px=0.0, start_px=-35.0, lines=70)

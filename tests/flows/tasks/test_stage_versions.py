@@ -122,7 +122,7 @@ def test_every_barrier_stands_in_a_way(barrier: str) -> None:
             "SceneGrid",
         ),
         "segment": ("encode_packed", "fill_dead", "MOST_DEAD", "Segmenter", "write_class_tile"),
-        "capture": ("RigSource", "CaptureRunner", "open_mirror", "HeadwallCamera", "fit_clocks", "EFFECTS"),
+        "capture": ("RigSource", "CaptureRunner", "open_mirror", "HeadwallCamera", "lines_by_time", "EFFECTS"),
         "patches": ("read_patches", "LineCache", "calibrate", "PatchWriter"),
     }.items(),
 )

@@ -28,7 +28,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.planning.coverage import on_scene
-from pipeline.simulator.effects.registry import BY_NAME
+from pipeline.simulator.render import BY_NAME
 from storage.archive.archive import Archive
 from storage.arrays.class_maps import ClassMap, load_class_map
 from storage.remote.opening import verify_archive

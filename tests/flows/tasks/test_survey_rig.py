@@ -34,13 +34,10 @@ from pipeline.rig.camera.camera_cubes import mean_frame
 from pipeline.rig.capture.capture_paths import REFERENCES
 from pipeline.rig.capture.capture_runner import RigDevices
 from pipeline.rig.device_settings import SurveyRig
-from pipeline.rig.devices import SYSTEM_CLOCK, DeviceGone
-from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock
+from pipeline.rig.emulator.emulated_rig import REFERENCE_FRAMES, EmulatedRig, FastClock, SceneView
 from pipeline.rig.emulator.mirror_device import Mode
-from pipeline.rig.emulator.scene_camera import REFERENCE_FRAMES, SceneView
 from pipeline.rig.mirror.pro_mode import Command
-from pipeline.rig.transports import SerialTransport
-from pipeline.simulator.effects.registry import effects_on
+from pipeline.rig.transports import SYSTEM_CLOCK, DeviceGone, SerialTransport
 from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import References
@@ -53,6 +50,7 @@ from tests.flows.conftest import CommandLine
 from tests.pipeline.rig.camera_faults import CameraFault, FaultyRig
 from tests.pipeline.rig.in_process import InProcessRig, ManualClock
 from tests.pipeline.rig.mirror_faults import make_fault
+from tests.pipeline.simulator.small_scenes import effects_on
 from tests.prior_work import without_effects
 
 QUIET = Console(quiet=True)
@@ -247,19 +245,6 @@ def test_a_rig_as_the_defaults_have_it(tmp_path: Path, monkeypatch: pytest.Monke
         assert {one["method"] for one in record["captures"]} == {"log"}
     alike = class_map_of(published, tmp_path) == simulated_map
     assert alike.mean() > 0.9, alike.mean()
-
-
-def test_log_beside_pulses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Every capture is tied by the edges in the mirror's log: lines are the planned ones, where it measured them."""
-    told = {"rig.log_pulses": True, "rig.log_samples": 16000, "effects": "none"}
-    settings = small_settings(tmp_path, source="rig", visit="first", **told)
-    with emulated(settings, {}, monkeypatch):
-        published = run_survey(settings, QUIET)
-    record = json.loads((tmp_path / published.receipt["products"]["raw_coarse"] / "rig.json").read_text())
-    assert record["rig"]["log_pulses"]
-    assert [one["method"] for one in record["captures"]] == ["log"]
-    assert all(one["drift_ppm"] is not None and one["residual_px"] < 2 for one in record["captures"])
-    assert {finding.kind for finding in verify_archive(Archive.open(tmp_path))} == {"whole"}
 
 
 def test_what_the_rig_is_at_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -26,7 +26,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, REMOVED_LAW, farm_scene
-from pipeline.simulator.scenes.farm.seasons import sun_over_farm
+from pipeline.simulator.scenes.farm.land import sun_over_farm
 from pipeline.simulator.scenes.scene import RasterScene
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue

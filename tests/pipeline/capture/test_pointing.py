@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.capture.pointing import PlayedVector, angles_to_positions, split_vector
+from pipeline.capture.straight_scans import PlayedVector, angles_to_positions, split_vector
 from pipeline.errors import SceneError
 from pipeline.geometry.mirror import REST_TANGENT, direction_to_scene, position_to_direction
 

@@ -16,12 +16,11 @@ from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
 from pipeline.rectify.resample import resample
 from pipeline.signal.calibrate import calibrate
-from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource
 from tests.pipeline.rectify.aiming import geolocation
-from tests.pipeline.simulator.small_scenes import made_scene
+from tests.pipeline.simulator.small_scenes import effects_on, made_scene
 
 CAMERA = LineCamera(
     bits=14, electrons_per_dn=1.0

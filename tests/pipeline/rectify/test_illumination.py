@@ -16,10 +16,10 @@ from pipeline.rectify.placed import PixelGrid, place
 from pipeline.rectify.region import mosaic_tile
 from pipeline.rectify.registration.illumination import LightRatio, light_ratio, overlap_light, solve_lights
 from pipeline.rectify.registration.overlaps import Window
-from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+from tests.pipeline.simulator.small_scenes import effects_on
 
 WAVELENGTH = np.linspace(400, 1000, 31)
 PLACE = (WAVELENGTH - 700) / 300

@@ -21,10 +21,10 @@ from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
 from pipeline.rectify.placed import place
 from pipeline.rectify.region import mosaic_rows, patch_pixels, read_every_patch, read_patches
 from pipeline.signal.lines import LineCache
-from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+from tests.pipeline.simulator.small_scenes import effects_on
 
 LINES, SAMPLES, BANDS = 300, 100, 2
 

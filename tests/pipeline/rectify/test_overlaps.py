@@ -21,11 +21,10 @@ from pipeline.rectify.registration.overlaps import BroadSweep, PlacedImage, over
 from pipeline.rectify.registration.seams import Registration, place_images, register_sweeps
 from pipeline.signal.lines import broad_bands
 from pipeline.simulator.effects.pointing import PointingErrors
-from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import SceneRadiance, raster_from_values
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
-from tests.pipeline.simulator.small_scenes import seen_at
+from tests.pipeline.simulator.small_scenes import effects_on, seen_at
 
 CAMERA = LineCamera(samples=160)
 GRID = SceneGrid(260, 300, 16, 4)

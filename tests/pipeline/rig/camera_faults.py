@@ -12,10 +12,8 @@ import numpy as np
 
 from pipeline.errors import RigError
 from pipeline.rig.emulator import Chunk
-from pipeline.rig.emulator.camera_device import PROMPT, CameraDevice, EmulatedCapture
-from pipeline.rig.emulator.camera_server import CameraServer, FileHandler
-from pipeline.rig.emulator.emulated_rig import EmulatedRig
-from pipeline.rig.emulator.scene_camera import SceneCamera
+from pipeline.rig.emulator.camera_device import PROMPT, CameraDevice, CameraServer, EmulatedCapture, FileHandler
+from pipeline.rig.emulator.emulated_rig import EmulatedRig, SceneCamera
 from pipeline.simulator.simulated import SimulatedSource
 from tests.pipeline.rig.mirror_faults import Fault, FaultyMirror
 

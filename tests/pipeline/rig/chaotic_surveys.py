@@ -15,7 +15,7 @@ from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.capture.capture_runner import RigDevices
 from pipeline.rig.capture.rig_source import RigSource
 from pipeline.rig.device_settings import CameraAddress, ControlPatience, FileServer
-from pipeline.rig.emulator.camera_server import CameraServer
+from pipeline.rig.emulator.camera_device import CameraServer
 from pipeline.source import Line, References
 from tests.pipeline.rig.chaos_line import OFTEN, ChaosLine
 from tests.pipeline.rig.in_process import ManualClock

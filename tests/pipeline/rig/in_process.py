@@ -11,14 +11,12 @@ from pipeline.errors import SettingsError
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.capture.capture_runner import RigDevices
 from pipeline.rig.device_settings import FileServer, MirrorSettings
-from pipeline.rig.devices import Clock, Closing, DeadlinePassed, DeviceGone
 from pipeline.rig.emulator import Chunk
-from pipeline.rig.emulator.camera_device import CameraDevice
-from pipeline.rig.emulator.camera_server import CameraConnection
+from pipeline.rig.emulator.camera_device import CameraConnection, CameraDevice
 from pipeline.rig.emulator.emulated_rig import EmulatedRig
 from pipeline.rig.emulator.mirror_device import MirrorDevice
 from pipeline.rig.mirror.mirror_controller import MirrorController
-from pipeline.rig.transports import BITS_PER_BYTE
+from pipeline.rig.transports import BITS_PER_BYTE, Clock, Closing, DeadlinePassed, DeviceGone
 from tests.pipeline.rig.mirror_faults import FaultyMirror, VanishedError
 
 

@@ -18,7 +18,6 @@ from pipeline.rig.camera.camera_files import Kept, KeptInMemory
 from pipeline.rig.capture.capture_runner import RigDevices
 from pipeline.rig.capture.rig_source import RigSource
 from pipeline.rig.device_settings import SurveyRig
-from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
@@ -26,6 +25,7 @@ from pipeline.source import Line
 from tests.pipeline.rig.camera_faults import CameraFault, CameraFaults, FaultyRig
 from tests.pipeline.rig.in_process import InProcessRig, ManualClock
 from tests.pipeline.rig.mirror_faults import Fault
+from tests.pipeline.simulator.small_scenes import effects_on
 
 CAMERA = LineCamera(samples=48)
 NAMES = ("rotation", "slit", "smear", "vignetting", "shot", "read-noise")

@@ -16,8 +16,7 @@ import serial
 
 from pipeline.errors import SettingsError
 from pipeline.rig.device_settings import MirrorSettings, SurveyRig
-from pipeline.rig.devices import SYSTEM_CLOCK, DeadlinePassed, DeviceGone
-from pipeline.rig.transports import SerialTransport
+from pipeline.rig.transports import SYSTEM_CLOCK, DeadlinePassed, DeviceGone, SerialTransport
 from tests.pipeline.rig.in_process import ManualClock
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo terminals are of POSIX systems")

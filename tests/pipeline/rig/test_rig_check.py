@@ -16,13 +16,13 @@ from pipeline.rig.camera.camera_files import log_in
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.capture.capture_paths import capture_prefix
 from pipeline.rig.device_settings import FileServer, MirrorSettings, Pulses
-from pipeline.rig.devices import Clock, DeviceGone, DeviceRefused
 from pipeline.rig.emulator.camera_device import CameraUnit
 from pipeline.rig.emulator.mirror_device import Mode
 from pipeline.rig.emulator.mirror_state import MirrorUnit
 from pipeline.rig.mirror.mirror_controller import MirrorController, MotionLog
 from pipeline.rig.mirror.pro_mode import Command, Status
 from pipeline.rig.rig_check import SQUARE, CheckRow, check_camera, check_mirror, check_triggers, failed, works
+from pipeline.rig.transports import Clock, DeviceGone, DeviceRefused
 from tests.pipeline.rig.camera_faults import CameraFault, CameraFaults, FaultyRig
 from tests.pipeline.rig.in_process import InProcessRig, ManualClock
 from tests.pipeline.rig.mirror_faults import make_fault
@@ -299,7 +299,7 @@ class Mock:
     def goto(self, x: float, y: float) -> None:
         self.place = (x, y)
 
-    def start_log(self, rate_hz: float | None = None, *, with_index: bool = False) -> None: ...
+    def start_log(self, rate_hz: float) -> None: ...
 
     def settle(self, within_s: float) -> None: ...
 

@@ -10,8 +10,7 @@ import numpy as np
 
 from pipeline.simulator.effects.effect import OFF, Effect, Radiance, SweepBlock
 from pipeline.simulator.effects.probe import noise_electrons
-from pipeline.simulator.effects.registry import EFFECTS, READOUT
-from pipeline.simulator.render import expected_light
+from pipeline.simulator.render import EFFECTS, READOUT, expected_light
 from pipeline.simulator.selection.options import SAFETY, Menu, list_options
 from pipeline.simulator.selection.verification import (
     ROUNDING,

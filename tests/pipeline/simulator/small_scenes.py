@@ -10,6 +10,8 @@ from scipy.ndimage import map_coordinates
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.lazy import Once
+from pipeline.simulator.effects.counting import GAUSSIAN, SHOT
+from pipeline.simulator.render import BY_NAME, EFFECTS, Choice
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster, raster_from_values
 
 
@@ -33,3 +35,9 @@ def seen_at(scene: RasterScene, y: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Components at points, (..., component): linear between pixels, the edge repeated outside."""
     found = [map_coordinates(plane, [y, x], order=1, mode="nearest") for plane in np.moveaxis(scene.planes, -1, 0)]
     return np.stack(found, axis=-1)
+
+
+def effects_on(*names: str) -> Choice:
+    """Give effects by their names, in the order of the chain: exact ones, but for shot noise, which is cheap."""
+    assert set(names) <= set(BY_NAME)
+    return Choice(tuple((one, GAUSSIAN if one is SHOT else one.variants[0]) for one in EFFECTS if one.name in names))

@@ -14,11 +14,10 @@ from pipeline.geometry.scan import Axis, Sweep
 from pipeline.rectify.registration.overlaps import BroadSweep
 from pipeline.rectify.registration.seams import Anchor, anchor_sweep
 from pipeline.simulator.effects.pointing import CommonOffset
-from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
-from tests.pipeline.simulator.small_scenes import image_scene, seen_at
+from tests.pipeline.simulator.small_scenes import effects_on, image_scene, seen_at
 
 CAMERA = LineCamera(samples=96)
 GRID = SceneGrid(240, 300, 16, 4)

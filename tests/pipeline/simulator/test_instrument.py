@@ -14,12 +14,11 @@ from pipeline.geometry.camera import LineCamera, expose, footprint
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.simulator.effects.pointing import CommonOffset
-from pipeline.simulator.effects.registry import EFFECTS, USUAL, effects_on
-from pipeline.simulator.render import Choice, expected_light
+from pipeline.simulator.render import EFFECTS, USUAL, Choice, expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig, Sky
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import render_lines, sweep_block
-from tests.pipeline.simulator.small_scenes import image_scene, made_scene, seen_at
+from tests.pipeline.simulator.small_scenes import effects_on, image_scene, made_scene, seen_at
 
 CAMERA = LineCamera()
 OPTICS = effects_on("rotation", "slit", "smear")

@@ -18,13 +18,13 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel, Sweep, line_positions
 from pipeline.signal.calibrate import calibrate
 from pipeline.simulator.effects.counting import SHOT, dark_electrons, dead_elements, hot_electrons
-from pipeline.simulator.effects.registry import BY_NAME, EFFECTS, USUAL, effects_on
-from pipeline.simulator.effects.sensor import response_gain, stripe_gain
+from pipeline.simulator.effects.spectrometer import response_gain, stripe_gain
+from pipeline.simulator.render import BY_NAME, EFFECTS, USUAL
 from pipeline.simulator.rig_model import Detector, Rig, Sky
 from pipeline.simulator.scenes.scene import RasterScene
-from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_starts
+from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_block, sweep_starts
 from pipeline.source import References, Source
-from tests.pipeline.simulator.small_scenes import image_scene, made_scene
+from tests.pipeline.simulator.small_scenes import effects_on, image_scene, made_scene
 
 CAMERA = LineCamera()
 SWEEP = Sweep("s", "fine", "x", swath_px=0.0, start_px=-19.5, lines=40)
@@ -145,9 +145,7 @@ def test_lines_come_one_by_one() -> None:
 
 
 def test_impossible_settings_are_refused() -> None:
-    """Unknown effects and variants, and sums that overflow uint16 are named."""
-    with pytest.raises(SettingsError, match=r"'fog'.*choose from.*slit"):
-        effects_on("slit", "fog")
+    """Unknown variants, and sums that overflow uint16 are named."""
     with pytest.raises(SettingsError, match=r"shot has no variant 'rough'"):
         source_of(np.ones((8, 8, 1)), chosen={SHOT: "rough"})
     with pytest.raises(ShapeError, match="bin at most 16"):
@@ -195,7 +193,9 @@ def test_sweeps_end_before_the_next_and_within_the_price(sizes: list[int], step:
 def test_blocks_tell_the_time_of_mid_exposure() -> None:
     """Since the survey's start: line 3 of a sweep that starts after 60 s is exposed from 60.3 to 60.4 s."""
     source = SimulatedSource(image_scene(np.ones((8, 8, 1)), CAMERA, [500.0]), Rig(CAMERA), clock={"a": 60.0})
-    assert source.block(Sweep("a", "fine", "x", 0.0, 0.0, 9), range(3, 5)).time_s == pytest.approx([60.35, 60.45])
+    sweep = Sweep("a", "fine", "x", 0.0, 0.0, 9)
+    block = sweep_block(source.scene, source.rig, sweep, range(3, 5), started_s=source.started_s(sweep))
+    assert block.time_s == pytest.approx([60.35, 60.45])
 
 
 def test_light_goes_with_the_clock() -> None:

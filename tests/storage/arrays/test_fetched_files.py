@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.rig.devices import NotKept
+from pipeline.rig.transports import NotKept
 from storage.arrays.fetched_files import SUMS, FetchedFiles
 from tests.storage.small_archive import flip
 

@@ -10,26 +10,24 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.simulator.scenes.farm.land import (
+    CROPS,
     Border,
+    Crop,
     Field,
+    Land,
     Parcel,
+    Sun,
     allot,
     divide_land,
-    smooth_noise,
-    stream,
-    visible_area,
-)
-from pipeline.simulator.scenes.farm.seasons import (
-    CROPS,
-    Crop,
-    Land,
-    Sun,
     foliage,
     land_on,
     lodged_fraction,
+    smooth_noise,
     soil_moisture,
     stage_fractions,
+    stream,
     sun_over_farm,
+    visible_area,
 )
 from pipeline.simulator.scenes.farm.spectra import MATERIALS, wet_fraction
 

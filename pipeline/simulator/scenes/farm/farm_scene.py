@@ -44,14 +44,15 @@ from pipeline.simulator.scenes.farm.fields import paint_fields, plant_weeds
 from pipeline.simulator.scenes.farm.land import (
     Band,
     Points,
+    Sun,
     band_pixels,
     disc_pixels,
     edge,
+    foliage,
     scene_points,
     smooth_noise,
     stream,
 )
-from pipeline.simulator.scenes.farm.seasons import Sun, foliage
 from pipeline.simulator.scenes.farm.spectra import WHITE_REFERENCE_REFLECTANCE, band_centres, spectral_library
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
 

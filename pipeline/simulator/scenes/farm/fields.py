@@ -21,25 +21,23 @@ from pipeline.simulator.scenes.farm.farm_plan import (
     moist_soil,
 )
 from pipeline.simulator.scenes.farm.land import (
-    Field,
-    Points,
-    disc_pixels,
-    edge,
-    parcel_pixels,
-    polygon_area,
-    smooth_noise,
-    stream,
-    stripes,
-)
-from pipeline.simulator.scenes.farm.seasons import (
     YEAR_DAYS,
     Crop,
+    Field,
+    Points,
     Sun,
     canopy_cover,
     crop_height,
     days_since_turned,
+    disc_pixels,
+    edge,
     lodged_fraction,
+    parcel_pixels,
+    polygon_area,
+    smooth_noise,
     stage_fractions,
+    stream,
+    stripes,
     weed_size,
 )
 

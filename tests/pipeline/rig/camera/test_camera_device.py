@@ -7,9 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from pipeline.rig.devices import DeviceRefused
-from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit
-from pipeline.rig.emulator.camera_server import CameraConnection
+from pipeline.rig.emulator.camera_device import CameraConnection, CameraDevice, CameraUnit
+from pipeline.rig.transports import DeviceRefused
 from tests.pipeline.rig.camera.camera_line import LinesOf, control_of
 from tests.pipeline.rig.camera_faults import CameraFault, CameraFaults, FaultyCamera
 from tests.pipeline.rig.in_process import ManualClock

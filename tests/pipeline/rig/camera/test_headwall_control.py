@@ -12,7 +12,7 @@ from pipeline.rig.camera import headwall_replies
 from pipeline.rig.camera.headwall_camera import CaptureUnknown, HeadwallCamera
 from pipeline.rig.camera.headwall_replies import ReplyReader
 from pipeline.rig.device_settings import ControlPatience, FileServer
-from pipeline.rig.devices import Clock, DeviceGone, DeviceRefused, StateUnknown
+from pipeline.rig.transports import Clock, DeviceGone, DeviceRefused, StateUnknown
 from tests.pipeline.rig.in_process import ManualClock
 from tests.pipeline.rig.scripted import Late, Pair, Reply, ScriptedTransport
 

@@ -11,8 +11,8 @@ from pipeline.errors import RigError
 from pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_files, log_in
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.device_settings import CameraAddress, ControlPatience, FileServer
-from pipeline.rig.devices import DeadlinePassed, DeviceGone
 from pipeline.rig.rig_check import check_camera
+from pipeline.rig.transports import DeadlinePassed, DeviceGone
 from tests.pipeline.rig.camera.hostile_camera import Answers, HostileControl, HostileFiles, Pieces, flood, trickled
 
 STALL_S = 0.3

@@ -9,9 +9,8 @@ import numpy as np
 
 from pipeline.rig.camera.camera_files import KeptInMemory
 from pipeline.rig.capture import JOURNAL
-from pipeline.rig.capture.capture_paths import CaptureRecord
+from pipeline.rig.capture.capture_paths import CaptureRecord, LinePositions
 from pipeline.rig.capture.capture_runner import CaptureJournal
-from pipeline.rig.capture.line_positions import LinePositions
 from tests.faults.growing_files import flip_journal
 from tests.pipeline.rig.small_rig import COARSE, FINE
 
@@ -57,8 +56,7 @@ def test_folder_whose_name_comes_again_is_the_latest() -> None:
 
 def tied(residual_us: float) -> LinePositions:
     """How lines were tied, with a residual that tells one from another."""
-    nothing = np.zeros(0)
-    return LinePositions(np.zeros((0, 2)), nothing, np.zeros(0, np.bool_), "log", residual_us, 0.1)
+    return LinePositions(np.zeros((0, 2)), np.zeros(0, np.bool_), "log", residual_us, 0.1)
 
 
 def test_flipped_bit_of_the_journal_changes_no_capture():

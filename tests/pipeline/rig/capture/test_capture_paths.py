@@ -16,13 +16,13 @@ from pipeline.rig.capture.capture_paths import (
     Announced,
     CaptureRecord,
     LoggedPath,
+    MirrorScanPath,
     UntiedError,
     announced,
     capture_prefix,
     next_path,
     place_lines,
 )
-from pipeline.rig.capture.line_positions import MirrorScanPath
 from pipeline.rig.device_settings import check_capture
 from tests.pipeline.rig.small_rig import CAMERA, COARSE, FINE
 
@@ -125,7 +125,7 @@ def test_mirror_that_stepped_otherwise_is_not_believed(sweep: Sweep, last: int):
 def test_log_began_before_its_acknowledgement():
     """Between the request for the log and its acknowledgement: the middle counts, and the span is not known."""
     path = next_path(FINE, 3, CAMERA, vector_pairs=6, triggered=False)
-    log = LoggedPath("/captured/x/mirror_log", 1000.0, started_s=0.06, start_error_s=0.04)
+    log = LoggedPath("/captured/x/mirror_log", 1000.0, started_s=0.06, start_error_s=0.04, crc32=0)
     taken = CaptureRecord(FINE, 3, 9, "/captured/x", False, (5.0, 5.1), (0.1, 0.2), log=log)
     scan_path = MirrorScanPath(np.arange(1000) / 1000, np.zeros((1000, 2)))
     tied = place_lines(frames(list(range(6))), path, taken, CAMERA, scan_path).tied

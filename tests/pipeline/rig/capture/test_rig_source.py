@@ -90,7 +90,7 @@ def test_lines_of_a_mirror_mounted_otherwise_are_the_same_once_it_is_told(mounti
         assert_same(list(source.lines(COARSE)), COARSE)
         assert_same(list(source.lines(FINE)), FINE)
         assert source.record["rig"]["mounting"] == asdict(mounting)
-    with small_rig(mounting=mounting, log_pulses=True, log_samples=16000, **told) as rig:
+    with small_rig(mounting=mounting, pulses="none", log_samples=16000, **told) as rig:
         found = list(rig.source().lines(FINE))
     assert_simulated(found, FINE)
     off = np.array([(line.mirror_x, line.mirror_y) for line in found]) - line_positions(FINE, CAMERA)
@@ -185,24 +185,6 @@ def test_without_pulses_lines_lie_where_the_log_measured(pulses: str):
     assert (told["method"], told["sweep"], told["first"], told["stop"]) == ("log", "coarse-0", 0, 10)
     assert 0 < told["residual_px"] < 3
     assert any("software timing" in note for note in told["notes"])
-
-
-@pytest.mark.parametrize(("sweep", "pulses"), [(FINE, "frame"), (FINE, "position"), (COARSE, "position")])
-def test_edges_in_the_log_tie_lines_to_where_the_mirror_was(sweep: Sweep, pulses: str):
-    """With pulses and the log, positions are measured ones at mid exposure, by a fit of both clocks to the edges."""
-    with small_rig(pulses=pulses, log_pulses=True, log_samples=16000) as rig:
-        source = rig.source()
-        found = list(source.lines(sweep))
-        middle_s = [capture.middle_s(np.arange(sweep.lines)) for capture in rig.emulated.camera.captures]
-        true = rig.emulated.mirror.positions(middle_s[0])
-    assert_simulated(found, sweep)
-    assert all(line.valid for line in found)
-    off = np.array([(line.mirror_x, line.mirror_y) for line in found]) - true
-    assert np.hypot(*off.T).max() * 11275 < 0.2  # px
-    (told,) = source.record["captures"]
-    assert told["method"] == "log"
-    assert abs(told["drift_ppm"]) < 1000
-    assert told["residual_us"] < 2000
 
 
 def test_devices_are_let_go_of_whatever_ends_a_look():

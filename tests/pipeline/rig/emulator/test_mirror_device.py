@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from pipeline.rig.emulator.mirror_device import MirrorDevice, Mode
 from pipeline.rig.emulator.mirror_state import MirrorUnit
-from pipeline.rig.mirror.pro_mode import Status
+from pipeline.rig.mirror.mirror_controller import hold_values
+from pipeline.rig.mirror.pro_mode import Status, encode, set_values
 from tests.pipeline.rig.in_process import ManualClock
 
 GO_PRO_CRC = b"GOPROCRC\r\n"
@@ -25,21 +26,8 @@ SIMPLE = {
     "version": (b"GETVERSION\r\n", b"EMULATOR 1.0\r\n"),
     "serial": (b"GETSN\r\n", b"EMUL0001\r\n"),
     "temperature": (b"GETTEMP\r\n", b"25.00\r\n"),
-    "status": (b"STATUS\r\n", b"00000000\r\n"),
-    "status in motion": (b"X=0.1\r\nSTATUS\r\n", b"OK\r\n00000010\r\n"),
-    "acknowledge": (b"ACKNOWLEDGE\r\n", b"OK\r\n"),
-    "x": (b"X=0.250000\r\n", b"OK\r\n"),
-    "y": (b"Y=-0.25\r\n", b"OK\r\n"),
-    "xy": (b"XY=0.6;-0.8\r\n", b"OK\r\n"),
-    "x above": (b"X=1.5\r\n", b"OU\r\n"),
-    "x below": (b"X=-1.5\r\n", b"OL\r\n"),
-    "outside the disk": (b"XY=0.9;0.9\r\n", b"OU\r\n"),
-    "not a number": (b"X=1,5\r\n", b"ERROR\r\n"),
-    "one of two": (b"XY=0.5\r\n", b"ERROR\r\n"),
-    "two of one": (b"X=0.5;0.5\r\n", b"ERROR\r\n"),
     "unknown": (b"HELLO\r\n", b"NO\r\n"),
     "too long": (b"X=0." + b"0" * 60 + b"\r\n", b"ERROR\r\n"),
-    "reset": (b"RESET\r\nSTART\r\n", b"OK\r\n"),
     "pro": (b"GOPRO\r\n", b"OK\r\n"),
     "pro with CRC": (GO_PRO_CRC, b"OK\r\n"),
 }
@@ -149,58 +137,32 @@ def test_each_mode_knows_its_own_requests_alone() -> None:
 
 
 def test_a_reset_forgets_everything() -> None:
-    """After a reset the controller is deaf for a second, then in simple mode, at rest in the middle, memory empty."""
+    """After a reset the controller is deaf for a while, then in simple mode, at rest in the middle, memory empty."""
     clock = ManualClock()
     device = MirrorDevice(clock)
-    answer(device, b"XY=0.3;0.4\r\nGOPROCRC\r\n" + bytes.fromhex(PRO["set vector"][0] + PRO["simple mode"][0]))
+    answer(device, GO_PRO_CRC + bytes.fromhex(PRO["set two"][0] + PRO["set vector"][0]))
     clock.advance(1.0)
     assert np.any(device.state.memory)
-    assert answer(device, b"RESET\r\nSTART\r\n") == b"OK\r\n"
+    assert np.any(device.positions(clock.now()))
+    device.restart(boot_s=1.0)
     clock.advance(0.99)
     assert answer(device, b"START\r\n") == b""
     clock.advance(0.02)
-    assert answer(device, b"START\r\nSTATUS\r\n") == b"OK\r\n00000000\r\n"
+    assert answer(device, b"START\r\n") == b"OK\r\n"
     assert not np.any(device.state.memory)
     np.testing.assert_array_equal(device.positions(clock.now()), (0, 0))
 
 
 def test_a_target_beyond_the_rim_goes_to_the_rim_and_is_told() -> None:
-    """The mirror goes to the nearest point of the rim; the bit and its latched copy stand until acknowledged."""
+    """The mirror goes to the nearest point of the rim, and the bit stands as long as the target does."""
     clock = ManualClock()
     device = MirrorDevice(clock)
-    answer(device, b"XY=3;4\r\n")
-    clock.advance(1.0)
-    np.testing.assert_allclose(device.positions(clock.now()), (0.6, 0.8), atol=1e-12)
-    assert answer(device, b"STATUS\r\n") == b"00002080\r\n"
-    assert answer(device, b"XY=0;0\r\n") == b"OK\r\n"
-    clock.advance(1.0)
-    assert answer(device, b"STATUS\r\n") == b"00002000\r\n"
-    assert answer(device, b"ACKNOWLEDGE\r\nSTATUS\r\n") == b"OK\r\n00000000\r\n"
-
-
-@pytest.mark.parametrize(
-    ("now", "was"),
-    [
-        (Status.DISCONNECTED, Status.WAS_DISCONNECTED),
-        (Status.ELECTRONICS_WARM, Status.WAS_ELECTRONICS_WARM),
-        (Status.MIRROR_WARM, Status.WAS_MIRROR_WARM),
-        (Status.OUTPUT_LIMIT, Status.WAS_OUTPUT_LIMIT),
-        (Status.AVERAGE_LIMIT, Status.WAS_AVERAGE_LIMIT),
-        (Status.EEPROM_INVALID, Status(0)),
-    ],
-)
-def test_what_was_stays_until_it_is_acknowledged(now: Status, was: Status) -> None:
-    """A bit that came and went leaves its copy; one that still is, is latched again at once."""
-    device = MirrorDevice(ManualClock())
-    device.state.flags = now
-    assert device.state.status() == now | was
-    device.state.flags = Status(0)
-    assert device.state.status() == was
-    device.state.acknowledge()
-    assert device.state.status() == Status(0)
-    device.state.flags = now
-    device.state.acknowledge()
-    assert device.state.status() == now | was
+    answer(device, GO_PRO_CRC)
+    for target, place, bits in (((1.0, 1.0), (np.sqrt(0.5), np.sqrt(0.5)), Status.TRIMMED), ((0, 0), (0, 0), 0)):
+        answer(device, encode(set_values(hold_values(*target))))
+        clock.advance(1.0)
+        np.testing.assert_allclose(device.positions(clock.now()), place, atol=1e-7)
+        assert device.state.status() == Status(bits)
 
 
 @given(cuts=st.lists(st.integers(0, 400), max_size=40))
@@ -208,7 +170,7 @@ def test_what_was_stays_until_it_is_acknowledged(now: Status, was: Status) -> No
 def test_any_cutting_of_the_bytes_gives_the_same_answers(cuts: list[int]) -> None:
     """However a stream of lines and frames is cut, the bytes that come back are the same."""
     frames = b"".join(bytes.fromhex(PRO[name][0]) for name in STORY)
-    stream = b"start\r\nGETID\r\nXY=0.1;0.2\r\n" + GO_PRO_CRC + frames + b"STATUS\r\nNONSENSE\r\n"
+    stream = b"start\r\nGETID\r\n" + GO_PRO_CRC + frames + b"START\r\nNONSENSE\r\n"
     whole = answer(MirrorDevice(ManualClock()), stream)
     device = MirrorDevice(ManualClock())
     edges = sorted({0, len(stream), *(cut for cut in cuts if cut < len(stream))})
@@ -234,6 +196,6 @@ def test_no_bytes_confuse_the_controller_for_long(junk: bytes) -> None:
 def test_the_acts_tell_what_was_done_by_which_unit() -> None:
     """What was carried out is kept with its time; texts and the size of the memory are settings."""
     device = MirrorDevice(ManualClock(5.0), unit=MirrorUnit(model="MR-E-3", vector_pairs=2))
-    assert answer(device, b"GETID\r\nX=0.5\r\n") == b"MR-E-3\r\nOK\r\n"
-    assert [(act.time_s, act.request.line) for act in device.acts] == [(5.0, "GETID"), (5.0, "X=0.5")]
+    assert answer(device, b"GETID\r\nSTART\r\n") == b"MR-E-3\r\nOK\r\n"
+    assert [(act.time_s, act.request.line) for act in device.acts] == [(5.0, "GETID"), (5.0, "START")]
     assert device.state.memory.size == 4

@@ -10,9 +10,9 @@ import pytest
 
 from pipeline.errors import RigError
 from pipeline.rig.device_settings import MirrorSettings
-from pipeline.rig.devices import StateUnknown
 from pipeline.rig.mirror.mirror_controller import MirrorController
 from pipeline.rig.mirror.pro_mode import Command, Frame, FrameReader, VectorRegister, X, Y, cell_int, read_registers
+from pipeline.rig.transports import StateUnknown
 from tests.pipeline.rig.in_process import InProcessTransport, ManualClock
 from tests.pipeline.rig.mirror_faults import HARMLESS, KINDS, FaultyMirror, make_fault
 

@@ -11,12 +11,12 @@ import pytest
 
 from pipeline.errors import PoseError, RigError, SettingsError, ShapeError
 from pipeline.rig.device_settings import MirrorSettings
-from pipeline.rig.devices import DeadlinePassed, DeviceGone, DeviceRefused, StateUnknown
 from pipeline.rig.emulator.mirror_device import MirrorDevice
 from pipeline.rig.mirror import mirror_controller
 from pipeline.rig.mirror.mirror_controller import MirrorController, open_mirror
 from pipeline.rig.mirror.mirror_requests import Identity
 from pipeline.rig.mirror.pro_mode import Status, Trigger
+from pipeline.rig.transports import DeadlinePassed, DeviceGone, DeviceRefused, StateUnknown
 from tests.pipeline.rig.in_process import InProcessTransport, ManualClock
 from tests.pipeline.rig.mirror import mirror_bytes as w
 from tests.pipeline.rig.mirror.mirror_bytes import connected, pair
@@ -273,26 +273,12 @@ def test_a_log_is_started_stopped_and_fetched():
     start = [w.STOP_LOG, w.SET_LOG, (w.START_LOG[0], [Late(0.002, bytes(w.START_LOG[1]))])]
     with scripted([*w.CONNECT, *start, w.STOP_LOG, X3, Y3]) as transport:
         mirror = connected(transport, log_rate_hz=1000.0)
-        mirror.start_log()
+        mirror.start_log(1000.0)
         transport.clock.sleep(0.0035)
         log = mirror.read_log()
     np.testing.assert_array_equal(log.position, np.array([[0.5, -0.25], [1, 0], [0, -0.25]], np.float32))
     assert log.rate_hz == 1000.0
     assert (log.started_s, log.start_error_s) == (pytest.approx(0.002), pytest.approx(0.002))
-
-
-def test_cells_that_are_played_are_logged_beside_positions():
-    """The index of X's vector unit in slot 2, read as whole numbers."""
-    slots = "24 00 24 01 24 02 24 11 00 00 23 02 00 00 23 03 00 00 68 0A 44 7A 00 00"
-    set_three = pair(f"7E 00 12 1A 00 04 {slots} 60 DF 7E", w.DONE)
-    index = pair("7E 00 15 05 24 02 00 00 0C 35 2E 7E", "7E 00 15 0C 00 00 00 00 00 00 00 01 00 00 00 07 79 1B 7E")
-    with scripted([*w.CONNECT, w.STOP_LOG, set_three, w.START_LOG, w.STOP_LOG, X3, Y3, index]) as transport:
-        mirror = connected(transport)
-        mirror.start_log(1000.0, with_index=True)
-        log = mirror.read_log(3)
-    assert log.index is not None
-    assert log.index.tolist() == [0, 1, 7]
-    assert log.position.tolist() == [[0.5, -0.25], [1, 0], [0, -0.25]]
 
 
 def test_a_log_ends_where_the_device_says(caplog: pytest.LogCaptureFixture):

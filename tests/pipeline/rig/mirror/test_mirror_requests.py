@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from pipeline.errors import RigError, ShapeError
 from pipeline.rig.device_settings import Patience
-from pipeline.rig.devices import DeadlinePassed, DeviceRefused, StateUnknown
 from pipeline.rig.mirror.mirror_requests import (
     LineReader,
     ProLink,
@@ -23,7 +22,7 @@ from pipeline.rig.mirror.mirror_requests import (
     to_line,
 )
 from pipeline.rig.mirror.pro_mode import cell_int, get_value
-from pipeline.rig.transports import Wire
+from pipeline.rig.transports import DeadlinePassed, DeviceRefused, StateUnknown, Wire
 from tests.pipeline.rig.mirror.mirror_bytes import CONNECT, ENTER, GREET, LEAVE, WELL, WHO, connected, pair, set_value
 from tests.pipeline.rig.scripted import Pair, Reply, ScriptedTransport, scripted
 

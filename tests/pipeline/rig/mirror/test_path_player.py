@@ -9,11 +9,10 @@ from hypothesis import strategies as st
 
 from pipeline.errors import PoseError, RigError, SettingsError, ShapeError
 from pipeline.rig.device_settings import Patience, ReadBack
-from pipeline.rig.devices import DeadlinePassed
 from pipeline.rig.mirror.mirror_controller import check_play, frames_to_check, upload, wire_positions
 from pipeline.rig.mirror.mirror_requests import ProLink
 from pipeline.rig.mirror.pro_mode import Command, Frame, FrameReader, encode, read_vector
-from pipeline.rig.transports import BITS_PER_BYTE, Wire
+from pipeline.rig.transports import BITS_PER_BYTE, DeadlinePassed, Wire
 from tests.pipeline.rig.in_process import ManualClock
 
 

@@ -9,8 +9,7 @@ import pytest
 
 from pipeline.errors import RigError
 from pipeline.rig.device_settings import Patience
-from pipeline.rig.devices import DeadlinePassed, DeviceGone, StateUnknown
-from pipeline.rig.transports import Kind, Wire
+from pipeline.rig.transports import DeadlinePassed, DeviceGone, Kind, StateUnknown, Wire
 from tests.pipeline.rig.in_process import ManualClock
 from tests.pipeline.rig.scripted import Late, Pair, ScriptedTransport, scripted
 

@@ -14,18 +14,20 @@ from scipy import stats
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.effects.counting import (
+    CHIP_SAMPLES,
     DARK_CURRENT,
     DEFECTS,
+    MOST_VARIATION,
     QUANTISATION,
     READ_NOISE,
     SATURATION,
     SHOT,
     dark_electrons,
     dead_elements,
+    divergence,
     hot_electrons,
     warmth,
 )
-from pipeline.simulator.effects.noise import CHIP_SAMPLES, MOST_VARIATION, divergence
 from pipeline.simulator.effects.probe import Probe, Unit
 from pipeline.simulator.readout import read_out
 from pipeline.simulator.rig_model import Detector, Rig

@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 import pipeline.simulator.effects as package
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects import registry
+from pipeline.simulator import render as registry
 from pipeline.simulator.effects.effect import OFF, Bound, Effect
 from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.effects.probe import Probe
-from pipeline.simulator.effects.registry import AIMS, BY_NAME, EFFECTS, FOOTPRINT, LIGHT, RAYS, READOUT
 from pipeline.simulator.readout import read_out
-from pipeline.simulator.render import expected_light
+from pipeline.simulator.render import AIMS, BY_NAME, EFFECTS, FOOTPRINT, LIGHT, RAYS, READOUT, expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.selection.choice import decide, list_effects

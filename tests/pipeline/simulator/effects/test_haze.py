@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.coverage import full_sweeps
-from pipeline.simulator.effects.effect import OFF
-from pipeline.simulator.effects.haze import (
+from pipeline.simulator.effects.air import (
     ABSORPTION,
     AIR_MASS_M,
     PATH_RADIANCE,
@@ -22,6 +21,7 @@ from pipeline.simulator.effects.haze import (
     rayleigh_per_m,
     transmission,
 )
+from pipeline.simulator.effects.effect import OFF
 from pipeline.simulator.effects.probe import fixed_variance
 from pipeline.simulator.rig_model import Air, Optics, Rig, Sky
 from pipeline.simulator.selection import survey_probe

@@ -14,7 +14,7 @@ from scipy.linalg import expm
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.effect import SweepBlock
-from pipeline.simulator.effects.mirror_path import LAG, STAIRCASE, beside_plan, responses, transient
+from pipeline.simulator.effects.pointing import LAG, STAIRCASE, beside_plan, responses, transient
 from pipeline.simulator.rig_model import MirrorMotion, Rig
 from tests.pipeline.simulator.made_up_effects import steep_probe
 

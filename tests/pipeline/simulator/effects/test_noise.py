@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from pipeline.simulator.compiled_loops import draw_pairs, read_merged
-from pipeline.simulator.effects.noise import (
+from pipeline.simulator.effects.counting import (
     CHIP_SAMPLES,
     MOST_VARIATION,
     PIECE,

@@ -15,10 +15,11 @@ from pipeline.geometry.scan import Sweep, line_positions, points_of_scan, sweep_
 from pipeline.simulator.effects.air import PARALLAX, WIND
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
-from pipeline.simulator.effects.mirror_path import LAG, STAIRCASE
 from pipeline.simulator.effects.pointing import (
     HYSTERESIS,
     JITTER,
+    LAG,
+    STAIRCASE,
     THERMAL_DRIFT,
     PointingErrors,
     at_line_ends,
@@ -27,13 +28,12 @@ from pipeline.simulator.effects.pointing import (
     scan_sign,
     tilt_to_scene,
 )
-from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from tests.pipeline.simulator.made_up_effects import steep_probe
-from tests.pipeline.simulator.small_scenes import image_scene, made_scene
+from tests.pipeline.simulator.small_scenes import effects_on, image_scene, made_scene
 
 SWEEP = Sweep("swath", "fine", "x", 0.0, -500.0, 1001)
 RIG = Rig(mirror=replace(MirrorMotion(), repeatability_urad=40.0))

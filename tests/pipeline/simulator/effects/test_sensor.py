@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from pipeline.simulator.effects.sensor import PRNU, STRAY_LIGHT, STRIPING, response_gain, stripe_gain
+from pipeline.simulator.effects.spectrometer import PRNU, STRAY_LIGHT, STRIPING, response_gain, stripe_gain
 from pipeline.simulator.rig_model import Detector, Rig
 from tests.pipeline.simulator.spectral_light import block_of, probe_of, random_light, rig_with, worst
 

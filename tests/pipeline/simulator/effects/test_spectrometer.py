@@ -6,8 +6,14 @@ import numpy as np
 import pytest
 
 from pipeline.simulator.effects.effect import SweepBlock
-from pipeline.simulator.effects.sensor import STRAY_LIGHT
-from pipeline.simulator.effects.spectrometer import RESPONSE, SMILE, missing_variance, wavelength_shift, widen_bands
+from pipeline.simulator.effects.spectrometer import (
+    RESPONSE,
+    SMILE,
+    STRAY_LIGHT,
+    missing_variance,
+    wavelength_shift,
+    widen_bands,
+)
 from pipeline.simulator.render import expected_light
 from tests.pipeline.simulator.spectral_light import (
     SAMPLES,

@@ -13,9 +13,8 @@ from hypothesis.extra.numpy import arrays
 from pipeline.geometry.mirror import direction_to_normal, position_to_normal, scene_to_direction
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
-from pipeline.simulator.optics.kernel_fit import NEGLIGIBLE, Footprint, Moments, fold
+from pipeline.simulator.optics.kernel_fit import NEGLIGIBLE, Footprint, Moments, box_weight, fold
 from pipeline.simulator.optics.rays import REST_NORMAL, middle_normal, normals_met, spread_of_rays, spread_of_waves
-from pipeline.simulator.optics.tap_tables import box_weight
 from pipeline.simulator.rig_model import Rig
 from tests.pipeline.simulator.fine_image import FLAT, SWEEP, probe_of
 

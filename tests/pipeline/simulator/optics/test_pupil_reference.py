@@ -17,7 +17,7 @@ def test_quadrature_over_chords_is_the_closed_form() -> None:
     np.testing.assert_allclose(passed, pupil_contrast(u), atol=1e-6)
 
 
-@pytest.mark.parametrize("number", [0, 3])
+@pytest.mark.parametrize("number", [0, 23])
 def test_kernels_show_what_the_pupil_does(number: int) -> None:
     """Of noise, edges, points and beside wide bright fields light is within 0.1 sigma of the integral."""
     assert distances(random_tile(number)).max() < 0.1
@@ -25,4 +25,4 @@ def test_kernels_show_what_the_pupil_does(number: int) -> None:
 
 def test_kernels_show_the_disc_too() -> None:
     """Out of focus as well, 40 m away when focused at infinity."""
-    assert distances(random_tile(0, math.inf)).max() < 0.1
+    assert distances(random_tile(32, math.inf)).max() < 0.1

@@ -14,12 +14,12 @@ from scipy.special import ndtr
 from pipeline.geometry.camera import LineCamera, footprint_kernel
 from pipeline.geometry.mirror import position_to_normal
 from pipeline.geometry.scan import Sweep
+from pipeline.simulator.compiled_loops import read_weights
 from pipeline.simulator.effects.blurs import ABERRATION, KEYSTONE
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
+from pipeline.simulator.optics.kernel_fit import TapTable, blurred_weight, box_weight
 from pipeline.simulator.optics.rays import exact_views, middle_normal
-from pipeline.simulator.optics.tap_tables import TapTable, blurred_weight, box_weight
-from pipeline.simulator.optics.window_sums import read_weights
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Optics, Rig
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene

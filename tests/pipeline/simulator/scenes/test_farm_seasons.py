@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pipeline.geometry.camera import LineCamera, digitise
 from pipeline.simulator.scenes.farm.farm_scene import crown_shadows
-from pipeline.simulator.scenes.farm.seasons import (
+from pipeline.simulator.scenes.farm.land import (
     CROPS,
     LATITUDE_DEG,
     Sun,

@@ -158,12 +158,10 @@ def test_worked_by_hand(effects: list[MadeUp], tolerance: float, asked: str, wan
 
 
 def test_totals_of_a_decision():
-    """Errors sum with the factor of safety; the cheapest within a tenth of the tolerance is all exact here."""
+    """Errors sum with the factor of safety."""
     assert (decide(PROBE, RIG, THREE, 0.11).error, decide(PROBE, RIG, THREE, 0.11).cost_ns) == pytest.approx(
         (0.108, 0.3)
     )
-    shot = decide(PROBE, RIG, POISSON, 0.1)
-    assert (shot.taken[0].reason, shot.cheap_cost_ns) == ("needed", 24.7)  # 0.012 is more than a tenth
 
 
 def test_gains_multiply_the_errors_of_others_but_not_their_own():

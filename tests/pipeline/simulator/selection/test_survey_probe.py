@@ -15,8 +15,7 @@ from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.effects.probe import Probe, noise_electrons, stored_mean
-from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.render import expected_light
+from pipeline.simulator.render import EFFECTS, expected_light
 from pipeline.simulator.rig_model import Detector, Rig
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.selection.options import SAFETY, list_options

@@ -16,8 +16,7 @@ from pipeline.simulator.effects.effect import Radiance as Light32
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.effects.probe import Probe, noise_electrons
-from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.render import expected_light
+from pipeline.simulator.render import EFFECTS, expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, SceneRadiance, SceneRaster
 from pipeline.simulator.selection import survey_probe

@@ -1,0 +1,118 @@
+"""Effects: what the stage that decides on them keeps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flows.settings.load import load_settings
+from flows.simulate.command import open_simulation
+from flows.tasks.run import CaptureRun
+from flows.tasks.stages import effects as effect_choice
+from flows.tasks.stages.effects import choose_effects, chosen_effects, load_manifest, source_with
+from pipeline.errors import BoundError, IncompleteStoreError
+from pipeline.simulator.render import EFFECTS
+from pipeline.simulator.scenes.scene import SceneRaster
+from storage.archive.keys import StageRef
+
+ASKED = "rotation,vignetting,shot,read-noise"
+CAMERA = {"camera.samples": 160}  # as wide as the small picture: all of what else it sees takes its time
+
+
+def choose(run: CaptureRun) -> StageRef:
+    """The stage's store, made in the run's archive."""
+    return choose_effects.produce(run.archive, choose_effects.wants(run))[0]
+
+
+def key_of(run: CaptureRun) -> str:
+    """The key that the stage asks for, without making anything."""
+    return choose_effects.key(choose_effects.wants(run))
+
+
+def opened(scene_files: Path, out: Path, **flags: Any) -> CaptureRun:
+    """A simulation of the small picture."""
+    given = {"scene": str(scene_files / "scene.png"), "source": "sim", "out": str(out), "effects": ASKED}
+    return open_simulation(load_settings(None, given | CAMERA | flags))[0]
+
+
+@pytest.fixture(scope="module")
+def decided(scene_files: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, StageRef]:
+    """An archive with a decision, and its store."""
+    out = tmp_path_factory.mktemp("decided")
+    return out, choose(opened(scene_files, out))
+
+
+def test_the_manifest_and_the_source_have_what_was_decided(decided: tuple[Path, StageRef], scene_files: Path) -> None:
+    """Every effect in the chain's order, those left out within their bounds; the source has variants and clock."""
+    manifest = load_manifest(decided[1])
+    rows = {row["name"]: row for row in manifest["effects"]}
+    assert list(rows) == [effect.name for effect in EFFECTS]
+    assert {name for name, row in rows.items() if row["state"] == "on"} == {
+        *ASKED.split(","),
+        "quantisation",
+        "saturation",
+    }
+    assert rows["diffraction"]["bound"] >= rows["diffraction"]["measured"] > 0
+    assert (manifest["total"]["asked"], manifest["total"]["tolerance"]) == (ASKED, 0.1)
+    source = source_with(opened(scene_files, decided[0]).simulated, decided[1], {"a": 3.0})
+    on = {row["name"]: row["variant"] for row in load_manifest(decided[1])["effects"] if row["state"] == "on"}
+    assert {effect.name: variant for effect, variant in source.choice.effects} == on
+    assert (source.clock, list(chosen_effects(decided[1]))) == (
+        {"a": 3.0},
+        [effect for effect, _ in source.choice.effects],
+    )
+
+
+def test_a_decision_that_is_there_draws_nothing(
+    scene_files: Path, decided: tuple[Path, StageRef], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither probe nor chips; not one point of the scene is asked for."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("the scene was looked at")
+
+    run = opened(scene_files, decided[0], budget="0.9", policy="random")
+    monkeypatch.setattr(SceneRaster, "thinned", refuse)
+    monkeypatch.setattr(effect_choice, "probe_survey", refuse)
+    assert choose(run) == decided[1]
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        {"tol": "0.2"},
+        {"tol": "0.1dn"},
+        {"effects": "auto"},
+        {"seed": "1"},
+        {"camera.exposure_ms": "50"},
+        {"optics.smile_nm": 0.5},
+        {"sky.started": "2026-06-01T12:00:00Z"},
+    ],
+    ids=str,
+)
+def test_what_the_decision_depends_on_is_its_key(
+    scene_files: Path, decided: tuple[Path, StageRef], flags: dict[str, Any]
+) -> None:
+    """Tolerance with its unit, what was asked, seed, camera and rig."""
+    assert key_of(opened(scene_files, decided[0])) == decided[1].key
+    assert key_of(opened(scene_files, decided[0], **flags)) != decided[1].key
+
+
+def test_broken_bounds_and_unknown_effects_are_refused(
+    scene_files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, decided: tuple[Path, StageRef]
+) -> None:
+    """What cannot be trusted is not kept; an effect that this version does not know is named."""
+
+    def broken(*_: object) -> None:
+        raise BoundError("smile: what was left out changes light by 3")
+
+    monkeypatch.setattr(effect_choice, "_verified", broken)
+    with pytest.raises(BoundError, match="smile"):
+        choose(opened(scene_files, tmp_path))
+    assert not list((tmp_path / "stages").glob("effects/*"))
+    row = {"name": "glare", "state": "on", "variant": "exact"}
+    monkeypatch.setattr(effect_choice, "load_manifest", lambda effects: {"effects": [row]})
+    with pytest.raises(IncompleteStoreError, match="the effect glare, exact, which this version does not know"):
+        chosen_effects(decided[1])
