@@ -60,8 +60,8 @@ from storage.archive.keys import array_digest
 from storage.arrays.layout import AngularGrid, image_spec
 from storage.arrays.tile_work import tile_budget
 from storage.readers.open_cubes import load_labels_array
-from storage.readers.raster_work import RasterPixels
-from storage.readers.scene_files import OpenScene
+from storage.readers.raster_fields import RasterPixels
+from storage.readers.scene_files import SceneFile
 from storage.remote.opening import is_archive, open_archive
 
 if TYPE_CHECKING:
@@ -303,7 +303,7 @@ def _run_by(
 
 def _scene_for(
     model: SurveyModel, settings: Settings, recorded: OpenedRecording | None, *, planning: bool
-) -> tuple[OpenScene | None, RasterScene, tuple[str, ...], tuple[str, ...]]:
+) -> tuple[SceneFile | None, RasterScene, tuple[str, ...], tuple[str, ...]]:
     """Open a scene that the weights can read, drawn unless for ``planning``; what to say of it and of its labels.
 
     The first value is the scene's file where its pixels are taken as they are.

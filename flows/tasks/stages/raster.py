@@ -16,7 +16,7 @@ from storage.arrays.layout import NO_VALUE, blank_coarse, blank_pixels
 from storage.arrays.mosaics import MosaicWriter, PatchWriter
 from storage.arrays.quicklooks import choose_bands, stretched
 from storage.arrays.tile_work import Thumbnail
-from storage.readers.raster_work import RasterPixels, write_means, write_patches
+from storage.readers.raster_fields import RasterPixels, write_means, write_patches
 
 
 @stage("average_raster", "coarse means of the raster", MOSAIC, inputs=0)
