@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
@@ -39,19 +38,7 @@ from storage.arrays.ground_maps import load_bands, open_image
 from storage.export.image_files import EnviFile, has_map_info, write_cog, write_envi
 from storage.export.map_files import STYLE
 from storage.export.recorded_files import write_recorded_files
-from storage.export.stac_items import (
-    COG,
-    ZARR,
-    Item,
-    angular,
-    check_owner,
-    clean_id,
-    footprint,
-    projection,
-    spectral_bands,
-    wavelengths,
-    write_stac,
-)
+from storage.export.stac_items import COG, ZARR, Item, check_owner, clean_id, footprint, projection, write_stac
 from storage.remote.opening import open_archive
 
 COLLECTION_TEXT = (
@@ -121,7 +108,7 @@ def run_export(
     out = check_outside(out, opened.archive.root)
     surveys = opened.archive.root.name
     collection_id = clean_id(surveys, "surveys")
-    choice = check_zones(opened, choice)
+    check_zones(opened, choice)
     layers = [*map_layers(opened), *prior_map_layers(opened), *spectral_layers(opened, choice)]
     export = Export(opened, out)
     try:
@@ -164,7 +151,7 @@ def _export_images(export: Export, layers: Sequence[Layer], console: Console) ->
         path = export.folder / f"{layer.name}.tif"
         with console.status(f"writing {path.name}"):
             write_cog(path, layer.image, layer.rows())
-        fields = {"bands": band_fields(layer), **grid_fields(export.run, layer), **layer.fields}
+        fields = {"bands": band_fields(layer), **grid_fields(export.run, layer)}
         export.add(layer.name, path, layer.title, COG, list(layer.roles), **fields)
         style = write_layer_style(layer, path)
         export.add(f"{layer.name}_style", style, f"QGIS style of {path.name}", STYLE, ["metadata", "style"])
@@ -219,14 +206,10 @@ class Export:
 
 
 def band_fields(layer: Layer) -> list[Asset]:
-    """STAC's words for the bands of an image."""
+    """STAC's words for the bands of an image, which are called by their wavelengths."""
     nodata: Any = "nan" if layer.image.nodata != layer.image.nodata else layer.image.nodata
     unit = {} if layer.unit is None else {"unit": layer.unit}
     about = {"data_type": layer.image.dtype, "nodata": nodata, **unit}
-    if layer.image.wavelength_nm is not None:
-        width = None if layer.image.fwhm_nm is None else np.array(layer.image.fwhm_nm)
-        bands: list[Asset] = spectral_bands(np.array(layer.image.wavelength_nm), width, about)["bands"]
-        return bands
     return [{"name": name, **about} for name in layer.image.bands]
 
 
@@ -235,21 +218,17 @@ def grid_fields(run: ExportedRun, layer: Layer) -> dict[str, Any]:
     if run.geobox is None:
         return {}
     geobox = layer.image.place.geobox(layer.image.shape)
-    if geobox is None:
-        return angular(layer.image.place.transform, layer.image.shape)
-    return projection(geobox)
+    return {"proj:code": None} if geobox is None else projection(geobox)
 
 
 def name_stores(export: Export) -> None:
     """Name the archive's own stores and the run's files to the catalogue, where they are."""
     run, root = export.run, export.run.archive.root
     nowhere = export.nowhere
-    about = {"data_type": "float32", "nodata": "nan", "unit": "1"}
     boxes = {product: load_geobox(run.path(product)) for product in ("mosaic", "class_map")}
     places = {product: nowhere if box is None else projection(box) for product, box in boxes.items()}
-    bands = spectral_bands(*load_bands(run.path("mosaic")), about)
     stores: dict[str, tuple[str, dict[str, Any]]] = {
-        "mosaic": ("Coarse mosaic", {**places["mosaic"], **bands}),
+        "mosaic": ("Coarse mosaic", places["mosaic"]),
         "class_map": ("Class map and confidence on the camera's grid", places["class_map"]),
         "attention": ("Score and rank of the patches", nowhere),
         "patches": ("Fine patches", nowhere),
@@ -280,7 +259,6 @@ def describe_item(export: Export) -> Item:
         "processing:level": "L4",
         "processing:lineage": ", then ".join(f"{one['name']} {one['key']}" for one in receipt["stages"] if one["key"]),
         "processing:software": dict(receipt["versions"]),
-        **wavelengths(load_bands(run.path("mosaic"))[0]),
     }
     outline = None
     if run.geobox is not None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,6 @@ from storage.arrays.layout import grid_of, open_group
 from storage.arrays.quicklooks import choose_bands
 from storage.export.image_files import ANGULAR, CogImage, Place, value_span
 from storage.export.map_files import GREENS, GREYS, write_class_style, write_colour_style, write_ramp_style
-from storage.export.stac_items import classes
 
 Rows = Iterator[tuple[int, NDArray[Any]]]
 RGB = ("red", "green", "blue")
@@ -117,7 +116,6 @@ class Layer:
     image: CogImage
     rows: Callable[[], Rows]
     unit: str | None = None
-    fields: Mapping[str, Any] = field(default_factory=dict)  # STAC's, beside its bands and its grid
 
 
 def map_layers(run: ExportedRun) -> list[Layer]:
@@ -131,7 +129,7 @@ def map_layers(run: ExportedRun) -> list[Layer]:
     seen = _picture(run) if product == "class_map" else image_layer(run, product, "picture", RGB, nodata=0)
     score = patch_layer(run, "attention", "score", ("score",))
     return [
-        Layer("class_map", "Class map", ("data",), *drawn, fields=classes(legend)),
+        Layer("class_map", "Class map", ("data",), *drawn),
         Layer("confidence", "Probability of the class given", ("data", "confidence"), *sure, "1"),
         Layer("attention", "Worth of a fine look, by patch", ("data",), *score, "1"),
         Layer("rgb", "Picture of the coarse pass", ("visual", "overview"), *seen),
@@ -240,7 +238,7 @@ def prior_map_layers(run: ExportedRun) -> list[Layer]:
         legend = legend_of(open_group(run.path(product)))
         was = image_layer(run, product, OLD_CLASS, ("class",), nodata=UNLABELLED, legend=legend)
         title = "Class remembered, where the map is sure of another one"
-        layers.append(Layer(OLD_CLASS, title, ("data",), *was, fields=classes(legend)))
+        layers.append(Layer(OLD_CLASS, title, ("data",), *was))
     return layers
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,17 +14,14 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from flows.archive.export_layers import ExportedRun
-from flows.archive.export_values import MosaicView
 from flows.archive.product_choice import ProductChoice, class_numbers
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.georeference import crs_wkt, degree_m, pixel_side_m, to_degrees, to_plane
 from pipeline.products.areas import CellGrid, Heading, ToAxes, cell_polygons, count_classes, dose_cells, pixel_axes
-from pipeline.products.crop_rows import find_rows
 from pipeline.products.regions import class_polygons, grow_class, merge_small
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.ground_maps import open_image
-from storage.arrays.mosaics import mosaic_brightness
 from storage.export.map_files import (
     DEGREE_DIGITS,
     GEOJSON,
@@ -37,10 +34,8 @@ from storage.export.map_files import (
     TaskGrid,
     TaskText,
     ramp_colour,
-    write_geojson,
-    write_geopackage,
     write_polygon_style,
-    write_shapefile,
+    write_polygons,
     write_task_data,
 )
 
@@ -98,11 +93,8 @@ class ClassRaster:
         return ClassRaster(classes, self.legend, self.transform, self.geobox)
 
 
-def check_zones(run: ExportedRun, choice: ProductChoice) -> ProductChoice:
-    """Fill in the heading of crop rows where that is asked for.
-
-    Raises SettingsError: the run's classes, its place or its rows do not give what is asked for.
-    """
+def check_zones(run: ExportedRun, choice: ProductChoice) -> None:
+    """Refuse what the run's classes or its place do not give (SettingsError)."""
     names = open_image(run.path(run.map_product), "classes").about["class_names"]
     class_numbers(names, choice.buffers_m, "--buffer")
     if run.geobox is None and (choice.buffers_m or choice.least_area_m2 or choice.simplify_m is not None):
@@ -111,9 +103,6 @@ def check_zones(run: ExportedRun, choice: ProductChoice) -> ProductChoice:
         class_numbers(names, choice.prescription.doses, "--prescription")
         if run.geobox is None:
             raise SettingsError(f"a prescription is in metres, and {NEEDS_PLACE}")
-        if choice.prescription.heading is None:
-            return replace(choice, prescription=replace(choice.prescription, heading=row_heading(run)))
-    return choice
 
 
 def write_zones(run: ExportedRun, folder: Path, choice: ProductChoice) -> Iterator[Made]:
@@ -136,7 +125,7 @@ def _write_polygons(run: ExportedRun, raster: ClassRaster, folder: Path, choice:
     names = [raster.legend.names[number] for number in found.classes]
     columns = {"class": found.classes.astype(np.int32), "name": names, unit: area}
     path = folder / "classes.gpkg"
-    write_geopackage(path, "classes", found.polygons, columns, crs, run.receipt["finished"])
+    write_polygons(path, found.polygons, columns, crs, layer="classes", when=run.receipt["finished"])
     yield Made("polygons", path, f"Classes as {len(names)} polygons", GEOPACKAGE)
     entries: list[Entry] = [
         (name, name, tuple(colour))
@@ -145,7 +134,7 @@ def _write_polygons(run: ExportedRun, raster: ClassRaster, folder: Path, choice:
     yield _styled(path, "name", entries)
     if crs is not None:
         path = folder / "classes.geojson"
-        write_geojson(path, "classes", found.polygons, columns, crs)
+        write_polygons(path, found.polygons, columns, crs, layer="classes")
         yield Made("polygons_geojson", path, "Classes as polygons, longitude and latitude", GEOJSON, fields=IN_DEGREES)
 
 
@@ -161,7 +150,6 @@ def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, cho
     assert raster.geobox is not None
     assert raster.pixel_m is not None
     doses = class_numbers(raster.legend.names, asked.doses, "--prescription")
-    assert asked.heading is not None
     heading = Heading(asked.heading)
     plane, to_own = to_plane(raster.geobox)
 
@@ -174,7 +162,7 @@ def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, cho
     row, column = np.nonzero(seen)
     columns = {"dose": found[seen], "unit": [asked.unit.name] * len(row), "row": row, "col": column}
     path = folder / "prescription.shp"
-    write_shapefile(path, cell_polygons(grid, heading)[seen], columns, to_own)
+    write_polygons(path, cell_polygons(grid, heading)[seen], columns, to_own)
     words = ", ".join(f"{name} {dose:g} {asked.unit.name}" for name, dose in asked.doses.items())
     title = f"Prescription ({words}) in cells of {asked.cell_m:g} m along {heading.degrees:g} degrees"
     yield Made("prescription", path, f"{title}; .shx, .dbf, .prj and .cpg beside it", SHAPEFILE)
@@ -220,22 +208,3 @@ def _dosed(
     grid = CellGrid.around(around, step)
     counts = count_classes(grid, raster.classes, raster.transform, to_axes, len(raster.legend.names))
     return grid, dose_cells(counts, doses, least_fraction)
-
-
-def row_heading(run: ExportedRun) -> float:
-    """Heading of the crop rows on the map, 0 to 180 degrees clockwise from north, as the coarse pass shows them.
-
-    Raises SettingsError: no rows are seen.
-    """
-    angle = find_rows(mosaic_brightness(run.path("mosaic"))).angle_deg
-    if angle is None:
-        raise SettingsError("no crop rows are seen in this run; give --heading in degrees from north")
-    across, down = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))
-    ground = MosaicView(run).ground
-    if ground is None:
-        a, b, _, d, e, _ = MosaicView(run).place.transform
-        east, north = a * across + b * down, d * across + e * down
-    else:  # about the middle of the scene: perspective turns rows elsewhere a little otherwise
-        ends = ground.frame.view.scene_to_ground(np.array([[-down, -across], [down, across]]))
-        east, north = np.diff(ground.frame.ground_to_map(ends), axis=0)[0]
-    return round(float(np.rad2deg(np.arctan2(east, north))) % 180, 1)

@@ -14,8 +14,6 @@ from pipeline.errors import SettingsError
 from pipeline.products.indices import SpectralIndex, find_index
 from storage.export.map_files import UNITS, DoseUnit
 
-ROWS = "rows"  # said as a heading: along the crop rows
-
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
@@ -37,9 +35,7 @@ class ProductFlags:
     ] = None
     dose_unit: Annotated[str, Parameter(help="Unit of the doses: l/ha or kg/ha.")] = "l/ha"
     cell: Annotated[float, Parameter(help="Side of the prescription's cells [m].")] = 3.0
-    heading: Annotated[
-        str, Parameter(help="Along which its cells lie, clockwise from north [deg], or `rows`: along the crop rows.")
-    ] = "0"
+    heading: Annotated[float, Parameter(help="Along which its cells lie, clockwise from north [deg].")] = 0.0
     least_fraction: Annotated[
         float, Parameter(help="A cell gets the dose of a class of which it has more than this fraction, 0 to 1.")
     ] = 0.0
@@ -64,7 +60,7 @@ class Prescription:
     doses: Mapping[str, float]
     unit: DoseUnit
     cell_m: float
-    heading: float | None  # degrees clockwise from north; None along the crop rows, whatever that is in a run
+    heading: float  # degrees clockwise from north
     least_fraction: float
 
 
@@ -107,11 +103,9 @@ def _prescription(flags: ProductFlags, doses: Mapping[str, float]) -> Prescripti
         raise SettingsError(f"--cell expects metres above 0, got {flags.cell:g}")
     if not 0 <= flags.least_fraction < 1:
         raise SettingsError(f"--least-fraction expects a fraction from 0 to below 1, got {flags.least_fraction:g}")
-    try:
-        heading = None if flags.heading == ROWS else float(flags.heading) % 360
-    except ValueError:
-        raise SettingsError(f"--heading expects degrees from north, or {ROWS}, got {flags.heading!r}") from None
-    return Prescription(doses, UNITS[flags.dose_unit], flags.cell, heading, flags.least_fraction)
+    if not abs(flags.heading) <= 360:
+        raise SettingsError(f"--heading expects degrees from north, -360 to 360, got {flags.heading:g}")
+    return Prescription(doses, UNITS[flags.dose_unit], flags.cell, flags.heading % 360, flags.least_fraction)
 
 
 def by_class(text: str | None, flag: str, example: str) -> dict[str, float]:

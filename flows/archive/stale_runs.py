@@ -21,7 +21,7 @@ from storage.archive.keys import canonical_json
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run, Store
 from storage.readers.open_cubes import split_variable
-from storage.readers.recorded_runs import RAW_PRODUCTS, find_raw_cubes
+from storage.readers.recordings import RAW_PRODUCTS, find_raw_cubes
 
 OF_THE_SURVEY = ("labels", "weights", "memory", "accuracy", "prior")  # settings that its raw cubes do not bring
 # what the light of a field depends on; surveys that agree in these are generations of one

@@ -41,7 +41,7 @@ from pipeline.rig.device_settings import MOST_PAIRS
 from pipeline.setting_fields import format_number, span_of
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, REMOVED_LAW
 from storage.archive.staging import read_toml
-from storage.readers.recorded_runs import find_recorded_run
+from storage.readers.recordings import find_recorded_run
 
 
 @dataclasses.dataclass(frozen=True)

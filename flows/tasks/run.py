@@ -68,8 +68,8 @@ from pipeline.source import References
 from storage.archive.archive import Archive
 from storage.arrays.layout import image_spec
 from storage.readers.open_cubes import load_labels_array
-from storage.readers.raster_work import RasterPixels
-from storage.readers.scene_files import OpenScene
+from storage.readers.raster_fields import RasterPixels
+from storage.readers.scene_files import SceneFile
 from storage.remote.opening import is_archive, open_archive
 
 if TYPE_CHECKING:
@@ -394,7 +394,7 @@ def _run_by(
 
 def _scene_for(
     model: SurveyModel, settings: Settings, recorded: OpenedRecording | None, *, planning: bool
-) -> tuple[OpenScene | None, RasterScene, tuple[str, ...], tuple[str, ...]]:
+) -> tuple[SceneFile | None, RasterScene, tuple[str, ...], tuple[str, ...]]:
     """Open a scene that the weights can read, drawn unless for ``planning``; what to say of it and of its labels.
 
     The first value is the scene's file where its pixels are taken as they are.

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ from pipeline.source import Source
 from storage.readers.cube_sources import machine_bytes
 from storage.readers.open_cubes import load_labels_array, split_variable
 from storage.readers.raster_fields import is_glob, open_raster
-from storage.readers.scene_files import OpenScene, SceneFacts, load_scene_file
+from storage.readers.scene_files import SceneFile, load_scene_file
 
 # Peak of a survey of the farm without controls: 1.58 GB for 1280 x 1024 px, 4.12 GB for 2560 x 2560 px
 FARM_BYTES, FARM_BYTES_PER_PX = 1_000_000_000, 490
@@ -77,7 +77,7 @@ def open_scene(settings: Settings, known: Sequence[str] | None = None) -> tuple[
     return scene, (*notes, *_gap_note(scene, "were given their band's median"))
 
 
-def open_map(settings: Settings, known: Sequence[str] | None = None) -> tuple[OpenScene, RasterScene, tuple[str, ...]]:
+def open_map(settings: Settings, known: Sequence[str] | None = None) -> tuple[SceneFile, RasterScene, tuple[str, ...]]:
     """Open a raster whose pixels are taken as they are; its scene holds all but light, which no camera looks at.
 
     Raises SceneError, WavelengthError: its files. Labels found by their name count as in `open_scene`.
@@ -106,10 +106,7 @@ def open_map(settings: Settings, known: Sequence[str] | None = None) -> tuple[Op
     return file, scene, (*notes, *_gap_note(scene, "are as they are in the other bands"))
 
 
-Facts = TypeVar("Facts", bound=SceneFacts)
-
-
-def _judged_by_known(file: Facts, known: Sequence[str] | None) -> Facts:
+def _judged_by_known(file: SceneFile, known: Sequence[str] | None) -> SceneFile:
     """Leave labels out that were found by their name and have a class beside the ``known`` ones."""
     out_of_range = [name for name in file.class_names if known is not None and name not in known]
     if not (file.labels_found and out_of_range):

@@ -47,8 +47,7 @@ class TrainingData:
                 seed, day, hour = read_farm_name(name)
                 yield farm_scene(seed, FARM_SHAPE, camera=self.camera, day=day, hour=hour)
             else:
-                file = dict(self.files.train())[name] if self.files.train_mask else self.files.load(name)
-                yield scene_of_file(file, self.camera)
+                yield scene_of_file(self.files.load(name, "train"), self.camera)
 
 
 def scene_of_file(file: SceneFile, camera: LineCamera) -> RasterScene:

@@ -134,24 +134,19 @@ def _nodata_lines(draft: SceneDraft) -> list[str]:
 
 
 def _class_lines(draft: SceneDraft) -> list[str]:
-    classes, legend = draft.classes, draft.legend
+    classes = draft.classes
     if not classes:
         return []
-    void = [one for one in classes if one.no_class]
-    guess = [] if void else [one for one in classes if one.value in (0, 255, (0, 0, 0), (255, 255, 255))]
-    lines = [f"unlabelled = {_value(one)}   # {one.name}: {one.fraction:.1%}" for one in void[:1]]
-    lines += [
+    guess = [one for one in classes if one.value in (0, 255, (0, 0, 0), (255, 255, 255))]
+    lines = [
         f"# unlabelled = {_value(one)}   # if it stands for no class: take away the #, and its line below"
         for one in guess[:1]
     ]
-    named = f"names from {printable(legend.name)}" if legend is not None else "rename them as you like"
-    parts = f"name = value in the label files, fraction of all pixels; {named}"
+    parts = "name = value in the label files, fraction of all pixels; rename them as you like"
     if all(is_polygon_file(label) for label in draft.files.labels.values()):
         parts = "name = number, fraction of the labelled pixels; polygons say the name or the number"
     lines += ["", f"[classes]   # {parts}"]
-    return lines + [
-        f"{_key(one.name)} = {_value(one)}   # {one.fraction:.1%}" for one in classes if one not in void[:1]
-    ]
+    return lines + [f"{_key(one.name)} = {_value(one)}   # {one.fraction:.1%}" for one in classes]
 
 
 def _value(one: FoundClass) -> str:

@@ -72,15 +72,6 @@ def with_unknown(legend: ClassNames) -> ClassNames:
     return ClassNames((*legend.names, name), np.vstack([legend.colours, np.array([UNKNOWN_COLOUR], np.uint8)]))
 
 
-def write_class_map(path: Path, found: ClassMap) -> None:
-    """Store classes with their names and colours, and the confidence.
-
-    Raises ShapeError: sizes differ, or a pixel has a class without a name.
-    """
-    create_class_map(path, found.classes.shape, ClassNames(found.names, found.colours), grid=found.grid)
-    write_class_tile(path, (0, 0), found.classes, found.confidence)
-
-
 def create_class_map(
     path: Path, shape: tuple[int, ...], legend: ClassNames, *, grid: AngularGrid | None = None
 ) -> None:

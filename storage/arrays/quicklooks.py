@@ -13,14 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from storage.arrays.layout import open_group, read_array, write_image
+from storage.arrays.layout import read_array, write_image
 
 ARRAY = "quicklook"
 DIMS = ("quicklook_y", "quicklook_x", "rgb")
@@ -216,11 +215,6 @@ def write_quicklook(group: zarr.Group, found: Quicklook) -> None:
     if found.bands:
         about |= {"bands": list(found.bands), "step": found.step, "low": list(found.low), "high": list(found.high)}
     write_image(group, ARRAY, DIMS, found.image, about)
-
-
-def load_quicklook(path: Path) -> Quicklook | None:
-    """The picture of the cube or mosaic stored at ``path``, None where it has none; see `quicklook_of`."""
-    return quicklook_of(open_group(path))
 
 
 def quicklook_of(group: zarr.Group) -> Quicklook | None:

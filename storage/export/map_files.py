@@ -52,40 +52,30 @@ Colour = tuple[int, ...]
 Entry = tuple[Any, str, Colour]  # value, name, red green blue
 
 
-def write_geopackage(path: Path, layer: str, polygons: Any, columns: Columns, crs: str | None, when: str) -> None:
-    """Write polygons as a GeoPackage of one layer. ``when`` (ISO 8601) is kept as its date, so that bytes repeat.
+def write_polygons(
+    path: Path, polygons: Any, columns: Columns, crs: str | None, *, layer: str | None = None, when: str | None = None
+) -> None:
+    """Write polygons as a GeoPackage, as GeoJSON or as a shapefile, by the ending of ``path``.
 
-    ``polygons`` are shapely's, ``columns`` values of each, ``crs`` WKT, None where there is none. Raises ArchiveError:
-    GDAL or the disk refuses.
+    ``polygons`` are shapely's, ``columns`` values of each, ``crs`` WKT, None where there is none. A GeoPackage keeps
+    ``when`` (ISO 8601) as its date, so that bytes repeat. GeoJSON is in longitude and latitude, its shells
+    anticlockwise (RFC 7946). A shapefile has .shx, .dbf, .prj and .cpg beside it, and names of columns of 10 letters.
+    Raises ArchiveError: GDAL or the disk refuses.
     """
-    with _writing(path, [path.name], when) as aside, warnings.catch_warnings():
+    kind = path.suffix
+    names = [path.with_suffix(part).name for part in reversed(SHAPE_PARTS)] if kind == ".shp" else [path.name]
+    with _writing(path, names, when) as aside, warnings.catch_warnings():
         warnings.filterwarnings("ignore", "'crs' was not provided", UserWarning)  # that is told where it is missing
-        _frame(polygons, columns, crs).to_file(aside / path.name, layer=layer, driver="GPKG", engine="pyogrio")
+        frame = geopandas.GeoDataFrame(dict(columns), geometry=list(polygons), crs=crs)
+        frame = frame.to_crs(4326) if kind == ".geojson" else frame
+        frame.to_file(aside / path.name, layer=layer, engine="pyogrio", **_OPTIONS[kind])
 
 
-def write_geojson(path: Path, layer: str, polygons: Any, columns: Columns, crs: str) -> None:
-    """Write polygons as GeoJSON in longitude and latitude, shells anticlockwise (RFC 7946); otherwise as above."""
-    with _writing(path, [path.name], None) as aside:
-        _frame(polygons, columns, crs).to_crs(4326).to_file(
-            aside / path.name,
-            layer=layer,
-            driver="GeoJSON",
-            engine="pyogrio",
-            RFC7946="YES",
-            COORDINATE_PRECISION=DEGREE_DIGITS,
-        )
-
-
-def write_shapefile(path: Path, polygons: Any, columns: Columns, crs: str) -> None:
-    """Write polygons as a shapefile: ``path`` and beside it .shx, .dbf, .prj and .cpg. Names of columns: 10 letters."""
-    with _writing(path, [path.with_suffix(part).name for part in reversed(SHAPE_PARTS)], None) as aside:
-        _frame(polygons, columns, crs).to_file(
-            aside / path.name, driver="ESRI Shapefile", engine="pyogrio", encoding="UTF-8"
-        )
-
-
-def _frame(polygons: Any, columns: Columns, crs: str | None) -> Any:
-    return geopandas.GeoDataFrame(dict(columns), geometry=list(polygons), crs=crs)
+_OPTIONS: Mapping[str, Mapping[str, Any]] = {
+    ".gpkg": {"driver": "GPKG"},
+    ".geojson": {"driver": "GeoJSON", "RFC7946": "YES", "COORDINATE_PRECISION": DEGREE_DIGITS},
+    ".shp": {"driver": "ESRI Shapefile", "encoding": "UTF-8"},
+}
 
 
 @contextmanager

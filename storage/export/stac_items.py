@@ -1,6 +1,6 @@
 """STAC: one item a run, one collection a folder of exports, with relative links and nothing that needs a server.
 
-Footprints, grids, wavelengths, bands and classes are said in the words of its extensions.
+Footprints and grids are said in the words of its extensions; wavelengths and classes stand in the files.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from odc.geo.geobox import GeoBox
 
 from pipeline.errors import ArchiveError
 from storage.archive.whole_files import write_whole
-from storage.arrays.class_maps import ClassNames
 from storage.arrays.georeference import map_attributes
 
 COG = "image/tiff; application=geotiff; profile=cloud-optimized"
@@ -31,9 +30,6 @@ ZARR = "application/vnd.zarr; version=3"
 SCHEMAS = {
     "proj": "https://stac-extensions.github.io/projection/v2.0.0/schema.json",
     "processing": "https://stac-extensions.github.io/processing/v1.2.0/schema.json",
-    "hsi": "https://stac-extensions.github.io/hsi/v1.0.0/schema.json",
-    "classification": "https://stac-extensions.github.io/classification/v2.0.0/schema.json",
-    "eo": "https://stac-extensions.github.io/eo/v2.0.0/schema.json",
 }
 _DIGITS = 9  # of a degree: 0.1 mm
 
@@ -77,42 +73,6 @@ def projection(geobox: GeoBox) -> dict[str, Any]:
         "proj:shape": [int(size) for size in geobox.shape],
         "proj:transform": [float(number) for number in geobox.affine[:6]],
         "proj:bbox": [float(number) for number in geobox.boundingbox.bbox],
-    }
-
-
-def angular(transform: Sequence[float], shape: Sequence[int]) -> dict[str, Any]:
-    """Fields of the projection extension of an image without a CRS, its transform in radians."""
-    return {"proj:code": None, "proj:shape": list(map(int, shape)), "proj:transform": list(transform)}
-
-
-def wavelengths(centre_nm: NDArray[np.float64]) -> dict[str, float]:
-    """Fields of the hyperspectral extension [micrometres]."""
-    return {"hsi:wavelength_min": float(centre_nm.min()) / 1000, "hsi:wavelength_max": float(centre_nm.max()) / 1000}
-
-
-def spectral_bands(centre_nm: NDArray[np.float64], fwhm_nm: NDArray[np.float64] | None, about: Any) -> dict[str, Any]:
-    """Bands of a cube, each with its centre and width [micrometres] and what is true of all of them."""
-    bands = [
-        {"name": f"B{number:03d}", "eo:center_wavelength": centre / 1000, **about}
-        for number, centre in enumerate(centre_nm.tolist())
-    ]
-    for band, width in zip(bands, [] if fwhm_nm is None else fwhm_nm.tolist(), strict=fwhm_nm is not None):
-        band["eo:full_width_half_max"] = width / 1000
-    return {"bands": bands}
-
-
-def classes(legend: ClassNames) -> dict[str, Any]:
-    """Fields of the classification extension: every class's number, name and colour."""
-    return {
-        "classification:classes": [
-            {
-                "value": number,
-                "name": clean_id(name, f"class-{number}"),
-                "title": name,
-                "color_hint": "{:02X}{:02X}{:02X}".format(*colour),
-            }
-            for number, (name, colour) in enumerate(zip(legend.names, legend.colours.tolist(), strict=True))
-        ]
     }
 
 
@@ -201,7 +161,6 @@ def _item(pystac: Any, item: Item) -> Any:
     for key, about in item.assets.items():
         made.add_asset(key, pystac.Asset.from_dict(dict(about)))
     names = {*item.properties, *(name for about in item.assets.values() for name in about)}
-    names.update(name for about in item.assets.values() for band in about.get("bands", ()) for name in band)
     made.stac_extensions = [SCHEMAS[prefix] for prefix in SCHEMAS if any(n.startswith(f"{prefix}:") for n in names)]
     return made
 

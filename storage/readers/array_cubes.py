@@ -1,4 +1,4 @@
-"""Cubes out of named arrays with CF attributes, wherever these are stored: Zarr stores, NetCDF and HDF5 files.
+"""Cubes out of named arrays, wherever these are stored: Zarr stores, NetCDF and HDF5 files, packs of arrays.
 
 Axes are found by their names, else by the number of wavelengths. Values follow from scale, offset and fill value, the
 place on the earth from a grid mapping.
@@ -7,10 +7,11 @@ place on the earth from a grid mapping.
 from __future__ import annotations
 
 import base64
+import math
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,6 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError
 from pipeline.rig.camera.camera_texts import MICROMETRES, NANOMETRES, UNSAID
 from storage.arrays.georeference import find_geobox
-from storage.readers.array_files import split_step
 from storage.readers.cube_sources import Bands, CubeSource, unpacked
 
 ROWS = ("y", "line", "lines", "row", "rows", "lat", "latitude", "northing", "downtrack", "along_scan_path")
@@ -28,10 +28,39 @@ _ACROSS = ("crosstrack", "across_scan_path")
 COLUMNS = ("x", "sample", "samples", "column", "columns", "col", "lon", "longitude", "easting", *_ACROSS)
 BANDS = ("band", "bands", "wavelength", "wavelengths", "channel", "channels", "spectral")
 TIMES = ("time", "t", "date", "dates", "step", "visit")
-WAVELENGTHS = ("wavelength", "wavelengths", "radiation_wavelength")
+WAVELENGTHS = (
+    "wavelength",
+    "wavelengths",
+    "radiation_wavelength",
+    "wavelength_nm",
+    "wavelengths_nm",
+    "wl",
+    "lambda",
+    "nm",
+)
 METRES = {"m", "meter", "meters", "metre", "metres"}
 
 Arrays = Mapping[str, Any]  # by name, or by path within a file; each has shape, ndim, dtype, attrs and [...]
+UNNAMED = "dims have no names, read as y, x, band"
+_SHOWN = 5  # arrays in a note
+
+
+@dataclass(frozen=True)
+class FileArray:
+    """One array of a file: its axes, attributes, and the function that reads a part of it."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    attrs: Mapping[str, Any]
+    get: Callable[[Any], NDArray[Any]] = field(repr=False)
+    chunks: tuple[int, ...] | None = None
+
+    @property
+    def ndim(self) -> int:
+        return len(self.shape)
+
+    def __getitem__(self, part: Any) -> NDArray[Any]:
+        return self.get(part)
 
 
 @dataclass(frozen=True)
@@ -50,15 +79,17 @@ class ArrayCube:
         return dims_of(self.array) or (["y", "x", "band"] if self.moment is None else ["time", "y", "x", "band"])
 
 
-def find_cube(arrays: Arrays, variable: str | None, path: Path) -> ArrayCube:
+def find_cube(arrays: Arrays, variable: str | None, path: Path, *, labels: bool = False) -> ArrayCube:
     """Find the array that is a cube: the one named, the only one with three axes, or the only one with wavelengths.
 
-    ``variable`` may end in a step of time (``values:3``), or be one. Nothing but names, shapes and attributes is read.
-    Raises SceneError: there is no such array, there are several, or its axes are not y, x and band.
+    Of ``labels`` the only one with two axes comes first. ``variable`` may end in a step of time (``values:3``), or be
+    one. Nothing but names, shapes and attributes is read. Raises SceneError: there is no such array, there are several,
+    or its axes are not y, x and band.
     """
-    named, step = split_step(variable, arrays)
-    name, notes = _chosen(arrays, named, path, series=step is not None)
-    moment = _moment(arrays[name], step, f"{path}:{name}" if name else str(path))
+    named, step = _split_step(variable, arrays)
+    name, notes = _chosen(arrays, named, path, _AXES[labels, step is not None])
+    series = arrays[name].ndim == 4 or (labels and step is not None and arrays[name].ndim == 3)
+    moment = _moment(arrays[name], step, f"{path}:{name}" if name else str(path), unnamed=series)
     order, more = _axes(arrays, name, path, moment)
     return ArrayCube(name, arrays[name], order, moment, (*notes, *more))
 
@@ -141,7 +172,7 @@ def _bands_of(cube: ArrayCube, arrays: Arrays, count: int) -> Bands:
         found = axis
     if found is None:
         return Bands()
-    centres = np.asarray(arrays[found][...], np.float64)
+    centres = np.asarray(arrays[found][...], np.float64).ravel()
     unit = _unit(arrays[found].attrs)
     scale = _scale(unit, float(centres.max()))
     if scale is None or not (np.isfinite(centres) & (centres > 0)).all():
@@ -150,50 +181,73 @@ def _bands_of(cube: ArrayCube, arrays: Arrays, count: int) -> Bands:
     beside, widths = _vector(arrays, ("fwhm",), count), None
     if beside is not None:
         own = _unit(arrays[beside].attrs)
-        widths = np.asarray(arrays[beside][...], np.float64)
+        widths = np.asarray(arrays[beside][...], np.float64).ravel()
         widths = widths * (scale if own in UNSAID else _scale(own, 0.0) or np.nan)
         widths = widths if (widths > 0).all() else None
     return Bands(centres * scale, widths, unit, f"wavelengths from the array {found}, {stated}")
 
 
-def _chosen(arrays: Arrays, variable: str | None, path: Path, *, series: bool) -> tuple[str, tuple[str, ...]]:
-    listing = ", ".join(f"{name} {array.shape}" for name, array in arrays.items() if array.ndim > 1) or "none"
+_AXES = {(False, False): (3, 4, 2), (True, False): (2, 3), (False, True): (4,), (True, True): (3, 4)}
+
+
+def _split_step(variable: str | None, names: Container[str]) -> tuple[str | None, int | None]:
+    """Return name and step of ``cube``, ``cube:3`` or, where no array is called so, of the step ``3`` alone."""
+    if variable is None or variable in names:
+        return variable, None
+    name, colon, step = variable.rpartition(":")
+    return (name if colon else None, int(step)) if step.isdecimal() else (variable, None)
+
+
+def _chosen(arrays: Arrays, variable: str | None, path: Path, axes: Sequence[int]) -> tuple[str, tuple[str, ...]]:
+    """Return the name of the array that is meant, with a number of axes that is tried in this order; and notes."""
+    listed = [f"{name} {array.shape}" for name, array in arrays.items() if array.ndim > 1]
+    listing = ", ".join(listed) or "none"
+    if list(arrays) == [""]:
+        if variable is not None:
+            raise SceneError(f"{path} holds one array, which has no name; only a step of time can be named: {path}:0")
+        return "", ()
     if variable is not None:
         fitting = [name for name in arrays if name == variable] or [one for one in arrays if _base(one) == variable]
         if len(fitting) != 1:
-            raise SceneError(f"{path} has no array {variable}; it has {listing}")
+            raise SceneError(f"{path} has no array {variable}; it has {listing}; name one: {path.name}:ARRAY")
         return fitting[0], ()
-    cubes = [name for name, array in arrays.items() if array.ndim == 3 + series and array.dtype.kind in "buif"]
-    own = [name for name in ("dn", "values") if name in cubes]
-    if own or len(cubes) == 1:
-        return (own or cubes)[0], ()
-    spectra = [name for name in cubes if _spectral_axes(arrays, arrays[name])]
-    if len(spectra) == 1:
-        others = ", ".join(f"{name} {arrays[name].shape}" for name in cubes if name != spectra[0])
-        return spectra[0], (f"array {spectra[0]}, the only one with wavelengths; the file also has {others}",)
-    if cubes:
-        raise SceneError(f"{path} has several arrays with three axes; it has {listing}; name one: {path.name}:ARRAY")
-    if list(arrays) == [""]:
-        return "", ()
-    over_time = [name for name, array in arrays.items() if array.ndim == 4 and array.dtype.kind in "buif"]
-    if len(over_time) == 1:
-        return over_time[0], ()
+    for count in axes:
+        fitting = [name for name, one in arrays.items() if one.ndim == count and one.dtype.kind in "buifc"]
+        fitting = [name for name in fitting if min(arrays[name].shape) > 1] or fitting  # vectors stand back
+        fitting = [name for name in fitting if math.prod(arrays[name].shape) > 1]
+        own = [name for name in fitting if name == "values"]
+        spectra = [name for name in fitting if _spectral_axes(arrays, arrays[name])]
+        for chosen, why in ((own, ""), (fitting, ""), (spectra, ", the only one with wavelengths")):
+            if len(chosen) == 1:
+                others = [f"{name} {one.shape}" for name, one in arrays.items() if one.ndim > 1 and name != chosen[0]]
+                more = f"array {chosen[0]} of the file{why}, which also has {', '.join(others[:_SHOWN])}"
+                return chosen[0], (more,) if others else ()
+        if fitting:
+            raise SceneError(
+                f"{path} has several arrays with {count} axes; it has {listing}; name one: {path.name}:ARRAY"
+            )
     raise SceneError(f"{path} has no array of numbers with the axes y, x and band; it has {listing}")
 
 
-def _moment(array: Any, step: int | None, address: str) -> tuple[int, int] | None:
-    """Return axis and step of an array with an axis of time (SceneError: none is named, or one that it lacks)."""
+def _moment(array: Any, step: int | None, address: str, *, unnamed: bool) -> tuple[int, int] | None:
+    """Return axis and step of an array with an axis of time (SceneError: none is named, or one that it lacks).
+
+    The first of ``unnamed`` axes is time.
+    """
     words = [_word(dim) for dim in dims_of(array)]
-    unnamed = 0 if array.ndim == 4 and not any(words) else None
     known = set(words) & set(ROWS) and set(words) & set(COLUMNS)
-    axis = next((at for at, word in enumerate(words) if known and word in TIMES), unnamed)
+    first = 0 if unnamed and not any(words) else None
+    axis = next((at for at, word in enumerate(words) if known and word in TIMES), first)
     if axis is None:
         if step is not None:
             raise SceneError(f"{address} has the shape {array.shape} and no axis of time; leave :{step} out")
         return None
     steps = array.shape[axis]
     if step is None and steps > 1:
-        raise SceneError(f"{address} has {steps} steps of time; name one, {address}:0 to {address}:{steps - 1}")
+        raise SceneError(
+            f"{address} has the shape {array.shape} and {steps} steps of time; name one, {address}:0 to "
+            f"{address}:{steps - 1}"
+        )
     if step is not None and step >= steps:
         raise SceneError(f"{address} has {steps} steps of time, counted from 0; got :{step}")
     return axis, step or 0
@@ -206,11 +260,13 @@ def _axes(
     array = arrays[name]
     named, own = dims_of(array), [axis for axis in range(array.ndim) if moment is None or axis != moment[0]]
     if len(own) not in (2, 3):
-        raise SceneError(f"{path} holds shape {array.shape}; expected y, x and band; store one time or level")
+        raise SceneError(
+            f"{path} holds shape {array.shape}; expected (y, x, band), or (y, x) for one band; store one time or level"
+        )
     if not any(_word(dim) in (*ROWS, *COLUMNS, *BANDS, *TIMES) or dim in arrays for dim in named):
         spectral = [axis for axis in _spectral_axes(arrays, array) if axis in own]
         if len(own) == 2 or len(spectral) != 1 or spectral == own[-1:]:
-            return tuple(own), ("dims have no names, read as y, x, band",)
+            return tuple(own), (UNNAMED,)
         rest = [axis for axis in own if axis not in spectral]
         return (*rest, *spectral), (f"dims have no names, read as y, x and band: axis {spectral[0]} (from 0) is band",)
     words = {axis: _word(named[axis]) for axis in own}
@@ -223,7 +279,8 @@ def _axes(
 
 def _spectral_axes(arrays: Arrays, array: Any) -> list[int]:
     """Return the axes of an array that are as long as the wavelengths: one, unless sizes are alike by chance."""
-    lengths = {arrays[name].shape[0] for name in arrays if _word(name) in WAVELENGTHS and arrays[name].ndim == 1}
+    known = [arrays[name].shape for name in arrays if _word(name) in WAVELENGTHS]
+    lengths = {max(shape) for shape in known if shape and max(shape) == math.prod(shape)}
     by_name = [axis for axis, dim in enumerate(dims_of(array)) if _is_spectral(arrays.get(dim))]
     return by_name or [axis for axis, size in enumerate(array.shape) if size in lengths]
 
@@ -242,7 +299,9 @@ def _vector(arrays: Arrays, words: tuple[str, ...], count: int) -> str | None:
 
 
 def _is_line(arrays: Arrays, name: str, count: int) -> bool:
-    return name in arrays and arrays[name].shape == (count,) and arrays[name].dtype.kind in "uif"
+    """Tell whether an array is ``count`` numbers in a row, along whichever of its axes."""
+    shape = arrays[name].shape if name in arrays else ()
+    return bool(shape) and math.prod(shape) == max(shape) == count and arrays[name].dtype.kind in "uif"
 
 
 def _base(name: str) -> str:

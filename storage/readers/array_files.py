@@ -1,6 +1,12 @@
-"""Arrays out of .npy, .npz and .mat files: listed by their headers, and only the one wanted is read.
+"""Cubes out of files of named arrays: NetCDF, HDF5 and products of EMIT, PRISMA and NEON; .npy, .npz and .mat.
 
-Nothing but plain numbers is read: no Python objects, cells or structures. A step of a time series may be named.
+h5py opens NetCDF and HDF5, which are read a few lines at a time. EMIT's files follow CF but for their wavelengths,
+which lie in a group of their own, and a list of good ones. NEON says scale, no-data value and place in its own words.
+PRISMA keeps a cube for each of its two spectrometers, with scale, wavelengths and place as attributes of the file. The
+layouts are those that the providers publish; no such file was at hand.
+
+Packs and .mat files are listed by their headers, and only the array wanted is read: plain numbers, no Python objects,
+cells or structures.
 """
 
 from __future__ import annotations
@@ -11,155 +17,356 @@ import mmap
 import struct
 import warnings
 import zipfile
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
 from functools import partial
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from affine import Affine
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from storage.readers.cube_sources import DEFLATE_RATIO, Bands, check_claim, check_memory
-from storage.readers.scene_toml import MICROMETRES, check_wavelengths
+from pipeline.lazy import deferred
+from storage.readers.array_cubes import UNNAMED, ArrayCube, FileArray, cube_source, find_cube, names_beside
+from storage.readers.cube_sources import (
+    BLOCK_LINES,
+    DEFLATE_RATIO,
+    Bands,
+    CubeSource,
+    check_claim,
+    check_memory,
+    read_by_chunks,
+    reading,
+    unpacked,
+)
 
+if TYPE_CHECKING:
+    import h5py
+    import odc.geo.geobox as odc_geobox
+    import xarray as xr
+    from odc.geo.geobox import GeoBox
+else:
+    h5py = deferred("h5py")
+    odc_geobox = deferred("odc.geo.geobox")
+    xr = deferred("xarray")
+
+KIND = "NetCDF or HDF5"
+HDF_ENDINGS = (".nc", ".nc4", ".h5", ".hdf5", ".he5")
+GOOD_BANDS = ("good_wavelengths", "good_bands", "bbl")  # 0 marks a bad band
+NO_UNIT = ("", "1", "unitless", "none", "dimensionless")
+_CLASSIC = b"CDF"  # how NetCDF files of version 3 begin
+_ONLY_A_DIMENSION = "This is a netCDF dimension but not a netCDF variable"
+_PRISMA = "HDFEOS/SWATHS/PRS_L2{}_HCO/Data Fields/{}_Cube"
+_PRISMA_TOP = 65535  # the number that stands for the greatest value
 ARRAY_ENDINGS = (".npy", ".npz", ".mat")
-_OF_WAVELENGTHS = ("wavelength", "wavelengths", "wavelength_nm", "wavelengths_nm", "wl", "lambda", "nm")
-_MATLAB = {"double": 8, "single": 4, "logical": 1} | {f"{u}int{8 * n}": n for n in (1, 2, 4, 8) for u in ("", "u")}
+_MATLAB = {"double": "f8", "single": "f4", "logical": "?"} | {
+    f"{u}int{8 * n}": f"{u or 'i'}{n}" for n in (1, 2, 4, 8) for u in ("", "u")
+}
 MOST_UNEVEN = 16  # times that a picture is longer than wide
 
 
-@dataclass(frozen=True)
-class HeldArray:
-    """One array that a file holds; ``load`` reads it."""
+def open_hdf_cube(path: Path, variable: str | None = None, *, labels: bool = False) -> CubeSource:
+    """Open one array of a NetCDF or HDF5 file as a cube; nothing but attributes and coordinates is read yet.
 
-    shape: tuple[int, ...]
-    load: Callable[[], NDArray[Any]]
-
-
-@dataclass(frozen=True)
-class NamedArray:
-    """One array of a file, and what the others say of it."""
-
-    values: NDArray[Any]
-    bands: Bands
-    notes: tuple[str, ...] = ()
-
-
-def load_array(path: Path, variable: str | None, dims: int) -> NamedArray:
-    """Read the array named, or the only one with ``dims`` axes; that of a .npy file is a read-only view.
-
-    Of a cube the wavelengths, where another array is called so and has one a band. ``variable`` may be a step of time,
-    or end in one: see :func:`take_step`. Raises SceneError: there is no such array, or several; it is no table of
-    numbers; or it claims more than the file or the machine can hold.
+    ``variable`` names the array, by its name alone or with its groups (``SERC/Reflectance/Reflectance_Data``), and may
+    end in a step of time. Raises SceneError: the file is damaged, has no such array or several, or axes that are not
+    y, x and band.
     """
-    try:
-        return _load_array(path, variable, dims)
-    except SceneError:
-        raise
-    except Exception as error:  # decoders raise anything at all on damaged bytes
-        objects = "pickle" in str(error) or "Python objects" in str(error)
-        why = "it holds Python objects or is damaged" if objects else str(error)
-        raise SceneError(f"{path} cannot be read as {path.suffix}: {why}; write it again as plain numbers") from error
+    with reading(path, KIND):
+        with path.open("rb") as file:
+            classic = file.read(3) == _CLASSIC
+        arrays, attributes = _classic_arrays(path) if classic else _hdf_arrays(path)
+        level = next((one for one in "DCB" if _PRISMA.format(one, "VNIR") in arrays), None)
+        if level is not None and variable is None:
+            return _prisma_cube(path, level, arrays, attributes)
+        if any(name.startswith("HDFEOS/SWATHS/PRS_") for name in arrays):
+            what = "is a PRISMA product of level 1" if level is None else f"has {variable} as a part of one cube"
+            raise SceneError(
+                f"{path} {what}, which is not read; give a product of level 2B, 2C or 2D by its name alone, and --bands"
+                " for some of its bands"
+            )
+        cube = find_cube(arrays, variable, path, labels=labels)
+        near = _in_scope(arrays, cube.name)
+        for name in names_beside(arrays) | {dim for dim in cube.dims if dim in near}:
+            _check_array(path, name, (arrays | near)[name], lines=None)
+        chunk = 1 if cube.array.chunks is None else cube.array.chunks[cube.order[0]]
+        _check_array(path, cube.name, cube.array, lines=(cube.order[0], max(chunk, BLOCK_LINES)))
+        about = {**attributes, **cube.array.attrs}
+        source = cube_source(path, cube, near, about, lambda: reading(path, KIND))
+        unit, (lines, _, count) = str(about.get("units", "")).strip(), source.shape
+        notes = (*cube.notes, *([] if unit.lower() in NO_UNIT else [f"values are in {unit}"]))
+        geobox, where = (source.geobox, ()) if source.geobox is not None else _other_place(near, cube, source.shape)
+        return replace(
+            source,
+            read=read_by_chunks(source.read, lines, chunk),
+            bad_bands=_bad_bands(near, count),
+            geobox=geobox,
+            notes=(*notes, *source.notes[len(cube.notes) :], *where),
+        )
 
 
-def _load_array(path: Path, variable: str | None, dims: int) -> NamedArray:
-    if path.suffix.lower() == ".npy":
-        named, step = split_step(variable, ())
-        if named is not None:
-            raise SceneError(f"{path} holds one array, which has no name; only a step of time can be named: {path}:0")
-        return NamedArray(take_step(np.load(path, mmap_mode="r", allow_pickle=False), step, dims, str(path)), Bands())
-    if path.suffix.lower() == ".npz":
-        found = _npz_arrays(path)
-    else:
-        found = _hdf_arrays(path) if _is_hdf(path) else _mat_arrays(path)
-    listing = ", ".join(f"{name} {held.shape}" for name, held in found.items()) or "none"
-    named, step = split_step(variable, found)
-    if named is not None and named not in found:
-        raise SceneError(f"{path} has no array {named}; it has {listing}; name one: {path.name}:VARIABLE")
-    name = named if named is not None else _only_one(path, found, _AXES[dims, step is not None], listing)
-    others = [f"{other} {held.shape}" for other, held in found.items() if other != name]
-    notes = (f"array {name} of the file, which also has {', '.join(others)}",) if others and named is None else ()
-    values = take_step(found[name].load(), step, dims, f"{path}:{name}")
-    return NamedArray(values, _wavelengths(path, found, values.shape[2]) if values.ndim == 3 else Bands(), notes)
+def _bad_bands(arrays: Mapping[str, Any], count: int) -> tuple[int, ...]:
+    """Bands, from 0, that a list of the file marks by 0, as EMIT's of good wavelengths does."""
+    for name, array in arrays.items():
+        if name.rpartition("/")[2].lower() in GOOD_BANDS and array.shape == (count,):
+            return tuple(int(band) for band in np.flatnonzero(array[...] == 0))
+    return ()
 
 
-def _wavelengths(path: Path, found: Mapping[str, HeldArray], bands: int) -> Bands:
-    """Return wavelengths that stand beside a cube, in nm or micrometres by their size."""
-    for name, held in found.items():
-        if name.lower() not in _OF_WAVELENGTHS or math.prod(held.shape) != bands or max(held.shape) != bands:
-            continue
-        with suppress(SceneError, ValueError, TypeError):
-            centres = np.asarray(held.load(), np.float64).ravel()
-            unit = "micrometres by their size" if centres.max() <= MICROMETRES[1] else "nm"
-            nm = check_wavelengths(centres * (1000 if unit != "nm" else 1), str(path))
-            return Bands(nm, None, unit, f"wavelengths from {path}:{name}, read as {unit}")
-    return Bands()
+def _other_place(
+    arrays: Mapping[str, Any], cube: ArrayCube, shape: tuple[int, int, int]
+) -> tuple[GeoBox | None, tuple[str, ...]]:
+    """Return the place by NEON's map info and EPSG code; else a note where the file has a place that is not read."""
+    folder = f"{cube.name.rpartition('/')[0]}/Metadata/Coordinate_System"
+    if f"{folder}/Map_Info" in arrays and f"{folder}/EPSG Code" in arrays:
+        told = [
+            np.asarray(arrays[f"{folder}/{name}"][()]).astype(np.str_).reshape(-1)[0]
+            for name in ("Map_Info", "EPSG Code")
+        ]
+        try:
+            words = [word.strip() for word in told[0].split(",")]
+            x, y, east, north, wide, high = map(float, words[1:7])
+            if any(word.lower().startswith("rotation") and float(word.partition("=")[2]) for word in words):
+                raise ValueError("it is turned")
+            corner = Affine(wide, 0, east - (x - 1) * wide, 0, -high, north + (y - 1) * high)
+            return odc_geobox.GeoBox(shape[:2], corner, f"EPSG:{int(told[1])}"), ()
+        except Exception as error:  # of PROJ, too
+            return None, (f"its place on the earth cannot be read: map info {told[0]!r}: {error}",)
+    names = {name.rpartition("/")[2].lower() for name, array in arrays.items() if array.ndim == 2}
+    if "glt_x" in names:
+        return None, (
+            "its pixels are in the sensor's own geometry and have no map grid; for a place on the earth, write it"
+            " orthorectified by its geolocation grids (glt_x, glt_y) first",
+        )
+    if {"lat", "latitude"} & names:
+        return None, ("its place is told by a latitude and longitude of each pixel, which are not read",)
+    return None, ()
 
 
-_AXES = {(3, False): (3, 4, 2), (2, False): (2, 3), (3, True): (4,), (2, True): (3, 4)}  # in the order in which tried
+def _prisma_cube(path: Path, level: str, arrays: Mapping[str, FileArray], about: Mapping[str, Any]) -> CubeSource:
+    """Both cubes of a PRISMA product of level 2 as one, its used bands by ascending wavelength.
 
+    Their axes are y, band and x. Pixels that are 0 in every band lie outside the swath.
+    """
+    parts: list[tuple[FileArray, float, float]] = []
+    centres: list[float] = []
+    widths: list[float] = []
+    used: list[NDArray[np.bool_]] = []
+    for part in ("Vnir", "Swir"):
+        array = arrays[_PRISMA.format(level, part.upper())]
+        _check_array(path, f"{part}_Cube", array, lines=(0, (array.chunks or (1,))[0]))
+        told = [np.asarray(about[f"List_{word}_{part}"], np.float64).ravel() for word in ("Cw", "Fwhm")]
+        if array.ndim != 3 or any(len(one) != array.shape[1] for one in told):
+            raise SceneError(
+                f"{path}: {part}_Cube has the shape {array.shape} and {len(told[0])} wavelengths, expected (y, band, x)"
+                " with one for each band; copy the file again"
+            )
+        low, high = (float(about[f"L2Scale{part}{end}"]) for end in ("Min", "Max"))
+        parts.append((array, low, (high - low) / _PRISMA_TOP))
+        centres, widths = [*centres, *told[0]], [*widths, *told[1]]
+        used += [told[0] > 0]
+    (lines, _, samples), bands = parts[0][0].shape, np.flatnonzero(np.concatenate(used))
+    if {(array.shape[0], array.shape[2]) for array, _, _ in parts} != {(lines, samples)}:
+        raise SceneError(f"{path}: the cubes {[array.shape for array, _, _ in parts]} (y, band, x) are of two sizes")
+    order = bands[np.argsort(np.array(centres)[bands], kind="stable")]
 
-def _only_one(path: Path, found: Mapping[str, HeldArray], axes: Sequence[int], listing: str) -> str:
-    """Return the name of the only array with the first of these numbers of axes that any has; vectors stand back."""
-    for wanted in axes:
-        fitting = [name for name, held in found.items() if len(held.shape) == wanted and math.prod(held.shape) > 1]
-        planes = [name for name in fitting if min(found[name].shape) > 1] or fitting
-        if len(planes) == 1:
-            return planes[0]
-        if planes:
-            break
-    raise SceneError(
-        f"{path} has no single array with {axes[0]} axes; it has {listing}; name one: {path.name}:VARIABLE"
+    def read(start: int, stop: int) -> NDArray[Any]:
+        """Give some lines (line, sample, band)."""
+        with reading(path, KIND):
+            raw = [np.moveaxis(array[start:stop], 1, 2) for array, _, _ in parts]
+        void = np.logical_and.reduce([(block == 0).all(axis=2) for block in raw])
+        values = [unpacked(block, scale, low, None) for block, (_, low, scale) in zip(raw, parts, strict=True)]
+        lit = np.concatenate(values, axis=2)[..., order]
+        lit[void] = np.nan
+        return lit
+
+    chunk = max((array.chunks or (1,))[0] for array, _, _ in parts)
+    check_memory(path, max(chunk, BLOCK_LINES) * samples * len(centres) * 8)
+    geobox, notes = _prisma_place(about, (lines, samples)) if level == "D" else (None, ("it has no map grid",))
+    unused = len(centres) - len(order)
+    return CubeSource(
+        name=path.name,
+        shape=(lines, samples, len(order)),
+        dtype=np.dtype(np.float32),
+        read=read_by_chunks(read, lines, chunk),
+        files=(path,),
+        bands=Bands(np.array(centres)[order], np.array(widths)[order], "nm", "wavelengths from List_Cw of the file"),
+        geobox=geobox,
+        notes=(f"a PRISMA product of level 2{level}; {unused} bands without a wavelength are left out", *notes),
     )
 
 
-def split_step(variable: str | None, names: Container[str]) -> tuple[str | None, int | None]:
-    """Return name and step of ``cube``, ``cube:3`` or, where no array is called so, of the step ``3`` alone."""
-    if variable is None or variable in names:
-        return variable, None
-    name, colon, step = variable.rpartition(":")
-    if not step.isdecimal():
-        return variable, None
-    return name if colon else None, int(step)
+def _prisma_place(about: Mapping[str, Any], shape: tuple[int, int]) -> tuple[GeoBox | None, tuple[str, ...]]:
+    """The grid between the centres of the upper left and the lower right pixel."""
+    try:
+        (west, north), (east, south) = (
+            [float(about[f"Product_{corner}corner_{axis}"]) for axis in ("easting", "northing")]
+            for corner in ("UL", "LR")
+        )
+        wide, high = (east - west) / (shape[1] - 1), (north - south) / (shape[0] - 1)
+        corner = Affine(wide, 0, west - wide / 2, 0, -high, north + high / 2)
+        return odc_geobox.GeoBox(shape, corner, f"EPSG:{int(about['Epsg_Code'])}"), ()
+    except Exception as error:  # attributes may be missing or hold anything; of PROJ, too
+        return None, (f"its place on the earth cannot be read: {type(error).__name__}: {error}",)
 
 
-def take_step(values: NDArray[Any], step: int | None, dims: int, where: str) -> NDArray[Any]:
-    """Return one step of a time series, (time, y, x, band), counted from 0; what is none is returned as it is.
+def _in_scope(arrays: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """All arrays by their paths; those of the array's group and of groups above by their names alone, too."""
+    groups = name.split("/")[:-1]
+    found: dict[str, Any] = {}
+    for depth in range(len(groups) + 1):
+        head = "".join(f"{group}/" for group in groups[:depth])
+        found |= {
+            other.removeprefix(head): array
+            for other, array in arrays.items()
+            if other.startswith(head) and "/" not in other.removeprefix(head)
+        }
+    return found | {other: array for other, array in arrays.items() if "/" in other}
 
-    Of labels (``dims`` is 2), (time, y, x). Raises SceneError: a series without a step, or one that it lacks; a step of
-    what is no series.
+
+def _check_array(path: Path, name: str, array: FileArray, *, lines: tuple[int, int] | None) -> None:
+    """Refuse what the memory cannot hold: all of an array, or so many ``lines`` of an axis (SceneError)."""
+    part = math.prod(array.shape) * array.dtype.itemsize
+    if lines is not None and array.shape[lines[0]]:
+        part = part // array.shape[lines[0]] * min(lines[1], array.shape[lines[0]])
+    claimed = max(math.prod(array.shape), math.prod(array.chunks or ())) * array.dtype.itemsize
+    check_claim(f"{path}:{name}", claimed, path.stat().st_size)
+    check_memory(path, part + math.prod(array.chunks or ()) * array.dtype.itemsize)
+
+
+def _classic_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
+    """Arrays and attributes of a NetCDF file of version 3, which is no HDF5.
+
+    The file is read whole: asked for more bytes than it has, it would take the memory for them first.
     """
-    shape = values.shape
-    series = values.ndim in ((4,) if dims == 3 else (3, 4))
-    if step is None:
-        if dims == 3 and series:
-            raise SceneError(
-                f"{where} has the shape {shape}, read as (time, y, x, band); name one of its {shape[0]} steps, "
-                f"{where}:0 to {where}:{shape[0] - 1}"
-            )
-        return values
-    if not series:
-        raise SceneError(f"{where} has the shape {shape}, no axis of time (time, y, x, band); leave :{step} out")
-    if step >= shape[0]:
-        raise SceneError(f"{where} has {shape[0]} steps of time, counted from 0; got :{step}")
-    return np.asarray(values[step])
+    check_memory(path, 3 * path.stat().st_size)
+    data = xr.open_dataset(BytesIO(path.read_bytes()), engine="scipy", decode_cf=False)
+    arrays = {
+        str(name): FileArray(
+            one.shape,
+            one.dtype,
+            {**_plain(one.attrs), "_ARRAY_DIMENSIONS": [str(dim) for dim in one.dims]},
+            lambda part, one=one: np.asarray(one[part].values),  # type: ignore[misc]
+        )
+        for name, one in data.variables.items()
+        if one.dtype.kind in "buif"
+    }
+    return arrays, _plain(data.attrs)
+
+
+def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
+    """Arrays of an HDF5 file by their paths, and the attributes of its root.
+
+    Only what is kept in this very file: links and virtual arrays may lead anywhere on the disk.
+    """
+    arrays: dict[str, FileArray] = {}
+
+    def visit(name: str, item: Any) -> None:
+        """Keep an array of numbers, or a single text."""
+        if not isinstance(item, h5py.Dataset) or item.external or item.is_virtual or item.shape is None:
+            return
+        about = _plain(item.attrs)
+        if str(about.get("NAME", "")).startswith(_ONLY_A_DIMENSION) or item.dtype.kind not in "buifSO":
+            return
+        if item.dtype.kind in "SO" and item.ndim:
+            return  # texts are read where they are one, as NEON's map info
+        arrays[name] = FileArray(
+            item.shape, item.dtype, {**about, **_words(about, item)}, partial(_read, path, name), item.chunks
+        )
+
+    with h5py.File(path, "r") as file:
+        file.visititems(visit)  # hard links alone
+        return arrays, _plain(file.attrs)
+
+
+def _read(path: Path, name: str, part: Any) -> NDArray[Any]:
+    with h5py.File(path, "r") as file:
+        return np.asarray(file[name][part])
+
+
+def _words(about: Mapping[str, Any], item: Any) -> dict[str, Any]:
+    """What an array says in other words than CF's: names of its axes, NEON's scale, no-data value and units."""
+    dims = [dim[0].name.removeprefix("/") if len(dim) else dim.label for dim in item.dims]
+    words: dict[str, Any] = {"_ARRAY_DIMENSIONS": dims} if any(dims) else {}
+    scale = about.get("Scale_Factor") or about.get("Scale Factor")  # divides values, where CF's scale_factor multiplies
+    void = about.get("Data_Ignore_Value", about.get("data ignore value"))
+    unit = about.get("units", about.get("Units"))
+    words |= {} if scale is None else {"scale_factor": 1 / float(scale)}
+    words |= {} if void is None else {"_FillValue": float(void)}
+    return words | ({} if unit is None else {"units": unit})
+
+
+def _plain(attributes: Any) -> dict[str, Any]:
+    """Attributes as Python's own texts and numbers, lists as arrays; those that cannot be read are left out."""
+    found = {}
+    for name in attributes:
+        try:
+            value = attributes[name]
+        except Exception:  # of a type that h5py does not know
+            continue
+        if isinstance(value, np.ndarray | np.generic) and value.size == 1:
+            value = np.asarray(value).reshape(-1)[0]
+            value = value.item() if isinstance(value, np.generic) else value
+        found[str(name)] = value.decode("utf-8", "replace") if isinstance(value, bytes) else value
+    return found
+
+
+# --- .npy, .npz and .mat ----------------------------------------------------------------------------------------------
+
+
+def open_array_file(path: Path, variable: str | None = None, *, labels: bool = False) -> CubeSource:
+    """Open the array named, or the only one with three axes; one of a .npy file is never read as a whole.
+
+    Of ``labels`` the only one with two axes. Raises SceneError: there is no such array, or several; it is no table of
+    numbers; or it claims more than the file or the machine can hold.
+    """
+    guard = partial(reading_array, path)
+    with guard():
+        if path.suffix.lower() == ".npy":
+            values = load_npy(path)
+            arrays = {"": FileArray(values.shape, values.dtype, {}, values.__getitem__)}
+        elif path.suffix.lower() == ".npz":
+            arrays = _npz_arrays(path)
+        else:
+            arrays = _mat73_arrays(path) if _is_hdf(path) else _mat_arrays(path)
+        cube = find_cube(arrays, variable, path, labels=labels)
+        values = cube.array[...]
+        whole = FileArray(values.shape, values.dtype, {}, values.__getitem__)
+        notes = tuple(note for note in cube.notes if note != UNNAMED)  # as everyone keeps them
+        return cube_source(path, replace(cube, array=whole, notes=notes), arrays, {}, guard)
+
+
+def reading_array(path: Path) -> AbstractContextManager[None]:
+    """Return the guard that names what a file of arrays cannot be read for."""
+    return reading(path, path.suffix, "write it again as plain numbers")
+
+
+def load_npy(path: Path) -> NDArray[Any]:
+    """Return the array of a .npy file as a read-only view of it."""
+    return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
 
 
 def check_picture(shape: tuple[int, ...], where: object) -> None:
     """Question a table of numbers that is given for a scene of one band (SceneError)."""
-    if len(shape) == 2 and max(shape) >= MOST_UNEVEN * min(shape) and max(shape) >= 1000:
+    if max(shape) >= MOST_UNEVEN * min(shape) and max(shape) >= 1000:
         raise SceneError(
             f"{where} is a table of {shape[0]} x {shape[1]} numbers, expected a picture (y, x) or a cube (y, x, band);"
             " are its columns or rows spectra? Then store them as a cube: values.reshape(height, width, bands)"
         )
 
 
-def _npz_arrays(path: Path) -> dict[str, HeldArray]:
+def _lazy(shape: tuple[int, ...], kind: np.dtype[Any], load: Callable[[], NDArray[Any]]) -> FileArray:
+    """Return an array that is read as a whole, whichever part is asked for."""
+    return FileArray(shape, kind, {}, lambda part: load()[part])
+
+
+def _npz_arrays(path: Path) -> dict[str, FileArray]:
     """List the arrays of a pack; those of Python objects are passed over."""
-    found: dict[str, HeldArray] = {}
+    found: dict[str, FileArray] = {}
     with zipfile.ZipFile(path) as pack:
         for member in pack.infolist():
             if member.filename.endswith(".npy"):
@@ -169,7 +376,7 @@ def _npz_arrays(path: Path) -> dict[str, HeldArray]:
                     shape, _, kind = (formats.read_array_header_1_0 if old else formats.read_array_header_2_0)(stream)
                 if not kind.hasobject:
                     load = partial(_member, path, member, math.prod(shape) * kind.itemsize)
-                    found[member.filename.removesuffix(".npy")] = HeldArray(shape, load)
+                    found[member.filename.removesuffix(".npy")] = _lazy(shape, kind, load)
     return found
 
 
@@ -190,7 +397,7 @@ def _is_hdf(path: Path) -> bool:
     return b"\x89HDF\r\n\x1a\n" in (head[:8], head[512:])
 
 
-def _mat_arrays(path: Path) -> dict[str, HeldArray]:
+def _mat_arrays(path: Path) -> dict[str, FileArray]:
     """List the arrays of numbers of a .mat file of versions 4 to 7."""
     scipy_io = importlib.import_module("scipy.io")
 
@@ -206,7 +413,9 @@ def _mat_arrays(path: Path) -> dict[str, HeldArray]:
         _check_names(content)
         listed = scipy_io.whosmat(content)
     return {
-        name: HeldArray(shape, partial(load, name, math.prod(shape) * _MATLAB[kind]))
+        name: _lazy(
+            shape, np.dtype(_MATLAB[kind]), partial(load, name, math.prod(shape) * np.dtype(_MATLAB[kind]).itemsize)
+        )
         for name, shape, kind in listed
         if kind in _MATLAB
     }
@@ -236,29 +445,16 @@ def _mapped(path: Path) -> Iterator[mmap.mmap]:
         yield content
 
 
-def _hdf_arrays(path: Path) -> dict[str, HeldArray]:
-    """List the arrays of numbers of a .mat file of version 7.3, axes as MATLAB counts them.
+def _mat73_arrays(path: Path) -> dict[str, FileArray]:
+    """List the arrays of numbers of a .mat file of version 7.3, axes as MATLAB counts them."""
 
-    Only what is kept in this very file: links may lead anywhere on the disk.
-    """
-    h5py = importlib.import_module("h5py")
-    found: dict[str, HeldArray] = {}
-
-    def load(name: str) -> NDArray[Any]:
+    def load(name: str, array: FileArray) -> NDArray[Any]:
         """Read one array (SceneError: it claims more than the file or the memory can hold)."""
-        with h5py.File(path, "r") as file:
-            item = file[name]
-            stored = min(item.id.get_storage_size(), path.stat().st_size)
-            chunk = math.prod(item.chunks or ()) * item.dtype.itemsize
-            check_claim(f"{path}:{name}", max(int(item.nbytes), chunk), stored, DEFLATE_RATIO)
-            check_memory(path, int(item.nbytes) + chunk)
-            return np.asarray(item).T
+        _check_array(path, name, array, lines=None)
+        return array[...].T
 
-    with h5py.File(path, "r") as file:
-        for name in file:
-            item = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
-            if not isinstance(item, h5py.Dataset) or item.external or item.is_virtual or item.shape is None:
-                continue
-            if item.dtype.kind in "buifc" and item.attrs.get("MATLAB_class") not in (b"char", "char"):
-                found[name] = HeldArray(tuple(item.shape[::-1]), partial(load, name))
-    return found
+    return {
+        name: _lazy(one.shape[::-1], one.dtype, partial(load, name, one))
+        for name, one in _hdf_arrays(path)[0].items()
+        if "/" not in name and one.dtype.kind in "buif" and one.attrs.get("MATLAB_class") != "char"
+    }

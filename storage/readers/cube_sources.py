@@ -6,19 +6,21 @@ The size that a file claims is checked against its bytes and the machine before 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numcodecs.errors import UnknownCodecError  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.signal.calibrate import calibrate
 from pipeline.source import References
+from storage.arrays.layout import missing_codec
 
 if TYPE_CHECKING:
     from odc.geo.geobox import GeoBox
@@ -55,6 +57,24 @@ def check_memory(where: object, needed: int) -> None:
             f"{where}: reading it takes about {needed / 1e9:.1f} GB of memory, this machine has {there / 1e9:.1f}; cut "
             "a part out of it, or store it as ENVI, GeoTIFF in tiles or Zarr, which are read a few lines at a time"
         )
+
+
+@contextmanager
+def reading(path: Path, kind: str, cure: str = "copy it again") -> Iterator[None]:
+    """Turn whatever a decoder raises on damaged bytes into a SceneError that names the file and its kind."""
+    try:
+        yield
+    except SceneError:
+        raise
+    except UnknownCodecError as error:
+        raise SceneError(missing_codec(str(path), error.codec_id)) from error
+    except KeyError as error:
+        raise SceneError(f"{path} lacks what files of its kind have: {error}; copy it again") from error
+    except Exception as error:
+        why = error.__cause__ or error  # rasterio's own says no more than that it failed
+        raise SceneError(
+            f"{path} cannot be read as {kind}: {type(why).__name__}: {why}; is it damaged? {cure}"
+        ) from error
 
 
 BLOCK_LINES = 64
@@ -97,10 +117,6 @@ class CubeSource:
     bands: Bands = field(default_factory=Bands)
     dark: NDArray[np.float32] | None = None  # (sample, band)
     white: NDArray[np.float32] | None = None  # (sample, band)
-    white_reference: NDArray[np.float32] | None = None  # (band,) value of the white reference; 1 where None
-    bad: NDArray[np.bool_] | None = None  # (sample, band) elements not to be believed
-    flat: NDArray[np.float32] | None = None  # (sample, band) response left over by the white frame
-    position: NDArray[np.float64] | None = None  # (line, 2) mirror, where the light falls off with its tilt
     nodata: float | None = None
     geobox: GeoBox | None = None  # where (line, sample) lie on the earth
     bad_bands: tuple[int, ...] = ()  # that the files themselves call bad, from 0
@@ -183,7 +199,7 @@ def read_by_chunks(read: ReadLines, lines: int, chunk_lines: int) -> ReadLines:
 def scene_lines(source: CubeSource, start: int, stop: int) -> NDArray[Any]:
     """Lines as a scene shows them, (line, sample, band): over the white reference where dark and white are known.
 
-    float32 with NaN where a line is missing, an element bad or the file says no data; the source's own numbers where
+    float32 with NaN where a line is missing or the file says no data; the source's own numbers where
     nothing is missing and there are no references.
     """
     raw = source.read(start, stop)
@@ -193,13 +209,8 @@ def scene_lines(source: CubeSource, start: int, stop: int) -> NDArray[Any]:
             return raw
         values = raw.astype(np.float32)
     else:
-        white_reference = (
-            np.ones(source.shape[2], np.float32) if source.white_reference is None else source.white_reference
-        )
-        by_mirror = source.position is not None
-        references = References(source.dark, source.white, white_reference, source.bad, source.flat, by_mirror)
-        position = None if source.position is None else source.position[start:stop]
-        values, usable = calibrate(raw, references, saturated_dn=np.inf, position=position)
+        references = References(source.dark, source.white, np.ones(source.shape[2], np.float32))
+        values, usable = calibrate(raw, references, saturated_dn=np.inf)
         values[~usable] = np.nan
         if source.nodata is not None:
             values[raw == source.nodata] = np.nan

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,10 +34,10 @@ from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings,
 
 @dataclass(frozen=True)
 class DataSet:
-    """Named scene files. ``train`` and ``test`` load them one at a time."""
+    """Named scene files, loaded one at a time."""
 
     path: Path
-    files: dict[str, str]  # name -> file (or FILE:VARIABLE)
+    files: dict[str, str]  # name -> file (or FILE:ARRAY)
     held_out: tuple[str, ...] = ()
     labels: str | Path | None = None
     bands: tuple[int, ...] | None = None
@@ -87,36 +88,26 @@ class DataSet:
         """Scenes to train on."""
         return tuple(name for name in self.files if name not in self.held_out)
 
-    def load(self, name: str) -> SceneFile:
-        """Read one scene with all its labels; its ``name`` is the data set's. Errors as load_scene_file."""
+    def load(self, name: str, part: Literal["train", "test"] | None = None) -> SceneFile:
+        """Read one scene with its labels: all, or those that a training mask takes or leaves for a test.
+
+        Its ``name`` is the data set's. Errors as load_scene_file.
+        """
         if name not in self.files:
             raise SceneError(f"{self.path} has no scene {name}; it has {', '.join(self.files)}")
-        return load_scene_file(
+        scene = load_scene_file(
             self.files[name],
             labels=self.labels or self.label_files.get(name),
             bands=self.bands,
             wavelengths=self.wavelengths,
             classes=self.classes,
         )
-
-    def train(self) -> Iterator[tuple[str, SceneFile]]:
-        """Scenes to train on, with the labels to train on."""
-        for name in self.train_names:
-            scene = self.load(name)
-            if self.train_mask is not None:
-                train, _ = split_labels(scene, self.train_mask, self.mask_classes)
-                scene = scene.with_labels(train, f"labels only where {self.train_mask} says so: training")
-            yield name, scene
-
-    def test(self) -> Iterator[tuple[str, SceneFile]]:
-        """Scenes held out; with a training mask, the same scene with the labels that training does not see."""
-        for name in self.held_out:
-            yield name, self.load(name)
-        if self.train_mask is not None:
-            for name in self.train_names:
-                scene = self.load(name)
-                _, rest = split_labels(scene, self.train_mask, self.mask_classes)
-                yield name, scene.with_labels(rest, f"labels only where {self.train_mask} does not train: test")
+        if part is None or self.train_mask is None:
+            return scene
+        train, rest = split_labels(scene, self.train_mask, self.mask_classes)
+        if part == "train":
+            return scene.with_labels(train, f"labels only where {self.train_mask} says so: training")
+        return scene.with_labels(rest, f"labels only where {self.train_mask} does not train: test")
 
 
 def load_data_set(

@@ -34,6 +34,7 @@ from storage.readers.cube_sources import (
     check_claim,
     check_memory,
     read_by_chunks,
+    reading,
     unpacked,
 )
 
@@ -71,22 +72,20 @@ _COLOURS_NM: Mapping[tuple[str, ...], tuple[float, ...]] = {
 SAMPLED_PX, MOST_BETWEEN = 256, 0.1  # a mask is recognised by so many pixels a side, of which so many are half there
 
 
-def open_image(path: Path, name: str | None = None, *, scaled: bool = True, palette: bool = False) -> CubeSource:
+def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> CubeSource:
     """Open an image, (y, x, band), without its alpha channel.
 
-    ``name`` is what GDAL calls an image within the file or folder ``path``. Scale and offset of the file are applied,
-    unless not ``scaled``; ``palette`` keeps the numbers of a picture's colours. Raises SceneError: there is no such
-    file, it is damaged, or claims more than its bytes can mean.
+    Scale and offset of the file are applied, unless not ``scaled``; ``palette`` keeps the numbers of a picture's
+    colours. Raises SceneError: there is no such file, it is damaged, or claims more than its bytes can mean.
     """
-    if name is None and not path.is_file():
+    if not path.is_file():
         raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
-    image = name or str(path)
-    driver = _driver(image)
-    with _opened(path, image) as file:
-        pages, notes = _pages(path, image, file)
+    driver = _DRIVERS[path.suffix.lower()]
+    with _opened(path) as file:
+        pages, notes = _pages(path, file)
         block, item = max(file.block_shapes), max(np.dtype(one).itemsize for one in file.dtypes)
         claimed = (file.height, file.width, file.count * len(pages))
-        _check_size(path, image, driver, claimed, item, math.prod(block) * file.count)  # before any of it is read
+        _check_size(path, driver, claimed, item, math.prod(block) * file.count)  # before any of it is read
         kinds = [kind.name for kind in file.colorinterp]
         if driver in _CALLED and "alpha" in kinds and not _is_mask(file, kinds.index("alpha")):
             kinds, notes = ["undefined" if kind == "alpha" else kind for kind in kinds], [*notes, NO_MASK_NOTE]
@@ -180,47 +179,38 @@ def rescaled(
     )
 
 
-def _driver(image: str) -> str:
-    return _DRIVERS[Path(image).suffix.lower()]
-
-
 @contextmanager
-def _opened(path: Path, image: str) -> Iterator[Any]:
-    """Open one image of a file (SceneError: it is damaged, or no image of its ending)."""
+def _opened(path: Path, image: str = "") -> Iterator[Any]:
+    """Open the first or another image of a file (SceneError: it is damaged, or no image of its ending)."""
     rasterio = importlib.import_module("rasterio")
-    driver = _driver(image)
+    driver = _DRIVERS[path.suffix.lower()]
     with warnings.catch_warnings(), rasterio.Env(**_STRICT):
         warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)  # a scene lies on the camera's grid
-        try:
-            with rasterio.open(image, driver=driver) as file:
-                yield file
-        except SceneError:
-            raise
-        except Exception as error:  # decoders raise anything at all on damaged bytes
-            kind, why = _CALLED.get(driver, path.suffix.lower()), error.__cause__ or error
-            raise SceneError(
-                f"{path} cannot be read as {kind}: {why}; is it damaged? Copy it again, or save it as PNG or TIFF"
-            ) from error
+        kind = _CALLED.get(driver, path.suffix.lower())
+        with (
+            reading(path, kind, "Copy it again, or save it as PNG or TIFF"),
+            rasterio.open(image or path, driver=driver) as file,
+        ):
+            yield file
 
 
-def _pages(path: Path, image: str, first: Any) -> tuple[list[str], list[str]]:
+def _pages(path: Path, first: Any) -> tuple[list[str], list[str]]:
     """Return names of the images that are bands of one cube, and notes; the first alone where others differ."""
     names = list(first.subdatasets)
     if len(names) < 2:
-        return [image], []
+        return [""], []
     for name in names:
         with _opened(path, name) as other:
             if (other.shape, other.dtypes) != (first.shape, first.dtypes):
-                return [image], [f"the first of {len(names)} images in the file, which are of several kinds"]
+                return [""], [f"the first of {len(names)} images in the file, which are of several kinds"]
     return names, [f"{len(names)} images of one size in the file are taken as its bands"]
 
 
-def _check_size(path: Path, image: str, driver: str, shape: tuple[int, int, int], item: int, block: int) -> None:
+def _check_size(path: Path, driver: str, shape: tuple[int, int, int], item: int, block: int) -> None:
     """Refuse more than the file's bytes can mean, or the memory can hold (SceneError)."""
-    stored = Path(image).stat().st_size if Path(image).is_file() else path.stat().st_size
     claimed = math.prod(shape) * item
     if driver != "JPEG":  # which may say that blocks without end are alike
-        check_claim(path, claimed, stored, MOST_RATIO if driver in _CALLED else DEFLATE_RATIO)
+        check_claim(path, claimed, path.stat().st_size, MOST_RATIO if driver in _CALLED else DEFLATE_RATIO)
     check_memory(path, claimed * 3 if driver not in _CALLED else block * item + claimed // shape[0] * BLOCK_LINES)
 
 

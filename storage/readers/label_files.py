@@ -1,4 +1,4 @@
-"""Label files that belong to scenes by their names, and the names of classes that lie beside label files.
+"""Label files that belong to scenes by their names.
 
 Labels are pictures, or polygons where there is no picture. They lie beside their images (``001_mask.png``,
 ``field_a_labels.png``, ``field_a.gpkg``) or in a folder of labels there, or beside a folder of images
@@ -8,26 +8,21 @@ and lower case are alike.
 
 from __future__ import annotations
 
-import csv
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import SceneError
 from storage.readers.open_cubes import CUBE_ENDINGS
 from storage.readers.polygons import POLYGON_ENDINGS, split_layer
-from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, is_image_folder
+from storage.readers.scene_toml import SETTINGS_NAME, SceneSettings, is_image_folder
 
 LABEL_WORDS = ("mask", "masks", "label", "labels", "annotation", "annotations", "gt", "groundtruth", "truth", "seg")
 LABEL_FOLDERS = {*LABEL_WORDS, "ground_truth", "segmentation", "segmentations", "targets", "labelimages"}
 IMAGE_WORDS = ("image", "img", "rgb", "picture", "photo", "scene", "ortho", "cube")
 SHOWN = 5  # names in a message
-STEMS = ("classes", "class_names", "classnames", "labels", "label_names", "legend", "categories", "class_dict", "names")
-TEXTS = (".txt", ".csv", ".tsv")
-MOST_BYTES = 1 << 20  # of a legend
-_HEX = re.compile(r"^#?([0-9a-fA-F]{6})$")
 
 
 def _word_at_an_end(words: Sequence[str]) -> re.Pattern[str]:
@@ -53,7 +48,7 @@ class MatchedFiles:
 
 
 def scene_entries(folder: Path) -> list[Path]:
-    """Files, Zarr stores and .SAFE folders that may be scenes or labels, by name; hidden ones are nobody's."""
+    """Files and Zarr stores that may be scenes or labels, by name; hidden ones are nobody's."""
     return sorted(
         entry
         for entry in folder.iterdir()
@@ -129,8 +124,8 @@ def listed_names(paths: Iterable[Path]) -> str:
 
 
 def is_store(entry: Path) -> bool:
-    """Whether a folder is one scene: a Zarr store or a product of Sentinel-2."""
-    return entry.suffix.lower() in (".zarr", ".safe") and entry.is_dir()
+    """Whether a folder is one scene: a Zarr store."""
+    return entry.suffix.lower() == ".zarr" and entry.is_dir()
 
 
 def _in_label_folders(folder: Path) -> list[Path]:
@@ -208,73 +203,3 @@ def scene_number(path: Path) -> str | None:
     """``059_image.png`` -> ``059``: the first digits of the file's name."""
     digits = re.search(r"\d+", path.stem)
     return None if digits is None else digits.group()
-
-
-# --- names of classes -------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Legend:
-    """Names by the value of their class in the label files, or in the order of their numbers where no value stands."""
-
-    path: Path
-    names: Mapping[ClassValue, str]
-    listed: tuple[str, ...] = ()
-
-    def name_of(self, value: ClassValue, place: int, values: Sequence[ClassValue]) -> str | None:
-        """Return the name of a value, the ``place``-th of the ``values`` that the files hold; None where none is known.
-
-        Names in a list without numbers are those of 0, 1, ...; where there are as many as values, of these in order.
-        """
-        if value in self.names:
-            return self.names[value]
-        if isinstance(value, int) and self.listed and max(v for v in values if isinstance(v, int)) < len(self.listed):
-            return self.listed[value]
-        return self.listed[place] if isinstance(value, int) and len(self.listed) == len(values) else None
-
-
-def find_legend(folders: Sequence[Path]) -> Legend | None:
-    """Return the first list of names in the folders; None where there is none."""
-    for folder in dict.fromkeys(folders):
-        for path in sorted(folder.iterdir()):
-            if path.stem.lower() in STEMS and path.suffix.lower() in TEXTS and path.is_file():
-                legend = read_legend(path)
-                if legend is not None:
-                    return legend
-    return None
-
-
-def read_legend(path: Path) -> Legend | None:
-    """Read a list of names, leniently: ``1 crop``, ``crop: 1``, ``crop, 0, 255, 0``, ``#00ff00 crop``, or names alone.
-
-    None where nothing in it names a class.
-    """
-    if path.stat().st_size > MOST_BYTES:
-        return None
-    try:
-        pairs = [pair for line in path.read_text(encoding="utf-8-sig").splitlines() if (pair := _of_line(line))]
-    except ValueError:
-        return None
-    names = {value: name for value, name in pairs if value is not None}
-    listed = tuple(name for value, name in pairs if value is None)
-    return Legend(path, names, listed) if names or listed else None
-
-
-def _of_line(line: str) -> tuple[ClassValue | None, str] | None:
-    """Return value and name of one line, in any order; None of a heading, a comment or an empty line."""
-    bare = line.strip()
-    if not bare or bare.startswith("//") or (bare.startswith("#") and not _HEX.match(bare.split()[0])):
-        return None
-    parts = next(csv.reader([bare])) if "," in bare else re.split(r"[\t:;=]+", bare)
-    words = [word for part in parts for word in part.split()]
-    numbers = [int(word) for word in words if word.isdecimal()]
-    colours = [found[1] for word in words if (found := _HEX.match(word)) and not word.isdecimal()]
-    name = " ".join(w for w in words if not w.isdecimal() and not (_HEX.match(w) and w.startswith("#")))
-    if not name or name.lower().split()[0] in ("name", "class", "id", "r"):
-        return None
-    if len(numbers) >= 3 and max(numbers[-3:]) < 256:
-        return (numbers[-3], numbers[-2], numbers[-1]), name
-    if not numbers and colours and name != colours[0]:
-        red, green, blue = bytes.fromhex(colours[0])
-        return (red, green, blue), name
-    return (numbers[0] if numbers else None), name

@@ -67,7 +67,7 @@ def load_labels(
     if by_colour and not is_colour and codes.max(initial=0) < 256:
         codes = np.where(codes < 0, codes, codes * 0x010101)  # a grey value g is the colour (g, g, g)
     none = None if unlabelled is None else _code(unlabelled)
-    stated = dict(classes) or _found_classes(codes, none, is_colour or by_colour, str(address))
+    stated = dict(classes) or found_codes(codes, none, is_colour or by_colour, str(address))
     colours = [v if isinstance(v, tuple) else default_colour(index) for index, v in enumerate(stated.values())]
     return Labels(
         index=_index(codes, stated, none, str(address)),
@@ -86,12 +86,11 @@ def found_classes(addresses: Iterable[str | Path], unlabelled: ClassValue | None
         values, of_colours = load_codes(address, by_number=False)
         is_colour = is_colour or of_colours
         parts.append((np.unique(values), of_colours))
-        if len(parts[-1][0]) > MOST_FOUND_CLASSES:
-            _found_classes(parts[-1][0], None, of_colours, str(address))  # refuses this file by its name
+        found_codes(parts[-1][0], None, of_colours, str(address))  # refuses mixed values by the file's name
     for values, of_colours in parts:  # a grey value g is the colour (g, g, g) where others have colours
         codes |= {int(code) * (0x010101 if is_colour and not of_colours else 1) for code in values if code >= 0}
     none = None if unlabelled is None else _code(unlabelled)
-    return _found_classes(np.array(sorted(codes), np.int64), none, is_colour, f"of {len(parts)} files")
+    return found_codes(np.array(sorted(codes), np.int64), none, is_colour, f"of {len(parts)} files")
 
 
 def load_codes(address: str | Path, *, by_number: bool) -> tuple[NDArray[np.int64], bool]:
@@ -130,12 +129,7 @@ def colour_of(code: int) -> Colour:
     return code >> 16 & 255, code >> 8 & 255, code & 255
 
 
-def shown_value(code: int, *, is_colour: bool) -> str:
-    """Return words for a number of `load_codes`."""
-    return f"colour {list(colour_of(int(code)))}" if is_colour else f"value {code}"
-
-
-def _found_classes(codes: NDArray[np.int64], none: int | None, is_colour: bool, where: str) -> dict[str, ClassValue]:
+def found_codes(codes: NDArray[np.int64], none: int | None, is_colour: bool, where: str) -> dict[str, ClassValue]:
     """One class for each value in the file, ascending: ``class_N`` after a number, ``colour_RRGGBB`` after a colour.
 
     A name follows from the value alone: a file without some of the classes names the others as before.
@@ -173,7 +167,8 @@ def _index(
 
 
 def _shown(code: int, classes: Mapping[str, ClassValue]) -> str:
-    return shown_value(code, is_colour=any(isinstance(value, tuple) for value in classes.values()))
+    colours = any(isinstance(value, tuple) for value in classes.values())
+    return f"colour {list(colour_of(code))}" if colours else f"value {code}"
 
 
 def default_colour(index: int) -> Colour:

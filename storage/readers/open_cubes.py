@@ -12,7 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from storage.readers.array_files import ARRAY_ENDINGS, check_picture, load_array
+from storage.readers.array_files import (
+    ARRAY_ENDINGS,
+    HDF_ENDINGS,
+    check_picture,
+    load_npy,
+    open_array_file,
+    open_hdf_cube,
+    reading_array,
+)
 from storage.readers.cube_sources import Bands, CubeSource, check_cube_source
 from storage.readers.envi_files import (
     DATA_ENDINGS,
@@ -22,16 +30,14 @@ from storage.readers.envi_files import (
     open_envi_source,
     open_headwall_cube,
 )
-from storage.readers.hdf_files import HDF_ENDINGS, open_hdf_cube
 from storage.readers.image_files import IMAGE_ENDINGS, JPEG2000_ENDINGS, open_image
-from storage.readers.safe_products import is_safe_product, open_safe_cube
 from storage.readers.scene_toml import SceneSettings, find_scene_settings, settle_wavelengths
 from storage.readers.zarr_files import find_zarr_store, open_zarr_cube
 
-Reader = Literal["zarr", "headwall", "envi", "hdf", "safe", "image", "array", "none"]
+Reader = Literal["zarr", "headwall", "envi", "hdf", "image", "array", "none"]
 CUBE_ENDINGS = (*IMAGE_ENDINGS, *ARRAY_ENDINGS, ".hdr", *HDF_ENDINGS)
 _WITH_VARIABLE = re.compile(
-    r"^(?P<path>.+\.(?:mat|npz|zarr|npy|safe|zip)):(?P<variable>[^/\\:]+(?::\d+)?)$"
+    r"^(?P<path>.+\.(?:mat|npz|zarr|npy)):(?P<variable>[^/\\:]+(?::\d+)?)$"
     r"|^(?P<path2>.+\.(?:nc4?|h5|hdf5|he5)):(?P<variable2>[^:]+(?::\d+)?)$",
     re.IGNORECASE | re.DOTALL,
 )
@@ -63,13 +69,10 @@ def split_variable(address: str | Path) -> tuple[Path, str | None]:
 def reader_of(address: str | Path) -> Reader:
     """Tell which reader takes an address; none where there is no such file, or one of a kind that is not read.
 
-    A folder is a Sentinel-2 product, a Zarr store or a Headwall camera's, an ENVI cube is named by its header or its
-    data file.
+    A folder is a Zarr store or a Headwall camera's, an ENVI cube is named by its header or its data file.
     """
     path, _ = split_variable(address)
     ending = path.suffix.lower()
-    if is_safe_product(path):
-        return "safe"
     if path.is_dir():
         return "headwall" if find_zarr_store(path) is None else "zarr"
     if ending == ".hdr":
@@ -97,21 +100,22 @@ def open_cube(
     frames: list[tuple[str, str | Path | None]] = [("dark", dark), ("white", white)]
     match reader_of(address):
         case "zarr":
-            source = open_zarr_cube(path, variable)
+            source = open_zarr_cube(path, variable, labels=labels)
         case "headwall":
             source = open_headwall_cube(path)
             frames = [(kind, frame or find_reference(path, kind)) for kind, frame in frames]
         case "envi":
             source = open_envi_source(path)
         case "hdf":
-            source = open_hdf_cube(path, variable)
-        case "safe":
-            source = open_safe_cube(path, variable)
+            source = open_hdf_cube(path, variable, labels=labels)
         case "image":
             _check_content(path)
             source = open_image(path, scaled=not labels)
         case "array":
-            source = _array_source(address, path, variable, dims=2 if labels else 3)
+            _check_content(path)
+            source = open_array_file(path, variable, labels=labels)
+            if source.shape[2] == 1 and not labels and min(source.shape):
+                check_picture(source.shape[:2], address)
         case "none":
             raise _refusal(path)
     for kind, named in frames:
@@ -142,13 +146,14 @@ def load_frame(address: str | Path) -> tuple[NDArray[np.float32], tuple[Path, ..
 
     Raises SceneError: the file cannot be read or holds no real numbers.
     """
-    path, variable = split_variable(address)
+    path, _ = split_variable(address)
     kind = reader_of(address)
-    if kind in ("zarr", "headwall", "safe"):
+    if kind in ("zarr", "headwall"):
         raise SceneError(f"{path} is a folder, expected a reference frame (ENVI or .npy); name the file")
     files: tuple[Path, ...] = (path,)
-    if kind == "array":
-        values = load_array(path, variable, dims=3).values
+    if path.suffix.lower() == ".npy":
+        with reading_array(path):
+            values = load_npy(path)
     elif kind == "envi":
         files, values = find_envi_pair(path), open_envi_cube(path).values
     else:
@@ -174,26 +179,6 @@ def with_wavelengths(source: CubeSource, address: str | Path, stated: Sequence[f
     found = settle_wavelengths(path, range(count), count, stated=stated, settings=settings, known=Bands())
     folder = "" if settings.path is None else f"{settings.path.parent}/"
     return replace(source, bands=replace(found, origin=found.origin.replace(folder, "")))
-
-
-def _array_source(address: str | Path, path: Path, variable: str | None, dims: int) -> CubeSource:
-    _check_content(path)
-    found = load_array(path, variable, dims)
-    if dims == 3:
-        check_picture(found.values.shape, address)
-    cube = found.values[..., None] if found.values.ndim == 2 else found.values
-    if cube.ndim != 3:
-        raise SceneError(f"{path} holds shape {cube.shape}; expected (y, x, band), or (y, x) for one band")
-    native = cube.dtype.newbyteorder("=")
-    return CubeSource(
-        name=path.name,
-        shape=(cube.shape[0], cube.shape[1], cube.shape[2]),
-        dtype=native,
-        read=lambda start, stop: np.asarray(cube[start:stop], native),
-        files=(path,),
-        bands=found.bands,
-        notes=found.notes,
-    )
 
 
 def _check_content(path: Path) -> None:

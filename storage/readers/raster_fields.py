@@ -1,10 +1,13 @@
-"""Rasters whose pixels are taken as they are: one file, or tiles of a folder or a glob placed side by side."""
+"""Rasters whose pixels are taken as they are: one file, or tiles of a folder or a glob placed side by side.
+
+Their pixels are stored as a survey's images, coarse means and patches, a block of rows in memory at a time.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,8 +17,12 @@ from affine import Affine
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.geometry.grid import UNLABELLED
+from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.lazy import deferred
+from storage.arrays.layout import SHARD_ROWS
+from storage.arrays.mosaics import PATCHES_A_SHARD, MosaicWriter, PatchWriter
+from storage.arrays.quicklooks import Thumbnail
+from storage.parallel.pool import RESERVED_BYTES, memory_refusal
 from storage.readers.envi_files import is_headwall_folder
 from storage.readers.label_files import (
     folders_within,
@@ -27,7 +34,7 @@ from storage.readers.label_files import (
 )
 from storage.readers.labels import Labels, load_labels
 from storage.readers.open_cubes import reader_of, split_variable
-from storage.readers.scene_files import OpenScene, open_scene_file
+from storage.readers.scene_files import SceneFile, open_scene_file
 from storage.readers.scene_toml import find_scene_settings
 
 if TYPE_CHECKING:
@@ -40,6 +47,9 @@ WILD = "*?["
 OFF_GRID_PX = 0.02  # by which tiles of one grid may lie beside it: their places are written with rounded numbers
 SCALE = 1e-6  # by which pixels of one size may differ
 APART_NM = 0.1  # wavelengths of one band
+COPIES = 6  # of a block while it is read: the file's numbers, their float32, and what is made of them
+FRACTION = 4  # of the memory beside what the process takes anyway: more at once is read no faster
+Report = Callable[[float], None]
 
 
 def open_raster(
@@ -48,7 +58,7 @@ def open_raster(
     labels: str | Path | None = None,
     bands: Sequence[int] | None = None,
     wavelengths: Sequence[float] | None = None,
-) -> OpenScene:
+) -> SceneFile:
     """Open a file, or the tiles of a folder or a glob as one field, to be read some rows at a time.
 
     Of tiles that overlap the first by name wins where it has a value; what no tile shows is missing. ``labels`` are on
@@ -70,7 +80,7 @@ def is_glob(address: str | Path) -> bool:
 def tiles_of(address: str | Path) -> tuple[str, ...]:
     """Return the files that an address stands for: itself, the images of a folder, or what a glob names, by name.
 
-    A folder that is itself a cube (Zarr, Sentinel-2, a Headwall camera) stands for itself. Label files are no tiles.
+    A folder that is itself a cube (Zarr, a Headwall camera) stands for itself. Label files are no tiles.
     Raises SceneError: there is no image.
     """
     path, _ = split_variable(address)
@@ -97,7 +107,7 @@ def tiles_of(address: str | Path) -> tuple[str, ...]:
 class _Tile:
     """A tile with the row and column of the field at which it begins."""
 
-    scene: OpenScene
+    scene: SceneFile
     row: int
     column: int
 
@@ -107,7 +117,7 @@ class _Tile:
         return slice(self.row, self.row + height), slice(self.column, self.column + width)
 
 
-def _side_by_side(address: Path, opened: Sequence[OpenScene], labels: str | Path | None) -> OpenScene:
+def _side_by_side(address: Path, opened: Sequence[SceneFile], labels: str | Path | None) -> SceneFile:
     """Place tiles on the grid of the first, as one field."""
     first = opened[0]
     for other in opened[1:]:
@@ -133,31 +143,25 @@ def _side_by_side(address: Path, opened: Sequence[OpenScene], labels: str | Path
         found = load_labels(labels, shape, classes=settings.classes, unlabelled=settings.unlabelled)
     places = [(tile.scene.light_hash, tile.row, tile.column) for tile in tiles]
     light_hash = hashlib.sha256(json.dumps(places).encode()).hexdigest()
-    told = "" if found is None else hashlib.sha256(found.index.tobytes()).hexdigest()
 
     def read(start: int, stop: int) -> NDArray[np.float32]:
         return _rows_of(tiles, shape[1], len(first.wavelength_nm), start, stop)
 
     folder = address.parent if is_glob(address) else address
-    return OpenScene(
+    scene = SceneFile(
         name="tiles" if is_glob(folder) else folder.resolve().name or "tiles",
         path=address,
         wavelength_nm=first.wavelength_nm,
         fwhm_nm=first.fwhm_nm,
-        labels=None if found is None else found.index,
-        class_names=() if found is None else found.names,
-        class_colours=np.zeros((0, 3), np.uint8) if found is None else found.colours,
-        class_values=() if found is None else found.values,
-        content_hash=light_hash + told,
         light_hash=light_hash,
         provenance=tuple(notes),
         geobox=geobox,
-        labels_found=found is not None and labels is None,
         shape=shape,
         read=read,
         missing=missing,
         filled_px=filled + beside,
     )
+    return scene.labelled(found, by_name=labels is None)
 
 
 def _rows_of(tiles: Sequence[_Tile], width: int, bands: int, start: int, stop: int) -> NDArray[np.float32]:
@@ -177,7 +181,7 @@ def _rows_of(tiles: Sequence[_Tile], width: int, bands: int, start: int, stop: i
     return out
 
 
-def _check_bands(first: OpenScene, other: OpenScene) -> None:
+def _check_bands(first: SceneFile, other: SceneFile) -> None:
     """Refuse tiles of other bands (SceneError)."""
     one, two = first.wavelength_nm, other.wavelength_nm
     if len(one) != len(two) or not np.allclose(one, two, rtol=0, atol=APART_NM):
@@ -188,7 +192,7 @@ def _check_bands(first: OpenScene, other: OpenScene) -> None:
         )
 
 
-def _placed(opened: Sequence[OpenScene]) -> tuple[list[_Tile], GeoBox]:
+def _placed(opened: Sequence[SceneFile]) -> tuple[list[_Tile], GeoBox]:
     """Find row and column of each tile, and the grid of them all (SceneError: they do not lie on one)."""
     first, origins = opened[0], list[tuple[int, int]]()
     for one in opened:
@@ -211,7 +215,7 @@ def _placed(opened: Sequence[OpenScene]) -> tuple[list[_Tile], GeoBox]:
     return tiles, odc_geobox.GeoBox(shape, first.geobox.affine * Affine.translation(left, top), first.geobox.crs)
 
 
-def _origin(first: OpenScene, other: OpenScene, grid: GeoBox, own: GeoBox) -> tuple[int, int]:
+def _origin(first: SceneFile, other: SceneFile, grid: GeoBox, own: GeoBox) -> tuple[int, int]:
     """Row and column of a tile on the grid of the first (SceneError: other pixels, or pixels that lie between)."""
     a, b, c, d, e, f = (~grid.affine * own.affine)[:6]
     if max(abs(a - 1), abs(b), abs(d), abs(e - 1)) > SCALE:
@@ -248,3 +252,102 @@ def _merged_labels(tiles: Sequence[_Tile], shape: tuple[int, int], notes: list[s
             index[tile.place][there] = tile.scene.labels[there]
         free[tile.place] &= ~there
     return Labels(index, like.class_names, like.class_values, like.class_colours)
+
+
+# --- pixels as a survey's images --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RasterPixels:
+    """The pixels of a raster: ``read`` gives (y, x, band) float32 of some rows, NaN without a value."""
+
+    read: Callable[[int, int], NDArray[np.float32]]
+    missing: NDArray[np.bool_]  # (y, x) of which nothing is known
+    bands: int
+    grid: SceneGrid
+
+    def rows(self, start: int, stop: int) -> NDArray[np.float32]:
+        """Read rows of the raster, NaN in every band of the missing pixels."""
+        values = self.read(start, stop)
+        values[self.missing[start:stop]] = np.nan
+        return values
+
+    def rows_at_once(self, memory: int) -> int:
+        """Return how many rows are read at a time: whole rows of patches, at least one (SettingsError: too many)."""
+        grid = self.grid
+        deep, row = grid.patch * grid.factor, COPIES * grid.width * self.bands * 4
+        means = SHARD_ROWS * grid.coarse_shape[1] * self.bands * 4
+        patches = PATCHES_A_SHARD * grid.patch**2 * self.bands * 4
+        least = RESERVED_BYTES + max(means, patches) + deep * row
+        if least > memory:
+            why = f"{deep} rows of a raster of {grid.width} px and {self.bands} bands are read at a time"
+            raise memory_refusal(least, memory, why)
+        return deep * max(1, (memory - RESERVED_BYTES) // FRACTION // (deep * row))
+
+
+def write_means(
+    raster: RasterPixels, writer: MosaicWriter, *, memory: int, seen: Thumbnail, report: Report = lambda done: None
+) -> None:
+    """Store the mean of every factor x factor pixels that have a value, with coverage 1 where one has.
+
+    Raises SettingsError: not even one row of patches fits the memory.
+    """
+    grid, factor = raster.grid, raster.grid.factor
+    at_once, (height, width) = raster.rows_at_once(memory) // factor, grid.coarse_shape
+    every = slice(0, width)
+    for top in range(0, height, SHARD_ROWS):
+        below = min(top + SHARD_ROWS, height)
+        values = np.empty((below - top, width, raster.bands), np.float32)
+        coverage = np.empty((below - top, width), np.intp)
+        for first in range(top, below, at_once):
+            last = min(first + at_once, below)
+            part = slice(first - top, last - top)
+            pixels = raster.rows(first * factor, min(last * factor, grid.height))
+            known = np.asarray(np.isfinite(pixels).any(axis=-1), np.intp)
+            values[part], coverage[part] = block_means(pixels, known, factor)
+        writer.write_tile(top, 0, values, coverage)
+        rows = slice(top, below)
+        seen.put(rows, every, seen.cut(rows, every, values).copy())
+        report(below / height)
+
+
+def write_patches(
+    raster: RasterPixels,
+    writer: PatchWriter,
+    patch_index: NDArray[np.integer],
+    *,
+    memory: int,
+    report: Report = lambda done: None,
+) -> None:
+    """Store the patches of ascending ``patch_index`` at the raster's own pixels; beyond its edge that is repeated.
+
+    Raises SettingsError: not even one row of patches fits the memory.
+    """
+    done = 0
+    for values, valid in patches_of(raster, patch_index, memory=memory):
+        writer.write(values, valid)
+        done += len(values)
+        report(done / len(patch_index))
+
+
+def patches_of(
+    raster: RasterPixels, patch_index: NDArray[np.integer], *, memory: int
+) -> Iterator[tuple[NDArray[np.float32], NDArray[np.bool_]]]:
+    """Read the patches of ascending ``patch_index``: (patch, y, x, band) values and (patch, y, x) validity, rows at a time.
+
+    Raises SettingsError: not even one row of patches fits the memory.
+    """
+    grid = raster.grid
+    p, (_, across) = grid.patch, grid.patch_shape
+    deep = raster.rows_at_once(memory) // p
+    row, column = np.divmod(patch_index, across)
+    for first in sorted({int(one) // deep * deep for one in np.unique(row)}):
+        here = (row >= first) & (row < first + deep)
+        top, below = first * p, min((int(row[here].max()) + 1) * p, grid.height)
+        pixels = raster.rows(top, below)
+        beyond = [(0, -len(pixels) % p), (0, across * p - grid.width)]
+        valid = np.pad(~raster.missing[top:below], beyond)
+        pixels = np.pad(pixels, [*beyond, (0, 0)], mode="edge")
+        cut = pixels.reshape(-1, p, across, p, raster.bands).swapaxes(1, 2)
+        place = row[here] - first, column[here]
+        yield cut[place], valid.reshape(-1, p, across, p).swapaxes(1, 2)[place]

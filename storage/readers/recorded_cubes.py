@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,18 +165,15 @@ def find_references(
             f"{name} has no white frame: full scale ({white_dn} DN) is assumed to be white, and values are relative; "
             "give --white"
         )
-    bad = found.get("bad", source.bad)
+    bad: NDArray[Any] | None = found.get("bad")
     if bad is None and measured and files["bad"] is None:
         bad = find_bad_elements(dark, white)
     bands = frame[1]
-    white_reference = (
-        white_reference if source.white_reference is None else np.asarray(source.white_reference, np.float32)
-    )
     if white_reference.shape not in ((), (bands,)):
         raise SceneError(
             f"the white reference has {white_reference.shape} values, the cube {bands} bands; give one or one a band"
         )
-    by_mirror, file = at_rest or source.position is not None, files["white"]
+    by_mirror, file = at_rest, files["white"]
     if file is not None and reader_of(file) == "envi":
         fields = load_envi_header(find_envi_pair(file)[0]).fields
         listed = listed_numbers(fields, "white_reference", bands, [])
@@ -183,7 +181,7 @@ def find_references(
         by_mirror = by_mirror or fields.get("mirror at rest", "0").strip() == "1"
     bad = None if bad is None or not np.any(bad) else np.asarray(bad, np.bool_)
     white_reference = np.broadcast_to(white_reference, bands).copy()
-    return References(dark, white, white_reference, bad, found.get("flat", source.flat), by_mirror)
+    return References(dark, white, white_reference, bad, found.get("flat"), by_mirror)
 
 
 def _load_fitting(file: Path, frame: tuple[int, ...], kind: str, notes: list[str]) -> NDArray[np.float32]:

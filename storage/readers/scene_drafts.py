@@ -16,11 +16,9 @@ from pipeline.geometry.grid import UNLABELLED
 from pipeline.readings import edge_fill
 from storage.readers.cube_sources import CubeSource
 from storage.readers.label_files import (
-    Legend,
     MatchedFiles,
     filled,
     find_label,
-    find_legend,
     folders_within,
     image_folder,
     is_label_name,
@@ -29,13 +27,12 @@ from storage.readers.label_files import (
     match_folder,
     scene_number,
 )
-from storage.readers.labels import MIXED, MOST_FOUND_CLASSES, colour_of, load_codes, shown_value
+from storage.readers.labels import found_codes, load_codes
 from storage.readers.open_cubes import open_cube, split_variable, with_wavelengths
 from storage.readers.polygons import is_polygon_file, load_polygon_labels, polygon_classes
 from storage.readers.scene_toml import ClassValue, SceneSettings
 
 Report = Callable[[float, str], None]  # how far it is, 0..1, and at which file
-NO_CLASS = ("unlabelled", "unlabeled", "void", "ignore", "ignored", "undefined", "nodata", "no data", "none")
 _ROWS_OF_EDGE = 32  # whose first and last pixels are looked at
 
 
@@ -46,7 +43,6 @@ class FoundClass:
     name: str
     value: ClassValue
     fraction: float
-    no_class: bool = False  # its own name says that it stands for none
 
 
 @dataclass(frozen=True)
@@ -63,7 +59,6 @@ class SceneDraft:
     edge: tuple[float, float] | None  # value that fills the edge, and its fraction of it
     missing: float  # fraction of NaN among the values looked at
     classes: tuple[FoundClass, ...] = ()
-    legend: Path | None = None
     notes: tuple[str, ...] = ()  # what readers made of the first image
     unseen: tuple[str, ...] = field(default=())  # what could not be read or does not fit, one sentence each
 
@@ -90,7 +85,6 @@ def draft_scene(address: str | Path, report: Report = lambda done, name: None) -
     folder = path.parent if alone else path
     first = address if alone else found.images[0]
     source = with_wavelengths(open_cube(first), first, None)
-    legend = find_legend([folder, *(label.parent for label in found.labels.values())])
     unseen: list[str] = []
     # files that may hold outlines in words that no reader here knows
     outlines = [one for image in found.bare for one in map(image.with_suffix, (".json", ".xml")) if one.is_file()]
@@ -98,7 +92,7 @@ def draft_scene(address: str | Path, report: Report = lambda done, name: None) -
         unseen.append(f"what is in {listed_names(outlines)}: outlines are read as GeoPackage, GeoJSON or shapefile")
     pictures = {image: label for image, label in found.labels.items() if not is_polygon_file(label)}
     if pictures or not found.labels:
-        classes = _classes(replace(found, labels=pictures), source.shape, legend, unseen, report)
+        classes = _classes(replace(found, labels=pictures), source.shape, unseen, report)
     else:
         classes = _polygon_classes(found, unseen, report)
     edge, missing = _check_edge(source)
@@ -113,7 +107,6 @@ def draft_scene(address: str | Path, report: Report = lambda done, name: None) -
         edge=edge,
         missing=missing,
         classes=classes,
-        legend=None if legend is None else legend.path,
         notes=source.notes,
         unseen=tuple(unseen),
     )
@@ -137,16 +130,15 @@ def _pattern(found: MatchedFiles, folder: Path) -> str | None:
 
 
 def _classes(
-    found: MatchedFiles, shape: tuple[int, int, int], legend: Legend | None, unseen: list[str], report: Report
+    found: MatchedFiles, shape: tuple[int, int, int], unseen: list[str], report: Report
 ) -> tuple[FoundClass, ...]:
     """All values of the label files, as classes; what cannot be read or has another size than its image is told."""
-    by_number = legend is not None and bool(legend.listed or any(isinstance(one, int) for one in legend.names))
     counts: Counter[int] = Counter()
     greys: Counter[int] = Counter()  # of files without colours, while others have some
     for number, (image, label) in enumerate(found.labels.items()):
         report(number / len(found.labels), label.name)
         try:
-            codes, is_colour = load_codes(label, by_number=by_number)
+            codes, is_colour = load_codes(label, by_number=False)
             size = shape if image == found.images[0] else open_cube(image).shape
         except PipelineError as error:
             unseen.append(str(error))
@@ -155,32 +147,20 @@ def _classes(
             unseen.append(f"{image} has {size[2]} bands, the first image {shape[2]}: train on images of one camera")
         if codes.shape != size[:2]:
             unseen.append(f"{label} is {codes.shape[0]} x {codes.shape[1]} px, its image {size[0]} x {size[1]} (y x x)")
-        values, number_of = np.unique(codes, return_counts=True)
-        _refuse_mixed(label, values, number_of, is_colour=is_colour)
+        there, number_of = np.unique(codes, return_counts=True)
+        found_codes(there, None, is_colour, str(label))  # refuses mixed values by the file's name
         into = counts if is_colour else greys
-        into.update({int(value): int(count) for value, count in zip(values, number_of, strict=True) if value >= 0})
+        into.update({int(value): int(count) for value, count in zip(there, number_of, strict=True) if value >= 0})
     if found.labels:
         report(1.0, "")
     of_colours = bool(counts)
     counts.update({code * (0x010101 if of_colours else 1): count for code, count in greys.items()})
-    if len(counts) > MOST_FOUND_CLASSES:
-        raise SceneError(
-            f"the label files have {len(counts)} different values together, at most {MOST_FOUND_CLASSES} are taken for"
-            f" classes: {MIXED}"
-        )
-    values_found = [colour_of(code) if of_colours else code for code in sorted(counts)]
+    values = found_codes(np.array(sorted(counts), np.int64), None, of_colours, "of all images together")
     every = counts.total()
-    classes = []
-    for place, (code, value) in enumerate(zip(sorted(counts), values_found, strict=True)):
-        told = None if legend is None else legend.name_of(value, place, values_found)
-        name = told or (f"colour_{code:06x}" if of_colours else f"class_{code}")
-        classes.append(FoundClass(name, value, counts[code] / every, (told or "").lower() in NO_CLASS))
-    if len({one.name for one in classes}) < len(classes):
-        unseen.append(f"{legend.path if legend else 'a legend'} gives one name to two values; classes are numbered")
-        classes = [
-            FoundClass(f"{one.name}_{at}", one.value, one.fraction, one.no_class) for at, one in enumerate(classes)
-        ]
-    return tuple(classes)
+    return tuple(
+        FoundClass(name, value, counts[code] / every)
+        for code, (name, value) in zip(sorted(counts), values.items(), strict=True)
+    )
 
 
 def _polygon_classes(found: MatchedFiles, unseen: list[str], report: Report) -> tuple[FoundClass, ...]:
@@ -200,16 +180,6 @@ def _polygon_classes(found: MatchedFiles, unseen: list[str], report: Report) -> 
     report(1.0, "")
     values = polygon_classes(readable, settings) if readable else {}
     return tuple(FoundClass(name, value, counts[name] / counts.total()) for name, value in values.items())
-
-
-def _refuse_mixed(label: Path, values: NDArray[np.int64], counts: NDArray[np.int64], *, is_colour: bool) -> None:
-    if len(values) <= MOST_FOUND_CLASSES:
-        return
-    most = np.argsort(-counts)[:4]
-    shown = ", ".join(f"{shown_value(values[at], is_colour=is_colour)} {counts[at] / counts.sum():.0%}" for at in most)
-    what = "colours" if is_colour else "numbers"
-    told = f" (most of it: {shown})" if counts[most].sum() > counts.sum() / 2 else ""
-    raise SceneError(f"{label} has {len(values)} different {what}{told}: {MIXED}")
 
 
 def _check_edge(source: CubeSource) -> tuple[tuple[float, float] | None, float]:

@@ -5,15 +5,17 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
+from pipeline.readings import MOST_STEPS, MOST_VALUE, Beyond, beyond_range, find_beyond
+from pipeline.simulator.scenes.scene import BRIGHT_PERCENTILE
 from storage.archive.staging import file_hash
 from storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, check_memory, scene_lines
 from storage.readers.label_files import label_file
@@ -21,33 +23,55 @@ from storage.readers.labels import Labels, load_labels
 from storage.readers.open_cubes import open_cube, split_variable
 from storage.readers.polygons import is_polygon_file, load_polygon_labels
 from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings, settle_wavelengths
-from storage.readers.scene_values import ValueCount, as_values, bands_text
 
 if TYPE_CHECKING:
     from odc.geo.geobox import GeoBox
 
 ReadRows = Callable[[int, int], NDArray[np.float32]]
+_SAMPLED = 1 << 20  # values, evenly spread, by which the range of a scene is told
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneFacts:
-    """What a scene's file says beside its numbers."""
+class SceneFile:
+    """A scene as its file gives it, on the file's own pixels; its numbers are read when they are asked for."""
 
     name: str
     path: Path
     wavelength_nm: NDArray[np.float64]  # (band,)
-    fwhm_nm: NDArray[np.float64] | None  # (band,)
-    labels: NDArray[np.uint8] | None  # (y, x) class index, 255 = unlabelled
-    class_names: tuple[str, ...]
-    class_colours: NDArray[np.uint8]  # (class, 3)
-    class_values: tuple[ClassValue, ...]  # what each class is in the label file: a number or a colour
-    content_hash: str  # of everything above, and of the values
+    fwhm_nm: NDArray[np.float64] | None = None  # (band,)
+    shape: tuple[int, int]  # (y, x)
+    read: ReadRows  # from one row to before another: (y, x, band) float32, NaN where the file has no value
+    missing: NDArray[np.bool_]  # (y, x) pixels without a value in more than half of their bands
+    filled_px: int  # pixels without a value in a band
     light_hash: str  # of values and wavelengths alone: labels do not change what a camera sees
     provenance: tuple[str, ...]  # one sentence for each thing assumed or left out
+    labels: NDArray[np.uint8] | None = None  # (y, x) class index, 255 = unlabelled
+    class_names: tuple[str, ...] = ()
+    class_values: tuple[ClassValue, ...] = ()  # what each class is in the label file: a number or a colour
+    class_colours: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))  # (class, 3)
     geobox: GeoBox | None = None  # where the pixels lie on the earth
     labels_found: bool = False  # by the file's name: nobody stated them
+    kept: NDArray[np.float32] | None = field(default=None, repr=False)  # all values, where they were kept
 
-    def without_labels(self, note: str) -> Self:
+    @property
+    def values(self) -> NDArray[np.float32]:
+        """Return all values, (y, x, band), NaN where the file has none."""
+        return self.read(0, self.shape[0]) if self.kept is None else self.kept
+
+    def labelled(self, found: Labels | None, *, by_name: bool) -> SceneFile:
+        """Return the scene with labels and their classes."""
+        if found is None:
+            return self
+        return replace(
+            self,
+            labels=found.index,
+            class_names=found.names,
+            class_values=found.values,
+            class_colours=found.colours,
+            labels_found=by_name,
+        )
+
+    def without_labels(self, note: str) -> SceneFile:
         """The same scene as if it had no labels; the note says why."""
         return replace(
             self,
@@ -55,31 +79,12 @@ class SceneFacts:
             class_names=(),
             class_colours=self.class_colours[:0],
             class_values=(),
-            content_hash=self.light_hash,
             provenance=(*self.provenance, note),
         )
 
-    def with_labels(self, labels: NDArray[np.uint8], note: str) -> Self:
-        """The same scene with other labels; hash and provenance say so."""
-        digest = _labelled_hash(self.light_hash, self.class_names, self.class_values, labels)
-        return replace(self, labels=labels, content_hash=digest, provenance=(*self.provenance, note))
-
-
-@dataclass(frozen=True, kw_only=True)
-class SceneFile(SceneFacts):
-    """A scene as its file gives it, on the file's own pixels."""
-
-    values: NDArray[np.float32]  # (y, x, band), NaN where the file has none
-
-
-@dataclass(frozen=True, kw_only=True)
-class OpenScene(SceneFacts):
-    """A scene file whose numbers are read some rows at a time, when they are asked for."""
-
-    shape: tuple[int, int]  # (y, x)
-    read: ReadRows  # from one row to before another: (y, x, band) float32, NaN where the file has no value
-    missing: NDArray[np.bool_]  # (y, x) pixels without a value in more than half of their bands
-    filled_px: int  # pixels without a value in a band
+    def with_labels(self, labels: NDArray[np.uint8], note: str) -> SceneFile:
+        """The same scene with other labels; its provenance says so."""
+        return replace(self, labels=labels, provenance=(*self.provenance, note))
 
 
 def load_scene_file(
@@ -91,9 +96,9 @@ def load_scene_file(
     classes: Mapping[str, ClassValue] | None = None,
     labels_needed: bool = True,
 ) -> SceneFile:
-    """Read a scene from an image, .npy, .npz, .mat, ENVI, Zarr, NetCDF, HDF5, Sentinel-2 or a Headwall folder.
+    """Read a scene from an image, .npy, .npz, .mat, ENVI, Zarr, NetCDF, HDF5 or a Headwall folder.
 
-    ``path`` may be ``FILE.mat:VARIABLE`` or ``STORE.zarr:ARRAY``, and end in a step of time, ``FILE.npy:STEP``. Axes
+    ``path`` may be ``FILE.mat:ARRAY`` or ``STORE.zarr:ARRAY``, and end in a step of time, ``FILE.npy:STEP``. Axes
     are y, x, band; two axes are one band. What comes in lines with dark and white frames is taken over the white reference.
     What is given here wins over the ``scene.toml`` beside the file, and that over what the file says: a file of class
     numbers or colours on the same pixels, or of polygons (others are found by their names), bands to use, counted from
@@ -102,9 +107,7 @@ def load_scene_file(
     Raises SceneError: a file is missing, damaged, of a kind or shape that cannot be used, or the labels do not fit.
     WavelengthError: wavelengths are missing, or their number, unit or range is wrong.
     """
-    facts, _, values, _ = _open(path, labels, bands, wavelengths, classes or {}, labels_needed, keep=True)
-    assert values is not None
-    return SceneFile(values=values, **facts)
+    return _open(path, labels, bands, wavelengths, classes or {}, labels_needed, keep=True)
 
 
 def open_scene_file(
@@ -113,14 +116,13 @@ def open_scene_file(
     labels: str | Path | None = None,
     bands: Sequence[int] | None = None,
     wavelengths: Sequence[float] | None = None,
-) -> OpenScene:
+) -> SceneFile:
     """Open a scene as `load_scene_file` reads it, whose numbers are looked through once and not kept.
 
     GeoTIFF, ENVI, Zarr and .npy are read some rows at a time; images, .mat and .npz are whole in memory. Labels that
     were found by their names and cannot be used are left out with a note. Raises what `load_scene_file` does.
     """
-    facts, read, _, count = _open(path, labels, bands, wavelengths, {}, False, keep=False)
-    return OpenScene(shape=count.missing.shape, read=read, missing=count.missing, filled_px=count.filled_px, **facts)
+    return _open(path, labels, bands, wavelengths, {}, False, keep=False)
 
 
 def _open(
@@ -132,8 +134,8 @@ def _open(
     labels_needed: bool,
     *,
     keep: bool,
-) -> tuple[dict[str, Any], ReadRows, NDArray[np.float32] | None, ValueCount]:
-    """Return the fields of `SceneFacts`, the reader of rows, all values where they are to be kept, and the counts."""
+) -> SceneFile:
+    """Look through all rows of a scene once, and find its labels."""
     file, variable = split_variable(address)
     source, settings = open_cube(address), find_scene_settings(file)
     height, width, count = source.shape
@@ -149,60 +151,45 @@ def _open(
         if void.all():
             void, gap_notes = None, ("every pixel is transparent or masked, which is not believed",)
 
-    def rows(first: int, last: int) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
-        return scene_lines(source, first, last), None if void is None else void[first:last]
+    def gaps(first: int, last: int) -> NDArray[np.bool_] | None:
+        return None if void is None else void[first:last]
 
     def read(first: int, last: int) -> NDArray[np.float32]:
         """Give rows (y, x, band), NaN where the file has no value."""
-        numbers, gaps = rows(first, last)
-        return as_values(numbers, chosen, nodata, gaps)
+        return as_values(scene_lines(source, first, last), chosen, nodata, gaps(first, last))
 
     if keep:
         check_memory(address, 8 * height * width * count)  # as float32, and once more while the scene is made
     counted = ValueCount(file, chosen, nodata, (height, width))
-    values = _count_values(counted, rows, np.empty((height, width, len(chosen)), np.float32) if keep else None)
+    values = np.empty((height, width, len(chosen)), np.float32) if keep else None
+    for first in range(0, height, BLOCK_LINES):
+        last = min(first + BLOCK_LINES, height)
+        taken = counted.take(scene_lines(source, first, last), gaps(first, last))
+        if values is not None:
+            values[first:last] = taken
     missing_notes = counted.notes()
     found, label_note, by_name = _labels_of(
         file, source.shape[:2], source.geobox, labels, settings, classes, labels_needed
     )
+    assert light.wavelength_nm is not None
     light_hash = _light_hash(file, variable, source, chosen, light, settings.nodata, void)
     some = () if chosen == list(range(count)) else (f"bands {bands_text(chosen)} of {count}, counted from 0",)
     over = ("values are over the white reference",) if calibrated else ()
-    of_labels: dict[str, Any] = {
-        "labels": None if found is None else found.index,
-        "class_names": () if found is None else found.names,
-        "class_colours": np.zeros((0, 3), np.uint8) if found is None else found.colours,
-        "class_values": () if found is None else found.values,
-        "labels_found": by_name and found is not None,
-    }
-    labelled = light_hash if found is None else _labelled_hash(light_hash, found.names, found.values, found.index)
-    facts = {
-        "name": file.stem,
-        "path": file,
-        "wavelength_nm": light.wavelength_nm,
-        "fwhm_nm": light.fwhm_nm,
-        "content_hash": labelled,
-        "light_hash": light_hash,
-        "provenance": (*some, *bad_note, *source.notes, *over, light.origin, *gap_notes, *missing_notes, *label_note),
-        "geobox": source.geobox,
-        **of_labels,
-    }
-    return facts, read, values, counted
-
-
-def _count_values(
-    counted: ValueCount,
-    rows: Callable[[int, int], tuple[NDArray[Any], NDArray[np.bool_] | None]],
-    values: NDArray[np.float32] | None,
-) -> NDArray[np.float32] | None:
-    """Read all rows once, count what is missing, and fill ``values`` (y, x, band) where they are to be kept."""
-    height = counted.missing.shape[0]
-    for first in range(0, height, BLOCK_LINES):
-        last = min(first + BLOCK_LINES, height)
-        taken = counted.take(*rows(first, last))
-        if values is not None:
-            values[first:last] = taken
-    return values
+    scene = SceneFile(
+        name=file.stem,
+        path=file,
+        wavelength_nm=light.wavelength_nm,
+        fwhm_nm=light.fwhm_nm,
+        shape=(height, width),
+        read=read,
+        missing=counted.missing,
+        filled_px=counted.filled_px,
+        light_hash=light_hash,
+        provenance=(*some, *bad_note, *source.notes, *over, light.origin, *gap_notes, *missing_notes, *label_note),
+        geobox=source.geobox,
+        kept=values,
+    )
+    return scene.labelled(found, by_name=by_name)
 
 
 def _light_hash(
@@ -322,11 +309,140 @@ def _one_class_note(found: Labels) -> tuple[str, ...]:
     )
 
 
-def _labelled_hash(
-    light_hash: str, names: Sequence[str], values: Sequence[ClassValue], index: NDArray[np.uint8]
-) -> str:
-    return _digest(light_hash, names, values, hashlib.sha256(np.ascontiguousarray(index).tobytes()).hexdigest())
-
-
 def _digest(*parts: object) -> str:
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+
+
+# --- values -----------------------------------------------------------------------------------------------------------
+
+
+def as_values(
+    rows: NDArray[Any], chosen: Sequence[int], nodata: float | None, void: NDArray[np.bool_] | None
+) -> NDArray[np.float32]:
+    """Return the chosen bands of (y, x, band) rows as float32; ``void`` (y, x), no data and infinities are NaN."""
+    _, values, _ = _converted(rows, chosen, nodata, void)
+    values[np.isinf(values)] = np.nan
+    return values
+
+
+def _converted(
+    rows: NDArray[Any], chosen: Sequence[int], nodata: float | None, void: NDArray[np.bool_] | None
+) -> tuple[NDArray[Any], NDArray[np.float32], NDArray[np.bool_] | None]:
+    """Return the chosen bands in the file's numbers and as float32 with NaN, and which of them are no data."""
+    picked = rows if list(chosen) == list(range(rows.shape[2])) else rows[..., list(chosen)]
+    if void is not None:
+        picked = np.where(void[..., None], picked.dtype.type(0), picked)  # whatever lies under gaps is no value
+    with np.errstate(over="ignore"):
+        values = np.array(picked, np.float32, order="C")
+    if void is not None:
+        values[void] = np.nan
+    if nodata is None:
+        return picked, values, None
+    # Compared as numbers: -9999 in the numbers of the file would wrap to 55537 where they are uint16.
+    with np.errstate(over="ignore"):
+        empty = np.asarray(picked == nodata if np.isfinite(nodata) else np.isnan(values), np.bool_)
+    values[empty] = np.nan
+    return picked, values, empty
+
+
+class ValueCount:
+    """Count what is missing or no reading among the values of a file, given from the top down."""
+
+    def __init__(self, path: Path, chosen: Sequence[int], nodata: float | None, shape: tuple[int, int]) -> None:
+        self.missing = np.zeros(shape, np.bool_)  # (y, x) pixels without a value in more than half of their bands
+        self.filled_px = 0  # pixels without a value in a band
+        self._path, self._chosen, self._nodata = path, list(chosen), nodata
+        self._every = max(1, shape[0] * shape[1] * len(chosen) // _SAMPLED)
+        self._seen = np.zeros(len(chosen), np.bool_)  # bands with a value somewhere
+        self._void = self._infinite = self._absent = self._size = self._row = self._beyond = 0
+        self._first_beyond: Beyond | None = None
+        self._first_infinite = ""
+        self._lit: list[NDArray[np.float32]] = []
+
+    def take(self, rows: NDArray[Any], void: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
+        """Count the next (y, x, band) rows of the file, and return what `as_values` does."""
+        picked, values, empty = _converted(rows, self._chosen, self._nodata, void)
+        if (out_of_range := beyond_range(picked)) is not None and empty is not None:
+            picked = np.where(empty, picked.dtype.type(0), picked)
+        self._void += 0 if empty is None else int(np.count_nonzero(empty))
+        if out_of_range is not None:
+            self._note_out_of_range(picked, values)
+        values[np.isinf(values)] = np.nan
+        known = np.isfinite(values)
+        if not known.all():
+            count = known.sum(axis=2)
+            self._absent += values.size - int(count.sum())
+            self.missing[self._row : self._row + len(values)] = 2 * count < values.shape[2]
+            self.filled_px += int(np.count_nonzero(count < values.shape[2]))
+        self._seen |= known.any(axis=(0, 1))
+        some = values.reshape(-1)[-self._size % self._every :: self._every]
+        self._lit.append(some[some > 0])  # no NaN
+        self._size += values.size
+        self._row += len(values)
+        return values
+
+    def _note_out_of_range(self, picked: NDArray[Any], values: NDArray[np.float32]) -> None:
+        infinite = np.isinf(values)
+        if infinite.any() and not self._infinite:
+            place = [int(at) for at in np.unravel_index(int(infinite.argmax()), infinite.shape)]
+            self._first_infinite = f"y {self._row + place[0]}, x {place[1]}, band {self._chosen[place[2]]}"
+        self._infinite += int(np.count_nonzero(infinite))
+        if (found := find_beyond(picked)) is not None:
+            self._beyond += found.count
+            if self._first_beyond is None:
+                y, x, band = found.place
+                self._first_beyond = Beyond(found.count, (self._row + y, x, band), found.value)
+
+    def notes(self) -> tuple[str, ...]:
+        """Return a sentence for each thing that is missing, once all rows were taken.
+
+        Raises SceneError: a value is no reading, a band has no value anywhere, or no value is finite.
+        """
+        path, first, notes = self._path, self._first_beyond, list[str]()
+        if first is not None:
+            found = Beyond(self._beyond, first.place, first.value)
+            raise SceneError(
+                f"{path} has {found.words(np.array(self._chosen))}, beyond the {MOST_VALUE:g} that readings reach; if "
+                f"it stands for no data, write nodata = {found.value!s} into a {SETTINGS_NAME} beside the file, else "
+                "leave the band out with --bands, or give the values in a larger unit"
+            )
+        if self._nodata is not None:
+            notes.append(f"{self._void} samples have the file's no-data value {self._nodata:g}")
+        if self._infinite:
+            notes.append(f"{self._infinite} infinite samples count as missing, the first at {self._first_infinite}")
+        if self._absent == self._size:
+            raise SceneError(f"{path} holds no finite number in the bands used; choose others")
+        empty = [band for band, seen in zip(self._chosen, self._seen, strict=True) if not seen]
+        if empty:
+            rest = bands_text([band for band in self._chosen if band not in set(empty)])
+            raise SceneError(
+                f"{path} has no value anywhere in bands {bands_text(empty)} (from 0); take the others: --bands {rest}"
+            )
+        if self._absent:
+            notes.append(f"{self._absent} of {self._size} samples are missing")
+        return (*notes, *self._dark_note())
+
+    def _dark_note(self) -> tuple[str, ...]:
+        """Say where the bright end is so far above all else that hardly any light is left for it."""
+        lit = np.concatenate(self._lit) if self._lit else np.empty(0, np.float32)
+        if not lit.size:
+            return ()
+        middle, bright = (float(value) for value in np.percentile(lit, (50, BRIGHT_PERCENTILE)))
+        if bright <= MOST_STEPS * middle:
+            return ()
+        return (
+            f"the brightest values, {bright:.3g}, are more than {MOST_STEPS} times the middle one, {middle:.3g}, and "
+            f"all else is dark beside them; if they stand for no data, write nodata = {float(lit.max())!r} into a"
+            f" {SETTINGS_NAME}",
+        )
+
+
+def bands_text(bands: Sequence[int]) -> str:
+    """Band numbers as ``--bands`` takes them: ``0-3,7``."""
+    runs: list[list[int]] = []
+    for band in bands:
+        if runs and band == runs[-1][1] + 1:
+            runs[-1][1] = band
+        else:
+            runs.append([band, band])
+    return ",".join(str(first) if first == last else f"{first}-{last}" for first, last in runs)

@@ -2,6 +2,17 @@
 
 A store is checked before it is opened: links may not lead out of it, and its codecs may only carry numbers. A codec of
 another name (``pickle`` is one) is refused, so that reading data never runs what it brings.
+A cube of files is ingested as one immutable store:
+
+::
+
+    cube.zarr/values          (line, sample, band): whole numbers as uint8 or uint16 where they fit, else float32
+    cube.zarr/wavelength      (band,) nm, fwhm beside it; missing where nothing says them
+    cube.zarr/valid_line      (line,) false for lines that no file holds whole; time, exposure_ms, frame where known
+    cube.zarr/dark, white     (sample, band) reference frames, where there are some
+    cube.zarr/quicklook       (y, x, 3) uint8 for viewers; the same as quicklook.png beside the cube
+
+Attributes say where it came from: file names without folders, sizes, SHA-256, header texts, notes.
 """
 
 from __future__ import annotations
@@ -9,24 +20,26 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import zarr
-from numcodecs.errors import UnknownCodecError  # type: ignore[import-untyped]
 from numpy.typing import NDArray
+from PIL import Image
 
 from pipeline.errors import SceneError
-from storage.arrays.layout import missing_codec
+from storage.arrays.georeference import ON_THE_MAP, map_attributes, write_grid_mapping
+from storage.arrays.layout import create_array, create_group, image_spec, write_bands, write_counts, write_small
+from storage.arrays.quicklooks import LineThumbnail, write_quicklook
 from storage.readers.array_cubes import cube_source, dims_of, find_cube, names_beside
-from storage.readers.cube_sources import BLOCK_LINES, MOST_RATIO, CubeSource, LineFacts, check_memory
+from storage.readers.cube_sources import BLOCK_LINES, CubeSource, LineFacts, check_claim, check_memory, reading
 
-FRAMES = ("dark", "white", "white_reference", "bad", "flat")
-OF_LINES = ("mirror_x", "mirror_y", "valid_line", "time", "exposure_ms", "frame")
+KIND = "ingested cube"  # of this project
+FRAMES = ("dark", "white")
+OF_LINES = ("valid_line", "time", "exposure_ms", "frame")
 METADATA = ("zarr.json", ".zarray", ".zgroup")
 LARGEST_METADATA = 1 << 24  # bytes
 _CHECKSUMS = {"crc32", "crc32c", "adler32", "fletcher32", "jenkins_lookup3"}
@@ -34,6 +47,9 @@ _PACKERS = {"blosc", "zstd", "gzip", "zlib", "bz2", "lzma", "lz4", "pcodec", "zf
 _ORDERS = {"bytes", "transpose", "sharding_indexed", "shuffle"}
 _NUMBERS = {"delta", "fixedscaleoffset", "quantize", "bitround", "astype", "cast_value", "scale_offset"}
 CODECS = _CHECKSUMS | _PACKERS | _ORDERS | _NUMBERS
+LONGEST_HEADER = 1 << 16  # characters of a header's text that are kept
+
+Report = Callable[[float], None]
 
 
 def find_zarr_store(path: Path) -> Path | None:
@@ -44,17 +60,17 @@ def find_zarr_store(path: Path) -> Path | None:
     return None
 
 
-def open_zarr_cube(path: Path, variable: str | None = None) -> CubeSource:
+def open_zarr_cube(path: Path, variable: str | None = None, *, labels: bool = False) -> CubeSource:
     """Open one array of a store, or of the ``cube.zarr`` in a folder, as a cube.
 
-    Of this project: raw cubes (with their references), ingested cubes, mosaics. Of anyone's: the only array with three
-    axes of numbers, or the one named, at the step of time named (``values:3`` or ``3``); wavelengths come from a
-    coordinate of that name, or of the band axis with a unit.
+    Of this project: ingested cubes, mosaics. Of anyone's: the only array with three axes of numbers, or the one named,
+    at the step of time named (``values:3`` or ``3``); wavelengths come from a coordinate of that name, or of the band
+    axis with a unit.
     Raises SceneError: the store is damaged, holds no such array, has dims that are not known, a codec that is not
     allowed, or claims to hold far more than lies on the disk.
     """
     path = find_zarr_store(path) or path
-    with _named(path):
+    with reading(path, "Zarr"):
         _check_store(path)
         # a group is read from its members: only their metadata were checked
         is_group = (path / ".zgroup").is_file() or (
@@ -63,10 +79,16 @@ def open_zarr_cube(path: Path, variable: str | None = None) -> CubeSource:
         options: dict[str, Any] = {"use_consolidated": False} if is_group else {}
         node = zarr.open(path, mode="r", **options)
         attributes = dict(node.attrs) if isinstance(node, zarr.Group) else {}
+        if "sweep" in attributes:
+            raise SceneError(
+                f"{path} holds raw lines of a survey, whose pixels lie where the mirror looked; survey them as "
+                f"--sweeps {path}"
+            )
         arrays: dict[str, Any] = dict(node.arrays()) if isinstance(node, zarr.Group) else {"": node}
-        cube = find_cube(arrays, variable, path)
+        cube = find_cube(arrays, variable, path, labels=labels)
         for used in {cube.name, *names_beside(arrays), *({*FRAMES, *OF_LINES, *dims_of(cube.array)} & set(arrays))}:
-            _check_size(arrays[used], path / used)
+            one, stored = arrays[used], sum(file.stat().st_size for file in (path / used).rglob("*") if file.is_file())
+            check_claim(path / used, one.dtype.itemsize * max(math.prod(one.shape), math.prod(one.chunks)), stored)
         parts = [BLOCK_LINES if axis == cube.order[0] else size for axis, size in enumerate(cube.array.shape)]
         if cube.moment is not None:
             parts[cube.moment[0]] = 1
@@ -74,48 +96,27 @@ def open_zarr_cube(path: Path, variable: str | None = None) -> CubeSource:
         for size, chunk, part in zip(cube.array.shape, cube.array.chunks, parts, strict=True):
             numbers *= min(-(-part // chunk) + 1, -(-size // chunk)) * chunk
         check_memory(path, numbers * cube.array.dtype.itemsize)
-        source = cube_source(path, cube, arrays, {**attributes, **dict(cube.array.attrs)}, lambda: _named(path))
+        source = cube_source(
+            path, cube, arrays, {**attributes, **dict(cube.array.attrs)}, lambda: reading(path, "Zarr")
+        )
         source = replace(source, root=path, files=tuple(sorted(file for file in path.rglob("*") if file.is_file())))
-        own = "sweep" in attributes or attributes.get("kind") == "ingested cube"
-        return _with_own(source, arrays, attributes) if own else source
-
-
-@contextmanager
-def _named(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except SceneError:
-        raise
-    except UnknownCodecError as error:
-        raise SceneError(missing_codec(str(path), error.codec_id)) from error
-    except Exception as error:  # codecs and parsers raise anything at all on damaged bytes
-        raise SceneError(f"{path} cannot be read as Zarr: {type(error).__name__}: {error}; is it damaged?") from error
+        return _with_own(source, arrays, attributes) if attributes.get("kind") == KIND else source
 
 
 def _with_own(source: CubeSource, arrays: dict[str, Any], attributes: dict[str, Any]) -> CubeSource:
-    """Add what stores of this project say of lines, reference frames and bad bands."""
+    """Add what ingested cubes say of lines, reference frames and bad bands."""
     lines, samples, bands = source.shape
 
-    def column(name: str) -> NDArray[Any] | None:
-        return np.asarray(arrays[name][...]) if name in arrays and arrays[name].shape == (lines,) else None
+    def known(name: str, *shape: int) -> NDArray[Any] | None:
+        return np.asarray(arrays[name][...]) if name in arrays and arrays[name].shape == shape else None
 
-    def frame(name: str, *shape: int) -> NDArray[np.float32] | None:
-        known = name in arrays and arrays[name].shape == shape
-        return np.asarray(arrays[name][...], np.float32) if known else None
-
-    bad, valid = frame("bad", samples, bands), column("valid_line")
-    x, y = (frame(f"mirror_{axis}", lines) if attributes.get("by_mirror") is True else None for axis in "xy")
+    valid = known("valid_line", lines)
+    valid = None if valid is None else valid.astype(np.bool_)
     return replace(
         source,
-        lines=LineFacts(
-            None if valid is None else valid.astype(np.bool_), column("time"), column("exposure_ms"), column("frame")
-        ),
-        dark=frame("dark", samples, bands),
-        white=frame("white", samples, bands),
-        white_reference=frame("white_reference", bands),
-        bad=None if bad is None else bad.astype(np.bool_),
-        flat=frame("flat", samples, bands),
-        position=None if x is None or y is None else np.stack([x, y], axis=-1).astype(np.float64),
+        lines=LineFacts(valid, known("time", lines), known("exposure_ms", lines), known("frame", lines)),
+        dark=known("dark", samples, bands),
+        white=known("white", samples, bands),
         nodata=attributes.get("nodata", source.nodata),
         bad_bands=tuple(int(band) for band in attributes.get("bad_bands", ())),
     )
@@ -159,12 +160,113 @@ def _codecs(content: object) -> Iterator[str]:
                 yield from _codecs(codec.get("configuration") if isinstance(codec, dict) else None)
 
 
-def _check_size(array: zarr.Array[Any], folder: Path) -> None:
-    """Refuse an array that claims more than its bytes can mean, before any of it is asked for (SceneError)."""
-    stored = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-    claimed, chunk = (array.dtype.itemsize * math.prod(sizes) for sizes in (array.shape, array.chunks))
-    if max(claimed, chunk) > max(stored, 1) * MOST_RATIO:
-        raise SceneError(
-            f"{folder} claims {array.shape} of {array.dtype} in chunks of {array.chunks}, and {stored} bytes lie on "
-            "the disk; copy it again"
-        )
+# --- ingested cubes ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SourceFile:
+    """One file that a cube came from."""
+
+    name: str  # without folders, but those within a store
+    size: int
+    sha256: str
+
+
+def write_ingested_cube(
+    folder: Path, source: CubeSource, files: Sequence[SourceFile], *, name: str, report: Report = lambda done: None
+) -> None:
+    """Store a cube as ``cube.zarr`` and ``quicklook.png`` in a folder, 64 lines at a time.
+
+    Its attributes have its name and the files that it came from; ``report`` is told how far it is, 0..1. Raises
+    SceneError: lines cannot be read.
+    """
+    kind = stored_dtype(source, lambda done: report(0.3 * done))
+    sampled = source.dtype.kind in "ui" and source.dtype not in (np.uint8, np.uint16)
+    begin = 0.3 if sampled else 0.0
+    group = create_group(folder / "cube.zarr", f"{KIND} {name}", _attributes(source, files, name))
+    about: dict[str, Any] = {"long_name": "numbers of the file", "units": "1", **_write_coordinates(group, source)}
+    array = create_array(group, "values", image_spec(("line", "sample", "band"), source.shape, kind.str), about)
+    thumbnail = LineThumbnail(source.shape, source.bands.wavelength_nm, dark=source.dark, white=source.white)
+    for start in range(0, source.shape[0], BLOCK_LINES):
+        stop = min(start + BLOCK_LINES, source.shape[0])
+        lines, valid = source.read(start, stop), source.valid[start:stop]
+        with np.errstate(over="ignore"):  # a float64 beyond float32 becomes infinite, which a scene takes for missing
+            block = lines.astype(kind)
+        if not valid.all():
+            block[~valid] = np.nan if kind.kind == "f" else 0
+        array[start:stop] = block
+        thumbnail.add(start, lines, valid)
+        report(begin + (1 - begin) * stop / source.shape[0])
+    picture = thumbnail.finish()
+    write_quicklook(group, picture)
+    Image.fromarray(picture.image).save(folder / "quicklook.png")
+
+
+def stored_dtype(source: CubeSource, report: Report = lambda done: None) -> np.dtype[Any]:
+    """Type of the store: uint8 and uint16 stay, other whole numbers become uint16 where all fit, the rest float32."""
+    if source.dtype.kind == "b" or source.dtype == np.uint8:
+        return np.dtype(np.uint8)
+    if source.dtype == np.uint16:
+        return np.dtype(np.uint16)
+    if source.dtype.kind not in "ui":
+        return np.dtype(np.float32)
+    for start in range(0, source.shape[0], BLOCK_LINES):
+        stop = min(start + BLOCK_LINES, source.shape[0])
+        lines = source.read(start, stop)
+        if lines.min() < 0 or lines.max() > np.iinfo(np.uint16).max:
+            return np.dtype(np.float32)
+        report(stop / source.shape[0])
+    return np.dtype(np.uint16)
+
+
+def _attributes(source: CubeSource, files: Sequence[SourceFile], name: str) -> dict[str, Any]:
+    facts: dict[str, Any] = {
+        "kind": KIND,
+        "name": name,
+        "files": [asdict(file) for file in files],
+        "headers": {file: text[:LONGEST_HEADER] for file, text in source.headers.items()},
+        "source_dtype": source.dtype.str,
+        "lost_lines": source.lost_lines,
+        "notes": list(source.notes),
+        "wavelength_origin": source.bands.origin or "nothing says the wavelengths",
+        "wavelength_units_in_file": source.bands.units,
+    }
+    if source.nodata is not None and np.isfinite(source.nodata):
+        facts["nodata"] = source.nodata
+    if source.bad_bands:
+        facts["bad_bands"] = list(source.bad_bands)
+    if source.geobox is not None:
+        facts |= {**map_attributes(source.geobox), "spatial:dimensions": ["line", "sample"]}
+    if source.lines.first_stamp_us is not None:
+        facts["first_stamp_us"] = source.lines.first_stamp_us
+    return facts
+
+
+def _write_coordinates(group: zarr.Group, source: CubeSource) -> dict[str, str]:
+    """Store what is known of lines, bands and place, and the reference frames; give the attributes that name it."""
+    write_counts(group, line=source.shape[0], sample=source.shape[1])
+    names: list[str] = []
+    if source.bands.wavelength_nm is not None:
+        names.append(write_bands(group, source.bands.wavelength_nm, source.bands.fwhm_nm))
+    columns: Mapping[str, tuple[NDArray[Any] | None, dict[str, Any]]] = {
+        "time": (source.lines.time_s, {"long_name": "since the first stamp of a frame", "units": "s"}),
+        "exposure_ms": (source.lines.exposure_ms, {"units": "ms"}),
+        "frame": (source.lines.frame, {"long_name": "number that the camera gave, -1 where not known", "units": "1"}),
+        "valid_line": (source.valid, {"long_name": "line is whole in its file"}),
+    }
+    for name, (values, about) in columns.items():
+        if values is not None:
+            write_small(group, name, ("line",), np.asarray(values), about)
+            names.append(name)
+    frames: Mapping[str, tuple[NDArray[Any] | None, str]] = {
+        "dark": (source.dark, "dark reference frame"),
+        "white": (source.white, "white reference frame"),
+    }
+    for name, (frame, title) in frames.items():
+        if frame is not None:
+            write_small(group, name, ("sample", "band"), np.asarray(frame), {"long_name": title, "units": "1"})
+    placed = {} if source.geobox is None else ON_THE_MAP
+    if source.geobox is not None:
+        write_grid_mapping(group, source.geobox)
+        names.append(ON_THE_MAP["coordinates"])
+    return {**placed, **({"coordinates": " ".join(names)} if names else {})}

@@ -30,6 +30,7 @@ from storage.archive.keys import StageRef, in_text, open_folder, store_at
 from storage.archive.manifests import (
     check_files,
     extended_from,
+    file_problem,
     is_cleared,
     parse_manifest,
     read_manifest,
@@ -468,32 +469,20 @@ def _problems(objects: Objects, there: Mapping[str, Listed], folder: Path, place
     if problem is not None:
         yield f"{MANIFEST_NAME} cannot be believed: {problem}"
         return
+    broken: dict[str, str] = {}
     for name, entry in manifest["files"].items():
-        problem = _object_problem(objects, there, f"{place}/{name}", entry)
-        if problem is None:
-            continue
-        about = [f"{parent.as_posix()}/zarr.json" for parent in Path(name).parents if parent != Path()]
-        for one in (name, *about):  # which part of an array it is, and which of its chunks can be read
-            try:
-                objects.save(f"{place}/{one}", folder / one)
-            except FileNotFoundError:
-                (folder / one).unlink(missing_ok=True)
-        yield f"{name} {problem}{name_damage(folder, name)}"
+        file = folder / name
+        try:
+            objects.save(f"{place}/{name}", file)
+        except FileNotFoundError:
+            file.unlink(missing_ok=True)
+        if (problem := file_problem(file, entry, hashes=True)) is not None:
+            broken[name] = problem
+        elif file.name != "zarr.json":  # which says what part of an array a broken file is
+            file.unlink()
+    yield from (f"{name} {problem}{name_damage(folder, name)}" for name, problem in broken.items())
     extra = {path.removeprefix(f"{place}/") for path in there if path.startswith(f"{place}/")} - set(manifest["files"])
     yield from (f"{name} is not in the manifest: take it out of the archive" for name in sorted(extra))
-
-
-def _object_problem(objects: Objects, there: Mapping[str, Listed], name: str, entry: Mapping[str, Any]) -> str | None:
-    size = _listed_size(there, name)
-    if size not in (None, entry["size"]):
-        return f"has {size} bytes, expected {entry['size']}"
-    try:
-        same = size is not None and objects.measure(name) == entry["sha256"]
-    except FileNotFoundError:
-        size = None
-    if size is None:
-        return "cannot be read: it is missing"
-    return None if same else "has changed since it was published (its SHA-256 differs)"
 
 
 def _listed_size(there: Mapping[str, Listed], name: str) -> int | None:

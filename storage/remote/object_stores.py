@@ -261,13 +261,6 @@ class Objects:
             with suppress(OSError):
                 aside.unlink(missing_ok=True)
 
-    def measure(self, name: str) -> str:
-        """SHA-256 of an object, read to its end (FileNotFoundError: there is none)."""
-        digest = hashlib.sha256()
-        for block in self.blocks(name):
-            digest.update(block)
-        return digest.hexdigest()
-
     def children(self, folder: str) -> list[str]:
         """Names of what lies in a folder and is one itself."""
         with answers_of(self.place):

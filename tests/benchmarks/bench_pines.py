@@ -111,7 +111,7 @@ def _open(folder: Path) -> Split:
     from storage.readers.datasets import load_data_set
 
     files = load_data_set(folder / SCENE, **_choices(folder))
-    (_, train), (_, test) = next(files.train()), next(files.test())
+    train, test = files.load(Path(SCENE).stem, "train"), files.load(Path(SCENE).stem, "test")
     assert train.labels is not None
     assert test.labels is not None
     return Split(np.asarray(train.values, np.float32), train.labels, test.labels, len(train.class_names))

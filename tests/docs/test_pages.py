@@ -19,7 +19,6 @@ PATH = re.compile(
     r"(?:pipeline|models|storage|flows|tests|docs|\.ci)(?:/[\w.-]+)*/?|[\w-]+\.(?:md|toml|yaml|txt)|Makefile"
 )
 OF_USERS = {"scene.toml", "emulated.toml", "field.toml", "survey.toml", "north.toml"}  # pages have people write them
-OF_USERS |= {"classes.txt", "labels.txt"}
 
 
 def named(page: Path) -> str:

@@ -11,6 +11,7 @@ from typing import Any
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.manifests import _seal, _text
+from storage.arrays.class_maps import ClassMap, ClassNames, create_class_map, write_class_tile
 from storage.remote.opening import verify_archive
 
 DAY_S = 86400
@@ -84,3 +85,9 @@ def grow_old(ref: StageRef, days: float) -> None:
 def problems(archive: Archive) -> list[str]:
     """What verify finds."""
     return [f"{one.uri} {one.problem}" for one in verify_archive(archive) if one.problem is not None]
+
+
+def write_class_map(path: Path, found: ClassMap) -> None:
+    """Store a class map at once, as stages do tile by tile."""
+    create_class_map(path, found.classes.shape, ClassNames(found.names, found.colours), grid=found.grid)
+    write_class_tile(path, (0, 0), found.classes, found.confidence)

@@ -175,4 +175,3 @@ def _folders(here: Path, picture: np.ndarray) -> None:
     image = Image.fromarray(mask, "P")
     image.putpalette([120, 80, 10, 0, 200, 0])
     image.save(here / "palette" / "001_mask.png")
-    (here / "palette" / "classes.txt").write_text("0 soil\n1 sugar beet\n")

@@ -20,7 +20,6 @@ from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.readings import edge_fill
 from storage.readers.datasets import load_data_set
-from storage.readers.label_files import read_legend
 from storage.readers.scene_files import load_scene_file
 from storage.readers.scene_toml import load_scene_settings
 from tests.flows.conftest import command_line
@@ -55,21 +54,15 @@ def test_what_init_writes_reads_as_the_folder_did(folder: str, made: Path, comma
     assert json.loads(ended.out)["next"].startswith("spectralzoom train ")
 
 
-def test_init_takes_names_from_a_legend_and_keeps_what_is_there(made: Path, command_line: Any) -> None:
-    """classes.txt names the numbers; a scene.toml goes aside with --force, and stays where none is written."""
-    (made / "bad_key" / "classes.txt").write_text("soil\ncrop\n")
+def test_init_keeps_what_is_there(made: Path, command_line: Any) -> None:
+    """A scene.toml goes aside with --force, and stays where none is written."""
     (made / "bad_key" / "labels").mkdir()
     for name in ("001", "002"):
         Image.fromarray(np.eye(32, dtype=np.uint8)[:24]).save(made / "bad_key" / "labels" / f"{name}.png")
     old = (made / "bad_key" / "scene.toml").read_bytes()
     assert command_line("init", made / "bad_key", "--force").code == 0
-    assert load_scene_settings(made / "bad_key" / "scene.toml").classes == {"soil": 0, "crop": 1}
+    assert load_scene_settings(made / "bad_key" / "scene.toml").classes == {"class_0": 0, "class_1": 1}
     assert (made / "bad_key" / "scene.toml.old").read_bytes() == old
-    command_line("init", made / "palette")
-    assert load_scene_settings(made / "palette" / "scene.toml").classes == {"soil": 0, "sugar beet": 1}
-    scene = load_scene_file(made / "palette" / "001.png")
-    assert scene.labels is not None
-    assert (scene.labels == (scene.values[..., 0] > 99)).all()
     (made / "soft" / "scene.toml").write_text("nodata = 0\n")
     command_line("init", made / "soft", "--force").refused(1, "different colours")
     assert (made / "soft" / "scene.toml").read_text() == "nodata = 0\n"
@@ -102,33 +95,6 @@ def test_init_tells_what_it_could_not_see(made: Path, command_line: Any) -> None
     told = json.loads(command_line("init", made / "cube.npy", "--json", "--force").out)["unseen"]
     assert "the wavelengths of 5 bands: write wavelengths_nm into scene.toml" in told
     (made / "scene.toml").unlink()
-
-
-LEGENDS = {
-    "0 soil\n1 sugar beet\n": {0: "soil", 1: "sugar beet"},
-    "soil: 0\ncrop: 1": {0: "soil", 1: "crop"},
-    "name,r,g,b\nsoil,0,0,0\ncrop,0,255,0\n": {(0, 0, 0): "soil", (0, 255, 0): "crop"},
-    "0 0 0\tsoil\n0 255 0\tcrop\n": {(0, 0, 0): "soil", (0, 255, 0): "crop"},
-    "#000000 soil\n#00ff00 crop\n": {(0, 0, 0): "soil", (0, 255, 0): "crop"},
-}
-
-
-@pytest.mark.parametrize("text", LEGENDS)
-def test_legends_are_read_as_people_write_them(text: str, tmp_path: Path) -> None:
-    """Numbers or colours before or after the name, in text, CSV or JSON."""
-    path = tmp_path / "legend.txt"
-    path.write_text(text)
-    legend = read_legend(path)
-    assert legend is not None
-    assert legend.names == LEGENDS[text]
-
-
-@given(st.binary(max_size=200))
-def test_any_bytes_are_a_legend_or_none(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:
-    """Whatever lies under such a name, it is read or passed over."""
-    folder = tmp_path_factory.getbasetemp()
-    (folder / "legend.txt").write_bytes(content)
-    assert read_legend(folder / "legend.txt") is None or read_legend(folder / "legend.txt")
 
 
 @given(st.integers(0, 40), st.sampled_from([0.0, -9999.0, 1e30]))

@@ -48,7 +48,7 @@ from storage.archive.manifests import read_table
 from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import load_class_map
 from storage.arrays.mosaics import open_patches
-from storage.readers.raster_work import RasterPixels, patches_of
+from storage.readers.raster_fields import RasterPixels, patches_of
 
 RECORD = "accuracy.json"
 ACCURACY = Product("evaluate", version=10, files=(RECORD,), by_weights=True)

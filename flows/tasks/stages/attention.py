@@ -29,7 +29,7 @@ from pipeline.planning.uniform_scans import format_scan
 from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table, write_table
 from storage.arrays.mosaics import Attention, write_attention
-from storage.readers.raster_work import RasterPixels
+from storage.readers.raster_fields import RasterPixels
 
 ATTENTION = Product("score", version=8, files=("attention.zarr", "plan.json"), by_weights=True)
 Scores = NDArray[np.float64]

@@ -12,7 +12,7 @@ from flows.tasks.stages.attention import load_plan
 from flows.tasks.stages.placement import MOSAIC, PATCHES, finish_mosaic, patch_writer, thumbnail_of
 from storage.archive.keys import StageRef
 from storage.arrays.mosaics import MosaicWriter
-from storage.readers.raster_work import RasterPixels, write_means, write_patches
+from storage.readers.raster_fields import RasterPixels, write_means, write_patches
 
 
 @stage("average_raster", "coarse means of the raster", MOSAIC, inputs=0)

@@ -29,12 +29,12 @@ from storage.arrays.class_maps import (
     load_class_map,
     write_changes,
     write_changes_tile,
-    write_class_map,
     write_probabilities_tile,
 )
 from storage.arrays.ground_maps import GroundMap, load_ground_map
 from storage.arrays.layout import AngularGrid
 from storage.arrays.mosaics import MosaicWriter
+from tests.storage.small_archive import write_class_map
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, height_m=14.0)

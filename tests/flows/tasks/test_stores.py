@@ -22,7 +22,8 @@ from pipeline.errors import RigError
 from pipeline.source import Line
 from storage.archive.archive import Archive
 from storage.arrays.cubes import RawCube, open_raw_cube
-from storage.arrays.quicklooks import load_quicklook
+from storage.arrays.layout import open_group
+from storage.arrays.quicklooks import quicklook_of
 from storage.arrays.spool import Spool
 from storage.remote.opening import verify_archive
 from tests.conftest import Survey
@@ -118,7 +119,7 @@ def test_the_picture_of_raw_lines_reads_no_raw_line(copied: Path, monkeypatch: p
     monkeypatch.setattr(RawCube, "read_window", read)
     assert (_survey_farm(copied).folder / "quicklook.png").stat().st_size > 10_000
     stores = [ref.path for stage in ("capture", "rectify") for ref in Archive.open(copied).refs(stage)]
-    assert all(load_quicklook(path) for store in stores for path in store.glob("*.zarr"))
+    assert all(quicklook_of(open_group(path)) for store in stores for path in store.glob("*.zarr"))
 
 
 BROKEN_AT = 21

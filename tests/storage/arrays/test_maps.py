@@ -14,14 +14,7 @@ from pyproj import CRS
 
 from pipeline.errors import ChunkError, IncompleteStoreError, PoseError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
-from storage.arrays.class_maps import (
-    ClassMap,
-    ClassNames,
-    create_class_map,
-    load_class_map,
-    write_class_map,
-    write_class_tile,
-)
+from storage.arrays.class_maps import ClassMap, ClassNames, create_class_map, load_class_map, write_class_tile
 from storage.arrays.georeference import ON_THE_MAP, load_geobox, map_attributes, write_map_coordinates
 from storage.arrays.ground_maps import BLOCK, GroundMapWriter, load_ground_map
 from storage.arrays.layout import (
@@ -33,6 +26,7 @@ from storage.arrays.layout import (
     create_group,
     write_image,
 )
+from tests.storage.small_archive import write_class_map
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 LEGEND = ClassNames(("sugar beet", "bare soil"), np.array([[10, 200, 30], [120, 90, 60]], np.uint8))

@@ -13,8 +13,9 @@ from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.scan import Sweep
 from pipeline.source import Line, References
 from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
+from storage.arrays.layout import open_group
 from storage.arrays.mosaics import MosaicWriter
-from storage.arrays.quicklooks import LineThumbnail, load_quicklook, picture_bands, picture_step, stretched
+from storage.arrays.quicklooks import LineThumbnail, picture_bands, picture_step, quicklook_of, stretched
 
 WAVES = np.linspace(400, 900, 12)
 LINES = np.random.default_rng(5).integers(100, 4000, (150, 600, 12), dtype=np.uint16)
@@ -131,11 +132,11 @@ def test_a_flat_or_missing_band_is_black() -> None:
 def test_pictures_are_read_without_the_cube(tmp_path: Path) -> None:
     """The cube's chunks may be gone: what shows a picture does not ask for them."""
     path = _stored(tmp_path / "store" / "fine-0.zarr")
-    before = load_quicklook(path)
+    before = quicklook_of(open_group(path))
     for shard in (path / "dn" / "c").rglob("*"):
         if shard.is_file():
             shard.write_bytes(b"not read")
-    seen = load_quicklook(path)
+    seen = quicklook_of(open_group(path))
     assert before is not None
     assert seen is not None
     np.testing.assert_array_equal(seen.image, before.image)
@@ -153,14 +154,14 @@ def test_stores_of_before_open_without_a_picture(tmp_path: Path) -> None:
     assert cube.quicklook() is None
     np.testing.assert_array_equal(cube.read(0, 3), LINES[:3])
     MosaicWriter(tmp_path / "m.zarr", (8, 8), WAVES)
-    assert load_quicklook(tmp_path / "m.zarr") is None
+    assert quicklook_of(open_group(tmp_path / "m.zarr")) is None
 
 
 def test_a_mosaic_has_its_picture_as_it_was_given(tmp_path: Path) -> None:
     """Of a picture that was made elsewhere nothing but its colours is known."""
     image = np.random.default_rng(1).integers(0, 255, (20, 30, 3), dtype=np.uint8)
     MosaicWriter(tmp_path / "m.zarr", (80, 120), WAVES).write_quicklook(image)
-    seen = load_quicklook(tmp_path / "m.zarr")
+    seen = quicklook_of(open_group(tmp_path / "m.zarr"))
     assert seen is not None
     np.testing.assert_array_equal(seen.image, image)
     assert (seen.low, seen.bands) == ((), ())
@@ -183,6 +184,6 @@ def test_white_as_dark_as_dark_is_missing(tmp_path: Path) -> None:
     header = replace(header, references=replace(header.references, white=white))
     with RawCubeWriter(tmp_path / "a.zarr", header) as cube:
         cube.write([Line(n, LINES[n], 0.0, 0.0, 0.1 * n, 100.0) for n in range(64)])
-    seen = load_quicklook(tmp_path / "a.zarr")
+    seen = quicklook_of(open_group(tmp_path / "a.zarr"))
     assert seen is not None
     assert not seen.image[:, 2].any()

@@ -18,19 +18,6 @@ from pystac.validation.local_validator import get_local_schema_cache
 from referencing import Registry, Resource
 
 NUMBER, TEXT = {"type": "number"}, {"type": "string", "minLength": 1}
-MICROMETRES = {"type": "number", "exclusiveMinimum": 0, "maximum": 100}
-CLASS = {
-    "type": "object",
-    "required": ["value", "name"],
-    "additionalProperties": False,
-    "properties": {
-        "value": {"type": "integer"},
-        "name": {"type": "string", "pattern": "^[0-9A-Za-z_-]+$"},
-        "title": TEXT,
-        "description": TEXT,
-        "color_hint": {"type": "string", "pattern": "^[0-9A-Fa-f]{6}$"},
-    },
-}
 FIELDS: Mapping[str, Mapping[str, Any]] = {
     "proj:code": {"type": ["string", "null"], "pattern": "^[A-Za-z0-9_]+:[A-Za-z0-9_]+$"},
     "proj:wkt2": {"type": ["string", "null"], "pattern": r"^[A-Z]+CRS\["},
@@ -40,25 +27,11 @@ FIELDS: Mapping[str, Mapping[str, Any]] = {
     "processing:level": {"enum": ["RAW", "L0", "L1", "L2", "L3", "L4"]},
     "processing:lineage": TEXT,
     "processing:software": {"type": "object", "minProperties": 1, "additionalProperties": {"type": "string"}},
-    "hsi:wavelength_min": MICROMETRES,
-    "hsi:wavelength_max": MICROMETRES,
-    "eo:center_wavelength": MICROMETRES,
-    "eo:full_width_half_max": MICROMETRES,
-    "classification:classes": {"type": "array", "items": CLASS, "minItems": 1, "uniqueItems": True},
 }
-PREFIXES = {
-    "proj": "projection/v2.0.0",
-    "processing": "processing/v1.2.0",
-    "hsi": "hsi/v1.0.0",
-    "eo": "eo/v2.0.0",
-    "classification": "classification/v2.0.0",
-}
+PREFIXES = {"proj": "projection/v2.0.0", "processing": "processing/v1.2.0"}
 PLACES = {  # where the fields of each extension may stand in an item
     "proj": {"properties", "asset"},
     "processing": {"properties", "asset"},
-    "hsi": {"properties"},
-    "eo": {"properties", "asset", "band"},
-    "classification": {"properties", "asset", "band"},
 }
 
 
@@ -102,11 +75,6 @@ def _tables(item: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, An
 
 def _together(table: Mapping[str, Any]) -> Iterator[str]:
     """Fields that need each other."""
-    low, high = table.get("hsi:wavelength_min"), table.get("hsi:wavelength_max")
-    if (low is None) != (high is None):
-        yield "hsi:wavelength_min and hsi:wavelength_max are needed both"
-    elif low is not None and high is not None and low > high:
-        yield f"wavelengths go from {low} to {high}"
     if "proj:bbox" in table and table.get("proj:code") is None and table.get("proj:wkt2") is None:
         yield "proj:bbox without a CRS"
     box, transform, shape = (table.get(f"proj:{name}") for name in ("bbox", "transform", "shape"))
@@ -115,9 +83,6 @@ def _together(table: Mapping[str, Any]) -> Iterator[str]:
         corners = [min(c, c + a * columns), min(f, f + e * rows), max(c, c + a * columns), max(f, f + e * rows)]
         if any(abs(one - other) > 1e-6 * max(abs(one), 1) for one, other in zip(box, corners, strict=True)):
             yield f"proj:bbox {box} is not that of transform and shape, {corners}"
-    values = [entry.get("value") for entry in table.get("classification:classes", ())]
-    if len(set(values)) < len(values):
-        yield "two classes have one value"
 
 
 def core_problems(path: Path) -> list[str]:

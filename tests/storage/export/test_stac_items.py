@@ -13,28 +13,12 @@ import shapely
 from odc.geo.geobox import GeoBox
 
 from pipeline.errors import ArchiveError
-from storage.arrays.class_maps import ClassNames
-from storage.export.stac_items import (
-    COG,
-    COLLECTION,
-    ZARR,
-    Item,
-    angular,
-    classes,
-    clean_id,
-    footprint,
-    projection,
-    spectral_bands,
-    wavelengths,
-    write_stac,
-)
+from storage.export.stac_items import COG, COLLECTION, ZARR, Item, clean_id, footprint, projection, write_stac
 from tests.storage.export.stac_rules import core_problems, extension_problems
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 BOX = GeoBox.from_bbox((500000, 5770000, 500050, 5770040), crs="EPSG:32632", resolution=0.5)
 ABOUT = "field-a"
-LEGEND = ClassNames(("sugar beet", "???"), np.array([[10, 200, 30], [255, 0, 7]], np.uint8))
-WAVE = np.array([444.5, 550.0, 800.0])
 
 
 def seen(shape: tuple[int, int] = (80, 100)) -> np.ndarray:
@@ -46,16 +30,15 @@ def seen(shape: tuple[int, int] = (80, 100)) -> np.ndarray:
 
 def item(name: str, *, day: int = 1, placed: bool = True) -> Item:
     """An item with an image and a store."""
-    image: dict[str, Any] = {"href": "class_map.tif", "type": COG, "roles": ["data"], **classes(LEGEND)}
+    image: dict[str, Any] = {"href": "class_map.tif", "type": COG, "roles": ["data"]}
     image["bands"] = [{"name": "class", "data_type": "uint8", "nodata": 255}]
-    bands = spectral_bands(WAVE, np.full(3, 6.0), {"data_type": "float32", "nodata": "nan"})
-    store: dict[str, Any] = {"href": "../../a/mosaic.zarr", "type": ZARR, "roles": ["data"], **bands}
-    properties = {"processing:level": "L4", "processing:software": {"spectralzoom": "0.1.0"}, **wavelengths(WAVE)}
+    store: dict[str, Any] = {"href": "../../a/mosaic.zarr", "type": ZARR, "roles": ["data"]}
+    properties = {"processing:level": "L4", "processing:software": {"spectralzoom": "0.1.0"}}
     place = None
     if placed:
         properties["proj:code"] = "EPSG:32632"
         image |= projection(BOX)
-        store |= angular((1e-3, 0, -0.1, 0, 1e-3, -0.1), (20, 30))
+        store["proj:code"] = None
         place = footprint(BOX, [(0, seen())])
     times = f"2026-05-{day:02d}T10:00:00Z", f"2026-05-{day:02d}T11:00:00Z"
     return Item(name, *times, properties, {"class_map": image, "mosaic": store}, place)
@@ -94,10 +77,10 @@ def test_without_a_place_there_is_no_geometry(tmp_path: Path) -> None:
 
 
 def test_every_prefix_used_is_declared_and_no_other(tmp_path: Path) -> None:
-    """Extensions are those of the fields in properties, assets and bands."""
+    """Extensions are those of the fields in properties and assets."""
     content = read(write_stac(tmp_path, ABOUT, "Surveys", item("r1"))[0])
     names = [uri.split("/")[3] for uri in content["stac_extensions"]]
-    assert names == ["projection", "processing", "hsi", "classification", "eo"]
+    assert names == ["projection", "processing"]
     plain = Item("r2", "2026-05-01T10:00:00Z", "2026-05-01T11:00:00Z", {}, {"a": {"href": "a.tif", "type": COG}})
     assert read(write_stac(tmp_path, ABOUT, "Surveys", plain)[0])["stac_extensions"] == []
 
@@ -159,23 +142,11 @@ def test_the_grid_is_said_as_the_projection_extension_wants_it() -> None:
     own = GeoBox(BOX.shape, BOX.affine, "+proj=tmerc +lat_0=52.1 +lon_0=9.5 +units=m +datum=WGS84")
     assert projection(own)["proj:code"] is None
     assert projection(own)["proj:wkt2"].startswith("PROJCRS")
-    assert angular((1, 0, 0, 0, 1, 0), (2, 3))["proj:code"] is None
 
 
-def test_wavelengths_are_in_micrometres() -> None:
-    """Of the whole cube, and of every band beside its width."""
-    assert wavelengths(WAVE) == {"hsi:wavelength_min": 0.4445, "hsi:wavelength_max": 0.8}
-    bands = spectral_bands(WAVE, np.array([5.0, 6.0, 7.0]), {"unit": "1"})["bands"]
-    assert bands[2] == {"name": "B002", "eo:center_wavelength": 0.8, "unit": "1", "eo:full_width_half_max": 0.007}
-    assert "eo:full_width_half_max" not in spectral_bands(WAVE, None, {})["bands"][0]
-
-
-def test_classes_have_names_that_the_extension_allows() -> None:
-    """Letters, digits, - and _ alone, the name as it is beside it, and the colour in six hex digits."""
-    found = classes(LEGEND)["classification:classes"]
-    assert found[0] == {"value": 0, "name": "sugar-beet", "title": "sugar beet", "color_hint": "0AC81E"}
-    assert found[1]["name"] == "class-1"
-    assert clean_id("Feld 3/Süd", "x") == "Feld-3-S-d"
+def test_an_id_is_a_name_of_a_file() -> None:
+    """Letters, digits, - and _ alone."""
+    assert (clean_id("Feld 3/Süd", "x"), clean_id("???", "class-1")) == ("Feld-3-S-d", "class-1")
 
 
 def test_a_folder_of_another_archive_is_refused(tmp_path: Path) -> None:

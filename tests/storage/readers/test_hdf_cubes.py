@@ -281,7 +281,7 @@ def linked_outside(path: Path) -> None:
         (no_wavelengths, "has 5 bands and nothing says their wavelengths; give --wavelengths"),
         (wrong_axes, r"has dims level, lat, lon; expected y, x, band \(or band, y, x\); rename them"),
         (no_cube, "has no array of numbers with the axes y, x and band; it has none"),
-        (lost_attribute, "lacks what products of its kind have: .*L2ScaleSwirMax"),
+        (lost_attribute, "lacks what files of its kind have: .*L2ScaleSwirMax"),
         (short_list, r"Vnir_Cube has the shape \(7, 4, 6\) and 3 wavelengths"),
         (level_1, "is a PRISMA product of level 1, which is not read; give a product of level 2B, 2C or 2D"),
         (linked_outside, "has no array of numbers with the axes y, x and band; it has none"),

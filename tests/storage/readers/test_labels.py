@@ -97,24 +97,6 @@ def test_classes_are_found_where_none_are_stated(tmp_path: Path) -> None:
     assert len({default_colour(index) for index in range(80)}) == 80
 
 
-def test_a_photograph_is_no_label_file(tmp_path: Path) -> None:
-    """More than 64 colours are not taken for classes, and fractions not for numbers."""
-    noise = np.random.default_rng(0).integers(0, 255, (20, 20, 3), dtype=np.uint8)
-    Image.fromarray(noise).save(tmp_path / "a.png")
-    with pytest.raises(SceneError, match="different colours, at most 64"):
-        load_labels(tmp_path / "a.png", (20, 20), classes={})
-    np.save(tmp_path / "a.npy", noise[..., 0] / 3)
-    with pytest.raises(SceneError, match="fractions"):
-        load_labels(tmp_path / "a.npy", (20, 20), classes={})
-
-
-def test_another_size_is_refused_with_both(tmp_path: Path) -> None:
-    """The message holds the labels' and the scene's size."""
-    np.save(tmp_path / "a.npy", np.zeros((3, 4), int))
-    with pytest.raises(SceneError, match="3 x 4 px, the scene is 4 x 3 px"):
-        load_labels(tmp_path / "a.npy", (4, 3), classes={})
-
-
 def test_unlabelled_cannot_be_a_class(tmp_path: Path) -> None:
     """One number cannot mean a class and no class."""
     np.save(tmp_path / "a.npy", np.zeros((3, 4), int))

@@ -19,10 +19,9 @@ from rasterio.control import GroundControlPoint
 from pipeline.errors import SceneError
 from pipeline.setting_fields import numbers_of
 from storage.readers.image_files import bad_bands
-from storage.readers.ingested_cubes import write_ingested_cube
 from storage.readers.open_cubes import open_cube
-from storage.readers.scene_files import load_scene_file
-from storage.readers.scene_values import bands_text
+from storage.readers.scene_files import bands_text, load_scene_file
+from storage.readers.zarr_files import write_ingested_cube
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:Use `@` matmul:PendingDeprecationWarning", "ignore:Dataset has no geotransform"

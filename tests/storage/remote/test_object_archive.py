@@ -8,7 +8,6 @@ import shutil
 import subprocess
 import sys
 import threading
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from storage.archive.lineage import Catalogue
 from storage.arrays.layout import create_group, write_image
 from storage.maintenance.garbage import clear_up
 from storage.remote import object_stores
-from storage.remote.object_stores import AT_ONCE, Objects, UnreachableError, is_remote, parse_place, some_at_a_time
+from storage.remote.object_stores import Objects, UnreachableError, is_remote, parse_place
 from tests.storage.small_archive import problems, small_survey
 from tests.storage.small_bucket import FIRST, SECOND, Machine, make, object_of, rot
 
@@ -175,15 +174,6 @@ def test_a_run_is_seen_elsewhere_with_all_it_rests_on(machine: Machine) -> None:
     again = machine(FIRST)
     small_survey(again)
     assert problems(again) == []
-
-
-def test_many_writers_of_a_name_have_one_winner(machine: Machine) -> None:
-    """A conditional put is one: of eight at a time one is written."""
-    objects = machine(FIRST).objects
-    for name in ("a", "b", "c", "d", "e"):
-        wrote = some_at_a_time(partial(objects.create, name), [b"%d" % number for number in range(AT_ONCE)])
-        assert sum(wrote) == 1
-        assert objects.read(name) == b"%d" % wrote.index(True)
 
 
 def test_runs_of_one_second_have_names_of_their_own(machine: Machine) -> None:

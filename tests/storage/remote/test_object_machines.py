@@ -129,13 +129,13 @@ def test_a_store_that_is_cleared_away_under_verify_is_no_damage(
     """gc on another machine takes a store whose manifest was read, and its files not yet."""
     archive = machine(FIRST)
     ref, _ = make(archive)
-    measure = Objects.measure
+    save = Objects.save
 
-    def clear_first(self: Objects, name: str) -> str:
+    def clear_first(self: Objects, name: str, path: Path) -> str:
         archive.discard(ref)
-        return measure(self, name)
+        return save(self, name, path)
 
-    monkeypatch.setattr(Objects, "measure", clear_first)
+    monkeypatch.setattr(Objects, "save", clear_first)
     assert problems(archive) == []
 
 

@@ -1,0 +1,98 @@
+"""JPEG 2000, and TIFF files that say scale and offset; GDAL reads the same."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rasterio
+from affine import Affine
+from numpy.typing import NDArray
+
+from pipeline.errors import SceneError
+from storage.readers.open_cubes import open_cube
+from storage.readers.scene_files import load_scene_file
+
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:Use `@` matmul:PendingDeprecationWarning", "ignore:Dataset has no geotransform"
+)
+RNG = np.random.default_rng(9)
+REVERSIBLE = {"QUALITY": "100", "REVERSIBLE": "YES"}
+
+
+def write_jp2(path: Path, values: NDArray[np.uint16], pixel_m: float = 10.0, **about: Any) -> Path:
+    """A lossless JPEG 2000 of (band, y, x) values on a map."""
+    count, height, width = values.shape
+    place = {"crs": "EPSG:32632", "transform": Affine(pixel_m, 0, 600_000, 0, -pixel_m, 5_700_000)}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    known = {"driver": "JP2OpenJPEG", "count": count, "height": height, "width": width, "dtype": "uint16"}
+    with rasterio.open(path, "w", **known, **place, **REVERSIBLE, **about) as file:
+        file.write(values)
+    return path
+
+
+def test_jpeg_2000(tmp_path: Path) -> None:
+    """Numbers and place as rasterio gives them, whole and by lines; wavelengths have to be stated."""
+    values = RNG.integers(1, 60_000, (3, 70, 50)).astype(np.uint16)
+    path = write_jp2(tmp_path / "a.jp2", values)
+    source = open_cube(path)
+    assert source.geobox is not None
+    np.testing.assert_array_equal(np.concatenate([source.read(0, 64), source.read(64, 70)]), np.moveaxis(values, 0, -1))
+    np.testing.assert_array_equal(
+        load_scene_file(path, wavelengths=[500, 600, 700]).values, np.moveaxis(values, 0, -1).astype(np.float32)
+    )
+    path.write_bytes(path.read_bytes()[:80])
+    with pytest.raises(SceneError, match="cannot be read as JPEG 2000"):
+        load_scene_file(path, wavelengths=[500, 600, 700])
+
+
+def write_tiff(path: Path, scales: tuple[float, ...] | None = None, offsets: tuple[float, ...] = (0, 0)) -> Path:
+    values = np.arange(24, dtype=np.int16).reshape(2, 3, 4) * 100
+    with rasterio.open(path, "w", "GTiff", 4, 3, 2, dtype="int16", nodata=0, photometric="MINISBLACK") as file:
+        file.write(values)
+        if scales is not None:
+            file.scales, file.offsets = scales, offsets
+    return path
+
+
+def test_scale_and_offset_of_tiff(tmp_path: Path) -> None:
+    """Applied band by band, to a scene and by lines alike; no-data is found before; another scale, another hash."""
+    scaled = write_tiff(tmp_path / "scaled.tif", (0.001, 0.002), (0.5, 0.0))
+    scene = load_scene_file(scaled, wavelengths=[500, 600])
+    raw = np.moveaxis(np.arange(24).reshape(2, 3, 4) * 100, 0, -1)
+    expected = np.where(raw == 0, np.nan, raw * [0.001, 0.002] + [0.5, 0.0])
+    np.testing.assert_allclose(scene.values, expected, rtol=1e-6)
+    np.testing.assert_allclose(open_cube(scaled).read(1, 3), expected[1:3], rtol=1e-6)
+    assert any(
+        note.startswith("values are the file's numbers times 0.001 plus 0.5, or others") for note in scene.provenance
+    )
+    sidecar = write_tiff(tmp_path / "sidecar.tif")
+    before = load_scene_file(sidecar, wavelengths=[500, 600])
+    bands = "".join(f'<PAMRasterBand band="{band}"><Scale>0.1</Scale></PAMRasterBand>' for band in (1, 2))
+    (tmp_path / "sidecar.tif.aux.xml").write_text(f"<PAMDataset>{bands}</PAMDataset>")
+    after = load_scene_file(sidecar, wavelengths=[500, 600])
+    np.testing.assert_allclose(after.values, before.values * 0.1, rtol=1e-6)
+    assert before.light_hash != after.light_hash
+
+
+def test_labels_are_never_scaled(tmp_path: Path) -> None:
+    """A label file is numbers, whatever scale it says."""
+    write_tiff(tmp_path / "a.tif")
+    with rasterio.open(tmp_path / "labels.tif", "w", "GTiff", 4, 3, 1, dtype="uint8", photometric="MINISBLACK") as file:
+        file.write(np.arange(12, dtype=np.uint8).reshape(1, 3, 4) % 3 + 1)
+        file.scales = (0.5,)
+    scene = load_scene_file(tmp_path / "a.tif", labels=tmp_path / "labels.tif", wavelengths=[500, 600])
+    assert scene.class_values == (1, 2, 3)
+
+
+def test_unscaled_files_keep_their_hash(tmp_path: Path) -> None:
+    """Files without a scale have the hash of their bytes, bands and wavelengths alone."""
+    path = write_tiff(tmp_path / "plain.tif")
+    scene = load_scene_file(path, wavelengths=[500, 600])
+
+    parts = [hashlib.sha256(path.read_bytes()).hexdigest(), None, [0, 1], [500.0, 600.0], None]
+    assert scene.light_hash == hashlib.sha256(json.dumps(parts).encode()).hexdigest()
