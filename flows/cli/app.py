@@ -40,7 +40,6 @@ VERBS = {  # by what is typed: the module of the function, loaded once it is ask
 }
 GOES_ON = ("survey", "train", "evaluate", "export", "reprocess", "simulate", "serve")  # verbs that keep what is done
 stderr = on_stderr()
-removed: dict[str, str] = {}  # flags that are no more, and why: filled by the module whose verbs had them
 
 ArchiveName = Annotated[str, Parameter(help="The archive's folder, or s3://bucket/prefix.")]
 AsJson = Annotated[bool, Parameter(name="--json", negative="", help="Print one JSON object on stdout.")]

@@ -20,7 +20,7 @@ from zoneinfo import ZoneInfo
 import tzlocal
 from rich.markup import escape
 
-from flows.cli.app import removed, stderr
+from flows.cli.app import stderr
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
 from flows.tasks.local_server import ServerUnavailable, check_answers, local_server, quiet_environment
@@ -55,10 +55,6 @@ else:
     reprocess_flow = deferred("flows.archive.reprocess_flow")
     survey_flow = deferred("flows.survey")
 
-removed.update(
-    late="Prefect begins a run late rather than never, and cancels one that is due while the field's last still runs",
-    notify="Prefect tells of failed runs by an automation: prefect automation create --from-file automation.yaml",
-)
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 UNITS_S = {"s": 1, "m": 60, "h": 3600, "d": 86400}
 LEAST, MOST = timedelta(minutes=1), timedelta(days=366)

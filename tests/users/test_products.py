@@ -20,18 +20,14 @@ from isoxml.converter.np_grid import to_numpy_array
 from isoxml.util.isoxml_io import isoxml_from_path
 from rich.console import Console
 
-from flows.archive import export_zones
 from flows.archive.export_command import run_export
-from flows.archive.export_layers import open_exported
 from flows.archive.product_choice import ProductFlags, choose_products
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from pipeline.errors import SettingsError, WavelengthError
 from pipeline.ground.map_grid import grid_of_map, ground_grid, image_at
 from pipeline.ground.view import GroundView, RigPose
-from pipeline.products.crop_rows import CropRows
 from pipeline.products.indices import find_index
-from storage.archive.archive import Archive
 from storage.readers.scene_files import load_scene_file
 from tests.prior_work import without_effects
 from tests.storage.export.stac_rules import core_problems, extension_problems, is_cog
@@ -46,7 +42,7 @@ FLAGS = {
     "polygons": True,
     "prescription": "track=2.5,grass=1",
     "cell": 3.0,
-    "heading": "20",
+    "heading": 20.0,
     "least_fraction": 0.1,
     "least_area": 0.6,
     "buffer": "track=0.8",
@@ -188,17 +184,6 @@ def test_cells_lie_along_the_heading(posed: Products) -> None:
     np.testing.assert_allclose(turned, 20, atol=1e-3)
 
 
-def test_the_heading_of_rows_follows_the_picture(posed: Products, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rows across the picture run square to where the rig looks, rows down it along: to the meridians' convergence."""
-    run = open_exported(Archive.open(posed.archive), None)
-    for angle, heading in ((0.0, POSE.heading_deg + 90), (90.0, POSE.heading_deg)):
-        monkeypatch.setattr(export_zones, "find_rows", lambda image, angle=angle: CropRows(angle, 1.0))
-        assert export_zones.row_heading(run) == pytest.approx(heading, abs=1.0)
-    monkeypatch.setattr(export_zones, "find_rows", lambda image: CropRows(None, 0.0))
-    with pytest.raises(SettingsError, match="no crop rows are seen in this run; give --heading in degrees"):
-        export_zones.row_heading(run)
-
-
 def test_task_data_hold_what_the_map_says(posed: Products) -> None:
     """Read by another library: each cell's dose against the pixels whose longitude and latitude lie in it."""
     task_data, numbers = isoxml_from_path(posed.file("task_data"))
@@ -261,7 +246,7 @@ def test_the_catalogue_names_every_product(posed: Products) -> None:
         ({"prescription": "weed=1", "dose_unit": "gal/ac"}, "--dose-unit expects l/ha or kg/ha, got 'gal/ac'"),
         ({"prescription": "weed=1", "cell": 0.0}, "--cell expects metres above 0, got 0"),
         ({"prescription": "weed=1", "least_fraction": 1.0}, "--least-share expects a fraction"),
-        ({"prescription": "weed=1", "heading": "north"}, "--heading expects degrees from north, or rows"),
+        ({"prescription": "weed=1", "heading": 400.0}, "--heading expects degrees from north, got 400"),
         ({"prescription": "thistle=1"}, "no class 'thistle'; its classes are soil, maize"),
         ({"polygons": True, "buffer": "thistle=1"}, "--buffer: the run has no class 'thistle'"),
         ({"buffer": "weed=1"}, "shape polygons and prescriptions; ask for one of them as well"),
@@ -320,7 +305,7 @@ def test_products_of_a_georeferenced_scene_lie_where_it_does(
 ) -> None:
     """Corners of indices and polygons to 0.1 px, in its CRS; cells are square in metres; a gap gets no dose."""
     run = survey(write_geotiff(tmp_path / "a.tif", transform, gap=True, crs=crs), weights, tmp_path / "archive")
-    flags = {"polygons": True, "indices": "VARI", "prescription": "class_1=2", "cell": 0.5, "heading": "30"}
+    flags = {"polygons": True, "indices": "VARI", "prescription": "class_1=2", "cell": 0.5, "heading": 30.0}
     out = tmp_path / "out"
     answer = run_export(tmp_path / "archive", None, out, False, QUIET, choose_products(ProductFlags(**flags)))
     done = Products(tmp_path / "archive", run.receipt, answer, out)
