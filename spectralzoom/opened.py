@@ -1,12 +1,11 @@
 """An archive opened to look at: its runs by name, and what each left as xarray.
 
-Every axis has a coordinate, bands are found by wavelength, classes are numbers. Places that a store names itself are
-taken as they stand; what stores of before lack follows from their transform.
+Every axis has a coordinate, as the stores name it; bands are found by wavelength, classes are numbers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,8 +28,6 @@ else:
 
 LATEST = "latest"
 PICTURES = ("quicklook",)  # for viewers, on axes of their own
-TANGENT = "tangent of the angle from the undeflected direction"
-_AXES = {"y": 5, "x": 2}  # where an affine transform has each axis' first edge, and its step before that
 
 
 def open(archive: str | Path) -> OpenedArchive:
@@ -211,7 +208,8 @@ def open_labelled(path: Path) -> xarray.Dataset:
             path, engine="zarr", consolidated=False, mask_and_scale=False, chunks=None, cache=False
         )
         opened = _in_shards(opened.drop_vars([name for name in PICTURES if name in opened]))
-    return by_wavelength(on_axes(opened, opened.attrs))
+    bare = {name: np.arange(size) for name, size in opened.sizes.items() if name not in opened.variables}  # as rgb
+    return by_wavelength(opened.assign_coords(bare))
 
 
 def _in_shards(opened: xarray.Dataset) -> xarray.Dataset:
@@ -222,26 +220,6 @@ def _in_shards(opened: xarray.Dataset) -> xarray.Dataset:
         return one.chunk(dict(zip(one.dims, blocks, strict=True)))
 
     return opened.assign({name: split(one) for name, one in opened.data_vars.items()})
-
-
-def on_axes(opened: xarray.Dataset, about: Mapping[Hashable, Any]) -> xarray.Dataset:
-    """Give each axis without a coordinate one: places by the transform in ``about``, wavelengths, else numbers."""
-    if "band" in opened.dims and "band" not in opened.variables and "wavelength" in opened.variables:
-        opened = opened.assign_coords(band=("band", opened["wavelength"].values, opened["wavelength"].attrs))
-    place = about.get("spatial:transform")
-    missing = {str(name): size for name, size in opened.sizes.items() if name not in opened.variables}
-    return opened.assign_coords({name: (name, *_labels(name, size, place)) for name, size in missing.items()})
-
-
-def _labels(name: str, size: int, place: list[float] | None) -> tuple[Any, dict[str, str]]:
-    """Values and attributes of one axis."""
-    about = {"axis": name.upper()} if name in _AXES else {}
-    if place is None or name not in _AXES:
-        unit = {"units": "px"} if name in (*_AXES, "sample") else {}
-        return np.arange(size), {"long_name": f"number of the {name}" if name not in _AXES else name, **unit, **about}
-    last = _AXES[name]
-    step, first = place[4 if name == "y" else 0], place[last]
-    return first + (np.arange(size) + 0.5) * step, {"long_name": f"{TANGENT}, {name}", "units": "rad", **about}
 
 
 def by_wavelength(opened: xarray.Dataset) -> xarray.Dataset:

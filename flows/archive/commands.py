@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 from rich.tree import Tree
 
 from flows.cli.app import ArchiveName, AsJson, Switch, stderr
 from flows.publish.receipt import is_pending
-from flows.settings.survey_settings import Settings
+from flows.settings.load import of_this_version, parse_settings
+from flows.settings.survey_settings import OF_THE_MACHINE, Settings
 from flows.tasks.open_survey import versions, versions_made_again
 from flows.tasks.scores import score_of
 from flows.terminal.figures import DASH, counted, format_bytes, format_points, format_seconds, known_number
 from flows.terminal.processes import DONE, FAILED, PARTLY
-from flows.terminal.progress import StageProgress, put_out
+from flows.terminal.progress import StageProgress, put_out, table
 from pipeline.lazy import deferred
 from storage.archive.archive import Archive
 from storage.archive.keys import in_text
@@ -34,9 +33,9 @@ from storage.maintenance.verification import Finding
 from storage.remote.opening import open_archive, verify_archive
 
 if TYPE_CHECKING:
-    import flows.archive.reprocess_command as reprocess_command
+    import flows.publish.survey_command as survey_command
 else:
-    reprocess_command = deferred("flows.archive.reprocess_command")
+    survey_command = deferred("flows.publish.survey_command")
 
 DEEPEST = 60  # levels of a lineage that are shown
 SHORT_KEY = 12
@@ -137,8 +136,9 @@ def run_verify(
     if not as_json:
         show_verdict(content, console)
 
-    def survey_again(settings: dict[str, Any]) -> None:
-        reprocess_command.survey_as_before(settings, opened.name, console)
+    def survey_again(settings: dict[str, Any]) -> None:  # on this machine's own terms
+        here = {**of_this_version(settings), "out": opened.name, **dict.fromkeys(OF_THE_MACHINE)}
+        survey_command.run_survey(parse_settings(here), console)
 
     done = repair(opened, bad, rerun or survey_again, versions=versions())
     content["repair"] = {
@@ -260,9 +260,7 @@ def _tree(catalogue: Catalogue, uri: str, shown: set[str], path: tuple[str, ...]
 
 
 def _took(catalogue: Catalogue, store: Store) -> tuple[float | None, float | None]:
-    """Wall and CPU seconds of the making, by the manifest or by the receipt of the run that made it."""
-    if store.cost is not None:
-        return store.cost.wall_s, store.cost.cpu_s
+    """Wall and CPU seconds of the making, by the receipt of the run that made it."""
     rows = [row for run in catalogue.runs for row in run.stages if row.get("key") == store.ref.key]
     ran = next((row for row in rows if row.get("state") == "ran"), {})
     return known_number(ran.get("wall_s")), known_number(ran.get("cpu_s"))
@@ -312,43 +310,34 @@ def command(settings: Mapping[str, Any], out: str) -> str:
 
 def show_contents(content: dict[str, Any], console: Console) -> None:
     """Print what `ls` found."""
-    runs = _table("Runs", "run", "scene", "seed", "budget", "mIoU", "size", "age", "state", left=2)
-    for run in content["runs"]:
-        miou = run["miou"] if isinstance(run["miou"], int | float) else None
-        scored = "not yet" if is_pending(run) else format_points(miou)
-        runs.add_row(
-            escape(run["id"]),
-            escape(PurePath(str(run["scene"])).name) if run["scene"] else DASH,
-            _plain(run["seed"]),
-            _plain(run["budget"]),
-            scored,
-            format_bytes(run["bytes"]),
-            _age(run["age_s"]),
-            run["state"] if run["state"] == "there" else f"[bold red]{escape(run['state'])}[/]",
-        )
-    console.print(runs if content["runs"] else "no runs")
-    stores = _table("Stores", "stage", "key", "version", "size", "age", "runs that name it")
-    for stage, rows in content["stages"].items():
-        for number, row in enumerate(rows[-MOST_ROWS:]):
-            size = "cleared" if row["cleared"] else format_bytes(row["bytes"])
-            size = "[bold red]damaged[/]" if row["problem"] else size
-            stores.add_row(
-                escape(stage) if number == 0 else "",
-                escape(row["key"]),
-                escape(row["version"]),
-                size,
-                _age(row["age_s"]),
-                str(row["runs"] or "none"),
-            )
-        if len(rows) > MOST_ROWS:
-            stores.add_row("", f"[dim]and {len(rows) - MOST_ROWS} older[/]", "", "", "", "")
-    console.print(stores if content["stages"] else "no stores")
+    columns: Sequence[str] = ("run", "scene", "seed", "budget", "mIoU", "size", "age", "state")
+    runs = map(_shown_run, content["runs"])
+    console.print(table(columns, runs, title="Runs", left=2, whole=WHOLE) if content["runs"] else "no runs")
+    rows = [row for stage, stores in content["stages"].items() for row in _shown_stores(stage, stores)]
+    columns = ("stage", "key", "version", "size", "age", "runs that name it")
+    console.print(table(columns, rows, title="Stores", left=3, whole=WHOLE) if rows else "no stores")
     for uri in content["lost"]:
         console.print(f"[bold red]{escape(uri)} has lost its manifest; run verify[/]", soft_wrap=True)
-    count = sum(map(len, content["stages"].values()))
-    _say(
-        console, f"{counted(len(content['runs']), 'run')}, {counted(count, 'store')}, {format_bytes(content['bytes'])}"
-    )
+    count = counted(sum(map(len, content["stages"].values())), "store")
+    _say(console, f"{counted(len(content['runs']), 'run')}, {count}, {format_bytes(content['bytes'])}")
+
+
+def _shown_run(run: Mapping[str, Any]) -> list[str]:
+    scene, miou = PurePath(str(run["scene"] or DASH)).name, known_number(run["miou"])
+    asked = [DASH if run[name] is None else str(run[name]) for name in ("seed", "budget")]
+    state = run["state"] if run["state"] == "there" else f"[bold red]{escape(run['state'])}[/]"
+    figures = ["not yet" if is_pending(run) else format_points(miou), format_bytes(run["bytes"]), _age(run["age_s"])]
+    return [*map(escape, (run["id"], scene, *asked)), *figures, state]
+
+
+def _shown_stores(stage: str, stores: Sequence[Mapping[str, Any]]) -> Iterator[list[str]]:
+    for number, row in enumerate(stores[-MOST_ROWS:]):
+        size = "cleared" if row["cleared"] else format_bytes(row["bytes"])
+        size = "[bold red]damaged[/]" if row["problem"] else size
+        name = escape(stage) if number == 0 else ""
+        yield [name, escape(row["key"]), escape(row["version"]), size, _age(row["age_s"]), str(row["runs"] or "none")]
+    if len(stores) > MOST_ROWS:
+        yield ["", f"[dim]and {len(stores) - MOST_ROWS} older[/]"]
 
 
 def show_clearance(content: dict[str, Any], console: Console) -> None:
@@ -385,13 +374,12 @@ def _show_changes(content: dict[str, Any], console: Console) -> None:
     if content["before"] is None:
         _say(console, "there is no earlier version of it in this archive")
         return
-    table = _table(f"Changed since {content['before']}", "stage", "what", "name", "before", "now", left=5)
-    for change in content["changes"][:MOST_ROWS]:
-        values = [_short(change[name]) for name in ("old", "new")]
-        table.add_row(*map(escape, (change["where"], change["kind"], change["name"], *values)))
-    if len(content["changes"]) > MOST_ROWS:
-        table.add_row("", "", f"[dim]and {len(content['changes']) - MOST_ROWS} more; --json has all[/]", "", "")
-    console.print(table)
+    shown, more = content["changes"][:MOST_ROWS], len(content["changes"]) - MOST_ROWS
+    parts = ([one["where"], one["kind"], one["name"], *(_short(one[when]) for when in ("old", "new"))] for one in shown)
+    rows = [list(map(escape, row)) for row in parts]
+    rows += [["", "", f"[dim]and {more} more; --json has all[/]"]] if more > 0 else []
+    title = escape(f"Changed since {content['before']}")
+    console.print(table(("stage", "what", "name", "before", "now"), rows, title=title, left=5, whole=WHOLE))
 
 
 def _branch(node: Mapping[str, Any], parent: Tree | None) -> Tree:
@@ -442,22 +430,6 @@ def show_repair(content: dict[str, Any], console: Console) -> None:
     _say(console, f"{len(done['remade'])} remade, {len(done['dropped'])} that no run named removed; {left}")
 
 
-def _table(title: str, *columns: str, left: int = 3) -> Table:
-    table = Table(
-        pad_edge=False,
-        title=escape(title),
-        title_justify="left",
-        title_style="bold",
-        header_style="dim",
-        box=SIMPLE_HEAD,
-        collapse_padding=True,
-    )
-    for number, column in enumerate(columns):
-        justify: Literal["left", "right"] = "left" if number < left else "right"
-        table.add_column(column, justify=justify, overflow="fold", no_wrap=column in WHOLE)
-    return table
-
-
 def _say(console: Console, text: str) -> None:
     console.print(escape(text), soft_wrap=True)
 
@@ -469,10 +441,6 @@ def _age(seconds: float | None) -> str:
         if seconds >= 2 * unit:
             return f"{seconds // unit:.0f} {word}"
     return format_seconds(max(seconds, 0))
-
-
-def _plain(value: object) -> str:
-    return DASH if value is None else escape(str(value))
 
 
 def _short(value: object) -> str:

@@ -7,10 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from flows.cli.app import ArchiveName, AsJson, OutFolder, check_outside
 from flows.publish.receipt import areas_on_ground
@@ -19,7 +17,7 @@ from flows.settings.survey_settings import BUILT_IN_SCENES
 from flows.tasks.scores import score_of
 from flows.terminal.figures import format_area, format_count, format_percent, format_points, known_number
 from flows.terminal.processes import DONE
-from flows.terminal.progress import put_out
+from flows.terminal.progress import put_out, table
 from pipeline.errors import ArchiveError, SceneError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import deferred
@@ -146,7 +144,9 @@ def _comparison(runs: tuple[Run, Run], maps: list[ClassMap]) -> dict[str, Any]:
     pairs = [divmod(int(one), len(names)) for one in order]
     differing = int(changed.sum())
     asked = [flatten({name: one for name, one in run.settings.items() if name not in NOT_ASKED}) for run in runs]
-    made = [_versions_and_keys(run) for run in runs]
+    keys = [{f"stage.{row.get('name')}": row.get("key") for row in run.stages} for run in runs]  # equal: the same store
+    versions = [one if isinstance(one := run.receipt.get("versions"), dict) else {} for run in runs]
+    made = [{**one, **own} for one, own in zip(versions, keys, strict=True)]
     sides = [
         {
             **{name: run.settings.get(name) for name in ("scene", "seed")},
@@ -190,13 +190,6 @@ def _classes(runs: tuple[Run, Run], joint: NDArray[np.int64], names: list[str]) 
     return found
 
 
-def _versions_and_keys(run: Run) -> dict[str, str]:
-    """What the receipt says of software, and the key of every stage: equal keys are the same store."""
-    versions = run.receipt.get("versions")
-    found = {str(name): str(value) for name, value in versions.items()} if isinstance(versions, Mapping) else {}
-    return found | {f"stage.{row.get('name')}": str(row.get("key")) for row in run.stages}
-
-
 def _changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[dict[str, Any]]:
     both = ((name, old.get(name, ABSENT), new.get(name, ABSENT)) for name in sorted(old.keys() | new.keys()))
     return [{"name": name, "old": before, "new": after} for name, before, after in both if before != after]
@@ -210,29 +203,19 @@ def _spent(receipt: Mapping[str, Any], name: str) -> float | None:
 
 def show_comparison(content: dict[str, Any], console: Console) -> None:
     """Print what `compare` found."""
-    table = _table("", "A", "B")
-    for name, show in (("run", str), ("miou", format_points), ("overall_accuracy", format_points)):
-        table.add_row(name.replace("_", " "), *(escape(show(content[side][name])) for side in "ab"))
-    for name, (label, cost) in COST_LABELS.items():
-        table.add_row(label, *map(cost, content["savings"][name]))
-    for name in ("settings", "made"):
-        for row in content[name]:
-            table.add_row(*(escape(str(row[part])) for part in ("name", "old", "new")))
-    console.print(table)
-    table = _table("class", "px in A", "px in B", "in A", "in B", "IoU of A and B")
+    figures = (("run", str), ("miou", format_points), ("overall_accuracy", format_points))
+    rows = [[name.replace("_", " "), *(escape(show(content[side][name])) for side in "ab")] for name, show in figures]
+    rows += [[label, *map(cost, content["savings"][name])] for name, (label, cost) in COST_LABELS.items()]
+    changed = [*content["settings"], *content["made"]]
+    rows += [[escape(str(row[part])) for part in ("name", "old", "new")] for row in changed]
+    console.print(table(("", "A", "B"), rows))
+    rows = []
     for row in content["classes"]:
         cells = [*map(format_area, row["ha"])] if "ha" in row else [*map(format_count, row["pixels"])]
-        table.add_row(escape(row["name"]), *cells, *map(format_percent, row["fraction"]), format_points(row["iou"]))
-    console.print(table)
+        rows.append([escape(row["name"]), *cells, *map(format_percent, row["fraction"]), format_points(row["iou"])])
+    console.print(table(("class", "px in A", "px in B", "in A", "in B", "IoU of A and B"), rows))
     figures = content["differing"]
     console.print(f"{format_count(figures['pixels'])} px, {format_percent(figures['fraction'])} differ")
     for row in content["largest"]:
         console.print(escape(f"  {row['from']} to {row['to']}: {format_count(row['pixels'])} px"), soft_wrap=True)
     console.print(escape(f"  {content['picture']}"), soft_wrap=True)
-
-
-def _table(*columns: str) -> Table:
-    table = Table(header_style="dim", box=SIMPLE_HEAD)
-    for number, column in enumerate(columns):
-        table.add_column(column, justify="right" if number else "left", overflow="fold")
-    return table

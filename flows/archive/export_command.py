@@ -25,7 +25,6 @@ from flows.archive.export_values import CSV, spectral_layers, write_areas
 from flows.archive.export_zones import check_zones, write_zones
 from flows.archive.product_choice import NO_PRODUCTS, ProductChoice, ProductFlags, choose_products
 from flows.cli.app import ArchiveName, AsJson, OutFile, Switch, check_outside, stderr
-from flows.settings.survey_settings import RASTER
 from flows.terminal.processes import DONE
 from flows.terminal.progress import print_json
 from pipeline.errors import ArchiveError, PipelineError
@@ -47,12 +46,8 @@ COLLECTION_TEXT = (
 )
 ENVI_NUMBERS = "application/octet-stream"
 NOT_PLACED = (
-    "The survey has no rig pose, and its scene no georeference: its images lie on the camera's angular grid "
-    "(transforms in radians), and where on earth that is is not known."
-)
-NOT_PLACED_RASTER = (  # nothing but a camera's angles is known without a place
-    "The raster does not say where on earth it lies: its images lie on the angular grid that a camera of the settings "
-    "would have (transforms in radians), one pixel of it for each of the raster's."
+    "The survey has no rig pose, and its scene no georeference: its images lie on a camera's angular grid (transforms "
+    "in radians), and where on earth that is is not known."
 )
 RUN_FILES = {
     "receipt.json": ("Receipt", "application/json", ["metadata"]),
@@ -123,8 +118,7 @@ def run_export(
             write_areas(opened, areas)
             export.add("areas", areas, "Areas of the classes, and how surely they are known", CSV, ["data", "metadata"])
             with console.status("drawing polygons"):
-                for made in write_zones(opened, export.folder, choice):
-                    export.add(made.key, made.path, made.title, made.kind, list(made.roles), **made.fields)
+                write_zones(opened, export.folder, choice, export.add)
             name_stores(export)
             if envi:
                 _export_cubes(export, console)
@@ -163,8 +157,7 @@ def _export_cubes(export: Export, console: Console) -> None:
     rows, columns, bands = mosaic.shape
     wave, width = load_bands(run.path("mosaic"))
     geobox = mosaic.geobox if mosaic.geobox is not None and has_map_info(mosaic.geobox) else None
-    unplaced = NOT_PLACED_RASTER if run.receipt["source"] == RASTER else NOT_PLACED
-    place = unplaced if run.geobox is None else "camera grid, no CRS" if geobox is None else "on the scene's map"
+    place = NOT_PLACED if run.geobox is None else "camera grid, no CRS" if geobox is None else "on the scene's map"
     text = f"coarse mosaic of {run.id}, scene values; {place}"
     file = EnviFile((rows, columns, bands), "f4", wave, width, text, float("nan"), geobox)
     header = export.folder / "envi" / "mosaic.hdr"
@@ -250,8 +243,7 @@ def describe_item(export: Export) -> Item:
     """The run's item, with all assets that were added."""
     run, receipt = export.run, export.run.receipt
     placed = run.geobox is not None
-    unplaced = NOT_PLACED_RASTER if receipt["source"] == RASTER else NOT_PLACED
-    where = "Images lie on a map." if placed else unplaced
+    where = "Images lie on a map." if placed else NOT_PLACED
     properties: dict[str, Any] = {
         "title": f"Survey of {receipt['survey']}",
         "description": f"Survey of {receipt['survey']} ({receipt['source']} source). {where}",

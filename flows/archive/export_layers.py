@@ -72,7 +72,7 @@ class ExportedRun:
         return self.archive.locate(self.receipt["products"][product])
 
     def sweeps(self) -> list[Path]:
-        refs = [self.store(product) for product in ("raw_coarse", "raw_fine", "raw_again")]  # the last of earlier runs
+        refs = [self.store(product) for product in ("raw_coarse", "raw_fine")]
         return [path for ref in refs if ref is not None for path in sorted(ref.path.glob("*.zarr"))]
 
     @cached_property
@@ -147,7 +147,7 @@ def layer_tags(run: ExportedRun, product: str, place: Place) -> dict[str, str]:
     }
 
 
-def _place(run: ExportedRun, stored: StoredImage) -> Place:
+def place_of(run: ExportedRun, stored: StoredImage) -> Place:
     """Where a store's images lie, as the store itself says."""
     if stored.geobox is not None:
         return Place.on_map(stored.geobox)
@@ -168,7 +168,7 @@ def image_layer(
 ) -> tuple[CogImage, Callable[[], Rows]]:
     """An image of a store as it stands there, on the store's own grid."""
     stored = open_image(run.path(product), array)
-    place = _place(run, stored)
+    place = place_of(run, stored)
     shape = (stored.shape[0], stored.shape[1])
     image = CogImage(shape, stored.dtype.name, place, bands, nodata, legend, layer_tags(run, product, place))
     return image, stored.rows
@@ -197,7 +197,7 @@ def _picture(run: ExportedRun) -> tuple[CogImage, Callable[[], Rows]]:
     """The coarse mosaic in a photograph's tones, 1 to 255, and 0 where nothing was captured."""
     stored, ref = open_image(run.path("mosaic"), "coverage"), run.store("mosaic")
     assert ref is not None
-    place = _place(run, stored)
+    place = place_of(run, stored)
     image = CogImage((stored.shape[0], stored.shape[1]), "uint8", place, RGB, 0, tags=layer_tags(run, "mosaic", place))
 
     def rows() -> Rows:
@@ -221,7 +221,7 @@ def seen_rows(run: ExportedRun) -> Iterator[tuple[int, NDArray[np.bool_]]]:
 def prior_map_layers(run: ExportedRun) -> list[Layer]:
     """Days since each pixel was looked at; of a run that goes on from another what changed, and from which class.
 
-    On the map where there is a pose. A run that believes nothing, of an earlier version, has none of them.
+    On the map where there is a pose.
     """
     layers = []
     if (product := _product_with(run, "age")) is not None:

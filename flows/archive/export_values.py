@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.archive.export_layers import ExportedRun, Layer, Rows, layer_tags
+from flows.archive.export_layers import ExportedRun, Layer, Rows, layer_tags, place_of
 from flows.archive.product_choice import ProductChoice
 from flows.settings.survey_settings import RASTER
 from pipeline.errors import SettingsError
@@ -35,16 +35,8 @@ from storage.export.image_files import CogImage, Place
 
 CSV = "text/csv"
 COLUMNS = (
-    "class",
-    "pixels",
-    "hectares",
-    "fraction",
-    "mean_confidence",
-    "estimated_fraction",
-    "estimated_hectares",
-    "standard_error_fraction",
-    "standard_error_hectares",
-    "estimated_from",
+    *("class", "pixels", "hectares", "fraction", "mean_confidence", "estimated_fraction"),
+    *("estimated_hectares", "standard_error_fraction", "standard_error_hectares", "estimated_from"),
 )
 DIGITS = 6
 BYTES_AT_ONCE = 1 << 27
@@ -126,10 +118,7 @@ class MosaicView:
         """Where the image lies."""
         if self.ground is not None:
             return Place.on_map(self.ground.geobox)
-        geobox = load_geobox(self.run.path("mosaic"))
-        if geobox is not None:
-            return Place.on_map(geobox)
-        return Place(tuple(map(float, open_image(self.run.path("mosaic"), "values").about["spatial:transform"])))
+        return place_of(self.run, open_image(self.run.path("mosaic"), "values"))
 
     @cached_property
     def shape(self) -> tuple[int, int]:
@@ -186,10 +175,7 @@ class RasterView:
     @cached_property
     def place(self) -> Place:
         """Where the image lies."""
-        about = open_image(self.run.path("class_map"), "classes")
-        if about.geobox is not None:
-            return Place.on_map(about.geobox)
-        return Place(tuple(map(float, about.about["spatial:transform"])))
+        return place_of(self.run, open_image(self.run.path("class_map"), "classes"))
 
     @cached_property
     def shape(self) -> tuple[int, int]:
@@ -256,7 +242,7 @@ def spectral_layers(run: ExportedRun, choice: ProductChoice) -> list[Layer]:
     Raises WavelengthError: the cube lacks bands of an index. SettingsError: an index wants reflectance, and the cube's
     values are none.
     """
-    if not (choice.reflectance or choice.indices):
+    if not (choice.flags.reflectance or choice.indices):
         return []
     # a raster's own pixels, unless its map is drawn on the ground by a pose; else the coarse mosaic
     own = run.receipt["source"] == RASTER and run.store("ground_map") is None
@@ -271,7 +257,7 @@ def spectral_layers(run: ExportedRun, choice: ProductChoice) -> list[Layer]:
                 f"{index.name} wants reflectance (0 to 1), and the values of run {run.id} reach {white:.3g}; choose "
                 "an index of ratios, such as NDVI or PRI"
             )
-    layers = [_reflectance(view, white)] if choice.reflectance else []
+    layers = [_reflectance(view, white)] if choice.flags.reflectance else []
     return layers + [_index(view, index, bands, white) for index, bands in zip(choice.indices, picked, strict=True)]
 
 

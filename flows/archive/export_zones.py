@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -41,18 +41,7 @@ from storage.export.map_files import (
 
 IN_DEGREES = {"proj:code": "EPSG:4326"}
 NEEDS_PLACE = "the run does not say where on earth it was; survey with a [pose], or a scene with a CRS"
-
-
-@dataclass(frozen=True)
-class Made:
-    """One file that was written, as the catalogue is to name it."""
-
-    key: str
-    path: Path
-    title: str
-    kind: str
-    roles: tuple[str, ...] = ("data",)
-    fields: dict[str, Any] = field(default_factory=dict)
+Add = Callable[..., None]  # names a file to the catalogue: key, path, title, media type, roles, fields of STAC's
 
 
 @dataclass(frozen=True)
@@ -67,12 +56,11 @@ class ClassRaster:
     @classmethod
     def of(cls, run: ExportedRun) -> ClassRaster:
         """Read them from the map's store."""
-        path = run.path(run.map_product)
-        stored = open_image(path, "classes")
+        stored = open_image(run.path(run.map_product), "classes")
         names, colours = stored.about["class_names"], np.array(stored.about["class_colours"], np.uint8)
-        transform = Affine(*stored.about["spatial:transform"])
         classes = np.concatenate([rows for _, rows in stored.rows()])
-        return cls(classes, ClassNames(tuple(names), colours.reshape(-1, 3)), transform, run.geobox)
+        legend = ClassNames(tuple(names), colours.reshape(-1, 3))
+        return cls(classes, legend, Affine(*stored.about["spatial:transform"]), run.geobox)
 
     @cached_property
     def pixel_m(self) -> float | None:
@@ -81,44 +69,41 @@ class ClassRaster:
 
     def shaped(self, choice: ProductChoice) -> ClassRaster:
         """Small regions given to a neighbour, classes grown in their order, and what that cut off given away again."""
-        buffers = class_numbers(self.legend.names, choice.buffers_m, "--buffer")
         if self.pixel_m is None:
             return self
-        least_px = choice.least_area_m2 / self.pixel_m**2
+        buffers = class_numbers(self.legend.names, choice.buffers_m, "--buffer")
+        least_px = choice.flags.least_area / self.pixel_m**2
         classes = merge_small(self.classes, least_px)
         for number, metres in buffers.items():
             classes = grow_class(classes, number, metres / self.pixel_m)
-        if buffers:
-            classes = merge_small(classes, least_px)
-        return ClassRaster(classes, self.legend, self.transform, self.geobox)
+        return replace(self, classes=merge_small(classes, least_px) if buffers else classes)
 
 
 def check_zones(run: ExportedRun, choice: ProductChoice) -> None:
     """Refuse what the run's classes or its place do not give (SettingsError)."""
     names = open_image(run.path(run.map_product), "classes").about["class_names"]
     class_numbers(names, choice.buffers_m, "--buffer")
-    if run.geobox is None and (choice.buffers_m or choice.least_area_m2 or choice.simplify_m is not None):
+    class_numbers(names, choice.doses, "--prescription")
+    flags = choice.flags
+    if run.geobox is None and (choice.buffers_m or flags.least_area or flags.simplify is not None):
         raise SettingsError(f"--buffer, --least-area and --simplify are in metres, and {NEEDS_PLACE}")
-    if choice.prescription is not None:
-        class_numbers(names, choice.prescription.doses, "--prescription")
-        if run.geobox is None:
-            raise SettingsError(f"a prescription is in metres, and {NEEDS_PLACE}")
+    if run.geobox is None and choice.doses:
+        raise SettingsError(f"a prescription is in metres, and {NEEDS_PLACE}")
 
 
-def write_zones(run: ExportedRun, folder: Path, choice: ProductChoice) -> Iterator[Made]:
-    """Write polygons and prescriptions that were asked for into ``folder``, each with its style."""
-    if not (choice.polygons or choice.prescription):
-        return
-    raster = ClassRaster.of(run).shaped(choice)
-    if choice.polygons:
-        yield from _write_polygons(run, raster, folder, choice)
-    if choice.prescription:
-        yield from _write_prescription(run, raster, folder, choice)
+def write_zones(run: ExportedRun, folder: Path, choice: ProductChoice, add: Add) -> None:
+    """Write polygons and prescriptions that were asked for into ``folder``, each with its style, and ``add`` them."""
+    if choice.flags.polygons or choice.doses:
+        raster = ClassRaster.of(run).shaped(choice)
+        if choice.flags.polygons:
+            _write_polygons(run, raster, folder, choice.flags.simplify, add)
+        if choice.doses:
+            _write_prescription(run, raster, folder, choice, add)
 
 
-def _write_polygons(run: ExportedRun, raster: ClassRaster, folder: Path, choice: ProductChoice) -> Iterator[Made]:
+def _write_polygons(run: ExportedRun, raster: ClassRaster, folder: Path, simplify_m: float | None, add: Add) -> None:
     side, crs = raster.pixel_m, None if raster.geobox is None else crs_wkt(raster.geobox)
-    tolerance = 1.0 if side is None or choice.simplify_m is None else choice.simplify_m / side
+    tolerance = 1.0 if side is None or simplify_m is None else simplify_m / side
     found = class_polygons(raster.classes, tolerance).moved(raster.transform)
     unit = "area_rad2" if side is None else "area_m2"
     area = found.polygon_areas() * (1.0 if side is None else side**2 / abs(raster.transform.determinant))
@@ -126,71 +111,55 @@ def _write_polygons(run: ExportedRun, raster: ClassRaster, folder: Path, choice:
     columns = {"class": found.classes.astype(np.int32), "name": names, unit: area}
     path = folder / "classes.gpkg"
     write_polygons(path, found.polygons, columns, crs, layer="classes", when=run.receipt["finished"])
-    yield Made("polygons", path, f"Classes as {len(names)} polygons", GEOPACKAGE)
-    entries: list[Entry] = [
-        (name, name, tuple(colour))
-        for name, colour in zip(raster.legend.names, raster.legend.colours.tolist(), strict=True)
-    ]
-    yield _styled(path, "name", entries)
+    add("polygons", path, f"Classes as {len(names)} polygons", GEOPACKAGE, ["data"])
+    colours = map(tuple, raster.legend.colours.tolist())
+    _add_style(path, "name", [(name, name, one) for name, one in zip(raster.legend.names, colours, strict=True)], add)
     if crs is not None:
         path = folder / "classes.geojson"
         write_polygons(path, found.polygons, columns, crs, layer="classes")
-        yield Made("polygons_geojson", path, "Classes as polygons, longitude and latitude", GEOJSON, fields=IN_DEGREES)
+        add("polygons_geojson", path, "Classes as polygons, longitude and latitude", GEOJSON, ["data"], **IN_DEGREES)
 
 
-def _styled(path: Path, column: str, entries: Sequence[Entry]) -> Made:
+def _add_style(path: Path, column: str, entries: Sequence[Entry], add: Add) -> None:
     style = path.with_suffix(".qml")
     write_polygon_style(style, column, entries)
-    return Made(f"{path.stem}_polygon_style", style, f"QGIS style of {path.name}", STYLE, ("metadata", "style"))
+    add(f"{path.stem}_polygon_style", style, f"QGIS style of {path.name}", STYLE, ["metadata", "style"])
 
 
-def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, choice: ProductChoice) -> Iterator[Made]:
-    asked = choice.prescription
-    assert asked is not None
+def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, choice: ProductChoice, add: Add) -> None:
     assert raster.geobox is not None
     assert raster.pixel_m is not None
-    doses = class_numbers(raster.legend.names, asked.doses, "--prescription")
-    heading = Heading(asked.heading)
+    flags, unit, heading = choice.flags, choice.unit, Heading(choice.flags.heading % 360)
+    doses = class_numbers(raster.legend.names, choice.doses, "--prescription")
     plane, to_own = to_plane(raster.geobox)
 
     def along_heading(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
         place = plane(x, y)
         return heading.to_axes(place[..., 0], place[..., 1])
 
-    grid, found = _dosed(raster, doses, asked.least_fraction, (asked.cell_m, asked.cell_m), along_heading)
+    grid, found = _dosed(raster, doses, flags.least_fraction, (flags.cell, flags.cell), along_heading)
     seen = np.isfinite(found)
     row, column = np.nonzero(seen)
-    columns = {"dose": found[seen], "unit": [asked.unit.name] * len(row), "row": row, "col": column}
+    columns: dict[str, Any] = {"dose": found[seen], "unit": [unit.name] * len(row), "row": row, "col": column}
     path = folder / "prescription.shp"
     write_polygons(path, cell_polygons(grid, heading)[seen], columns, to_own)
-    words = ", ".join(f"{name} {dose:g} {asked.unit.name}" for name, dose in asked.doses.items())
-    title = f"Prescription ({words}) in cells of {asked.cell_m:g} m along {heading.degrees:g} degrees"
-    yield Made("prescription", path, f"{title}; .shx, .dbf, .prj and .cpg beside it", SHAPEFILE)
+    words = ", ".join(f"{name} {dose:g} {unit.name}" for name, dose in choice.doses.items())
+    title = f"Prescription ({words})"
+    cells = f"in cells of {flags.cell:g} m along {heading.degrees:g} degrees; .shx, .dbf, .prj and .cpg beside it"
+    add("prescription", path, f"{title} {cells}", SHAPEFILE, ["data"])
     most = max(doses.values())
     levels = sorted({0.0, *found[seen].tolist()})
-    shown = [(d, f"{d:g} {asked.unit.name}", ramp_colour(d / most, REDS) if d else NONE) for d in levels]
-    yield _styled(path, "dose", shown)
-    step = tuple(round(asked.cell_m / metres, DEGREE_DIGITS) for metres in degree_m(raster.geobox))
-    degrees = to_degrees(raster.geobox)
-    grid, found = _dosed(raster, doses, asked.least_fraction, (step[0], step[1]), degrees)
-    known = int((raster.classes != UNLABELLED).sum())
-    about = TaskText(
-        run.receipt["survey"],
-        run.receipt["survey"],
-        words,
-        str(run.receipt["versions"].get("spectralzoom", "unknown")),
-        known * raster.pixel_m**2,
-    )
-    task = TaskGrid(*grid.corner, *grid.step, found, asked.unit)
-    for key, path, kind in zip(
-        ("task_data", "task_grid"),
-        write_task_data(folder, task, about),
-        ("application/xml", "application/octet-stream"),
-        strict=True,
-    ):
-        yield Made(
-            key, path, f"{title.split(' in ')[0]} as ISOXML task data, cells along north", kind, fields=IN_DEGREES
-        )
+    shown = [(d, f"{d:g} {unit.name}", ramp_colour(d / most, REDS) if d else NONE) for d in levels]
+    _add_style(path, "dose", shown, add)
+    down, across = (round(flags.cell / metres, DEGREE_DIGITS) for metres in degree_m(raster.geobox))
+    grid, found = _dosed(raster, doses, flags.least_fraction, (down, across), to_degrees(raster.geobox))
+    known_m2 = int((raster.classes != UNLABELLED).sum()) * raster.pixel_m**2
+    survey, version = run.receipt["survey"], str(run.receipt["versions"].get("spectralzoom", "unknown"))
+    task = TaskGrid(*grid.corner, *grid.step, found, unit)
+    files = write_task_data(folder, task, TaskText(survey, survey, words, version, known_m2))
+    kinds = (("task_data", "application/xml"), ("task_grid", "application/octet-stream"))
+    for (key, kind), file in zip(kinds, files, strict=True):
+        add(key, file, f"{title} as ISOXML task data, cells along north", kind, ["data"], **IN_DEGREES)
 
 
 def _dosed(

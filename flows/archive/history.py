@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import base64
-import difflib
 import io
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -72,10 +72,6 @@ class FieldHistory:
     visits: Sequence[Mapping[str, str]] = ()
     colours: Mapping[str, str] = dataclass_field(default_factory=dict)  # of the classes on the maps, as CSS writes them
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return what is written as JSON."""
-        return {"field": self.field, "archive": self.archive, "runs": list(self.runs)}
-
 
 def report(archive: ArchiveName, *, field: str | None = None, out: OutFile, as_json: AsJson = False) -> int:
     """Write a field's history as one page that opens from disk: dates, class areas, savings.
@@ -83,7 +79,7 @@ def report(archive: ArchiveName, *, field: str | None = None, out: OutFile, as_j
     Parameters
     ----------
     field
-        What it is called; without one an index of all fields is written, beside a page for each.
+        What it is called; needed where the archive has several.
     out
         The page to write.
     """
@@ -94,48 +90,34 @@ def report(archive: ArchiveName, *, field: str | None = None, out: OutFile, as_j
     if page.suffix.lower() not in (".html", ".htm"):
         raise SettingsError(f"--out {out}: expected a page's name that ends in .html")
     with stderr.status("reading the archive"):
-        histories = read_histories(opened, field)
-    names = {one.field: page.name if field else f"{page.stem}-{one.field}{page.suffix}" for one in histories}
-    written = []
-    for one in histories:
-        written.append(page.with_name(names[one.field]))
-        write_whole(written[-1], render_history(one, "" if opened.in_bucket else way_to(opened.root, written[-1])))
-    content = (
-        histories[0].to_dict() if field else {"archive": opened.name, "fields": [one.to_dict() for one in histories]}
-    )
-    if not field:
-        write_whole(page, render_index(histories, opened.name, names))
-        written.append(page)
-    stderr.print(f"  {escape(str(written[-1]))}", soft_wrap=True)
+        history = read_history(opened, field)
+    runs_at = "" if opened.in_bucket else quote(Path(os.path.relpath(opened.root, page.parent)).as_posix())
+    write_whole(page, render_history(history, runs_at))
+    stderr.print(f"  {escape(str(page))}", soft_wrap=True)
     if as_json:
-        print_json({**content, "pages": [str(path) for path in written]})
+        print_json({"field": history.field, "archive": history.archive, "runs": list(history.runs), "page": str(page)})
     return DONE
 
 
-def read_histories(archive: Archive, field: str | None = None) -> list[FieldHistory]:
-    """Return the histories of all fields by name, or of one. Raises ArchiveError: no field is called so."""
+def read_history(archive: Archive, field: str | None = None) -> FieldHistory:
+    """Return the history of a field, or of the only one. Raises ArchiveError: no field is called so, or several are."""
     catalogue = Catalogue.read(archive.root)
     names = sorted({called(run) for run in catalogue.runs})
-    if field is not None and field not in names:
-        near = difflib.get_close_matches(field, names, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(names) or 'none'}"
-        raise ArchiveError(f"no field of {archive.name} is called {field!r}; {hint}")
-    found = []
-    for name in names if field is None else [field]:
-        own = sorted(
-            (run for run in catalogue.runs if called(run) == name), key=lambda run: str(time_of_visit(run) or "")
-        )
-        maps = {run.uri: shown for run in own if (shown := _map_of(archive, catalogue, run)) is not None}
-        rows = [_row(run, maps.get(run.uri)) for run in own]
-        mapped = [(run, row) for run, row in zip(own, rows, strict=True) if run.uri in maps][-MOST_VISITS:]
-        visits = [_visit(archive, run, row, maps[run.uri]) for run, row in mapped]
-        colours = {
-            one: f"#{bytes(map(int, rgb)).hex()}"
-            for shown in maps.values()
-            for one, rgb in zip(shown.names, shown.colours, strict=False)
-        }
-        found.append(FieldHistory(name, archive.name, rows, visits, colours))
-    return found
+    name = names[0] if field is None and len(names) == 1 else field
+    if name not in names:
+        which = f"no field of {archive.name} is called {name!r}" if name else f"{archive.name} has {len(names)} fields"
+        raise ArchiveError(f"{which}; give --field with one of: {', '.join(names) or 'none'}")
+    own = sorted((run for run in catalogue.runs if called(run) == name), key=lambda run: str(time_of_visit(run) or ""))
+    maps = {run.uri: shown for run in own if (shown := _map_of(archive, catalogue, run)) is not None}
+    rows = [_row(run, maps.get(run.uri)) for run in own]
+    mapped = [(run, row) for run, row in zip(own, rows, strict=True) if run.uri in maps][-MOST_VISITS:]
+    visits = [_visit(archive, run, row, maps[run.uri]) for run, row in mapped]
+    colours = {
+        one: f"#{bytes(map(int, rgb)).hex()}"
+        for shown in maps.values()
+        for one, rgb in zip(shown.names, shown.colours, strict=False)
+    }
+    return FieldHistory(str(name), archive.name, rows, visits, colours)
 
 
 def _map_of(archive: Archive, catalogue: Catalogue, run: Run) -> ClassMap | None:
@@ -294,26 +276,6 @@ def _drawn(charts: Sequence[tuple[str, Points, bool]], colours: Mapping[str, str
         yield title, f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode('ascii')}"
 
 
-def render_index(histories: Sequence[FieldHistory], archive: str, names: Mapping[str, str]) -> str:
-    """Return a page of all fields of an archive; ``names`` are the files of their histories."""
-    return pages.render_page(
-        "fields.html",
-        kicker="SpectralZoom archive",
-        title="Fields",
-        lead=f"{counted(len(histories), 'field')}.",
-        about=f"{archive}; times in UTC",
-        fields=[
-            {
-                "name": one.field,
-                "page": names[one.field],
-                "runs": len(one.runs),
-                "newest": _short(max((str(row["created"]) for row in one.runs), default="")) or DASH,
-            }
-            for one in histories
-        ],
-    )
-
-
 def _shown(row: Row, runs_at: str) -> dict[str, Any]:
     largest = sorted(row["areas"].items(), key=lambda item: -item[1])[:3]
     show = format_area if row["unit"] == "ha" else format_percent
@@ -331,12 +293,3 @@ def _shown(row: Row, runs_at: str) -> dict[str, Any]:
 def _short(text: str) -> str:
     moment = read_moment(text)
     return text if moment is None else f"{moment:%Y-%m-%d %H:%M}"
-
-
-def way_to(archive: Path, page: Path) -> str:
-    """Return the way from a page's folder to the archive's, as a link; an absolute one where nothing is in common."""
-    folder, root = page.absolute().parent, archive.absolute()
-    for up, parent in enumerate((folder, *folder.parents)):
-        if root.is_relative_to(parent) and parent != Path(parent.anchor):
-            return "/".join([*[".."] * up, *(quote(part) for part in root.relative_to(parent).parts)]) or "."
-    return root.as_uri()

@@ -7,12 +7,11 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from textwrap import shorten
 from typing import TYPE_CHECKING, Any, Literal
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from flows.cli.app import AsJson
 from flows.cli.survey_verbs import NO_FLAGS, SurveyFlags, by_setting
@@ -28,14 +27,14 @@ from flows.tasks.stages.accuracy import evaluate
 from flows.tasks.stages.attention import load_plan
 from flows.terminal.figures import format_bytes, format_count, format_percent, format_points, format_seconds
 from flows.terminal.processes import DONE
-from flows.terminal.progress import put_out
+from flows.terminal.progress import put_out, table
 from pipeline.errors import IncompleteStoreError, PipelineError
 from pipeline.lazy import deferred
 from pipeline.planning.fine_pass import FinePlan
 from pipeline.planning.uniform_scans import format_scan
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, plain, store_at
-from storage.archive.lineage import Catalogue, Change, changes_between
+from storage.archive.lineage import Catalogue, Change, changes_between, scenes_of
 from storage.archive.records import Store
 from storage.archive.staging import refusals
 from storage.arrays.class_maps import ClassMap, load_class_map
@@ -128,9 +127,8 @@ def forecast(settings: Settings, preview: Path | None = None) -> Forecast:
         fine = _planned_fine(planner.products["score"])
         figures = field_figures(run, fine)
         if preview is not None:
-            shown = plan_preview.PlanPicture(run, fine, _last_map(run, catalogue), figure_lines(figures))
             with refusals(preview.parent, "write the preview"):
-                plan_preview.draw_preview(preview, shown)
+                plan_preview.draw_preview(preview, run, fine, _last_map(run, catalogue), figure_lines(figures))
     kept = None if run.budget is None else run.budget.figures(run.budget.most_patches)
     return Forecast(planner.rows, run.refused, run.scans, figures, kept)
 
@@ -200,19 +198,13 @@ class Planner(OpenSurvey):
             for one in self.catalogue.stores.values()
             if one.ref.stage == store.ref.stage and not one.problem and stage.inputs in (None, len(one.inputs))
         ]
-        same = [one for one in stored if self._is_of_scene(one)]
+        known = replace(self.catalogue, stores=self.catalogue.stores | self._planned)
+        same = [one for one in stored if scenes_of(known, one.ref.uri) <= {self.run.scene.key}]
         before = max(same, key=lambda one: one.created, default=None)
         if before is None:
             return ("nothing stored yet of this scene" if stored else "nothing stored yet"), ()
-        known = replace(self.catalogue, stores=self.catalogue.stores | self._planned)
         found = tuple(change for change in changes_between(known, before, store) if change.kind != "library")
         return _format_summary(found, store.ref.stage), found
-
-    def _is_of_scene(self, store: Store) -> bool:
-        """Whether a store is of the run's scene, or of none: a geolocation grid is of a path."""
-        below = [store.ref.uri, *self.catalogue.ancestors([store.ref.uri])]
-        stores = (self.catalogue.stores[uri] for uri in below if uri in self.catalogue.stores)
-        return {str(one.params["scene"]) for one in stores if "scene" in one.params} <= {self.run.scene.key}
 
 
 def _format_summary(changes: Sequence[Change], stage: str) -> str:
@@ -237,6 +229,7 @@ def _shown(value: object) -> str:
 
 
 MOST_SCANS = 8  # of the frontier that are shown
+SCANS_TITLE = "One uniform scan of the field, by the weights' record"
 MARKS = {"taken": "this survey", "reference": "nearly as good as any"}
 MOST_LETTERS = 250  # of a reason
 COLOURS = {"cached": "green", "to run": "bold", "blocked": "yellow"}
@@ -271,13 +264,11 @@ def scans_content(scans: ScanChoice) -> dict[str, Any]:
 
 def show_plan(content: dict[str, Any], console: Console) -> None:
     """Print the forecast as a table."""
-    table = Table(header_style="dim", box=SIMPLE_HEAD, collapse_padding=True)
-    for name in ("stage", "state", "why"):
-        table.add_column(name, overflow="fold", no_wrap=name != "why")
-    for row in content["stages"]:
-        why = row["why"] if len(row["why"]) <= MOST_LETTERS else f"{row['why'][: MOST_LETTERS - 3]}..."
-        table.add_row(row["stage"], f"[{COLOURS[row['state']]}]{row['state']}[/]", escape(why))
-    console.print(table)
+    rows = [
+        [row["stage"], f"[{COLOURS[row['state']]}]{row['state']}[/]", escape(shorten(row["why"], MOST_LETTERS))]
+        for row in content["stages"]
+    ]
+    console.print(table(("stage", "state", "why"), rows, left=3, whole=("stage", "state")))
     for line in figure_lines(content["field"]):
         console.print(escape(line), soft_wrap=True)
     if "kept" in content:
@@ -296,9 +287,8 @@ def show_plan(content: dict[str, Any], console: Console) -> None:
 
 def figure_lines(figures: Mapping[str, Any]) -> list[str]:
     """The figures of the field and of the captures in words, a line each."""
-    ((_, ground),) = finding_rows({"field": figures})
-    size = "" if figures["view_deg"] is None else f"{' x '.join(map(format_count, figures['size_px']))} px, "
-    lines = [f"field: {size}{ground}"]
+    size = f"{' x '.join(map(format_count, figures['size_px']))} px"
+    lines = [f"field: {'; '.join((size, *(words for _, words in finding_rows({'field': figures}))))}"]
     if figures["kept_fraction"] is not None:
         lines.append(f"zones: {format_percent(figures['kept_fraction'])} of the field is kept to")
     if figures["ground_pixel_m"] is None:
@@ -327,17 +317,14 @@ def format_kept(kept: Mapping[str, Any]) -> str:
 
 def _show_scans(scans: dict[str, Any], console: Console) -> None:
     """Print what uniform scans of the field cost, and what the weights' record expects of them."""
-    title = "One uniform scan of the field, by the weights' record"
-    table = Table(title=title, title_justify="left", header_style="dim", box=SIMPLE_HEAD, collapse_padding=True)
-    for name in ("scan", "", "seconds", "raw data", "mIoU, about"):
-        table.add_column(name, justify="left" if name in ("scan", "") else "right", no_wrap=True)
     rows = {scan["seconds"]: scan for scan in scans["frontier"]}
     marks = {name: scans[name] for name in ("taken", "reference") if scans[name] is not None}
     rows |= {scan["seconds"]: scan for scan in marks.values()}
+    cells = []
     for seconds, scan in sorted(rows.items()):
         said = ", ".join(MARKS[name] for name, one in marks.items() if one == scan)
         spread = "" if scan["expected_spread"] is None else f" ± {format_points(scan['expected_spread'])}"
-        expected = f"{format_points(scan['expected_miou'])}{spread}"
-        figures = f"{seconds:.1f}", format_bytes(scan["bytes_raw"]), expected
-        table.add_row(format_scan(scan["step"], scan["exposure_ms"]), said, *figures)
-    console.print(table)
+        figures = f"{seconds:.1f}", format_bytes(scan["bytes_raw"]), f"{format_points(scan['expected_miou'])}{spread}"
+        cells.append([format_scan(scan["step"], scan["exposure_ms"]), said, *figures])
+    columns = ("scan", "", "seconds", "raw data", "mIoU, about")
+    console.print(table(columns, cells, left=2, title=SCANS_TITLE, whole=columns))

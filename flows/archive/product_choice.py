@@ -1,4 +1,4 @@
-"""What products an export is asked for: flags, what they mean for the classes of a run, and what cannot be meant."""
+"""The products that an export is asked for: flags, and what they mean, checked as far as words alone can be."""
 
 from __future__ import annotations
 
@@ -54,58 +54,35 @@ NO_PRODUCTS = ProductFlags()
 
 
 @dataclass(frozen=True)
-class Prescription:
-    """Doses by class, and the cells that get them."""
+class ProductChoice:
+    """The flags as values: indices, doses by class (empty without a prescription) and their unit, metres by class."""
 
+    flags: ProductFlags
+    indices: tuple[SpectralIndex, ...]
     doses: Mapping[str, float]
     unit: DoseUnit
-    cell_m: float
-    heading: float  # degrees clockwise from north
-    least_fraction: float
-
-
-@dataclass(frozen=True)
-class ProductChoice:
-    """Products to make of a run, checked as far as words alone can be."""
-
-    reflectance: bool
-    indices: tuple[SpectralIndex, ...]
-    polygons: bool
-    prescription: Prescription | None
-    least_area_m2: float
     buffers_m: Mapping[str, float]
-    simplify_m: float | None  # None by a pixel
 
 
 def choose_products(flags: ProductFlags) -> ProductChoice:
     """Read the flags. Raises SettingsError: a number, an index or a unit that cannot be, or that nothing asks for."""
-    for name, value in (("--least-area", flags.least_area), ("--simplify", flags.simplify or 0.0)):
-        if not 0 <= value < float("inf"):
-            raise SettingsError(f"{name} expects 0 or more, got {value:g}")
     doses = by_class(flags.prescription, "--prescription", "weed=2.5")
+    numbers = (
+        ("--least-area", flags.least_area, 0 <= flags.least_area < float("inf"), "0 or more"),
+        ("--simplify", flags.simplify, 0 <= (flags.simplify or 0.0) < float("inf"), "0 or more"),
+        ("--cell", flags.cell, 0 < flags.cell < float("inf"), "metres above 0"),
+        ("--heading", flags.heading, abs(flags.heading) <= 360, "degrees from north"),
+        ("--least-fraction", flags.least_fraction, 0 <= flags.least_fraction < 1, "a fraction from 0 to below 1"),
+    )
+    for name, value, is_right, expected in numbers:
+        if not is_right:
+            raise SettingsError(f"{name} expects {expected}, got {value:g}")
     if (flags.buffer or flags.least_area) and not (doses or flags.polygons):
         raise SettingsError("--buffer and --least-area shape polygons and prescriptions; ask for one of them as well")
-    return ProductChoice(
-        flags.reflectance,
-        tuple(dict.fromkeys(find_index(name) for name in split_list(flags.indices))),
-        flags.polygons,
-        _prescription(flags, doses) if doses else None,
-        flags.least_area,
-        by_class(flags.buffer, "--buffer", "weed=0.3"),
-        flags.simplify,
-    )
-
-
-def _prescription(flags: ProductFlags, doses: Mapping[str, float]) -> Prescription:
     if flags.dose_unit not in UNITS:
         raise SettingsError(f"--dose-unit expects {' or '.join(UNITS)}, got {flags.dose_unit!r}")
-    if not 0 < flags.cell < float("inf"):
-        raise SettingsError(f"--cell expects metres above 0, got {flags.cell:g}")
-    if not 0 <= flags.least_fraction < 1:
-        raise SettingsError(f"--least-fraction expects a fraction from 0 to below 1, got {flags.least_fraction:g}")
-    if not abs(flags.heading) <= 360:
-        raise SettingsError(f"--heading expects degrees from north, -360 to 360, got {flags.heading:g}")
-    return Prescription(doses, UNITS[flags.dose_unit], flags.cell, flags.heading % 360, flags.least_fraction)
+    indices = tuple(dict.fromkeys(find_index(name) for name in split_list(flags.indices)))
+    return ProductChoice(flags, indices, doses, UNITS[flags.dose_unit], by_class(flags.buffer, "--buffer", "weed=0.3"))
 
 
 def by_class(text: str | None, flag: str, example: str) -> dict[str, float]:

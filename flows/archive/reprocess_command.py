@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +16,10 @@ from rich.markup import escape
 
 from flows.archive.compare_command import find_run
 from flows.archive.stale_runs import (
-    Generation,
     asked_again,
     from_raw_cubes,
     is_called,
     is_current,
-    is_whole,
     newest_runs,
     renewals,
     renewed_prior,
@@ -31,8 +28,7 @@ from flows.cli.app import ArchiveName, AsJson, Scheduler, Switch, Workers, stder
 from flows.publish.receipt import Receipt
 from flows.publish.run_folder import extend_with_accuracy, load_receipt
 from flows.publish.survey_command import run_survey, show_published
-from flows.settings.load import of_this_version, parse_settings
-from flows.settings.survey_settings import OF_THE_MACHINE, Settings
+from flows.settings.survey_settings import Settings
 from flows.tasks.observer import Observer
 from flows.tasks.open_survey import JUDGED, STAGES, TITLES, OpenSurvey, Products, versions
 from flows.tasks.run import SurveyRun, open_run
@@ -60,9 +56,7 @@ STATES = ("ran", "would run", "skipped", "failed")
 def reprocess(
     archive: ArchiveName,
     *,
-    since: str | None = None,
     field: str | None = None,
-    failed: Switch = False,
     weights: Path | None = None,
     scheduler: Scheduler = "threads",
     workers: Workers = None,
@@ -73,139 +67,94 @@ def reprocess(
 
     Parameters
     ----------
-    since
-        Only fields whose newest run is of this date (UTC) or later: 2026-05-01
     field
         Only fields whose survey, scene file or newest run is called so; * stands for any letters.
-    failed
-        Only fields whose newest run is damaged or lacks stores; what `verify` finds in bytes is for its --repair.
     weights
         Other model weights for all of them.
     dry_run
         Only say what would run.
     """
-    request = ReprocessRequest(archive, since, field, failed, weights, dry_run, WorkerPool(scheduler, workers))
-    return run_reprocess(request, stderr, as_json=as_json)
+    pool = WorkerPool(scheduler, workers)
+    return run_reprocess(archive, stderr, as_json=as_json, field=field, weights=weights, dry_run=dry_run, pool=pool)
 
 
-@dataclass(frozen=True)
-class ReprocessRequest:
-    """Which fields, and with what."""
-
-    archive: str | Path
-    since: str | None = None  # ISO date (UTC); the newest run of the field is of this day or later
-    field: str | None = None  # what survey, scene file or run is called; * for any letters
-    failed: bool = False  # only where the newest run is damaged or lacks stores
-    weights: Path | None = None
-    dry_run: bool = False
-    pool: WorkerPool = THREADS  # who makes blocks; what the old runs were made by need not be there
-
-
-def run_reprocess(
-    request: ReprocessRequest, console: Console, *, survey: Survey | None = None, as_json: bool = False
-) -> int:
-    """Survey again what was asked for; progress on ``console``, the summary on stdout. Raises as `reprocess_fields`."""
-    content = reprocess_fields(request, console, survey)
+def run_reprocess(archive: str | Path, console: Console, *, as_json: bool = False, **wishes: Any) -> int:
+    """Survey again what was asked for, as `reprocess_fields`; progress on ``console``, the summary on stdout."""
+    content = reprocess_fields(archive, console, **wishes)
     put_out(content, _show, as_json=as_json)
     failed = sum(row["state"] == "failed" for row in content["fields"])
     return DONE if not failed else FAILED if failed == len(content["fields"]) else PARTLY
 
 
-def reprocess_fields(request: ReprocessRequest, console: Console, survey: Survey | None = None) -> dict[str, Any]:
-    """Survey again what was asked for, and return a row a field.
+def reprocess_fields(
+    archive: str | Path,
+    console: Console,
+    *,
+    field: str | None = None,
+    weights: Path | None = None,
+    dry_run: bool = False,
+    pool: WorkerPool = THREADS,
+    survey: Survey | None = None,
+) -> dict[str, Any]:
+    """Survey again what was asked for, and return a row a field; ``pool`` makes blocks, whoever made the old ones.
 
     Fields whose newest run is already as it would become are skipped: the same command goes on after an interruption.
-    Raises SettingsError: a date that is none, or no field is called so; ArchiveError: the archive cannot be read or
-    written.
+    Raises SettingsError: no field is called so; ArchiveError: the archive cannot be read or written.
     """
-    opened = open_archive(request.archive, create=False, write=not request.dry_run)
+    opened = open_archive(archive, create=False, write=not dry_run)
     catalogue = Catalogue.read(opened.root)
-    wanted = _chosen(catalogue, request)
+    if weights is not None and not weights.is_file():
+        raise SettingsError(f"--weights {weights}: there is no such file; give weights that train has written")
+    fields = newest_runs(catalogue)
+    wanted = fields if field is None else [one for one in fields if is_called(one, field)]
+    if field is not None and not wanted:
+        names = ", ".join(dict.fromkeys(one.field for one in fields)) or "none"
+        raise SettingsError(f"--field {field}: no field of this archive is called so; there are {names}")
     rows: list[dict[str, Any]] = []
     renewed = renewals(catalogue)
-    with request.pool.open():  # one start of its workers for all fields
+    with pool.open():  # one start of its workers for all fields
         for number, generation in enumerate(wanted, 1):
-            summary = f"{number} of {len(wanted)}: {generation.field} ({generation.run.folder.name})"
+            old = generation.run.folder.name
+            summary = f"{number} of {len(wanted)}: {generation.field} ({old})"
             console.print(f"[bold]reprocess {escape(summary)}[/]", soft_wrap=True)
-            rows.append(_again(catalogue, generation, request, console, survey or _survey, renewed))
-            if rows[-1]["new"] is not None:
-                renewed[generation.run.folder.name] = rows[-1]["new"]
+            begun, before = time.perf_counter(), _scores(generation.run.receipt, "before")
+            row = {"field": generation.field, "scene": generation.run.settings.get("scene"), "old": old, "new": None}
+            row |= {"state": "failed", "message": None, **before, **_scores({}, "after")}
+            try:
+                settings = _asked(catalogue, generation.run, str(archive), weights, pool, renewed)
+                if settings is None:
+                    row |= {"state": "skipped", "message": "is as it would become"}
+                    row |= _scores(generation.run.receipt, "after")
+                elif dry_run:
+                    row |= {"state": "would run"}
+                else:
+                    folder = (survey or _survey)(settings, console)
+                    row |= {"new": folder.name, "state": "ran", **_scores(read_run(folder, {}).receipt, "after")}
+                    renewed[old] = folder.name
+            except PipelineError as error:
+                row |= {"message": str(error)}
+            rows.append(row | {"seconds": time.perf_counter() - begun})
             console.print(escape(_format_row(rows[-1])), soft_wrap=True)
-    return {"archive": opened.name, "dry_run": request.dry_run, "fields": rows}
+    return {"archive": opened.name, "dry_run": dry_run, "fields": rows}
 
 
-def _chosen(catalogue: Catalogue, request: ReprocessRequest) -> list[Generation]:
-    if request.weights is not None and not request.weights.is_file():
-        raise SettingsError(f"--weights {request.weights}: there is no such file; give weights that train has written")
-    since = None if request.since is None else _moment(request.since)
-    fields = newest_runs(catalogue)
-    if request.field is not None:
-        names = ", ".join(dict.fromkeys(one.field for one in fields)) or "none"
-        fields = [one for one in fields if is_called(one, request.field)]
-        if not fields:
-            raise SettingsError(f"--field {request.field}: no field of this archive is called so; there are {names}")
-    if since is not None:
-        fields = [one for one in fields if _moment(one.run.created or "0001-01-01") >= since]
-    if request.failed:
-        fields = [one for one in fields if not is_whole(catalogue, one.run)]
-    return fields
+def _asked(
+    catalogue: Catalogue, run: Run, archive: str, weights: Path | None, pool: WorkerPool, renewed: Mapping[str, str]
+) -> Settings | None:
+    """Return what to survey a field by again; None where its newest run is already as it would become.
 
-
-def _moment(text: str) -> datetime:
-    try:
-        moment = datetime.fromisoformat(text)
-    except ValueError:
-        raise SettingsError(f"--since expects a date such as 2026-05-01, got {text!r}") from None
-    return moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
-
-
-def _again(
-    catalogue: Catalogue,
-    generation: Generation,
-    request: ReprocessRequest,
-    console: Console,
-    survey: Survey,
-    renewed: Mapping[str, str],
-) -> dict[str, Any]:
-    """Survey one field again; ``renewed`` names the newest run of each visit that another may go on from."""
-    run, begun = generation.run, time.perf_counter()
-    row: dict[str, Any] = {
-        "field": generation.field,
-        "scene": run.settings.get("scene"),
-        "old": run.folder.name,
-        "new": None,
-        "state": "failed",
-        "message": None,
-        **_scores(run.receipt, "before"),
-        **_scores({}, "after"),
-        "seconds": None,
-    }
-    try:
-        settings = asked_again(run, str(request.archive), request.weights)
-        settings = replace(settings, scheduler=request.pool.scheduler, workers=request.pool.workers)
-        prior = renewed_prior(settings.prior, renewed)
-        if prior == settings.prior and is_current(catalogue, run, settings):
-            same = {"state": "skipped", "message": "is as it would become"}
-            return row | same | _scores(run.receipt, "after")
-        settings = from_raw_cubes(catalogue, run, replace(settings, prior=prior))
-        settings = replace(settings, scheduler=request.pool.scheduler, workers=request.pool.workers)
-        if request.dry_run:
-            return row | {"state": "would run"}
-        folder = survey(settings, console)
-    except PipelineError as error:
-        return row | {"message": str(error), "seconds": time.perf_counter() - begun}
-    after, seconds = _scores(read_run(folder, {}).receipt, "after"), time.perf_counter() - begun
-    return row | {"new": folder.name, "state": "ran", **after, "seconds": seconds}
+    ``renewed`` names the newest run of each visit that another may go on from.
+    """
+    here: dict[str, Any] = {"scheduler": pool.scheduler, "workers": pool.workers}
+    settings = replace(asked_again(run, archive, weights), **here)
+    prior = renewed_prior(settings.prior, renewed)
+    if prior == settings.prior and is_current(catalogue, run, settings):
+        return None
+    return replace(from_raw_cubes(catalogue, run, replace(settings, prior=prior)), **here)
 
 
 def _survey(settings: Settings, console: Console) -> Path:
     return run_survey(settings, console).folder
-
-
-def survey_as_before(settings: Mapping[str, Any], out: str, console: Console) -> None:
-    """Survey by the settings of a run's receipt into the archive ``out``, on this machine's own terms."""
-    here = {**of_this_version(settings), "out": out, **dict.fromkeys(OF_THE_MACHINE)}
-    run_survey(parse_settings(here), console)
 
 
 def _scores(receipt: Mapping[str, Any], when: str) -> dict[str, float | None]:
@@ -254,7 +203,8 @@ def run_judge(
     if labels is not None:
         settings = replace(settings, labels=labels)
     there = "accuracy" in receipt and labels is None
-    if there and (receipt["accuracy"]["controls"] or _places_none(settings) or not settings.controls):
+    placed = not settings.plain or settings.is_map  # patches, beside which other placements are judged
+    if there and (receipt["accuracy"]["controls"] or not (placed and settings.controls)):
         console.print(escape(f"{found.uri} has its accuracy already"), soft_wrap=True)
         return receipt
     use_one_thread()
@@ -287,11 +237,6 @@ def run_judge(
             published = extend_with_accuracy(survey, draft, evaluate(survey, *made.there(*JUDGED)))
     show_published(published, settings.out, console)
     return published.receipt
-
-
-def _places_none(settings: Settings) -> bool:
-    """Return whether a survey placed no patches, so that no other placement is judged beside it."""
-    return settings.plain and not settings.is_map
 
 
 def _needed(survey: OpenSurvey) -> tuple[str, ...]:

@@ -10,28 +10,20 @@ from prefect import flow
 from prefect.client.schemas.objects import ConcurrencyLimitConfig, ConcurrencyLimitStrategy
 from prefect.types.entrypoint import EntrypointType
 
-from flows.archive.reprocess_command import ReprocessRequest, reprocess_fields
+from flows.archive.reprocess_command import reprocess_fields
 from flows.terminal.progress import on_stderr
 from pipeline.errors import ArchiveError
 
 
 @flow(name="reprocess", flow_run_name="reprocess-{archive}", persist_result=False)
-def reprocess(
-    archive: str,
-    since: str | None = None,
-    field: str | None = None,
-    failed: bool = False,
-    weights: str | None = None,
-    dry_run: bool = False,
-) -> str:
+def reprocess(archive: str, field: str | None = None, weights: str | None = None, dry_run: bool = False) -> str:
     """Survey every field of an archive again: what it holds is found, only what has changed is made anew.
 
     The parameters are those of the command `spectralzoom reprocess`. Returns how it ended. Raises PipelineError: the
     archive or a parameter cannot be used, or no field could be reprocessed.
     """
     named = None if weights is None else Path(weights)
-    request = ReprocessRequest(archive, since, field, failed, named, dry_run)
-    rows = reprocess_fields(request, on_stderr())["fields"]
+    rows = reprocess_fields(archive, on_stderr(), field=field, weights=named, dry_run=dry_run)["fields"]
     refused = [f"{row['field']}: {row['message']}" for row in rows if row["state"] == "failed"]
     if refused and len(refused) == len(rows):
         raise ArchiveError(f"no field could be reprocessed: {'; '.join(refused)}")

@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from flows.terminal.figures import DASH, format_seconds
+from flows.terminal.progress import table
 from pipeline.simulator.selection.choice import UNIT_NAMES
 
-WIDE = 100  # characters, from which words fit into the table
 COLOURS = {"on": "green", "off": "dim"}
 _KEY = (
     "left out: what any stored number would change by at most without the effect [{unit}]; error: by what is done"
@@ -23,21 +21,14 @@ Row = Mapping[str, Any]
 
 
 def print_effects(effects: Iterable[Row], total: Row, console: Console) -> None:
-    """Print a row for every effect of the rig and what all come to; words stand below a narrow terminal's table."""
+    """Print a row for every effect of the rig and what all come to; words stand below the table."""
     rows = list(effects)
     there = [row for row in rows if row["reason"] != "absent"]
-    wide = console.width >= WIDE
-    table = Table(header_style="dim", box=SIMPLE_HEAD, collapse_padding=True, pad_edge=wide)
-    for name in ("effect", "computed", "left out", "error", "measured", "CPU", *(["why"] if wide else [])):
-        figure = name in ("left out", "error", "measured", "CPU")
-        table.add_column(name, justify="right" if figure else "left", no_wrap=name != "why", overflow="fold")
-    for row in there:
-        table.add_row(*_figures(row, total), *([escape(_format_row(row))] if wide else []))
-    console.print(table)
+    columns = ("effect", "computed", "left out", "error", "measured", "CPU")
+    console.print(table(columns, (_figures(row, total) for row in there), left=2, whole=columns))
     console.print(escape(_KEY.format(unit=UNIT_NAMES[total["unit"]])), style="dim")
-    if not wide:
-        for row in there:
-            console.print(f"[bold]{escape(row['name'])}[/]: {escape(_format_row(row))}")
+    for row in there:
+        console.print(f"[bold]{escape(row['name'])}[/]: {escape(_format_row(row))}")
     absent = [f"{row['name']} ({row['magnitude']})" for row in rows if row["reason"] == "absent"]
     if absent:
         console.print(f"[bold]Not there[/]: {escape(', '.join(absent))}.")

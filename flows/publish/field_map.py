@@ -6,7 +6,6 @@ import base64
 import io
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,12 +17,11 @@ from flows.publish.panels import UNLABELLED_COLOUR, class_palette
 from flows.publish.quicklook import QuicklookData, colours_of
 from flows.publish.receipt import Receipt
 from flows.publish.receipt_table import format_days
-from flows.tasks.open_survey import Products
 from flows.tasks.prior_maps import Prior
 from flows.tasks.run import SurveyRun
-from flows.terminal.figures import counted, format_percent, format_seconds
+from flows.terminal.figures import format_percent
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.geometry.scan import Sweep, exposing
+from pipeline.geometry.scan import Sweep
 from pipeline.planning.fine_pass import FinePlan
 from storage.archive.keys import StageRef
 from storage.arrays.class_maps import ProbabilityStore
@@ -39,11 +37,10 @@ Bytes = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class MapLayer:
-    """A layer of the map: a picture, or boxes (y0, y1, x0, x1) half open [px] with what is said of each."""
+    """A layer of the map, a picture."""
 
     title: str
-    picture: str = ""  # as an address of data
-    boxes: Sequence[tuple[tuple[int, int, int, int], str]] = ()
+    picture: str  # as an address of data
     shown: bool = False
     opacity: float = 1.0
 
@@ -93,7 +90,7 @@ def prior_map(prior: Prior | None, drawn: StageRef, receipt: Receipt) -> PriorMa
 
 
 def field_map(
-    run: SurveyRun, products: Products, plan: FinePlan, coarse_prediction: QuicklookData, before: PriorMapField | None
+    run: SurveyRun, plan: FinePlan, coarse_prediction: QuicklookData, before: PriorMapField | None
 ) -> FieldMap:
     """Gather the layers of a run; ``coarse_prediction`` is what its quicklook shows."""
     height, width = coarse_prediction.class_map.shape
@@ -128,8 +125,6 @@ def field_map(
         layers.append(
             MapLayer("Looked at twice", png_address(_on_field(run, patch_index)[thin, thin], table), opacity=0.6)
         )
-    if sweeps := _sweep_boxes(run, products, plan):
-        layers.append(MapLayer("Sweeps, in their order", boxes=sweeps))
     counts = np.bincount(coarse_prediction.class_map.ravel(), minlength=256) / max(coarse_prediction.class_map.size, 1)
     covered = [
         *counts[: len(coarse_prediction.class_names)].tolist(),
@@ -185,26 +180,6 @@ def _on_field(run: SurveyRun, patches: Bytes) -> Bytes:
     """Return numbers of patches (row, column) on the pixels of the field (y, x)."""
     p = run.grid.patch
     return patches.repeat(p, axis=0).repeat(p, axis=1)[: run.grid.height, : run.grid.width]
-
-
-def _sweep_boxes(run: SurveyRun, products: Products, plan: FinePlan) -> list[tuple[tuple[int, int, int, int], str]]:
-    """Return the sweeps in the order in which they were taken: where each looked, and when."""
-    passes = (("capture_coarse", run.plan.coarse), ("capture_fine", plan.sweeps))
-    taken = [(sweep, products[stage].path / f"{sweep.name}.zarr") for stage, sweeps in passes for sweep in sweeps]
-    return [
-        (block_of(sweep, run), f"{number} of {len(taken)}: {_format_sweep(run, sweep, path)}")
-        for number, (sweep, path) in enumerate(taken, 1)
-    ]
-
-
-def _format_sweep(run: SurveyRun, sweep: Sweep, path: Path) -> str:
-    """Return which sweep it was, its lines, and how long they took by their own times."""
-    group, exposure = open_group(path), exposing(run.camera, sweep).exposure_ms
-    times, started = read_array(group, "time"), group.attrs.get("started")
-    seconds = float(times.max() - times.min()) + exposure / 1000
-    begun = "" if started is None else f", from {started} on"
-    kind = "scan" if run.plan.plain else f"{sweep.kind} sweep"
-    return f"{kind}, {counted(sweep.lines, 'line')} of {exposure:g} ms in {format_seconds(seconds)}{begun}"
 
 
 def block_of(sweep: Sweep, run: SurveyRun) -> tuple[int, int, int, int]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -71,51 +71,29 @@ def _kept(run: SurveyRun, scale: FieldScale) -> FieldScale:
     """The scale of what zones leave of the field."""
     if run.zones.kept is None or scale.area_m2 is None:
         return scale
-    rows, columns = (slice(0, size) for size in scale.shape)
-    areas = run.zones.place.pixel_areas_m2(rows, columns)
-    assert areas is not None
-    return FieldScale(scale.shape, scale.view_deg, scale.pixel_m, float(np.nansum(areas[run.zones.kept.kept])))
+    return replace(scale, area_m2=_ground_m2(run, run.zones.kept.kept))
 
 
 def find_ground(
     run: SurveyRun, posed: GroundMap | None, found: ClassMap, probabilities: ProbabilityStore
 ) -> dict[str, Any]:
     """``ground``: grid, hectares of each class, what changed and what is old. Empty where nobody says where it lies."""
-    figures = placed_findings(run, found) if posed is None else posed_findings(posed)
-    if figures is None:
+    geobox = run.scene.geobox if posed is None else posed.geobox
+    if geobox is None:
         return {}
+    if posed is None:  # the class map itself, in hectares of the ellipsoid
+        areas = class_areas_m2(geobox, found.classes, len(found.names)) / M2_PER_HECTARE
+        hectares, side = dict(zip(found.names, areas.tolist(), strict=True)), pixel_side_m(geobox)
+    else:
+        hectares = {name: area["ha"] for name, area in posed.areas.items()}
+        side = abs(float(geobox.resolution.x))
+    figures: dict[str, Any] = {"crs": crs_name(geobox), "resolution_m": side}
+    figures |= {"shape": [int(size) for size in geobox.shape], "areas_ha": hectares}
     place, drawn = run.zones.place, found.classes != UNLABELLED
     figures |= {"older_ha": older_hectares(place, np.where(drawn, probabilities.age(), np.nan))}
     if (old_class := probabilities.old_class()) is not None:
         figures |= {"changes_ha": changed_hectares(place, old_class, found)}
     return {"ground": figures}
-
-
-def posed_findings(drawn: GroundMap) -> dict[str, Any]:
-    """Of a survey with a pose: the map that was drawn on the ground."""
-    return {
-        "crs": crs_name(drawn.geobox),
-        "resolution_m": abs(float(drawn.geobox.resolution.x)),
-        "shape": [int(size) for size in drawn.geobox.shape],
-        "areas_ha": {name: area["ha"] for name, area in drawn.areas.items()},
-    }
-
-
-def placed_findings(run: SurveyRun, found: ClassMap) -> dict[str, Any] | None:
-    """Of a survey whose scene's file says where it lies: the class map itself; None where it does not.
-
-    Hectares are of the ellipsoid, not of the map's plane.
-    """
-    geobox = run.scene.geobox
-    if geobox is None:
-        return None
-    areas = class_areas_m2(geobox, found.classes, len(found.names)) / M2_PER_HECTARE
-    return {
-        "crs": crs_name(geobox),
-        "resolution_m": pixel_side_m(geobox),
-        "shape": [int(size) for size in geobox.shape],
-        "areas_ha": dict(zip(found.names, areas.tolist(), strict=True)),
-    }
 
 
 def older_hectares(place: FieldPlace, age_days: NDArray[np.float32]) -> dict[str, float]:

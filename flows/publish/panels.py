@@ -39,22 +39,8 @@ STYLE: Any = {
 UNLABELLED_COLOUR = (0.86, 0.86, 0.84)
 # Okabe and Ito (2008), then Paul Tol's muted scheme (2021) without near twins: told apart by colour-blind readers
 _SAFE = (
-    "#E69F00",
-    "#009E73",
-    "#56B4E9",
-    "#D55E00",
-    "#F0E442",
-    "#0072B2",
-    "#CC79A7",
-    "#882255",
-    "#44AA99",
-    "#332288",
-    "#999933",
-    "#DDCC77",
-    "#AA4499",
-    "#117733",
-    "#88CCEE",
-    "#CC6677",
+    *("#E69F00", "#009E73", "#56B4E9", "#D55E00", "#F0E442", "#0072B2", "#CC79A7", "#882255"),
+    *("#44AA99", "#332288", "#999933", "#DDCC77", "#AA4499", "#117733", "#88CCEE", "#CC6677"),
 )
 
 

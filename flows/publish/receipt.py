@@ -7,41 +7,25 @@ receipt that was read is a plain dictionary of the same keys.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from flows.settings.survey_settings import RASTER
-from flows.tasks.scores import JUDGING
 from pipeline.errors import ShapeError
-from storage.archive.records import StageRecord, State
+from storage.archive.records import StageRecord
 from storage.archive.whole_files import to_json
 
 Receipt = dict[str, Any]
 AccuracyIs = Literal["judged", "pending", "left out", "without labels"]  # pending: it is worked out after the map
 Facts = dict[str, Any]
 COSTS = ("lines", "samples", "bytes_raw", "bytes_stored", "capture_s", "tokens", "multiply_adds")
-# what another run of the same seed has otherwise
-_OF_ONE_RUN = ("wall_s", "cpu_s", "peak_rss_bytes", "state", "manifest_sha256")
 
 
 class _Part(BaseModel):
     model_config = ConfigDict(extra="allow")
-
-
-class StageRow(_Part):
-    """One stage: seconds, memory and bytes; null of one whose store was found."""
-
-    name: str
-    key: str
-    state: State
-    wall_s: float | None
-    cpu_s: float | None
-    peak_rss_bytes: int | None
-    bytes_in: int | None
-    bytes_out: int | None
 
 
 class Saving(_Part):
@@ -122,7 +106,7 @@ class ReceiptFields(_Part):
     finished: str
     versions: dict[str, str]
     settings: Facts
-    stages: list[StageRow]
+    stages: list[StageRecord]
     savings: Savings
     accuracy_is: AccuracyIs | None = None
     judged: str | None = None  # when accuracy was added
@@ -209,22 +193,3 @@ def areas_on_ground(receipt: Mapping[str, Any]) -> Mapping[str, Any] | None:
     ground = receipt.get("ground")
     areas = ground.get("areas_ha") if isinstance(ground, Mapping) else None
     return areas if isinstance(areas, Mapping) else None
-
-
-def comparable(receipt: Receipt) -> dict[str, Any]:
-    """Return what two runs of the same seed and settings must agree on.
-
-    Without times, memory, the archive's place, whether a stage was read or made, hashes of manifests (which hold their
-    times), and the addresses of the products (their names stay).
-    """
-    same = _without(receipt, ("started", "finished", "judged"))
-    same["settings"] = _without(receipt["settings"], ("out",))
-    same["stages"] = [
-        _without(stage, (*_OF_ONE_RUN, *(("bytes_out",) if stage["name"] == JUDGING else ())))
-        for stage in receipt["stages"]
-    ]
-    return same | {"products": sorted(receipt["products"])}
-
-
-def _without(part: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:
-    return {key: value for key, value in part.items() if key not in set(names)}

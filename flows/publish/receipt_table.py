@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from flows.publish.receipt import Receipt, is_pending
 from flows.tasks.scores import format_worst_class
@@ -24,7 +22,8 @@ from flows.terminal.figures import (
     format_seconds,
     three_digits,
 )
-from pipeline.ground.field_places import M2_PER_HECTARE, SECONDS_PER_HOUR
+from flows.terminal.progress import table
+from pipeline.ground.field_places import M2_PER_HECTARE
 from pipeline.planning.uniform_scans import format_scan
 
 COST_LABELS = {
@@ -39,6 +38,10 @@ COST_LABELS = {
 MOST_CHANGES = 4  # in words
 LEADING = 3  # classes of a plot in words
 FOREIGN = 0.2  # fraction of a map that is unknown from which on its weights are the wrong ones
+FOREIGN_WORDS = (
+    "These weights do not know this field: train some on labelled scenes of it (spectralzoom train DATASET), or leave "
+    "the class out with --unknown off"
+)
 
 
 def cost_rows(savings: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -52,15 +55,13 @@ def cost_rows(savings: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def print_table(receipt: Receipt, console: Console) -> None:
     """Print the savings to the terminal, and what became of a prior map or of weights that do not know the field."""
-    table = Table(header_style="dim", box=SIMPLE_HEAD, show_edge=False)
-    for name in ("cost", "this survey", "everything", "ratio"):
-        table.add_column(name, justify="left" if name == "cost" else "right", no_wrap=name != "cost")
-    for row in cost_rows(receipt["savings"]):
-        table.add_row(row["label"], row["done"], row["full"], format_percent(row["ratio"]))
-    console.print(table)
+    columns = ("cost", "this survey", "everything", "ratio")
+    costs = cost_rows(receipt["savings"])
+    rows = [[row["label"], row["done"], row["full"], format_percent(row["ratio"])] for row in costs]
+    console.print(table(columns, rows, whole=columns[1:]))
     for name, words in finding_rows({name: receipt[name] for name in ("memory", "unknown") if name in receipt}):
         if name != "unknown" or receipt["unknown"]["fraction"] > FOREIGN:
-            console.print(escape(f"{name} {words}"))
+            console.print(escape(f"{name}: {words}"))
 
 
 def headline(receipt: Receipt, captured_again: float | None = None) -> str:
@@ -106,106 +107,33 @@ def headline(receipt: Receipt, captured_again: float | None = None) -> str:
 
 
 def finding_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the findings of a receipt as rows of a table: what is said of which thing."""
+    """Return the findings of a receipt as rows of a table: label, and figures with their names."""
     rows = [
-        *(
-            (label, words)
-            for key, label, words_of in _ROWS
-            if (part := found.get(key)) and (words := words_of(part, found))
-        ),
-        *(
-            (f"pointing, {name}", words)
-            for name, one in found.get("pointing", {}).items()
-            if isinstance(one, Mapping) and (words := _format_pointing(one))
-        ),
-        *(
-            (
-                f"sweep {name}",
-                f"lines {', '.join(f'{count} {what}' for what, count in facts.items() if count)}: left out",
-            )
-            for name, facts in found.get("lines", {}).items()
-        ),
+        (_LABELS.get(part, part), _figures(part, found.get(part))) for part in dict.fromkeys(f[0] for f in _FIGURES)
+    ]
+    rows += [
+        (f"pointing, {name}", _figures("pass", one))
+        for name, one in found.get("pointing", {}).items()
+        if isinstance(one, Mapping)
+    ]
+    rows += [
+        (f"sweep {name}", f"lines {', '.join(f'{count} {what}' for what, count in facts.items() if count)}: left out")
+        for name, facts in found.get("lines", {}).items()
     ]
     if "scans" not in found and found.get("plan", {}).get("kind", "raster") != "raster":
         words = "the weights have no scan performance table, so that seconds stand beside every line at full exposure"
         rows.append(("uniform scans", f"{words}; train --min-exposure-ms 3 makes one, by scenes kept for validation"))
+    if (found.get("unknown") or {}).get("fraction", 0.0) > FOREIGN:
+        rows.append(("weights", FOREIGN_WORDS))
     return [(label, words) for label, words in rows if words]
 
 
-def _format_field(field: Mapping[str, Any], _: object) -> str:
-    if field["view_deg"] is None:
-        size = " x ".join(map(format_count, field["size_px"])) + " px"
-    else:
-        size = f"{field['view_deg'][0]:.3g} x {field['view_deg'][1]:.3g} degrees of the view"
-    if field["ground_pixel_m"] is None:
-        return size
-    away = "" if field["range_m"] is None else f", {format_metres(field['range_m']['median'])} away in the middle"
-    ground = f"{size}{away}: {format_area(field['hectares'])} at {format_metres(field['ground_pixel_m'])} a pixel"
-    pace = field["hectares_per_hour"]
-    if pace is None:  # a raster took no time
-        return ground
-    return (
-        f"{ground}, {three_digits(pace)} ha an hour of the camera ({three_digits(SECONDS_PER_HOUR / pace)} s a hectare)"
+def _figures(part: str, found: Mapping[str, Any] | None) -> str:
+    """Return the figures of a part that say something, in words; None, 0 and what is empty say nothing."""
+    largest = [one[1:] for one in _FIGURES if one[0] == part] if found else []
+    return "; ".join(
+        filter(None, (words.format(show(found[name])) for name, words, show in largest if found and found.get(name)))
     )
-
-
-def _format_plan(plan: Mapping[str, Any], _: object) -> str:
-    parts = [plan["reason"] if plan["kind"] in ("full", "scan", "raster") else f"{plan['lines']} fine lines"]
-    if plan["out_of_reach"]:
-        parts.append(f"{plan['out_of_reach']} places worth a second pass lie beyond the mirror's range")
-    if plan.get("spared_s"):
-        fraction = f" ({format_percent(plan['spared_fraction'])} of the full scan's)" if plan["spared_fraction"] else ""
-        parts.append(
-            f"the threshold of {plan['threshold']:g} a second left {plan['spared_s']:.1f} s{fraction} unspent: no further "
-            "run of lines pays"
-        )
-    return "; ".join(filter(None, parts))
-
-
-def _format_recording(recording: Mapping[str, Any], _: object) -> str:
-    done_s, full_s = recording["passes_s"], recording["full_scan_s"]
-    own = "the recorded scan" if recording["full_scan_is"] == "recorded" else "a scan of every line"
-    saved = f", {format_percent(1 - done_s / full_s)} less" if 0 < done_s < full_s else ""
-    return (
-        f"{format_count(recording['lines_read'])} of {format_count(recording['lines_recorded'])} recorded lines were "
-        f"read; a camera would take {format_seconds(done_s)} for these passes, by the cost model, and "
-        f"{format_seconds(full_s)} for {own}{saved}"
-    )
-
-
-def _format_extent(scan_pass: Mapping[str, Any], _: object) -> str:
-    rest = "the rest is as before" if scan_pass["remembers"] else "of the rest nothing is known"
-    text = f"lines {scan_pass['lines']}, {format_percent(scan_pass['fraction'])} of the field; {rest}"
-    if "expected_gain" in scan_pass:
-        text += f"; about {format_percent(scan_pass['expected_wrong'])} of the prior map was expected to be wrong there"
-    if scan_pass.get("due_left"):
-        text += f"; {format_count(scan_pass['due_left'])} of {format_count(scan_pass['due'])} places that were due had to wait"
-    return text
-
-
-def _format_kept(kept: Mapping[str, Any], found: Mapping[str, Any]) -> str:
-    read, stored = (kept[name]["done"] / kept[name]["everything"] for name in ("multiply_adds", "bytes"))
-    fraction = kept["patches"] / kept["of_patches"] if kept["of_patches"] else 0.0
-    text = (
-        f"{format_percent(fraction)} of the patches, for {format_percent(read)} of the multiply-adds of reading everything"
-        f" and {format_percent(stored)} of the bytes of keeping it"
-    )
-    accuracy = found.get("accuracy") or {}
-    every = (accuracy.get("all") or {}).get("miou")
-    return text if every is None else f"{text}; everything read scores {format_points(every)}"
-
-
-def _format_prior_map(memory: Mapping[str, Any], _: object) -> str:
-    since, shift = f"{memory['run']}, {format_days(memory['days'])}", float(np.hypot(*memory["shift_px"]))
-    if memory["put_aside"] == "turned":
-        return f"{since}: put aside, the rig was turned since by {abs(memory['turned_deg']):.1f} degrees"
-    alike = "nothing" if memory["agreement"] is None else format_percent(memory["agreement"])
-    if memory["put_aside"]:
-        return f"{since}: put aside, today's capture agrees with {alike} of it: another field, or a rig that was moved"
-    fraction = format_percent(memory["changed_px"] / memory["compared_px"]) if memory["compared_px"] else "nothing"
-    most = ", ".join(f"{_spaced(old)} to {_spaced(new)}" for _, old, new in memory["changes"][:MOST_CHANGES])
-    beside = f", which lay {shift:.0f} px beside it" if shift else ""
-    return f"{since}{beside}: today's capture agrees with {alike} of it, {fraction} changed{': ' if most else ''}{most}"
 
 
 def format_days(days: float) -> str:
@@ -213,69 +141,6 @@ def format_days(days: float) -> str:
     if days < 1:
         return f"{24 * days:.1f} hours earlier"
     return f"{days:.1f} days earlier" if days < 10 else f"{days:.0f} days earlier"
-
-
-def _format_unknown(unknown: Mapping[str, Any], found: Mapping[str, Any]) -> str:
-    text = (
-        f"{format_percent(unknown['fraction'])} of the map is unknown, unlike all that the weights were trained on; of"
-        f" what they know it would be about {format_percent(unknown['rate'])}"
-    )
-    if pixels := (found.get("accuracy") or {}).get("unknown_px"):
-        text += f"; {format_count(pixels)} such pixels have a label and count as wrong"
-    if unknown["fraction"] > FOREIGN:
-        text += (
-            ". These weights do not know this field: train some on labelled scenes of it (spectralzoom train DATASET), "
-            "or leave the class out with --unknown off"
-        )
-    return text
-
-
-def _format_scans(scans: Mapping[str, Mapping[str, Any]], found: Mapping[str, Any]) -> str:
-    own = "this one, read whole" if "kept" in found else "this one"
-    titles = {"taken": own, "best_in_time": "best in the same seconds", "reference": "nearly as good as any"}
-    return "; ".join(
-        f"{title}: {format_scan(one['step'], one['exposure_ms'])}, {one['seconds']:.1f} s, about "
-        f"{format_points(one['expected_miou'])} ± {format_points(one.get('expected_spread'))}"
-        for name, title in titles.items()
-        if (one := scans.get(name)) is not None
-    )
-
-
-def _format_zones(zones: Mapping[str, Any], _: object) -> str:
-    ground = "" if zones["kept_m2"] is None else f", {format_area(zones['kept_m2'] / M2_PER_HECTARE)}"
-    no_go = f"; no-go zones touch {format_count(zones['no_go_px'])} px" if zones["no_go_px"] else ""
-    fraction = format_percent(zones["kept_px"] / zones["field_px"])
-    return f"{format_count(zones['kept_px'])} px, {fraction} of the field{ground}{no_go}; of the rest no map is drawn"
-
-
-def _format_ground(ground: Mapping[str, Any], _: object) -> str:
-    areas = ", ".join(f"{_spaced(name)} {format_area(area)}" for name, area in ground["areas_ha"].items() if area)
-    words = [f"{ground['crs']}, {ground['resolution_m']:.4g} m a pixel: {areas}"]
-    if changes := ground.get("changes_ha"):
-        largest = [f"{_spaced(old)} to {_spaced(new)} {format_area(area)}" for area, old, new in changes[:MOST_CHANGES]]
-        words.append(f"{format_area(sum(area for area, _, _ in changes))} changed: {', '.join(largest)}")
-    older = [(int(days), area) for days, area in ground.get("older_ha", {}).items() if area]
-    words += [f"{format_area(area)} last captured more than {counted(days, 'day')} ago" for days, area in older]
-    return "; ".join(words)
-
-
-def _format_pointing(one: Mapping[str, Any]) -> str:
-    put = [float(np.hypot(*offset)) for sweep, offset in one["sweeps"].items() if sweep not in one["not_found"]]
-    parts = []
-    if len(one["sweeps"]) == 1 and one["held"] in one["sweeps"]:
-        parts.append("one sweep, which has no seam to be put right by")
-    elif put:
-        parts.append(f"put right by up to {max(put):.1f} px")
-        parts += (
-            [] if one["residual_rms_px"] is None else [f"{one['residual_rms_px']:.2f} px rms are left at the seams"]
-        )
-    if one["not_found"]:
-        parts.append(f"{', '.join(one['not_found'])} left where the mirror reported: nothing was found")
-    if one["too_narrow"]:
-        parts.append(f"{counted(len(one['too_narrow']), 'overlap')} too narrow to compare")
-    if one.get("partly_seen"):
-        parts.append(f"{counted(one['partly_seen'], 'chosen place')} not seen whole, mapped there by the coarse pass")
-    return "; ".join(parts)
 
 
 def plot_rows(plots: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
@@ -302,20 +167,89 @@ def _spaced(name: str) -> str:
     return name.replace("_", " ")
 
 
-_ROWS: Sequence[tuple[str, str, Any]] = (
-    ("field", "field", _format_field),
-    ("plan", "plan", _format_plan),
-    ("recording", "recording", _format_recording),
-    ("extent", "captured", _format_extent),
-    ("kept", "kept in detail", _format_kept),
-    ("memory", "goes on from", _format_prior_map),
-    ("unknown", "unknown", _format_unknown),
-    (
-        "expected",
-        "expected score",
-        lambda one, _: f"about {format_points(one['miou'])} ± {format_points(one['error'])}, with no label asked",
-    ),
-    ("scans", "uniform scans", _format_scans),
-    ("zones", "zones", _format_zones),
-    ("ground", "on the ground", _format_ground),
+def _areas(areas: Mapping[str, float]) -> str:
+    return ", ".join(f"{_spaced(name)} {format_area(area)}" for name, area in areas.items() if area)
+
+
+def _changes(changes: Sequence[Sequence[Any]]) -> str:
+    most = [f"{_spaced(old)} to {_spaced(new)} {format_area(area)}" for area, old, new in changes[:MOST_CHANGES]]
+    return f"{format_area(sum(area for area, _, _ in changes))} changed: {', '.join(most)}"
+
+
+def _older(areas: Mapping[str, float]) -> str:
+    return "; ".join(
+        f"{format_area(area)} last captured more than {counted(int(days), 'day')} ago"
+        for days, area in areas.items()
+        if area
+    )
+
+
+def _fraction(cost: Mapping[str, float]) -> str:
+    return format_percent(cost["done"] / cost["everything"])
+
+
+def _scan(scan: Mapping[str, Any]) -> str:
+    score = f"{format_points(scan['expected_miou'])} ± {format_points(scan.get('expected_spread'))}"
+    return f"{format_scan(scan['step'], scan['exposure_ms'])}, {scan['seconds']:.1f} s, about {score}"
+
+
+def _most_px(sweeps: Mapping[str, Sequence[float]]) -> str:
+    return f"{max(float(np.hypot(down, across)) for down, across in sweeps.values()):.1f}"
+
+
+# parts of a receipt whose rows are called otherwise
+_LABELS = {
+    **{"extent": "captured", "kept": "kept in detail", "memory": "prior map", "expected": "expected score"},
+    **{"scans": "uniform scans", "ground": "on the ground"},
+}
+# part of a receipt, figure, its words and its form, in the order of rows and of words
+_FIGURES: Sequence[tuple[str, str, str, Callable[[Any], Any]]] = (
+    ("field", "view_deg", "{} degrees of the view", lambda one: f"{one[0]:.3g} x {one[1]:.3g}"),
+    ("field", "range_m", "{} away in the middle", lambda one: format_metres(one["median"])),
+    ("field", "hectares", "{}", format_area),
+    ("field", "ground_pixel_m", "{} a pixel", format_metres),
+    ("field", "hectares_per_hour", "{} ha an hour of the camera", three_digits),
+    ("plan", "reason", "{}", str),
+    ("plan", "lines", "{} fine lines", format_count),
+    ("plan", "out_of_reach", "{} patches worth a second pass lie beyond the mirror's range", format_count),
+    ("plan", "spared_s", "the threshold left {} unspent", format_seconds),
+    ("recording", "lines_read", "{} lines were read", format_count),
+    ("recording", "lines_recorded", "{} are recorded", format_count),
+    ("recording", "passes_s", "a camera would take {} for these passes, by the cost model", format_seconds),
+    ("recording", "full_scan_s", "{} for a scan of every line", format_seconds),
+    ("extent", "lines", "lines {}", str),
+    ("extent", "fraction", "{} of the field", format_percent),
+    ("extent", "remembers", "the rest is as before", bool),
+    ("extent", "expected_wrong", "about {} of the prior map was expected to be wrong there", format_percent),
+    ("extent", "due_left", "{} places that were due had to wait", format_count),
+    ("kept", "patches", "{} patches", format_count),
+    ("kept", "multiply_adds", "{} of the multiply-adds of reading everything", _fraction),
+    ("kept", "bytes", "{} of the bytes of keeping everything", _fraction),
+    ("memory", "run", "{}", str),
+    ("memory", "days", "{}", format_days),
+    ("memory", "shift_px", "{}", lambda one: f"lay {np.hypot(*one):.0f} px beside it" if any(one) else ""),
+    ("memory", "turned_deg", "{}", lambda one: f"turned by {abs(one):.1f} degrees" if abs(one) >= 1 else ""),
+    ("memory", "put_aside", "put aside: {}", str),
+    ("memory", "agreement", "today's capture agrees with {} of it", format_percent),
+    ("memory", "changed_px", "{} px changed", format_count),
+    ("unknown", "fraction", "{} of the map is unknown, unlike all that the weights were trained on", format_percent),
+    ("unknown", "rate", "of what they know it would be about {}", format_percent),
+    ("expected", "miou", "about {}, with no label asked", format_points),
+    ("expected", "error", "error {}", format_points),
+    ("scans", "taken", "this one, read whole: {}", _scan),
+    ("scans", "best_in_time", "best in the same seconds: {}", _scan),
+    ("scans", "reference", "nearly as good as any: {}", _scan),
+    ("zones", "kept_px", "{} px are mapped", format_count),
+    ("zones", "kept_m2", "{}", lambda one: format_area(one / M2_PER_HECTARE)),
+    ("zones", "no_go_px", "no-go zones touch {} px", format_count),
+    ("ground", "crs", "{}", str),
+    ("ground", "resolution_m", "{:.4g} m a pixel", float),
+    ("ground", "areas_ha", "{}", _areas),
+    ("ground", "changes_ha", "{}", _changes),
+    ("ground", "older_ha", "{}", _older),
+    ("pass", "sweeps", "put right by up to {} px", _most_px),
+    ("pass", "residual_rms_px", "{:.2f} px rms are left at the seams", float),
+    ("pass", "not_found", "{} left where the mirror reported: nothing was found", ", ".join),
+    ("pass", "too_narrow", "{} too narrow to compare", lambda one: counted(len(one), "overlap")),
+    ("pass", "partly_seen", "{} chosen patches not captured whole", format_count),
 )

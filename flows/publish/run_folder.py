@@ -114,7 +114,7 @@ def _publish(run: SurveyRun, draft: RunDraft, products: Products, plan: FinePlan
     picture = (draft.folder / "quicklook.png").read_bytes()
     maps = (load_ground_map(ref.path / STORE) for ref in products.there("ground"))
     pictures = [Picture(draw_ground(drawn), "The map on the ground, north up.") for drawn in maps]
-    field = field_map(run, products, plan, coarse_prediction, prior_map(run.prior, products["segment"], receipt))
+    field = field_map(run, plan, coarse_prediction, prior_map(run.prior, products["segment"], receipt))
     page = render_report(receipt, picture, pictures, captured_again=again, field=field)
     (draft.folder / "report.html").write_text(page, encoding="utf-8")
     rests_on = run.archive.manifest_hashes(products.values())
@@ -137,6 +137,12 @@ def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
     for name in LIBRARIES:
         with suppress(PackageNotFoundError):  # run from a source tree that is not installed
             versions[name] = version(name)
+    best = run.scans.best_within(run.plan.coarse_s + plan.seconds)
+    scans = {
+        "taken": run.scans.chosen,
+        "best_in_time": best,
+        "reference": run.scans.reference,
+    }  # where there is a table
     return build_receipt(
         survey=run.name,
         source=run.source.name,
@@ -154,7 +160,7 @@ def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
         effects=effects.get("effects"),
         effects_total=effects.get("total"),
         products={**stores, **{name: f"{folder}/{name}" for name in files}},
-        scans=scans_told(run, run.plan.coarse_s + plan.seconds),
+        scans={name: as_figures(scan) for name, scan in scans.items() if scan is not None},
         **find_out(run, products),
     )
 
@@ -292,16 +298,6 @@ def _both_scales(
     return canvas
 
 
-def scans_told(run: SurveyRun, seconds: float) -> dict[str, Any]:
-    """Uniform scans by the weights' record: the one taken, the best in as many seconds, and the cheapest good one.
-
-    Empty where the weights have no record.
-    """
-    scans = run.scans
-    figures = {"taken": scans.chosen, "best_in_time": scans.best_within(seconds), "reference": scans.reference}
-    return {name: as_figures(scan) for name, scan in figures.items() if scan is not None}
-
-
 def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     """``plan``, and what not every survey has: see `flows.publish.receipt.FINDINGS`."""
     plan = load_plan(products["score"])
@@ -326,7 +322,8 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     if run.recorded is not None:
         found["recording"] = _recording(run, run.recorded, plan)
     if run.budget is not None:
-        found["kept"] = run.budget.figures(plan.patch_index) | {"stored_bytes": _stored_detail(run, products)}
+        stored = sum(run.archive.stored_bytes(ref) for ref in (products.mosaic, products.patches))
+        found["kept"] = run.budget.figures(plan.patch_index) | {"stored_bytes": stored}
     if (memory := prior_map_figures(products["segment"].path)) is not None:
         found["memory"] = memory
     if run.settings.extent != EXTENT_WHOLE:
@@ -367,11 +364,6 @@ def _recording(run: SurveyRun, recorded: RecordedPasses, plan: FinePlan) -> dict
         "full_scan_s": cost.seconds(full, run.camera),
         "full_scan_is": "recorded" if whole else "planned",
     }
-
-
-def _stored_detail(run: SurveyRun, products: Products) -> int:
-    """Bytes that coarse means and patches take as they are stored."""
-    return sum(run.archive.stored_bytes(ref) for ref in (products.mosaic, products.patches))
 
 
 def _pointing(ref: StageRef) -> dict[str, Any]:

@@ -207,13 +207,14 @@ def load_settings(
             origin[key] = "flag"
     if table.get("source") == SURVEY["source"].item.default:  # as if it were not said
         del table["source"]
-    given = _given(table)
+    given = {key for key, value in table.items() if value is not None}
     recorded = usual_of_recording(table) if "sweeps" in given else {}
     for name in TABLES:
         inner = table.get(name)
         if isinstance(inner, Mapping):
             table[name] = {**recorded.pop(name, {}), **inner}
-    asked = {**_usual_policy(table), **(usual or {}), **recorded, **table}
+    cheap = {"policy": CHEAP_POLICY} if "macs" in given and not {"least_gain", "policy"} & given else {}
+    asked = {**cheap, **(usual or {}), **recorded, **table}
     for wrong in (*_camera_of_a_map(asked, origin), *_contradictions(given, origin)):
         raise SettingsError(wrong)
     return parse_settings(asked, origin)
@@ -222,10 +223,6 @@ def load_settings(
 def _is_usual(value: object, declared: Declared | None, origin: str | None) -> bool:
     """Return whether a file, and no flag, says what is the default anyway."""
     return declared is not None and origin != "flag" and declared.read(value, "") == declared.item.default
-
-
-def _given(table: Mapping[str, object]) -> set[str]:
-    return {key for key, value in table.items() if value is not None}
 
 
 def _camera_of_a_map(table: Mapping[str, object], origin: Mapping[str, str]) -> Iterator[str]:
@@ -249,12 +246,6 @@ def _camera_of_a_map(table: Mapping[str, object], origin: Mapping[str, str]) -> 
                     " whose pixels are taken as they are: leave it out, or give --source sim to have the simulated rig"
                     " photograph the file"
                 )
-
-
-def _usual_policy(table: Mapping[str, object]) -> dict[str, object]:
-    """Where multiply-adds are short, the policy whose scores take hardly any; a least gain needs scores in nat."""
-    short = table.get("macs") is not None and table.get("least_gain") is None
-    return {"policy": CHEAP_POLICY} if short and table.get("policy") is None else {}
 
 
 def parse_settings(table: Mapping[str, object], origin: Mapping[str, str] | None = None) -> Settings:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Annotated
@@ -82,7 +82,7 @@ def parse_budget(value: object) -> float:
 def parse_bytes(value: object) -> int:
     """Bytes above 0, from a whole number or text such as 4GiB or 500 MB."""
     try:
-        count = int(_BYTES.validate_python(value))
+        count = 0 if "%" in str(value) else int(_BYTES.validate_python(value))
     except ValidationError:
         count = 0
     if count <= 0:
@@ -116,8 +116,7 @@ def parse_bytes_kept(value: object) -> str:
 
 def _parse_percent(value: object) -> str | None:
     """Text such as 25% of a fraction above 0 and at most all; None of anything else."""
-    text = value.strip() if isinstance(value, str) else ""
-    percent = _to_float(text.removesuffix("%")) if text.endswith("%") else None
+    percent = _amount(value, {"%": 1.0})
     return f"{percent!r}%".replace(".0%", "%") if percent is not None and 0 < percent <= 100 else None
 
 
@@ -257,6 +256,14 @@ def _to_float(value: object) -> float | None:
     return number if math.isfinite(number) else None
 
 
+def _amount(value: object, units: Mapping[str, float]) -> float | None:
+    """A finite number by its unit, the text behind it; None of anything else, and of a unit that is none of these."""
+    text = "" if isinstance(value, bool) else str(value).strip().lower()
+    unit = next((one for one in units if one and text.endswith(one)), "")
+    number = _to_float(text.removesuffix(unit))
+    return None if number is None or unit not in units else number * units[unit]
+
+
 def to_whole(value: object) -> int | None:
     """A whole number, also from text; None for anything else, 2.0 included."""
     if isinstance(value, str) and re.fullmatch(r"\s*[+-]?\d{1,20}\s*", value):
@@ -308,15 +315,11 @@ def format_extent(runs: Iterable[LineRun]) -> str:
 
 
 LEAST_REFRESH, MOST_REFRESH = 1 / 24, 3660.0  # days
-_DAYS = {"h": 1 / 24, "d": 1.0, "w": 7.0}
 
 
 def parse_refresh(value: object) -> float:
     """Days, from a number of them or text such as 14d, 36h or 2w."""
-    text = str(value).strip().lower()
-    unit = text[-1:] if text[-1:] in _DAYS else ""
-    number = None if isinstance(value, bool) else _to_float(text.removesuffix(unit))
-    days = None if number is None else number * _DAYS.get(unit, 1.0)
+    days = _amount(value, {"h": 1 / 24, "d": 1.0, "w": 7.0, "": 1.0})
     if days is None or not LEAST_REFRESH <= days <= MOST_REFRESH:
         raise ValueError(f"must be a time of 1h to {MOST_REFRESH:g}d, such as 14d, 36h or 2w; got {value!r}")
     return days
@@ -331,7 +334,7 @@ def parse_unknown(value: object) -> str:
     word = str(value).strip().lower()
     if word in (UNKNOWN_AUTO, UNKNOWN_OFF):
         return word
-    percent = _to_float(word.removesuffix("%")) if word.endswith("%") else None
+    percent = _amount(value, {"%": 1.0})
     if percent is None or not LEAST_UNKNOWN <= percent <= MOST_UNKNOWN:
         raise ValueError(
             f"must be auto, off, or the fraction of known pixels that may be called unknown, {LEAST_UNKNOWN:g}% to"
@@ -345,9 +348,7 @@ LEAST_EXPECTED_ERROR, MOST_EXPECTED_ERROR = 0.001, 0.5
 
 def parse_expected_error(value: object) -> float:
     """Fraction of what is remembered, from a number or text such as 2%."""
-    word = str(value).strip()
-    number = None if isinstance(value, bool) else _to_float(word.removesuffix("%"))
-    fraction = None if number is None else number / 100 if word.endswith("%") else number
+    fraction = _amount(value, {"%": 0.01, "": 1.0})
     if fraction is None or not LEAST_EXPECTED_ERROR <= fraction <= MOST_EXPECTED_ERROR:
         raise ValueError(
             f"must be {LEAST_EXPECTED_ERROR:.1%} to {MOST_EXPECTED_ERROR:.0%} of what is remembered, such as 2%; got {value!r}"

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from types import TracebackType
-from typing import Any
+from typing import Any, Literal
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, Task, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.segment import Segment
-from rich.table import Column
+from rich.table import Column, Table
 from rich.text import Text
 
 from pipeline.errors import visible
@@ -56,6 +57,32 @@ def put_out(content: dict[str, Any], show: Callable[[dict[str, Any], Console], N
         print_json(content)
     else:
         show(content, on_stdout())
+
+
+def table(
+    columns: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    *,
+    left: int = 1,
+    title: str | None = None,
+    whole: Sequence[str] = (),
+) -> Table:
+    """Return a table of rows of markup: the first ``left`` columns to the left, those in ``whole`` never folded."""
+    made = Table(
+        title=title,
+        title_justify="left",
+        title_style="bold",
+        header_style="dim",
+        box=SIMPLE_HEAD,
+        pad_edge=False,
+        collapse_padding=True,
+    )
+    for number, name in enumerate(columns):
+        justify: Literal["left", "right"] = "left" if number < left else "right"
+        made.add_column(name, justify=justify, overflow="fold", no_wrap=name in whole)
+    for row in rows:
+        made.add_row(*row)
+    return made
 
 
 Listener = Callable[[str, float, float], None]  # the stage, how much is done, of how much

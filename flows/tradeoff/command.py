@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
+from dataclasses import asdict
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -12,17 +12,17 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from flows.publish.panels import GRID, INK, PAPER, save_png
 from flows.terminal.figures import format_seconds
 from flows.terminal.processes import writing
+from flows.terminal.progress import table
 from flows.tradeoff.entries import Point, Result, measure_tradeoff
 from flows.tradeoff.stages import TRADEOFFS, find_tradeoff
 from pipeline.errors import SettingsError
+from storage.archive.whole_files import to_json
 
 _COLOURS = ("#0072B2", "#007A5A", "#8a6d00", "#D55E00", "#A23B72")
 _LEVEL = "#D55E00"
@@ -44,9 +44,9 @@ def run_tradeoff(stage: str | None, out: Path, repeats: int, seed: int, console:
         with console.status(f"measuring {tradeoff.stage}: {tradeoff.knob}"):
             results.append(measure_tradeoff(tradeoff, repeats=repeats, seed=seed))
         print_tradeoff(results[-1], console)
-    content = {"tradeoffs": [result.to_dict() for result in results]}
+    content = {"tradeoffs": [asdict(result) for result in results]}
     with writing(out):
-        (out / "tradeoff.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+        (out / "tradeoff.json").write_text(to_json(content), encoding="utf-8")
         save_png(tradeoff_figure(results), out / "tradeoff.png")
     console.print(f"{out / 'tradeoff.json'}\n{out / 'tradeoff.png'}", soft_wrap=True)
     return content
@@ -56,23 +56,12 @@ def print_tradeoff(result: Result, console: Console) -> None:
     """Print the settings from the most to the least exact; those that no other beats are marked."""
     points = sorted(result.points, key=lambda point: point.error)
     rows, figures = [_row(point) for point in points], ("error", *result.points[0].beside)
-    table = Table(
-        title=f"{escape(result.stage)}, {escape(result.knob)}: to be right to ... you pay ...",
-        title_justify="left",
-        title_style="bold",
-        header_style="dim",
-        box=SIMPLE_HEAD,
-        caption=_caption(result),
-        caption_justify="left",
-        collapse_padding=True,
-    )
-    for number, name in enumerate(("", result.knob, *figures, f"per {result.unit}", "price", "x first")):
-        heading = name if number < 2 else name.replace(" ", "\n")
-        least = max(len(word) for word in (*heading.split(), *(row[number] for row in rows)))
-        table.add_column(escape(heading), justify="left" if number < 2 else "right", min_width=least if number else 1)
-    for row, point in zip(rows, points, strict=True):
-        table.add_row(*map(escape, row), style="" if point.pareto else "dim")
-    console.print(table)
+    headings = [name.replace(" ", "\n") for name in (*figures, f"per {result.unit}", "price", "x first")]
+    pairs = zip(rows, points, strict=True)
+    shown = [[f"{'' if point.pareto else '[dim]'}{escape(cell)}" for cell in row] for row, point in pairs]
+    title = f"{escape(result.stage)}, {escape(result.knob)}: to be right to ... you pay ..."
+    columns = ("", result.knob, *headings)
+    console.print(table(columns, shown, left=2, title=title, whole=columns), _caption(result))
 
 
 def _row(point: Point) -> list[str]:

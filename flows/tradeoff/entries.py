@@ -15,7 +15,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib import metadata
 from pathlib import Path
@@ -155,16 +155,6 @@ class Result:
     points: tuple[Point, ...]
     modelled: bool
     level: tuple[str, float] | None = None
-
-    def to_dict(self) -> dict[str, object]:
-        """Return plain values for JSON, which has no NaN and no infinity: they become None."""
-        return {**asdict(self), "points": [_finite(asdict(point)) for point in self.points]}
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _finite(one) for key, one in value.items()}
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def measure_tradeoff(tradeoff: Tradeoff, *, repeats: int = 5, seed: int = 0) -> Result:

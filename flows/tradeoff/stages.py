@@ -23,13 +23,10 @@ from models.network.machine import keep_freed_memory
 from models.network.sizes import multiply_adds
 from models.policies.policies import score_patches
 from models.reading.inference import (
-    CoarsePass,
     CoarsePrediction,
     DrawnMap,
     coarse_prediction,
     coarse_prediction_of_columns,
-    read_coarse_pass,
-    read_coarse_prediction,
     segment,
 )
 from models.weights.files import Weights, load_weights
@@ -226,9 +223,9 @@ class PlannedPass:
     seen: CoarsePrediction
     patch_index: NDArray[np.intp]
     columns: Values  # (patch, p, p, column)
-    seconds: float
-    bytes_raw: int
     weights: Weights  # that read it
+    seconds: float = 0.0
+    bytes_raw: int = 0
 
 
 @dataclass(frozen=True)
@@ -269,7 +266,7 @@ def uniform_pass(
     patch_index, size = grid.valid_patches(), raw_bytes(sweeps, camera, len(source.wavelength_nm))
     seconds = cost.seconds(sweeps, camera)
     return PlannedPass(
-        coarse_prediction_of_columns(weights, small, grid), patch_index, columns[patch_index], seconds, size, weights
+        coarse_prediction_of_columns(weights, small, grid), patch_index, columns[patch_index], weights, seconds, size
     )
 
 
@@ -311,7 +308,7 @@ def plan_every_way(seed: int) -> PlannedField:
         plan = plan_fine(grid, camera, cost, along, scores, budget_s=budget * full_s - coarse_s, full=full)
         columns = every.columns[np.searchsorted(every.patch_index, plan.patch_index)]
         size = raw_bytes([*coarse, *plan.sweeps], camera, bands)
-        scan_passes[words] = PlannedPass(seen, plan.patch_index, columns, coarse_s + plan.seconds, size, weights)
+        scan_passes[words] = PlannedPass(seen, plan.patch_index, columns, weights, coarse_s + plan.seconds, size)
     return PlannedField(np.asarray(scene.labels, np.uint8), bands, scan_passes)
 
 
@@ -342,59 +339,27 @@ POLICY = "gain"
 RAW_LINES = 96
 
 
-@dataclass(frozen=True)
-class FarmPass:
-    """A farm, the weights that read it, and its sweeps."""
-
-    weights: Weights
-    source: SimulatedSource
-    grid: SceneGrid
-    along: Axis
-    full: list[Sweep]
-
-
-def view_farm(seed: int) -> FarmPass:
-    """Draw a farm and plan its full scan, with the shipped weights at hand."""
+def sources_of_farm(seed: int) -> tuple[Weights, SceneGrid, SimulatedSource, Axis, list[Sweep]]:
+    """Draw a farm and plan its full scan; gives weights, grid, source, direction of the lines and sweeps."""
     weights, camera = load_weights(shipped_weights()), LineCamera()
     grid = SceneGrid(*FARM_SHAPE, weights.config.patch, weights.config.factor)
     along, full, _ = cheapest_full(grid, camera, CostModel())
-    return FarmPass(weights, SimulatedSource(farm_scene(seed, FARM_SHAPE), Rig(camera), seed), grid, along, list(full))
+    return weights, grid, SimulatedSource(farm_scene(seed, FARM_SHAPE), Rig(camera), seed), along, list(full)
 
 
-@dataclass(frozen=True)
-class FarmToSegment:
-    """A farm seen coarsely, and the spectral features of every patch of it."""
-
-    weights: Weights
-    labels: NDArray[np.uint8]
-    scan_pass: CoarsePass
-    columns: Values  # (patch, p, p, column), valid or not
-
-    def draw(self, fraction: Setting) -> DrawnMap:
-        """Predict coarsely, score and draw; with every patch there is nothing to choose."""
-        valid, wanted = self.scan_pass.grid.valid_fraction().ravel() > 0, float(fraction)
-        if wanted == 1:
-            patch_index = np.flatnonzero(valid)
-            return segment(self.weights, self.scan_pass, self.columns[patch_index], patch_index)
-        seen = read_coarse_prediction(self.weights, self.scan_pass)
-        patch_index = frame_patches(score_patches(POLICY, seen), wanted, valid).patch_index
-        return segment(self.weights, seen, self.columns[patch_index], patch_index)
-
-    def miss(self, _fraction: Setting, drawn: DrawnMap) -> float:
-        """Return 1 - mIoU of a map."""
-        return 1 - mean_iou(confusion(self.labels, drawn.classes, self.weights.config.classes))
-
-
-def see_farm(seed: int) -> FarmToSegment:
-    """Take a farm coarsely and finely everywhere."""
+def plan_every_fraction(seed: int) -> PlannedField:
+    """Take a farm coarsely and finely everywhere, and choose every fraction of its patches by their scores."""
     keep_freed_memory()  # as surveys do
-    farm = view_farm(seed)
-    mosaic = coarse_mosaic(farm.source, coarse_sweeps(farm.grid, farm.source.camera, farm.along), farm.grid)
-    scan_pass = read_coarse_pass(farm.weights, [mosaic], farm.source.wavelength_nm, farm.grid)
-    columns = columns_of_all_patches(
-        farm.source, farm.full, farm.grid, farm.weights, memory=MEMORY, kernel="catmull-rom"
-    )
-    return FarmToSegment(farm.weights, np.asarray(farm.source.scene.labels, np.uint8), scan_pass, columns)
+    weights, grid, source, along, full = sources_of_farm(seed)
+    mosaic = coarse_mosaic(source, coarse_sweeps(grid, source.camera, along), grid)
+    seen = coarse_prediction(weights, mosaic, source.wavelength_nm, grid)
+    columns = columns_of_all_patches(source, full, grid, weights, memory=MEMORY, kernel="catmull-rom")
+    scores, valid = score_patches(POLICY, seen), grid.valid_fraction().ravel() > 0
+    scan_passes: dict[Setting, PlannedPass] = {}
+    for fraction in FRACTIONS:
+        patch_index = frame_patches(scores, fraction, valid).patch_index if fraction < 1 else np.flatnonzero(valid)
+        scan_passes[fraction] = PlannedPass(seen, patch_index, columns[patch_index], weights)
+    return PlannedField(np.asarray(source.scene.labels, np.uint8), len(source.wavelength_nm), scan_passes)
 
 
 SEGMENT = Tradeoff(
@@ -402,19 +367,19 @@ SEGMENT = Tradeoff(
     knob="fraction of patches",
     error="1 - mIoU",
     unit="scene px",
-    reference=f"labels of a farm of {FARM_SHAPE[1]} x {FARM_SHAPE[0]} px; policy {POLICY}, scores included",
+    reference=f"labels of a farm of {FARM_SHAPE[1]} x {FARM_SHAPE[0]} px; policy {POLICY}, patches scored beforehand",
     settings=FRACTIONS,
-    prepare=see_farm,
-    run=FarmToSegment.draw,
-    judge=FarmToSegment.miss,
+    prepare=plan_every_fraction,
+    run=PlannedField.read,
+    judge=PlannedField.miss,
     work=lambda state: float(state.labels.size),
 )
 
 
 def capture_raw(seed: int) -> NDArray[np.uint16]:
     """Take some raw lines (line, sample, band) of a farm."""
-    farm = view_farm(seed)
-    return SimulatedSweep(farm.source, farm.full[0]).read(0, RAW_LINES)
+    _, _, source, _, full = sources_of_farm(seed)
+    return SimulatedSweep(source, full[0]).read(0, RAW_LINES)
 
 
 STORE = Tradeoff(

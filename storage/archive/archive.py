@@ -36,12 +36,8 @@ from storage.archive.keys import (
 )
 from storage.archive.lineage import rests_on
 from storage.archive.manifests import (
-    Cost,
     check_files,
     cleared_facts,
-    clocks,
-    cost_of,
-    cost_since,
     is_cleared,
     made_bytes,
     manifest_sha256,
@@ -61,7 +57,7 @@ from storage.archive.staging import (
 )
 from storage.arrays.layout import consolidate_stores
 
-__all__ = ["Archive", "Cost", "RunDraft", "StageRef", "StagedStore", "stage_key"]
+__all__ = ["Archive", "RunDraft", "StageRef", "StagedStore", "stage_key"]
 
 
 @dataclass(frozen=True)
@@ -129,7 +125,7 @@ class Archive:
     def find(self, stage: str, key: str) -> StageRef | None:
         """The published store, or None, also where its files were cleared away.
 
-        Sizes are compared with the manifest, content only by :meth:`verify`. Raises IncompleteStoreError: it is there,
+        Sizes are compared with the manifest, content only by `verify`. Raises IncompleteStoreError: it is there,
         but its manifest or a file is missing, or has another size.
         """
         ref = store_at(self.root, stage, key)
@@ -146,15 +142,13 @@ class Archive:
         *,
         version: int | str = 1,
         params: Mapping[str, Any] | None = None,
-        inputs: Sequence[str] | Mapping[str, str] = (),
-        work: float | None = None,
+        inputs: Sequence[str] = (),
     ) -> Iterator[StagedStore]:
         """Give a folder to write into, and publish it when the block ends well.
 
         One process at a time makes a key; the others wait and then find ``done``. When the block fails, the folder is
-        removed and the archive is as before. The manifest says what the block took, with ``work``, how much it had to
-        do in units of the stage's own: from these the cost of the next one is estimated. Raises ArchiveError: the disk
-        refuses; the message names the path and what to do.
+        removed and the archive is as before. Raises ArchiveError: the disk refuses; the message names the path and what
+        to do.
         """
         ref = self.ref(stage, key)
         final = self.root / ref.uri
@@ -165,10 +159,9 @@ class Archive:
             remove_tree(part)
             part.mkdir(parents=True)
             try:
-                start = clocks()
                 yield StagedStore(part, ref, done)
                 if not done:
-                    facts |= {"cost": cost_since(start, work), "created": date_of_store(self.root, ref.uri)}
+                    facts |= {"created": date_of_store(self.root, ref.uri)}
                     consolidate_stores(part)
                     write_manifest(part, facts)
                     self._put_in_place(part, final)
@@ -188,33 +181,25 @@ class Archive:
         *,
         version: int | str,
         params: Mapping[str, Any],
-        inputs: Sequence[str] | Mapping[str, str] = (),
-        work: float | None = None,
+        inputs: Sequence[str] = (),
     ) -> tuple[StageRef, bool]:
-        """Find the store of these facts, or have ``build`` write it; the second value says whether it was built.
-
-        ``work`` has no part in the key: it is what `cost` tells later, beside the time that ``build`` took.
-        """
+        """Find the store of these facts, or have ``build`` write it; the second value says whether it was built."""
         key = stage_key(stage, version, params, inputs)
         found = self.find(stage, key)
         if found is not None:
             return found, False
-        with self.publish(stage, key, version=version, params=params, inputs=inputs, work=work) as staged:
+        with self.publish(stage, key, version=version, params=params, inputs=inputs) as staged:
             if not staged.done:
                 build(staged.path)
         return staged.ref, not staged.done
 
     def manifest(self, ref: StageRef) -> dict[str, Any]:
-        """What is known of a store: stage, key, version, params, inputs, cost, created, libraries, files."""
+        """What is known of a store: stage, key, version, params, inputs, created, libraries, files."""
         return read_manifest(self.root / ref.uri)
 
     def stored_bytes(self, ref: StageRef) -> int:
         """Size of a store's files by its manifest, as they were made: also of those that were cleared away."""
         return made_bytes(self.manifest(ref))
-
-    def cost(self, ref: StageRef) -> Cost | None:
-        """What the making of a store took, by its manifest; None where that does not tell."""
-        return cost_of(self.manifest(ref))
 
     def manifest_hash(self, ref: StageRef) -> str:
         """SHA-256 of a store's manifest.json, and so of every byte of the store."""
@@ -235,15 +220,10 @@ class Archive:
         False where another process works on it and ``wait`` is false. ``unnamed`` says that no run may name it, which
         in a bucket is looked after once more: here whoever clears up is alone.
         """
-        with refusals(self.root, "remove from the archive"):
-            release = take_lock(self._lock_path(f"{ref.stage}-{ref.key}"), wait=wait)
-            if release is None:
-                return False
-            try:
+        with refusals(self.root, "remove from the archive"), self._locked(f"{ref.stage}-{ref.key}", wait=wait) as held:
+            if held:
                 retire(ref.path)
-            finally:
-                release()
-        return True
+        return held
 
     def clear(self, ref: StageRef, *, wait: bool = True) -> bool:
         """Take a store's files away and keep what its manifest tells; asked for again, it is made again.
@@ -251,22 +231,18 @@ class Archive:
         False where another process works on it and ``wait`` is false. Raises IncompleteStoreError: its manifest is
         damaged.
         """
-        with refusals(self.root, "clear up the archive"):
-            release = take_lock(self._lock_path(f"{ref.stage}-{ref.key}"), wait=wait)
-            if release is None:
-                return False
-            part = (self.root / ref.uri).with_name(ref.key + PART_SUFFIX)
-            try:
-                before = read_manifest(self.root / ref.uri)
-                if not is_cleared(before):
+        final = self.root / ref.uri
+        part = final.with_name(ref.key + PART_SUFFIX)
+        with refusals(self.root, "clear up the archive"), self._locked(f"{ref.stage}-{ref.key}", wait=wait) as held:
+            if held and not is_cleared(before := read_manifest(final)):
+                try:
                     remove_tree(part)
                     part.mkdir()
-                    write_manifest(part, cleared_facts(before, manifest_sha256(self.root / ref.uri)))
-                    take_its_place(part, self.root / ref.uri)
-            finally:
-                remove_tree(part)
-                release()
-        return True
+                    write_manifest(part, cleared_facts(before, manifest_sha256(final)))
+                    take_its_place(part, final)
+                finally:
+                    remove_tree(part)
+        return held
 
     @contextmanager
     def in_use(self, *, alone: bool = False) -> Iterator[bool]:
@@ -283,13 +259,6 @@ class Archive:
                 release()
 
     # --- verification and clearing up ---------------------------------------------------------------------------------
-
-    def verify(self, ref: StageRef) -> None:
-        """Read every byte of one store again.
-
-        Raises IncompleteStoreError: names the first file that is missing, changed or not listed.
-        """
-        check_files(ref.path, hashes=True)
 
     def reclaim(self) -> list[str]:
         """Remove unfinished folders that no living process works on; gives their addresses."""
@@ -348,20 +317,7 @@ class Archive:
 
     def _begin_run(self, run_id: str) -> RunDraft | None:
         """Take a run's name and make its folder, empty; None where the name is taken."""
-        folder = self.root / "runs" / (run_id + PART_SUFFIX)
-        release = take_lock(self._lock_path(f"runs-{run_id}"), wait=False)
-        if release is None:
-            return None
-        try:
-            if folder.with_name(run_id).exists():
-                release()
-                return None
-            remove_tree(folder)  # of a run that was killed within this second
-            folder.mkdir(parents=True)
-        except OSError:
-            release()
-            raise
-        return RunDraft(run_id, folder, self.root, release)
+        return self._draft(run_id, wait=False, extends=False)
 
     def extend_run(self, run_id: str, *, wait: bool = True) -> RunDraft | None:
         """Begin to add to a published run; it stays as it is until :meth:`RunDraft.publish` of what is given.
@@ -370,20 +326,29 @@ class Archive:
         run of this name.
         """
         check_name(run_id)
-        folder = self.root / "runs" / (run_id + PART_SUFFIX)
         with refusals(self.root, "write to the archive"):
-            release = take_lock(self._lock_path(f"runs-{run_id}"), wait=wait)
-            if release is None:
-                return None
-            try:
-                if not folder.with_name(run_id).is_dir():
-                    raise ArchiveError(f"there is no run {run_id} in {self.name}; see ls")
-                remove_tree(folder)  # of a process that was killed
-                folder.mkdir()
-            except BaseException:
+            draft = self._draft(run_id, wait=wait, extends=True)
+        if draft is not None and not draft.published.is_dir():
+            draft.abandon()
+            raise ArchiveError(f"there is no run {run_id} in {self.name}; see ls")
+        return draft
+
+    def _draft(self, run_id: str, *, wait: bool, extends: bool) -> RunDraft | None:
+        """Make an empty folder for a run, once it is held; None where another holds it, or has just published it."""
+        folder = self.root / "runs" / (run_id + PART_SUFFIX)
+        release = take_lock(self._lock_path(f"runs-{run_id}"), wait=wait)
+        if release is None:
+            return None
+        try:
+            if not extends and folder.with_name(run_id).exists():
                 release()
-                raise
-        return RunDraft(run_id, folder, self.root, release, extends=True)
+                return None
+            remove_tree(folder)  # of a process that was killed
+            folder.mkdir(parents=True)
+        except BaseException:
+            release()
+            raise
+        return RunDraft(run_id, folder, self.root, release, extends=extends)
 
     def runs(self) -> list[Path]:
         """Folders of the published runs, oldest first."""
@@ -407,10 +372,11 @@ class Archive:
         return self.root / ".locks" / f"{name}.lock"
 
     @contextmanager
-    def _locked(self, name: str) -> Iterator[None]:
-        release = take_lock(self._lock_path(name))
+    def _locked(self, name: str, *, wait: bool = True) -> Iterator[bool]:
+        """Hold a lock while the block runs; gives False where another holds it and ``wait`` is false."""
+        release = take_lock(self._lock_path(name), wait=wait)
         try:
-            yield
+            yield release is not None
         finally:
             if release is not None:
                 release()

@@ -29,9 +29,7 @@ KEY_LENGTH = 20
 SIGNIFICANT_DIGITS = 12
 
 
-def stage_key(
-    stage: str, version: int | str, params: Mapping[str, Any], inputs: Sequence[str] | Mapping[str, str]
-) -> str:
+def stage_key(stage: str, version: int | str, params: Mapping[str, Any], inputs: Sequence[str]) -> str:
     """Key of one stage's output: 20 hex digits of the SHA-256 of stage, version, parameters and input keys.
 
     Floats count to 12 significant digits, 2 and 2.0 alike; the order of parameters does not count, that of a list of

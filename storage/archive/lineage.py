@@ -263,8 +263,8 @@ def version_before(catalogue: Catalogue, uri: str) -> Store | None:
         and _moment(store) < _moment(this)
         and _same_part(catalogue, store, this)
     ]
-    scenes = _scenes(catalogue, uri)
-    same = [store for store in before if not scenes or _scenes(catalogue, store.ref.uri) in (scenes, set())]
+    scenes = scenes_of(catalogue, uri)
+    same = [store for store in before if not scenes or scenes_of(catalogue, store.ref.uri) in (scenes, set())]
     return max(same, key=_moment, default=None)
 
 
@@ -331,7 +331,8 @@ def _same_part(catalogue: Catalogue, *pair: Store) -> bool:
     return first[0] == first[1]
 
 
-def _scenes(catalogue: Catalogue, uri: str) -> set[str]:
+def scenes_of(catalogue: Catalogue, uri: str) -> set[str]:
+    """Return the scenes that a store and what it rests on name in their parameters: at most one, but for damage."""
     stores = (catalogue.stores.get(one) for one in {uri, *catalogue.ancestors([uri])})
     return {str(store.params["scene"]) for store in stores if store is not None and "scene" in store.params}
 

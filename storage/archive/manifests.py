@@ -9,18 +9,15 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import json
-import math
 import os
-import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from pipeline.errors import ArchiveError, IncompleteStoreError
+from pipeline.errors import IncompleteStoreError
 from storage.archive.staging import (
     MANIFEST_NAME,
     NotPlainError,
@@ -37,32 +34,6 @@ CLEARED = "cleared"  # what a store was before its files were cleared away, as t
 EXTENDED = "extended"  # what a run was before something was added to it
 CURE = "restore it from a copy, or run verify --repair on the archive"
 _DISTRIBUTIONS = ("spectralzoom", "numpy", "numba", "torch", "xarray", "zarr", "numcodecs")
-
-
-@dataclass(frozen=True)
-class Cost:
-    """What the making of one store took. ``work`` is in units of the stage's own, None where it gave none."""
-
-    wall_s: float
-    cpu_s: float
-    work: float | None
-    size: int  # of the store's files as they were made [bytes]
-
-
-def cost_since(start: tuple[float, float], work: float | None) -> dict[str, Any]:
-    """The entry ``cost`` of a manifest, from the wall and CPU seconds that `clocks` gave at the start.
-
-    Raises ArchiveError: ``work`` is no amount.
-    """
-    if work is not None and not (math.isfinite(work) and work >= 0):
-        raise ArchiveError(f"work is {work}, expected a number of units of work, 0 or more, or None")
-    wall, cpu = (round(now - then, 6) for now, then in zip(clocks(), start, strict=True))
-    return {"wall_s": wall, "cpu_s": cpu} | ({} if work is None else {"work": float(work)})
-
-
-def clocks() -> tuple[float, float]:
-    """Wall and CPU seconds of this process."""
-    return time.perf_counter(), time.process_time()
 
 
 def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
@@ -136,22 +107,6 @@ def manifest_sha256(folder: Path) -> str:
         return file_hash(folder / MANIFEST_NAME)
     except OSError as error:
         raise IncompleteStoreError(f"{folder / MANIFEST_NAME} cannot be read: {error.strerror}; {CURE}") from error
-
-
-def cost_of(manifest: Mapping[str, Any]) -> Cost | None:
-    """What the making took; None where the manifest does not tell."""
-    cost = manifest.get("cost")
-    if not isinstance(cost, Mapping):
-        return None
-
-    def amount(name: str) -> float | None:
-        value = cost.get(name)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value < 0:
-            return None
-        return float(value)
-
-    wall, cpu, work = amount("wall_s"), amount("cpu_s"), amount("work")
-    return None if wall is None or cpu is None else Cost(wall, cpu, work, made_bytes(manifest))
 
 
 def listed_bytes(manifest: Mapping[str, Any]) -> int:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from storage.archive.keys import StageRef, in_text
-from storage.archive.manifests import Cost, cost_of, extended_at, is_cleared, listed_bytes, try_manifest
+from storage.archive.manifests import extended_at, is_cleared, listed_bytes, try_manifest
 from storage.archive.staging import MANIFEST_NAME, file_hash, read_plain
 
 RECEIPT = "receipt.json"
@@ -62,9 +62,8 @@ class Store:
     @property
     def inputs(self) -> list[str]:
         """Keys of the stores that it was made of, in order."""
-        inputs = self.facts.get("inputs", [])
-        values = inputs.values() if isinstance(inputs, dict) else inputs if isinstance(inputs, list) else []
-        return [value for value in values if isinstance(value, str)]
+        inputs = self.facts.get("inputs")
+        return [value for value in inputs if isinstance(value, str)] if isinstance(inputs, list) else []
 
     @property
     def created(self) -> str:
@@ -75,11 +74,6 @@ class Store:
     def cleared(self) -> bool:
         """Whether its files were cleared away, to be made again when they are asked for."""
         return is_cleared(self.facts)
-
-    @property
-    def cost(self) -> Cost | None:
-        """What its making took."""
-        return cost_of(self.facts) if self.facts else None
 
     @property
     def size(self) -> int:

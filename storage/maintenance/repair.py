@@ -111,7 +111,7 @@ def _hopeless(catalogue: Catalogue, uri: str, versions: Mapping[str, int | str] 
     """Why a store cannot be made again; empty where it can."""
     store, stage = catalogue.stores.get(uri), uri.split("/")[1]
     if catalogue.is_only_copy(uri):
-        return "raw lines that cannot be had again: restore them from a copy; the chunks not named can still be read"
+        return "raw lines that cannot be had again: restore them from a copy; lines not named can still be read"
     if uri in catalogue.lost and versions is not None and stage not in versions:
         return f"there is no stage {stage}, so nothing tells what it was: take it out of the archive"
     made = "" if store is None else store.version

@@ -1,14 +1,13 @@
 """Reading a whole archive again: every byte against its manifest, every manifest against its seal and its runs.
 
 What is no file where one should be, such as a link or a pipe, is told and never opened. Of a broken file of an array it
-is told which part it holds, and which chunks of it can no longer be read.
+is told which part it holds.
 """
 
 from __future__ import annotations
 
-import itertools
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -33,7 +32,6 @@ from storage.arrays.fetched_files import SUMS, first_unlike
 from storage.arrays.spool import ENDING, spool_problems
 
 WORDS = {"y": "rows", "x": "columns", "line": "lines", "sample": "samples", "band": "bands", "patch": "patches"}
-MOST_NAMED = 3
 SPOOLS = "spool"
 _NO_ARRAY = (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError)
 
@@ -41,7 +39,7 @@ _NO_ARRAY = (OSError, ValueError, KeyError, TypeError, IndexError, RecursionErro
 def name_damage(store: Path, name: str) -> str:
     """What is known of a broken file of a store, in words to follow its name; empty where it belongs to no array.
 
-    For example ``(values: rows 0 to 63, columns 0 to 639; unreadable: rows 32 to 63, columns 0 to 31)``.
+    For example ``(values: rows 0 to 63, columns 0 to 639)``; a dimension of which it has everything is left out.
     """
     file = store / name
     inner = [path for path in file.parents if path.is_relative_to(store)]
@@ -55,46 +53,13 @@ def name_damage(store: Path, name: str) -> str:
         box = [slice(number * size, min((number + 1) * size, whole)) for number, size, whole in sizes]
     except _NO_ARRAY:  # such as a store's own description
         return ""
-    where = f"{folder.relative_to(store).as_posix()}: {_words(array, box)}"
-    return f" ({where}{_unreadable(array, box) if kind_of(file) == 'a file' else ''})"
-
-
-def _words(array: zarr.Array[Any], box: Sequence[slice]) -> str:
-    """Index ranges of a part of an array; a dimension of which it has everything is left out."""
     dims = getattr(array.metadata, "dimension_names", None) or [f"axis {axis}" for axis in range(array.ndim)]
     ranges = [
         f"{WORDS.get(dim, dim)} {part.start} to {part.stop - 1}"
         for dim, size, part in zip(dims, array.shape, box, strict=True)
         if part.stop - part.start < size
     ]
-    return ", ".join(ranges) or "all of it"
-
-
-def _unreadable(array: zarr.Array[Any], box: Sequence[slice]) -> str:
-    """Which chunks of a file cannot be decoded: all of them where the file's index is damaged."""
-    steps = [
-        [slice(start, min(start + step, part.stop)) for start in range(part.start, part.stop, step)]
-        for part, step in zip(box, array.chunks, strict=True)
-    ]
-    chunks = list(itertools.product(*steps))
-    broken = [chunk for chunk in chunks if not _can_be_read(array, chunk)]
-    if len(chunks) == 1:
-        return ""
-    if not broken:
-        return "; every chunk of it can still be read"
-    if len(broken) == len(chunks):
-        return "; none of its chunks can be read"
-    more = f" and {len(broken) - MOST_NAMED} more" if len(broken) > MOST_NAMED else ""
-    return f"; unreadable: {'; '.join(_words(array, chunk) for chunk in broken[:MOST_NAMED])}{more}"
-
-
-def _can_be_read(array: zarr.Array[Any], box: tuple[slice, ...]) -> bool:
-    """Whether one chunk decodes; whatever a decoder says of damaged bytes, the answer is no."""
-    try:
-        array[box]
-    except Exception:
-        return False
-    return True
+    return f" ({folder.relative_to(store).as_posix()}: {', '.join(ranges) or 'all of it'})"
 
 
 Kind = Literal["whole", "broken", "missing", "stray", "growing"]

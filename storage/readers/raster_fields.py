@@ -17,7 +17,7 @@ from affine import Affine
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.geometry.grid import UNLABELLED, SceneGrid
+from pipeline.geometry.grid import UNLABELLED, SceneGrid, block_means
 from pipeline.lazy import deferred
 from storage.arrays.layout import SHARD_ROWS
 from storage.arrays.mosaics import PATCHES_A_SHARD, MosaicWriter, PatchWriter

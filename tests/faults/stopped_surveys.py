@@ -23,12 +23,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from flows.publish.receipt import comparable, is_pending
+from flows.publish.receipt import is_pending
 from flows.terminal.processes import TERMINATED
 from storage.archive.archive import Archive
 from tests.faults.fault_table import Clock, Row, reported_wrong
 from tests.faults.nursery import ROOT
 from tests.faults.small_survey import problems, stored
+from tests.receipts import comparable
 
 BANDS = ",".join(str(band) for band in range(4, 268, 8))
 SURVEY = f"survey --scene farm --size 256x256 --bands {BANDS} --seed 5 --budget 0.8"

@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 
-from flows.publish.receipt import check_receipt, comparable, is_pending
+from flows.publish.receipt import check_receipt, is_pending
 from flows.terminal.processes import TERMINATED
 from storage.archive.archive import Archive
 from storage.arrays.spool import Spool
@@ -27,6 +27,7 @@ from storage.remote.opening import verify_archive
 from tests.faults.nursery import ROOT, Ended
 from tests.faults.small_survey import Subject, problems, stored, words, wrong_after_fault, wrong_after_rerun
 from tests.flows.small_fields import write_field, write_weights
+from tests.receipts import comparable
 
 GOING_ON = "terminated; the same command goes on from here"
 SYNCS = (2, 60)  # of a survey's files, before which it is stopped

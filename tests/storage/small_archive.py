@@ -58,7 +58,7 @@ def _store(archive: Archive, stage: str, params: dict[str, Any], inputs: list[St
     def build(path: Path) -> None:
         (path / "data.bin").write_bytes(json.dumps([stage, params]).encode() * 40)
 
-    return archive.produce(stage, build, version=1, params=params, inputs=[ref.key for ref in inputs], work=64.0)[0]
+    return archive.produce(stage, build, version=1, params=params, inputs=[ref.key for ref in inputs])[0]
 
 
 def flip(path: Path, at: int = -3, bit: int = 2) -> None:

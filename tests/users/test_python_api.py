@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import spectralzoom
-from spectralzoom.opened import NoRunError, OpenedRun, by_wavelength, on_axes, open_labelled
+from spectralzoom.opened import NoRunError, OpenedRun, by_wavelength
 from storage.archive.archive import Archive
 from storage.arrays.class_maps import load_class_map
 from storage.arrays.ground_maps import load_geobox
@@ -137,21 +137,6 @@ def test_the_nearest_band_is_found_in_any_order(wavelengths: list[int], wanted: 
     assert float(chosen.wavelength) == wavelengths[int(chosen)]
 
 
-def test_an_axis_without_a_place_counts_pixels() -> None:
-    """Where nothing says where it lies."""
-    found = on_axes(xr.Dataset({"values": (("y", "x"), np.zeros((2, 3)))}), {})
-    assert (found.y.values.tolist(), found.x.attrs["units"]) == ([0, 1], "px")
-
-
-def test_stores_without_coordinates_get_them(run: OpenedRun) -> None:
-    """Stores of before said their transform alone: centres follow from it."""
-    whole = open_labelled(Path(run.archive_name) / run.receipt["products"]["mosaic"])
-    bare = on_axes(whole.drop_vars(["y", "x", "band"]), whole.attrs)
-    for axis in ("y", "x", "band"):
-        np.testing.assert_allclose(bare[axis], whole[axis], atol=1e-12)
-        assert bare[axis].attrs["units"] == whole[axis].attrs["units"]
-
-
 def test_the_map_on_the_ground_has_its_crs(run: OpenedRun) -> None:
     """By rioxarray's convention, with the transform that the store was written with."""
     drawn = run.ground_map
@@ -237,9 +222,3 @@ def test_what_cannot_be_is_one_error(make_weights: WeightsMaker, tmp_path: Path)
     with pytest.raises(AttributeError, match="it has Error"):
         _ = spectralzoom.surveys
     assert not out.exists()
-
-
-def test_a_product_that_a_run_lacks_is_named(run: OpenedRun) -> None:
-    """With those that it has."""
-    with pytest.raises(spectralzoom.Error, match=r"left no no_such; it left .*class_map"):
-        run.dataset("no_such")

@@ -17,7 +17,7 @@ from PIL import Image
 from rich.console import Console
 
 import storage.readers.recordings
-from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
+from flows.archive.reprocess_command import run_reprocess
 from flows.publish.run_folder import Published, load_receipt
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
@@ -418,13 +418,13 @@ def test_a_run_of_the_rig_is_reprocessed_from_its_raw_cubes(
     with emulated(rig_settings(archive, weights), {}, monkeypatch, scene=field()):
         published = run_survey(rig_settings(archive, weights, scan_step=2), QUIET)
     be_version(monkeypatch, "capture", 99)
-    assert run_reprocess(ReprocessRequest(archive), QUIET) == 0
+    assert run_reprocess(archive, QUIET) == 0
     first, second = Archive.open(archive).runs()
     again = load_receipt(second)
     assert first == published.folder
     assert (again["source"], again["survey"]) == ("recorded", published.receipt["survey"])
     assert digest_of_map(archive, again) == digest_of_map(archive, published.receipt)
-    assert run_reprocess(ReprocessRequest(archive), QUIET) == 0
+    assert run_reprocess(archive, QUIET) == 0
     assert len(Archive.open(archive).runs()) == 2
 
 
@@ -437,7 +437,7 @@ def test_a_recording_whose_files_moved_is_reprocessed(
     survey_sweeps(archive, folder / "scan.hdr", weights=str(weights))
     folder.rename(tmp_path / "elsewhere")
     other = make_weights(dim=24)
-    assert run_reprocess(ReprocessRequest(archive, weights=other), QUIET) == 0
+    assert run_reprocess(archive, QUIET, weights=other) == 0
     again = load_receipt(Archive.open(archive).runs()[-1])
     fresh = survey_sweeps(tmp_path / "b", tmp_path / "elsewhere" / "scan.hdr", weights=str(other))
     assert digest_of_map(archive, again) == digest_of_map(tmp_path / "b", fresh.receipt)
@@ -489,7 +489,7 @@ def test_numbers_of_sixteen_bits_are_surveyed_and_found_again(tmp_path: Path, we
     published = survey_sweeps(tmp_path / "a", folder / "scan.hdr", weights=str(weights))
     camera = published.receipt["settings"]["camera"]
     assert (camera["bits"], camera["exposure_ms"] + camera["readout_ms"]) == (16, 3500)
-    assert run_reprocess(ReprocessRequest(tmp_path / "a"), QUIET) == 0
+    assert run_reprocess(tmp_path / "a", QUIET) == 0
     assert len(Archive.open(tmp_path / "a").runs()) == 1
     with pytest.raises(SettingsError, match=r"at most 1 for 16-bit lines .*take one uniform scan"):
         survey_sweeps(tmp_path / "b", folder / "scan.hdr", weights=str(weights), budget=0.6)

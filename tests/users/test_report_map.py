@@ -26,7 +26,7 @@ SHOWN = "document.querySelectorAll('#map .leaflet-overlay-pane img').length"
 
 
 def known_map() -> FieldMap:
-    """Two pictures and a sweep, with words that mean no good."""
+    """Three pictures, with words that mean no good."""
     numbers = np.zeros((HEIGHT, WIDTH), np.uint8)
     numbers[:, WIDTH // 2 :] = 1
     picture = png_address(numbers, np.array([[120, 80, 40], [20, 200, 60]], np.uint8))
@@ -34,7 +34,6 @@ def known_map() -> FieldMap:
         MapLayer("True colour", picture, shown=True),
         MapLayer("Class map", picture, shown=True),
         MapLayer("Truth", picture, opacity=0.5),
-        MapLayer("Sweeps", boxes=[((8, 16, 0, WIDTH), f"1 of 1{BAD}")]),
     ]
     return FieldMap((WIDTH, HEIGHT), layers, [{"name": f"crop{BAD}", "fraction": "50 %", "colour": "#14c83c"}])
 
@@ -68,15 +67,12 @@ def opened(tab: Tab, page: Path) -> Tab:
 
 @needs_browser
 def test_layers_are_switched(opened: Tab) -> None:
-    """What is off is not on the map; a sweep says which it is, in words that stay words."""
-    assert opened.run(f"{BOXES}.map((one) => one.checked)") == [True, True, False, False]
+    """What is off is not on the map."""
+    assert opened.run(f"{BOXES}.map((one) => one.checked)") == [True, True, False]
     assert opened.run(SHOWN) == 2
     opened.run(f"{BOXES}.filter((one) => !one.checked).forEach((one) => one.click())")
     assert opened.run(SHOWN) == 3
     assert opened.run("document.querySelector('#map img[alt=Truth]').style.opacity") == "0.5"
-    opened.run("document.querySelector('#map path').dispatchEvent(new MouseEvent('mouseover', {bubbles: true}))")
-    said = opened.run("document.querySelector('.leaflet-tooltip').textContent")
-    assert said == "1 of 1" + BAD.replace("\u202e", "\\u202e")
 
 
 @needs_browser

@@ -54,7 +54,7 @@ def test_a_receipt_says_no_metres_where_nobody_knows(surveyed_png: Survey, tmp_p
 
 
 def test_words_are_those_of_the_figures() -> None:
-    """Hectares an hour and seconds a hectare are of the same pace."""
+    """Field, ground pixel and pace stand in one row."""
     field = {
         "view_deg": [7.74, 6.2],
         "ground_pixel_m": 0.12,
@@ -63,4 +63,4 @@ def test_words_are_those_of_the_figures() -> None:
         "hectares_per_hour": 1.887 / 24.5 * 3600,
     }
     ((_, said),) = finding_rows({"field": field})
-    assert "860 m away in the middle: 1.89 ha at 12 cm a pixel, 277 ha an hour of the camera (13 s a hectare)" in said
+    assert "860 m away in the middle; 1.89 ha; 12 cm a pixel; 277 ha an hour of the camera" in said

@@ -6,7 +6,6 @@ import io
 import json
 import shlex
 import shutil
-import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -15,10 +14,8 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from flows.archive import commands as archive_tables
 from flows.archive.commands import command, contents, explain, gc, ls, run_verify
 from flows.settings.load import load_settings
-from flows.terminal.figures import DASH
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from pipeline.errors import ArchiveError
 from storage.archive.archive import Archive
@@ -65,21 +62,6 @@ def test_ls_shows_runs_and_stores(two_budgets: Path, capsys: pytest.CaptureFixtu
     assert "age" in out
 
 
-def test_of_many_stores_the_newest_are_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """And how many older ones there are; those that are missing are not counted as there."""
-    archive = Archive.open(tmp_path)
-    for number in range(archive_tables.MOST_ROWS + 2):
-        with archive.publish("segment", f"key{number:02d}", inputs=["gone"]):
-            pass
-        time.sleep(0.002)
-    ls(tmp_path)
-    out = capsys.readouterr().out
-    assert "and 2 older" in out
-    assert ("key01" in out, "key02" in out, "key21" in out) == (False, True, True)
-    content = _json(capsys, lambda: run_verify(tmp_path, QUIET, as_json=True), FAILED)
-    assert content["checked"] == content["whole"] == archive_tables.MOST_ROWS + 2
-
-
 def test_ages_are_told_in_days(two_budgets: Path) -> None:
     """A clock that was set back gives no error; progress goes to the console, not among answers."""
     for days in (3, -3):
@@ -88,26 +70,6 @@ def test_ages_are_told_in_days(two_budgets: Path) -> None:
     told = io.StringIO()
     run_verify(two_budgets, Console(file=told))
     assert "reading again: 100%" in told.getvalue()
-
-
-@pytest.mark.parametrize(
-    ("seconds", "words"),
-    [
-        (None, DASH),
-        (-5, "0.00 s"),
-        (59, "59 s"),
-        (119, "119 s"),
-        (120, "2 min"),
-        (7199, "119 min"),
-        (7200, "2 h"),
-        (2 * 86400 - 1, "47 h"),
-        (2 * 86400, "2 days"),
-        (4000 * 86400.0, "4000 days"),
-    ],
-)
-def test_ages_are_short(seconds: float | None, words: str) -> None:
-    """One number and one unit."""
-    assert archive_tables._age(seconds) == words
 
 
 def test_an_empty_and_a_damaged_archive_are_listed(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,7 +13,7 @@ from rich.console import Console
 from flows.archive.commands import contents, explain, gc, ls, run_verify
 from flows.archive.export_command import run_export
 from flows.archive.plan_command import forecast
-from flows.archive.reprocess_command import ReprocessRequest, run_judge, run_reprocess
+from flows.archive.reprocess_command import run_judge, run_reprocess
 from flows.settings.load import load_settings
 from flows.tasks.open_survey import versions_made_again
 from flows.terminal.processes import DONE
@@ -80,15 +80,14 @@ def _settings(archive: Archive) -> Any:
 
 def test_fields_are_as_they_would_become(archive: Archive) -> None:
     """What was cleared is nothing that a survey would find otherwise: nothing is surveyed again."""
-    assert run_reprocess(ReprocessRequest(archive.root), QUIET) == DONE
+    assert run_reprocess(archive.root, QUIET) == DONE
     assert len(archive.runs()) == 2
 
 
 def test_other_weights_read_patches_that_are_cut_again(archive: Archive, tmp_path: Path) -> None:
     """A new map of the old light."""
     save_weights(random_weights(RGB_NM, width=12), tmp_path / "other.safetensors")
-    request = ReprocessRequest(archive.root, weights=tmp_path / "other.safetensors")
-    assert run_reprocess(request, QUIET) == DONE
+    assert run_reprocess(archive.root, QUIET, weights=tmp_path / "other.safetensors") == DONE
     newest = json.loads((archive.runs()[-1] / "receipt.json").read_text())
     states = {row["name"]: row["state"] for row in newest["stages"]}
     assert (states["capture_coarse"], states["rectify"], states["segment"]) == ("cached", "cached", "ran")

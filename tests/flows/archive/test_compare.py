@@ -115,18 +115,6 @@ def test_runs_of_different_fields_are_refused(survey_png: Survey, scene_files: P
         compare(tmp_path / "archive", "nothing", "latest")
 
 
-def test_what_sets_two_farms_apart_is_told(tmp_path: Path) -> None:
-    """Seed and size stand in what a built-in scene is called by; its bands are of the camera."""
-    archive = Archive.open(tmp_path)
-    for size in ("96x64", "96x96"):
-        receipt = {"scene": f"farm@1/seed=0/shape={size}/bands=9", "settings": {"scene": "farm", "seed": 0}}
-        with archive.new_run("farm") as draft:
-            draft.write_file("receipt.json", json.dumps(receipt | {"products": {"class_map": "stages/segment/aaaa/m"}}))
-    old, new = (path.name for path in archive.runs())
-    with pytest.raises(SceneError, match=r"shape=96x64, runs/.*shape=96x96;"):
-        compare(tmp_path, old, new)
-
-
 def test_a_map_that_cannot_be_believed_is_not_compared(two_budgets: Path, tmp_path: Path) -> None:
     """Though its numbers can still be read."""
     archive = Path(shutil.copytree(two_budgets, tmp_path / "archive"))

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flows.archive.history import FieldHistory, read_histories, render_history, render_index, time_of_visit, way_to
+from flows.archive.history import FieldHistory, read_history, render_history, time_of_visit
 from storage.archive.archive import Archive
 from storage.archive.records import Run
 from storage.arrays.class_maps import load_class_map
@@ -36,8 +36,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory, survey_png: Any) -> Path:
 
 def test_runs_are_one_history(archive: Path) -> None:
     """Visits stand by their due times; shares add up; a map that was drawn is among the pictures."""
-    north, south = read_histories(Archive.open(archive))
-    assert (north.field, south.field) == ("north", "south")
+    north = read_history(Archive.open(archive), "north")
     assert [row["visit"] for row in north.runs] == ["2026-06-01T10:00:00Z", f"b {BAD}"]
     assert north.runs[0]["visited"] == "2026-06-01T10:00:00Z"
     assert sum(north.runs[0]["areas"].values()) == pytest.approx(1.0)
@@ -54,7 +53,7 @@ def test_runs_are_one_history(archive: Path) -> None:
 
 
 def test_pages_load_nothing_and_lead_to_reports(archive: Path, command_line: Any, tmp_path: Path) -> None:
-    """Without a script, every word escaped; each link is a file that is there, on either page."""
+    """Without a script, every word escaped; each link is a file that is there."""
     page = tmp_path / "pages" / "history.html"
     ended = command_line("report", archive, "--field", "north", "-o", page)
     assert ended.code == 0, ended.err
@@ -68,18 +67,13 @@ def test_pages_load_nothing_and_lead_to_reports(archive: Path, command_line: Any
     assert len(found.links) == 2
     assert all((page.parent / link).is_file() for link in found.links)
     assert all(words in text for words in ("2026-06-01 10:00", "Fraction of the map"))
-    page = tmp_path / "index.html"
-    ended = command_line("report", archive, "-o", page)
-    assert ended.code == 0, ended.err
-    found = Page(page.read_text(encoding="utf-8"))
-    assert sorted(found.links) == ["index-north.html", "index-south.html"]
-    assert all((tmp_path / link).is_file() for link in found.links)
 
 
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
-        ("--field nrth -o {0}/x.html", 1, "no field of .* is called 'nrth'; did you mean north?"),
+        ("--field nrth -o {0}/x.html", 1, "no field of .* is called 'nrth'; give --field with one of: north, south"),
+        ("-o {0}/x.html", 1, "has 2 fields; give --field with one of: north, south"),
         ("-o {0}", 2, "is a folder, expected the file to write"),
         ("-o {0}/x.pdf", 2, "expected a page's name that ends in .html"),
         ("-o {1}/x.html", 2, "lies in the archive"),
@@ -91,17 +85,6 @@ def test_a_report_that_cannot_be_written(
     """One message, the exit code, and no file."""
     command_line("report", archive, *words.format(tmp_path, archive).split()).refused(code, message)
     assert not list(tmp_path.glob("*.html"))
-
-
-def test_pages_of_little(tmp_path: Path) -> None:
-    """A field without a run has a page; links are relative."""
-    page = render_history(FieldHistory("new", "archive", []), "")
-    Page(page)
-    assert "No run has left a figure yet" in page
-    Page(render_index([], "archive", {}))
-    assert way_to(tmp_path / "archive", tmp_path / "x.html") == "archive"
-    assert way_to(tmp_path / "archive", tmp_path / "pages" / "x.html") == "../archive"
-    assert way_to(tmp_path / "my field", tmp_path / "x.html") == "my%20field"
 
 
 @pytest.mark.parametrize(

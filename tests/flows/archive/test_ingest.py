@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import os
 import signal
@@ -227,18 +226,6 @@ def test_a_source_that_changes_meanwhile(
     with pytest.raises(SceneError, match="changed while it was read; ingest it again once it is whole"):
         ingest(header, tmp_path / "archive")
     assert Archive.open(tmp_path / "archive").refs() == []
-
-
-def test_progress_and_notes_are_shown(tmp_path: Path, raw: NDArray[np.uint16]) -> None:
-    """The size, what is doubtful and where the store lies stand on the console."""
-    shown = io.StringIO()
-    source = str(write_envi(tmp_path / "a.img", raw[:5], lines=9))
-    run_ingest(source, tmp_path / "archive", Console(file=shown, width=200))
-    text = shown.getvalue()
-    for words in ("storing the cube: 100%", "9 x 40 px, 3 bands, 450-650 nm", "4 of 9 lines are in no file", "stored:"):
-        assert words in text
-    run_ingest(source, tmp_path / "archive", Console(file=shown, width=200))
-    assert "already there:" in shown.getvalue()
 
 
 CODE = """

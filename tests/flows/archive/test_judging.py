@@ -12,17 +12,16 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
-from flows.cli.model_verbs import _run_address
+from flows.archive.reprocess_command import run_reprocess
 from flows.publish import run_folder as publish
-from flows.publish.receipt import check_receipt, comparable, is_pending
+from flows.publish.receipt import check_receipt, is_pending
 from flows.tasks.open_survey import STAGES
 from flows.tasks.stages import accuracy as evaluation
 from models.weights.files import save_weights
-from pipeline.errors import SettingsError
 from storage.archive.archive import Archive
 from tests.conftest import RGB_NM, random_weights
 from tests.flows.conftest import CommandLine, act_instead, be_version, problems, turned
+from tests.receipts import comparable
 from tests.storage.small_archive import flip
 
 pytestmark = pytest.mark.usefixtures("no_effects")
@@ -162,7 +161,7 @@ def test_reprocess_adds_what_a_stopped_survey_lacks(
     """The field is not as it would become: its run is judged, and no other is made."""
     break_off(survey, monkeypatch)
     for _ in range(2):
-        assert run_reprocess(ReprocessRequest(out), QUIET) == 0
+        assert run_reprocess(out, QUIET) == 0
         (receipt,) = receipts(out)
         assert receipt["accuracy_is"] == "judged"
     assert problems(out) == []
@@ -197,15 +196,6 @@ def test_ls_and_the_receipt_say_that_a_map_is_not_judged_yet(
     assert [(row["accuracy_is"], row["miou"]) for row in listed] == [("pending", None), ("left out", None)]
     pages = [(run / "report.html").read_text() for run in Archive.open(out).runs()]
     assert ["The map is not judged yet" in page for page in pages] == [True, False]
-
-
-def test_accuracy_that_is_left_out(surveyed: Path) -> None:
-    """The receipt says so, and no stage judged."""
-    (receipt,) = receipts(surveyed)
-    assert receipt["accuracy_is"] == "left out"
-    assert "evaluate" not in [stage["name"] for stage in receipt["stages"]]
-    assert "accuracy" not in receipt
-    assert problems(surveyed) == []
 
 
 def test_what_was_left_out_is_added_later(
@@ -308,23 +298,3 @@ def test_words_that_mean_neither_are_refused(case: str, surveyed: Path, command_
     """One message that says which of the two wants what, or which runs there are."""
     code, words, message = WORDS[case]
     command_line("evaluate", *words.replace("ARCHIVE", str(surveyed)).split()).refused(code, message)
-
-
-@pytest.mark.parametrize(
-    ("text", "found"),
-    [
-        ("archive/runs/20261120T101701-farm", ("archive", "20261120T101701-farm")),
-        ("/a/runs/b/runs/c/", ("/a/runs/b", "c")),
-        ("s3://bucket/prefix/runs/c", ("s3://bucket/prefix", "c")),
-        ("archive/stages/segment/c", None),
-        ("runs/c", None),
-        ("farm", None),
-    ],
-)
-def test_addresses_of_runs(text: str, found: tuple[str, str] | None) -> None:
-    """Archive and name, as `survey` prints them; anything else without --weights is refused."""
-    if found is not None:
-        assert _run_address(text, None, given=False) == found
-        return
-    with pytest.raises(SettingsError, match="give --weights FILE to judge weights on this data set"):
-        _run_address(text, None, given=False)

@@ -88,8 +88,17 @@ def means_of(values: NDArray[Any], factor: int = 4) -> NDArray[np.float64]:
     return np.array(rows).reshape(-(-height // factor), -(-width // factor), values.shape[2])
 
 
-@pytest.mark.parametrize("shape", [(33, 47), (1, 40), (40, 1), (64, 96), (5, 3)], ids=str)
-@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float32], ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize(
+    ("shape", "kind"),
+    [
+        ((33, 47), np.uint8),
+        ((33, 47), np.float32),
+        ((64, 96), np.uint16),
+        ((1, 40), np.uint8),
+        ((40, 1), np.float32),
+        ((5, 3), np.uint16),
+    ],
+)
 def test_what_is_stored_is_what_the_file_says(
     surveyed: Raster, tmp_path: Path, kind: type[np.generic], shape: tuple[int, int]
 ) -> None:

@@ -6,8 +6,6 @@ import dataclasses
 import io
 import json
 import shutil
-import time
-from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +15,7 @@ from rich.console import Console
 
 from flows.archive import stale_runs as generations
 from flows.archive.commands import run_verify
-from flows.archive.reprocess_command import ReprocessRequest, _survey, run_reprocess
+from flows.archive.reprocess_command import _survey, run_reprocess
 from flows.settings.survey_settings import Settings
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from pipeline.errors import SettingsError, WeightsError
@@ -65,7 +63,7 @@ class Reprocess:
 
     def __call__(self, archive: Path, code: int = DONE, survey: Any = None, **wishes: Any) -> list[dict[str, Any]]:
         self.capsys.readouterr()
-        assert run_reprocess(ReprocessRequest(archive, **wishes), QUIET, survey=survey, as_json=True) == code
+        assert run_reprocess(archive, QUIET, survey=survey, as_json=True, **wishes) == code
         fields: list[dict[str, Any]] = json.loads(self.capsys.readouterr().out)["fields"]
         return fields
 
@@ -85,7 +83,7 @@ def _captures(archive: Path) -> list[str]:
 
 
 def test_nothing_has_changed_in_fields_however_they_are_chosen(surveyed: Path, reprocess: Reprocess) -> None:
-    """By name, pattern, scene file or date; a name that is none is refused; the newest run of a field counts."""
+    """By name, pattern or scene file; a name that is none is refused; the newest run of a field counts."""
     newest = Archive.open(surveyed).runs()[-1].name
     rows = reprocess(surveyed)
     assert [(row["field"], row["state"]) for row in rows] == [("turned", "skipped"), ("scene", "skipped")]
@@ -93,15 +91,12 @@ def test_nothing_has_changed_in_fields_however_they_are_chosen(surveyed: Path, r
     assert len(Archive.open(surveyed).runs()) == 3
     for field in ("turned", "tur*", "turned.png"):
         assert reprocess.states(surveyed, field=field) == [("turned", "skipped")]
-    assert len(reprocess(surveyed, since="2020-01-01")) == 2
-    assert reprocess(surveyed, since="2999-01-01") == []
     for wishes, words in (
         ({"field": "none"}, r"--field none.*turned, scene"),
-        ({"since": "spring"}, "--since expects a date"),
         ({"weights": Path("nowhere.safetensors")}, "there is no such file"),
     ):
         with pytest.raises(SettingsError, match=words):
-            run_reprocess(ReprocessRequest(surveyed, **wishes), QUIET)
+            run_reprocess(surveyed, QUIET, **wishes)
 
 
 def test_new_weights_make_a_generation_beside_the_old(archive: Path, other: Path, reprocess: Reprocess) -> None:
@@ -133,9 +128,8 @@ def test_an_interrupted_run_goes_on(archive: Path, other: Path, reprocess: Repro
         done.append(_survey(settings, console))
         return done[0]
 
-    request = ReprocessRequest(archive, weights=other)
     with pytest.raises(KeyboardInterrupt):
-        run_reprocess(request, QUIET, survey=interrupted)
+        run_reprocess(archive, QUIET, weights=other, survey=interrupted)
     assert reprocess.states(archive, weights=other) == [("scene", "ran"), ("turned", "skipped")]
 
 
@@ -164,19 +158,17 @@ def test_one_field_fails_and_the_others_are_done(archive: Path, other: Path, rep
     assert reprocess.states(archive, FAILED, survey=picky, weights=other, field="turned") == [("turned", "failed")]
 
 
-def test_only_damaged_fields_are_surveyed_again(archive: Path, reprocess: Reprocess) -> None:
-    """`--failed`: a run that lacks a store is made whole by a newer one; what is damaged is left to verify --repair."""
-    assert reprocess(archive, failed=True) == []
+def test_damaged_fields_are_surveyed_again(archive: Path, reprocess: Reprocess) -> None:
+    """A run that lacks a store is made whole by a newer one; what is damaged is left to verify --repair."""
     newest = Catalogue.read(archive).runs[-1]
     store = archive / newest.products["class_map"].rpartition("/")[0]
     manifest = (store / "manifest.json").read_bytes()
     (store / "manifest.json").unlink()
-    (row,) = reprocess(archive, FAILED, failed=True)
+    (row,) = reprocess(archive, FAILED, field="scene")
     assert "verify --repair" in row["message"]
     (store / "manifest.json").write_bytes(manifest)
     shutil.rmtree(store)
-    assert reprocess.states(archive, failed=True) == [("scene", "ran")]
-    assert reprocess(archive, failed=True) == []
+    assert reprocess.states(archive) == [("turned", "skipped"), ("scene", "ran")]
 
 
 def test_a_run_without_settings_is_told(archive: Path, reprocess: Reprocess) -> None:
@@ -187,28 +179,11 @@ def test_a_run_without_settings_is_told(archive: Path, reprocess: Reprocess) -> 
     assert any("cannot be read" in str(row["message"]) for row in rows)
 
 
-def test_a_date_counts_from_its_first_moment_in_utc(
-    surveyed: Path, reprocess: Reprocess, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Wherever the clock on the wall is, and the moment itself included."""
-    newest = Catalogue.read(surveyed).runs[-1].created
-    monkeypatch.setenv("TZ", "UTC-14")
-    time.tzset()
-    try:
-        for since in (newest, newest.removesuffix("+00:00")):
-            assert reprocess.states(surveyed, since=since) == [("scene", "skipped")]
-        later = (datetime.fromisoformat(newest) + timedelta(milliseconds=1)).isoformat()
-        assert reprocess(surveyed, since=later) == []
-    finally:
-        monkeypatch.undo()
-        time.tzset()
-
-
 def test_a_dry_run_leaves_everything(surveyed: Path, other: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """It says what would run, for people on stdout and its progress on the console."""
     before = sorted(path for path in surveyed.rglob("*") if ".locks" not in path.parts)
     told = io.StringIO()
-    assert run_reprocess(ReprocessRequest(surveyed, weights=other, dry_run=True), Console(file=told)) == DONE
+    assert run_reprocess(surveyed, Console(file=told), weights=other, dry_run=True) == DONE
     out = capsys.readouterr().out
     assert "2 fields: 2 would run" in out
     assert "reprocess 1 of 2: turned" in told.getvalue()

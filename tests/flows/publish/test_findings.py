@@ -53,7 +53,7 @@ def test_changed_hectares_are_told_from_class_to_class() -> None:
 def test_words_tell_what_changed_and_what_is_old() -> None:
     """From which class to which, with hectares; days with what is older; of a first capture nothing of either."""
     later = {"changes_ha": [[0.5, "crop", "bare_soil"], [0.0004, "weed", "crop"]], "older_ha": {"1": 0.25, "7": 0.0}}
-    first = "EPSG:32632, 0.12 m a pixel: bare soil 1 ha"
+    first = "EPSG:32632; 0.12 m a pixel; bare soil 1 ha"
     assert finding_rows({"ground": GROUND | {"older_ha": {"1": 0.0}}}) == [("on the ground", first)]
     ((_, words),) = finding_rows({"ground": GROUND | later})
     assert words == (
@@ -84,7 +84,7 @@ def test_a_plain_scan_is_told_what_its_map_scores_by_itself(survey_png: Survey, 
     assert receipt["expected"]["miou"] == pytest.approx(told.miou, abs=1e-5)
     assert receipt["expected"]["error"] == pytest.approx(told.error, abs=1e-5)
     assert set(receipt["expected"]["per_class_iou"]) <= set(CLASSES)
-    words = f"about {100 * told.miou:.1f} ± {100 * told.error:.1f}"
+    words = f"about {100 * told.miou:.1f}, with no label asked; error {100 * told.error:.1f}"
     assert words in dict(finding_rows(receipt))["expected score"]
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from flows.publish.receipt import COSTS, Receipt, build_receipt, check_receipt, comparable
+from flows.publish.receipt import COSTS, Receipt, build_receipt, check_receipt
 from flows.publish.receipt_table import finding_rows, headline, print_table
 from flows.publish.report import Picture, render_report
 from flows.settings.survey_settings import Settings
@@ -22,6 +22,7 @@ from pipeline.errors import ShapeError
 from storage.archive.records import StageRecord
 from storage.archive.whole_files import to_json
 from tests.flows.conftest import Page
+from tests.receipts import comparable
 
 
 def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
@@ -131,7 +132,7 @@ def test_receipt_has_the_fields_of_the_design_and_reads_back():
     "path",
     [
         ("versions",),
-        ("stages", 0, "peak_rss_bytes"),
+        ("stages", 0, "key"),
         ("savings", "tokens"),
         ("savings", "lines", "full_is"),
         ("savings", "multiply_adds", "score"),
@@ -274,6 +275,6 @@ def test_findings_are_rows_and_what_is_not_there_is_none():
         "expected": {"miou": 0.8, "error": 0.02},
     }
     assert finding_rows(found) == [
-        ("expected score", "about 80.0 ± 2.0, with no label asked"),
-        ("zones", "50 px, 50 % of the field, 5 ha; of the rest no map is drawn"),
+        ("expected score", "about 80.0, with no label asked; error 2.0"),
+        ("zones", "50 px are mapped; 5 ha"),
     ]

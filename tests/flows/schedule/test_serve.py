@@ -7,7 +7,6 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Sequence
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +34,6 @@ BAD = {
     "twice": (("north", "north"), "--every 30m", 2, "are both called north"),
     "limit": (("north",), "--every 30m --limit 0", 2, "--limit 0: expected 1 or more"),
     "name": (("named",), "--every 30m", 2, "'name' in .*named.toml must be a name of letters, digits"),
-    "late": (("north",), "--every 30m --late 0.5", 2, "--late; Prefect begins a run late rather than never"),
-    "notify": (("north",), "--every 30m --notify x", 2, "--notify; Prefect tells of failed runs by an automation"),
     "engine": (("north",), "--every 30m --engine plain", 2, "Unknown option: --engine"),
 }
 
@@ -120,13 +117,6 @@ def test_a_field_is_a_deployment_of_the_survey(field_file: Callable[..., Path], 
     assert (schedule.schedule.cron, schedule.schedule.timezone) == ("0 6 * * *", "Europe/Berlin")
     again = deployment(str(tmp_path / "other"))
     assert (again.flow_name, again.name, again.schedules) == ("reprocess", "archive", [])
-
-
-def test_an_interval_counts_from_1970(tmp_path: Path) -> None:
-    """Due times do not depend on when serving began."""
-    schedule = schedule_of(None, "90m", None)
-    assert schedule.interval == timedelta(minutes=90)
-    assert schedule.anchor_date == datetime(1970, 1, 1, tzinfo=UTC)
 
 
 @pytest.mark.parametrize("ending", [asyncio.CancelledError, ConnectionError])

@@ -121,7 +121,6 @@ def found_of(**told: Any) -> dict[str, Any]:
 
 
 TOLD: dict[str, tuple[dict[str, Any], str]] = {
-    "one sweep": ({}, "one sweep, which has no seam to be put right by"),
     "put right": (
         {"sweeps": {"a": [0, 0], "b": [3, -4]}, "residual_rms_px": 0.123},
         "put right by up to 5.0 px; 0.12 px rms are left at the seams",
@@ -129,12 +128,11 @@ TOLD: dict[str, tuple[dict[str, Any], str]] = {
     "nothing left": ({"sweeps": {"a": [0, 0], "b": [3, -4]}}, "put right by up to 5.0 px"),
     "none found": (
         {"held": "the mosaic", "sweeps": {"b": [0, 0]}, "not_found": ["b"]},
-        "b left where the mirror reported: nothing was found",
+        "put right by up to 0.0 px; b left where the mirror reported: nothing was found",
     ),
     "partly seen": (
         {"sweeps": {"a": [0, 0], "b": [3, -4]}, "too_narrow": [{}], "partly_seen": 7},
-        "put right by up to 5.0 px; 1 overlap too narrow to compare; 7 chosen places not seen whole, mapped there by "
-        "the coarse pass",
+        "put right by up to 5.0 px; 1 overlap too narrow to compare; 7 chosen patches not captured whole",
     ),
 }
 

@@ -16,7 +16,7 @@ import xarray as xr
 from PIL import Image
 from rich.console import Console
 
-from flows.publish.receipt import check_receipt, comparable
+from flows.publish.receipt import check_receipt
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
@@ -34,6 +34,7 @@ from storage.arrays.class_maps import ClassMap, load_class_map
 from storage.remote.opening import verify_archive
 from tests.conftest import CLASSES, RGB_NM, patchy_scene, random_weights
 from tests.flows.conftest import FEW_BANDS, Page
+from tests.receipts import comparable
 
 STAGES = [
     "choose_effects",

@@ -123,7 +123,7 @@ def test_a_threshold_leaves_seconds_and_says_so(
     assert plan["spared_s"] > 0
     assert plan["spared_fraction"] == pytest.approx(plan["spared_s"] / receipt["savings"]["capture_s"]["full"])
     assert plan["spared_score"] > 0
-    assert "unspent: no further run of lines pays" in dict(finding_rows(receipt))["plan"]
+    assert "unspent" in dict(finding_rows(receipt))["plan"]
     assert "threshold" not in without[0].receipt["plan"]
     receipt: Any = without[0].receipt
     key = next(stage["key"] for stage in receipt["stages"] if stage["name"] == "score")

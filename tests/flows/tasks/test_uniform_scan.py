@@ -12,7 +12,7 @@ import xarray as xr
 from rich.console import Console
 
 from flows.archive.plan_command import plan_content
-from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
+from flows.archive.reprocess_command import run_reprocess
 from flows.settings.load import load_settings
 from pipeline.errors import BudgetError, SettingsError, WeightsError
 from pipeline.rectify.tiles import block_means
@@ -126,7 +126,7 @@ def test_seconds_choose_the_scan_and_are_kept(
     assert settings["scan_step"] in (1, 2, 4)
     flat = {**RECORD, "miou": [[0.5] * 3, [0.5] * 3, [0.9, 0.5, 0.5]]}  # these would have taken every fourth line
     captured = {path.parent.name for path in tmp_path.glob("**/capture/**/*.zarr")}
-    assert run_reprocess(ReprocessRequest(tmp_path, weights=make_weights(scans=flat)), QUIET) == 0
+    assert run_reprocess(tmp_path, QUIET, weights=make_weights(scans=flat)) == 0
     assert {path.parent.name for path in tmp_path.glob("**/capture/**/*.zarr")} == captured
     newest = max(tmp_path.glob("runs/*/receipt.json"), key=lambda path: path.stat().st_mtime)
     again = json.loads(newest.read_text())

@@ -37,22 +37,6 @@ def test_inputs_and_dependents_are_followed_all_the_way(tmp_path: Path, archive:
     assert catalogue.roles(small.raw.uri) == {"capture_coarse"}
 
 
-def test_a_store_tells_what_its_making_took(archive: Archive) -> None:
-    """Seconds, work and bytes."""
-    small = small_survey(archive)
-    cost = archive.cost(small.map)
-    assert cost is not None
-    assert (cost.work, cost.size) == (64.0, archive.stored_bytes(small.map))
-    assert cost.wall_s >= 0 <= cost.cpu_s
-
-
-def test_work_that_is_no_amount_is_refused(archive: Archive) -> None:
-    """It would spoil every estimate made of it."""
-    with pytest.raises(ArchiveError, match="work is nan"), archive.publish("segment", "key", work=float("nan")):
-        pass
-    assert archive.refs() == []
-
-
 @pytest.mark.parametrize(
     "content",
     [
@@ -84,7 +68,7 @@ def test_any_manifest_can_be_read_or_is_told_damaged(tmp_path: Path, archive: Ar
 def test_odd_inputs_are_borne(tmp_path: Path, archive: Archive, inputs: object) -> None:
     """Whatever a manifest says of what is no file of it, nothing ends in a traceback."""
     small = small_survey(archive)
-    odd = {"inputs": inputs, "params": 3, "created": None, "libraries": [], "cost": "x"}
+    odd = {"inputs": inputs, "params": 3, "created": None, "libraries": []}
     rewrite(small.map.path / "manifest.json", **odd)
     catalogue = Catalogue.read(tmp_path)
     assert catalogue.dependents([small.map.uri]) == set()
@@ -166,14 +150,6 @@ def test_products_go_by_many_names(tmp_path: Path, archive: Archive) -> None:
         found = find_product(catalogue, text)
         assert isinstance(found, Run)
         assert found.folder == small.run
-
-
-def test_without_a_run_stores_are_offered(tmp_path: Path) -> None:
-    """An archive of ingested cubes alone has no products, but addresses."""
-    with Archive.open(tmp_path).publish("ingest", "abcd1"):
-        pass
-    with pytest.raises(ArchiveError, match=r"no run has products; there is stages/ingest/abcd1$"):
-        find_product(Catalogue.read(tmp_path), "mosaic")
 
 
 def test_a_stage_narrows_the_beginning_of_a_key(tmp_path: Path, archive: Archive) -> None:

@@ -120,16 +120,6 @@ def test_a_linked_part_is_refused_at_the_door(tmp_path: Path, name: str) -> None
         Archive.open(tmp_path / "archive", create=False, write=False)
 
 
-def test_a_linked_lock_is_refused(tmp_path: Path) -> None:
-    """No file is made or opened where it leads."""
-    archive = Archive.open(tmp_path / "archive")
-    (archive.root / ".locks").mkdir()
-    (archive.root / ".locks" / "use.lock").symlink_to(tmp_path / ELSEWHERE)
-    with pytest.raises(ArchiveError, match=r"use\.lock is a link, expected a lock file of its own"), archive.in_use():
-        pass
-    assert not (tmp_path / ELSEWHERE).exists()
-
-
 # --- one file ---------------------------------------------------------------------------------------------------------
 
 

@@ -318,26 +318,6 @@ def test_a_damaged_manifest_in_the_bucket_does_not_reach_the_copy(machine: Machi
     assert any("its seal does not fit" in one for one in problems(again))
 
 
-@pytest.mark.parametrize("name", ["../receipt.json", "/tmp/receipt.json", "a/b", "", ".", "x.part"])
-def test_files_of_a_run_stay_in_it(tmp_path: Path, name: str) -> None:
-    """What could lie elsewhere is refused, and the run is as before."""
-    with Archive.open(tmp_path / "archive").new_run("farm") as draft:
-        with pytest.raises(ArchiveError, match="cannot be a name"):
-            draft.write_file(name, "x")
-        assert list(draft.folder.iterdir()) == []
-    assert [path.name for path in tmp_path.iterdir()] == ["archive"]
-
-
-def test_a_published_run_holds_nothing(tmp_path: Path) -> None:
-    """Also where nobody leaves a block; to abandon it then does nothing."""
-    draft = Archive.open(tmp_path).new_run("farm")
-    draft.write_file("receipt.json", "{}")
-    folder = draft.publish()
-    assert list((tmp_path / ".locks").iterdir()) == []
-    draft.abandon()
-    assert (folder / "receipt.json").read_text() == "{}"
-
-
 def test_folders_exchange_their_names(tmp_path: Path) -> None:
     """Each has what the other had; a name that leads nowhere is the system's own error."""
     for name in "ab":

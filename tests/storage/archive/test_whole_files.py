@@ -47,14 +47,6 @@ def test_a_block_that_fails_leaves_the_old(tmp_path: Path, error: BaseException,
     assert _files(tmp_path) == {"x": "old"}
 
 
-def test_what_was_not_written_is_an_error_and_the_old_stays(tmp_path: Path) -> None:
-    """No name is given before all files are there."""
-    write_whole(tmp_path / "x", "old")
-    with pytest.raises(FileNotFoundError), written_aside(tmp_path, ["x", "y"]) as aside:
-        (aside / "x").write_text("new")
-    assert _files(tmp_path) == {"x": "old"}
-
-
 def test_old_and_new_files_are_never_mixed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Killed at any rename, there are no files of the second name beside a first of another time."""
     for name in ("x", "y"):

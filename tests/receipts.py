@@ -1,0 +1,31 @@
+"""What two runs of the same seed and settings must agree on in their receipts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from flows.publish.receipt import Receipt
+from flows.tasks.scores import JUDGING
+
+# what another run of the same seed has otherwise
+OF_ONE_RUN = ("wall_s", "cpu_s", "peak_rss_bytes", "state", "manifest_sha256")
+
+
+def comparable(receipt: Receipt) -> dict[str, Any]:
+    """Return what two runs of the same seed and settings must agree on.
+
+    Without times, memory, the archive's place, whether a stage was read or made, hashes of manifests (which hold their
+    times), and the addresses of the products (their names stay).
+    """
+    same = _without(receipt, ("started", "finished", "judged"))
+    same["settings"] = _without(receipt["settings"], ("out",))
+    same["stages"] = [
+        _without(stage, (*OF_ONE_RUN, *(("bytes_out",) if stage["name"] == JUDGING else ())))
+        for stage in receipt["stages"]
+    ]
+    return same | {"products": sorted(receipt["products"])}
+
+
+def _without(part: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:
+    return {key: value for key, value in part.items() if key not in set(names)}
