@@ -18,8 +18,8 @@ from flows.tasks.run import SurveyRun
 from flows.tasks.stages.maps import out_of_range_pixels
 from models.evaluation.expected_scores import expected_counts
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, FieldScale, areas_by_number
-from pipeline.ground.georeference import class_areas_m2, crs_name, pixel_side_m
+from pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, FieldScale, PlacedPicture, areas_by_number
+from pipeline.ground.georeference import crs_name, pixel_side_m
 from pipeline.ground.zones import figures_of_plots
 from pipeline.planning.fine_pass import FinePlan
 from storage.archive.keys import StageRef
@@ -109,12 +109,13 @@ def placed_findings(run: SurveyRun, found: ClassMap) -> dict[str, Any] | None:
     geobox = run.scene.geobox
     if geobox is None:
         return None
-    areas = class_areas_m2(geobox, found.classes, len(found.names)) / M2_PER_HECTARE
+    areas = areas_by_number(PlacedPicture(geobox), found.classes, len(found.names))
+    assert areas is not None
     return {
         "crs": crs_name(geobox),
         "resolution_m": pixel_side_m(geobox),
         "shape": [int(size) for size in geobox.shape],
-        "areas_ha": dict(zip(found.names, areas.tolist(), strict=True)),
+        "areas_ha": dict(zip(found.names, (areas / M2_PER_HECTARE).tolist(), strict=True)),
     }
 
 

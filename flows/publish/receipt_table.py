@@ -153,12 +153,6 @@ def _format_plan(plan: Mapping[str, Any], _: object) -> str:
     parts = [plan["reason"] if plan["kind"] in ("full", "scan", "raster") else f"{plan['lines']} fine lines"]
     if plan["out_of_reach"]:
         parts.append(f"{plan['out_of_reach']} places worth a second pass lie beyond the mirror's range")
-    if plan.get("spared_s"):
-        fraction = f" ({format_percent(plan['spared_fraction'])} of the full scan's)" if plan["spared_fraction"] else ""
-        parts.append(
-            f"the threshold of {plan['threshold']:g} a second left {plan['spared_s']:.1f} s{fraction} unspent: no further "
-            "run of lines pays"
-        )
     return "; ".join(filter(None, parts))
 
 

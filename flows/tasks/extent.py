@@ -32,5 +32,4 @@ def work_of_map(run: SurveyRun, patch_index: NDArray[np.integer]) -> MultiplyAdd
 
 def reading_costs(run: SurveyRun) -> ReadingCosts:
     """What it takes to read the field of a survey."""
-    channels = 3 if run.vgg is None else run.vgg.channels
-    return ReadingCosts(run.described.config, run.grid, len(run.scene.wavelength_nm), channels)
+    return ReadingCosts(run.described.config, run.grid, len(run.scene.wavelength_nm))

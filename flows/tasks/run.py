@@ -34,11 +34,10 @@ from flows.tasks.scene import (
     open_map,
     open_scene,
 )
-from flows.tasks.survey_model import SurveyModel, beyond_training, vgg_file, weights_offered
+from flows.tasks.survey_model import SurveyModel, beyond_training, weights_offered
 from flows.tasks.zones import SurveyZones, open_zones, place_of_field
 from models.evaluation.expected_scores import MapScores
 from models.network.machine import PROCESSOR, choose_device
-from models.policies.vgg_file import VggFile
 from models.weights.files import Description, Weights
 from models.weights.parts import OodPart, ReaderPart
 from pipeline.capture.recorded_passes import RecordedPasses
@@ -198,11 +197,6 @@ class SurveyRun(CaptureRun):
         """The mask of policy ``mask``, (y, x) or (y, x, channel)."""
         return None if self.settings.mask is None else load_labels_array(self.settings.mask)
 
-    @cached_property
-    def vgg(self) -> VggFile | None:
-        """VGG19 for the policies ``vgg-static`` and ``vgg-trained``."""
-        return vgg_file(self.settings)
-
     @property
     def place_key(self) -> dict[str, Any]:
         """What images on the scene's pixels depend on beside what was seen: where they lie, and what is no scene."""
@@ -263,8 +257,7 @@ def _run_by(
         plan = plan_capture(settings, grid, zones.shown, passes)
     else:
         raster = RasterPixels(pixels.read, pixels.missing, bands, grid)
-    channels = 3 if model.vgg is None else model.vgg.channels
-    costs = ReadingCosts(described.config, grid, bands, channels)
+    costs = ReadingCosts(described.config, grid, bands)
     budget = PatchBudget.asked(settings, costs, None if zones.fractions is None else zones.fractions > 0)
     simulated, planned = make_source(scene, settings), (*plan.coarse, *plan.full)
     source = field_source(scene, settings, simulated, planned) if recorded is None else recorded.field
@@ -276,7 +269,7 @@ def _run_by(
     prior, prior_notes = found or find_prior(archive, settings, name, grid, described.class_names)
     if settings.prior != AUTO:  # what is meant when it is asked for again
         settings = replace(settings, prior=NONE if prior is None else prior.run)
-    said = (*notes, *zones.notes, *prior_notes, *extent_notes, *model.notes(planning=planning), *outside, *label_notes)
+    said = (*notes, *zones.notes, *prior_notes, *extent_notes, *outside, *label_notes)
     return SurveyRun(
         settings=settings,
         archive=archive,

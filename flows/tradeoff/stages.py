@@ -378,7 +378,7 @@ class FarmToSegment:
             patch_index = np.flatnonzero(valid)
             return segment(self.weights, self.scan_pass, self.columns[patch_index], patch_index)
         seen = read_coarse_prediction(self.weights, self.scan_pass)
-        patch_index = frame_patches(score_patches(POLICY, seen), wanted, valid).patch_index
+        patch_index = frame_patches(score_patches(POLICY, seen), wanted, valid)
         return segment(self.weights, seen, self.columns[patch_index], patch_index)
 
     def miss(self, _fraction: Setting, drawn: DrawnMap) -> float:

@@ -16,7 +16,7 @@ from flows.tasks.field_work import FieldWork, region_params
 from flows.tasks.patch_budget import PatchBudget
 from flows.tasks.run import SurveyRun
 from flows.tasks.stage import Product, Wanted, stage
-from models.policies.policies import IMAGE_POLICIES, SEEDED_POLICIES, SEEING_POLICIES, score_patches
+from models.policies.policies import SEEING_POLICIES, score_patches
 from models.reading.inference import CoarsePrediction
 from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.geometry.grid import patch_pixels
@@ -47,9 +47,7 @@ def score(run: SurveyRun, mosaic: StageRef) -> Wanted:
         rank[plan.patch_index[np.argsort(-scores[plan.patch_index], kind="stable")]] = np.arange(len(plan.patch_index))
         shape = run.grid.patch_shape
         write_attention(path / "attention.zarr", Attention(scores.reshape(shape), rank.reshape(shape), settings.policy))
-        content = asdict(plan) | {"patches": plan.patch_index.tolist()}
-        absent = [name for name in ("threshold", "spared_s") if content[name] is None]
-        write_table(path / "plan.json", {name: value for name, value in content.items() if name not in absent})
+        write_table(path / "plan.json", asdict(plan) | {"patches": plan.patch_index.tolist()})
 
     captures = {
         "fine_s": run.plan.fine_s,
@@ -63,12 +61,10 @@ def score(run: SurveyRun, mosaic: StageRef) -> Wanted:
         **run.model_key,
         "grid": asdict(run.grid),
         "policy": settings.policy,
-        "seed": settings.seed if settings.policy in SEEDED_POLICIES else None,
+        "seed": settings.seed if settings.policy == "random" else None,
         "mask": None if run.mask is None else array_digest(run.mask),
         **(captures if run.raster is None else {}),
         **(region_params(run.grid) if settings.policy in SEEING_POLICIES else {}),
-        **({} if run.vgg is None else {"vgg": run.vgg.key}),
-        **({} if settings.threshold is None else {"threshold": settings.threshold}),
         **({"plain": True} if run.plan.plain else {}),
         **({} if run.budget is None else {"patches": {name: getattr(settings, name) for name in SPARING}}),
         **run.zones.key,
@@ -96,7 +92,6 @@ def _scored(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> tuple[NDArray[
         budget_s=run.plan.fine_s,
         margin_px=run.plan.margin_px,
         full=run.plan.full,
-        threshold=run.settings.threshold,
     )
     plan = plan_on()
     if run.recorded is not None:
@@ -183,7 +178,7 @@ def _on_no_scene(run: SurveyRun) -> NDArray[np.bool_]:
 
 def _scores_of_patches(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> NDArray[np.float64]:
     policy = run.settings.policy
-    if policy in SEEING_POLICIES + IMAGE_POLICIES:
+    if policy in SEEING_POLICIES:
         return work.score(policy, mosaic.path / "mosaic.zarr", lambda done: run.report(0.5 * done)).ravel()
     nothing = np.empty((0, 0, 0), np.float32)
     return score_patches(policy, CoarsePrediction(run.grid, nothing, nothing), seed=run.settings.seed, mask=run.mask)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from flows.tasks.run import SurveyRun
 from flows.tasks.stage import Product, Wanted, stage
 from pipeline.geometry.grid import UNLABELLED
+from pipeline.ground.field_places import PosedField, areas_by_number
 from pipeline.ground.map_grid import GroundGrid, ground_grid, image_at, map_blocks, nearest_at
 from pipeline.ground.view import GroundView
 from storage.archive.keys import StageRef
@@ -38,7 +39,9 @@ def ground(run: SurveyRun, class_map: StageRef, mosaic: StageRef) -> Wanted:
         for rows, columns in map_blocks(grid.shape, BLOCK):
             writer.write_block(rows, columns, shown.at(grid.scene_pixels(rows, columns)))
             run.report(rows.stop / grid.shape[0])
-        writer.finish(grid.class_areas_m2(shown.found.classes, len(shown.found.names)))
+        areas = areas_by_number(PosedField(grid), shown.found.classes, len(shown.found.names))
+        assert areas is not None
+        writer.finish(areas)
 
     params = {
         "pose": asdict(grid.frame.view.pose),

@@ -97,7 +97,7 @@ REFUSED = {
     "weights corrupt": (1, "--weights corrupt.safetensors", "corrupt.safetensors is not a readable safetensors file"),
     "weights missing": (1, "--weights none.safetensors", "no weights at none.safetensors; train some"),
     "weights of other wavelengths": (1, "--weights infrared.safetensors", "for 1500-2000 nm; .* at 460-640 nm"),
-    "unknown policy": (2, "--policy guess", "one of gain, entropy, margin, sobel, .*mask.*; got 'guess'"),
+    "unknown policy": (2, "--policy guess", "one of gain, entropy, sobel, random, mask; got 'guess'"),
     "mask of another size": (1, "--policy mask --mask small.png", r"\(50, 128\) px \(y, x\), the scene is \(96, 128\)"),
     "policy mask without one": (2, "--policy mask", "needs a mask file"),
     "unknown flag": (2, "--budgets 1", "Unknown option"),

@@ -30,7 +30,6 @@ def _run(side: int, policy: str, *, plain: bool = False) -> SurveyRun:
     made: Any = SimpleNamespace(
         grid=SceneGrid(side, side, 16, 4),
         described=SimpleNamespace(config=CONFIG),
-        vgg=None,
         scene=SimpleNamespace(wavelength_nm=np.linspace(400, 1000, BANDS)),
         settings=SimpleNamespace(policy=policy),
         plan=SimpleNamespace(plain=plain),
@@ -41,10 +40,7 @@ def _run(side: int, policy: str, *, plain: bool = False) -> SurveyRun:
     return cast("SurveyRun", made)
 
 
-@pytest.mark.parametrize(
-    ("policy", "scan_passes"),
-    [("gain", 2), ("entropy", 2), ("sobel", 1), ("random", 1), ("saliency", 1), ("vgg-static", 1)],
-)
+@pytest.mark.parametrize(("policy", "scan_passes"), [("gain", 2), ("entropy", 2), ("sobel", 1), ("random", 1)])
 def test_a_policy_that_asks_the_coarse_prediction_reads_the_coarse_look_once_more(
     policy: str, scan_passes: int
 ) -> None:
