@@ -17,15 +17,14 @@ _CHECK = re.compile(rb', "check": "([0-9a-f]{8})"\}')
 _OPENS, _CLOSES = b', "check": "', b'"}'
 _LENGTH = len(_OPENS) + 8 + len(_CLOSES)
 
-State = Literal["whole", "unchecked", "torn", "changed"]
+State = Literal["whole", "torn", "changed"]
 
 
 @dataclass(frozen=True)
 class CheckedLine:
     """One line as it was found; ``content`` is None where it cannot be believed.
 
-    ``unchecked``: an object without a checksum, as earlier versions wrote them. ``torn``: what a power cut leaves of a
-    line, or of others' bytes. ``changed``: it was whole once.
+    ``torn``: what a power cut leaves of a line, or of others' bytes. ``changed``: it was whole once.
     """
 
     number: int  # from 1
@@ -43,7 +42,7 @@ def with_check(text: bytes, seed: int = 0) -> bytes:
 def read_checked(content: bytes, seed: int = 0) -> Iterator[CheckedLine]:
     """Give every line of a file. Two that only lost the end between them are both whole, and one more is ``changed``.
 
-    No single bit that flips makes a line with a checksum ``unchecked`` or ``torn``, or gives it another content.
+    No single bit that flips makes a line ``torn``, or gives it another content.
     """
     for number, text in enumerate(content.split(b"\n"), 1):
         if text:
@@ -62,12 +61,8 @@ def _line(number: int, text: bytes, seed: int) -> Iterator[CheckedLine]:
             if found is not None:
                 yield CheckedLine(number, part, found, "whole")
                 break
-    content = None if ends or _had_check(text) else _object(text)
-    if content is not None:
-        yield CheckedLine(number, text, content, "unchecked")
-    else:
-        changed = ends or _had_check(text) or text.endswith(b"}")
-        yield CheckedLine(number, text, None, "changed" if changed else "torn")
+    changed = ends or _had_check(text) or text.endswith(b"}")
+    yield CheckedLine(number, text, None, "changed" if changed else "torn")
 
 
 def _whole(text: bytes, seed: int) -> dict[str, Any] | None:

@@ -55,7 +55,6 @@ DISTRIBUTIONS = {
     "serial": "pyserial",
     "skimage": "scikit-image",
     "odc": "odc-geo",
-    "cv2": "opencv-contrib-python-headless",
     "mpl_toolkits": "matplotlib",
 }
 FILE_MODULES = {"pathlib", "shutil", "tempfile", "glob", "io", "fileinput"}

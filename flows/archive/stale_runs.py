@@ -14,7 +14,7 @@ from flows.settings.load import load_settings, of_this_version, parse_settings
 from flows.settings.survey_settings import BUILT_IN_SCENES, OF_THE_MACHINE, RECORDED, Settings
 from flows.tasks.open_survey import STAGES, versions
 from flows.tasks.survey_model import weights_path
-from models.weights.files import content_key
+from models.weights.files import describe_weights
 from pipeline.errors import PipelineError, SettingsError, WeightsError
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, USUAL_DAY, USUAL_HOUR, law_of_key
 from storage.archive.keys import canonical_json
@@ -191,4 +191,4 @@ def weights_key(settings: Settings) -> str | None:
 @cache
 def _file_key(path: Path, changed_ns: int, size: int) -> str:
     """Read once for all fields, and again when the file has changed."""
-    return content_key(path)
+    return describe_weights(path).key

@@ -6,7 +6,7 @@ import inspect
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
@@ -67,7 +67,6 @@ def train(
     patch: int | None = None,
     factor: int = 4,
     columns: int = 24,
-    positions: Literal["2d", "paper"] = "2d",
     init: Path | None = None,
     train_temporal: Path | None = None,
     fit_ood: Path | None = None,
@@ -116,11 +115,8 @@ def train(
         How many times coarser the coarse pass is than the fine one.
     columns
         How many numbers a pixel's spectrum is brought to, whatever bands a camera has.
-    positions
-        How patches are told their places: `2d`, by row and column, or `paper`, by one running number.
     init
-        Weights to begin from: a vision transformer of timm or DeiT, a Segmenter checkpoint with its variant.yml beside
-        it, or weights that this command made. What is taken is said, and kept in the weights.
+        Weights to begin from, which this command made. What is taken is said, and kept in the weights.
     train_temporal
         Weights to train a reader of prior maps for, and nothing else: it weighs what earlier visits left against a
         later one. OUT has the weights with it, and surveys with --prior use it. It takes --scenes, --steps, --minutes,
@@ -131,7 +127,7 @@ def train(
         again, which DATASET has to be. OUT has the weights with it; surveys call pixels unknown that are unlike all of
         them. New weights have it from their training, if scenes were kept for validation.
     dim
-        Width of the transformer, the numbers that a patch becomes; 192 and 384 are those of ViT-Tiny and ViT-Small.
+        Width of the transformer, the numbers that a patch becomes.
     layers
         Layers of the transformer.
     heads
@@ -163,14 +159,6 @@ def train(
         commas.
     """
 
-    if train_temporal is not None:
-        how = TemporalTraining(minutes, steps, seed)
-        lands, judged = LANDS if scenes is None else scenes, JUDGED_LANDS if validation is None else validation
-        asked = TemporalRequest(dataset, train_temporal, out, lands, judged, settings=how, command=asked_command())
-        record = run_remember(asked, stderr)
-        if as_json:
-            print_json(record)
-        return 0
     choices = {
         "labels": labels,
         "bands": parse_wholes(bands, "--bands"),
@@ -178,31 +166,33 @@ def train(
         "train_mask": train_mask,
         "mask_classes": parse_wholes(mask_classes, "--mask-classes"),
     }
-    if fit_ood is not None:
-        known = run_measure_ood(OodRequest(dataset, fit_ood, out, choices, asked_command()), stderr)
-        if as_json:
-            print_json(known)
-        return 0
-    size = crop if crop is not None else usual_crop(dataset)
-    request = TrainRequest(
-        dataset,
-        out,
-        split_list(hold_out),
-        validation,
-        scenes,
-        patch,
-        factor,
-        columns,
-        positions=positions,
-        tokens={"dim": dim, "layers": layers, "heads": heads, "mlp_ratio": mlp_ratio},
-        init=init,
-        choices=choices,
-        settings=TrainingSettings(
-            steps=steps, minutes=minutes, seed=seed, crop=size, batch=batch, darkest_ms=min_exposure_ms
-        ),
-        device=device,
-    )
-    record = run_train(request, stderr)
+    if train_temporal is not None:
+        how = TemporalTraining(minutes, steps, seed)
+        lands, judged = LANDS if scenes is None else scenes, JUDGED_LANDS if validation is None else validation
+        asked = TemporalRequest(dataset, train_temporal, out, lands, judged, settings=how, command=asked_command())
+        record = run_remember(asked, stderr)
+    elif fit_ood is not None:
+        record = run_measure_ood(OodRequest(dataset, fit_ood, out, choices, asked_command()), stderr)
+    else:
+        size = crop if crop is not None else usual_crop(dataset)
+        request = TrainRequest(
+            dataset,
+            out,
+            split_list(hold_out),
+            validation,
+            scenes,
+            patch,
+            factor,
+            columns,
+            tokens={"dim": dim, "layers": layers, "heads": heads, "mlp_ratio": mlp_ratio},
+            init=init,
+            choices=choices,
+            settings=TrainingSettings(
+                steps=steps, minutes=minutes, seed=seed, crop=size, batch=batch, darkest_ms=min_exposure_ms
+            ),
+            device=device,
+        )
+        record = run_train(request, stderr)
     if as_json:
         print_json(record)
     return 0
@@ -220,7 +210,6 @@ def evaluate(
     scenes: int | None = None,
     seed: int = 0,
     draws: int = 2000,
-    rig: bool = True,
     labels: str | None = None,
     bands: str | None = None,
     wavelengths: str | None = None,
@@ -260,8 +249,6 @@ def evaluate(
         Of noise, random placements and the bootstrap.
     draws
         How often frames are drawn anew for the intervals (bootstrap).
-    rig
-        Also compare plans of lines at equal capture seconds: ours, evenly spaced blocks and random blocks.
     labels
         For one scene, or a run: the file of its labels.
     bands
@@ -296,7 +283,6 @@ def evaluate(
         scenes,
         seed,
         draws,
-        rig,
         choices,
         device,
     )

@@ -25,7 +25,7 @@ from flows.evaluate.frames import (
     scene_of,
     sort_frames,
 )
-from flows.evaluate.judge import BUDGETS, Record, Trial, judge_frame, seeds_of, summarise
+from flows.evaluate.judge import Record, Trial, judge_frame, seeds_of, summarise
 from flows.terminal.processes import writing
 from flows.terminal.progress import StageProgress, on_stdout
 from flows.training.data import TrainingData, alike_notes
@@ -33,7 +33,6 @@ from models.evaluation.metrics import LEVEL
 from models.network.machine import PROCESSOR, choose_device, keep_freed_memory
 from models.weights.files import Weights, load_weights
 from pipeline.lazy import deferred
-from pipeline.planning.line_blocks import WIDTHS
 from pipeline.simulator.scenes.scene import RasterScene
 from storage.archive.whole_files import to_json, write_whole
 
@@ -44,7 +43,7 @@ else:
     table = deferred("flows.evaluate.table")  # matplotlib
     panels = deferred("flows.publish.panels")
 
-KEPT_VERSION = 3  # of what a kept result says
+KEPT_VERSION = 4  # of what a kept result says
 
 
 def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = False) -> dict[str, Any]:
@@ -76,7 +75,7 @@ def evaluate_weights(request: EvaluateRequest, show: Show = lambda what, done, w
         with writing(request.out):
             request.out.mkdir(parents=True, exist_ok=True)  # before minutes are spent on what cannot be kept
     jobs = sort_frames(request, data, candidates, show)
-    trial = Trial(request.fractions, request.policies, request.seed, request.rig)
+    trial = Trial(request.fractions, request.policies, request.seed)
     runs = _judged(request, data, candidates, jobs.frames, trial, show)
     names = [*jobs.frames, *jobs.left_out]
     asked = {**asdict(trial), "draws": request.draws, "level": LEVEL}
@@ -138,7 +137,7 @@ def _judged(
             labels = None if data.files is None or scene.labels is None else zlib.crc32(scene.labels.tobytes())
             follows_from = {
                 **{"weights": one.key, "frame": name, "scene": scene.key, "labels": labels, **asdict(trial)},
-                **{"camera": asdict(one.camera), "cost": asdict(COST), "budgets": BUDGETS, "widths": WIDTHS},
+                **{"camera": asdict(one.camera), "cost": asdict(COST)},
                 **({} if device == PROCESSOR else {"device": device}),
             }
             runs[index].append(kept.made(follows_from, judged))

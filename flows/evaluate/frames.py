@@ -21,10 +21,10 @@ from flows.training.observed_scenes import observe_scene
 from models.evaluation.metrics import DRAWS
 from models.network.machine import PROCESSOR
 from models.network.spectral import patches_of
-from models.policies.policies import NETWORK_POLICIES, POLICIES
+from models.policies.policies import POLICIES
 from models.reading.inference import CoarsePrediction, coarse_prediction_of_columns
 from models.training.examples import normalised
-from models.weights.files import Description, Weights, content_key, describe_weights
+from models.weights.files import Description, Weights, describe_weights
 from pipeline.errors import PipelineError, SceneError, SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
@@ -33,7 +33,7 @@ from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
 from pipeline.simulator.scenes.scene import RasterScene
 
 FRACTIONS = (0.05, 0.10, 0.15, 0.20, 0.35)
-JUDGED = tuple(name for name in POLICIES if name not in ("mask", *NETWORK_POLICIES))  # these need a file of one's own
+JUDGED = tuple(name for name in POLICIES if name != "mask")  # that needs a file of one's own
 USUAL = ("gain", "entropy", "sobel", "random")
 COST = CostModel()
 
@@ -51,7 +51,6 @@ class EvaluateRequest:
     scenes: int | None = None  # of the built-in farm
     seed: int = 0
     draws: int = DRAWS
-    rig: bool = True  # also plans of lines at equal seconds
     choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths
     device: str = PROCESSOR  # where the networks of surveys compute; or auto
 
@@ -88,7 +87,8 @@ class Candidate:
     @staticmethod
     def of(path: Path) -> Candidate:
         """Describe a file; WeightsError where it cannot be read. None of its tensors is read yet."""
-        return Candidate(path, describe_weights(path), content_key(path)[:16])
+        described = describe_weights(path)
+        return Candidate(path, described, described.key[:16])
 
     @property
     def camera(self) -> LineCamera:
@@ -104,7 +104,7 @@ class Candidate:
         Seen in other bands a scene has another identity: where bands or wavelengths were given, here or to the
         training, a frame of the data set ``law`` is also told by its name.
         """
-        train, record = self._split.get("train", {}), self.described.record
+        train, record = self.split.get("train", {}), self.described.record
         if scene.key in train.values():
             return self.pixels_of(scene) is None
         chosen = bands_chosen or any(flag in record.get("command", "") for flag in ("--bands", "--wavelengths"))
@@ -112,20 +112,17 @@ class Candidate:
 
     def pixels_of(self, scene: RasterScene) -> str | None:
         """Those pixels of a scene that taught these weights, packed; None where a mask kept none of them out."""
-        pixels: str | None = self._split.get("pixels", {}).get(scene.key)
+        pixels: str | None = self.split.get("pixels", {}).get(scene.key)
         return pixels
 
     @property
     def held_out(self) -> tuple[str, ...]:
         """Frames of its data set that were kept from training by name."""
-        return tuple(self._split.get("held_out", ()))
-
-    def validated_on(self, name: str, law: str) -> bool:
-        """Whether a frame of the data set ``law`` was kept for the figures that training ends with."""
-        return self.described.record.get("data") == law and name in self._split.get("validation", ())
+        return tuple(self.split.get("held_out", ()))
 
     @property
-    def _split(self) -> dict[str, Any]:
+    def split(self) -> dict[str, Any]:
+        """What training saw, validated on and left out."""
         split: dict[str, Any] = self.described.record.get("split", {})
         return split
 
@@ -244,7 +241,9 @@ def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[
             at
             for at, one in enumerate(weights)
             if not one.trained_on(scene, name, data.law, bands_chosen=chosen)
-            and not (in_turn and one.validated_on(name, data.law))
+            and not (
+                in_turn and one.described.record.get("data") == data.law and name in one.split.get("validation", ())
+            )
         ]
         if not fit:
             jobs.left_out.append(name)

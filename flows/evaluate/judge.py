@@ -1,7 +1,7 @@
 """One frame judged by one set of weights, and the figures of many: means over seeds, intervals over frames and seeds.
 
-A record holds plain lists and numbers: counts of labels and map by every policy at each fraction of the patches and by
-plans of lines, which add up over frames, and what each map costs. Weights of frames left out in turn have no frame in
+A record holds plain lists and numbers: counts of labels and map by every policy at each fraction of the patches, which add
+up over frames, and what each map costs. Weights of frames left out in turn have no frame in
 common: together they are one seed of the training, judged on all of their frames. Weights that fraction a frame are
 different seeds.
 """
@@ -9,7 +9,7 @@ different seeds.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -32,23 +32,17 @@ from models.network.sizes import multiply_adds
 from models.policies.policies import score_multiply_adds, score_patches
 from models.reading.inference import segment
 from models.weights.files import Weights
-from pipeline.errors import BudgetError, PoseError
+from pipeline.errors import PoseError
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Axis
 from pipeline.planning.coverage import cheapest_full, coarse_sweeps
-from pipeline.planning.fine_pass import plan_fine, price_of_patches
-from pipeline.planning.line_blocks import WIDTHS, line_blocks, most_shown
-from pipeline.planning.prices import BYTES_PER_SAMPLE, check_budget, count_lines
+from pipeline.planning.fine_pass import runs_showing
+from pipeline.planning.prices import BYTES_PER_SAMPLE
 from pipeline.planning.selection import frame_patches
 
 ORACLE = "oracle"
 ENDS = ("none", "all")  # no patch, every patch
-BUDGETS = (0.35, 0.4, 0.5, 0.65, 0.8)  # of the full scan's seconds, coarse pass included
-PLANNED = ("gain", "entropy")
-UNIFORM, RANDOM = "uniform lines", "random lines"
 Record = dict[str, Any]
 PatchIndex = NDArray[np.intp]
-Spend = Callable[[float], tuple[PatchIndex, float, int]]  # seconds of the fine pass -> patches, seconds, lines
 
 
 @dataclass(frozen=True)
@@ -61,7 +55,6 @@ class Trial:
     fractions: tuple[float, ...]  # of the valid patches, above 0 and below 1
     policies: tuple[str, ...]
     seed: int = 0
-    rig: bool = True  # also plans of lines at equal seconds
 
 
 def judge_frame(trial: Trial, scan_pass: ScenePasses, weights: Weights, camera: LineCamera) -> Record:
@@ -90,8 +83,7 @@ def judge_frame(trial: Trial, scan_pass: ScenePasses, weights: Weights, camera: 
             "multiply_adds": multiply_adds(weights.config, grid, len(patch_index), scan_pass.bands, score=scored).total,
         }
         rows.append(row | seconds(policy, patch_index))
-    plans = _judged_plans(trial, scan_pass, weights, camera) if trial.rig else []
-    return {"frame": scan_pass.name, "shape": [grid.height, grid.width], "rows": rows, "plans": plans}
+    return {"frame": scan_pass.name, "shape": [grid.height, grid.width], "rows": rows}
 
 
 def _placed(
@@ -106,7 +98,7 @@ def _placed(
             seed = trial.seed + 1000 * (draw + 1)
             scores = gain if policy == ORACLE else score_patches(policy, scan_pass.seen, seed=seed)
             for fraction in trial.fractions:
-                yield policy, draw, fraction, frame_patches(scores, fraction, allowed).patch_index
+                yield policy, draw, fraction, frame_patches(scores, fraction, allowed)
 
 
 def _counts(scan_pass: ScenePasses, weights: Weights, patch_index: PatchIndex) -> list[list[int]]:
@@ -128,72 +120,16 @@ def _seconds_of_patches(scan_pass: ScenePasses, camera: LineCamera) -> Callable[
         return lambda policy, patch_index: {"capture_s": None, "full_s": None}
 
     def priced(policy: str, patch_index: PatchIndex) -> Record:
-        seconds = full_s if policy == "all" else coarse_s
-        if policy != "all" and len(patch_index):
-            seconds += price_of_patches(grid, camera, COST, along, patch_index).least[1]
-        return {"capture_s": seconds, "full_s": full_s}
+        if policy == "all" or not len(patch_index):
+            return {"capture_s": full_s if policy == "all" else coarse_s, "full_s": full_s}
+        fine_s = COST.seconds(runs_showing(grid, camera, COST, along, patch_index), camera)
+        return {"capture_s": coarse_s + min(fine_s, full_s), "full_s": full_s}
 
     return priced
 
 
-def _judged_plans(trial: Trial, scan_pass: ScenePasses, weights: Weights, camera: LineCamera) -> list[Record]:
-    """Judge plans of lines at each budget that pays; none where the field is beyond the mirror's range."""
-    grid, rows = scan_pass.seen.grid, []
-    try:
-        along, full, full_s = cheapest_full(grid, camera, COST)
-        coarse = coarse_sweeps(grid, camera, along)
-    except PoseError:
-        return []
-    coarse_s = COST.seconds(coarse, camera)
-    spends = _plans(scan_pass, camera, along, trial.seed)
-    for budget in BUDGETS:
-        try:
-            fine_s = check_budget(budget, coarse_s, full_s)
-        except BudgetError:
-            continue
-        for plan, draw, spend in spends:
-            patch_index, seconds, lines = spend(fine_s)
-            row = {"policy": plan, "draw": draw, "fraction": budget, "patches": len(patch_index)}
-            row |= {"capture_s": coarse_s + seconds, "full_s": full_s}
-            row |= {"lines": count_lines(coarse) + lines, "full_lines": count_lines(full)}
-            rows.append(row | {"counts": _counts(scan_pass, weights, patch_index)})
-    return rows
-
-
-def _plans(scan_pass: ScenePasses, camera: LineCamera, along: Axis, seed: int) -> list[tuple[str, int, Spend]]:
-    """Give our plans and two without a model: lines that lie evenly, and lines by chance, several times."""
-    grid = scan_pass.seen.grid
-    options = [line_blocks(grid, camera, COST, along, rows) for rows in WIDTHS]
-
-    def ours(policy: str) -> Spend:
-        scores = score_patches(policy, scan_pass.seen, seed=seed)
-
-        def spend(seconds: float) -> tuple[PatchIndex, float, int]:
-            plan = plan_fine(grid, camera, COST, along, scores, budget_s=seconds)
-            return plan.patch_index, plan.seconds, plan.lines
-
-        return spend
-
-    def without_a_model(draw: int | None) -> Spend:
-        """Give what shows the most of lines that lie evenly, or by chance where a draw is numbered."""
-
-        def spend(seconds: float) -> tuple[PatchIndex, float, int]:
-            if draw is None:
-                lines = most_shown(options, lambda blocks: blocks.evenly(seconds))
-            else:
-                seeds = [seed, 0xB10C, draw]
-                lines = most_shown(options, lambda blocks: blocks.at_random(seconds, np.random.default_rng(seeds)))
-            return lines.patch_index, COST.seconds(lines.sweeps, camera), count_lines(lines.sweeps)
-
-        return spend
-
-    found = [(policy, 0, ours(policy)) for policy in PLANNED]
-    found.append((UNIFORM, 0, without_a_model(None)))
-    return [*found, *((RANDOM, draw, without_a_model(draw)) for draw in range(RANDOM_DRAWS))]
-
-
 Runs = Sequence[Sequence[Record]]  # of each weights, or of each seed, the records of its frames
-COSTS = ("patches", "samples", "bytes", "multiply_adds", "capture_s", "full_s", "lines", "full_lines")
+COSTS = ("patches", "samples", "bytes", "multiply_adds", "capture_s", "full_s")
 
 
 @dataclass(frozen=True)
@@ -234,14 +170,14 @@ def seeds_of(runs: Runs) -> list[list[int]]:
     return [members for _, members in seeds]
 
 
-def collect_row(seeds: Runs, policy: str, fraction: float, kind: str = "rows") -> Row | None:
-    """Gather the counts of one row, or of one of the ``plans``, from the records of all seeds; None without any."""
+def collect_row(seeds: Runs, policy: str, fraction: float) -> Row | None:
+    """Gather the counts of one row from the records of all seeds; None without any."""
     order = sorted({record["frame"] for records in seeds for record in records})
     found = [
         (number, order.index(record["frame"]), row)
         for number, records in enumerate(seeds)
         for record in records
-        for row in record[kind]
+        for row in record["rows"]
         if (row["policy"], row["fraction"]) == (policy, fraction)
     ]
     if not found:
@@ -263,11 +199,11 @@ def difference(row: Row, other: Row | None, trial: Trial, draws: int) -> Record 
         return {"difference": None, "low": None, "high": None, "frames": 0}
     counts, seeds = (row.counts[:, both], other.counts[:, both]), (row.of_seed, other.of_seed)
     found = paired_interval(*counts, seeds=seeds, draws=draws, seed=trial.seed)
-    return {**found.as_dict(), "frames": int(both.sum())}
+    return {**asdict(found), "frames": int(both.sum())}
 
 
 def summarise(runs: Runs, class_names: Sequence[str], trial: Trial, draws: int) -> Record:
-    """Give the figures of every row against every patch and against chance, and of every plan of lines.
+    """Give the figures of every row against every patch and against chance.
 
     ``runs`` are of each weights the records of `judge_frame`, ``draws`` those of the bootstrap.
     """
@@ -292,23 +228,7 @@ def summarise(runs: Runs, class_names: Sequence[str], trial: Trial, draws: int) 
         figures["against_random"] = difference(row, rows.get(("random", fraction)), trial, draws)
         table.append(figures | {"cost": _cost(row, whole)})
     named = dict(zip(class_names, support.tolist(), strict=True))
-    return {"rows": table, "support": named, "rig": _plan_figures(seeds, class_names, trial, draws)}
-
-
-def _plan_figures(seeds: Runs, class_names: Sequence[str], trial: Trial, draws: int) -> list[Record]:
-    """Give mIoU, seconds and lines of every plan at every budget, and ours against the two without a model.
-
-    A budget at which a frame has no plan is judged on the other frames, in every row alike; their number is said.
-    """
-    every = [(plan, budget) for plan in (*PLANNED, UNIFORM, RANDOM) for budget in BUDGETS]
-    rows = {key: row for key in every if (row := collect_row(seeds, *key, "plans")) is not None}
-    table = []
-    for (plan, budget), row in rows.items():
-        figures = {"policy": plan, "budget": budget, **_accuracy(row, class_names), "cost": _cost(row, row)}
-        for other, name in ((UNIFORM, "against_uniform"), (RANDOM, "against_random")):
-            figures[name] = difference(row, rows[other, budget], trial, draws) if plan in PLANNED else None
-        table.append(figures)
-    return table
+    return {"rows": table, "support": named}
 
 
 def _accuracy(row: Row, class_names: Sequence[str]) -> Record:
@@ -336,7 +256,8 @@ def _cost(row: Row, whole: Row) -> Record:
     """Give what a frame takes in the mean, of each cost, and its fraction of that of every patch."""
     found = {}
     for name in COSTS:
-        done, full = (_mean_or_none([one.get(name) for one in some.parts]) for some in (row, whole))
+        known = ([one[name] for one in some.parts if one.get(name) is not None] for some in (row, whole))
+        done, full = (float(np.mean(values)) if values else None for values in known)
         if done is not None:
             found[name] = {"done": done, "ratio": done / full if full else None}
     return found
@@ -347,8 +268,3 @@ def _mean(values: Sequence[float] | NDArray[np.float64]) -> float:
     known = np.asarray(values, np.float64)
     known = known[~np.isnan(known)]
     return float(known.mean()) if known.size else float("nan")
-
-
-def _mean_or_none(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None

@@ -1,4 +1,4 @@
-"""An evaluation as tables and as a plot: accuracy with intervals, costs, plans of lines, classes."""
+"""An evaluation as tables and as a plot: accuracy with intervals, costs, classes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ CAPTION = (
 
 
 def print_evaluation(content: dict[str, Any], console: Console) -> None:
-    """Print what was judged, accuracy with costs, plans of lines and classes, and what the figures mean."""
+    """Print what was judged, accuracy with costs and classes, and what the figures mean."""
     weights = content["weights"]
     named = f"{len(weights)} sets of weights" if len(weights) > 1 else weights[0]["file"]
     left = f"; left out as seen in training: {len(content['left_out'])}" if content["left_out"] else ""
@@ -46,8 +46,6 @@ def print_evaluation(content: dict[str, Any], console: Console) -> None:
         console.print(escape(line), soft_wrap=True)
     console.print(_accuracy(content))
     console.print(_costs(content))
-    if content["rig"]:
-        console.print(_rig(content))
     console.print(_classes(content))
     console.print(escape(CAPTION.format(draws=content["settings"]["draws"])), soft_wrap=True, style="dim")
 
@@ -101,24 +99,6 @@ def _seconds(cost: dict[str, Any]) -> tuple[str, str]:
     return format_seconds(done), format_percent(done / full)
 
 
-def _rig(content: dict[str, Any]) -> Table:
-    names = ("budget", "frames", "seconds", "of full scan", "lines", "mIoU", "overall", "to uniform", "to random")
-    table = _table("plan", *names, title="plans of lines: mIoU at equal capture seconds")
-    for row in sorted(content["rig"], key=lambda row: row["budget"]):
-        table.add_row(
-            row["policy"],
-            format_percent(row["budget"]),
-            str(row["frames"]),
-            *_seconds(row["cost"]),
-            format_count(row["cost"]["lines"]["done"]),
-            _miou(row),
-            format_points(row["pixel_accuracy"]),
-            format_difference(row["against_uniform"]),
-            format_difference(row["against_random"]),
-        )
-    return table
-
-
 def _classes(content: dict[str, Any]) -> Table:
     shown = [row for row in content["rows"] if row["policy"] in ENDS]
     first = [row for row in content["rows"] if row["policy"] == content["rows"][1]["policy"]]
@@ -155,18 +135,17 @@ def _table(first: str, *columns: str, title: str | None = None) -> Table:
 
 
 def evaluation_figure(content: dict[str, Any]) -> Figure:
-    """Draw mIoU over the bytes of the captures and, where lines were planned, over their seconds: a line a policy."""
-    panels = [("rows", "bytes", "MB a frame, before compression", 1e6)]
-    panels += [("rig", "capture_s", "capture seconds a frame, coarse pass included", 1.0)] if content["rig"] else []
+    """Draw mIoU over the bytes of the captures and over their seconds, where these are known: a line a policy."""
+    panels = [("bytes", "MB a frame, before compression", 1e6)]
+    if "capture_s" in content["rows"][0]["cost"]:
+        panels.append(("capture_s", "capture seconds a frame, coarse pass included", 1.0))
     figure = Figure(figsize=(7.0 * len(panels), 5.0), dpi=110, layout="constrained", facecolor=PAPER)
     ends = {row["policy"]: 100 * row["miou"] for row in content["rows"] if row["policy"] in ENDS}
-    for axes, (kind, cost, label, unit) in zip(
-        figure.subplots(1, len(panels), squeeze=False).flat, panels, strict=True
-    ):
+    for axes, (cost, label, unit) in zip(figure.subplots(1, len(panels), squeeze=False).flat, panels, strict=True):
         for name, style in (("none", ":"), ("all", "-")):
             axes.axhline(ends[name], color=INK, linewidth=1.0, linestyle=style, label=name)
-        for policy in dict.fromkeys(row["policy"] for row in content[kind] if row["policy"] not in ENDS):
-            own = [row for row in content[kind] if row["policy"] == policy]
+        for policy in dict.fromkeys(row["policy"] for row in content["rows"] if row["policy"] not in ENDS):
+            own = [row for row in content["rows"] if row["policy"] == policy]
             points = sorted((row["cost"][cost]["done"] / unit, 100 * row["miou"]) for row in own)
             axes.plot(*zip(*points, strict=True), marker="o", markersize=5, label=policy)
         axes.set(xlabel=label, ylabel="mIoU [%]", facecolor=PAPER)

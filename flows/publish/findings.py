@@ -18,8 +18,8 @@ from flows.tasks.run import SurveyRun
 from flows.tasks.stages.maps import out_of_range_pixels
 from models.evaluation.expected_scores import expected_counts
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, FieldScale, areas_by_number
-from pipeline.ground.georeference import class_areas_m2, crs_name, pixel_side_m
+from pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, FieldScale, PlacedPicture, areas_by_number
+from pipeline.ground.georeference import crs_name, pixel_side_m
 from pipeline.ground.zones import figures_of_plots
 from pipeline.planning.fine_pass import FinePlan
 from storage.archive.keys import StageRef
@@ -82,8 +82,10 @@ def find_ground(
     if geobox is None:
         return {}
     if posed is None:  # the class map itself, in hectares of the ellipsoid
-        areas = class_areas_m2(geobox, found.classes, len(found.names)) / M2_PER_HECTARE
-        hectares, side = dict(zip(found.names, areas.tolist(), strict=True)), pixel_side_m(geobox)
+        areas = areas_by_number(PlacedPicture(geobox), found.classes, len(found.names))
+        assert areas is not None
+        hectares = dict(zip(found.names, (areas / M2_PER_HECTARE).tolist(), strict=True))
+        side = pixel_side_m(geobox)
     else:
         hectares = {name: area["ha"] for name, area in posed.areas.items()}
         side = abs(float(geobox.resolution.x))

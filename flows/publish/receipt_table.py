@@ -212,7 +212,6 @@ _FIGURES: Sequence[tuple[str, str, str, Callable[[Any], Any]]] = (
     ("plan", "reason", "{}", str),
     ("plan", "lines", "{} fine lines", format_count),
     ("plan", "out_of_reach", "{} patches worth a second pass lie beyond the mirror's range", format_count),
-    ("plan", "spared_s", "the threshold left {} unspent", format_seconds),
     ("recording", "lines_read", "{} lines were read", format_count),
     ("recording", "lines_recorded", "{} are recorded", format_count),
     ("recording", "passes_s", "a camera would take {} for these passes, by the cost model", format_seconds),

@@ -311,13 +311,6 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
         "full_seconds": plan.full_seconds,
         "out_of_reach": plan.out_of_reach,
     }
-    if plan.threshold is not None:  # what it left, and the score that was not worth more seconds
-        figures |= {
-            "threshold": plan.threshold,
-            "spared_s": plan.spared_s,
-            "spared_fraction": None if plan.spared_s is None else plan.spared_s / run.plan.full_s,
-            "spared_score": plan.wanted_gain - plan.expected_gain,
-        }
     found: dict[str, Any] = {"field": field_figures(run, plan), "plan": figures}
     if run.recorded is not None:
         found["recording"] = _recording(run, run.recorded, plan)

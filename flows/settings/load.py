@@ -35,7 +35,6 @@ from flows.settings.survey_settings import (
     source_of,
 )
 from flows.settings.values import EXTENT_PART, EXTENT_WHOLE, parse_moment, parse_text, to_whole, unit_guess
-from models.network.sizes import TRAINED_VGG_FROM, VGG_FROM
 from pipeline.errors import BudgetError, PoseError, SettingsError
 from pipeline.rig.device_settings import MOST_PAIRS
 from pipeline.setting_fields import format_number, span_of
@@ -340,7 +339,6 @@ def _contradictions(given: set[str], origin: Mapping[str, str]) -> Iterator[str]
 
 CHEAP_POLICY = "sobel"  # of the coarse image alone: gain would have the network read it twice
 IN_NAT = ("gain", "entropy")  # policies whose scores are gains, or the most that these can be
-_VGG_FROM = {"vgg-static": VGG_FROM, "vgg-trained": TRAINED_VGG_FROM}  # policies that read a file of VGG19
 
 
 def _wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
@@ -358,17 +356,6 @@ def _policy_wrongs(settings: Settings) -> Iterator[str]:
     if (policy == "mask") != (settings.mask is not None):
         wants = "policy 'mask' needs a mask file" if settings.mask is None else "a mask is used by policy 'mask' only"
         yield f"{wants}: got policy = {policy!r}, mask = {settings.mask!r}; give both or neither"
-    vgg_from = _VGG_FROM.get(policy)
-    if vgg_from is not None and settings.vgg is None:
-        yield f"policy {policy!r} needs --vgg FILE, {vgg_from}"
-    if vgg_from is None and settings.vgg is not None:
-        wanted = " or ".join(map(repr, _VGG_FROM))
-        yield f"a vgg file is for policy {wanted}, got policy = {policy!r}; leave --vgg out"
-    if settings.threshold is not None and policy not in IN_NAT:
-        yield (
-            f"threshold is a gain [nat], and policy {policy!r} scores in a unit of its own: leave --threshold out, or "
-            f"take --policy {' or '.join(IN_NAT)} (entropy is the most that a look can gain)"
-        )
 
 
 def _scene_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:

@@ -56,10 +56,10 @@ OF_A_PART = ("max_age", "skip_below_error")  # of what a field that is remembere
 OF_RECORDINGS = ("sweeps", "pointing", "dark", "white", "scan")
 UNIFORM = ("seconds", "bytes_raw", "goal", "scan_step", "scan")  # settings of which one asks for a uniform scan
 SPARING = ("macs", "bytes_kept", "least_gain")  # by which a uniform scan is kept and read in detail in part
-OF_TWO_PASSES = ("budget", "coarse_exposure_ms", "policy", "threshold", "mask", "vgg")  # and of which none may
-OF_CHOOSING = ("policy", "mask", "vgg")  # but for these where a part of the scan is chosen
+OF_TWO_PASSES = ("budget", "coarse_exposure_ms", "policy", "mask")  # and of which none may
+OF_CHOOSING = ("policy", "mask")  # but for these where a part of the scan is chosen
 PATHS = (
-    *("scene", "labels", "sweeps", "pointing", "dark", "white", "out", "mask", "vgg", "weights"),
+    *("scene", "labels", "sweeps", "pointing", "dark", "white", "out", "mask", "weights"),
     *("zones.area", "zones.no_go", "zones.plots"),
 )
 AUTO, SIM, RIG, RASTER = "auto", "sim", "rig", "raster"  # where pixels come from
@@ -67,7 +67,7 @@ RECORDED = "recorded"  # likewise, and the uniform scan that takes a recording's
 # of a camera alone: tables, and settings beside them
 OF_A_CAMERA = (
     *("camera", "optics", "mirror", "detector", "air", "sky", "cost", "rig", *UNIFORM, "scan_exposure_ms"),
-    *("coarse_exposure_ms", "budget", "threshold", "effects", "tol", "resampling", "pointing_px", "extent", *OF_A_PART),
+    *("coarse_exposure_ms", "budget", "effects", "tol", "resampling", "pointing_px", "extent", *OF_A_PART),
 )
 OF_A_VIEW = ("camera.pitch_um", "camera.focal_length_mm")  # how large a pixel is seen, which a [pose] asks for
 ALL_OF_IT = "leave it out to keep and read all of the scan"
@@ -254,7 +254,6 @@ class Settings:
     )
     policy: Policy = stated("gain", "Where to capture again")
     mask: str | None = stated(None, "Image of where to capture again, for the policy mask", example="mask.png")
-    vgg: str | None = stated(None, "Weights of VGG19, for the policies vgg-static and vgg-trained", example="vgg19.pth")
     weights: str | None = stated(
         None,
         "Model weights (.safetensors); those for `farm` are built in: `farm` names them for another source's field",
@@ -264,15 +263,6 @@ class Settings:
         "auto",
         "Pixels unlike all that the weights were trained on get the class unknown: auto (where the weights know "
         "what is familiar to them, at 0.1%), off, or the fraction of known pixels that may be called unknown: 0.5%",
-    )
-    threshold: float | None = stated(
-        None,
-        "Least gain (per px, summed over patches) in a second of the fine pass, the receipt's score_per_second; for the "
-        "policies gain and entropy",
-        "nat per second",
-        0,
-        1e9,
-        example=0.5,
     )
     seed: int = stated(0, "Seed of the scene `farm` and of all noise", "", 0, 2**63 - 1)
     effects: Effects = stated(

@@ -16,12 +16,10 @@ from numpy.typing import NDArray
 
 from flows.tasks.reading_costs import SHARD
 from models.network.machine import PROCESSOR
-from models.network.sizes import saliency_bytes
-from models.policies.policies import GLANCING_POLICIES, IMAGE_POLICIES, score_patches
-from models.policies.vgg_file import VggFile
+from models.policies.policies import GLANCING_POLICIES, score_patches
 from models.reading.inference import CoarsePass, CoarsePrediction, read_coarse_pass, read_coarse_prediction
 from models.reading.ood import OodDetector
-from models.reading.regions import HALO_CELLS, REGION_PX, Region, most_bytes, plan_regions, whole_field
+from models.reading.regions import HALO_CELLS, REGION_PX, Region, most_bytes, plan_regions
 from models.weights.checksummed_files import SEAL
 from models.weights.files import Weights, describe_weights, load_ood, load_reader, load_weights
 from pipeline.errors import WeightsError
@@ -76,7 +74,6 @@ class Scoring:
     weights: WeightsFile
     mosaic: Path
     policy: str
-    vgg: VggFile | None = None
 
     def __call__(self, region: Region) -> NDArray[np.float64]:
         """Scores of the patches that are kept, (seat_y, seat_x)."""
@@ -89,8 +86,7 @@ class Scoring:
             seen = CoarsePrediction(
                 scan_pass.grid, scan_pass.columns, np.empty((0, 0, 0), np.float32), origin=scan_pass.origin
             )
-        network = None if self.vgg is None else self.vgg.saliency(weights)
-        return region.crop_patches(score_patches(self.policy, seen, network=network))
+        return region.crop_patches(score_patches(self.policy, seen))
 
 
 def coarse_region(weights: Weights, mosaic: Path, region: Region) -> CoarsePass:
@@ -138,9 +134,6 @@ def patch_features(
     return patch_index[:kept], columns[:kept]
 
 
-IMAGE_BYTES = 128  # a coarse pixel, of what a policy of the whole image holds at once beside the columns
-
-
 def region_params(grid: SceneGrid) -> dict[str, Any]:
     """What the result depends on where a field is cut: nothing where it is read whole."""
     return {} if len(plan_regions(grid, SHARD)) == 1 else {"regions": {"most_px": REGION_PX, "halo": HALO_CELLS}}
@@ -154,49 +147,28 @@ class FieldWork:
     regions: Sequence[Region]
     pool: WorkerPool
     memory: int  # of this process and those that it starts, together [bytes]
-    vgg: VggFile | None = None  # for the policies vgg-static and vgg-trained
 
     def score(self, policy: str, mosaic: Path, report: Callable[[float], None]) -> NDArray[np.float64]:
         """Score every patch of the padded grid by the coarse mosaic alone, (seat_y, seat_x).
 
-        A policy that sees the image as a whole gets the field as one region, whatever its size. Raises SettingsError:
-        not even one region at a time, or not the whole image that such a policy needs, fits the memory.
+        Raises SettingsError: not even one region at a time fits the memory.
         """
-        if policy in IMAGE_POLICIES:
-            return self._score_image(policy, mosaic.resolve(), report)
-        vgg = self.vgg
-        beside = max(saliency_bytes(one.coarse.shape, vgg.channels) for one in self.regions) if vgg else 0
-        pool = self.pool_for(np.empty(0, np.int64), len(mosaic_wavelengths(mosaic)), beside=beside)
+        pool = self.pool_for(np.empty(0, np.int64), len(mosaic_wavelengths(mosaic)))
         path = mosaic.resolve()
-        work, paths = Scoring(self.weights, path, policy, vgg), [path, *([vgg.path] if vgg else [])]
-        parts = run_blocks(work, self.regions, pool, report=report, paths=paths)
+        parts = run_blocks(Scoring(self.weights, path, policy), self.regions, pool, report=report, paths=[path])
         scores = np.zeros(self.regions[0].field.patch_shape)
         for region, part in zip(self.regions, parts, strict=True):
             scores[region.kept_patches.rows, region.kept_patches.columns] = part
         return scores
 
-    def _score_image(self, policy: str, mosaic: Path, report: Callable[[float], None]) -> NDArray[np.float64]:
-        """Score by the coarse image of the whole field: one block of work, and no reading by the model."""
-        grid, pool = self.regions[0].field, self.pool
-        y, x = grid.padded_shape
-        image = (2 * 4 * self.weights.load().config.columns + IMAGE_BYTES) * (y * x // grid.factor**2)
-        least = RESERVED_BYTES * (1 if pool.shares_memory else 2) + image
-        if least > self.memory and not pool.elsewhere:
-            why = f"the policy {policy!r} sees the coarse image of the field as a whole, which takes {mib(image)}"
-            raise memory_refusal(least, self.memory, why, ", or choose a policy that does not, such as entropy")
-        work = Scoring(self.weights, mosaic, policy)
-        (scores,) = run_blocks(work, [whole_field(grid)], pool, report=report, paths=[mosaic])
-        return np.asarray(scores, np.float64)
-
-    def pool_for(self, patch_index: NDArray[np.integer], bands: int, *, beside: int = 0) -> WorkerPool:
+    def pool_for(self, patch_index: NDArray[np.integer], bands: int) -> WorkerPool:
         """Give the worker pool, no larger than memory holds regions with their parts of these patches of the field.
 
-        ``beside`` each region lie so many bytes more. Raises SettingsError: not even one region at a time fits the
-        memory; names the least that does.
+        Raises SettingsError: not even one region at a time fits the memory; names the least that does.
         """
         if self.pool.elsewhere:
             return self.pool
-        region = most_bytes(self.weights.load().config, self.regions, patch_index, bands) + beside
+        region = most_bytes(self.weights.load().config, self.regions, patch_index, bands)
         apart = not self.pool.shares_memory
         each = region + RESERVED_BYTES * apart
         least = RESERVED_BYTES + each

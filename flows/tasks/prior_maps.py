@@ -28,7 +28,7 @@ PROBABILITIES = "class_probabilities"  # a product of runs
 MEMORY = "prior_map.json"  # beside a map that goes on from an earlier one: what became of the memory
 OF_THE_LIGHT = (  # settings that the same light has alike
     *("scene", "source", "seed", "size", "visit", "day", "hour", "effects", "pointing_px"),
-    *("extent", "scan_step", "scan_exposure_ms", "coarse_exposure_ms", "budget", "policy", "threshold"),
+    *("extent", "scan_step", "scan_exposure_ms", "coarse_exposure_ms", "budget", "policy"),
 )
 
 

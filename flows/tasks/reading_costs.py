@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.network.sizes import MultiplyAdds, SegmenterConfig, multiply_adds
-from models.policies.policies import GLANCING_POLICIES, IMAGE_POLICIES, score_multiply_adds
-from models.reading.regions import Region, plan_regions, whole_field
+from models.policies.policies import GLANCING_POLICIES, score_multiply_adds
+from models.reading.regions import Region, plan_regions
 from pipeline.geometry.grid import SceneGrid
 from storage.arrays.layout import SHARD_COLUMNS, SHARD_ROWS
 
@@ -24,7 +24,6 @@ class ReadingCosts:
     config: SegmenterConfig
     grid: SceneGrid
     bands: int
-    vgg_channels: int = 3  # that a policy of VGG19 reads
 
     @cached_property
     def _regions(self) -> list[Region]:
@@ -47,8 +46,5 @@ class ReadingCosts:
         """
         drawn = self.of_map(patch_index)
         scan_passes = 2 if policy in GLANCING_POLICIES else 1
-        scored = [whole_field(self.grid)] if policy in IMAGE_POLICIES else self._regions
-        score = sum(
-            score_multiply_adds(policy, self.config, region.grid, channels=self.vgg_channels) for region in scored
-        )
+        score = sum(score_multiply_adds(policy, self.config, region.grid) for region in self._regions)
         return replace(drawn, coarse_prediction=scan_passes * drawn.coarse_prediction, score=score)

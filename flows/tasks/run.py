@@ -39,12 +39,11 @@ from flows.tasks.scene import (
 )
 from flows.tasks.stage import FieldFrame, Report
 from flows.tasks.stages.capture import SweepRecorder
-from flows.tasks.survey_model import SurveyModel, beyond_training, vgg_file, weights_offered, weights_path
+from flows.tasks.survey_model import SurveyModel, beyond_training, weights_offered, weights_path
 from flows.tasks.zones import SurveyZones, open_zones, place_of_field
 from models.evaluation.expected_scores import MapScores
 from models.network.machine import PROCESSOR, choose_device
 from models.network.sizes import MultiplyAdds
-from models.policies.vgg_file import VggFile
 from models.reading.regions import plan_regions
 from models.weights.checksummed_files import SEAL
 from models.weights.files import Description, Weights
@@ -218,11 +217,6 @@ class SurveyRun(CaptureRun):
         """The mask of policy ``mask``, (y, x) or (y, x, channel)."""
         return None if self.settings.mask is None else load_labels_array(self.settings.mask)
 
-    @cached_property
-    def vgg(self) -> VggFile | None:
-        """VGG19 for the policies ``vgg-static`` and ``vgg-trained``."""
-        return vgg_file(self.settings)
-
     @property
     def frame(self) -> FieldFrame:
         """The frame of all images of the survey."""
@@ -239,7 +233,7 @@ class SurveyRun(CaptureRun):
     def work(self) -> FieldWork:
         """The model over the field, region by region."""
         file = WeightsFile(weights_path(self.settings).resolve(), self.described.about[SEAL], self.device)
-        return FieldWork(file, plan_regions(self.grid, SHARD), self.settings.pool, self.settings.memory, self.vgg)
+        return FieldWork(file, plan_regions(self.grid, SHARD), self.settings.pool, self.settings.memory)
 
     @property
     def part(self) -> bool:
@@ -352,8 +346,7 @@ def _run_by(
     else:
         raster = RasterPixels(pixels.read, pixels.missing, bands, grid)
     settings = replace(settings, extent=layout.extent, scan_step=layout.step, scan_exposure_ms=layout.exposure_ms)
-    channels = 3 if model.vgg is None else model.vgg.channels
-    costs = ReadingCosts(described.config, grid, bands, channels)
+    costs = ReadingCosts(described.config, grid, bands)
     spending = settings.policy, settings.macs, settings.bytes_kept, settings.least_gain
     budget = PatchBudget.asked(costs, None if zones.fractions is None else zones.fractions > 0, *spending)
     simulated, planned = make_source(scene, settings), (*plan.coarse, *plan.full)
@@ -366,7 +359,7 @@ def _run_by(
     prior, prior_notes = found or find_prior(archive, settings, name, grid, described.class_names)
     if settings.prior != AUTO:  # what is meant when it is asked for again
         settings = replace(settings, prior=NONE if prior is None else prior.run)
-    said = (*notes, *zones.notes, *prior_notes, *extent_notes, *model.notes(planning=planning), *outside, *label_notes)
+    said = (*notes, *zones.notes, *prior_notes, *extent_notes, *outside, *label_notes)
     return SurveyRun(
         settings=settings,
         archive=archive,

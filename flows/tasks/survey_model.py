@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from flows.settings.values import UNKNOWN_AUTO, UNKNOWN_OFF
 from models.network.machine import choose_device
-from models.policies.vgg_file import VggFile
 from models.weights.files import Description, Weights, describe_weights, load_ood, load_reader, load_weights
 from models.weights.parts import TRAINED_ON, OodPart, TrainedOn
 from pipeline.errors import SettingsError, WeightsError
@@ -34,7 +33,6 @@ class SurveyModel:
     path: Path
     described: Description
     load: Once[Weights]
-    vgg: VggFile | None
 
     @staticmethod
     def open(settings: Settings, path: Path, *, planning: bool) -> SurveyModel:
@@ -44,20 +42,14 @@ class SurveyModel:
         machine lacks the device.
         """
         described, load = describe_weights(path), Once(lambda: load_weights(path).on(choose_device(settings.device)))
-        model = SurveyModel(path, described, load, vgg_file(settings))
+        model = SurveyModel(path, described, load)
         if not planning:
             load()
             if described.reader is not None:
                 load_reader(path)
             if described.ood_detector is not None and settings.unknown != UNKNOWN_OFF:
                 load_ood(path)
-            if model.vgg is not None:
-                model.vgg.saliency(load())  # refuses one that does not go with the weights
         return model
-
-    def notes(self, *, planning: bool) -> tuple[str, ...]:
-        """What is to be said of these files."""
-        return () if self.vgg is None or planning else (f"VGG19 from {self.vgg.path.name}: {self.vgg.report()}",)
 
     def check_bands(self, wavelength_nm: NDArray[np.floating]) -> None:
         """Refuse weights of which no spectral column is reached by a band (WeightsError)."""
@@ -121,13 +113,6 @@ def shipped_weights(*, plain: bool = False) -> Path:
     """
     name = "farm-scan.safetensors" if plain else "farm.safetensors"
     return Path(str(resources.files("models") / "shipped" / name))
-
-
-def vgg_file(settings: Settings) -> VggFile | None:
-    """VGG19 for the policies that ask it; None for the others."""
-    if settings.vgg is None:
-        return None
-    return VggFile.found(Path(settings.vgg), trained=settings.policy == "vgg-trained")
 
 
 DAYS, SUN_DEG, DARKER, SCALE, BAND_NM = 10, 3.0, 0.9, 1.5, 25.0  # as much beside its ranges is still within training

@@ -357,7 +357,7 @@ def plan_every_fraction(seed: int) -> PlannedField:
     scores, valid = score_patches(POLICY, seen), grid.valid_fraction().ravel() > 0
     scan_passes: dict[Setting, PlannedPass] = {}
     for fraction in FRACTIONS:
-        patch_index = frame_patches(scores, fraction, valid).patch_index if fraction < 1 else np.flatnonzero(valid)
+        patch_index = frame_patches(scores, fraction, valid) if fraction < 1 else np.flatnonzero(valid)
         scan_passes[fraction] = PlannedPass(seen, patch_index, columns[patch_index], weights)
     return PlannedField(np.asarray(source.scene.labels, np.uint8), len(source.wavelength_nm), scan_passes)
 

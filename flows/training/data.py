@@ -66,12 +66,6 @@ def scene_of_file(file: SceneFile, camera: LineCamera) -> RasterScene:
     )
 
 
-def farm_data(scenes: int | None, validation: int, camera: LineCamera) -> TrainingData:
-    """Scenes of the farm on days of the season, on seeds far from those that surveys are shown on."""
-    train = farm_days(FARM_TRAIN_SEED, FARM_SCENES if scenes is None else scenes)
-    return TrainingData(FARM_LAW, train, farm_days(FARM_VALIDATION_SEED, validation, odd=True), (), camera)
-
-
 def farm_test_data(scenes: int, camera: LineCamera) -> TrainingData:
     """Scenes of the farm to judge weights on, all of them in ``train``."""
     return TrainingData(FARM_LAW, farm_days(FARM_TEST_SEED, scenes, odd=True), (), (), camera)
@@ -141,7 +135,9 @@ def open_training_data(
                 raise SettingsError(
                     f"{flag} is for scene files; the farm's scenes are drawn by seed and bring their own"
                 )
-        return farm_data(scenes, FARM_VALIDATION if validation is None else validation, camera)
+        train = farm_days(FARM_TRAIN_SEED, FARM_SCENES if scenes is None else scenes)
+        kept = farm_days(FARM_VALIDATION_SEED, FARM_VALIDATION if validation is None else validation, odd=True)
+        return TrainingData(FARM_LAW, train, kept, (), camera)
     if scenes is not None:
         raise SettingsError(f"--scenes is for the built-in farms; {dataset} has its own scenes")
     files = load_data_set(Path(dataset), **choices)  # type: ignore[arg-type]

@@ -22,7 +22,7 @@ from models.evaluation.metrics import (
 )
 from models.evaluation.placement import CONTROL_FRACTION, Controls, Counts, run_controls
 from models.network.spectral import patches_of
-from models.reading.inference import coarse_prediction_of_columns, segment
+from models.reading.inference import coarse_prediction_of_columns, map_of_columns
 from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from models.training.examples import Example
 from models.weights.files import Weights
@@ -146,13 +146,10 @@ def _scanned(
     grid, _, labels = _parts(weights, example)
     plain, classes = example.fine.astype(np.float32), weights.config.classes
     fine, means = scan_passes.scan(plain, example.noise, grid.factor, light=light, step=step, rng=rng)
-    valid = grid.valid_patches()
-    seen = coarse_prediction_of_columns(weights, means, grid)
-    drawn = segment(weights, seen, patches_of(fine, grid.patch)[valid], valid, every_class=True)
+    drawn, every_class = map_of_columns(weights, means, fine, grid)
     valid = (labels != UNLABELLED) & np.isfinite(drawn.confidence)
     sure = confidence_counts(drawn.confidence[valid], drawn.classes[valid] == labels[valid])
-    assert drawn.log_probability is not None
-    expected = expected_counts([drawn.log_probability[valid]], classes)
+    expected = expected_counts([every_class[valid]], classes)
     return _JudgedScan(confusion(labels, drawn.classes, classes), sure, expected)
 
 

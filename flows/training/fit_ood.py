@@ -19,8 +19,7 @@ from flows.terminal.progress import one_after_the_other
 from flows.training.data import Report, TrainingData, open_training_data, read_farm_name
 from flows.training.figures import judge_scans
 from flows.training.train_scenes import TrainRequest, as_read, observe_all
-from models.network.spectral import patches_of
-from models.reading.inference import coarse_prediction_of_columns, segment
+from models.reading.inference import map_of_columns
 from models.training.calibration import JudgedMap, judge_confidence
 from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from models.training.examples import Example
@@ -72,12 +71,8 @@ def measured_calibration(weights: Weights, frames: Sequence[Example], seed: int)
     maps = []
     for frame in frames:
         grid = SceneGrid(*frame.shape, weights.config.patch, weights.config.factor)
-        cells, valid = patches_of(frame.fine, grid.patch).astype(np.float32), grid.valid_patches()
-        drawn = segment(
-            weights, coarse_prediction_of_columns(weights, frame.coarse, grid), cells[valid], valid, every_class=True
-        )
-        assert drawn.log_probability is not None
-        maps.append(JudgedMap.of(drawn.log_probability, frame.labels[: grid.height, : grid.width]))
+        _, every_class = map_of_columns(weights, frame.coarse, frame.fine, grid)
+        maps.append(JudgedMap.of(every_class, frame.labels[: grid.height, : grid.width]))
     return judge_confidence(maps, seed) if maps else None
 
 

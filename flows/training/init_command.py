@@ -13,13 +13,19 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.markup import escape
 
 from flows.cli.app import AsJson, Switch, stderr
 from flows.terminal.figures import counted
 from flows.terminal.processes import DONE, writing
 from flows.terminal.progress import StageProgress, put_out
-from flows.training.survey_draft import draft_sweeps, printable, set_aside, show_survey_draft, write_survey_draft
+from flows.training.survey_draft import (
+    draft_sweeps,
+    printable,
+    set_aside,
+    show_draft,
+    show_survey_draft,
+    write_survey_draft,
+)
 from pipeline.readings import MOST_VALUE
 from storage.archive.whole_files import write_whole
 from storage.readers.label_files import is_store, listed_names
@@ -192,12 +198,5 @@ def _show(record: dict[str, Any], console: Console) -> None:
     images = counted(record["images"], "image")
     names = ", ".join(one["name"] for one in record["classes"][:8])
     more = f" and {len(record['classes']) - 8} more" if len(record["classes"]) > 8 else ""
-    console.print(f"{images}, {record['labelled']} with labels; the first has {height} x {width} px, {bands} bands")
-    if names:
-        console.print(escape(f"classes: {names}{more}"), soft_wrap=True)
-    for note in record["notes"]:
-        console.print(escape(f"note: {note}"), soft_wrap=True)
-    for words in record["unseen"]:
-        console.print(escape(f"not seen: {words}"), soft_wrap=True)
-    console.print(escape(f"written: {record['file']}"), soft_wrap=True)
-    console.print(escape(f"next: {record['next']}"), soft_wrap=True)
+    found = [f"{images}, {record['labelled']} with labels; the first has {height} x {width} px, {bands} bands"]
+    show_draft(record, [*found, *([f"classes: {names}{more}"] if names else [])], console)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from models.network.spectral import SpectralBasis, project
 from models.training.capture_augmentation import ColumnNoise
-from models.training.examples import Observation, noise_of, observe
+from models.training.examples import Example, noise_of, observe
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
@@ -54,7 +54,7 @@ class _Taken(SimulatedSweep):
 
 def observe_scene(
     scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis, rng: np.random.Generator
-) -> Observation:
+) -> Example:
     """Look at a labelled scene on the basis, noise by ``rng``; a farm by all lines. SceneError: no labels, or a gap."""
     if law_of_key(scene.key) is None:
         return observe(scene, camera, grid, basis, rng)
@@ -72,7 +72,7 @@ def observe_scene(
     small = (height // grid.factor, width // grid.factor)
     labels = np.full(grid.padded_shape, UNLABELLED, np.uint8)
     labels[: grid.height, : grid.width] = scene.labels
-    return Observation(
+    return Example(
         scene.name,
         np.asarray(pad_by_reflection(_columns(source, full, grid, matrix), grid.padded_shape), np.float32),
         np.asarray(pad_by_reflection(_columns(source, coarse, grid, matrix), small), np.float32),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -124,7 +124,13 @@ def printable(text: str) -> str:
 def show_survey_draft(record: Mapping[str, Any], console: Console) -> None:
     """Print what was found and written, and the next command."""
     lines = "" if record["lines"] is None else f" with {record['lines']} lines"
-    console.print(escape(f"{counted(len(record['sweeps']), 'sweep')}{lines}, {record['bands']} bands"), soft_wrap=True)
+    show_draft(record, [f"{counted(len(record['sweeps']), 'sweep')}{lines}, {record['bands']} bands"], console)
+
+
+def show_draft(record: Mapping[str, Any], found: Sequence[str], console: Console) -> None:
+    """Print what was found, what was not, where it is written, and the next command."""
+    for words in found:
+        console.print(escape(words), soft_wrap=True)
     for note in record["notes"]:
         console.print(escape(f"note: {note}"), soft_wrap=True)
     for words in record["unseen"]:

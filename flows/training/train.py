@@ -115,7 +115,6 @@ def _lesson(
     normalisation = measured_normalisation(seen, math.sqrt(darkest_ms * REFERENCE_MS))
     config, begun = network_config(request, about), None
     if start is not None:
-        config = replace(config, patch_kernel=start.patch_kernel)
         begun = start.begin(config, about.basis, normalisation, about.names)
     scan_passes = CaptureAugmentation(normalisation, darkest_ms=darkest_ms) if darkest_ms < REFERENCE_MS else None
     return Lesson(about, config, normalisation, as_read(seen, normalisation), scan_passes, begun)
@@ -289,11 +288,9 @@ def print_start(begun: Mapping[str, Any], console: Console) -> None:
     """Say what became of the tensors of the file."""
     skipped: Mapping[str, list[str]] = begun["skipped"]
     counts = f"{begun['matched']} tensors matched, {len(begun['resized'])} resized"
-    console.print(f"begun from {begun['file']} ({begun['kind']}): {counts}, {sum(map(len, skipped.values()))} skipped")
+    console.print(f"begun from {begun['file']}: {counts}, {sum(map(len, skipped.values()))} skipped")
     for name, how in begun["resized"].items():
         console.print(f"  resized {name}: {how}")
     for why, names in skipped.items():
         shown = f"{names[0]} and {len(names) - 1} more" if len(names) > 1 else names[0]
         console.print(f"  skipped {shown}: {why}")
-    if begun["licence"]:
-        console.print(f"  its licence: {begun['licence']}")

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from flows.training.data import Report, TrainingData, alike_notes, only_class, pack_mask, trained_pixels
 from flows.training.observed_scenes import observe_scene
 from models.network.machine import PROCESSOR
-from models.network.sizes import Positions, SegmenterConfig
+from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
-from models.training.examples import Example, Observation, normalised
+from models.training.examples import Example, normalised
 from models.training.train import TrainingSettings
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
@@ -37,7 +37,6 @@ class TrainRequest:
     factor: int = 4
     columns: int = 24
     width: int = 24
-    positions: Positions = "2d"
     tokens: dict[str, Any] = field(default_factory=dict)  # dim, layers, heads, mlp_ratio, where not the usual ones
     init: Path | None = None  # weights to begin from
     choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths, masks
@@ -68,7 +67,7 @@ def observe_all(
     what: str,
     report: Report,
     about: About | None = None,
-) -> tuple[list[Observation], About]:
+) -> tuple[list[Example], About]:
     """Look at named scenes of the data, and say what they have in common with each other, and with earlier ones."""
     seen = []
     for number, (name, scene) in enumerate(zip(names, data.scenes(names), strict=True)):
@@ -95,7 +94,7 @@ def observe_all(
     return seen, about
 
 
-def as_read(seen: Sequence[Observation], normalisation: Normalisation) -> list[Example]:
+def as_read(seen: Sequence[Example], normalisation: Normalisation) -> list[Example]:
     """What a network reads of looks by a basis that spans their bands, so that these reach every column of it."""
     reached = np.ones(len(normalisation.centre), np.bool_)
     return [normalised(one, normalisation, reached) for one in seen]
@@ -138,7 +137,6 @@ def network_config(request: TrainRequest, about: About) -> SegmenterConfig:
             patch=about.patch,
             factor=request.factor,
             width=request.width,
-            positions=request.positions,
             **request.tokens,
         )
     except ValueError as error:

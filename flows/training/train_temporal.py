@@ -19,9 +19,8 @@ from flows.terminal.progress import one_after_the_other
 from flows.training.data import Report
 from flows.training.observed_scenes import observe_finely
 from models.evaluation.metrics import confusion, mean_iou
-from models.network.spectral import patches_of
 from models.network.temporal_reader import TemporalReader
-from models.reading.inference import coarse_prediction_of_columns, segment
+from models.reading.inference import map_of_columns
 from models.reading.prior_map import CurrentVisit, PriorMap, first_probabilities, fuse
 from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation, ColumnNoise, drawn_step
 from models.training.temporal import PastPass, TemporalTraining, Visit, train_reader
@@ -160,13 +159,8 @@ class _Land:
         """What a uniform scan would have shown, read by the weights."""
         grid, light = self.grid, exposure_ms / REFERENCE_MS
         fine, means = scan_passes.scan(self.columns, self.noise, grid.factor, light=light, step=step, rng=rng)
-        patch_index = grid.valid_patches()
-        coarse_prediction = coarse_prediction_of_columns(weights, means, grid)
-        drawn = segment(
-            weights, coarse_prediction, patches_of(fine, grid.patch)[patch_index], patch_index, every_class=True
-        )
-        assert drawn.log_probability is not None
-        return CurrentVisit(drawn.log_probability, np.ones(self.labels.shape, np.bool_), means, light, step)
+        _, every_class = map_of_columns(weights, means, fine, grid)
+        return CurrentVisit(every_class, np.ones(self.labels.shape, np.bool_), means, light, step)
 
 
 def judge_temporal(

@@ -138,10 +138,6 @@ class Interval:
     low: float | None  # None with fewer than two frames, or where no draw has a difference
     high: float | None
 
-    def as_dict(self) -> dict[str, float | None]:
-        """Give the interval as the evaluation stores it."""
-        return {"difference": self.difference, "low": self.low, "high": self.high}
-
 
 def paired_interval(
     first: Counts, second: Counts, *, seeds: tuple[Numbers, Numbers] | None = None, draws: int = DRAWS, seed: int = 0

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from models.evaluation.metrics import agreement, confusion, gap_closed, mean_iou
 from models.network.sizes import MOST_GAIN
 from models.policies.policies import score_patches
-from models.reading.inference import CoarsePrediction, captured, origin_of, readings_of, segment
+from models.reading.inference import CoarsePrediction, captured, origin_of, reading_of, segment
 from models.weights.files import Weights
-from pipeline.geometry.grid import UNLABELLED
+from pipeline.geometry.grid import UNLABELLED, patch_pixels
 from pipeline.lazy import deferred
 from pipeline.planning.selection import frame_patches
 
@@ -46,17 +46,14 @@ def oracle_gain(
     indices of the scene's own size, 255 unlabelled.
     """
     grid, p = seen.grid, seen.grid.patch
-    full = np.full(grid.padded_shape, UNLABELLED, np.uint8)
-    full[: grid.height, : grid.width] = labels
-    rows, columns = grid.patch_shape
-    truth = full.reshape(rows, p, columns, p).swapaxes(1, 2).reshape(-1, p, p)
+    truth = patch_pixels(grid, labels, UNLABELLED)
     gain, valid = np.zeros(len(truth)), grid.valid_patches()
     patches, patch_index = captured(fine[valid], valid)
     model, first = weights.segmenter.eval(), 0
     with torch.inference_mode():
-        (reading,) = readings_of(weights, [seen])
+        reading = reading_of(weights, seen)
         numbers = torch.from_numpy(patch_index).to(model.device)
-        for after in model.read_fine_packed([reading], [patches], [numbers], [origin_of(seen)]):
+        for after in model.read_fine_in_chunks(reading, patches, numbers, origin_of(seen)):
             some = patch_index[first : first + len(after)]
             before = model.bring_up(model.around_patches(reading.logits, numbers[first : first + len(after)][None]))
             lower = _losses(before.cpu().numpy(), truth[some]) - _losses(after.cpu().numpy(), truth[some])
@@ -141,7 +138,7 @@ def run_controls(
         return confusion(labels, drawn.classes, weights.config.classes)
 
     def placed(policy: str, number: int = 0) -> NDArray[np.integer]:
-        return frame_patches(score_patches(policy, seen, seed=seed + number), fraction, valid).patch_index
+        return frame_patches(score_patches(policy, seen, seed=seed + number), fraction, valid)
 
     return Controls(
         fraction,

@@ -8,14 +8,12 @@ own tokens only, however often places are added.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
 
-from models.network.self_attention import LAST_QUERIES
 from models.network.sizes import BOTTOM
 from pipeline.errors import ShapeError
 
@@ -32,40 +30,13 @@ def code_2d(yx: Tensor, dim: int) -> Tensor:
     """
     if dim % 4:
         raise ShapeError(f"a 2-D code needs a width that divides by 4, got {dim}")
-    _check_precision(yx)
+    if yx.dtype in (torch.float16, torch.bfloat16):  # whole numbers run together above 2048 and 256
+        raise ShapeError(f"places of tokens must be float32, float64 or whole numbers, got {yx.dtype}")
     count = dim // 4
     periods = torch.linspace(math.log(2.0), math.log(LONGEST_PERIOD), count, dtype=torch.float64).exp()
     turns = yx.to(torch.float64)[..., None] / periods.to(yx.device)
     angle = 2 * math.pi * (turns - turns.round())
     return torch.cat([angle.sin(), angle.cos()], dim=-1).flatten(-2).to(torch.float32)
-
-
-def paper_numbers(yx: Tensor, scale: Tensor, columns: int, factor: int) -> Tensor:
-    """One-dimensional positions of the paper: patch n at P = n(m + 1) + 1, its patches at P + 1 ... P + m.
-
-    ``scale`` is above 0 for patches, 0 for patches. ``columns`` counts the coarse patches of a row, m = factor^2; patches
-    run row by row inside their patch. The paper's text says jumps of four, its formula and its example 21 -> 26 say
-    m + 1 = 5: the formula is taken.
-    """
-    cell = (yx / factor).floor()
-    number = (cell[..., 0] * columns + cell[..., 1]) * (factor**2 + 1) + 1
-    inside = (yx - cell * factor).floor()
-    patch_number = inside[..., 0] * factor + inside[..., 1] + 1
-    return torch.where(scale > 0, number, number + patch_number)
-
-
-def code_1d(position: Tensor, dim: int) -> Tensor:
-    """The sinusoids of Vaswani et al. (2017, sec. 3.5) at one number a token, (...) -> (..., dim) float32."""
-    _check_precision(position)
-    rate = torch.exp(torch.arange(0, dim, 2, dtype=torch.float64) * (-math.log(10000.0) / dim)).to(position.device)
-    angle = position.to(torch.float64)[..., None] * rate
-    return torch.stack([angle.sin(), angle.cos()], dim=-1).flatten(-2).to(torch.float32)
-
-
-def _check_precision(places: Tensor) -> None:
-    # whole numbers in half precision run together above 256 (bfloat16) and 2048 (float16)
-    if places.dtype in (torch.float16, torch.bfloat16):
-        raise ShapeError(f"places of tokens must be float32, float64 or whole numbers, got {places.dtype}")
 
 
 class TokenAttention(nn.Module):
@@ -94,10 +65,7 @@ class TokenAttention(nn.Module):
         """Queries (B, heads, N, d / heads) of (B, N, d) tokens, and their own keys and values."""
         b, n, d = x.shape
         q, k, v = self.qkv(x).view(b, n, 3, self.heads, d // self.heads).permute(2, 0, 3, 1, 4)
-        asked: Tensor = self.query_norm(q)
-        if (last := LAST_QUERIES.get()) is not None:
-            last[:] = [asked]
-        return asked, (self.key_norm(k), v)
+        return self.query_norm(q), (self.key_norm(k), v)
 
 
 class EncoderBlock(nn.Module):
@@ -131,29 +99,6 @@ class Encoder(nn.Module):
             x, own = block(x, None if before is None else before[layer])
             memory.append(own)
         return self.norm(x), memory
-
-
-def encode_packed(
-    encoder: Encoder, scenes: Sequence[Tensor], before: Sequence[list[Memory]] | None = None
-) -> tuple[list[Tensor], list[list[Memory]]]:
-    """Encode the tokens of each scene, (N, d), as ``Encoder`` does a scene alone, and give each scene's memory.
-
-    ``before`` holds what each scene's tokens read beside each other.
-    """
-    lengths = [len(tokens) for tokens in scenes]
-    x, memories = torch.cat(list(scenes))[None], [[] for _ in scenes]  # type: ignore[var-annotated]
-    for layer, block in enumerate(encoder.blocks):
-        q, own = block.attention.ask(block.norm1(x))  # type: ignore[operator, union-attr]
-        asked, keys, values = (torch.split(part, lengths, dim=2) for part in (q, *own))
-        mixed = []
-        for scene, (query, key, value) in enumerate(zip(asked, keys, values, strict=True)):
-            memories[scene].append((key, value))
-            if before is not None:
-                key, value = (torch.cat(pair, dim=2) for pair in zip(before[scene][layer], (key, value), strict=True))
-            mixed.append(F.scaled_dot_product_attention(query, key, value))
-        x = x + block.attention.out(torch.cat(mixed, dim=2).transpose(1, 2).flatten(2))  # type: ignore[operator, union-attr]
-        x = x + block.mlp(block.norm2(x))  # type: ignore[operator]
-    return list(torch.split(encoder.norm(x)[0], lengths)), memories
 
 
 def cut(image: Tensor, patch: int) -> Tensor:
@@ -200,9 +145,8 @@ class Residual(nn.Module):
 class PatchStem(nn.Module):
     """Patches of spectral columns to features at every level and ``side`` x ``side`` tokens."""
 
-    def __init__(self, columns: int, widths: list[int], dim: int, side: int, kernel: int = 0) -> None:
+    def __init__(self, columns: int, widths: list[int], dim: int, side: int) -> None:
         super().__init__()
-        self.embed = nn.Conv2d(columns, dim, kernel, stride=kernel) if kernel else None  # a vision transformer's
         self.enter = nn.Conv2d(columns, widths[0], 1)
         self.blocks = nn.ModuleList(Residual(width) for width in widths)
         self.down = nn.ModuleList(nn.Conv2d(upper, lower, 2, stride=2) for upper, lower in pairwise(widths))
@@ -219,8 +163,6 @@ class PatchStem(nn.Module):
             features.append(x)
         # In bfloat16, channels last, a kernel that covers its whole input gives wrong sums (torch 2.13, CPU).
         tokens = self.token(x.contiguous())
-        if self.embed is not None:
-            tokens = tokens + self.embed(patches.contiguous())
         return features, tokens.flatten(2).transpose(1, 2)
 
 

@@ -4,9 +4,7 @@ Shapes: B scenes of H x W fine px, padded to whole cells of p * s px; coarse ima
 coarse patches (H/ps) x (W/ps), each p x p coarse px. J spectral columns, d token width, K fine patches a scene, m
 tokens a side of a patch.
 
-Scenes of different sizes are read together: patches of all of them go through stems and heads in chunks that fit the
-caches, and so do tokens through everything of the encoder but attention itself, which runs scene by scene. Nothing is
-padded, no token waits for the longest scene, none is masked.
+Outside of training patches go through stems and heads in chunks that fit the caches. Nothing is padded, none is masked.
 """
 
 from __future__ import annotations
@@ -20,20 +18,7 @@ import torch.nn.functional as F  # noqa: N812 - its usual name
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from models.network.layers import (
-    ChannelNorm,
-    Encoder,
-    Memory,
-    PatchHead,
-    PatchStem,
-    Residual,
-    code_1d,
-    code_2d,
-    cut,
-    encode_packed,
-    joined,
-    paper_numbers,
-)
+from models.network.layers import ChannelNorm, Encoder, Memory, PatchHead, PatchStem, Residual, code_2d, cut, joined
 from models.network.sizes import PATCHES_AT_ONCE, SCORER_WIDTH, level_widths, scorer_inputs
 from models.network.sizes import SegmenterConfig as SegmenterConfig
 
@@ -58,9 +43,8 @@ class Segmenter(nn.Module):
         self.config = config
         side, dim = config.token_side, config.dim
         fine, coarse = (level_widths(width, config.patch) for width in (config.width, config.coarse_width))
-        kernel = config.patch // side if config.patch_kernel else 0
-        self.coarse_stem = PatchStem(config.columns, coarse, dim, side, kernel)
-        self.fine_stem = PatchStem(config.columns, fine, dim, side, kernel)
+        self.coarse_stem = PatchStem(config.columns, coarse, dim, side)
+        self.fine_stem = PatchStem(config.columns, fine, dim, side)
         self.scale_code = nn.Parameter(torch.zeros(2, dim))
         self.encoder = Encoder(dim, config.layers, config.heads, config.mlp_ratio)
         self.coarse_head = PatchHead(coarse, dim, side)
@@ -100,7 +84,7 @@ class Segmenter(nn.Module):
         """Tokens of ``rows`` x ``columns`` coarse patches a scene, (B * P, m^2, d), with codes, (B, P m^2, d)."""
         cells = torch.cartesian_prod(torch.arange(rows), torch.arange(columns))
         patches = tokens.view(-1, rows * columns, *tokens.shape[1:])
-        return self._coded(patches, cells.expand(len(patches), -1, -1), columns, origin, fine=False)
+        return self._coded(patches, cells.expand(len(patches), -1, -1), origin, fine=False)
 
     def reading_of(self, features: Tensor, memory: list[Memory], rows: int, columns: int) -> CoarseReading:
         """Put the features of coarse patches, (B * P, c, p, p), together to what is known of the images."""
@@ -129,76 +113,54 @@ class Segmenter(nn.Module):
         logits = self.decode_fine(features, read, self.canvas_windows(reading.canvas, patch_index))
         return logits.view(b, k, *logits.shape[1:])
 
-    def read_coarse_packed(
-        self, images: Sequence[Tensor], origins: Sequence[Tensor | None], living: Sequence[Tensor | None]
-    ) -> list[CoarseReading]:
-        """Read coarse images of any sizes, (1, J, H/s, W/s) each, as ``read_coarse`` reads one.
+    def read_coarse_in_chunks(self, image: Tensor, origin: Tensor | None, living: Tensor | None) -> CoarseReading:
+        """Read one coarse image (1, J, H/s, W/s) as ``read_coarse`` does, some patches at a time.
 
         Tokens that are not ``living``, (tokens,) bool, are left out: nothing reads them, and they tell nothing.
         """
-        if not images:
-            return []
-        p = self.config.patch
-        images = [image.to(self.device) for image in images]
-        living = [None if alive is None else alive.to(self.device) for alive in living]
-        sizes = [(image.shape[2] // p, image.shape[3] // p) for image in images]
-        counts = [rows * columns for rows, columns in sizes]
-        patches = torch.cat([cut(image, p)[0] for image in images])
-        described = [self.coarse_stem(chunk) for chunk in torch.split(patches, PATCHES_AT_ONCE)]
-        tokens = torch.split(torch.cat([token for _, token in described]), counts)
-        coded = [
-            self.code_coarse(token, *size, origin)[0][slice(None) if alive is None else alive]
-            for token, size, origin, alive in zip(tokens, sizes, origins, living, strict=True)
-        ]
-        read, memories = encode_packed(self.encoder, coded)
-        read = [
-            part if alive is None else part.new_zeros(len(alive), part.shape[1]).index_put((alive,), part)
-            for part, alive in zip(read, living, strict=True)
-        ]
-        drawn = torch.cat(
-            [self.coarse_head(features, token) for features, token in _with_tokens(described, torch.cat(read))]
-        )
-        return [
-            self.reading_of(features, memory, *size)
-            for features, memory, size in zip(torch.split(drawn, counts), memories, sizes, strict=True)
-        ]
+        p, image = self.config.patch, image.to(self.device)
+        rows, columns = image.shape[2] // p, image.shape[3] // p
+        described = [self.coarse_stem(chunk) for chunk in torch.split(cut(image, p)[0], PATCHES_AT_ONCE)]
+        coded = self.code_coarse(torch.cat([token for _, token in described]), rows, columns, origin)
+        if living is None:
+            read, memory = self.encoder(coded)
+        else:
+            living = living.to(self.device)
+            some, memory = self.encoder(coded[:, living])
+            read = torch.zeros_like(coded)
+            read[:, living] = some
+        drawn = [self.coarse_head(features, token) for features, token in _with_tokens(described, read[0])]
+        return self.reading_of(torch.cat(drawn), memory, rows, columns)
 
-    def read_fine_packed(
-        self,
-        readings: Sequence[CoarseReading],
-        patches: Sequence[NDArray[np.floating]],
-        patch_index: Sequence[Tensor],
-        origins: Sequence[Tensor | None],
+    def read_fine_in_chunks(
+        self, reading: CoarseReading, patches: NDArray[np.floating], patch_index: Tensor, origin: Tensor | None
     ) -> Iterator[Tensor]:
-        """Logits of the fine patches of all scenes, one after the other, (some, classes, p, p) at a time.
+        """Logits of fine patches of one scene, (some, classes, p, p) at a time.
 
-        Of each scene: its reading, patches (K, p, p, J), in which what is not finite counts as 0, the median, and the
-        numbers (K,) int64 of their patches.
+        ``patches`` are (K, p, p, J), in which what is not finite counts as 0, the median; ``patch_index`` (K,) their int64
+        numbers.
         """
-        described = [self.fine_stem(chunk.to(self.device)) for chunk in _chunks(patches)]
-        if not described:
+        if not len(patches):
             return
-        patch_index = [own.to(self.device) for own in patch_index]
-        tokens = torch.split(torch.cat([token for _, token in described]), [len(own) for own in patch_index])
-        coded = [
-            self.code_fine(token[None], own[None], reading.columns, origin)[0]
-            for token, own, reading, origin in zip(tokens, patch_index, readings, origins, strict=True)
-        ]
-        read, _ = encode_packed(self.encoder, coded, [reading.memory for reading in readings])
-        under = torch.cat(
-            [self.around_patches(reading.canvas, own[None]) for reading, own in zip(readings, patch_index, strict=True)]
-        )
-        chunks = torch.split(under, PATCHES_AT_ONCE)
-        for (features, token), window in zip(_with_tokens(described, torch.cat(read)), chunks, strict=True):
+        described = []
+        for first in range(0, len(patches), PATCHES_AT_ONCE):
+            chunk = torch.from_numpy(np.array(patches[first : first + PATCHES_AT_ONCE], np.float32))
+            chunk = chunk.nan_to_num_(0.0, 0.0, 0.0).permute(0, 3, 1, 2)
+            described.append(self.fine_stem(chunk.to(self.device)))
+        own = patch_index.to(self.device)[None]
+        coded = self.code_fine(torch.cat([token for _, token in described])[None], own, reading.columns, origin)
+        read, _ = self.encoder(coded, reading.memory)
+        windows = torch.split(self.around_patches(reading.canvas, own), PATCHES_AT_ONCE)
+        for (features, token), window in zip(_with_tokens(described, read[0]), windows, strict=True):
             yield self.decode_fine(features, token, self.bring_up(self.under(window)))
 
     def code_fine(self, tokens: Tensor, patch_index: Tensor, columns: int, origin: Tensor | None = None) -> Tensor:
         """Tokens of fine patches, (B, K, m^2, d), with their codes, (B, K m^2, d)."""
         across = columns * self.config.factor
         places = torch.stack([patch_index // across, patch_index % across], dim=-1)
-        return self._coded(tokens, places, columns, origin, fine=True)
+        return self._coded(tokens, places, origin, fine=True)
 
-    def _coded(self, tokens: Tensor, places: Tensor, columns: int, origin: Tensor | None, *, fine: bool) -> Tensor:
+    def _coded(self, tokens: Tensor, places: Tensor, origin: Tensor | None, *, fine: bool) -> Tensor:
         """Tokens with the codes of their scale and place, (B, P, m^2, d) -> (B, P m^2, d).
 
         ``places`` (B, P, 2) are rows and columns of patches: of patches where ``fine``, else of coarse patches.
@@ -209,11 +171,7 @@ class Segmenter(nn.Module):
         within = (torch.arange(side, device=exact).double() + 0.5) / side
         inside = torch.cartesian_prod(within, within).view(-1, 2)
         yx = (places.double()[:, :, None] + inside) * step  # centres in patch units, (B, P, m^2, 2)
-        if self.config.positions == "paper":
-            scale = torch.full(yx.shape[:-1], 0.0 if fine else 1.0, device=exact)
-            code = code_1d(paper_numbers(yx, scale, columns, self.config.factor), self.config.dim)
-        else:
-            code = code_2d(yx if origin is None else yx + origin[:, None, None].double(), self.config.dim)
+        code = code_2d(yx if origin is None else yx + origin[:, None, None].double(), self.config.dim)
         coded: Tensor = tokens + code.to(tokens.device) + self.scale_code[int(fine)]
         return coded.flatten(1, 2)
 
@@ -290,18 +248,6 @@ class PatchScorer(nn.Module):
         x = x + self.mix(self.around(F.gelu(x)))
         gain: Tensor = self.of_entropy * mean[:, -1] + self.leave(F.gelu(x))[:, 0]
         return gain
-
-
-def _chunks(patches: Sequence[NDArray[np.floating]]) -> Iterator[Tensor]:
-    """Patches of all scenes, so many at a time whichever scene they are of, (some, J, p, p) channels last."""
-    starts = np.cumsum([0, *map(len, patches)])
-    for first in range(0, int(starts[-1]), PATCHES_AT_ONCE):
-        parts = [
-            own[max(first - start, 0) : max(first + PATCHES_AT_ONCE - start, 0)]
-            for own, start in zip(patches, starts, strict=False)
-        ]
-        chunk = torch.from_numpy(np.concatenate(parts, dtype=np.float32))
-        yield chunk.nan_to_num_(0.0, 0.0, 0.0).permute(0, 3, 1, 2)
 
 
 def _with_tokens(described: Sequence[tuple[Features, Tensor]], read: Tensor) -> Iterator[tuple[Features, Tensor]]:

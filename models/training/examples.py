@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -25,31 +25,21 @@ HALO = 8  # rows around a strip that the footprint reaches, a multiple of every 
 
 @dataclass(frozen=True)
 class Example:
-    """One labelled scene in both looks. Sizes are whole cells of patch * factor px."""
+    """One labelled scene in both looks. Sizes are whole cells of patch * factor px; columns until they are normalised
+    are float32.
+    """
 
     name: str
-    fine: NDArray[np.float16]  # (y, x, column) normalised
-    coarse: NDArray[np.float32]  # (y / s, x / s, column) normalised
+    fine: NDArray[np.floating]  # (y, x, column), float16 once it is normalised
+    coarse: NDArray[np.float32]  # (y / s, x / s, column)
     labels: NDArray[np.uint8]  # (y, x), 255 unlabelled
     shape: tuple[int, int]  # of the scene before padding
     noise: ColumnNoise | None = None
 
 
-@dataclass(frozen=True)
-class Observation:
-    """Spectral columns of one scene, not normalised yet."""
-
-    name: str
-    fine: NDArray[np.float32]
-    coarse: NDArray[np.float32]
-    labels: NDArray[np.uint8]
-    shape: tuple[int, int]
-    noise: ColumnNoise | None = None
-
-
 def observe(
     scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis, rng: np.random.Generator
-) -> Observation:
+) -> Example:
     """Look at a labelled scene with the camera's own operator, fine and coarse, and project onto the basis.
 
     Goes in strips of rows; each strip draws its noise from a stream of its own.
@@ -74,7 +64,7 @@ def observe(
         electrons = electrons_of(scene, blurred, camera)
         fine[top : top + cell] = (expose(electrons, camera, step=1, rng=stream) * scale) @ matrix
         coarse[top // s : (top + cell) // s] = (expose(electrons, camera, step=s, rng=stream) * scale) @ matrix
-    return Observation(scene.name, fine, coarse, labels, (grid.height, grid.width), noise_of(scene, matrix, camera))
+    return Example(scene.name, fine, coarse, labels, (grid.height, grid.width), noise_of(scene, matrix, camera))
 
 
 def noise_of(scene: RasterScene, matrix: NDArray[np.float32], camera: LineCamera) -> ColumnNoise:
@@ -90,7 +80,7 @@ def electrons_of(scene: RasterScene, planes: NDArray[np.float32], camera: LineCa
     return np.asarray(planes @ scene.electrons * exposure, np.float32)
 
 
-def measured_normalisation(observations: list[Observation], exposure_ms: float = REFERENCE_MS) -> Normalisation:
+def measured_normalisation(observations: list[Example], exposure_ms: float = REFERENCE_MS) -> Normalisation:
     """Normalisation over the fine passes of all scenes (every third pixel of every third row), for looks so exposed."""
     sample = np.concatenate([seen.fine[::3, ::3].reshape(-1, seen.fine.shape[-1]) for seen in observations])
     noises = [seen.noise for seen in observations if seen.noise is not None]
@@ -101,10 +91,10 @@ def measured_normalisation(observations: list[Observation], exposure_ms: float =
     return Normalisation.measured(sample, np.mean(added, axis=0))
 
 
-def normalised(seen: Observation, normalisation: Normalisation, reached: NDArray[np.bool_]) -> Example:
-    """Turn an observation into an example."""
+def normalised(seen: Example, normalisation: Normalisation, reached: NDArray[np.bool_]) -> Example:
+    """Return a scene with normalised columns."""
     fine = np.clip(normalisation.apply(seen.fine, reached), -60000, 60000).astype(np.float16)
-    return Example(seen.name, fine, normalisation.apply(seen.coarse, reached), seen.labels, seen.shape, seen.noise)
+    return replace(seen, fine=fine, coarse=normalisation.apply(seen.coarse, reached))
 
 
 @dataclass(frozen=True)

@@ -55,19 +55,14 @@ def fit_ood(
         report(0.3 * (number + 1) / len(train))
     pixels, classes = (np.concatenate(parts) for parts in zip(*gathered, strict=True))
     centres, covariance = components(pixels, classes, seed)
-    noise = _mean_noise([example.noise for example in train if example.noise is not None], pixels.shape[1])
+    noises = [example.noise for example in train if example.noise is not None]
+    noises = noises or [ColumnNoise(np.zeros(pixels.shape[1]), np.zeros((pixels.shape[1], pixels.shape[1])))]
+    noise = ColumnNoise(np.mean([one.shot for one in noises], axis=0), np.mean([one.read for one in noises], axis=0))
     shot, read = _noise_of_columns(noise, centres, normalisation)
     none = np.zeros((1, 1, 1))
     draft = OodDetector(centres, covariance, shot, read, Limits(np.ones(1), np.ones(1), (1,), none, none[0]), bands)
     limits = measured_limits(draft, validation, scan_passes, rng, lambda done: report(0.5 + done / 2))
     return replace(draft, limits=limits)
-
-
-def _mean_noise(noises: Sequence[ColumnNoise], columns: int) -> ColumnNoise:
-    """What readings of the scenes leave in columns in the mean; nothing where nobody knows."""
-    if not noises:
-        return ColumnNoise(np.zeros(columns), np.zeros((columns, columns)))
-    return ColumnNoise(np.mean([one.shot for one in noises], axis=0), np.mean([one.read for one in noises], axis=0))
 
 
 def _noise_of_columns(noise: ColumnNoise, centres: Exact, normalisation: Normalisation) -> tuple[Exact, Exact]:

@@ -266,7 +266,7 @@ def run_identity(
     start: Mapping[str, Tensor] | None = None,
 ) -> str:
     """Hash of all that makes a run what it is: a checkpoint of another run is not gone on from."""
-    digest = hashlib.sha256(json.dumps([config.as_dict(), asdict(settings)], sort_keys=True).encode())
+    digest = hashlib.sha256(json.dumps([asdict(config), asdict(settings)], sort_keys=True).encode())
     for example in examples:
         digest.update(example.name.encode())
         digest.update(np.ascontiguousarray(example.coarse).tobytes())

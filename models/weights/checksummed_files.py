@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,34 +53,57 @@ def write_checksummed(path: Path, about: Mapping[str, Any], tensors: Mapping[str
         raise
 
 
-def read_about(file: Any) -> dict[str, Any]:
-    """Give the description of a file that `safetensors.safe_open` opened; empty where there is none."""
-    about = json.loads((file.metadata() or {}).get(ABOUT, "{}"))
-    return about if isinstance(about, dict) else {}
+class NotChecksummedError(ValueError):
+    """A file is not what was written; its text goes on from the file's name, and says in what."""
 
 
-def own_tensors(file: Any, start: str = "") -> dict[str, Tensor]:
-    """Tensors of a file that `safetensors.safe_open` opened whose names begin so, by name, in memory of their own.
+def read_about(path: Path, kind: str) -> dict[str, Any]:
+    """Read a file's description, without its tensors. NotSealedError: damaged, or no file of this ``kind``."""
+    with _opened(path, "np") as file:
+        about = json.loads((file.metadata() or {}).get(ABOUT, "{}"))
+    about = about if isinstance(about, dict) else {}
+    if about.get("format") != kind:
+        raise NotChecksummedError(f"holds {about.get('format', 'no format mark')}, expected {kind}")
+    if about.get(SEAL) is None or not isinstance(about.get(TENSORS), dict):
+        raise NotChecksummedError("is damaged: its hashes are missing")
+    if about[SEAL] != _seal(about):
+        raise NotChecksummedError("is damaged: its description is not what was written")
+    return about
+
+
+def read_tensors(
+    path: Path, about: Mapping[str, Any], wanted: Callable[[str], bool] = lambda name: True
+) -> dict[str, Tensor]:
+    """Read the tensors whose names are ``wanted``, in memory of their own. NotSealedError: one is not what was written.
 
     What safetensors gives lies in the mapped file, and would change with it where that is written over.
     """
-    return {name: file.get_tensor(name).clone() for name in file.keys() if name.startswith(start)}  # noqa: SIM118
+    with _opened(path, "pt") as file:
+        tensors = {name: file.get_tensor(name).clone() for name in file.keys() if wanted(name)}  # noqa: SIM118
+    hashes = {name: value for name, value in about[TENSORS].items() if wanted(name)}
+    for name in sorted(set(hashes) ^ set(tensors)):
+        what = "missing" if name in hashes else "none of those that were written"
+        raise NotChecksummedError(f"is damaged: tensor {name} is {what}")
+    for name, tensor in tensors.items():
+        if hash_of(tensor) != hashes[name]:
+            raise NotChecksummedError(f"is damaged: tensor {name} is not what was written")
+    return tensors
 
 
-def broken_seal(about: Mapping[str, Any]) -> str:
-    """Why a description is not what was written, in words; nothing where it is."""
-    told = about.get(SEAL)
-    if told is None or not isinstance(about.get(TENSORS), dict):
-        return "its hashes are missing"
-    return "" if told == _seal(about) else "its description is not what was written"
+def claimed_shapes(path: Path) -> dict[str, tuple[tuple[int, ...], str]]:
+    """Shape and kind of number of every tensor by a file's header, no tensor read. Raises NotSealedError."""
+    with _opened(path, "np") as file:
+        parts = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118
+        return {name: (tuple(one.get_shape()), one.get_dtype()) for name, one in parts.items()}
 
 
-def changed_tensor(told: Mapping[str, str], tensors: Mapping[str, Tensor]) -> str:
-    """Which tensor is not the one that was written, by their hashes, in words; nothing where all are."""
-    if other := sorted(set(told) ^ set(tensors)):
-        return f"tensor {other[0]} is {'missing' if other[0] in told else 'none of those that were written'}"
-    changed = next((name for name, tensor in tensors.items() if hash_of(tensor) != told[name]), None)
-    return "" if changed is None else f"tensor {changed} is not what was written"
+@contextmanager
+def _opened(path: Path, framework: str) -> Iterator[Any]:
+    try:
+        with safe_open(path, framework=framework) as file:
+            yield file
+    except DAMAGED as error:
+        raise NotChecksummedError(f"is not a readable safetensors file ({str(error)[:200]})") from error
 
 
 def hash_of(tensor: Tensor) -> str:
@@ -115,36 +138,25 @@ def save_checkpoint(path: Path, identity: str, about: dict[str, Any], tensors: d
 def load_checkpoint(path: Path, identity: str) -> Checkpoint | None:
     """Read the checkpoint of the same training run; None where there is none, or one of another run.
 
-    Raises WeightsError where what lies there is not what was written. Nothing of it is used, and it is left where it
-    is.
+    Raises WeightsError as `read_checkpoint`.
     """
     found = read_checkpoint(path)
     return None if found is None or found[0]["identity"] != identity else found
 
 
 def read_checkpoint(path: Path) -> Checkpoint | None:
-    """Read a checkpoint, of whichever run; None where there is no file. Raises WeightsError as ``load_checkpoint``."""
+    """Read a checkpoint, of whichever run; None where there is no file.
+
+    Raises WeightsError where what lies there is not what was written. Nothing of it is used, and it is left where it
+    is.
+    """
     if not path.is_file():
         return None
-    tensors: dict[str, Tensor] = {}
     try:
-        with safe_open(path, framework="pt") as file:
-            about = read_about(file)
-            kind = about.get("format")
-            if kind != CHECKPOINT:
-                wrong = f"it holds {kind or 'no format mark'}, expected {CHECKPOINT}"
-            elif not (wrong := broken_seal(about)):
-                tensors = own_tensors(file)
-                wrong = changed_tensor(about[TENSORS], tensors)
-    except DAMAGED as error:
-        raise _refused(path, str(error)[:120]) from error
-    if wrong:
-        raise _refused(path, wrong)
-    return about, tensors
-
-
-def _refused(path: Path, why: str) -> WeightsError:
-    return WeightsError(
-        f"the state of training in {path} cannot be gone on from: {why}; bring back a copy of it, or delete it to begin"
-        " anew"
-    )
+        about = read_about(path, CHECKPOINT)
+        return about, read_tensors(path, about)
+    except NotChecksummedError as error:
+        raise WeightsError(
+            f"the state of training in {path} cannot be gone on from: it {error}; bring back a copy of it, or delete it"
+            " to begin anew"
+        ) from error

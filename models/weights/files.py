@@ -8,25 +8,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import safe_open
 
 from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis, check_basis, project
 from models.reading.ood import Limits, OodDetector
+from models.weights import checksummed_files
 from models.weights.checksummed_files import (
-    DAMAGED,
-    TENSORS,
-    broken_seal,
-    changed_tensor,
+    NotChecksummedError,
+    claimed_shapes,
     hash_of,
     key_of,
-    own_tensors,
     read_about,
     write_checksummed,
 )
@@ -79,7 +76,7 @@ class Weights:
     normalisation: Normalisation
     class_names: tuple[str, ...]
     class_colours: NDArray[np.uint8]  # (class, 3)
-    record: dict[str, Any] = field(default_factory=dict)  # command, seed, data, split, validation, licence
+    record: dict[str, Any] = field(default_factory=dict)  # command, seed, data, split, validation
 
     @property
     def config(self) -> SegmenterConfig:
@@ -121,8 +118,8 @@ def save_weights(weights: Weights, path: Path) -> None:
         tensors[f"normalisation.{name}"] = torch.from_numpy(getattr(weights.normalisation, name).copy())
     tensors["class_colours"] = torch.from_numpy(weights.class_colours.copy())
     about = {
-        "config": weights.config.as_dict(),
-        "basis": {"low_nm": weights.basis.low_nm, "high_nm": weights.basis.high_nm, "columns": weights.basis.columns},
+        "config": asdict(weights.config),
+        "basis": asdict(weights.basis),
         "class_names": list(weights.class_names),
         "record": weights.record,
     }
@@ -158,16 +155,14 @@ def add_ood(
 
 def add_reader(weights: Path, out: Path, reader: TemporalReader, record: Mapping[str, Any]) -> None:
     """Write the weights of a file with their reader of prior maps to ``out``. Raises as `add_ood`."""
-    about = {"sizes": reader.sizes.as_dict(), "record": dict(record)}
+    about = {"sizes": asdict(reader.sizes), "record": dict(record)}
     _add_part(weights, out, READER, about, dict(reader.state_dict()))
 
 
 def _add_part(source: Path, out: Path, part: str, about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
     described = describe_weights(source)
-    with _opened(source, "pt") as file:
-        whole = own_tensors(file)
-    if wrong := changed_tensor(described.about[TENSORS], whole):
-        raise WeightsError(f"{source} is damaged: {wrong}; copy or train the file again")
+    with _told_as(source):
+        whole = checksummed_files.read_tensors(source, described.about)
     kept = {name: tensor for name, tensor in whole.items() if not name.startswith(f"{part}.")}
     added = {f"{part}.{name}": tensor for name, tensor in tensors.items()}
     keys = {**described.about["keys"], part: _key(about, tensors)}
@@ -215,18 +210,20 @@ def load_reader(weights: Path) -> TemporalReader:
 def _read_part(path: Path, described: Description, part: str, spreads: Sequence[str] = ()) -> dict[str, Tensor]:
     """Tensors of a part by their own names. Raises WeightsError where one is not what was written, or unusable."""
     start = f"{part}."
-    with _opened(path, "pt") as file:
-        tensors = own_tensors(file, start)
-    about = {name: value for name, value in described.about[TENSORS].items() if name.startswith(start)}
-    own = {name.removeprefix(start): tensor for name, tensor in tensors.items()}
-    if wrong := changed_tensor(about, tensors) or unusable(own, spreads):
-        raise WeightsError(f"{path} is damaged: {wrong}; copy or train the file again")
+    with _told_as(path):
+        tensors = checksummed_files.read_tensors(path, described.about, lambda name: name.startswith(start))
+        own = {name.removeprefix(start): tensor for name, tensor in tensors.items()}
+        check_numbers(own, spreads)
     return own
 
 
-def content_key(path: Path) -> str:
-    """Name weights by what they hold, 20 hexadecimal digits, whatever parts lie beside them. Raises WeightsError."""
-    return describe_weights(path).key
+@contextmanager
+def _told_as(path: Path) -> Iterator[None]:
+    """Raise WeightsError, with what to do, where a file of weights is not what was written."""
+    try:
+        yield
+    except NotChecksummedError as error:
+        raise WeightsError(f"{path} {error}; copy or train the file again") from error
 
 
 def load_weights(path: Path) -> Weights:
@@ -255,18 +252,11 @@ def read_tensors(path: Path, described: Description) -> dict[str, Tensor]:
 
     Raises WeightsError as ``load_weights``.
     """
-
-    with _opened(path, "pt") as file:
-        claimed = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
-        if wrong := misfit(described.config, claimed):
-            raise WeightsError(f"{path}: {wrong}; train it again")
-        parts = (f"{OOD}.", f"{READER}.")
-        tensors = {name: tensor for name, tensor in own_tensors(file).items() if not name.startswith(parts)}
-    about = {name: value for name, value in described.about[TENSORS].items() if not name.startswith(parts)}
-    if wrong := changed_tensor(about, tensors):
-        raise WeightsError(f"{path} is damaged: {wrong}; copy or train the file again")
-    if wrong := unusable(tensors, (SPREAD,)):
-        raise WeightsError(f"{path}: {wrong}; copy or train the file again")
+    parts = (f"{OOD}.", f"{READER}.")
+    with _told_as(path):
+        check_shapes(described.config, claimed_shapes(path))
+        tensors = checksummed_files.read_tensors(path, described.about, lambda name: not name.startswith(parts))
+        check_numbers(tensors, (SPREAD,))
     return tensors
 
 
@@ -278,12 +268,8 @@ def describe_weights(path: Path) -> Description:
     """
     if not path.is_file():
         raise WeightsError(f"no weights at {path}; train some with: spectralzoom train DATASET -o {path.name}")
-    with _opened(path, "np") as file:
-        about = read_about(file)
-    if about.get("format") != FORMAT:
-        raise WeightsError(f"{path} holds {about.get('format', 'no format mark')}, expected {FORMAT}; train it again")
-    if wrong := broken_seal(about):
-        raise WeightsError(f"{path} is damaged: {wrong}; copy or train the file again")
+    with _told_as(path):
+        about = read_about(path, FORMAT)
     try:
         config, basis = SegmenterConfig(**about["config"]), SpectralBasis(**about["basis"])
         names, record = tuple(map(str, about["class_names"])), dict(about["record"])
@@ -299,25 +285,15 @@ def describe_weights(path: Path) -> Description:
     return Description(config, basis, names, record, key, ood_detector, reader, about)
 
 
-@contextmanager
-def _opened(path: Path, framework: str) -> Iterator[Any]:
-    try:
-        with safe_open(path, framework=framework) as file:
-            yield file
-    except DAMAGED as error:
-        raise WeightsError(f"{path} is not a readable safetensors file ({error}); train or copy it again") from error
-
-
 def with_record(weights: Weights, **entries: Any) -> Weights:
     """Give the same weights with entries added to their record."""
     return replace(weights, record={**weights.record, **entries})
 
 
-def misfit(config: SegmenterConfig, claimed: Mapping[str, Any]) -> str:
-    """Which tensor of a file's header is not as the config asks, in words; nothing where all are. Reads no numbers.
+def check_shapes(config: SegmenterConfig, claimed: Mapping[str, tuple[tuple[int, ...], str]]) -> None:
+    """Refuse a file's header of which a tensor is not as the config asks (NotSealedError). Reads no numbers.
 
-    ``claimed`` are slices of `safetensors`, by the tensors' names. Shapes are those of the network on torch's meta
-    device, where tensors have a size and no memory.
+    Shapes are those of the network on torch's meta device, where tensors have a size and no memory.
     """
     one, all_pairs = (config.columns,), (config.columns, config.columns)
     with torch.device("meta"):
@@ -326,26 +302,19 @@ def misfit(config: SegmenterConfig, claimed: Mapping[str, Any]) -> str:
     wanted |= {"normalisation.centre": (one, "F32"), SPREAD: (one, "F32")}
     wanted |= {"normalisation.whitening": (all_pairs, "F32"), "class_colours": ((config.classes, 3), "U8")}
     for name, (shape, kind) in wanted.items():
-        if name not in claimed:
-            return f"tensor {name} should be {shape}, the file has nothing"
-        came, word = tuple(claimed[name].get_shape()), claimed[name].get_dtype()
+        came, word = claimed.get(name, ("nothing", kind))
         if came != shape:
-            return f"tensor {name} should be {shape}, the file has {came}"
+            raise NotChecksummedError(f"does not fit: tensor {name} should be {shape}, the file has {came}")
         if word != kind:
-            return f"tensor {name} should be of {KINDS[kind]}, the file has {word}"
-    return ""
+            raise NotChecksummedError(f"does not fit: tensor {name} should be of {KINDS[kind]}, the file has {word}")
 
 
-def unusable(tensors: Mapping[str, Tensor], spreads: Sequence[str]) -> str:
-    """Which tensor holds numbers that nothing can be computed with, in words; nothing where none does.
-
-    Those called as ``spreads`` are divided by.
-    """
+def check_numbers(tensors: Mapping[str, Tensor], spreads: Sequence[str]) -> None:
+    """Refuse numbers that nothing can be computed with (NotSealedError); those of ``spreads`` are divided by."""
     for name, value in tensors.items():
         if value.is_floating_point() and not bool(torch.isfinite(value).all()):
             count = int((~torch.isfinite(value)).sum())
-            return f"{count} of {value.numel()} numbers of tensor {name} are not finite"
+            raise NotChecksummedError(f"is damaged: {count} of {value.numel()} numbers of tensor {name} are not finite")
     for name in spreads:
         if not bool((tensors[name] > 0).all()):
-            return f"tensor {name} holds a spread that is not above 0"
-    return ""
+            raise NotChecksummedError(f"is damaged: tensor {name} holds a spread that is not above 0")

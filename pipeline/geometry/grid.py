@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
 
+Kind = TypeVar("Kind", bound=np.generic)
 UNLABELLED = 255  # in (y, x) uint8 images of class indices: this pixel has none
 
 
@@ -65,10 +67,10 @@ class SceneGrid:
         return np.stack([rows, columns], axis=-1).astype(np.intp) * self.patch
 
 
-def patch_pixels(grid: SceneGrid, image: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Cut a (y, x) image of the scene into patches, (patch, y, x) by their numbers; False beyond the scene."""
+def patch_pixels(grid: SceneGrid, image: NDArray[Kind], beyond: int = 0) -> NDArray[Kind]:
+    """Cut a (y, x) image of the scene into patches, (patch, y, x) by their numbers; ``beyond`` stands beside the scene."""
     (rows, columns), p = grid.patch_shape, grid.patch
-    padded = np.zeros(grid.padded_shape, np.bool_)
+    padded = np.full(grid.padded_shape, beyond, image.dtype)
     padded[: grid.height, : grid.width] = image
     return padded.reshape(rows, p, columns, p).transpose(0, 2, 1, 3).reshape(rows * columns, p, p)
 

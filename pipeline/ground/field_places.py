@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,14 +77,9 @@ def field_of_view_deg(shape: tuple[int, int], ifov_rad: float) -> tuple[float, f
     return float(np.rad2deg(down)), float(np.rad2deg(across))
 
 
-def scale_of_angles(shape: tuple[int, int], ifov_rad: float) -> FieldScale:
-    """Tell the field of view of a field of (y, x) px of which nobody knows how far away it lies."""
-    return FieldScale(shape, field_of_view_deg(shape, ifov_rad))
-
-
-def scale_of_pixels(shape: tuple[int, int], ifov_rad: float, pixel_m: float) -> FieldScale:
-    """Tell the scale of a field whose pixels are all squares of one side [m], such as a georeferenced picture's."""
-    area = shape[0] * shape[1] * pixel_m**2
+def scale_of_pixels(shape: tuple[int, int], ifov_rad: float, pixel_m: float | None) -> FieldScale:
+    """Tell the scale of a field whose pixels are all squares of one side [m]; without metres where that is None."""
+    area = None if pixel_m is None else shape[0] * shape[1] * pixel_m**2
     return FieldScale(shape, field_of_view_deg(shape, ifov_rad), pixel_m, area)
 
 
@@ -110,7 +105,9 @@ def footprint_of(view: GroundView, shape: tuple[int, int]) -> GroundFootprint:
     away = corners @ np.array([[np.cos(heading), np.sin(heading)], [-np.sin(heading), np.cos(heading)]])
     width, depth = np.ptp(away, axis=0).tolist()
     near, middle, far = _ranges(view, shape, least)
-    return GroundFootprint(corners, width, depth, _area(corners), median_footprint_m(view, shape), (near, middle, far))
+    x, y = corners.T
+    area = float(abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2)  # by the shoelace formula
+    return GroundFootprint(corners, width, depth, area, median_footprint_m(view, shape), (near, middle, far))
 
 
 def _ranges(view: GroundView, shape: tuple[int, int], least: float) -> tuple[float, float, float]:
@@ -121,37 +118,6 @@ def _ranges(view: GroundView, shape: tuple[int, int], least: float) -> tuple[flo
     length = np.sqrt(1 + np.sum((points * view.ifov_rad) ** 2, axis=-1))
     away = (length * view.height_m)[sink >= least] / sink[sink >= least]
     return float(away.min()), float(np.median(away)), float(away.max())
-
-
-def _area(corners: Floats) -> float:
-    """Area within corners in order, (corner, 2), by the shoelace formula."""
-    x, y = corners.T
-    return float(abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2)
-
-
-class FieldPlace(Protocol):
-    """Where a field lies."""
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Its size (y, x) [px]."""
-
-    @property
-    def crs(self) -> pyproj.CRS | None:
-        """Of the coordinates that polygons are given in; None where they are pixels."""
-
-    @property
-    def outline(self) -> BaseGeometry:
-        """What the field shows, in these coordinates."""
-
-    def to_pixels(self, shape: BaseGeometry) -> BaseGeometry:
-        """Bring a polygon from these coordinates to the scene's pixels."""
-
-    def pixel_areas_m2(self, rows: slice, columns: slice) -> Floats | None:
-        """The ground under some pixels (row, column) [m2], NaN where they show none; None where nobody knows."""
-
-    def scale(self, ifov_rad: float) -> FieldScale:
-        """Tell how large the field is and how finely it is seen."""
 
 
 def areas_by_number(place: FieldPlace, numbers: NDArray[np.integer], count: int) -> Floats | None:
@@ -180,18 +146,19 @@ class NoPlace:
 
     @property
     def outline(self) -> BaseGeometry:
+        """What the field shows, in the coordinates that polygons are given in."""
         return shapely.box(0, 0, self.shape[1], self.shape[0])
 
     def to_pixels(self, shape: BaseGeometry) -> BaseGeometry:
+        """Bring a polygon from these coordinates to the scene's pixels."""
         return shape
 
     def pixel_areas_m2(self, rows: slice, columns: slice) -> Floats | None:
+        """The ground under some pixels (row, column) [m2], NaN where they show none; None where nobody knows."""
         size = rows.stop - rows.start, columns.stop - columns.start
         return None if self.pixel_m is None else np.full(size, self.pixel_m**2)
 
     def scale(self, ifov_rad: float) -> FieldScale:
-        if self.pixel_m is None:
-            return scale_of_angles(self.shape, ifov_rad)
         return scale_of_pixels(self.shape, ifov_rad, self.pixel_m)
 
 
@@ -298,3 +265,6 @@ class PosedField:
 
     def scale(self, ifov_rad: float) -> FieldScale:
         return scale_of_view(self.view, self.shape)
+
+
+FieldPlace = NoPlace | PlacedPicture | PosedField  # where a field lies

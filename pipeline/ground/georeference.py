@@ -58,17 +58,6 @@ def crs_name(geobox: GeoBox) -> str:
     return str(geobox.crs.proj.name) if geobox.crs.epsg is None else crs_key(geobox)
 
 
-def class_areas_m2(geobox: GeoBox, classes: NDArray[np.uint8], count: int) -> Floats:
-    """Sum the ground under the pixels (y, x) of each class, (count,) [m2]: of the ellipsoid, whatever the map's scale.
-
-    A projection's scale is asked for at `TIE_POINTS` places along each side, and linear between: off by 2e-5 in a UTM zone.
-    """
-    areas = np.zeros(256)
-    for row, line in enumerate(pixel_rows_m2(geobox)):
-        areas += np.bincount(classes[row], line, len(areas))
-    return areas[:count]
-
-
 def pixel_side_m(geobox: GeoBox) -> float:
     """Side of the square on the ground that is as large as the middle pixel [m]."""
     rows, columns = geobox.shape
@@ -77,7 +66,10 @@ def pixel_side_m(geobox: GeoBox) -> float:
 
 
 def pixel_rows_m2(geobox: GeoBox) -> Iterator[Floats]:
-    """Ground under the pixels of each row, (x,) [m2], from the first row down."""
+    """Ground under the pixels of each row, (x,) [m2], from the first row down: of the ellipsoid, at any scale of a map.
+
+    A projection's scale is asked for at `TIE_POINTS` places along each side, and linear between: off by 2e-5 in a UTM zone.
+    """
     rows, columns = geobox.shape
     tie_points_y, tie_points_x = np.linspace(0, rows, TIE_POINTS), np.linspace(0, columns, TIE_POINTS)
     tie_points = _m2_of_units(geobox, *np.meshgrid(tie_points_x, tie_points_y))

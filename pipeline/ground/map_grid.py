@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import PoseError, ShapeError
-from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.georeference import WGS84
-from pipeline.ground.view import LEAST_SINK, ROWS_AT_ONCE, GroundView, RigPose, pixel_places
+from pipeline.ground.view import LEAST_SINK, GroundView, RigPose, pixel_places
 from pipeline.lazy import deferred
 from pipeline.rectify.resample import resample
 
@@ -190,25 +189,6 @@ class GroundGrid:
         view, total = self.frame.view, self.scene_shape[0] * self.scene_shape[1]
         near, ground = (view.count_ground(self.scene_shape, sink) for sink in (self.least_sink, LEAST_SINK))
         return {"mapped_px": near, "beyond_reach_px": ground - near, "no_ground_px": total - ground}
-
-    def class_areas_m2(self, classes: NDArray[np.uint8], count: int) -> Floats:
-        """Sum the ground under the scene's pixels by class, level share, (count,) [m2].
-
-        Of the pixels that the map shows, and from their footprints: counting the map's pixels would be off by as many
-        as lie on borders between classes.
-
-        Raises ShapeError: the class map is not the scene's.
-        """
-        if classes.shape != self.scene_shape:
-            raise ShapeError(f"expected the classes of a scene of {self.scene_shape} px (y, x), got {classes.shape}")
-        view, (y, x) = self.frame.view, pixel_places(self.scene_shape)
-        areas = np.zeros(UNLABELLED + 1)
-        for first in range(0, len(y), ROWS_AT_ONCE):
-            rows = slice(first, first + ROWS_AT_ONCE)
-            points = np.stack(np.meshgrid(y[rows], x, indexing="ij"), axis=-1)
-            seen = np.where(view.sink(points) > self.least_sink, view.area_m2(points), 0.0)
-            areas += np.bincount(classes[rows].ravel(), seen.ravel(), len(areas))
-        return areas[:count]
 
 
 def ground_grid(

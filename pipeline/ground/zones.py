@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.grid import UNLABELLED, SceneGrid
+from pipeline.geometry.grid import UNLABELLED, SceneGrid, patch_pixels
 from pipeline.ground.field_places import BORDER_PX, FieldPlace
 from pipeline.ground.georeference import WGS84
 from pipeline.lazy import deferred
@@ -141,13 +141,9 @@ def field_zones(area: Mask | None, no_go: Mask | None) -> FieldZones | None:
 
 def _patch_means(mask: Mask, grid: SceneGrid) -> Floats:
     """Mean over the pixels of each patch that lie on the scene, (patch,)."""
-    padded = np.zeros(grid.padded_shape, bool)
-    padded[: grid.height, : grid.width] = mask
-    rows, columns = grid.patch_shape
-    total = padded.reshape(rows, grid.patch, columns, grid.patch).sum(axis=(1, 3)) / grid.patch**2
-    fraction = grid.valid_fraction()
+    total, fraction = patch_pixels(grid, mask).mean(axis=(1, 2)), grid.valid_fraction().ravel()
     means: Floats = np.divide(total, fraction, out=np.zeros(fraction.shape), where=fraction > 0)
-    return means.ravel()
+    return means
 
 
 @dataclass(frozen=True)

@@ -22,44 +22,27 @@ WIDE_STEP = 0.7
 LEAST_RATE = 1e-10  # of the total worth over the price of all lines, to stand for "whatever it costs"
 
 
-def spend(field: Field, budget_s: float, floor: float = 0.0) -> Cover:
+def spend(field: Field, budget_s: float) -> Cover:
     """Choose the runs with the most worth found whose true price is at most ``budget_s``.
 
     Between the two covers that the budget lies between, the price of a second is halved down; what then is left goes
     to one run more, or to one run made longer. ``expected_gain`` counts what was bought for its worth, at least.
-
-    With a ``floor`` [worth/s] the price of a second never falls below it, and nothing is bought merely to use up the
-    time. A lower floor, or with the same one a bigger budget, never buys less.
     """
     low, low_rate = Cover(), np.inf
     best = low
     for high, rate in covers(field):
-        if high.seconds(field.prices) > budget_s or rate < floor:
-            return _better(best, _between(field, (low, high), (low_rate, rate), budget_s, floor))
+        if high.seconds(field.prices) > budget_s:
+            return _better(best, _between(field, (low, high), (low_rate, rate), budget_s))
         low, low_rate, best = high, rate, _better(best, high)
     return best
-
-
-def full_scan_pays(field: Field, full_s: float, floor: float) -> bool:
-    """Whether what each cover cheaper than a full scan leaves out is worth the rest of its seconds at the floor.
-
-    The covers asked do not depend on the floor: a full scan that pays at one floor does at every lower one.
-    """
-    return not floor or all(
-        field.total - cover.expected_gain >= floor * (full_s - seconds)
-        for cover, seconds in ((cover, cover.seconds(field.prices)) for cover, _ in covers(field))
-        if seconds < full_s
-    )
 
 
 def _better(one: Cover, other: Cover) -> Cover:
     return other if other.expected_gain > one.expected_gain else one
 
 
-def _between(
-    field: Field, covers: tuple[Cover, Cover], rates: tuple[float, float], budget_s: float, floor: float
-) -> Cover:
-    """Narrow down the edge from a cover that budget and floor allow to one that they do not.
+def _between(field: Field, covers: tuple[Cover, Cover], rates: tuple[float, float], budget_s: float) -> Cover:
+    """Narrow down the edge from a cover that the budget allows to one that it does not.
 
     No cover is taken that is worth more than a dearer one: with a bigger budget only the dearer one is looked at.
     """
@@ -71,14 +54,13 @@ def _between(
         prices = [cover.seconds(field.prices) for cover in (low, middle, high)]
         if not (low.expected_gain < middle.expected_gain < high.expected_gain and prices[0] < prices[1] < prices[2]):
             break
-        if prices[1] <= budget_s and rate >= floor:
+        if prices[1] <= budget_s:
             low, low_rate, best = middle, rate, _better(best, middle)
         else:
             high, high_rate = middle, rate
     for cover in (low, *_peeled(field, high)):
-        for found in (cover,) if floor else (cover, _one_more(field, cover, budget_s)):
-            pays = not floor or found.expected_gain - low.expected_gain >= floor * (found.even_s - low.even_s)
-            if pays and found.seconds(field.prices) <= budget_s:
+        for found in (cover, _one_more(field, cover, budget_s)):
+            if found.seconds(field.prices) <= budget_s:
                 best = _better(best, replace(found, expected_gain=min(found.expected_gain, high.expected_gain)))
     return best
 

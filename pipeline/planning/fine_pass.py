@@ -15,7 +15,7 @@ from pipeline.errors import BudgetError, PoseError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, CostModel, Sweep
-from pipeline.planning.budget_search import cheapest_cover, full_scan_pays, spend
+from pipeline.planning.budget_search import cheapest_cover, spend
 from pipeline.planning.coverage import check_reach, full_sweeps
 from pipeline.planning.prices import count_lines, prices_of
 from pipeline.planning.scan_runs import NEGLIGIBLE, Cover, Field, cut_swath
@@ -45,8 +45,6 @@ class FinePlan:
     wanted_gain: float = 0.0  # score of all patches that a line within the mirror's range shows
     full_seconds: float | None = None  # of the full scan with lines along the same axis; None beyond the mirror's range
     out_of_reach: int = 0  # patches worth something that no line within the mirror's range shows
-    threshold: float | None = None  # least score per second that was bought; None where there was no such limit
-    spared_s: float | None = None  # of the budget, left because nothing more pays by the threshold
 
     @property
     def lines(self) -> int:
@@ -59,23 +57,6 @@ class FinePlan:
         return self.expected_gain / self.seconds if self.seconds else None
 
 
-@dataclass(frozen=True)
-class PatchesPrice:
-    """What certain patches cost by runs of lines, and what the full scan does, which shows them too."""
-
-    lines: int
-    seconds: float
-    full_lines: int | None  # None where the full scan is beyond the mirror's range
-    full_seconds: float | None
-
-    @property
-    def least(self) -> tuple[int, float]:
-        """Lines and seconds of the cheaper way."""
-        if self.full_lines is not None and self.full_seconds is not None and self.full_seconds <= self.seconds:
-            return self.full_lines, self.full_seconds
-        return self.lines, self.seconds
-
-
 def plan_fine(
     grid: SceneGrid,
     camera: LineCamera,
@@ -86,7 +67,6 @@ def plan_fine(
     budget_s: float,
     margin_px: float = 0.0,
     full: Sequence[Sweep] | None = None,
-    threshold: float | None = None,
     swaths: Sequence[Sweep] | None = None,
 ) -> FinePlan:
     """Choose the line runs that show the most score for at most ``budget_s`` seconds.
@@ -105,40 +85,30 @@ def plan_fine(
         How far beside the plan the mirror may look: every run shows its patches even so. [px]
     full
         Sweeps of the full scan; None lays the fewest strips that cover the field.
-    threshold
-        Buy no run, and nothing of a run, that shows less score per second than this: a floor under the price of a
-        second, a line priced with its fraction of a reload and a run with its set-up. None, like 0, spends the budget.
-        With the same scores a lower threshold never has less ``expected_gain``.
     strips
         Strips that runs may lie on, ascending along the line, from the field's first row on and without lines; None
         takes all that `swaths_at_patches` gives.
 
     Raises
     ------
-    BudgetError : the budget or the threshold is negative or not finite.
+    BudgetError : the budget is negative or not finite.
     ShapeError : the number of scores is not that of the patches.
     SettingsError : a patch is wider than a line.
     PoseError : no line within the mirror's range shows any of the patches that are worth something.
     """
     if not isfinite(budget_s) or budget_s < 0:
         raise BudgetError(f"the fine pass needs a finite number of seconds, 0 or more, got {budget_s}")
-    limit = 0.0 if threshold is None else threshold
-    if not (isfinite(limit) and limit >= 0):
-        raise BudgetError(f"the threshold must be a finite score of 0 or more, got {threshold}")
     scale = _scale(scores)
-    expected_gain, unit = _expected_gain(
-        grid, np.asarray(scores, np.float64) / scale, min(limit / scale * budget_s, MOST_GAIN)
-    )
-    floor = limit / scale / unit
+    expected_gain = _expected_gain(grid, np.asarray(scores, np.float64) / scale)
     field = _field(grid, camera, cost, along, expected_gain, margin_px, swaths)
     told = scale if scale <= 1 or field.total <= MOST_FLOAT / scale else 1.0
     missed = int(np.count_nonzero(expected_gain)) - len(np.unique(field.views.patch_number))
     whole = _full(grid, camera, cost, along) if full is None else (list(full), cost.seconds(list(full), camera))
     full_s = None if whole is None else whole[1]
-    plan = spend(field, budget_s if full_s is None else min(budget_s, float(np.nextafter(full_s, 0.0))), floor)
+    plan = spend(field, budget_s if full_s is None else min(budget_s, float(np.nextafter(full_s, 0.0))))
     everything, total = plan.expected_gain >= field.total * (1 - NEGLIGIBLE), field.total * told
-    planned = partial(FinePlan, wanted_gain=total, full_seconds=full_s, out_of_reach=missed, threshold=threshold)
-    if whole is not None and whole[1] <= budget_s and not everything and full_scan_pays(field, whole[1], floor):
+    planned = partial(FinePlan, wanted_gain=total, full_seconds=full_s, out_of_reach=missed)
+    if whole is not None and whole[1] <= budget_s and not everything:
         reason = (
             f"to show every place worth a second pass takes no less time than to scan everything in detail, "
             f"{whole[1]:.1f} s; the full scan is taken, which shows all of the field"
@@ -152,8 +122,7 @@ def plan_fine(
         beside = f", less than the full scan's {full_s:.1f} s"
     reason = f"runs of lines take {seconds:.1f} s{beside}"
     patch_index = covered_patches(grid, camera, sweeps, margin_px=margin_px)
-    spared = budget_s - seconds if floor and not everything else None
-    return planned(sweeps, patch_index, seconds, plan.expected_gain * told, "lines", reason, spared_s=spared)
+    return planned(sweeps, patch_index, seconds, plan.expected_gain * told, "lines", reason)
 
 
 def _full(grid: SceneGrid, camera: LineCamera, cost: CostModel, along: Axis) -> tuple[list[Sweep], float] | None:
@@ -205,28 +174,24 @@ def _scale(scores: NDArray[np.floating]) -> float:
     return 1.0 if usual else 2.0 ** (frexp(peak)[1] - 1)
 
 
-def _expected_gain(grid: SceneGrid, scores: NDArray[np.floating], most: float) -> tuple[NDArray[np.float64], float]:
-    """Scores as worth, (patch,), and the score that is a worth of 1.
-
-    0 for what is not worth buying; finite for +inf, above all others together and above ``most``, which is the score
-    that the whole budget has to show.
-    """
+def _expected_gain(grid: SceneGrid, scores: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Scores as worth, (patch,): 0 for what is not worth buying; finite for +inf, and above all others together."""
     given = np.asarray(scores, np.float64)
     expected_gain = np.zeros_like(given)
     valid = grid.valid_patches()
     expected_gain[valid] = np.where(given[valid] > 0, given[valid], 0.0)
-    endless, peak = np.isposinf(expected_gain), 1.0
+    endless = np.isposinf(expected_gain)
     if endless.any():
         expected_gain[endless] = 0.0
         peak = float(expected_gain.max(initial=0.0)) or 1.0
-        expected_gain = np.where(endless, (expected_gain.sum() + most) / peak + 1, expected_gain / peak)
-    return expected_gain, peak
+        expected_gain = np.where(endless, expected_gain.sum() / peak + 1, expected_gain / peak)
+    return expected_gain
 
 
-def price_of_patches(
+def runs_showing(
     grid: SceneGrid, camera: LineCamera, cost: CostModel, along: Axis, patch_index: NDArray[np.integer]
-) -> PatchesPrice:
-    """Price exactly these patches by runs of lines, strip offsets free, beside the full scan.
+) -> list[Sweep]:
+    """Return the cheapest runs of lines found that show exactly these patches, strip offsets free.
 
     What ``frame`` mode leaves out: it buys patches free of each other, the rig pays for the lines beneath them.
 
@@ -241,7 +206,4 @@ def price_of_patches(
             f"patch {missed[0]} and {len(missed) - 1} more of {np.count_nonzero(expected_gain)} are shown by no line within "
             f"the mirror's range; leave them out"
         )
-    sweeps = _sweeps(field, cheapest_cover(field))
-    full = _full(grid, camera, cost, along)
-    whole = (None, None) if full is None else (count_lines(full[0]), full[1])
-    return PatchesPrice(count_lines(sweeps), cost.seconds(sweeps, camera), *whole)
+    return _sweeps(field, cheapest_cover(field))

@@ -159,9 +159,8 @@ def _filled(
         low, high = 0, int(stop.max())
         while low < high:  # the most lines that end in time
             lines = (low + high + 1) // 2
-            low, high = (
-                (lines, high) if _with(rows, camera, cost, beside, number, lines) <= seconds else (low, lines - 1)
-            )
+            taken_s = cost.seconds(sweeps_of_runs(rows.sweeps, [*beside, (number, 0, lines)]), camera)
+            low, high = (lines, high) if taken_s <= seconds else (low, lines - 1)
         run = _longest_run(values[number], first, stop, low)
         if run is None:
             continue
@@ -172,13 +171,6 @@ def _filled(
         if expected_gain > best.expected_gain:
             best = PartialScan(runs, cost.seconds(sweeps_of_runs(rows.sweeps, runs), camera), expected_gain)
     return best
-
-
-def _with(
-    rows: PatchRows, camera: LineCamera, cost: CostModel, beside: Sequence[LineRun], number: int, lines: int
-) -> float:
-    """Seconds of runs with so many lines of one more sweep."""
-    return cost.seconds(sweeps_of_runs(rows.sweeps, [*beside, (number, 0, lines)]), camera)
 
 
 def _longest_run(values: Floats, first: NDArray[np.intp], stop: NDArray[np.intp], lines: int) -> tuple[int, int] | None:

@@ -78,13 +78,10 @@ class ScanPerformance:
 
     def expected(self, step: int, exposure_ms: float) -> dict[str, float]:
         """Scores of a scan of a step and exposure within the record."""
-        return {name: self._between(table, step, exposure_ms) for name, table in self.scores.items()}
+        return {name: self.between(table, step, exposure_ms) for name, table in self.scores.items()}
 
-    def expected_spread(self, step: int, exposure_ms: float) -> float | None:
-        """How far the mIoU of one scene lies from the expected one, as a standard deviation."""
-        return None if self.spread is None else self._between(self.spread, step, exposure_ms)
-
-    def _between(self, table: NDArray[np.float64], step: int, exposure_ms: float) -> float:
+    def between(self, table: NDArray[np.float64], step: int, exposure_ms: float) -> float:
+        """Return a table's value for a step, between its exposures by their logarithm."""
         return float(np.interp(math.log(exposure_ms), np.log(self.exposures_ms), table[self.steps.index(step)]))
 
 
@@ -146,7 +143,7 @@ def priced_scan(
     """Price one scan, by its sweeps and an exposure, of a step that the record has."""
     step, exposed = sweeps[0].step, [replace(sweep, exposure_ms=exposure_ms) for sweep in sweeps]
     size, expected = raw_bytes(exposed, camera, bands), record.expected(step, exposure_ms)
-    spread = record.expected_spread(step, exposure_ms)
+    spread = None if record.spread is None else record.between(record.spread, step, exposure_ms)
     return UniformScan(step, exposure_ms, cost.seconds(exposed, camera), size, expected, spread)
 
 

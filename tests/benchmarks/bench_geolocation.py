@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from pipeline.geometry.mirror import (
     scene_to_direction,
 )
 from pipeline.geometry.scan import points_of_scan
-from pipeline.rectify.geolocation import KnotCurve, path_geolocation
+from pipeline.rectify.geolocation import path_geolocation
 from pipeline.rectify.placed import TieTable, tie_table
 from pipeline.rectify.scan_paths import ScanPath, make_scan_paths
 
@@ -35,30 +34,18 @@ Floats = NDArray[np.float64]
 
 
 def rows() -> list[Row]:
-    """Error and time of the ties, their spacing, the field, uneven paths."""
+    """Error and time of the ties."""
     scan_path = _scan_path(SWATH, np.arange(float(LINES)))
     truth = _by_reflected_rays(path_geolocation(scan_path, CAMERA, _pixels(), along="x"))
     clocks = time_in_turn(_calls(scan_path), rounds=5)
     table = tie_table(scan_path, CAMERA, along="x", **GRID)
-    return [
-        _error(table, truth),
-        *_against_tree(scan_path, table, truth, clocks),
-        _closed_form(scan_path, truth, clocks),
-        *(_spacing(scan_path, truth, tie, clocks) for tie in (8, 16, 32, 64)),
-        _field(),
-        _uneven(clocks),
-    ]
+    return [_error(table, truth), *_against_tree(scan_path, table, truth, clocks)]
 
 
 def _scan_path(along_px: Floats | float, scan_px: Floats) -> ScanPath:
     tangents = np.stack(np.broadcast_arrays(along_px, scan_px), axis=-1) * CAMERA.ifov_rad
     (scan_path,) = make_scan_paths(direction_to_position(scene_to_direction(tangents)), CAMERA, step_px=1.0)
     return scan_path
-
-
-def _jittered() -> ScanPath:
-    off = np.random.default_rng(0).uniform(-0.25, 0.25, (2, LINES))
-    return _scan_path(SWATH + off[0], np.arange(LINES) + off[1])
 
 
 def _pixels(**grid: Any) -> Floats:
@@ -77,16 +64,12 @@ def _samples() -> Floats:
 
 def _calls(scan_path: ScanPath) -> dict[str, Callable[[], object]]:
     samples, pixels = _samples(), _pixels()
-    tree, wild = cKDTree(samples), _jittered()
-    calls: dict[str, Callable[[], object]] = {
-        "closed form": partial(path_geolocation, scan_path, CAMERA, pixels, along="x"),
+    tree = cKDTree(samples)
+    return {
         "tree": lambda: cKDTree(samples).query(pixels, workers=1),
         "query": lambda: tree.query(pixels, workers=1),
-        "Newton": partial(path_geolocation, wild, CAMERA, pixels, along="x"),
+        "ties 16": lambda: _read(_tie_points(scan_path, 16)),
     }
-    for tie in (8, 16, 32, 64):
-        calls[f"ties {tie}"] = lambda tie=tie: _read(_tie_points(scan_path, tie))
-    return calls
 
 
 def _tie_points(scan_path: ScanPath, tie: int) -> TieTable:
@@ -165,55 +148,3 @@ def _against_tree(scan_path: ScanPath, table: TieTable, truth: Floats, clocks: d
             f"{tree_off:.2g} px",
         ),
     ]
-
-
-def _closed_form(scan_path: ScanPath, truth: Floats, clocks: dict[str, Timing]) -> Row:
-    off = _worst(path_geolocation(scan_path, CAMERA, _pixels(), along="x"), truth)
-    return Row("geolocation grid in closed form, every pixel", f"{_ns(clocks['closed form']):.3g} ns/px, {off:.1g} px")
-
-
-def _spacing(scan_path: ScanPath, truth: Floats, tie: int, clocks: dict[str, Timing]) -> Row:
-    table = _tie_points(scan_path, tie)
-    found = f"{_ns(clocks[f'ties {tie}']):.2g} ns/px, {_worst(_whole(table), truth):.2g} px"
-    return Row(f"ties every {tie} px, whatever the tolerance", found, peers=f"bound {table.bound_px:.2g} px")
-
-
-def _field() -> Row:
-    """Sweeps of 200 lines all over a field of 10240 px: the bound, the error, and the spacing that it takes."""
-    worst, over, spacings = 0.0, 0, []
-    for swath in np.arange(-4800, 4801, 1600.0):
-        for start in np.arange(-5120, 5000, 1900.0):
-            if np.hypot(swath, start) > 5900:
-                continue
-            scan_path = _scan_path(swath, start + np.arange(200.0))
-            grid = {"origin_px": (start - 20, swath - 330), "spacing_px": 1.0, "shape": (240, 660)}
-            table = tie_table(scan_path, CAMERA, along="x", **grid)
-            off = _worst(_whole(table), path_geolocation(scan_path, CAMERA, _pixels(**grid), along="x"))
-            worst, over = max(worst, off), over + (off > table.bound_px)
-            spacings.append(table.spacing)
-    fraction = np.mean(np.array(spacings) == 16)
-    what = f"ties at {len(spacings)} places of a field of 10240 px: worst error; places over their bound"
-    return Row(
-        what,
-        f"{worst:.2g} px; {over}",
-        "< 2e-3 px; none",
-        worst < 2e-3 and not over,
-        f"16 px apart at {fraction:.0%} of the places, {min(spacings)} at the least",
-    )
-
-
-def _uneven(clocks: dict[str, Timing]) -> Row:
-    scan_path = _jittered()
-    at = path_geolocation(scan_path, CAMERA, _pixels(), along="x")
-    on = np.isfinite(at[..., 0])
-    scan, _, across, _ = KnotCurve(scan_path).at(at[on, 0])
-    slope = (at[on, 1] + 0.5 - CAMERA.samples / 2) * CAMERA.ifov_rad
-    x, y = points_of_scan(across / CAMERA.ifov_rad, CAMERA, scan / CAMERA.ifov_rad, slope)  # type: ignore[arg-type]
-    off = np.abs(np.stack([y, x], axis=-1) - _pixels()[on]).max()
-    return Row(
-        "Newton on a path 0.25 px out of even, every pixel",
-        f"{_ns(clocks['Newton']):.3g} ns/px, {off:.1g} px",
-        "< 2e-3 px",
-        bool(off < 2e-3),
-        f"{1 - on.mean():.2%} of the pixels in gaps above 1.5 steps",
-    )

@@ -229,7 +229,7 @@ def _of_the_file(folder: Path, split: Split) -> list[Result]:
     from models.network.sizes import SegmenterConfig
     from models.network.spectral import SpectralBasis, patches_of
     from models.reading.inference import coarse_prediction_of_columns
-    from models.training.examples import Observation, measured_normalisation, normalised
+    from models.training.examples import Example, measured_normalisation, normalised
     from models.training.train import train
     from models.weights.files import Weights
     from pipeline.geometry.grid import SceneGrid, pad_by_reflection
@@ -243,7 +243,7 @@ def _of_the_file(folder: Path, split: Split) -> list[Result]:
     labels[:height, :width] = split.train
     coarse = np.asarray(patches_of(fine, grid.factor).mean(axis=(1, 2)), np.float32)
     coarse = coarse.reshape(fine.shape[0] // grid.factor, -1, basis.columns)
-    observed = Observation("pines", fine, coarse, labels, (height, width))
+    observed = Example("pines", fine, coarse, labels, (height, width))
     normalisation = measured_normalisation([observed])
     example = normalised(observed, normalisation, np.ones(basis.columns, bool))
     config = SegmenterConfig(split.classes, basis.columns, grid.patch, grid.factor)
@@ -267,7 +267,7 @@ def _judged(source: str, weights: Weights, seen: CoarsePrediction, fine: Values,
         for fraction in FRACTIONS:
             began = time.process_time()
             observation = coarse_prediction_of_columns(weights, seen.columns, seen.grid)
-            patch_index = frame_patches(score_patches("entropy", observation), fraction, valid).patch_index
+            patch_index = frame_patches(score_patches("entropy", observation), fraction, valid)
             drawn = segment(weights, observation, fine[patch_index], patch_index).classes
             spent, counts = time.process_time() - began, confusion(labels, drawn, weights.config.classes)
             found.append(

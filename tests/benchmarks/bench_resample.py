@@ -1,4 +1,4 @@
-"""Resampling: cost beside a copy of the same rows, beside other libraries, and by band count, mask and engine."""
+"""Resampling: cost beside a copy of the same rows, beside other libraries, and beside the order-3 spline."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from beside.resample_peers import BANDS, ENGINES, Peer, Turned, cv2_parts, peers, spline, turned_waves
+from beside.resample_peers import BANDS, Peer, Turned, cv2_parts, peers, spline, turned_waves
 from measure import Row, Timing, ratio, time_in_turn
 from numpy.typing import NDArray
 
-from pipeline.rectify.kernels import Kernel, windows
+from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.resample import resample
 
 KERNELS: dict[Kernel, tuple[int, str]] = {
@@ -35,8 +35,8 @@ def rows() -> list[Row]:
             warnings.simplefilter("ignore")  # what the other libraries warn of
             natural, flat = turned_waves(1), turned_waves(0)
             beside = [row for kernel in KERNELS for row in _beside_peers(kernel, natural, flat)]
-            beside += [*_over_linear(natural, flat), _beside_spline(natural), _engines(natural)]
-        return [*_over_take(natural), *beside, _by_bands(natural), _masked(natural)]
+            beside += [*_over_linear(natural, flat), _beside_spline(natural)]
+        return [*_over_take(natural), *beside]
     finally:
         torch.set_num_threads(before)
 
@@ -179,65 +179,4 @@ def _prepared(others: Sequence[Peer], scene: Turned) -> str:
     clocks = time_in_turn(before, 1)
     return "; not counted: " + _listed(
         {name: _ns(clock, len(scene.truth)) for name, clock in clocks.items()}, "{:.0f} ns/px"
-    )
-
-
-def _by_bands(scene: Turned) -> Row:
-    many, figures = (2, 4, 15, 64, 270, 939), []
-    for bands in many:
-        samples = np.random.default_rng(bands).random((*scene.samples.shape[:2], bands), np.float32)
-        out = np.empty((len(scene.truth), bands), np.float32)
-        cube = replace(scene, samples=samples)
-        times = max(1, 64 // bands)  # long enough that what happens between the calls does not count
-        clocks = time_in_turn({kernel: _often(_call(cube, kernel, out), times) for kernel in KERNELS}, ROUNDS)
-        figures.append([f"{_ns(clocks[kernel], times * out.size):.2g}" for kernel in KERNELS])
-    nearest, bilinear, cubic = ("/".join(column) for column in zip(*figures, strict=True))
-    return Row(
-        f"catmull-rom, ns/(px*band), {'/'.join(map(str, many))} bands",
-        cubic,
-        peers=f"ours bilinear {bilinear}, nearest {nearest}",
-    )
-
-
-def _masked(scene: Turned) -> Row:
-    """What masks cost: one sample in a thousand out, and one element of the detector in a thousand."""
-    rng, shape = np.random.default_rng(0), scene.samples.shape
-    samples, elements = rng.random(shape[:2]) > 1e-3, np.broadcast_to(rng.random(shape[1:]) > 1e-3, shape)
-    zeroed, out = replace(scene, samples=scene.samples * elements), np.empty(scene.truth.shape, np.float32)
-    calls = {
-        "none": _call(scene, "catmull-rom", out),
-        "samples": _call(scene, "catmull-rom", out, samples),
-        "elements": _call(scene, "catmull-rom", out, elements),
-        "zeroed": _call(zeroed, "catmull-rom", out, elements),
-    }
-    clocks = time_in_turn(calls, ROUNDS)
-    times = [f"{ratio(clocks, name, 'none'):.2f}" for name in ("samples", "elements", "zeroed")]
-    return Row(
-        "catmull-rom, 0.1 % of the samples / of the detector's elements / of elements that are 0 already out",
-        " / ".join(times) + " x",
-        peers="of the time with none out",
-    )
-
-
-def _engines(scene: Turned) -> Row:
-    """The same sixteen taps by other means, index and weights given: why the sums run on embedding_bag."""
-    table = torch.from_numpy(scene.samples.reshape(-1, BANDS))
-    blocks = []
-    for start in range(0, 4 * BLOCK, BLOCK):
-        placed = windows(scene.coordinates[start : start + BLOCK], "catmull-rom")
-        blocks.append(
-            (placed.flat_index(scene.samples.shape[:2]), placed.joint_weight(), torch.from_numpy(placed.weight))
-        )
-    calls = {
-        name: (lambda engine=engine: [engine(table, *block) for block in blocks]) for name, engine in ENGINES.items()
-    }
-    clocks = time_in_turn(calls, ROUNDS)
-    spent = {name: _ns(clock, len(blocks) * BLOCK * BANDS) for name, clock in clocks.items()}
-    first = spent.pop("embedding_bag 16 taps")
-    return Row(
-        f"engine of 16 taps, {BANDS} bands: embedding_bag",
-        f"{first:.2f} ns/(px*band)",
-        "least of all",
-        all(first < ns for ns in spent.values()),
-        _listed(spent, "{:.2f}"),
     )

@@ -1,41 +1,27 @@
-"""Seams: accuracy of registration, crop rows that alias, a survey put together, and real pictures cut and joined."""
+"""Seams: accuracy of registration, and crop rows that alias."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 import numpy as np
-from beside.seam_data import (
-    LINES,
-    RGBN,
-    ROW_PX,
-    SAMPLES,
-    cut_and_join,
-    given_neighbours,
-    join_neighbours,
-    left_again,
-    line_errors,
-    make_survey,
-    row_views,
-    seam_offsets,
-    wave_views,
-)
-from measure import Row, not_run
+from measure import Row
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
 
 from pipeline.rectify.registration.shifts import PairShift, pair_shift
 
 Floats = NDArray[np.float64]
-Image = NDArray[np.float32]
 Peer = Callable[[Floats, Floats], Floats]
 
 SHAPE = (512, 64)
 PRIOR_PX = 26.0
+ROW_PX = 12.0
 
 
 def rows() -> list[Row]:
     waves = [_waves("4-40 px", (4, 40), 50), _waves("40-400 px", (40, 400), 50), _waves("4-40 px", (4, 40), 1)]
-    return [*waves, _rows_with_gaps(), _rows_without(), *_survey(), *_pictures()]
+    return [*waves, _rows_with_gaps(), _rows_without()]
 
 
 def _waves(name: str, periods: tuple[float, float], snr: float, seeds: int = 20) -> Row:
@@ -96,54 +82,6 @@ def _row_results(seeds: int, gaps: float) -> tuple[list[tuple[PairShift, Floats]
     return results, peers
 
 
-def _survey() -> list[Row]:
-    survey = make_survey()
-    before, after = (seam_offsets(survey, shifts) for shifts in (survey.unregistered, survey.found.shifts))
-    # np.max, for max() would pass over a seam that is NaN: not seen, or not measured.
-    worst = [float(np.max([np.hypot(*seam.mean(axis=0)) for seam in seams])) for seams in (before, after)]
-    again = float(np.max([np.hypot(*mean) for mean in left_again(survey, survey.found.shifts)]))
-    jitter = np.concatenate(line_errors(survey)).std()
-    what = f"survey of {LINES} lines x {SAMPLES} samples, {len(survey.sweeps)} strips, 50 px and 0.8 px per line off"
-    return [
-        Row(
-            f"{what}: mean offset left at the worst seam",
-            f"{worst[1]:.3f} px",
-            "< 0.2 px",
-            worst[1] < 0.2,
-            f"not registered {worst[0]:.1f} px",
-        ),
-        Row("the same, seams registered again", f"{again:.3f} px", "< 0.2 px", again < 0.2),
-        Row("the same: what remains per line, rms", f"{jitter:.2f} px"),
-    ]
-
-
-def _pictures() -> list[Row]:
-    if not RGBN.is_dir():
-        return [not_run("two parts of rgbn.tif put together", RGBN)]
-    exact, smooth = cut_and_join()
-    rows = [
-        Row(
-            "two parts of rgbn.tif, 3 and 4 px out of place, put together by nearest: pixels that differ",
-            f"{exact.differing}",
-            "0",
-            exact.differing == 0,
-        ),
-        Row(
-            "the same by Catmull-Rom, one cut between pixels: rms error over the deviation",
-            f"{100 * smooth.relative:.2f} %",
-            "",
-            None,
-            f"bilinear {100 * smooth.bilinear:.2f} %",
-        ),
-    ]
-    pair = join_neighbours()
-    apart = ("rgbn_subb.tif on rgbn_suba.tif", pair.shift, float(np.sqrt(np.nanmean(pair.difference**2))))
-    for name, shift, left in [*given_neighbours(), apart]:
-        figure = f"{shift[0]:+.3f}, {shift[1]:+.3f} px; {left:.2f} DN rms"
-        rows.append(Row(f"{name}: found beside its georeference (rows, columns); left there", figure))
-    return rows
-
-
 def _skimage(reference: Floats, moving: Floats) -> Floats:
     from skimage.registration import phase_cross_correlation
 
@@ -159,6 +97,47 @@ def _opencv(reference: Floats, moving: Floats) -> Floats:
     # Copies, for it puts the window on what it is given where the size needs no padding.
     (right, down), _ = cv2.phaseCorrelate(reference.copy(), moving.copy(), window)
     return np.array([-down, -right])
+
+
+def wave_views(
+    seed: int, shape: tuple[int, int], shift: Floats, snr: float, periods: tuple[float, float]
+) -> tuple[Floats, Floats]:
+    """Sixty random waves with periods spread evenly in log; ``snr`` is the deviation over that of the noise."""
+    rng = np.random.default_rng(seed)
+    period = np.exp(rng.uniform(*np.log(periods), 60))
+    turn, phase = rng.uniform(0, 2 * np.pi, (2, 60))
+    y, x = np.arange(shape[0])[:, None], np.arange(shape[1])[None, :]
+
+    def view(dy: float, dx: float) -> Floats:
+        seen = np.zeros(shape)
+        for down, right, start in zip(np.sin(turn) / period, np.cos(turn) / period, phase, strict=True):
+            seen += np.cos(2 * np.pi * (down * (y + dy) + right * (x + dx)) + start)
+        return seen / np.sqrt(30) + rng.normal(size=shape) / snr
+
+    return view(0.0, 0.0), view(*shift)
+
+
+def row_views(seed: int, shape: tuple[int, int], shift: Floats, snr: float, gaps: float) -> tuple[Floats, Floats]:
+    """Crop rows 12 px apart along the first axis, a fraction ``gaps`` of their length bare; shifts of up to 50 px."""
+    rng = np.random.default_rng(seed)
+    stand = np.ones((int(shape[1] / ROW_PX) + 12, shape[0] + 120))
+    for row in stand:
+        start = 0
+        while start < len(row):
+            stop = start + int(rng.integers(5, 40))
+            row[start:stop] = rng.random() >= gaps
+            start = stop
+    stand = gaussian_filter1d(stand, 1.2, axis=1)
+    first = rng.uniform(0, ROW_PX)
+
+    def view(dy: float, dx: float) -> Floats:
+        along, across = np.arange(shape[0]) + dy + 60, np.arange(shape[1]) + dx + 60 - first
+        plants = np.exp(-0.5 * ((across[None, :] - ROW_PX * np.arange(len(stand))[:, None]) / 2.5) ** 2)
+        lengths = np.stack([np.interp(along, np.arange(stand.shape[1]), row) for row in stand])
+        seen = lengths.T @ plants
+        return seen / seen.std() + rng.normal(size=shape) / snr
+
+    return view(0.0, 0.0), view(*shift)
 
 
 PEERS: dict[str, Peer] = {"skimage": _skimage, "cv2.phaseCorrelate": _opencv}

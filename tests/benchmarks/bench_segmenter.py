@@ -1,41 +1,28 @@
-"""The segmenter's throughput: many frames packed, 270 bands against 4, what a fraction of the patches costs, half precision.
+"""The segmenter's throughput: 270 bands against 4, and what a fraction of the patches costs.
 
-Weights are drawn, not trained: time does not depend on them. ``bench_regions.py`` has fields too large to read whole.
+Weights are drawn, not trained: time does not depend on them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 import torch
-from measure import Row, Timing, ratio, time_in_turn
+from measure import Row, ratio, time_in_turn
 from numpy.typing import NDArray
 
-from models.network.layers import Encoder, Memory, cut
 from models.network.machine import keep_freed_memory, one_thread
 from models.network.segmenter import Segmenter
 from models.network.sizes import SegmenterConfig, multiply_adds
 from models.network.spectral import Normalisation, SpectralBasis
 from models.policies.policies import score_multiply_adds, score_patches
-from models.reading.inference import (
-    CoarsePass,
-    CoarsePrediction,
-    DrawnMap,
-    coarse_prediction,
-    draw_coarse,
-    read_coarse_prediction,
-    segment,
-    segment_batch,
-)
+from models.reading.inference import CoarsePass, DrawnMap, coarse_prediction, read_coarse_prediction, segment
 from models.weights.files import Weights
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.selection import frame_patches
 
-FRAMES, PADDED_AT_ONCE = 64, 8
-SIDES_PX, FRACTIONS = (96, 480), (0.0, 0.05, 0.1, 0.2, 0.35)
 FRAME = SceneGrid(966, 1296, 32, 4)
 FRAME_SIZES = {"classes": 3, "columns": 2, "patch": 32, "factor": 4}
 COST_GOALS = {0.05: 0.07, 0.10: 0.10, 0.15: 0.17, 0.20: 0.17, 0.35: None}
@@ -57,7 +44,7 @@ class Frame:
 def rows() -> list[Row]:
     keep_freed_memory()
     with one_thread():
-        return [*_batches(), *_bands(), *_fractions()]
+        return [*_bands(), *_fractions()]
 
 
 def drawn_weights(**sizes: int) -> Weights:
@@ -79,132 +66,6 @@ def drawn_frame(weights: Weights, grid: SceneGrid, fraction: float, rng: np.rand
     patch_index = np.sort(rng.permutation(valid)[: round(fraction * len(valid))]).astype(np.int64)
     patches = rng.standard_normal((len(patch_index), p, p, columns), dtype=np.float32)
     return Frame(CoarsePass(grid, rng.standard_normal((y, x, columns), dtype=np.float32)), patches, patch_index)
-
-
-def _batches() -> list[Row]:
-    weights, rng = drawn_weights(**FRAME_SIZES), np.random.default_rng(0)
-    sides, fractions = rng.integers(*SIDES_PX, (FRAMES, 2)), rng.choice(FRACTIONS, FRAMES)
-    frames = [
-        drawn_frame(weights, SceneGrid(int(y), int(x), 32, 4), float(fraction), rng)
-        for (y, x), fraction in zip(sides, fractions, strict=True)
-    ]
-    calls = {
-        "packed": partial(_packed, weights, frames),
-        "one by one": partial(_one_by_one, weights, frames),
-        "padded": partial(_padded, weights, frames),
-    }
-    clocks = time_in_turn(calls, ROUNDS)
-    apart = max(
-        float(np.abs(one.confidence - other.confidence).max())
-        for one, other in zip(calls["packed"](), calls["one by one"](), strict=True)
-    )
-    alike = all(
-        (one.classes == other.classes).all()
-        for one, other in zip(calls["packed"](), calls["one by one"](), strict=True)
-    )
-    alone, padded = (ratio(clocks, other, "packed") for other in ("one by one", "padded"))
-    sizes = f"sides of {SIDES_PX[0]} to {SIDES_PX[1]} px, 0 to {max(FRACTIONS):.0%} of the patches"
-    return [
-        Row(
-            f"{FRAMES} mixed frames packed ({sizes}): CPU of one by one over packed",
-            f"{alone:.2f}",
-            ">= 1",
-            alone >= 1,
-            f"frames a second of CPU: {', '.join(f'{name} {_rate(clock):.1f}' for name, clock in clocks.items())}",
-        ),
-        Row(
-            f"the same: CPU of batches of {PADDED_AT_ONCE} padded to their largest over packed",
-            f"{padded:.2f}",
-            "> 1",
-            padded > 1,
-            "padded: the same network, masked attention",
-        ),
-        Row(
-            "packed against one by one: greatest difference of confidence",
-            f"{apart:.1e}",
-            "<= 1e-6, same classes",
-            apart <= 1e-6 and alike,
-        ),
-    ]
-
-
-def _rate(clock: Timing) -> float:
-    return FRAMES / clock.cpu_min_s
-
-
-def _packed(weights: Weights, frames: Sequence[Frame]) -> list[DrawnMap]:
-    scan_passes, patches, patch_index = zip(
-        *((one.scan_pass, one.patches, one.patch_index) for one in frames), strict=True
-    )
-    return segment_batch(weights, scan_passes, patches, patch_index)
-
-
-def _one_by_one(weights: Weights, frames: Sequence[Frame]) -> list[DrawnMap]:
-    return [segment(weights, one.scan_pass, one.patches, one.patch_index) for one in frames]
-
-
-def _padded(weights: Weights, frames: Sequence[Frame]) -> list[DrawnMap]:
-    """The usual way: batches of equal shapes, what is missing filled with zeros and masked in attention."""
-    with torch.inference_mode():
-        starts = range(0, len(frames), PADDED_AT_ONCE)
-        return [drawn for first in starts for drawn in _padded_batch(weights, frames[first : first + PADDED_AT_ONCE])]
-
-
-def _padded_batch(weights: Weights, frames: Sequence[Frame]) -> list[DrawnMap]:
-    model, config, p = weights.segmenter, weights.config, weights.config.patch
-    rows, columns = (max(one.scan_pass.columns.shape[axis] for one in frames) // p for axis in (0, 1))
-    most = max(len(one.patch_index) for one in frames)
-    coarse = torch.zeros(len(frames), config.columns, rows * p, columns * p)
-    there = torch.zeros(len(frames), rows, columns, dtype=torch.bool)
-    fine, patch_index = (
-        torch.zeros(len(frames), most, config.columns, p, p),
-        torch.zeros(len(frames), most, dtype=torch.int64),
-    )
-    used = torch.zeros(len(frames), most, dtype=torch.bool)
-    for number, one in enumerate(frames):
-        y, x = one.scan_pass.columns.shape[:2]
-        coarse[number, :, :y, :x] = torch.from_numpy(one.scan_pass.columns).permute(2, 0, 1)
-        there[number, : y // p, : x // p] = True
-        row, column = np.divmod(one.patch_index, one.scan_pass.grid.patch_shape[1])
-        fine[number, : len(row)] = torch.from_numpy(one.patches).permute(0, 3, 1, 2)
-        patch_index[number, : len(row)] = torch.from_numpy(row * columns * config.factor + column)
-        used[number, : len(row)] = True
-    side = config.token_side**2
-    known, asked = (mask.flatten(1).repeat_interleave(side, dim=1) for mask in (there, used))
-    features, tokens = model.coarse_stem(cut(coarse, model.config.patch)[0])
-    read, memory = _masked(model.encoder, model.code_coarse(tokens, rows, columns), known, None)
-    image = model.coarse_head(features, read.view(tokens.shape)) * there.flatten()[:, None, None, None]
-    reading = model.reading_of(image, memory, rows, columns)
-    logits = torch.zeros(len(frames), 0, config.classes, p, p)
-    if most:
-        features, tokens = model.fine_stem(fine.flatten(0, 1))
-        coded = model.code_fine(tokens.view(len(frames), most, *tokens.shape[1:]), patch_index, columns)
-        read, _ = _masked(model.encoder, coded, torch.cat([known, asked], dim=1), memory)
-        windows = model.canvas_windows(reading.canvas, patch_index)
-        logits = model.decode_fine(features, read.view(tokens.shape), windows).view(len(frames), most, -1, p, p)
-    return [_drawn(one, reading.logits[number], logits[number]) for number, one in enumerate(frames)]
-
-
-def _masked(
-    encoder: Encoder, x: torch.Tensor, kept: torch.Tensor, before: list[Memory] | None
-) -> tuple[torch.Tensor, list[Memory]]:
-    memory = []
-    for layer, block in enumerate(encoder.blocks):
-        x, own = block(x, None if before is None else before[layer], kept)
-        memory.append(own)
-    return encoder.norm(x), memory
-
-
-def _drawn(frame: Frame, coarse: torch.Tensor, fine: torch.Tensor) -> DrawnMap:
-    grid, p = frame.scan_pass.grid, frame.scan_pass.grid.patch
-    y, x = frame.scan_pass.columns.shape[:2]
-    drawn = draw_coarse(coarse[None, :, :y, :x], grid)
-    confidence, classes = (part.numpy() for part in fine[: len(frame.patch_index)].softmax(dim=1).max(dim=1))
-    for (top, left), values, sure in zip(grid.patch_origin(frame.patch_index), classes, confidence, strict=True):
-        drawn.classes[top : top + p, left : left + p] = values
-        drawn.confidence[top : top + p, left : left + p] = sure
-    scene = np.s_[: grid.height, : grid.width]
-    return DrawnMap(drawn.classes[scene].copy(), drawn.confidence[scene].copy())
 
 
 def _bands() -> list[Row]:
@@ -244,15 +105,9 @@ def _fractions() -> list[Row]:
     calls = {"all": lambda: segment(weights, every.scan_pass, every.patches, every.patch_index)}
     patches_of = {}
     for fraction in COST_GOALS:
-        count = frame_patches(
-            np.zeros(FRAME.valid_fraction().size), fraction, FRAME.valid_fraction().ravel() > 0
-        ).patch_index
+        count = frame_patches(np.zeros(FRAME.valid_fraction().size), fraction, FRAME.valid_fraction().ravel() > 0)
         patches_of[fraction] = len(count)
         calls[f"{fraction:.0%}"] = partial(_adaptive, weights, every, len(count))
-    calls["35% in bfloat16"] = partial(_adaptive, weights, every, patches_of[0.35], "bfloat16")
-    calls["all in bfloat16"] = lambda: segment(
-        weights, every.scan_pass, every.patches, every.patch_index, precision="bfloat16"
-    )
     clocks = time_in_turn(calls, ROUNDS)
     full = multiply_adds(weights.config, FRAME, len(every.patch_index), 2).total
     found = []
@@ -270,20 +125,11 @@ def _fractions() -> list[Row]:
                 f"{clocks['all'].cpu_min_s:.2f} s, coarse prediction and scorer included",
             )
         )
-    half = {name: ratio(clocks, f"{name} in bfloat16", name) for name in ("35%", "all")}
-    native = torch.ops.mkldnn._is_mkldnn_bf16_supported()
-    return [
-        *found,
-        Row(
-            "bfloat16 over float32: CPU at 35 % of the patches",
-            f"{half['35%']:.2f}",
-            peers=f"at every patch {half['all']:.2f}; the processor {'has' if native else 'lacks'} bfloat16 arithmetic",
-        ),
-    ]
+    return found
 
 
-def _adaptive(weights: Weights, every: Frame, count: int, precision: str = "float32") -> DrawnMap:
-    seen: CoarsePrediction = read_coarse_prediction(weights, every.scan_pass, precision=precision)  # type: ignore[arg-type]
+def _adaptive(weights: Weights, every: Frame, count: int) -> DrawnMap:
+    seen = read_coarse_prediction(weights, every.scan_pass)
     scores = score_patches("gain", seen).ravel()[every.patch_index]
     best = np.sort(np.argsort(-scores, kind="stable")[:count])
-    return segment(weights, seen, every.patches[best], every.patch_index[best], precision=precision)  # type: ignore[arg-type]
+    return segment(weights, seen, every.patches[best], every.patch_index[best])

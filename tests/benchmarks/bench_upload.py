@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from measure import Row
@@ -17,7 +18,7 @@ from pipeline.rig.device_settings import MirrorSettings, ReadBack
 from pipeline.rig.emulator.emulated_rig import EmulatedPort
 from pipeline.rig.emulator.mirror_device import MirrorDevice
 from pipeline.rig.mirror.mirror_controller import open_mirror
-from pipeline.rig.transports import BITS_PER_BYTE, SYSTEM_CLOCK
+from pipeline.rig.transports import BITS_PER_BYTE, SYSTEM_CLOCK, Transport
 
 PAIRS = 1500
 BAUDS = (115200, 256000)
@@ -44,6 +45,27 @@ def _row(baud: int, read_back: ReadBack) -> Row:
     )
 
 
+class Counted:
+    """A transport that counts what goes over it."""
+
+    def __init__(self, transport: Transport) -> None:
+        self.transport, self.bytes = transport, 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.transport, name)
+
+    def write(self, data: bytes, deadline: float) -> None:
+        """Send and count."""
+        self.bytes += len(data)
+        self.transport.write(data, deadline)
+
+    def read(self, at_most: int, deadline: float) -> bytes:
+        """Read and count."""
+        found = self.transport.read(at_most, deadline)
+        self.bytes += len(found)
+        return found
+
+
 def _upload(baud: int, read_back: ReadBack) -> tuple[float, float, float, int]:
     """Wall time, time on the wire, processor time [s] of one upload, and how often its progress was told."""
     turn = np.linspace(0, 2 * np.pi, PAIRS)
@@ -55,11 +77,11 @@ def _upload(baud: int, read_back: ReadBack) -> tuple[float, float, float, int]:
         open_mirror(MirrorSettings(port=port.path, baud=baud, vector_pairs=PAIRS)) as mirror,
     ):
         mirror.is_playing()  # as the upload asks first: everything is loaded
-        wire, began_s, began_cpu_s = mirror.wire, time.perf_counter(), time.process_time()
-        before = wire.bytes_sent + wire.bytes_received
+        mirror.wire.transport = counted = Counted(mirror.wire.transport)
+        began_s, began_cpu_s = time.perf_counter(), time.process_time()
         mirror.load_path(positions, read_back, lambda done, total: told.append((done, total)))
         wall_s, cpu_s = time.perf_counter() - began_s, time.process_time() - began_cpu_s
-        wire_s = (wire.bytes_sent + wire.bytes_received - before) * BITS_PER_BYTE / baud
+        wire_s = counted.bytes * BITS_PER_BYTE / baud
     if not np.array_equal(device.state.memory, positions.T.ravel().astype(np.float32)):
         raise AssertionError("the memory holds something else")
     if told[-1][0] != told[-1][1] or any(one[0] >= other[0] for one, other in pairwise(told)):

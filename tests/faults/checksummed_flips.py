@@ -19,7 +19,7 @@ import torch
 
 from models.training.start_weights import StartFile
 from models.weights.checksummed_files import load_checkpoint, save_checkpoint
-from models.weights.files import content_key, load_weights, save_weights
+from models.weights.files import describe_weights, load_weights, save_weights
 from pipeline.errors import WeightsError
 from storage.archive.archive import Archive
 from tests.conftest import RGB_NM, random_weights
@@ -36,12 +36,12 @@ def _weights(path: Path) -> Content:
     found = load_weights(path)
     normal = {name: torch.from_numpy(value) for name, value in vars(found.normalisation).items()}
     tensors = {**found.segmenter.state_dict(), **normal, "colours": torch.from_numpy(found.class_colours)}
-    return (found.config, found.basis, found.class_names, found.record, content_key(path)), tensors
+    return (found.config, found.basis, found.class_names, found.record, describe_weights(path).key), tensors
 
 
 def _start(path: Path) -> Content:
     start = StartFile(path)
-    return (start.kind, start.sizes, start.earlier), start.state
+    return (start.described.config, start.earlier), start.tensors
 
 
 def _state(path: Path) -> Content:

@@ -98,7 +98,7 @@ def test_training_goes_on(subject: Subject, tmp_path: Path) -> None:
 def test_an_evaluation_goes_on(subject: Subject, tmp_path: Path) -> None:
     """Frames that were judged are kept, and not judged again."""
     field, file, out = write_field(tmp_path / "field"), tmp_path / "w.safetensors", tmp_path / "out"
-    how = "--fractions 0.5 --policies random --draws 20 --no-rig"
+    how = "--fractions 0.5 --policies random --draws 20"
     asked = ["evaluate", str(field), "--weights", str(write_weights(file)), "-o", str(out), *how.split()]
     place = {"place": "flows.evaluate.command:judge_frame", "number": signal.SIGTERM}
     ended = subject.nursery.run(asked, "end_before", call=3, **place)

@@ -165,7 +165,7 @@ def test_18_a_scene_all_dead_still_has_a_map():
     weights, grid = plain_weights(), SceneGrid(32, 32, 8, 2)
     seen = coarse_prediction(weights, np.full((16, 16, 9), np.nan), NM, grid)
     assert np.isfinite(seen.probability).all()
-    for policy in ("gain", "entropy", "sobel", "self-attention"):
+    for policy in ("gain", "entropy", "sobel"):
         assert np.isfinite(score_patches(policy, seen)).all()
     drawn = segment(weights, seen, _patches(2), np.array([0, 5]))
     assert np.isfinite(drawn.confidence).all()

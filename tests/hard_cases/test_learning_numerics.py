@@ -167,15 +167,14 @@ def test_28_patches_that_mislead_have_negative_gain():
     assert captured_gain(bought, best) is None
 
 
-@pytest.mark.parametrize("threshold", [0.0, 0.05])
-def test_28_negative_gains_are_never_bought_by_threshold(threshold: float):
-    """With a threshold no run is bought for a negative score, nor for one that is no number; all is left unspent."""
+def test_28_negative_gains_are_never_bought():
+    """No run is bought for a negative score, nor for one that is no number; all is left unspent."""
     grid, score = SceneGrid(256, 256, 16, 4), np.full(256, -0.3)
     score[[3, 70, 200]] = -5.0, np.nan, -np.inf
-    plan = plan_fine(grid, LineCamera(), CostModel(), "x", score, budget_s=10.0, threshold=threshold)
+    plan = plan_fine(grid, LineCamera(), CostModel(), "x", score, budget_s=10.0)
     assert (plan.patch_index.tolist(), plan.sweeps, plan.expected_gain) == ([], [], 0.0)
     score[100] = 5.0
-    plan = plan_fine(grid, LineCamera(), CostModel(), "x", score, budget_s=10.0, threshold=threshold)
+    plan = plan_fine(grid, LineCamera(), CostModel(), "x", score, budget_s=10.0)
     assert 100 in plan.patch_index
     assert plan.expected_gain == pytest.approx(5.0)
 

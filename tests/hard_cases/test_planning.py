@@ -10,7 +10,8 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel, Sweep, memory_loads
 from pipeline.planning.coverage import check_reach, full_sweeps
-from pipeline.planning.fine_pass import plan_fine, price_of_patches
+from pipeline.planning.fine_pass import plan_fine, runs_showing
+from pipeline.planning.prices import count_lines
 
 CAMERA, COST = LineCamera(), CostModel()
 GRID = SceneGrid(200, 900, 32, 4)
@@ -110,7 +111,7 @@ def test_a_patch_wider_than_the_line():
     with pytest.raises(SettingsError, match="patch of 641 px is wider than a line of 640"):
         plan_fine(grid, CAMERA, COST, "x", np.ones(1), budget_s=1.0)
     with pytest.raises(SettingsError, match="patch of 641 px"):
-        price_of_patches(grid, CAMERA, COST, "x", np.array([0]))
+        runs_showing(grid, CAMERA, COST, "x", np.array([0]))
 
 
 def test_a_patch_as_wide_as_the_line():
@@ -170,13 +171,13 @@ def test_patches_that_nothing_reaches_are_refused():
     with pytest.raises(PoseError, match=r"none of the 1 patches worth something \(the first is 0\)"):
         plan_fine(grid, CAMERA, COST, "x", scores, budget_s=1e4)
     with pytest.raises(PoseError, match="patch 0 and 0 more of 2 are shown by no line"):
-        price_of_patches(grid, CAMERA, COST, "x", np.array([0, 1225]))
+        runs_showing(grid, CAMERA, COST, "x", np.array([0, 1225]))
 
 
 def test_a_patch_costs_its_rotated_footprint():
     """Far off the axis a line lies across a patch: 320 (1 + tan psi) lines and the kernel's, not 320."""
     grid = SceneGrid(10_240, 10_240, 320, 1)
-    lines = price_of_patches(grid, CAMERA, COST, "x", np.array([16 * 32 + 31])).lines
+    lines = count_lines(runs_showing(grid, CAMERA, COST, "x", np.array([16 * 32 + 31])))
     xi = 4800 * CAMERA.ifov_rad
     psi = np.arctan2(xi, np.sqrt(1 + xi * xi))  # of a line at xi on the axis, to a few lines over the patch
     assert lines == pytest.approx(320 * (1 + np.tan(psi)) + 3, abs=6)

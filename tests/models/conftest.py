@@ -104,5 +104,5 @@ def make_weights(seed: int = 0, **sizes: Any) -> Weights:
 
 @pytest.fixture
 def tiny() -> Maker:
-    """Maker of small random weights: ``tiny(seed, classes=..., patch=..., factor=..., positions=...)``."""
+    """Maker of small random weights: ``tiny(seed, classes=..., patch=..., factor=...)``."""
     return make_weights

@@ -200,7 +200,7 @@ def test_weights_are_trained_and_judged(tmp_path: Path) -> None:
         data, tmp_path / "mine.safetensors", steps=2, hold_out=["003"], validation=0, **small, progress=told
     )
     assert made == tmp_path / "mine.safetensors"
-    quick = {"fractions": [0.25], "policies": ["entropy"], "draws": 10, "rig": False}
+    quick = {"fractions": [0.25], "policies": ["entropy"], "draws": 10}
     scores = spectralzoom.evaluate(data, weights=made, **quick, progress=told)
     assert scores["frames"] == ["003"]
     assert {"training", "looking at scenes"} <= heard

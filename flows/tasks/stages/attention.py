@@ -17,7 +17,7 @@ from flows.tasks.field_work import FieldWork, region_params
 from flows.tasks.patch_budget import PatchBudget
 from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
 from flows.tasks.zones import SurveyZones
-from models.policies.policies import IMAGE_POLICIES, SEEDED_POLICIES, SEEING_POLICIES, score_patches
+from models.policies.policies import SEEING_POLICIES, score_patches
 from models.reading.inference import CoarsePrediction
 from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.geometry.camera import LineCamera
@@ -49,7 +49,6 @@ def score(
     camera: LineCamera,
     cost: CostModel,
     policy: str,
-    threshold: float | None,
     seed: int,
     mask: NDArray[np.generic] | None,
     part: bool,
@@ -61,7 +60,7 @@ def score(
 
     def expected_gain() -> Scores:
         """Return the (patch,) worth of a fine look at each patch, by the fraction of it that zones leave."""
-        if policy in SEEING_POLICIES + IMAGE_POLICIES:
+        if policy in SEEING_POLICIES:
             scores = work.score(policy, mosaic.path / "mosaic.zarr", lambda done: report(0.5 * done)).ravel()
         else:
             nothing = np.empty((0, 0, 0), np.float32)
@@ -75,7 +74,7 @@ def score(
         """Return the scores where patches are chosen, and what is seen of the field in detail."""
         if not plan.plain:
             scores = expected_gain()
-            return scores, plan_detail(grid, plan, camera, cost, scores, threshold, recorded)
+            return scores, plan_detail(grid, plan, camera, cost, scores, recorded)
         seen = all_seen(grid, () if raster is not None else plan.coarse, camera, part=part)
         if budget is None:
             return np.zeros(int(np.prod(grid.patch_shape))), seen
@@ -95,8 +94,7 @@ def score(
         shape = grid.patch_shape
         write_attention(path / "attention.zarr", Attention(scores.reshape(shape), rank.reshape(shape), policy))
         content = asdict(found) | {"patch_index": found.patch_index.tolist()}
-        absent = [name for name in ("threshold", "spared_s") if content[name] is None]
-        write_table(path / "plan.json", {name: value for name, value in content.items() if name not in absent})
+        write_table(path / "plan.json", content)
 
     captures = {
         "fine_s": plan.fine_s,
@@ -110,12 +108,10 @@ def score(
         **model_key,
         "grid": asdict(grid),
         "policy": policy,
-        "seed": seed if policy in SEEDED_POLICIES else None,
+        "seed": seed if policy == "random" else None,
         "mask": None if mask is None else array_digest(mask),
         **(captures if raster is None else {}),
         **(region_params(grid) if policy in SEEING_POLICIES else {}),
-        **({} if work.vgg is None else {"vgg": work.vgg.key}),
-        **({} if threshold is None else {"threshold": threshold}),
         **({"plain": True} if plan.plain else {}),
         **({} if budget is None else {"patches": {name: getattr(budget, name) for name in SPARING}}),
         **zones.key,
@@ -129,7 +125,6 @@ def plan_detail(
     camera: LineCamera,
     cost: CostModel,
     scores: Scores,
-    threshold: float | None,
     recorded: RecordedPasses | None,
 ) -> FinePlan:
     """Plan the runs of lines that show most of the (patch,) scores in the time left.
@@ -146,7 +141,6 @@ def plan_detail(
         budget_s=plan.fine_s,
         margin_px=plan.margin_px,
         full=plan.full,
-        threshold=threshold,
     )
     found = plan_on()
     if recorded is None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from flows.settings.survey_settings import MapChoice
 from flows.tasks.stage import Product, Report, Wanted, stage
 from pipeline.geometry.grid import UNLABELLED
+from pipeline.ground.field_places import PosedField, areas_by_number
 from pipeline.ground.map_grid import GroundGrid, image_at, map_blocks, nearest_at
 from storage.archive.keys import StageRef
 from storage.arrays.class_maps import OLD_CLASS, ClassNames, ProbabilityStore, load_class_map
@@ -70,7 +71,9 @@ def ground(
         for rows, columns in map_blocks(grid.shape, BLOCK):
             writer.write_block(rows, columns, shown(grid.scene_pixels(rows, columns)))
             report(rows.stop / grid.shape[0])
-        writer.finish(grid.class_areas_m2(found.classes, len(found.names)))
+        areas = areas_by_number(PosedField(grid), found.classes, len(found.names))
+        assert areas is not None
+        writer.finish(areas)
 
     params = {
         "pose": asdict(grid.frame.view.pose),

@@ -16,7 +16,6 @@ SIDE, BANDS, EDGE = 256, 270, 176  # of the sweep; of the output grid, which lie
 TURN_DEG = 14.0
 CRS, ORIGIN_M = "EPSG:32631", (500_000.0, 5_000_000.0)  # one metre a pixel, for what wants to be on the Earth
 FEW = 18  # bands of the libraries that take one at a time and long for each
-Engine = Callable[[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor], Any]
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ def turned_waves(falloff: float, bands: int = BANDS) -> Turned:
 
     Their amplitude is the period to the power of ``falloff``: 1 as in pictures of natural scenes, 0 for all alike.
     """
-    waves = draw_waves(0, bands)
+    waves = draw_waves(0, bands, (4.0, 40.0))
     size = np.linalg.norm(waves.frequency, axis=1)[:, None] ** -falloff
     waves = replace(waves, cosine=waves.cosine * size, sine=waves.sine * size)
     cos, sin = np.cos(np.deg2rad(TURN_DEG)), np.sin(np.deg2rad(TURN_DEG))
@@ -127,7 +126,6 @@ def cv2_parts(scene: Turned, order: int) -> Callable[[], list[NDArray[np.float32
 
 
 def _grid_sample(scene: Turned, order: int) -> Peer:
-    import torch
 
     mode = {0: "nearest", 1: "bilinear", 3: "bicubic"}[order]
     grid = (scene.coordinates[:, ::-1] / (SIDE - 1) * 2 - 1).astype(np.float32).reshape(1, EDGE, EDGE, 2)
@@ -218,41 +216,3 @@ def _swath_and_area(scene: Turned) -> tuple[Any, Any]:
     lon, lat = pyproj.Transformer.from_crs(CRS, "EPSG:4326", always_xy=True).transform(east + x, north - y)
     extent = (east - 0.5, north - EDGE + 0.5, east + EDGE - 0.5, north + 0.5)
     return SwathDefinition(lon, lat), AreaDefinition("grid", "grid", "grid", pyproj.CRS(CRS), EDGE, EDGE, extent)
-
-
-def _bag(table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor, _apart: torch.Tensor) -> torch.Tensor:
-    return torch.nn.functional.embedding_bag(index, table, per_sample_weights=weight, mode="sum")
-
-
-def _two_stage(table: torch.Tensor, index: torch.Tensor, _weight: torch.Tensor, apart: torch.Tensor) -> torch.Tensor:
-    across = apart[1].T.repeat_interleave(4, dim=0)
-    lines = torch.nn.functional.embedding_bag(index.view(-1, 4), table, per_sample_weights=across, mode="sum")
-    return torch.bmm(apart[0].T[:, None], lines.view(len(index), 4, -1))[:, 0]
-
-
-def _sparse(table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor, _apart: torch.Tensor) -> torch.Tensor:
-    starts = torch.arange(0, index.numel() + 1, 16, dtype=index.dtype)
-    size = (len(index), len(table))
-    return torch.sparse_csr_tensor(starts, index.view(-1), weight.view(-1), size, check_invariants=False) @ table
-
-
-def _bmm(table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor, _apart: torch.Tensor) -> torch.Tensor:
-    return torch.bmm(weight[:, None], table[index])[:, 0]
-
-
-def _numpy(table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor, _apart: torch.Tensor) -> NDArray[np.float32]:
-    places, weights, values = index.numpy(), weight.numpy(), table.numpy()
-    total: NDArray[np.float32] = np.zeros((len(places), values.shape[1]), np.float32)
-    for tap in range(places.shape[1]):
-        total += np.take(values, places[:, tap], axis=0) * weights[:, tap, None]
-    return total
-
-
-# Each takes the table (row, band), the rows (n, 16), their weights (n, 16), and the weights along both axes (2, 4, n).
-ENGINES: dict[str, Engine] = {
-    "embedding_bag 16 taps": _bag,
-    "4 bags of 4 taps, then 4": _two_stage,
-    "sparse matrix": _sparse,
-    "gather and bmm": _bmm,
-    "numpy by tap": _numpy,
-}

@@ -16,8 +16,8 @@ Judged = tuple[EvaluateRequest, dict[str, Any]]
 
 @pytest.fixture(scope="package")
 def judged(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Judged:
-    """What was asked for, and an evaluation of two seeds with plans of lines."""
+    """What was asked for, and an evaluation of two seeds."""
     folder = tmp_path_factory.mktemp("out")
     weights = tuple(write_weights(folder / f"w{seed}.safetensors", seed) for seed in (0, 1))
-    request = EvaluateRequest(str(data), weights, folder / "out", **{**QUICK, "rig": True})
+    request = EvaluateRequest(str(data), weights, folder / "out", **QUICK)
     return request, evaluate_weights(request)

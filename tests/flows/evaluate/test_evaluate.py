@@ -14,8 +14,8 @@ from rich.console import Console
 from flows.cli.main import main
 from flows.evaluate import command as evaluate_command
 from flows.evaluate.command import KeptResults, evaluate_weights, run_evaluate
-from flows.evaluate.frames import COST, EvaluateRequest, open_candidates
-from flows.evaluate.judge import BUDGETS, ORACLE, Trial, collect_row, difference, judge_frame, seeds_of, summarise
+from flows.evaluate.frames import EvaluateRequest, open_candidates
+from flows.evaluate.judge import ORACLE, Trial, collect_row, difference, judge_frame, seeds_of, summarise
 from flows.evaluate.table import print_evaluation
 from flows.training.data import farm_test_data, pack_mask
 from flows.training.train import train_weights
@@ -28,7 +28,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.render import USUAL
 from pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from tests.flows.evaluate.conftest import Judged
-from tests.flows.small_fields import FRAMES, QUICK, observed_passes, scene_at, write_field, write_weights
+from tests.flows.small_fields import FRAMES, QUICK, observed_passes, scene_at, write_weights
 from tests.models.conftest import make_weights
 
 
@@ -36,7 +36,7 @@ def _row(content: dict[str, Any], policy: str, fraction: float) -> dict[str, Any
     return next(row for row in content["rows"] if (row["policy"], row["fraction"]) == (policy, fraction))
 
 
-TRIAL = Trial((0.5,), (), rig=False)
+TRIAL = Trial((0.5,), ())
 
 
 def test_every_row_is_there(judged: Judged):
@@ -266,7 +266,7 @@ def _record(name: str, rng: np.random.Generator) -> dict[str, Any]:
         {"policy": policy, "fraction": fraction, "counts": rng.integers(1, 9, (2, 2)).tolist(), **given}
         for policy, fraction in (("none", 0.0), ("oracle", 0.5), ("all", 1.0))
     ]
-    return {"frame": name, "rows": rows, "plans": []}
+    return {"frame": name, "rows": rows}
 
 
 def test_weights_without_a_common_frame_are_one_seed() -> None:
@@ -284,32 +284,6 @@ def test_weights_without_a_common_frame_are_one_seed() -> None:
     assert found is not None
     wanted = row.over_runs(mean_iou).mean() - less.over_runs(mean_iou).mean()
     assert (found["difference"], found["frames"]) == (pytest.approx(wanted), 3)
-
-
-# a narrow line, so that small frames take several strips, and a rig that is quick to set up
-CAMERA = LineCamera(samples=32)
-QUICK_RIG = replace(COST, slew_s=0.01, settle_frames=0.5, capture_start_s=0.01, reload_s=0.0)
-
-
-def test_no_plan_takes_more_than_its_budget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Each plan that pays for the coarse pass is within its seconds; ours stands against both others."""
-    write_field(tmp_path / "field", (48, 64))
-    scan_pass, weights = observed_passes(tmp_path / "field", tmp_path / "w.safetensors", factor=4, seed=1)
-    trial = replace(TRIAL, rig=True)
-    monkeypatch.setattr("flows.evaluate.judge.COST", QUICK_RIG)
-    record = judge_frame(trial, scan_pass, weights, CAMERA)
-    for row in record["plans"]:
-        assert row["capture_s"] <= row["fraction"] * row["full_s"] * (1 + 1e-9)
-        assert np.sum(row["counts"]) == 48 * 64
-    assert len({(row["policy"], row["draw"]) for row in record["plans"]}) == 3 + 5
-    found = summarise([[record, {**record, "frame": "002"}]], weights.class_names, trial, 10)["rig"]
-    rows = {(row["policy"], row["budget"]): row for row in found}
-    budget = BUDGETS[-1]
-    ours, even = rows["gain", budget], rows["uniform lines", budget]
-    assert ours["against_uniform"]["difference"] == pytest.approx(ours["miou"] - even["miou"])
-    assert (ours["frames"], even["against_uniform"]) == (2, None)
-    monkeypatch.setattr("flows.evaluate.judge.COST", replace(QUICK_RIG, capture_start_s=30.0))
-    assert judge_frame(trial, scan_pass, weights, CAMERA)["plans"] == []  # the coarse pass alone takes longer
 
 
 def test_the_farm_is_judged_on_seeds_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -348,7 +322,7 @@ def test_figures_are_printed(judged: Judged, data: Path, capsys: pytest.CaptureF
     """Rows, classes and what the figures mean, from what was kept; with --json one object on stdout."""
     run_evaluate(judged[0], Console(stderr=True))
     shown = capsys.readouterr()
-    for words in ("oracle*", "multiply-adds", "uniform lines", "crop", "uses labels", "paired bootstrap"):
+    for words in ("oracle*", "multiply-adds", "crop", "uses labels", "paired bootstrap"):
         assert words in shown.out
     assert "evaluation.json" in shown.err
     weights = write_weights(tmp_path / "w.safetensors")

@@ -14,7 +14,7 @@ from flows.tasks.survey_model import UNIFORM_STEPS, shipped_weights, weights_off
 from models.evaluation.metrics import mean_iou
 from models.evaluation.placement import Controls, run_controls
 from models.reading.inference import coarse_prediction
-from models.weights.files import Weights, content_key, describe_weights, load_weights
+from models.weights.files import Weights, describe_weights, load_weights
 from pipeline.errors import BudgetError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
@@ -53,7 +53,7 @@ def controls(weights: Weights) -> Controls:
 
 def test_file_is_small_and_tells_its_making(weights: Weights) -> None:
     """The key that its products know, at most 8 MB; command, seed, law of the data, figures of unseen scenes."""
-    assert content_key(PATH) == "1e1fce42c3bb18c27d7d"
+    assert describe_weights(PATH).key == "1e1fce42c3bb18c27d7d"
     assert PATH.stat().st_size <= 8e6
     assert weights.record["command"].startswith("spectralzoom train farm")
     assert weights.record["data"] == FARM_LAW

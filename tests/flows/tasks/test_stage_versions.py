@@ -113,15 +113,8 @@ def test_every_barrier_stands_in_a_way(barrier: str) -> None:
 @pytest.mark.parametrize(
     ("stage", "names"),
     {
-        "score": (
-            "PatchScorer",
-            "encode_packed",
-            "fill_dead",
-            "received_attention",
-            "attention_of_patches",
-            "SceneGrid",
-        ),
-        "segment": ("encode_packed", "fill_dead", "MOST_DEAD", "Segmenter", "write_class_tile"),
+        "score": ("PatchScorer", "Encoder", "fill_dead", "SceneGrid"),
+        "segment": ("Encoder", "fill_dead", "MOST_DEAD", "Segmenter", "write_class_tile"),
         "capture": ("RigSource", "CaptureRunner", "open_mirror", "HeadwallCamera", "lines_by_time", "EFFECTS"),
         "patches": ("read_patches", "LineCache", "calibrate", "PatchWriter"),
     }.items(),

@@ -15,7 +15,7 @@ from flows.archive.stale_runs import asked_again, newest_runs
 from flows.settings.load import load_settings, parse_settings
 from flows.settings.survey_settings import Settings
 from flows.tasks.scene import check_labels, farm_refusal, open_scene
-from flows.training.data import farm_data, farm_days, farm_test_data, read_farm_name
+from flows.training.data import farm_days, farm_test_data, open_training_data, read_farm_name
 from flows.training.observed_scenes import observe_scene
 from models.network.sizes import SegmenterConfig
 from models.network.spectral import SpectralBasis
@@ -150,7 +150,7 @@ def test_a_farm_is_asked_for_again_by_its_law(tmp_path: Path) -> None:
 
 def test_training_days_cover_the_season() -> None:
     """Each month from April to October has some, with enough sun, none of them judged on; names are read back."""
-    data = farm_data(None, 3, LineCamera())
+    data = open_training_data("farm", 3, None, LineCamera())
     learnt = [read_farm_name(name) for name in data.train]
     judged = [read_farm_name(name) for name in (*data.validation, *farm_test_data(4, LineCamera()).train)]
     assert np.histogram([day for _, day, _ in learnt], np.linspace(91, 305, 8))[0].min() >= 5

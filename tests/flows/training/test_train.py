@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import io
+import re
 import zlib
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from rich.console import Console
 from flows.cli.main import main
 from flows.settings.load import load_settings
 from flows.tasks.run import open_run
+from flows.tasks.survey_model import shipped_weights
 from flows.training import train as flow
 from flows.training import train_scenes
 from flows.training.data import pack_mask, unpack_mask
@@ -106,7 +108,7 @@ def test_new_weights_say_what_they_saw_and_know_what_is_ood(tmp_path: Path):
         ({"patch": 24}, "choose another --patch or --factor"),
         ({"patch": 8, "factor": 16}, "choose another --patch or --factor"),
         ({"factor": 0}, "choose another --patch or --factor"),
-        ({"init": True}, r"has --dim 16 --heads 2 .* pass --dim 64 --heads 1 --mlp-ratio 4 \(and"),
+        ({"init": True}, r"has --dim 16 --heads 2 .* pass --dim 128 --heads 4 --mlp-ratio 3 \(and"),
         ({"init": True, "tokens": {**TOKENS, "dim": 18}}, r"token width 18 .*choose another --dim or --heads"),
     ],
 )
@@ -114,7 +116,7 @@ def test_networks_that_cannot_be_are_refused_before_the_first_look(
     folder: Path, out: Path, choices: dict[str, Any], words: str, monkeypatch: pytest.MonkeyPatch
 ):
     """No scene is opened for a start of another width, and none is looked at for sizes that do not fit."""
-    begun = {"init": _transformer(out.with_name("vit.pth"))} if "init" in choices else {}
+    begun = {"init": shipped_weights()} if "init" in choices else {}
     opened = (flow, "open_training_data") if begun else (train_scenes, "observe_scene")
     monkeypatch.setattr(*opened, lambda *given, **named: pytest.fail("a scene was looked at"))
     with pytest.raises(SettingsError, match=words):
@@ -155,13 +157,11 @@ def test_patches_follow_the_size_of_scenes(shape: tuple[int, int], built_in: boo
     assert suggested_patch(shape, built_in=built_in) == patch
 
 
-@pytest.mark.parametrize("positions", ["2d", "paper"])
-def test_training_shows_the_figures_of_validation(folder: Path, out: Path, positions: str):
-    """The file holds the network that was asked for; the table has a row for each placement."""
+def test_training_shows_the_figures_of_validation(folder: Path, out: Path):
+    """The table has a row for each placement."""
     shown, rows = io.StringIO(), {"none", "random", "sobel", "entropy", "gain", "all"}
-    request = _request(folder, out, validation=1, positions=positions)
+    request = _request(folder, out, validation=1)
     figures = run_train(request, Console(file=shown, width=100))["validation"]
-    assert load_weights(out).config.positions == positions
     assert set(figures) - {"scenes", "fraction_of_patches"} == rows
     for name in rows:
         assert all(0 <= figures[name][figure] <= 1 for figure in ("miou", "overall_accuracy"))
@@ -222,16 +222,6 @@ def _begun(folder: Path, out: Path, **choices: Any) -> TrainRequest:
     return _request(folder, out, **{"tokens": TOKENS, "validation": 0, **choices})
 
 
-def _transformer(path: Path) -> Path:
-    """A file of one block and a norm, 64 wide: one head."""
-    rng, dim = torch.Generator().manual_seed(0), 64
-    sizes = {"attn.qkv": 3 * dim, "attn.proj": dim, "mlp.fc1": 4 * dim}
-    state = {f"blocks.0.{name}.weight": torch.randn(rows, dim, generator=rng) for name, rows in sizes.items()}
-    state |= {"pos_embed": torch.zeros(1, 5, dim), "norm.weight": torch.ones(dim)}
-    torch.save({"model": state, "license": "Apache-2.0"}, path)
-    return path
-
-
 @pytest.fixture(scope="module")
 def earlier(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Weights trained on three of the frames."""
@@ -243,7 +233,7 @@ def earlier(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_weights_begun_from_others_say_so_and_go_on_from_there(folder: Path, earlier: Path, out: Path):
     """File, hash and its frames are recorded; a step at a rate of nothing leaves them as they were."""
     begun = train_weights(_begun(folder, out, hold_out=("001", "002", "003"), init=earlier))["begun_from"]
-    assert (begun["file"], begun["kind"], begun["skipped"]) == ("first.safetensors", "spectralzoom", {})
+    assert (begun["file"], begun["skipped"]) == ("first.safetensors", {})
     assert begun["sha256"] == hashlib.sha256(earlier.read_bytes()).hexdigest()
     split = load_weights(out).record["split"]
     assert list(split["train"]) == ["004", *(f"first.safetensors: {name}" for name in ("001", "002", "003"))]
@@ -266,18 +256,15 @@ def test_frames_that_the_start_has_seen_validate_nothing(
         train_weights(_begun(folder, out, validation=1, init=earlier))
 
 
-def test_the_command_prints_what_became_of_a_transformer(command_line: Any, folder: Path, out: Path):
-    """Matched, resized and skipped with the reason, and the licence; a width that is another is a matter of usage."""
-    words = ("train", folder, "-o", out, "--validation", 0, "--init", _transformer(out.with_name("vit.pth")), *FLAGS)
+def test_the_command_prints_what_became_of_the_start(command_line: Any, folder: Path, earlier: Path, out: Path):
+    """Matched, resized and skipped; a width that is another is a matter of usage."""
+    words = ("train", folder, "-o", out, "--validation", 0, "--init", earlier, *FLAGS)
     refused = command_line(*words)
-    assert (refused.code, "pass --dim 64 --heads 1 --mlp-ratio 4" in refused.errors[0]) == (2, True)
-    done = command_line(*words, "--dim", 64, "--heads", 1, "--mlp-ratio", 4, "--layers", 1)
-    said = " ".join(done.err.split())
+    sizes = [word for name, size in TOKENS.items() for word in (f"--{name.replace('_', '-')}", size)]
+    assert (refused.code, f"pass --dim {TOKENS['dim']}" in refused.errors[0]) == (2, True)
+    done = command_line(*words, *sizes)
     assert done.code == 0
-    assert "begun from vit.pth (vision transformer): 4 tensors matched, 0 resized, 1 skipped" in said
-    assert "skipped pos_embed: positions on a grid of its own" in said
-    assert "its licence: Apache-2.0" in said
-    assert load_weights(out).config.dim == 64
+    assert re.search(r"begun from first.safetensors: \d+ tensors matched, \d resized, \d+ skipped", done.err)
 
 
 def test_masks_of_what_was_seen_add_up(earlier: Path, monkeypatch: pytest.MonkeyPatch):

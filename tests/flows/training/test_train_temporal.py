@@ -15,8 +15,9 @@ from models.evaluation.metrics import confusion, mean_iou
 from models.network.sizes import TemporalSizes
 from models.reading.prior_map import CurrentVisit, PriorMap, first_probabilities, fuse
 from models.training.temporal import PastPass, TemporalTraining, Visit, train_reader
-from models.weights.files import content_key, describe_weights, load_reader
+from models.weights.files import describe_weights, load_reader
 from pipeline.errors import SettingsError
+from pipeline.simulator.effects.registry import USUAL
 
 QUICK = TemporalTraining(minutes=0.5, steps=2, batch=2, crop=64, visits=2)
 
@@ -64,6 +65,9 @@ def test_lands_are_visited_in_the_order_of_their_days() -> None:
 @pytest.mark.parametrize("plain", [False, True])
 def test_the_command_trains_judges_and_says_how(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, plain: bool) -> None:
     """A file for the weights that it was trained for, with seeds, settings and what it is worth on another land."""
+    monkeypatch.setattr(
+        "flows.training.observed_scenes.chosen_effects", lambda *given: USUAL
+    )  # choosing takes seconds a look
     monkeypatch.setattr(remember, "VISITS", 2)
     monkeypatch.setattr(remember, "JUDGED_AFTER", (3,))
     monkeypatch.setattr(remember, "STEPS", {4: 0.7, 1: 0.3})  # of which weights with coarse pixels of 2 px read one
@@ -72,7 +76,7 @@ def test_the_command_trains_judges_and_says_how(tmp_path: Path, monkeypatch: pyt
     record = run_remember(request, Console(quiet=True))
     found = describe_weights(out).reader
     assert found is not None
-    assert content_key(out) == content_key(weights)
+    assert describe_weights(out).key == describe_weights(weights).key
     assert load_reader(out).sizes.factor == (2 if plain else 4)
     assert dict(found.record) == record
     assert (record["lands"], record["steps"], record["command"]) == ([200_000], 2, "spectralzoom train")

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from models.network.layers import Encoder, PatchHead, PatchStem, paper_numbers
+from models.network.layers import Encoder, PatchHead, PatchStem
 from models.network.sizes import level_widths
 from tests.models.conftest import noise
 
@@ -55,19 +55,3 @@ def test_tokens_lie_row_by_row():
     patch[..., 2:14, 18:30] = 1.0  # above, right
     moved = (stem(patch)[1][0] - still).abs().sum(dim=1)
     assert moved.argmax() == 1
-
-
-def _paper(yx: list[list[float]], fine: bool, columns: int = 16, factor: int = 2) -> list[float]:
-    places = torch.tensor(yx, dtype=torch.float64)
-    scale = torch.full((len(yx),), 0.0 if fine else 1.0)
-    return paper_numbers(places, scale, columns, factor).tolist()
-
-
-@pytest.mark.parametrize(("factor", "size"), [(2, (3, 5)), (4, (2, 3))])
-def test_no_number_is_given_twice(factor: int, size: tuple[int, int]):
-    """Patches and patches of a whole scene together take every number from 1 once."""
-    rows, columns = size
-    patches = [[(y + 0.5) * factor, (x + 0.5) * factor] for y in range(rows) for x in range(columns)]
-    patch_index = [[y + 0.5, x + 0.5] for y in range(rows * factor) for x in range(columns * factor)]
-    numbers = _paper(patches, False, columns, factor) + _paper(patch_index, True, columns, factor)
-    assert sorted(numbers) == list(range(1, rows * columns * (factor**2 + 1) + 1))

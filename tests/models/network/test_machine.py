@@ -58,13 +58,11 @@ def elsewhere() -> Segmenter:
 @torch.inference_mode()
 def test_what_a_map_is_drawn_from_is_brought_to_the_network(elsewhere: Segmenter) -> None:
     """Images, patches, patches and origins come from the processor; what is read lies with the network."""
-    image, origins = torch.zeros(1, 6, 16, 16), [None, torch.tensor([[2, 3]])]
-    readings = elsewhere.read_coarse_packed([image, image], origins, [None, None])
-    assert {reading.logits.device.type for reading in readings} == {"meta"}
-    assert elsewhere.score(readings[0]).device.type == "meta"
-    patches, patch_index = [np.zeros((2, 8, 8, 6), np.float32)] * 2, [torch.tensor([0, 5])] * 2
-    read = list(elsewhere.read_fine_packed(readings, patches, patch_index, origins))
-    assert {one.device.type for one in read} == {"meta"}
+    reading = elsewhere.read_coarse_in_chunks(torch.zeros(1, 6, 16, 16), torch.tensor([[2, 3]]), None)
+    assert reading.logits.device.type == elsewhere.score(reading).device.type == "meta"
+    patches, patch_index = np.zeros((2, 8, 8, 6), np.float32), torch.tensor([0, 5])
+    (read,) = elsewhere.read_fine_in_chunks(reading, patches, patch_index, torch.tensor([[2, 3]]))
+    assert read.device.type == "meta"
 
 
 def test_what_a_step_learns_from_is_brought_to_the_network(elsewhere: Segmenter) -> None:

@@ -46,12 +46,10 @@ def test_a_composite_holds_patches_where_patches_say(tiny: Maker):
 
 
 @torch.inference_mode()
-@pytest.mark.parametrize(
-    ("positions", "patch_index", "tokens"), [("2d", 100, 356), ("paper", 200, 456), ("paper", 0, 256)]
-)
-def test_tokens_are_counted_as_in_the_paper(tiny: Maker, positions: str, patch_index: int, tokens: int):
+@pytest.mark.parametrize(("patch_index", "tokens"), [(100, 356), (200, 456), (0, 256)])
+def test_tokens_are_counted_as_in_the_paper(tiny: Maker, patch_index: int, tokens: int):
     """A scene of 256 px with patches of 8 px and factor 2 has 256 coarse tokens, and one more a patch."""
-    model = tiny(positions=positions, width=4, dim=8).segmenter
+    model = tiny(width=4, dim=8).segmenter
     read: list[int] = []
     model.encoder.register_forward_hook(lambda module, args, out: read.append(out[0].shape[1]))
     coarse, fine = torch.zeros(1, 4, 128, 128), torch.zeros(1, patch_index, 4, 8, 8)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from models.network.spectral import SpectralBasis
 from models.training import examples
-from models.training.examples import CropSampler, Example, Observation, observe
+from models.training.examples import CropSampler, Example, observe
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera, expose, footprint
 from pipeline.geometry.grid import SceneGrid
@@ -27,7 +27,7 @@ def _scene(shape: tuple[int, int] = (40, 50), camera: LineCamera = CAMERA) -> Ra
     return raster_from_values(values, camera, name="s", wavelength_nm=NM, labels=labels, class_names=("a", "b", "c"))
 
 
-def _observed(scene: RasterScene, camera: LineCamera = CAMERA, seed: int = 0) -> Observation:
+def _observed(scene: RasterScene, camera: LineCamera = CAMERA, seed: int = 0) -> Example:
     basis = SpectralBasis.spanning(NM)
     return observe(scene, camera, SceneGrid(*scene.shape, 8, 2), basis, np.random.default_rng(seed))
 

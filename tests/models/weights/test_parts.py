@@ -16,7 +16,6 @@ from models.reading.ood import OodDetector
 from models.weights.files import (
     add_ood,
     add_reader,
-    content_key,
     describe_weights,
     load_ood,
     load_reader,
@@ -61,7 +60,7 @@ def test_what_is_added_is_read_and_leaves_the_weights_as_they_were(path: Path) -
     for add in (with_ood, with_reader, with_ood):
         add(path)
     told = describe_weights(path)
-    assert content_key(path) == told.key == bare.key
+    assert told.key == bare.key
     assert told.ood_detector is not None
     assert told.reader is not None
     assert (told.ood_detector.trained_on, told.ood_detector.record, told.reader.record) == (

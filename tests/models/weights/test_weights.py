@@ -101,7 +101,7 @@ def test_another_format_is_named(saved: Path):
         ({"layers": 10_000_000}, "description is damaged.*layers of a segmenter must be at least 1 and at most 256"),
         ({"dim": 2**40}, "description is damaged.*dim of a segmenter must be at least 1 and at most 16384"),
         ({"dim": 16384, "layers": 256}, r"tensor scale_code should be \(2, 16384\), the file has \(2, 16\)"),
-        ({"positions": "3d"}, "description is damaged.*positions of a segmenter is one of 2d, paper, got '3d'"),
+        ({"positions": "3d"}, "description is damaged.*positions of a segmenter is one of 2d, got '3d'"),
         ({"layers": 1.0}, "description is damaged.*layers of a segmenter must be a whole number, got 1.0"),
     ],
 )

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
-from models.network.layers import paper_numbers
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import (
     REST_TANGENT,
@@ -24,6 +22,7 @@ from pipeline.geometry.scan import CostModel, Sweep, device_range, memory_loads
 from tests.pipeline.geometry.paper_equations import (
     LINE_MODELS,
     line_points,
+    paper_numbers,
     straight_slope_rotation,
     unlimited_position,
 )
@@ -296,9 +295,8 @@ def test_e18_counts_of_the_table_and_jumps_of_the_encoding():
     """256 coarse patches and 100 to 500 fine ones are 356 to 756; patches of 4 patches are 5 numbers apart: 21, 26."""
     assert [(512 // 32) ** 2 + fine for fine in (100, 200, 300, 400, 500)] == [356, 456, 556, 656, 756]
     # 4 columns of coarse patches of 2 x 2 patches; patches 4 and 5 are the first two of the second row.
-    coarse = torch.tensor([[2.0, 0.0], [2.0, 2.0]]) + 1.0
-    numbers = paper_numbers(coarse, torch.tensor([2.0, 2.0]), 4, 2)
-    assert numbers.tolist() == [21, 26]
+    coarse = np.array([[2.0, 0.0], [2.0, 2.0]]) + 1.0
+    assert paper_numbers(coarse, fine=False, columns=4, factor=2).tolist() == [21, 26]
 
 
 def greatest_errors(field_deg: float) -> list[float]:

@@ -19,7 +19,7 @@ from pipeline.ground.field_places import (
     footprint_of,
     scale_of_view,
 )
-from pipeline.ground.georeference import class_areas_m2
+from pipeline.ground.georeference import pixel_rows_m2
 from pipeline.ground.map_grid import ground_grid
 from pipeline.ground.view import GroundView, RigPose, pixel_places
 from tests.pipeline.ground.test_view import view
@@ -30,16 +30,21 @@ CLASSES = np.random.default_rng(0).choice(np.array([0, 2, UNLABELLED], np.uint8)
 IFOV = 1e-4
 
 
-def test_before_a_rig_they_are_those_of_the_map_on_the_ground() -> None:
-    """Of a field whose upper rows see the sky; what is of no class counts nothing."""
+def test_before_a_rig_areas_are_sums_of_footprints() -> None:
+    """Of a field whose upper rows see the sky, of the pixels that its map shows; what is of no class counts nothing."""
     grid = ground_grid(view(tilt_deg=2.0), SHAPE)
-    assert areas_by_number(PosedField(grid), CLASSES, 3) == pytest.approx(grid.class_areas_m2(CLASSES, 3), rel=1e-12)
+    points = np.stack(np.meshgrid(*pixel_places(SHAPE), indexing="ij"), axis=-1)
+    near = grid.frame.view.sink(points) > grid.least_sink
+    assert 0 < near.sum() < near.size
+    wanted = [grid.frame.view.area_m2(points[near & (number == CLASSES)]).sum() for number in range(3)]
+    assert areas_by_number(PosedField(grid), CLASSES, 3) == pytest.approx(wanted, rel=1e-12)
 
 
 def test_on_a_georeferenced_picture_they_are_of_the_ellipsoid() -> None:
     """As hectares of classes are, on a grid that is turned."""
     geobox = GeoBox(SHAPE, Affine(4.33, 2.5, 534_257, 2.5, -4.33, 5_772_301), "EPSG:32632")
-    wanted = class_areas_m2(geobox, CLASSES, 3)
+    each = np.stack(list(pixel_rows_m2(geobox)))
+    wanted = [each[number == CLASSES].sum() for number in range(3)]
     assert areas_by_number(PlacedPicture(geobox), CLASSES, 3) == pytest.approx(wanted, rel=1e-9)
 
 

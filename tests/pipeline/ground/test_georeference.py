@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from odc.geo.geobox import GeoBox
 
 from pipeline.geometry.grid import SceneGrid, patch_pixels
-from pipeline.ground.georeference import class_areas_m2, pixel_side_m, zoomed_out
+from pipeline.ground.georeference import pixel_rows_m2, pixel_side_m, zoomed_out
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")
 PLACES = {32632: (8.0, 51.0), 3857: (8.0, 60.0), 3035: (8.0, 51.0), 4326: (8.0, 51.0), 2263: (-74.0, 40.7)}
@@ -39,19 +39,8 @@ def test_areas_are_those_of_the_ellipsoid(epsg: int, step: float) -> None:
     ellipsoid = pyproj.CRS.from_epsg(epsg).get_geod()
     assert ellipsoid is not None
     outline = abs(ellipsoid.polygon_area_perimeter(*places)[0])
-    assert class_areas_m2(geobox, np.zeros((rows, columns), np.uint8), 1)[0] == pytest.approx(outline, rel=1e-5)
+    assert np.sum(list(pixel_rows_m2(geobox))) == pytest.approx(outline, rel=1e-5)
     assert pixel_side_m(geobox) == pytest.approx(np.sqrt(outline / rows / columns), rel=1e-3)
-
-
-@given(st.integers(0, 2**32 - 1))
-def test_classes_fraction_the_ground(seed: int) -> None:
-    """Areas of all classes and of what has none add up, and no class has any of another's."""
-    geobox, rng = box(32632, 0.05, shape=(9, 11)), np.random.default_rng(seed)
-    classes = rng.choice(np.array([0, 1, 2, 255], np.uint8), (9, 11))
-    areas = class_areas_m2(geobox, classes, 3)
-    whole = class_areas_m2(geobox, np.zeros((9, 11), np.uint8), 1)[0]
-    fractions = [np.mean(classes == number) for number in range(3)]
-    np.testing.assert_allclose(areas, np.array(fractions) * whole, rtol=1e-6, atol=1e-12)
 
 
 @given(st.integers(1, 70), st.integers(1, 70), st.sampled_from([1, 2, 4, 8]), st.floats(-180, 180))

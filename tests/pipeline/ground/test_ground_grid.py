@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyproj import Proj
 
-from pipeline.errors import PoseError, ShapeError
+from pipeline.errors import PoseError
 from pipeline.geometry.grid import UNLABELLED
+from pipeline.ground.field_places import PosedField
 from pipeline.ground.map_grid import (
     GroundGrid,
     ground_grid,
@@ -55,22 +56,8 @@ def test_mapped_area_is_the_sum_of_the_pixels_footprints(pose: dict[str, float])
     grid = ground_grid(view(**pose), shape)
     rig, areal_scale = grid.frame.view.pose, Proj(grid.frame.crs).get_factors
     pixel_m2 = grid.geobox.resolution.x**2 / areal_scale(rig.lon_deg, rig.lat_deg).areal_scale
-    (exact,) = grid.class_areas_m2(np.zeros(shape, np.uint8), 1)
+    exact = np.nansum(PosedField(grid).pixel_areas_m2(slice(None), slice(None)))
     assert np.isfinite(whole(grid)[..., 0]).sum() * pixel_m2 == pytest.approx(exact, rel=2e-3)
-
-
-def test_areas_by_class_are_sums_of_footprints():
-    """Of the pixels that the map shows, over more rows than are taken at once; what is of no class counts nothing."""
-    shape = (600, 30)
-    grid = ground_grid(view(tilt_deg=2.0), shape)  # the upper rows see the sky
-    classes = np.random.default_rng(0).choice(np.array([0, 2, UNLABELLED], np.uint8), shape)
-    points = np.stack(np.meshgrid(*pixel_places(shape), indexing="ij"), axis=-1)
-    near = grid.frame.view.sink(points) > grid.least_sink
-    assert 0 < near.sum() < near.size
-    wanted = [grid.frame.view.area_m2(points[near & (classes == number)]).sum() for number in range(3)]
-    assert grid.class_areas_m2(classes, 3) == pytest.approx(wanted, rel=1e-12)
-    with pytest.raises(ShapeError, match=r"scene of \(600, 30\) px .*got \(30, 600\)"):
-        grid.class_areas_m2(classes.T, 3)
 
 
 def test_a_map_pixel_shows_the_scene_pixel_that_sees_it():

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import BudgetError, SettingsError
@@ -15,8 +15,8 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel
 from pipeline.planning.coverage import cheapest_full, coarse_sweeps, full_sweeps
-from pipeline.planning.fine_pass import PatchesPrice, plan_fine, price_of_patches
-from pipeline.planning.prices import check_budget
+from pipeline.planning.fine_pass import plan_fine, runs_showing
+from pipeline.planning.prices import check_budget, count_lines
 from pipeline.planning.swaths import covered_patches
 
 CAMERA, COST = LineCamera(), CostModel()
@@ -29,14 +29,10 @@ def drawn(grid: SceneGrid, seed: int = 0) -> np.ndarray:
 
 
 @settings(max_examples=7, deadline=None)
-@given(
-    st.floats(0, 60), st.floats(0, 60), st.integers(0, 99), st.sampled_from(["x", "y"]), st.none() | st.floats(0.05, 3)
-)
-def test_price_within_budget_and_worth_grows_with_it(
-    one: float, other: float, seed: int, along: str, threshold: float | None
-):
-    """The plan never costs more than the budget, and a bigger budget never buys less score, whatever the threshold."""
-    plan = partial(plan_fine, GRID, CAMERA, COST, along, drawn(GRID, seed), threshold=threshold)
+@given(st.floats(0, 60), st.floats(0, 60), st.integers(0, 99), st.sampled_from(["x", "y"]))
+def test_price_within_budget_and_worth_grows_with_it(one: float, other: float, seed: int, along: str):
+    """The plan never costs more than the budget, and a bigger budget never buys less score."""
+    plan = partial(plan_fine, GRID, CAMERA, COST, along, drawn(GRID, seed))
     small, large = (plan(budget_s=budget_s) for budget_s in sorted((one, other)))
     assert small.seconds <= min(one, other)
     assert large.seconds <= max(one, other)
@@ -93,8 +89,6 @@ def test_wrong_budgets_and_patches_are_refused():
     for bad in (-1.0, np.nan, np.inf):
         with pytest.raises(BudgetError, match="finite number of seconds, 0 or more, got"):
             plan_fine(GRID, CAMERA, COST, "x", drawn(GRID), budget_s=bad)
-        with pytest.raises(BudgetError, match="threshold must be a finite score of 0 or more, got"):
-            plan_fine(GRID, CAMERA, COST, "x", drawn(GRID), budget_s=9.0, threshold=bad)
     wide = SceneGrid(700, 700, 700, 1)
     with pytest.raises(SettingsError, match="patch of 700 px is wider than a line of 640"):
         plan_fine(wide, CAMERA, COST, "x", np.zeros(1), budget_s=1.0)
@@ -115,11 +109,10 @@ def test_planning_a_farm_pays():
 def test_a_patch_alone_costs_its_own_lines():
     """On a strip through the axis lines are not turned: a patch takes its rows, three for the kernel, and one set-up."""
     grid = SceneGrid(100, 150, 16, 4)
-    price = price_of_patches(grid, CAMERA, COST, "x", np.array([24]))
-    assert price.lines == 16 + 3
-    assert price.seconds == pytest.approx(price.lines * 0.1 + COST.setup_seconds(CAMERA) + COST.reload_s)
-    nothing = price_of_patches(grid, CAMERA, COST, "x", np.array([], np.intp))
-    assert (nothing.lines, nothing.seconds) == (0, 0.0)
+    runs = runs_showing(grid, CAMERA, COST, "x", np.array([24]))
+    assert count_lines(runs) == 16 + 3
+    assert COST.seconds(runs, CAMERA) == pytest.approx(19 * 0.1 + COST.setup_seconds(CAMERA) + COST.reload_s)
+    assert runs_showing(grid, CAMERA, COST, "x", np.array([], np.intp)) == []
 
 
 @settings(max_examples=10, deadline=None)
@@ -128,8 +121,8 @@ def test_neighbours_fraction_their_lines(patch_index: set[int]):
     """Patches bought together take at most the lines of each by itself, and no fewer than the dearest of them."""
     grid = SceneGrid(100, 250, 16, 2)  # 8 x 16 patches with the padding; those of the first rows lie on the scene
     valid = [patch_number for patch_number in patch_index if grid.valid_fraction().ravel()[patch_number] > 0]
-    alone = [price_of_patches(grid, CAMERA, COST, "y", np.array([patch_number])).lines for patch_number in valid]
-    together = price_of_patches(grid, CAMERA, COST, "y", np.array(valid, np.intp)).lines
+    alone = [count_lines(runs_showing(grid, CAMERA, COST, "y", np.array([patch_number]))) for patch_number in valid]
+    together = count_lines(runs_showing(grid, CAMERA, COST, "y", np.array(valid, np.intp)))
     assert max(alone, default=0) <= together <= sum(alone)
 
 
@@ -168,7 +161,7 @@ def test_the_full_scan_is_taken_where_runs_are_no_cheaper():
     below = plan_fine(grid, CAMERA, COST, "x", scores, budget_s=full_s - 1e-6)
     assert below.kind == "lines"
     assert below.expected_gain < 8.0
-    assert price_of_patches(grid, CAMERA, COST, "x", np.arange(8)).least[1] == full_s
+    assert COST.seconds(runs_showing(grid, CAMERA, COST, "x", np.arange(8)), CAMERA) > full_s
 
 
 @pytest.mark.parametrize("budget_s", [0.0, 20.0, 40.0, 80.0, 500.0])
@@ -178,14 +171,6 @@ def test_no_plan_takes_longer_than_the_full_scan(budget_s: float):
     assert plan.seconds <= plan.full_seconds
     assert plan.kind == "lines" or plan.seconds == plan.full_seconds
     assert f"{plan.full_seconds:.1f} s" in plan.reason
-
-
-def test_the_cheaper_way_is_taken():
-    """Few patches are cheaper by runs of lines, dear runs by the full scan, where the mirror reaches all of it."""
-    few = price_of_patches(GRID, CAMERA, COST, "x", GRID.valid_patches()[:2])
-    assert few.least == (few.lines, few.seconds)
-    assert PatchesPrice(900, 95.0, 800, 82.0).least == (800, 82.0)
-    assert PatchesPrice(900, 95.0, None, None).least == (900, 95.0)
 
 
 def test_a_margin_shows_the_patches_wherever_the_mirror_looks() -> None:
@@ -200,72 +185,13 @@ def test_a_margin_shows_the_patches_wherever_the_mirror_looks() -> None:
 
 
 @settings(max_examples=5, deadline=None)
-@given(st.floats(0, 4), st.floats(0, 4), st.floats(1, 80), st.integers(0, 99), st.sampled_from(["x", "y"]))
-@example(1.0, 4.0, 46.0, 54, "x")  # the budget pays for the full scan, and at the low threshold the last patches do not
-def test_a_higher_threshold_never_buys_more(one: float, other: float, budget_s: float, seed: int, along: str):
-    """Less worth, within the budget, and each plan shows the threshold's score a second, but for a part of a reload."""
-    scores = drawn(GRID, seed)
-    low, high = (
-        plan_fine(GRID, CAMERA, COST, along, scores, budget_s=budget_s, threshold=limit)
-        for limit in sorted((one, other))
-    )
-    assert high.expected_gain <= low.expected_gain
-    assert max(low.seconds, high.seconds) <= budget_s
-    for plan, limit in ((low, min(one, other)), (high, max(one, other))):
-        assert plan.expected_gain >= limit * (plan.seconds - COST.reload_s) * (1 - 1e-9)
-
-
-@pytest.mark.parametrize("budget_s", [0.0, 7.0, 25.0, 60.0])
-def test_a_threshold_of_0_is_none(budget_s: float):
-    """With scores of 0 and more the plan is the same to the last line."""
-    scores = drawn(GRID)
-    plain, zero = (
-        plan_fine(GRID, CAMERA, COST, "x", scores, budget_s=budget_s, threshold=limit) for limit in (None, 0.0)
-    )
-    assert (zero.sweeps, zero.patch_index.tolist(), zero.expected_gain) == (
-        plain.sweeps,
-        plain.patch_index.tolist(),
-        plain.expected_gain,
-    )
-    assert (plain.threshold, zero.threshold, zero.spared_s) == (None, 0.0, None)
-
-
-def test_a_threshold_leaves_seconds_where_nothing_more_pays():
-    """Two strong places and a faint field: with a threshold between them only the strong ones are shown."""
-    rows, columns = GRID.patch_shape
-    scores = np.full((rows, columns), 0.01)
-    scores[2, 3:8] = scores[5, 20:24] = 2.0
-    plan = plan_fine(GRID, CAMERA, COST, "x", scores.ravel(), budget_s=40.0, threshold=0.5)
-    strong = np.flatnonzero(scores.ravel() > 1)
-    assert set(strong) <= set(plan.patch_index.tolist())
-    assert plan.spared_s == pytest.approx(40.0 - plan.seconds)
-    assert plan.spared_s > 20
-    assert plan.threshold == 0.5
-    all_of_it = plan_fine(GRID, CAMERA, COST, "x", scores.ravel(), budget_s=40.0)
-    assert all_of_it.seconds > plan.seconds + 5
-    assert all_of_it.spared_s is None
-    nothing = plan_fine(GRID, CAMERA, COST, "x", scores.ravel(), budget_s=40.0, threshold=1e3)
-    assert (nothing.sweeps, nothing.expected_gain, nothing.spared_s) == ([], 0.0, 40.0)
-
-
-def test_the_full_scan_has_to_pay_as_well():
-    """It is taken where what it shows beside the runs is worth its seconds, and not where it is not."""
-    grid = SceneGrid(600, 1280, 400, 1)
-    kinds = [
-        plan_fine(grid, CAMERA, COST, "x", np.ones(8), budget_s=500.0, threshold=limit).kind
-        for limit in (0.0, 0.01, 5.0)
-    ]
-    assert kinds == ["full", "full", "lines"]
-
-
-@settings(max_examples=5, deadline=None)
 @given(st.integers(0, 99), st.floats(5, 40))
 def test_negative_scores_ride_along_and_change_nothing(seed: int, budget_s: float):
     """The plan is that of scores of 0 in their place: negative patches are shown by runs made for others alone."""
     scores = drawn(GRID, seed)
     gone = np.random.default_rng(seed).random(len(scores)) < 0.5
     negative, nothing = np.where(gone, -scores, scores), np.where(gone, 0.0, scores)
-    one, other = (plan_fine(GRID, CAMERA, COST, "x", s, budget_s=budget_s, threshold=0.1) for s in (negative, nothing))
+    one, other = (plan_fine(GRID, CAMERA, COST, "x", s, budget_s=budget_s) for s in (negative, nothing))
     assert (one.sweeps, one.expected_gain, one.patch_index.tolist()) == (
         other.sweeps,
         other.expected_gain,
@@ -273,15 +199,3 @@ def test_negative_scores_ride_along_and_change_nothing(seed: int, budget_s: floa
     )
     for sweep in one.sweeps:
         assert nothing[covered_patches(GRID, CAMERA, [sweep])].max() > 0
-
-
-def test_a_threshold_counts_scores_beside_an_infinite_one():
-    """Where a score is +inf the threshold still stands for the finite scores as they were given."""
-    rows, columns = GRID.patch_shape
-    scores = np.full((rows, columns), 0.001)
-    scores[1, 4], scores[5, 10:15] = np.inf, 8.0
-    plan = plan_fine(GRID, CAMERA, COST, "x", scores.ravel(), budget_s=40.0, threshold=1.0)
-    assert {columns + 4, *(5 * columns + np.arange(10, 15)).tolist()} <= set(plan.patch_index.tolist())
-    assert plan.spared_s is not None
-    few = plan_fine(GRID, CAMERA, COST, "x", scores.ravel(), budget_s=40.0, threshold=12.0)
-    assert columns + 4 in few.patch_index
