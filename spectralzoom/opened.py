@@ -87,8 +87,9 @@ class NoRunError(ArchiveError, KeyError):
 class OpenedRun:
     """One published run. Arrays are read when they are used; see `OpenedArchive` for how to come by one.
 
-    What lies on the scene's own grid (class map, confidence, mosaic, class probabilities) has the scene's CRS where it had one, and
-    directions seen from the rig [rad] where it had none. A run with a ``[pose]`` has a ``ground_map`` besides.
+    What lies on the scene's own grid (class map, confidence, mosaic, class probabilities) has the scene's CRS where it
+    had one, and directions seen from the rig [rad] where it had none. A run with a ``[pose]`` has a ``ground_map``
+    besides.
     """
 
     def __init__(self, archive: Archive, folder: Path) -> None:

@@ -24,11 +24,13 @@ from flows.terminal.figures import (
 
 SHOWN_FRACTION = 0.10  # of the patches, or the nearest one tried: what is shown where one share has to do
 CAPTION = (
-    "K: fraction of the valid patches, each free of the others. mIoU over the counts of all frames, mean over the classes "
-    "of the labels; overall: fraction of pixels that are right; ± the spread of seeds, else of random draws. [ ] 95 % of "
+    "K: fraction of the valid patches, each free of the others. mIoU over the counts of all frames, mean over the "
+    "classes "
+    "of the labels; overall: fraction of pixels that are right; ± the spread of seeds, else of random draws. [ ] 95 "
+    "% of "
     "{draws} draws: paired bootstrap over frames, and over seeds where there are several. * uses labels. captured: the "
-    "chosen patches' fraction of the gain of the oracle's. Data before compression; multiply-adds in closed form; seconds "
-    "by the cost model, coarse pass included, by runs of lines or the full scan where that is cheaper."
+    "chosen patches' fraction of the gain of the oracle's. Data before compression; multiply-adds in closed form; "
+    "seconds by the cost model, coarse pass included, by runs of lines or the full scan where that is cheaper."
 )
 
 

@@ -133,8 +133,8 @@ def render_report(
 ) -> str:
     """The page as text, ``pictures`` below the quicklook; the same receipt, pictures and map give the same bytes.
 
-    ``captured_again`` is the fraction of the field captured in detail, 0..1, for the first sentence; None leaves it out.
-    ``field`` is the map to move in, above all pictures; None leaves it out, with all scripts.
+    ``captured_again`` is the fraction of the field captured in detail, 0..1, for the first sentence; None leaves it
+    out. ``field`` is the map to move in, above all pictures; None leaves it out, with all scripts.
     """
     shown = [Picture(quicklook_png, "The survey at a glance."), *pictures]
     split: Mapping[str, Any] = receipt["savings"]["multiply_adds"]

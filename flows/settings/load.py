@@ -327,8 +327,8 @@ def _contradictions(given: set[str], origin: Mapping[str, str]) -> Iterator[str]
     passes = [place_of(key, origin.get(key)) for key in OF_TWO_PASSES if key in given and key not in chosen]
     if plain and passes:
         yield (
-            f"{plain[0]} asks for one uniform scan of the field, and {passes[0]} is for a survey that captures again; leave "
-            "one of them out"
+            f"{plain[0]} asks for one uniform scan of the field, and {passes[0]} is for a survey that captures "
+            "again; leave one of them out"
         )
     by_hand = [place_of(key, origin.get(key)) for key in ("scan_step", "scan_exposure_ms", "scan") if key in given]
     if by_hand and given & {"seconds", "bytes_raw", "goal"}:
@@ -451,8 +451,8 @@ def _sparing_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[s
     given = [place_of(name, origin.get(name)) for name in SPARING if getattr(settings, name) is not None]
     if given and not settings.plain:
         yield (
-            f"{given[0]} is for a raster or a uniform scan, of which a part is kept and read in detail: give --seconds or"
-            " --scan-step too; what a survey in two passes looks at in detail, its --budget says"
+            f"{given[0]} is for a raster or a uniform scan, of which a part is kept and read in detail: give "
+            "--seconds or --scan-step too; what a survey in two passes looks at in detail, its --budget says"
         )
     if given and settings.extent != EXTENT_WHOLE:
         place = place_of("extent", origin.get("extent"))

@@ -142,13 +142,13 @@ class Settings:
     )
     extent: Extent = stated(
         "whole",
-        "What a uniform scan looks at: whole (the field), part (with --seconds, of a field that is remembered: the lines "
-        "that promise most there), or lines by hand, as a receipt tells them: 0:12-310,1:0-40",
+        "What a uniform scan looks at: whole (the field), part (with --seconds, of a field that is remembered: the "
+        "lines that promise most there), or lines by hand, as a receipt tells them: 0:12-310,1:0-40",
     )
     max_age: Refresh | None = stated(
         None,
-        "With --extent part: how old what is remembered of any place may become, such as 14d or 36h; what would be older "
-        "is looked at before all else",
+        "With --extent part: how old what is remembered of any place may become, such as 14d or 36h; what would be "
+        "older is looked at before all else",
         "d",
         example="14d",
     )
@@ -204,8 +204,8 @@ class Settings:
     )
     seconds: float | None = stated(
         None,
-        "One uniform scan in the place of two passes: of those that end in so many of the camera's seconds, the one whose"
-        " map is likely to score most by the weights' record",
+        "One uniform scan in the place of two passes: of those that end in so many of the camera's seconds, the one "
+        "whose map is likely to score most by the weights' record",
         "s",
         0.1,
         1e6,
@@ -215,7 +215,8 @@ class Settings:
     bytes_raw: Bytes | None = stated(None, "The same with no more raw data than this", example="2GiB", why=INSTEAD)
     goal: Goal | None = stated(
         None,
-        "One uniform scan: the cheapest whose map is likely to have this mIoU in percent, or IoU of classes: 92,weed=70",
+        "One uniform scan: the cheapest whose map is likely to have this mIoU in percent, or IoU of classes: "
+        "92,weed=70",
         example="92",
         why=INSTEAD,
     )

@@ -97,8 +97,8 @@ def parse_compute(value: object) -> str:
     if percent is None and (number is None or not number >= 1):
         hint = f"; for {100 * number:g} % write {100 * number:g}%" if number is not None and 0 < number < 1 else ""
         raise BudgetError(
-            "must be a fraction of the multiply-adds of reading everything, above 0% and at most 100%, such as 25%, or a "
-            f"number of them such as 4e9; got {value!r}{hint}"
+            "must be a fraction of the multiply-adds of reading everything, above 0% and at most 100%, such as 25%, "
+            f"or a number of them such as 4e9; got {value!r}{hint}"
         )
     return percent or f"{number!r}"
 
@@ -109,8 +109,8 @@ def parse_bytes_kept(value: object) -> str:
         return _parse_percent(value) or str(parse_bytes(value))
     except ValueError:
         raise BudgetError(
-            "must be a fraction of the bytes of keeping everything, above 0% and at most 100%, such as 40%, or bytes with "
-            f"a unit such as 500MB; got {value!r}"
+            "must be a fraction of the bytes of keeping everything, above 0% and at most 100%, such as 40%, or "
+            f"bytes with a unit such as 500MB; got {value!r}"
         ) from None
 
 
@@ -351,7 +351,8 @@ def parse_expected_error(value: object) -> float:
     fraction = _amount(value, {"%": 0.01, "": 1.0})
     if fraction is None or not LEAST_EXPECTED_ERROR <= fraction <= MOST_EXPECTED_ERROR:
         raise ValueError(
-            f"must be {LEAST_EXPECTED_ERROR:.1%} to {MOST_EXPECTED_ERROR:.0%} of what is remembered, such as 2%; got {value!r}"
+            f"must be {LEAST_EXPECTED_ERROR:.1%} to {MOST_EXPECTED_ERROR:.0%} of what is remembered, such as 2%; got "
+            f"{value!r}"
         )
     return fraction
 

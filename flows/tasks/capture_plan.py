@@ -89,9 +89,9 @@ class PassLayout:
     def plan(self, budget: float | None) -> CapturePlan:
         """Lay out coarse and full sweeps; where the mirror may look beside the plan, with overlaps and margins.
 
-        ``budget`` is the fraction of the full scan's seconds that two passes may take, None of a uniform scan. Either pass
-        overlaps by what its own registration needs. Its map lies as the sweep that is held does, which another may lie
-        beside by twice the mirror's error: so much earlier sweeps begin, and later they end. Raises as `sweeps`;
+        ``budget`` is the fraction of the full scan's seconds that two passes may take, None of a uniform scan. Either
+        pass overlaps by what its own registration needs. Its map lies as the sweep that is held does, which another may
+        lie beside by twice the mirror's error: so much earlier sweeps begin, and later they end. Raises as `sweeps`;
         BudgetError: the budget does not pay for the coarse pass.
         """
         along, coarse, full = self.sweeps()

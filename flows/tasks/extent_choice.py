@@ -87,15 +87,15 @@ def choose_extent(
     """Choose the lines that a visit takes of a field that is remembered, in so many seconds; say why.
 
     Gives the layout of these lines, the choice, and a sentence. Patches that would be older than ``max_age`` days come
-    first. Raises NothingToMend: less than ``skip_below_error`` of what is remembered is expected to be wrong, and nothing is due;
-    WeightsError: the weights have no record of scans; BudgetError: no line of any scan ends in time, with the least
-    that does; PoseError: the field is beyond the mirror's range.
+    first. Raises NothingToMend: less than ``skip_below_error`` of what is remembered is expected to be wrong, and
+    nothing is due; WeightsError: the weights have no record of scans; BudgetError: no line of any scan ends in time,
+    with the least that does; PoseError: the field is beyond the mirror's range.
     """
     content, grid = weights.record.get("scans"), layout.grid
     if content is None:
         raise WeightsError(
-            f"the weights {path.name} have no record of uniform scans, by which a part of a field is chosen: leave --extent"
-            " out, or train weights with --min-exposure-ms 3, some scenes kept for validation"
+            f"the weights {path.name} have no record of uniform scans, by which a part of a field is chosen: leave "
+            "--extent out, or train weights with --min-exposure-ms 3, some scenes kept for validation"
         )
     there = grid.valid_fraction().ravel() > 0 if layout.shown is None else layout.shown
     swaths, classes = _swaths(prior, grid, weights, path), len(weights.class_names)
@@ -109,8 +109,8 @@ def choose_extent(
     if skip_below_error is not None and expected_errors.expected_wrong() < skip_below_error and not wanted.due.any():
         raise NothingToMend(
             prior.run,
-            f"nothing is looked at: {expected_errors.expected_wrong():.1%} of what is remembered is expected to be wrong, and a "
-            f"look is asked for from {skip_below_error:.1%} on; the map of {prior.run} stands",
+            f"nothing is looked at: {expected_errors.expected_wrong():.1%} of what is remembered is expected to be "
+            f"wrong, and a look is asked for from {skip_below_error:.1%} on; the map of {prior.run} stands",
         )
     free = replace(layout, recorded=None)
     step, exposure_ms, extent = _best_extent(free, wanted, seconds)

@@ -93,8 +93,8 @@ def write_mosaic(
     """Rectify and blend sweeps into a stored mosaic; return how. Whoever makes the tiles, the same bytes come out.
 
     Fewer tiles are made at a time where ``memory`` [bytes] of this process and those that it starts, not of workers
-    elsewhere, holds fewer. Raises SettingsError: not even one tile fits the memory, or the worker pool cannot work here.
-    WorkerError: processes that made tiles were lost.
+    elsewhere, holds fewer. Raises SettingsError: not even one tile fits the memory, or the worker pool cannot work
+    here. WorkerError: processes that made tiles were lost.
     """
     work = opened_work(recipe.open)
     tiles = plan_tiles(work.placed, work.camera, work.grid, writer.tile_shape)

@@ -25,8 +25,8 @@ DIGITS = 2  # of the least fraction that a refusal names
 class PatchBudget:
     """What may be spent on patches, and which there are to spend it on.
 
-    Shares are of reading every one of ``patch_index`` and choosing none, and of the bytes of all their pixels with the coarse
-    means of the field. A memory that the map goes on from is weighed whatever is seen, and counts for neither.
+    Shares are of reading every one of ``patch_index`` and choosing none, and of the bytes of all their pixels with the
+    coarse means of the field. A memory that the map goes on from is weighed whatever is seen, and counts for neither.
     """
 
     costs: ReadingCosts

@@ -41,8 +41,8 @@ class ReadingCosts:
     def with_scores(self, patch_index: NDArray[np.integer], policy: str) -> MultiplyAdds:
         """Count the same and what the policy takes to score all patches.
 
-        Stages keep nothing of the model for each other, so that each reads the coarse pass anew: ``coarse_prediction`` holds what
-        map and scores took for it.
+        Stages keep nothing of the model for each other, so that each reads the coarse pass anew: ``coarse_prediction``
+        holds what map and scores took for it.
         """
         drawn = self.of_map(patch_index)
         scan_passes = 2 if policy in GLANCING_POLICIES else 1

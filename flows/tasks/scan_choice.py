@@ -74,8 +74,8 @@ def choose_uniform_scan(
         if layout.step is None and plain:
             raise WeightsError(
                 f"the weights {file} have no record of uniform scans, by which one would be chosen: give the scan "
-                "with --scan-step and --scan-exposure-ms, or train weights with --min-exposure-ms 3, some scenes kept for"
-                " validation"
+                "with --scan-step and --scan-exposure-ms, or train weights with --min-exposure-ms 3, some scenes "
+                "kept for validation"
             )
         return ScanChoice()
     record = ScanPerformance.read(content)

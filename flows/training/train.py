@@ -248,8 +248,8 @@ def _check_counts(request: TrainRequest) -> None:
             raise SettingsError(f"{name} must be 0 or more, got {number}")
     if not 0 < settings.darkest_ms <= REFERENCE_MS:
         raise SettingsError(
-            f"--min-exposure-ms must be above 0 and at most {REFERENCE_MS:g}, the exposure that scenes are looked at with,"
-            f" got {settings.darkest_ms}"
+            f"--min-exposure-ms must be above 0 and at most {REFERENCE_MS:g}, the exposure that scenes are looked at "
+            f"with, got {settings.darkest_ms}"
         )
 
 

@@ -67,8 +67,8 @@ def train_temporal(request: TemporalRequest, report: Report = lambda what, done,
     """
     if request.dataset not in FARM_NAMES:
         raise SettingsError(
-            f"--train-temporal trains on one land at several days, which only the built-in farm gives: expected farm, got"
-            f" {request.dataset}; without a reader surveys go on from a memory by the surer of two looks"
+            "--train-temporal trains on one land at several days, which only the built-in farm gives: expected "
+            f"farm, got {request.dataset}; without a reader surveys go on from a memory by the surer of two looks"
         )
     if not request.out.parent.is_dir() or request.out.is_dir():
         raise SettingsError(f"-o {request.out}: expected the name of a file in a folder that exists")

@@ -1,8 +1,8 @@
 """Parts of the networks: codes of places, the transformer over tokens, and a patch's pixels down to them and back.
 
 In the transformer coarse tokens read each other and fine tokens read both; nothing flows from fine to coarse. So what a
-coarse pass says is computed once: the coarse prediction keeps the keys and values of its tokens, and a second pass pays for its
-own tokens only, however often places are added.
+coarse pass says is computed once: the coarse prediction keeps the keys and values of its tokens, and a second pass pays
+for its own tokens only, however often places are added.
 """
 
 from __future__ import annotations

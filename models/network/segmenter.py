@@ -67,8 +67,9 @@ class Segmenter(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Logits of the coarse image (B, classes, H/s, W/s) and of the fine patches (B, K, classes, p, p).
 
-        ``coarse`` (B, J, H/s, W/s) and ``fine`` (B, K, J, p, p) are normalised columns, ``patch_index`` (B, K) int64 patch
-        numbers, unique within a scene, ``origin`` (B, 2) patch units added to the places, for crops of larger scenes.
+        ``coarse`` (B, J, H/s, W/s) and ``fine`` (B, K, J, p, p) are normalised columns, ``patch_index`` (B, K) int64
+        patch numbers, unique within a scene, ``origin`` (B, 2) patch units added to the places, for crops of larger
+        scenes.
         """
         reading = self.read_coarse(coarse, origin)
         return reading.logits, self.read_fine(reading, fine, patch_index, origin)
@@ -137,8 +138,8 @@ class Segmenter(nn.Module):
     ) -> Iterator[Tensor]:
         """Logits of fine patches of one scene, (some, classes, p, p) at a time.
 
-        ``patches`` are (K, p, p, J), in which what is not finite counts as 0, the median; ``patch_index`` (K,) their int64
-        numbers.
+        ``patches`` are (K, p, p, J), in which what is not finite counts as 0, the median; ``patch_index`` (K,) their
+        int64 numbers.
         """
         if not len(patches):
             return

@@ -48,11 +48,11 @@ class TemporalReader(nn.Module):
     ) -> Tensor:
         """Give log-probabilities (B, class, y, x).
 
-        ``prior_map`` and ``observation`` are such; ``seen`` (B, 1, y, x) is 1 where there was a look today, ``age`` (B, 1,
-        y, x) days since the memory's last look there, ``rests_on`` (B, 1, y, x) the light that the memory was made by,
-        in reference exposures a pixel. ``light`` (B,) is today's exposure as a fraction of the reference, ``step`` (B,)
-        pixels between its lines. The coarse passes are normalised columns (B, J, y / s, x / s),
-        ``comparable`` (B, 1, y / s, x / s) is 1 where they may be compared.
+        ``prior_map`` and ``observation`` are such; ``seen`` (B, 1, y, x) is 1 where there was a look today, ``age`` (B,
+        1, y, x) days since the memory's last look there, ``rests_on`` (B, 1, y, x) the light that the memory was made
+        by, in reference exposures a pixel. ``light`` (B,) is today's exposure as a fraction of the reference, ``step``
+        (B,) pixels between its lines. The coarse passes are normalised columns (B, J, y / s, x / s), ``comparable`` (B,
+        1, y / s, x / s) is 1 where they may be compared.
         """
         size = prior_map.shape[-2:]
         change = (coarse_now - coarse_before) * comparable

@@ -26,9 +26,9 @@ def score_patches(
 ) -> Scores:
     """Score every patch of the padded grid, (patches,) float64; a patch counts by the fraction of it that lies on the scene.
 
-    ``policy`` is one of `POLICIES`: what the weights expect a look to gain (``gain``); by the coarse prediction's classes
-    ``entropy``; by the coarse image ``sobel`` edges (the paper's ED); ``random``, by ``seed``; ``mask``: a given (y, x)
-    image of the scene's size (the paper's fixed attention policy), in which NaN counts as 0.
+    ``policy`` is one of `POLICIES`: what the weights expect a look to gain (``gain``); by the coarse prediction's
+    classes ``entropy``; by the coarse image ``sobel`` edges (the paper's ED); ``random``, by ``seed``; ``mask``: a
+    given (y, x) image of the scene's size (the paper's fixed attention policy), in which NaN counts as 0.
 
     Raises SettingsError for an unknown policy, or ``mask`` without a mask; ShapeError for a mask of another size than
     the scene's.

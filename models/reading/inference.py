@@ -170,10 +170,10 @@ def segment(
 ) -> DrawnMap:
     """Draw the class map from the coarse pass and the fine patches, of the scene's own size.
 
-    ``patches`` (patch, p, p, column) are normalised columns of the fine pass. A dead pixel (see `dead_pixels`) counts as
-    the mean of its patch; a patch of which more than half is dead counts as not captured. ``patch_index`` (patch,) are their
-    numbers on the grid, each once; without one the map is the coarse prediction brought up to the fine grid. With ``every_class``
-    the map holds the log-probabilities of all classes too.
+    ``patches`` (patch, p, p, column) are normalised columns of the fine pass. A dead pixel (see `dead_pixels`) counts
+    as the mean of its patch; a patch of which more than half is dead counts as not captured. ``patch_index`` (patch,)
+    are their numbers on the grid, each once; without one the map is the coarse prediction brought up to the fine grid.
+    With ``every_class`` the map holds the log-probabilities of all classes too.
 
     Raises ShapeError for a patch given twice or outside the grid.
     """

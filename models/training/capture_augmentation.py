@@ -24,8 +24,8 @@ Columns = NDArray[np.float32]  # (y, x, column)
 class ColumnNoise:
     """Covariance of what one reading adds to columns, in squares of scene values.
 
-    At the fraction ``light`` of the reference exposure a pixel of spectrum v has the covariance shot(v) / light + read /
-    light^2: electrons grow with the exposure, the readings' noise does not. The mean of n samples, each read for
+    At the fraction ``light`` of the reference exposure a pixel of spectrum v has the covariance shot(v) / light + read
+    / light^2: electrons grow with the exposure, the readings' noise does not. The mean of n samples, each read for
     itself, has a n-th of both.
     """
 

@@ -1,9 +1,9 @@
 """What a training step asks for: patches drawn, the map with them and without, and what the scorer said of them.
 
-A crop is read twice: with no fine patch, and with a fraction of the patches drawn from ``FRACTIONS``. What the loss falls by at
-a captured patch is what the scorer learns to tell; a patch without a label tells it nothing. Three phases follow each
-other: patches are placed at random and by the entropy of the first reading; then also by the scorer; then in larger
-crops, of which fewer make a batch, as far as the scenes have larger ones.
+A crop is read twice: with no fine patch, and with a fraction of the patches drawn from ``FRACTIONS``. What the loss
+falls by at a captured patch is what the scorer learns to tell; a patch without a label tells it nothing. Three phases
+follow each other: patches are placed at random and by the entropy of the first reading; then also by the scorer; then
+in larger crops, of which fewer make a batch, as far as the scenes have larger ones.
 """
 
 from __future__ import annotations
@@ -96,7 +96,8 @@ def draw_patches(
 ) -> Tensor:
     """Draw how many patches and which: (B, K) distinct patch numbers. By entropy or gain they are placed with some chance.
 
-    ``coarse_prediction`` are logits of the coarse pixels (B, classes, H/s, W/s), ``score`` the gain of the patches (B, patches).
+    ``coarse_prediction`` are logits of the coarse pixels (B, classes, H/s, W/s), ``score`` the gain of the patches (B,
+    patches).
     """
     fractions, odds = zip(*FRACTIONS, strict=True)
     count = max(1, round(float(rng.choice(fractions, p=odds)) * score.shape[1]))
@@ -138,8 +139,8 @@ def map_loss(logits: Tensor, losses: Tensor, labels: Tensor, weight: Tensor, *, 
 def scoring_loss(score: Tensor, gain: Tensor, known: Tensor | None = None) -> Tensor:
     """How far scores of patches are from what these gained, in size and in order, (B, K) and (B, K); gains are clipped.
 
-    Huber's loss and, with a fifth of its weight, the pairs of a scene that stand in the wrong order. Patches that are not
-    ``known`` (B, K), which nothing is labelled in, have no say; 0, with a gradient of 0, where none is known.
+    Huber's loss and, with a fifth of its weight, the pairs of a scene that stand in the wrong order. Patches that are
+    not ``known`` (B, K), which nothing is labelled in, have no say; 0, with a gradient of 0, where none is known.
     """
     known_gain = torch.ones_like(score, dtype=torch.bool) if known is None else known
     if not known_gain.any():

@@ -1,8 +1,8 @@
 """Training of a reader of memories: visits to one land in a row, each weighed against what those before left.
 
-A memory is what the reader itself made of earlier visits, so that training sees what surveys will give it: class probabilities that
-were brought forward several times. Some visits see a part of the land alone; some memories are of another land, or lie
-beside it, and have to be seen through.
+A memory is what the reader itself made of earlier visits, so that training sees what surveys will give it: class
+probabilities that were brought forward several times. Some visits see a part of the land alone; some memories are of
+another land, or lie beside it, and have to be seen through.
 """
 
 from __future__ import annotations

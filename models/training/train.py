@@ -227,8 +227,9 @@ def train(
 ) -> tuple[Segmenter, dict[str, float | int]]:
     """Train a segmenter of these sizes; give its averaged weights and a summary (steps, last loss, seconds).
 
-    The same settings and examples start from the same weights and draw the same crops and patches. What follows is equal
-    to rounding only: sums differ in their last bit with where memory lies, and ``minutes`` may end the run elsewhere.
+    The same settings and examples start from the same weights and draw the same crops and patches. What follows is
+    equal to rounding only: sums differ in their last bit with where memory lies, and ``minutes`` may end the run
+    elsewhere.
 
     ``start``: Named tensors that the network begins with; others are drawn. ``checkpoint``: File that the state is kept
     in; a killed run of the same settings and examples goes on from it. ``device``: where it computes, by

@@ -193,8 +193,8 @@ def load_reader(weights: Path) -> TemporalReader:
     described = describe_weights(weights)
     if described.reader is None:
         raise WeightsError(
-            f"{weights} has no reader of prior maps; train one with: spectralzoom train DATASET --train-temporal {weights}"
-            f" -o {weights}"
+            f"{weights} has no reader of prior maps; train one with: spectralzoom train DATASET --train-temporal "
+            f"{weights} -o {weights}"
         )
     tensors = _read_part(weights, described, READER)
     with torch.device("meta"):

@@ -19,8 +19,8 @@ class SceneGrid:
     """A scene of ``height`` x ``width`` px cut into patches of ``patch`` px, coarse pixels of ``factor`` px.
 
     The padded grid is the smallest multiple of ``patch * factor`` that holds the scene, so that a coarse patch
-    (``patch`` coarse pixels a side) covers ``factor`` x ``factor`` whole patches. Patches are numbered row by row over the
-    padded grid; those without a valid pixel are never bought.
+    (``patch`` coarse pixels a side) covers ``factor`` x ``factor`` whole patches. Patches are numbered row by row over
+    the padded grid; those without a valid pixel are never bought.
     """
 
     height: int

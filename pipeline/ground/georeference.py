@@ -68,7 +68,8 @@ def pixel_side_m(geobox: GeoBox) -> float:
 def pixel_rows_m2(geobox: GeoBox) -> Iterator[Floats]:
     """Ground under the pixels of each row, (x,) [m2], from the first row down: of the ellipsoid, at any scale of a map.
 
-    A projection's scale is asked for at `TIE_POINTS` places along each side, and linear between: off by 2e-5 in a UTM zone.
+    A projection's scale is asked for at `TIE_POINTS` places along each side, and linear between: off by 2e-5 in a UTM
+    zone.
     """
     rows, columns = geobox.shape
     tie_points_y, tie_points_x = np.linspace(0, rows, TIE_POINTS), np.linspace(0, columns, TIE_POINTS)

@@ -29,11 +29,11 @@ MOST_FLOAT = float(np.finfo(np.float64).max)
 class FinePlan:
     """Sweeps of the fine pass, the valid patches they show, and the price.
 
-    ``expected_gain`` is the score that was bought. Patches that a sweep shows besides are in ``patch_index``; what they add may not be
-    in ``expected_gain``. ``kind`` says whether the sweeps are runs of lines, whose patches lie wholly in one of them, or those of
-    the full scan, taken because it is cheaper or as cheap; with "scan" a uniform scan has shown every patch
-    already, with "raster" all pixels were there; ``reason`` says so in a sentence. ``expected_gain`` and
-    ``wanted_gain`` are in a larger unit where a score is infinite, or the sum of all would be beyond float64.
+    ``expected_gain`` is the score that was bought. Patches that a sweep shows besides are in ``patch_index``; what they
+    add may not be in ``expected_gain``. ``kind`` says whether the sweeps are runs of lines, whose patches lie wholly in
+    one of them, or those of the full scan, taken because it is cheaper or as cheap; with "scan" a uniform scan has
+    shown every patch already, with "raster" all pixels were there; ``reason`` says so in a sentence. ``expected_gain``
+    and ``wanted_gain`` are in a larger unit where a score is infinite, or the sum of all would be beyond float64.
     """
 
     sweeps: list[Sweep]
@@ -72,9 +72,9 @@ def plan_fine(
     """Choose the line runs that show the most score for at most ``budget_s`` seconds.
 
     Each run lies at a strip offset of its own. The price counts lines, a set-up for each run and reloads of the vector
-    memory, and never exceeds the budget; with the same scores a bigger budget never has less ``expected_gain``. Where no runs
-    that take less than the full scan show all that is worth something and the budget pays for the full scan, its sweeps
-    are the plan, and show every patch.
+    memory, and never exceeds the budget; with the same scores a bigger budget never has less ``expected_gain``. Where
+    no runs that take less than the full scan show all that is worth something and the budget pays for the full scan,
+    its sweeps are the plan, and show every patch.
 
     Parameters
     ----------
@@ -150,8 +150,8 @@ def _field(
     if np.any(expected_gain > 0) and not len(views.patch_number):
         first = int(np.flatnonzero(expected_gain > 0)[0])
         raise PoseError(
-            f"none of the {np.count_nonzero(expected_gain > 0)} patches worth something (the first is {first}) is shown by a "
-            f"line within the mirror's range; use a smaller scene or a smaller angle per pixel"
+            f"none of the {np.count_nonzero(expected_gain > 0)} patches worth something (the first is {first}) is "
+            f"shown by a line within the mirror's range; use a smaller scene or a smaller angle per pixel"
         )
     row, column = np.divmod(np.arange(len(expected_gain)), grid.patch_shape[1])
     return Field(views, expected_gain, column if along == "x" else row, prices_of(camera, cost))
@@ -203,7 +203,7 @@ def runs_showing(
     missed = np.setdiff1d(np.flatnonzero(expected_gain), field.views.patch_number)
     if len(missed):
         raise PoseError(
-            f"patch {missed[0]} and {len(missed) - 1} more of {np.count_nonzero(expected_gain)} are shown by no line within "
-            f"the mirror's range; leave them out"
+            f"patch {missed[0]} and {len(missed) - 1} more of {np.count_nonzero(expected_gain)} are shown by no line "
+            f"within the mirror's range; leave them out"
         )
     return _sweeps(field, cheapest_cover(field))

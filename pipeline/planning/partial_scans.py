@@ -1,9 +1,9 @@
 """Looks at a part of a field: which lines of a scan are worth their seconds, where a field is known already.
 
-The patches of a field lie in rows along the lines of the sweeps that show them. A look takes one run of lines of a sweep,
-or none of it. At a price of a second each sweep has a best run, in closed form (the largest sum of neighbours); the
-lowest price at which all of them together end in time is searched for. What that leaves of the seconds one sweep gets:
-where rows are worth about the same, no price divides them.
+The patches of a field lie in rows along the lines of the sweeps that show them. A look takes one run of lines of a
+sweep, or none of it. At a price of a second each sweep has a best run, in closed form (the largest sum of neighbours);
+the lowest price at which all of them together end in time is searched for. What that leaves of the seconds one sweep
+gets: where rows are worth about the same, no price divides them.
 """
 
 from __future__ import annotations

@@ -17,8 +17,8 @@ def select_patches(score: Scores, count: int, valid: NDArray[np.bool_] | None = 
     """Return the ``count`` valid patches with the highest ``score``, (patch,) of any float type, best first.
 
     Equal scores go to the lowest number; +inf comes first, NaN and -inf last. The choice is nested: the first K of a
-    larger choice are the choice of K. When no valid patch has a score to rank (all NaN or -inf), patches are spread evenly
-    over the valid ones, nested too.
+    larger choice are the choice of K. When no valid patch has a score to rank (all NaN or -inf), patches are spread
+    evenly over the valid ones, nested too.
 
     Raises BudgetError: ``count`` is not a whole number, below 0, or above the number of valid patches.
     """

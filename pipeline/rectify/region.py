@@ -122,8 +122,8 @@ def read_every_patch(
 ) -> Iterator[tuple[Values, NDArray[np.bool_]]]:
     """Rectify the whole scene into patches, a row of patches at a time, or a column where lines lie along y.
 
-    Yields what :func:`read_patches` gives for these patches, whose numbers ascend, or go down the columns; with tables of
-    the scene's pixels (:func:`place`) within their bound. Raw lines are kept for the next row, up to ``most_bytes``.
+    Yields what :func:`read_patches` gives for these patches, whose numbers ascend, or go down the columns; with tables
+    of the scene's pixels (:func:`place`) within their bound. Raw lines are kept for the next row, up to ``most_bytes``.
     """
     pixels, p, shape = PixelGrid.of_scene(grid, 1), grid.patch, (grid.height, grid.width)
     firsts = [np.arange(0, size, p)[:, None] for size in shape]
@@ -154,10 +154,11 @@ def read_patches(
 ) -> tuple[Values, NDArray[np.bool_]]:
     """Rectify whole patches from the sweeps that saw them: placed with :func:`place`, or lines to be placed now.
 
-    Best in the order in which the sweeps pass the patches: neighbours share what is read and calibrated. ``cache`` holds
-    raw lines that earlier calls read; None reads what is needed, once.
+    Best in the order in which the sweeps pass the patches: neighbours share what is read and calibrated. ``cache``
+    holds raw lines that earlier calls read; None reads what is needed, once.
 
-    (patch, p, p, band) float32, NaN where no line reached, and (patch, p, p) pixels that lie on the scene and were seen.
+    (patch, p, p, band) float32, NaN where no line reached, and (patch, p, p) pixels that lie on the scene and were
+    seen.
     """
     placed = [one if isinstance(one, Placed) else place(one, camera) for one in sweeps]
     points, on_scene = patch_pixels(grid, patch_index)

@@ -134,8 +134,8 @@ def reflectance(raw: NDArray[np.uint16], references: References, *, position: Ar
 
     ``raw`` is (line, sample, band) uint16 DN; ``position`` (line, 2) mirror X and Y, needed where the references say
     ``by_mirror``: a line whose position is not finite becomes NaN there. (line, sample, band) float32 in the unit of
-    the white reference's values, negative below dark; NaN where the white frame is not above the dark one, a reference is not
-    finite, or a bad element is not filled.
+    the white reference's values, negative below dark; NaN where the white frame is not above the dark one, a reference
+    is not finite, or a bad element is not filled.
 
     Raises ShapeError: the references or the positions do not fit the lines.
     Raises PoseError: positions are needed and missing, or one lies beyond the mirror's rim.

@@ -53,7 +53,8 @@ class Signal:
             return judge_elements(plain)
         if self.gain.shape != plain.white_reference.shape:
             raise ShapeError(
-                f"sweep {self.lines.sweep.name} has {len(plain.white_reference)} bands, its gain has shape {self.gain.shape}"
+                f"sweep {self.lines.sweep.name} has {len(plain.white_reference)} bands, its gain has shape "
+                f"{self.gain.shape}"
             )
         return judge_elements(replace(plain, white_reference=(plain.white_reference * self.gain).astype(np.float32)))
 

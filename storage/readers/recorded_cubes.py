@@ -142,9 +142,10 @@ def find_references(
 ) -> References:
     """Return the reference frames of a cube whose companions are called ``stem.dark.hdr`` and the like.
 
-    ``stated`` files come first, then those of the cube's name, then the folder's only dark and white frame. ``white_reference``
-    is the value of the white reference, one or (band,), where nothing else says it; ``at_rest`` says that the white
-    frame was taken with the mirror at rest. Raises SceneError: a frame has other samples or bands than the cube.
+    ``stated`` files come first, then those of the cube's name, then the folder's only dark and white frame.
+    ``white_reference`` is the value of the white reference, one or (band,), where nothing else says it; ``at_rest``
+    says that the white frame was taken with the mirror at rest. Raises SceneError: a frame has other samples or bands
+    than the cube.
     """
     name, frame = stem.name, source.shape[1:]
     white_dn = camera.full_scale_dn * max(camera.samples // frame[0], 1)

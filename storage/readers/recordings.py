@@ -11,8 +11,8 @@
 Beside a cube ``NAME`` of files are found, where no flag names them: ``NAME.pointing.csv`` (.parquet, .toml),
 ``NAME.dark.hdr``, ``NAME.white.hdr``, ``NAME.bad.hdr``, ``NAME.flat.hdr``, or ``dark*.hdr`` and ``white*.hdr`` for all
 cubes of the folder. The header of an ENVI cube may say ``line axis = y``: lines lie along y of the field, and the scan
-goes along x. The header of a white frame may say ``white_reference = {...}``, the value of the white reference per band,
-and ``mirror at rest = 1`` where it was taken so.
+goes along x. The header of a white frame may say ``white_reference = {...}``, the value of the white reference per
+band, and ``mirror at rest = 1`` where it was taken so.
 """
 
 from __future__ import annotations

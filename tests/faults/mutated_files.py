@@ -74,8 +74,8 @@ class Tally:
     def words(self) -> str:
         """The figures."""
         return (
-            f"{self.read} read, {self.refused} refused, {reported_wrong(self.wrong)}; slowest {self.slowest_s * 1000:.0f} "
-            f"ms, {self.most_bytes / 1e6:.1f} MB at most"
+            f"{self.read} read, {self.refused} refused, {reported_wrong(self.wrong)}; slowest "
+            f"{self.slowest_s * 1000:.0f} ms, {self.most_bytes / 1e6:.1f} MB at most"
         )
 
     def try_one(self, address: Path, most_bytes: int, called: str) -> None:

@@ -189,8 +189,8 @@ def columns_of_raster(
 ) -> NDArray[np.float32]:
     """Read all pixels of a raster some rows at a time, and keep the normalised columns only.
 
-    Gives (patch, p, p, column) float32 of the padded grid; patches beyond the raster, and pixels without a value, are 0.
-    ``memory`` is in bytes.
+    Gives (patch, p, p, column) float32 of the padded grid; patches beyond the raster, and pixels without a value, are
+    0. ``memory`` is in bytes.
     """
     p, valid, done = raster.grid.patch, raster.grid.valid_patches(), 0
     columns = np.zeros((int(np.prod(raster.grid.patch_shape)), p, p, weights.basis.columns), np.float32)

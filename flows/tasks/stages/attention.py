@@ -168,8 +168,8 @@ def kept_within(budget: PatchBudget, scores: Scores, seen: FinePlan) -> FinePlan
     """Return the plan of a uniform scan with the patches that the budget pays for: all were seen, some are kept."""
     bought, s = budget.choose(scores), budget.grid.factor
     reason = (
-        f"{seen.reason}; {len(bought)} of {len(budget.patch_index)} patches are kept and read in detail, the others as means "
-        f"of {s} x {s} px"
+        f"{seen.reason}; {len(bought)} of {len(budget.patch_index)} patches are kept and read in detail, the others "
+        f"as means of {s} x {s} px"
     )
     finite = np.where(np.isfinite(scores), scores, 0.0)
     expected_gain, wanted = float(finite[bought].sum()), float(np.maximum(finite, 0.0).sum())

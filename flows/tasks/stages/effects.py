@@ -55,8 +55,8 @@ def choose_effects(
 ) -> Wanted:
     """Decide for scene and rig which effects to simulate, and check it on the worst lines of the scene.
 
-    Where a rig takes the lines there is nothing to decide. Raises BoundError: what would be left out changes light by more than its
-    bound says; SceneError: the scene holds a number that is not finite.
+    Where a rig takes the lines there is nothing to decide. Raises BoundError: what would be left out changes light by
+    more than its bound says; SceneError: the scene holds a number that is not finite.
     """
 
     def write(path: Path, manifest: dict[str, Any]) -> None:

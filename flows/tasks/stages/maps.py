@@ -59,7 +59,8 @@ def segment(
 ) -> Wanted:
     """Draw the class map from coarse and fine patches, region by region; no class where the scene has no value.
 
-    ``light`` is the exposure of a line that is read in detail as a fraction of the reference, and the pixels to the next.
+    ``light`` is the exposure of a line that is read in detail as a fraction of the reference, and the pixels to the
+    next.
     """
     grid, left_out = frame.grid, zones.left_out
 

@@ -275,8 +275,8 @@ def as_references(
     An element is bad where its dark frame is stuck, where either jumps amid its frames, or where
     :func:`pipeline.signal.detector.find_bad_elements` says so.
 
-    ``white_reference`` is the value of the white reference, one or (band,). RigError where the frames are of two sizes, swapped,
-    without light, do not show the same throughout, or too many elements would be bad.
+    ``white_reference`` is the value of the white reference, one or (band,). RigError where the frames are of two sizes,
+    swapped, without light, do not show the same throughout, or too many elements would be bad.
     """
     if dark.mean.shape != white.mean.shape:
         raise RigError(f"dark is {dark.mean.shape} (sample, band), white {white.mean.shape}; take both anew")

@@ -179,7 +179,8 @@ class SceneCamera(CameraDevice):
     kept
         So many finished captures keep their files, and references always; 0 is all.
 
-    With ``aside`` frames are looked at by calls of :meth:`keep_looking` alone, from a thread; until then it is capturing.
+    With ``aside`` frames are looked at by calls of :meth:`keep_looking` alone, from a thread; until then it is
+    capturing.
     """
 
     def __init__(

@@ -370,8 +370,9 @@ def transmission(metres: Floats, rig: Rig, wavelength_nm: Floats) -> Floats:
 class PathRadiance(LightChange):
     """Light L at a distance d arrives as L exp(-beta d) + H (1 - exp(-beta d)), beta of ``extinction_per_m``.
 
-    H, the light of endless air, is ``air.airlight_fraction`` of the white reference's and follows the daylight; none is added
-    where the white reference's light is not known. ``range`` takes each sample's own distance, ``uniform`` the middle.
+    H, the light of endless air, is ``air.airlight_fraction`` of the white reference's and follows the daylight; none is
+    added where the white reference's light is not known. ``range`` takes each sample's own distance, ``uniform`` the
+    middle.
     """
 
     name = "path-radiance"
@@ -403,7 +404,8 @@ class PathRadiance(LightChange):
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
         """Give what passes between the nearest and the farthest sample, and the greatest light that air adds. [e-]
 
-        Added light is the airlight's fraction of the white reference's, where that is known, times what the daylight grows by.
+        Added light is the airlight's fraction of the white reference's, where that is known, times what the daylight
+        grows by.
         """
         reach, nm = reach_m(rig), np.asarray(probe.wavelength_nm, np.float64)
         if reach is None:

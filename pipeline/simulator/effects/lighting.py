@@ -71,7 +71,8 @@ class Drift(Gain):
 class Cloud(Gain):
     """Straight bands of shadow, as wide as the gaps between them, that drift over the scene at a constant speed.
 
-    Direction and place follow from the seed alone: all sweeps lie under the same clouds. All bands lose the same fraction.
+    Direction and place follow from the seed alone: all sweeps lie under the same clouds. All bands lose the same
+    fraction.
     """
 
     name = "cloud"

@@ -291,11 +291,11 @@ class Moments:
 class Footprint:
     """Kernels of a footprint and how much each counts in each band. All widths in px of the camera, or of the level.
 
-    ``shift`` and ``variance`` are (2, kernel) along the line and the scan; ``fractions`` (kernel, node) of some bands, and
-    ``between`` (node, band) between which two each band lies; ``parts`` how many boxes across and along stand for one
-    that lies turned; ``level`` (kernel,) of which pixels each looks at: 1 is all, 2 every second, and so on; ``error``
-    by how much of its amplitude a wave is passed too much or too little at most; ``disc`` the diameters along line and
-    scan of what each kernel is blurred by besides.
+    ``shift`` and ``variance`` are (2, kernel) along the line and the scan; ``fractions`` (kernel, node) of some bands,
+    and ``between`` (node, band) between which two each band lies; ``parts`` how many boxes across and along stand for
+    one that lies turned; ``level`` (kernel,) of which pixels each looks at: 1 is all, 2 every second, and so on;
+    ``error`` by how much of its amplitude a wave is passed too much or too little at most; ``disc`` the diameters along
+    line and scan of what each kernel is blurred by besides.
     """
 
     box: tuple[float, float]  # across and along; 0 is none

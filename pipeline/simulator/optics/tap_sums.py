@@ -129,8 +129,8 @@ def fewest_parts(fraction: float, box: tuple[float, float], views: RayViews) -> 
 def misplaced(parts: Parts, box: tuple[float, float], shape: tuple[float, ...]) -> float:
     """Give the fraction of light, by size, that so many boxes put elsewhere than the turned footprint does.
 
-    ``shape`` is px of the scene along and scan per px of the camera along the line, then across it. Half of the fraction
-    times the range of a scene within the footprint is the most that a sample changes.
+    ``shape`` is px of the scene along and scan per px of the camera along the line, then across it. Half of the
+    fraction times the range of a scene within the footprint is the most that a sample changes.
     """
     apart = np.abs(_weights(parts, box, shape) - _weights(_FINER, box, shape))
     return float(apart.sum(axis=(1, 2)).max())

@@ -125,11 +125,11 @@ class RasterScene:
     ``planes`` is (y, x, component) float32 and ``electrons`` (component, band), or (band,) where each band has its own
     plane. Labels are (y, x) uint8 with 255 for unlabelled. ``filled_px`` counts pixels that came without a value in a
     band; ``missing`` (y, x) are those without one in most bands, of which nothing is known (None: no such pixel).
-    ``white_reference`` is the scene value of the white reference, ``wavelength_nm`` and ``fwhm_nm`` are centres and widths of the
-    bands, all (band,); widths are None where not known. Equal keys give equal light.
-    ``geobox`` is where the pixels lie on the earth, as the scene's file says (None: it does not); ``pixel_m`` is how
-    large a pixel of a scene without one is on the ground, where the scene's own law says so.
-    Planes, labels and electrons may be made when they are first asked for; all else is known at once.
+    ``white_reference`` is the scene value of the white reference, ``wavelength_nm`` and ``fwhm_nm`` are centres and
+    widths of the bands, all (band,); widths are None where not known. Equal keys give equal light. ``geobox`` is where
+    the pixels lie on the earth, as the scene's file says (None: it does not); ``pixel_m`` is how large a pixel of a
+    scene without one is on the ground, where the scene's own law says so. Planes, labels and electrons may be made when
+    they are first asked for; all else is known at once.
     """
 
     name: str

@@ -5,8 +5,8 @@ s about 1. Every part draws from its own stream of the seed. What is drawn, and 
 
 * Land (``land``): a rectangle 80 px larger than the scene (and at least 640 x 640) is split along two directions
   (turned by U(-0.6, 0.6) rad, each cut up to 0.12 rad off) at 0.36-0.64 of its length, until a parcel has less than
-  95 000 U(1.15, 1.9) px. Uses go by ``USE_FRACTIONS`` blurred by LN(0.25), the largest parcel to the use that lacks most,
-  each use at least once where there are enough parcels; lines between parcels by ``BORDER_FRACTIONS``, likewise.
+  95 000 U(1.15, 1.9) px. Uses go by ``USE_FRACTIONS`` blurred by LN(0.25), the largest parcel to the use that lacks
+  most, each use at least once where there are enough parcels; lines between parcels by ``BORDER_FRACTIONS``, likewise.
 * ``farm_plan``: heading and period of each field's rows, tramlines, weeds, lodging.
 * ``seasons``: calendars, cover, stages, lodging, weeds' growth, leaves of trees, water in the soil, the sun's place.
 * ``spectra``: materials at their stages, the soil line.

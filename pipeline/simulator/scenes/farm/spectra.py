@@ -53,8 +53,8 @@ class Canopy:
 
     Ranges of living plants here: structure n 1.3-2.1; chlorophyll ``cab`` 8-62, carotenoids ``car`` 4-14 and
     anthocyanins ``ant`` 0-6 ug/cm2; brown pigment 0-1; water ``cw`` 0.004-0.030 cm; dry matter ``cm`` 0.003-0.012
-    g/cm2; leaf area index 1-6; mean leaf angle ``lidfa`` 16-72 degrees from the horizontal; ``dry_soil`` is the fraction
-    of dry soil below.
+    g/cm2; leaf area index 1-6; mean leaf angle ``lidfa`` 16-72 degrees from the horizontal; ``dry_soil`` is the
+    fraction of dry soil below.
     """
 
     n: float
