@@ -2,7 +2,7 @@
 
 A record holds plain lists and numbers: counts of labels and map by every policy at each fraction of the patches, which
 add up over frames, and what each map costs. Weights of frames left out in turn have no frame in common: together they
-are one seed of the training, judged on all of their frames. Weights that fraction a frame are different seeds.
+are one seed of the training, judged on all of their frames. Weights that share a frame are different seeds.
 """
 
 from __future__ import annotations

@@ -456,7 +456,7 @@ def _sparing_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[s
         )
     if given and settings.extent != EXTENT_WHOLE:
         place = place_of("extent", origin.get("extent"))
-        yield f"{given[0]} chooses among the patches of a whole field, and {place} looks at a part: leave one of them out"
+        yield f"{given[0]} chooses among the patches of a whole field, {place} covers a part: leave one of them out"
     if settings.least_gain is not None and settings.policy not in IN_NAT:
         place = place_of("least_gain", origin.get("least_gain"))
         yield (

@@ -177,7 +177,7 @@ class DrawnField:
 
 
 def draw_field(field: FieldWork, work: Drawing, report: Callable[[float], None]) -> DrawnField:
-    """Draw class map and class probabilities into the stores that were created for them; count pixels that were left out.
+    """Draw class map and class probabilities into stores that were created for them; count the pixels left out.
 
     These are the coarse pixels, and the fine ones, with a value that the weights take for no reading. Raises
     SettingsError: not even one region at a time fits the memory.

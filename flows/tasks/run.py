@@ -269,7 +269,7 @@ class SurveyRun(CaptureRun):
         return self.settings.map
 
     def work_done(self, patch_index: NDArray[np.integer]) -> MultiplyAdds:
-        """Count the scores of the field, unless all is seen and read, and the map with fine patches at these patches."""
+        """Count the scores of the field, unless all is read, and the map with fine patches at these patches."""
         costs = self.costs
         done = costs.with_scores(patch_index, self.settings.policy) if self.chooses else costs.of_map(patch_index)
         if self.prior is None or self.reader is None:

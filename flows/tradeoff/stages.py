@@ -100,7 +100,7 @@ class Scattered:
 
 
 def scatter_points(seed: int) -> Scattered:
-    """Draw point samples of waves, and points at least 2 px inside, in the order of lines as a geolocation grid gives them."""
+    """Draw point samples of waves, and points at least 2 px inside, in the order of lines of a geolocation grid."""
     waves, rng = draw_waves(seed, BANDS, PERIODS_PX), np.random.default_rng([seed, 1])
     grid = np.argwhere(np.ones((SIDE, SIDE), bool)).astype(np.float64)
     samples = waves.at(grid).astype(np.float32).reshape(SIDE, SIDE, BANDS)

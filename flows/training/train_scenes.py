@@ -122,7 +122,7 @@ def _common(request: TrainRequest, scene: RasterScene) -> About:
 
 
 def suggested_patch(shape: tuple[int, int], *, built_in: bool) -> int:
-    """Patch size for scenes of this shape: 16 for the farm, 32 for frames, less where a scene would hold few patches."""
+    """Return the patch size for scenes of this shape: 16 for the farm, 32 for frames, less for small scenes."""
     if built_in:
         return 16
     return 32 if min(shape) >= 512 else 16 if min(shape) >= 256 else 8

@@ -1,4 +1,4 @@
-"""`spectralzoom train --train-temporal`: what reads a field's memory beside today's look, trained on lands through days.
+"""`spectralzoom train --train-temporal`: train the reader of prior maps on lands through days.
 
 Built-in lands are scanned on several days; by the law of noise each scan is shown as shorter exposures and wider steps
 would have shown it, and read by the weights that the memory is for. Other lands then say what the memory is worth.

@@ -121,7 +121,7 @@ def confidence_counts(confidence: NDArray[np.floating], right: NDArray[np.bool_]
 
 
 def calibration_error(counts: NDArray[np.float64]) -> float:
-    """Expected calibration error of `confidence_counts`, 0..1: how far confidence lies beside the fraction that is right.
+    """Return the expected calibration error of `confidence_counts`, 0..1: confidence less the fraction that is right.
 
     Mean over the bins by their pixels, of |share right - mean confidence|; NaN without a pixel. (Naeini et al. 2015)
     """

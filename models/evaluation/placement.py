@@ -94,7 +94,7 @@ class Controls:
     random: list[Counts]
 
     def as_dict(self) -> dict[str, dict[str, Any]]:
-        """`agreement` of every row, the fraction of the gap that it closes, and mean and spread of the random placements.
+        """Return `agreement` of every row, the fraction of the gap closed, mean and spread of the random placements.
 
         All rows are judged by the same labels, and so over the same classes.
         """

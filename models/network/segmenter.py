@@ -103,7 +103,7 @@ class Segmenter(nn.Module):
     def read_fine(
         self, reading: CoarseReading, fine: Tensor, patch_index: Tensor, origin: Tensor | None = None
     ) -> Tensor:
-        """Logits of the fine patches, (B, K, classes, p, p), from their own pixels and what the coarse prediction saw."""
+        """Return logits of the fine patches, (B, K, classes, p, p), from their pixels and the coarse prediction."""
         b, k = patch_index.shape
         p = self.config.patch
         if k == 0:  # convolutions take an empty batch forward but not backward

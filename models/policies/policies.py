@@ -24,7 +24,7 @@ MOST_SUMMED = 1e280  # of a mask's values: larger ones are summed in a larger un
 def score_patches(
     policy: str, seen: CoarsePrediction, *, seed: int = 0, mask: NDArray[np.generic] | None = None
 ) -> Scores:
-    """Score every patch of the padded grid, (patches,) float64; a patch counts by the fraction of it that lies on the scene.
+    """Score every patch of the padded grid, (patches,) float64, by the fraction of it that lies on the scene.
 
     ``policy`` is one of `POLICIES`: what the weights expect a look to gain (``gain``); by the coarse prediction's
     classes ``entropy``; by the coarse image ``sobel`` edges (the paper's ED); ``random``, by ``seed``; ``mask``: a

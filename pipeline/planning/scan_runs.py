@@ -234,7 +234,7 @@ class Field:
 
     @cached_property
     def side_by_side(self) -> Ints:
-        """Strips that fraction no patch column, from the lower end up, (window, 1): the layout of a full scan."""
+        """Strips that share no patch column, from the lower end up, (window, 1): the layout of a full scan."""
         low, high = self._spans
         found, last = [0], len(low) - 1
         while high[found[-1]] < high[-1]:

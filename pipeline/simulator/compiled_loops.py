@@ -153,7 +153,7 @@ def mix_neighbours(light: Radiance, weights: Radiance, first: int, made: Radianc
 
 
 Rows = NDArray[np.int64]
-TERMS = 4  # of a sum between two looks at its total, and samples that fraction what is read for them
+TERMS = 4  # of a sum between two looks at its total, and samples that share what is read for them
 LANES = 16  # floats: rows of a mixing matrix are some times as long, and begin where a line of the cache does
 _FLOATS_AT_ONCE = 2048  # floats of every kernel that stay in the processor's cache
 _ROWS = rows_of(OFFSETS, 1)

@@ -1,6 +1,6 @@
 """Several processes write one archive at once: ``python tests/faults many_writers``.
 
-The same survey two and four times; surveys that fraction their first stages; and one that is killed in the middle while
+The same survey two and four times; surveys that share their first stages; and one that is killed in the middle while
 others wait for what it was making.
 """
 

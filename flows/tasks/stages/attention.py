@@ -153,7 +153,7 @@ def plan_detail(
 
 
 def all_seen(grid: SceneGrid, sweeps: Sequence[Sweep], camera: LineCamera, *, part: bool) -> FinePlan:
-    """Return the plan of a uniform scan, or of a raster without sweeps: patches that are seen, nothing to go back for."""
+    """Return the plan of a uniform scan, or of a raster without sweeps: the patches seen, nothing to go back for."""
     patch_index = grid.valid_patches()
     if not sweeps:
         return FinePlan([], patch_index, 0.0, 0.0, "raster", "the pixels of the raster were taken as they are")

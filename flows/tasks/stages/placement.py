@@ -1,4 +1,4 @@
-"""Where lines lie and what they show: registration (none where the mirror is believed), geolocation grid, mosaic, patches."""
+"""The stages that place lines: registration (where the mirror may err), geolocation grid, mosaic, patches."""
 
 from __future__ import annotations
 
@@ -283,7 +283,7 @@ def extract_patches(
         return patch_index[np.lexsort((column, row) if plan.along == "x" else (row, column))]
 
     def everything(sweeps: Sequence[SweepPath], wanted: NDArray[np.integer]) -> Iterator[tuple[Values, Valid]]:
-        """Yield the wanted patches of a uniform scan by tables of its pixels: far faster than looking each of them up."""
+        """Yield the wanted patches of a uniform scan by tables of its pixels: faster than locating each of them."""
         placed = [one.placed(camera, PixelGrid.of_scene(grid, 1)) for one in sweeps]
         among, first = np.isin(in_order(grid.valid_patches()), wanted), 0
         for values, seen in read_every_patch(placed, camera, grid, kernel, most_bytes=most_bytes):

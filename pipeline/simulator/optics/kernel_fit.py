@@ -89,7 +89,7 @@ _ALONG = np.concatenate([np.outer(_RADII, np.cos(_TURNS)).ravel(), _RADII, 0 * _
 _SCAN = np.concatenate([np.outer(_RADII, np.sin(_TURNS)).ravel(), 0 * _RADII, _RADII])
 # What is wrong of waves longer than 20 px adds up over wide fields: they count up to three times.
 _STRICT = 1 + 2 / (1 + (np.hypot(_ALONG, _SCAN) / 0.05) ** 2)
-_ALIKE_PX = 0.2  # by which widths may differ of kernels that fraction a window
+_ALIKE_PX = 0.2  # by which widths may differ of kernels that share a window
 
 
 @dataclass(frozen=True)

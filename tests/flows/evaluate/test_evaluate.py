@@ -270,7 +270,7 @@ def _record(name: str, rng: np.random.Generator) -> dict[str, Any]:
 
 
 def test_weights_without_a_common_frame_are_one_seed() -> None:
-    """Folds of one training are joined, weights that fraction a frame are seeds; what none judged is not counted."""
+    """Folds of one training are joined, weights that share a frame are seeds; what none judged is not counted."""
     rng = np.random.default_rng(0)
     runs = [[_record(name, rng) for name in names] for names in ("ab", "c", "abc", "")]
     assert seeds_of(runs) == [[0, 1], [2]]
