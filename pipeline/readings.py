@@ -66,7 +66,7 @@ MOST_EDGE = 0.1  # of a picture's edge that is one value: by chance it is less
 
 
 def edge_fill(edge: NDArray[Any]) -> tuple[float, float] | None:
-    """The value that a picture's edge may be filled with, and its fraction of the edge; None where nothing suggests one.
+    """Return the value that may fill a picture's edge, and its fraction of the edge; None where nothing suggests one.
 
     ``edge`` is (pixel, band), NaN where nothing is known. Taken is the commonest value that all bands of a pixel have,
     where it is 0 or less, the most that its kind of whole numbers holds, or no reading.

@@ -30,7 +30,7 @@ class Line:
 
 @dataclass(frozen=True)
 class References:
-    """Dark and white frames of one sweep's binning, (sample, band) float32 DN, and the white reference's value per band.
+    """Dark and white frames of one sweep's binning, (sample, band) float32 DN, and the white reference's value a band.
 
     A sample's scene value is ``(raw - dark) / (white - dark) * white_reference``, over ``flat`` where there is one,
     over the mirror's throughput where ``by_mirror`` says that the light falls off with its tilt. ``bad`` elements of

@@ -4,7 +4,7 @@ A stage says which store it wants; the archive makes the key, finds the store, o
 stage. The record is made where the function is, in a module of `flows.tasks.stages`:
 
     @stage("rectify", "mosaic", MOSAIC)
-    def rectify(raw, geolocation grid, *, frame, camera, kernel): ...
+    def rectify(raw, geolocation, *, frame, camera, resampling): ...
 
 The function takes the stores that it is made of, and behind the star by name what it needs of the opened survey: an
 attribute of the run, or a setting. The order of the stages stands in `flows.survey`, which calls them with the opened

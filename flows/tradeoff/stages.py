@@ -258,7 +258,7 @@ def uniform_pass(
     weights: Weights, source: SimulatedSource, sweeps: list[Sweep], grid: SceneGrid, cost: CostModel
 ) -> PlannedPass:
     """Read a uniform scan whole; its coarse pass are the means of its own pixels, on a field of whole cells."""
-    columns = columns_of_all_patches(source, sweeps, grid, weights, memory=MEMORY, kernel="catmull-rom")
+    columns = columns_of_all_patches(source, sweeps, grid, weights, memory=MEMORY, resampling="catmull-rom")
     down, across = grid.patch_shape
     p, s, camera = grid.patch, grid.factor, source.camera
     cells = columns.reshape(down, across, p // s, s, p // s, s, -1).mean(axis=(3, 5), dtype=np.float32)
@@ -353,7 +353,7 @@ def plan_every_fraction(seed: int) -> PlannedField:
     weights, grid, source, along, full = sources_of_farm(seed)
     mosaic = coarse_mosaic(source, coarse_sweeps(grid, source.camera, along), grid)
     seen = coarse_prediction(weights, mosaic, source.wavelength_nm, grid)
-    columns = columns_of_all_patches(source, full, grid, weights, memory=MEMORY, kernel="catmull-rom")
+    columns = columns_of_all_patches(source, full, grid, weights, memory=MEMORY, resampling="catmull-rom")
     scores, valid = score_patches(POLICY, seen), grid.valid_fraction().ravel() > 0
     scan_passes: dict[Setting, PlannedPass] = {}
     for fraction in FRACTIONS:

@@ -43,7 +43,7 @@ class PatchExpectedErrors:
         *,
         come_true: float = 1.0,
     ) -> PatchExpectedErrors:
-        """Sort the pixels of a field. ``strips`` are (y, x, class) class probabilities and (y, x) ages from the top down [days].
+        """Sort the pixels of a field. ``strips`` are (y, x, class) probabilities and (y, x) ages [days] from the top.
 
         Every strip but the last is of whole patches high; ``come_true`` is the fraction of expected errors that do.
         """

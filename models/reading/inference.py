@@ -1,4 +1,4 @@
-"""Use of a trained segmenter on one scene: coarse prediction at the coarse pass, then go on from there with the fine patches."""
+"""Use of a trained segmenter on one scene: predict coarsely, then continue with the fine patches."""
 
 from __future__ import annotations
 

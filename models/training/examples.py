@@ -124,7 +124,7 @@ class CropSampler:
         noise: float = 0.0,
         scan_passes: CaptureAugmentation | None = None,
     ) -> None:
-        """``noise`` is the most that is added, in spreads of the normalised columns; with ``scan_passes`` they say it."""
+        """``noise`` is the most that is added, in spreads of the normalised columns, unless ``scan_passes`` add it."""
         cell = config_patch * factor
         smallest = min(min(example.labels.shape) for example in examples)
         self.size = max(cell, min(crop, smallest) // cell * cell)

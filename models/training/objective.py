@@ -41,7 +41,7 @@ RANK_NAT = 0.05  # two patches that differ by less are hardly put in order
 
 @dataclass(frozen=True)
 class Phase:
-    """How patches are placed, by odds, and how large crops are beside those of the settings, up to a part of the run."""
+    """Odds of the placements of patches, and sizes of crops beside those of the settings, up to a part of the run."""
 
     until: float
     random: float
@@ -72,7 +72,7 @@ def class_weights(labels: Iterable[NDArray[np.uint8]], classes: int, cap: float)
 def batch_loss(
     model: Segmenter, batch: Batch, weight: Tensor, rng: np.random.Generator, phase: Phase, *, soft_dice: bool
 ) -> Tensor:
-    """Loss of one batch: the map with a drawn fraction of patches, the coarse prediction alone, and what the scorer said of them."""
+    """Return the loss of one batch: of the map with some patches, of the coarse prediction, and of the scores."""
     reading = model.read_coarse(batch.coarse, batch.origin)
     score = model.score(reading).flatten(1)
     patch_index = draw_patches(reading.logits.detach(), score.detach(), model.config, rng, phase)
@@ -94,7 +94,7 @@ def batch_loss(
 def draw_patches(
     coarse_prediction: Tensor, score: Tensor, config: SegmenterConfig, rng: np.random.Generator, phase: Phase
 ) -> Tensor:
-    """Draw how many patches and which: (B, K) distinct patch numbers. By entropy or gain they are placed with some chance.
+    """Draw (B, K) distinct patch numbers; with some chance they are placed by entropy or by gain.
 
     ``coarse_prediction`` are logits of the coarse pixels (B, classes, H/s, W/s), ``score`` the gain of the patches (B,
     patches).

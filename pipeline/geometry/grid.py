@@ -68,7 +68,7 @@ class SceneGrid:
 
 
 def patch_pixels(grid: SceneGrid, image: NDArray[Kind], beyond: int = 0) -> NDArray[Kind]:
-    """Cut a (y, x) image of the scene into patches, (patch, y, x) by their numbers; ``beyond`` stands beside the scene."""
+    """Cut a (y, x) image of the scene into patches, (patch, y, x) by their numbers; ``beyond`` fills the rest."""
     (rows, columns), p = grid.patch_shape, grid.patch
     padded = np.full(grid.padded_shape, beyond, image.dtype)
     padded[: grid.height, : grid.width] = image

@@ -123,7 +123,7 @@ class FieldZones:
         return fractions if self.no_go is None else np.where(_patch_means(self.no_go, grid) > 0, 0.0, fractions)
 
     def shown_patches(self, grid: SceneGrid) -> Mask:
-        """Patches (patch,) of the patches that are read at once and hold a pixel that is kept: what lines have to show."""
+        """Return the patches (patch,) that are read together and hold a pixel that is kept: lines have to show them."""
         rows, columns = grid.patch_shape
         kept = _patch_means(self.kept, grid).reshape(rows // grid.factor, grid.factor, columns // grid.factor, -1) > 0
         shown: Mask = np.repeat(np.repeat(kept.any(axis=(1, 3)), grid.factor, axis=0), grid.factor, axis=1)

@@ -1,4 +1,4 @@
-"""The fine pass: which line runs at which strip offsets show the patches that matter most, within a budget of seconds."""
+"""The fine pass: the lines of the swaths that show the patches of most expected gain within a budget of seconds."""
 
 from __future__ import annotations
 

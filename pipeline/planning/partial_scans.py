@@ -85,7 +85,7 @@ class PatchRows:
 def _nearest_sweep(
     sweeps: Sequence[Sweep], grid: SceneGrid, camera: LineCamera, patch_index: NDArray[np.intp]
 ) -> NDArray[np.intp]:
-    """(patch,) number of the sweep whose lines have the middle of a patch nearest to their own; -1 where none has it."""
+    """Return (patch,) the number of the sweep whose lines lie nearest to the middle of a patch; -1 where none does."""
     size = np.array([grid.height, grid.width])
     origin = grid.patch_origin(patch_index)
     middle = (origin + np.minimum(origin + grid.patch, size)) / 2 - size / 2

@@ -33,7 +33,7 @@ class ScanPrices:
 
     @property
     def even_line_s(self) -> float:
-        """A line with its fraction of a reload: with this the price is additive, and below the true one by < a reload."""
+        """Price of a line with its fraction of a reload: additive, and below the true price by less than a reload."""
         return self.line_s + self.reload_s / self.lines_per_reload
 
     def seconds(self, lines: int, runs: int) -> float:

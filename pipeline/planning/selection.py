@@ -34,7 +34,7 @@ def select_patches(score: Scores, count: int, valid: NDArray[np.bool_] | None = 
 
 
 def frame_patches(score: Scores, fraction: float, valid: NDArray[np.bool_] | None = None) -> PatchIndex:
-    """Choose a fraction of the valid patches as if each could be captured by itself (``frame`` mode: compares policies).
+    """Choose a fraction of the valid patches as if each could be captured by itself (``frame`` mode).
 
     Halves of a patch are rounded up. Raises BudgetError: the fraction is not a number from 0 to 1.
     """

@@ -1,4 +1,4 @@
-"""Uniform scans: the whole field once, with lines so far apart and so long exposed, and which of them is worth its price.
+"""Uniform scans: one pass over the field for each line spacing and exposure, and the one that is worth its price.
 
 What a scan's map is likely to score stands in a record that was made with the weights: a table by step and exposure.
 Between two exposures the logarithm of the exposure counts; outside the table nothing is said.

@@ -34,7 +34,7 @@ class MosaicPart:
 
 
 def edge_distance(coordinates: NDArray[np.float64], lines: int, samples: int) -> NDArray[np.float64]:
-    """Distance of (..., 2) geolocation grid coordinates to the nearest edge of their sweep, (...) [px of it]; NaN off it."""
+    """Return the distance (...) of coordinates (..., 2) to the nearest edge of their sweep [px of it]; NaN off it."""
     line, sample = coordinates[..., 0], coordinates[..., 1]
     down = np.minimum(line + 0.5, lines - 0.5 - line)
     across = np.minimum(sample + 0.5, samples - 0.5 - sample)

@@ -103,7 +103,7 @@ def tie_table(
     tie: int = 16,
     tolerance_px: float = 2e-3,
 ) -> TieTable:
-    """Tabulate a track's geolocation grid over a grid, given by its first centre, the distance of centres [px] and (y, x).
+    """Tabulate the geolocation of a scan path over a grid: its first centre, the distance of centres [px], (y, x).
 
     The distance of ties starts at ``tie`` pixels and is halved until the error of the pixels between, in lines and in
     samples, is bound by ``tolerance_px`` [px of the sweep]. The bound is an eighth of the ties' second differences (of
@@ -209,7 +209,7 @@ class PixelGrid:
 
 @dataclass(frozen=True)
 class Placed:
-    """One sweep and where its lines lie: tracks, each with the tie table of a grid or None for direct geolocation grid."""
+    """One sweep and where its lines lie: scan paths, each with tie points of a grid, or None to locate directly."""
 
     lines: SweepLines
     scan_paths: tuple[tuple[ScanPath, TieTable | None], ...]

@@ -111,7 +111,7 @@ def patch_pixels(grid: SceneGrid, patch_index: NDArray[np.integer]) -> tuple[NDA
 
 
 def _on_the_scene(first: NDArray[np.integer], patch: int, size: int) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Pixels of patches along one axis that begin at ``first`` (patch, 1): numbers on the scene, and which are its own."""
+    """Return the pixels of patches along one axis from ``first`` (patch, 1): numbers on the scene, and validity."""
     pixel = first + np.arange(patch)
     mirrored = 2 * (size - 1) - pixel
     return np.where(pixel < size, pixel, np.where(mirrored >= first, mirrored, size - 1)), pixel < size

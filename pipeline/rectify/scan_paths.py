@@ -98,7 +98,7 @@ def make_scan_paths(
 def line_centres(
     position: Floats, camera: LineCamera, usable: NDArray[np.bool_] | None = None, shift_px: Floats | None = None
 ) -> tuple[Floats, Floats, NDArray[np.intp]]:
-    """Give where the usable lines of a sweep have their centres, in order of capture; raises as :func:`make_scan_paths`.
+    """Return the centres of the usable lines of a sweep, in order of capture; raises as :func:`make_scan_paths`.
 
     Tangents on the scan axis and along the line, (usable line,) each, and the numbers of these lines.
     """

@@ -235,7 +235,7 @@ def drop_changes(path: Path) -> None:
 
 
 def write_changes(path: Path, changed: Floats, patch_px: int) -> None:
-    """Add (seat_y, seat_x) fractions of pixels that changed to a stored class probabilities; a patch has ``patch_px`` a side."""
+    """Add (patch_y, patch_x) fractions of changed pixels to stored class probabilities, by patches of ``patch_px``."""
     with damage_named(str(path)):
         group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
     write_image(group, "changed", ("patch_y", "patch_x"), changed, {**CHANGED, "patch_px": patch_px})
@@ -247,7 +247,7 @@ def unpacked_days(packed: NDArray[np.uint16]) -> Floats:
 
 
 class ProbabilityStore:
-    """A stored class probabilities, read in parts. Raises IncompleteStoreError where there is none, or it is damaged."""
+    """Stored class probabilities, read in parts. Raises IncompleteStoreError where there are none, or damaged ones."""
 
     def __init__(self, path: Path) -> None:
         self._group = open_group(path)

@@ -25,7 +25,7 @@ _TANGENT = "tangent of the undeflected direction's plane"
 def path_digest(
     position: NDArray[np.floating], usable: NDArray[np.bool_] | None = None, shift: NDArray[np.floating] | None = None
 ) -> str:
-    """Name a sweep's path, in 20 hex digits, by all that its scan paths depend on: which lines are usable, where they lie.
+    """Name a sweep's path, in 20 hex digits, by all that its scan paths depend on: usable lines and their places.
 
     Positions and their corrections ``shift`` are (line, 2), as of :func:`pipeline.rectify.scan_paths.make_scan_paths`.
     What a line that is not usable reports does not count, nor whether a correction is zero or none. Camera, binning,
@@ -50,7 +50,7 @@ def write_geolocation(path: Path, tables: Tables, facts: Mapping[str, Any] | Non
 
 
 def open_geolocation(path: Path) -> dict[str, tuple[tuple[ScanPath, TieTable], ...]]:
-    """Read the scan paths and tie tables of all sweeps, by name (IncompleteStoreError: the store is missing or damaged)."""
+    """Read scan paths and tie tables of all sweeps, by name (IncompleteStoreError: the store is missing or damaged)."""
     root = open_group(path)
     with damage_named(str(path)):
         names = [str(name) for name in root.attrs["sweeps"]]  # type: ignore[union-attr]

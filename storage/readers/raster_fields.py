@@ -333,7 +333,7 @@ def write_patches(
 def patches_of(
     raster: RasterPixels, patch_index: NDArray[np.integer], *, memory: int
 ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.bool_]]]:
-    """Read the patches of ascending ``patch_index``: (patch, y, x, band) values and (patch, y, x) validity, rows at a time.
+    """Read the patches of ascending ``patch_index``: values (patch, y, x, band), validity (patch, y, x), by rows.
 
     Raises SettingsError: not even one row of patches fits the memory.
     """

@@ -121,7 +121,7 @@ def _ns(clock: Timing) -> float:
 def _error(table: TieTable, truth: Floats) -> Row:
     off = _worst(_whole(table), truth)
     turn = np.rad2deg(line_rotation(scene_to_direction(np.array([[SWATH, 0.0], [SWATH, LINES]]) * CAMERA.ifov_rad)))
-    what = f"geolocation grid of {PIXELS} px by ties, lines turned by {turn[0]:.1f}-{turn[1]:.1f} deg: error against reflected rays"
+    what = f"geolocation grid of {PIXELS} px by ties, lines turned by {turn[0]:.1f}-{turn[1]:.1f} deg: error"
     return Row(what, f"{off:.2g} px (bound {table.bound_px:.2g})", "< 2e-3 px", off < 2e-3 and off <= table.bound_px)
 
 

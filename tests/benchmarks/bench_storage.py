@@ -1,4 +1,4 @@
-"""Storage: our layout against plain zarr-python of the same arrays, the spool's fraction of a core, a survey run again."""
+"""Storage: our layout beside plain zarr-python, the spool's fraction of a core, a survey that runs again."""
 
 from __future__ import annotations
 

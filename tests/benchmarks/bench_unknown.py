@@ -70,7 +70,7 @@ def _figure(values: list[float], unit: str) -> str:
 
 
 def _farm(seed: int, day: int, scan_pass: dict[str, Any]) -> Judged:
-    """A farm's fraction of unknown pixels, what that changes of its mIoU [points], and the processor time of both maps."""
+    """A farm's fraction of unknown pixels, the change of its mIoU [points], and the processor time of both maps."""
     given = {"scene": "farm", "size": SIZE, "seed": seed, "day": day, **scan_pass}
     with tempfile.TemporaryDirectory() as out:
         without, with_it = (_survey({**given, "out": out}, word) for word in ("off", "auto"))

@@ -176,7 +176,7 @@ def test_late_line_is_used_where_the_mirror_was() -> None:
 
 
 def test_grid_outside_the_swath_is_nan() -> None:
-    """A grid beside, behind or far beyond the sweep has no coordinates, from the geolocation grid and from the table."""
+    """A grid beside, behind or far beyond the sweep has no coordinates, located directly or by the table."""
     position = aim(np.arange(50.0))
     (scan_path,) = make_scan_paths(position, CAMERA)
     for origin in ((0.0, 3100.0), (400.0, 2600.0), (-9000.0, -9000.0), (9000.0, 20_000.0)):

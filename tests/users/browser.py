@@ -88,7 +88,7 @@ class Tab:
             time.sleep(0.03)
 
     def centre(self, selector: str, fraction: tuple[float, float] = (0.5, 0.5)) -> tuple[float, float]:
-        """A place of an element that is scrolled into view, by its fraction of width and height, in px of the window."""
+        """A place of an element scrolled into view, by fractions of its width and height, in px of the window."""
         found = self.run(
             f"(() => {{ const one = document.querySelector({json.dumps(selector)}); "
             "one.scrollIntoView({block: 'center', behavior: 'instant'}); "

@@ -71,7 +71,7 @@ def evaluate(
     load: Once[Weights],
     model_key: Mapping[str, Any],
     controls: bool,
-    kernel: Kernel,
+    resampling: Kernel,
     memory: int,
     seed: int,
     report: Report,
@@ -102,7 +102,7 @@ def evaluate(
                 source = source_with(sure_source(simulated, off), captures[0])
                 sweeps = plan.coarse if plan.plain else plan.full
                 columns = columns_of_all_patches(
-                    source, sweeps, grid, weights, memory=memory, kernel=kernel, report=first_part
+                    source, sweeps, grid, weights, memory=memory, resampling=resampling, report=first_part
                 )
             fraction = CONTROL_FRACTION
             if budget is not None:  # as many as were kept of a uniform scan
@@ -127,7 +127,7 @@ def evaluate(
     def first_part(done: float) -> None:
         report(0.6 * done)
 
-    params = {**model_key, "labels": array_digest(labels), "controls": controls, "resampling": kernel, **source_key}
+    params = {**model_key, "labels": array_digest(labels), "controls": controls, "resampling": resampling, **source_key}
     return Wanted(build, params, [mosaic, patches, class_map, *captures])
 
 
@@ -212,7 +212,7 @@ def columns_of_all_patches(
     weights: Weights,
     *,
     memory: int,
-    kernel: Kernel,
+    resampling: Kernel,
     report: Report = lambda done: None,
 ) -> NDArray[np.float32]:
     """Scan the scene in full, a band of patches at a time, and keep the normalised columns only.
@@ -229,7 +229,7 @@ def columns_of_all_patches(
     done = 0
     for band in range(int(place.max()) // deep + 1):
         patch_index = valid[place // deep == band]
-        values, _ = read_patches(sweeps, source.camera, grid, patch_index, kernel)
+        values, _ = read_patches(sweeps, source.camera, grid, patch_index, resampling)
         columns[patch_index] = weights.columns(values, source.wavelength_nm)
         done += len(patch_index)
         report(done / len(valid))

@@ -196,7 +196,7 @@ def rectify(
     camera: LineCamera,
     frame: FieldFrame,
     plan: CapturePlan,
-    kernel: Kernel,
+    resampling: Kernel,
     memory: int,
     pool: WorkerPool,
     report: Report,
@@ -209,7 +209,7 @@ def rectify(
             raw.path,
             camera,
             PixelGrid.of_scene(frame.grid, frame.grid.factor),
-            kernel,
+            resampling,
             geolocation=geolocation.path / "geolocation.zarr",
             registration=record_of(registration),
             finer=PixelGrid.of_scene(frame.grid, 1) if plan.plain else None,
@@ -227,7 +227,7 @@ def rectify(
         finish_mosaic(writer, picture, frame)
         write_table(path / "lines.json", {one.lines.sweep.name: one.facts() for one in recipe.sweeps()})
 
-    params = {"grid": asdict(frame.grid), "resampling": kernel, **frame.key}
+    params = {"grid": asdict(frame.grid), "resampling": resampling, **frame.key}
     return Wanted(build, params, [raw, geolocation, *_there(registration)])
 
 
@@ -267,7 +267,7 @@ def extract_patches(
     camera: LineCamera,
     frame: FieldFrame,
     plan: CapturePlan,
-    kernel: Kernel,
+    resampling: Kernel,
     memory: int,
     report: Report,
 ) -> Wanted:
@@ -286,14 +286,14 @@ def extract_patches(
         """Yield the wanted patches of a uniform scan by tables of its pixels: faster than locating each of them."""
         placed = [one.placed(camera, PixelGrid.of_scene(grid, 1)) for one in sweeps]
         among, first = np.isin(in_order(grid.valid_patches()), wanted), 0
-        for values, seen in read_every_patch(placed, camera, grid, kernel, most_bytes=most_bytes):
+        for values, seen in read_every_patch(placed, camera, grid, resampling, most_bytes=most_bytes):
             kept = among[first : (first := first + len(values))]
             yield (values, seen) if kept.all() else (values[kept], seen[kept])
 
     def some(sweeps: Sequence[SweepPath], wanted: NDArray[np.integer]) -> Iterator[tuple[Values, Valid]]:
         placed, cache = [one.placed(camera) for one in sweeps], LineCache(most_bytes)
         for first in range(0, len(wanted), PATCHES_AT_ONCE):
-            yield read_patches(placed, camera, grid, wanted[first : first + PATCHES_AT_ONCE], kernel, cache=cache)
+            yield read_patches(placed, camera, grid, wanted[first : first + PATCHES_AT_ONCE], resampling, cache=cache)
 
     def build(path: Path) -> None:
         """Write the patches in the order in which sweeps pass them, a batch of patches at a time."""
@@ -307,7 +307,7 @@ def extract_patches(
             writer.write(values, seen)
             report(done / len(patch_index))
 
-    params = {"grid": asdict(grid), "resampling": kernel, **frame.key}
+    params = {"grid": asdict(grid), "resampling": resampling, **frame.key}
     return Wanted(build, params, [attention, raw, *_there(registration)])
 
 

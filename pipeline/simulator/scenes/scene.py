@@ -108,7 +108,7 @@ def _binomial(planes: NDArray[np.float32], firsts: NDArray[np.intp], axis: int) 
 
 @dataclass(frozen=True)
 class SceneRadiance:
-    """Electrons at the default exposure: (component, band) per unit of component, and (band,) of the white reference."""
+    """Return electrons at the default exposure: (component, band) per unit, and (band,) of the white reference."""
 
     electrons: NDArray[np.float32]
     white_reference_electrons: NDArray[np.float32]

@@ -66,7 +66,7 @@ class Run:
 
 
 def believe(folder: Path, age_days: np.ndarray, old_class: np.ndarray | None = None) -> None:
-    """A class probabilities of these ages (y, x), NaN where nothing is known; one that goes on from another with what changed."""
+    """Write class probabilities of these ages (y, x), NaN where nothing is known; of a later visit with changes."""
     values = np.where(np.isnan(age_days)[..., None], np.nan, np.log([0.5, 0.5])).astype(np.float32)
     path = folder / "class_probabilities.zarr"
     create_probabilities(path, SHAPE, LEGEND, goes_on=old_class is not None)
@@ -179,7 +179,7 @@ def field_pixels(run: Run, found: GroundMap) -> tuple[np.ndarray, np.ndarray]:
 def test_age_and_changes_are_those_of_the_pixel_that_is_shown(
     run: Run, stores: tuple[StageRef, StageRef], tmp_path: Path
 ) -> None:
-    """Of a second visit: days, fraction of the patch and old class are no blend of neighbours; what is unknown is NaN."""
+    """Of a second visit: days, changed fraction and old class are no blend of neighbours; the unknown is NaN."""
     rng = np.random.default_rng(3)
     age = 0.125 * rng.integers(0, 400, SHAPE).astype(np.float32)
     age[rng.random(SHAPE) < 0.1] = np.nan

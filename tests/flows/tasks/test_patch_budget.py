@@ -1,4 +1,4 @@
-"""Budgets of multiply-adds and bytes for a uniform scan: which patches they buy, what that takes, and what is refused."""
+"""Budgets of multiply-adds and bytes for a uniform scan: the patches that they buy, the costs, the refusals."""
 
 from __future__ import annotations
 

@@ -170,7 +170,7 @@ def test_second_run_is_read_from_the_archive(survey_png: Any, surveyed_png: Any,
 
 
 def test_products_open_with_plain_xarray(farm: Done) -> None:
-    """Named axes, wavelengths in nm and GeoZarr's place; patches where patches were chosen; CF flags; facts of lines."""
+    """Named axes, wavelengths in nm and GeoZarr's place; the patches chosen; CF flags; facts of lines."""
     mosaic, attention, patches, found = (farm.open(name) for name in ("mosaic", "attention", "patches", "class_map"))
     assert (mosaic["values"].dims, mosaic["values"].dtype) == (("y", "x", "band"), np.float32)
     assert (mosaic.sizes["y"], mosaic.sizes["x"]) == (FARM[0] // 4, FARM[1] // 4)

@@ -137,7 +137,7 @@ def test_seconds_choose_the_scan_and_are_kept(
 
 
 def test_a_mirror_off_the_plan_is_put_right_in_a_scan_too(survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
-    """Sweeps overlap and are registered by what neighbours show twice; every patch is seen, and in the seconds asked."""
+    """Sweeps overlap and are registered by what neighbours show twice; every patch is seen in the seconds asked."""
     flags = {"budget": None, "seconds": "12", "pointing_px": "3", "weights": str(recorded)}
     published = survey_png(tmp_path, **flags)
     assert published.receipt["savings"]["capture_s"]["done"] <= 12

@@ -108,7 +108,7 @@ def test_better_in_every_class_is_better_in_the_mean(pairs: list[tuple[int, int]
 
 @given(LABELLED, st.data())
 def test_stray_pixels_cost_their_own_class_alone(pairs: list[tuple[int, int]], data: st.DataObject):
-    """Right pixels turned into a false class lower the mean by those pixels' fraction of their class, over the classes."""
+    """Right pixels turned into a false class lower the mean by their fraction of their class, over the classes."""
     labels, _ = _maps(pairs)
     drawn = labels.copy()
     stray = data.draw(st.lists(st.integers(0, len(labels) - 1), unique=True))

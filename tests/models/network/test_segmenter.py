@@ -123,7 +123,7 @@ def test_a_scorer_learns_gains():
 
 
 def test_patches_without_a_label_have_no_say():
-    """What is scored at patches of which nothing is known changes no loss and learns nothing; with none known it is 0."""
+    """Scores at patches of which nothing is known change no loss and learn nothing; with none known it is 0."""
     gain, known = (
         torch.tensor([[0.3, 0.1, 0.0], [0.2, 0.0, 0.0]]),
         torch.tensor([[True, True, False], [True, False, False]]),

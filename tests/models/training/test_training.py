@@ -115,7 +115,7 @@ def test_patches_are_drawn_where_the_coarse_prediction_is_unsure_or_anywhere():
 
 
 def test_late_in_a_run_the_scorer_places_patches_too():
-    """In the last phase some draws begin with the patch that the scorer puts first; in the first phase hardly any do."""
+    """In the last phase some draws begin with the patch of the highest score; in the first phase hardly any do."""
     score = torch.zeros(1, 64)
     score[0, 41] = 5.0
 

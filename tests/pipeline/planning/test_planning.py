@@ -107,7 +107,7 @@ def test_planning_a_farm_pays():
 
 
 def test_a_patch_alone_costs_its_own_lines():
-    """On a strip through the axis lines are not turned: a patch takes its rows, three for the kernel, and one set-up."""
+    """Through the axis lines are not turned: a patch takes its rows, three for the kernel, and one set-up."""
     grid = SceneGrid(100, 150, 16, 4)
     runs = runs_showing(grid, CAMERA, COST, "x", np.array([24]))
     assert count_lines(runs) == 16 + 3
@@ -127,7 +127,7 @@ def test_neighbours_fraction_their_lines(patch_index: set[int]):
 
 
 def test_runs_lie_at_their_own_offsets():
-    """A block of patches in the middle of a field two strips wide takes one run, whose strip is none of a full scan's."""
+    """A block of patches in the middle of a field two swaths wide takes one run, on none of the full scan's swaths."""
     grid = SceneGrid(320, 1280, 32, 2)
     scores = np.zeros(grid.patch_shape)
     scores[4:6, 11:29] = 1.0
@@ -147,7 +147,7 @@ def scattered(grid: SceneGrid) -> np.ndarray:
 
 
 def test_the_full_scan_is_taken_where_runs_are_no_cheaper():
-    """Patches of which a line shows one take four strips, the full scan two: it is taken, shows all patches and says so."""
+    """Patches of which a line shows one take four swaths, the full scan two: it is taken, and says so."""
     grid = SceneGrid(600, 1280, 400, 1)
     scores = np.ones(8)
     full = full_sweeps(grid, CAMERA, "x")

@@ -179,7 +179,7 @@ PATHS = {
 @pytest.mark.parametrize("name", PATHS)
 @pytest.mark.parametrize("tie", [16, 7])
 def test_error_is_within_the_bound(name: str, tie: int) -> None:
-    """On every kind of path no pixel is farther from the exact geolocation grid than the bound, nor that from the tolerance."""
+    """On every kind of path the error of a pixel is within the bound, and the bound within the tolerance."""
     scan_path = scan_path_of(*PATHS[name])
     table = tie_table(scan_path, CAMERA, along="x", tie=tie, **GRID)
     error = np.abs(table.coordinates(*EVERYTHING) - exact(scan_path))

@@ -28,7 +28,7 @@ def frames(samples: int = 4, bands: int = 3) -> References:
 
 
 def test_hand_worked_values() -> None:
-    """Dark is 0, white is the white reference, a quarter of the way is a quarter of the white reference; below dark is negative."""
+    """Dark is 0, white is the white reference, between them it is linear; below dark is negative."""
     raw = np.tile(np.array([60, 1060, 310, 10], np.uint16)[None, :, None], (2, 1, 3))
     values = reflectance(raw, frames())
     assert values.dtype == np.float32

@@ -222,7 +222,7 @@ BANDS = 12
 
 
 def even_scene(fwhm_nm: float = 2.0) -> RasterScene:
-    """An even scene under light with a deep absorption, 40 % as bright as the white reference; values are reflectances."""
+    """An even scene under light with a deep absorption, 40 % of the white reference; values are reflectances."""
     nm = np.linspace(740, 784, BANDS)
     white_reference_electrons = (30_000 * (1 - 0.6 * np.exp(-(((nm - 762) / 5) ** 2)))).astype(np.float32)
     return made_scene(np.full((20, 20, 1), 0.4), white_reference_electrons[None], nm, fwhm_nm=np.full(BANDS, fwhm_nm))

@@ -62,7 +62,7 @@ def test_pictures_are_every_fourth_line_and_never_large(size: int, step: int) ->
 
 
 def test_a_raw_cube_has_the_picture_of_its_lines(tmp_path: Path) -> None:
-    """Every 4th line and sample of three bands over the white reference, stretched; the raw numbers are as they were."""
+    """Every 4th line and sample of three bands over the white reference, stretched; the raw numbers stay."""
     cube = open_raw_cube(_stored(tmp_path / "a.zarr"))
     seen = cube.quicklook()
     assert seen is not None

@@ -126,7 +126,7 @@ def test_a_killed_worker_costs_only_time(tmp_path: Path, processes: WorkerPool) 
 
 
 def test_a_block_that_kills_its_workers_is_one_error() -> None:
-    """Where every try kills the worker, the error says so and what to do; a worker pool kept open gets other workers."""
+    """Where every try kills the worker, the error says so and what to do; an open worker pool gets other workers."""
     with WorkerPool("processes", 1).open() as pool:
         (before, _), *_ = run_blocks(threads_here, [0], pool)
         with pytest.raises(
@@ -233,7 +233,7 @@ def dask(*words):
     return subprocess.Popen(command, stderr=subprocess.DEVNULL)
 
 def begin(worker pool):
-    started = dask("scheduler", "--host", worker pool.scheduler), dask("worker", worker pool.scheduler, "--nthreads", "1")
+    started = dask("scheduler", "--host", pool.scheduler), dask("worker", pool.scheduler, "--nthreads", "1")
     while True:
         with suppress(PipelineError):
             run_blocks(nap, range(1), worker pool)
@@ -267,7 +267,7 @@ def nap(number: int) -> int:
 
 
 def test_a_scheduler_that_goes_away_is_one_error(tmp_path: Path) -> None:
-    """In the middle of the work: one message, no traceback of dask's; one that comes back serves the same worker pool."""
+    """In the middle of the work: one message, no traceback of dask's; a scheduler that comes back serves the pool."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
     with run_script(tmp_path, GONE, address) as started:

@@ -28,7 +28,7 @@ CORNER = 400_000.0, 5_700_000.0  # upper left, of pixels of 2 m
 
 
 def emit_file(path: Path) -> NDArray[np.float32]:
-    """Write EMIT L2A reflectance: (downtrack, crosstrack, bands), and groups of wavelengths and of its geolocation grids."""
+    """Write EMIT L2A reflectance: (downtrack, crosstrack, bands), groups of wavelengths and of geolocation."""
     values = (CUBE / 9000).astype(np.float32)
     values[2, 3] = -9999
     root = xr.Dataset(

@@ -1,4 +1,4 @@
-"""What the farm is painted on: abundances of the day's materials and fractions of classes; surfaces that lie anywhere."""
+"""The plan of the farm: abundances of the day's materials, fractions of classes, and surfaces that lie anywhere."""
 
 from __future__ import annotations
 

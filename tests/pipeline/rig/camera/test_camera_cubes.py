@@ -186,7 +186,7 @@ def test_stuck_and_dead_elements_are_told() -> None:
 
 
 def test_references_that_do_not_fit() -> None:
-    """Swapped frames, two sizes and a white reference of other bands are refused; one frame cannot tell stuck elements."""
+    """Swapped frames, two sizes and other bands of the white reference are refused; one shows no stuck elements."""
     dark, white = mean_frame(frames(64)), mean_frame(frames(3000))
     with pytest.raises(RigError, match="are they swapped, or was the lamp off"):
         as_references(white, dark)

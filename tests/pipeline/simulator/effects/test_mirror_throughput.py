@@ -1,4 +1,4 @@
-"""What the tilted mirror passes: Fresnel's laws and published metals, fractions of its area, bounds over whole sweeps."""
+"""Throughput of the tilted mirror: Fresnel's laws, published metals, fractions of its area, bounds of sweeps."""
 
 from __future__ import annotations
 
