@@ -8,6 +8,7 @@ SECONDS ?= 25
 PYTEST_ARGS ?= -n 2 --dist worksteal
 BENCH ?=
 BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install -q --no-compile --disable-pip-version-check -c constraints.txt
 
 # The tools beneath are asked to send no analytics.
 export DO_NOT_TRACK = 1
@@ -21,37 +22,42 @@ setup: $(BIN)/.ok
 $(BIN)/.ok: pyproject.toml constraints.txt
 	$(PY) -m venv $(VENV) 2>/dev/null || { $(PY) -m venv --without-pip $(VENV) \
 		&& $(PY) -m pip --python $(BIN)/python install -q pip; }
-	$(BIN)/python -m pip install -q --no-compile --disable-pip-version-check -c constraints.txt -e '.[dev,s3,bench]'
+	$(PIP) -e .
+	touch $@
+
+# What tests, lint, pages and benchmarks need on top.
+$(BIN)/.ok-dev: $(BIN)/.ok
+	$(PIP) -e '.[dev,s3,bench]'
 	touch $@
 
 survey: $(BIN)/.ok
 	$(BIN)/spectralzoom survey --scene $(SCENE) --seconds $(SECONDS) --out $(ARCHIVE)
 
 # A rig emulated behind a pty and sockets, a whole survey through it, and the simulated one beside it. About a minute.
-survey-rig: $(BIN)/.ok
+survey-rig: $(BIN)/.ok-dev
 	OMP_NUM_THREADS=1 $(BIN)/python tests/soak survey-rig
 
 # Laws draw the same cases each time; PYTEST_ARGS="-n 2 --hypothesis-profile=anew" draws others.
 # Tests start hundreds of processes: bytecode is kept between them, also where the environment says otherwise.
-test: $(BIN)/.ok
+test: $(BIN)/.ok-dev
 	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q $(PYTEST_ARGS)
 
-lint: $(BIN)/.ok
+lint: $(BIN)/.ok-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
 # The pages of docs/ as docs/_build/index.html. A dead link, anchor or reference fails; nothing is fetched.
-docs: $(BIN)/.ok
+docs: $(BIN)/.ok-dev
 	$(BIN)/python -m sphinx -q -E -W --keep-going -n -d docs/_build/.doctrees docs docs/_build
 
 # The notebooks of docs/, run from top to bottom and kept with what they gave. The tests run them without a kernel.
 notebooks: $(BIN)/.ok
-	$(BIN)/python -m pip install -q --no-compile --disable-pip-version-check -c constraints.txt nbclient ipykernel
+	$(PIP) nbclient ipykernel
 	$(BIN)/python -c "$$RENDER" docs/notebooks/*.ipynb
 
 # Every goal with the peers beside it (BENCH="geometry lookup" for some), then what accuracy costs in time.
-bench: $(BIN)/.ok
+bench: $(BIN)/.ok-dev
 	OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks $(BENCH); crashed=$$?; \
 		OMP_NUM_THREADS=1 $(BIN)/spectralzoom tradeoff && exit $$crashed
 
@@ -59,14 +65,14 @@ FAULTS ?=
 
 # Half an hour: everything that may go wrong with an archive, by the hundred (FAULTS="disk_full clocks" for some);
 # the tests hold a quick part of each.
-faults: $(BIN)/.ok
+faults: $(BIN)/.ok-dev
 	OMP_NUM_THREADS=1 $(BIN)/python tests/faults $(FAULTS)
 
 SOAK ?=
 
 # Under an hour: a day of 72 surveys with kills, cables and full disks, and a week on Prefect's schedules
 # (SOAK="day --quick").
-soak: $(BIN)/.ok
+soak: $(BIN)/.ok-dev
 	OMP_NUM_THREADS=1 $(BIN)/python tests/soak $(SOAK)
 
 # Names and versions only. A machine that is offered a CPU wheel of torch does not resolve the accelerator's packages:
