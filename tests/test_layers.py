@@ -109,7 +109,7 @@ def test_imports_go_one_way() -> None:
 def test_storage_stores() -> None:
     """It rectifies and calibrates nothing: of `rectify` it knows what it writes down, of `signal` what files need."""
     known = {
-        "storage/arrays/lookups.py": {"pipeline.rectify.placed", "pipeline.rectify.scan_paths"},
+        "storage/arrays/geolocation.py": {"pipeline.rectify.placed", "pipeline.rectify.scan_paths"},
         "storage/readers/cube_sources.py": {"pipeline.signal.calibrate"},
         "storage/readers/recorded_cubes.py": {"pipeline.signal.detector"},
     }

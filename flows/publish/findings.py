@@ -148,7 +148,7 @@ def plots_csv(plots: Sequence[Mapping[str, Any]]) -> str:
     head = ["plot", "pixels", "mapped_pixels", "area_m2", "confidence"]
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerow([*head, *(f"share_{name}" for name in names)])
+    table.writerow([*head, *(f"fraction_{name}" for name in names)])
     for plot in plots:
         cells = [*(plot[name] for name in head), *(plot["fractions"][name] for name in names)]
         table.writerow(["" if cell is None else cell for cell in cells])

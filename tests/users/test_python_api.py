@@ -217,7 +217,7 @@ def test_what_cannot_be_is_one_error(make_weights: WeightsMaker, tmp_path: Path)
         spectralzoom.train("farm", tmp_path / "x.safetensors", stepps=2)
     with pytest.raises(spectralzoom.Error, match="needs weights=FILE"):
         spectralzoom.evaluate("farm")
-    with pytest.raises(spectralzoom.Error, match="evaluate has no 'share'"):
+    with pytest.raises(spectralzoom.Error, match="evaluate has no 'fraction'"):
         spectralzoom.evaluate("farm", weights=make_weights(), fraction=[0.1])
     with pytest.raises(AttributeError, match="it has Error"):
         _ = spectralzoom.surveys

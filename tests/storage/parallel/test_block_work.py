@@ -224,19 +224,19 @@ GONE = """
 import subprocess, sys, time
 from contextlib import suppress
 from pipeline.errors import PipelineError, WorkerError
-from storage.parallel import worker pool as crew_module
-from storage.parallel.worker pool import Crew, run_blocks
+from storage.parallel import pool as pool_module
+from storage.parallel.pool import WorkerPool, run_blocks
 from tests.storage.parallel.test_block_work import nap
 
 def dask(*words):
     command = [sys.executable, "-m", f"distributed.cli.dask_{words[0]}", *words[1:], "--no-dashboard"]
     return subprocess.Popen(command, stderr=subprocess.DEVNULL)
 
-def begin(worker pool):
+def begin(pool):
     started = dask("scheduler", "--host", pool.scheduler), dask("worker", pool.scheduler, "--nthreads", "1")
     while True:
         with suppress(PipelineError):
-            run_blocks(nap, range(1), worker pool)
+            run_blocks(nap, range(1), pool)
             return started
         time.sleep(0.1)
 
@@ -246,16 +246,16 @@ def end(started):
         one.wait()
 
 if __name__ == "__main__":
-    crew_module.ANSWER_S = 1.0
-    with Crew(sys.argv[1]).open() as worker pool:
-        started = begin(worker pool)
+    pool_module.ANSWER_S = 1.0
+    with WorkerPool(sys.argv[1]).open() as pool:
+        started = begin(pool)
         try:
-            run_blocks(nap, range(9), worker pool, each=lambda number, result: started[0].kill())
+            run_blocks(nap, range(9), pool, each=lambda number, result: started[0].kill())
         except WorkerError as error:
             print(error)
         end(started)
-        started = begin(worker pool)
-        print(run_blocks(nap, range(3), worker pool))
+        started = begin(pool)
+        print(run_blocks(nap, range(3), pool))
         end(started)
 """
 
