@@ -162,7 +162,7 @@ def test_training_shows_the_figures_of_validation(folder: Path, out: Path):
     shown, rows = io.StringIO(), {"none", "random", "sobel", "entropy", "gain", "all"}
     request = _request(folder, out, validation=1)
     figures = run_train(request, Console(file=shown, width=100))["validation"]
-    assert set(figures) - {"scenes", "fraction_of_patches"} == rows
+    assert set(figures) - {"scenes", "share_of_seats"} == rows
     for name in rows:
         assert all(0 <= figures[name][figure] <= 1 for figure in ("miou", "overall_accuracy"))
         assert name in shown.getvalue()
