@@ -154,7 +154,7 @@ class OpenedRun:
 
     @property
     def attention(self) -> xarray.Dataset:
-        """Worth (``score``) and order (``rank``, -1 not looked at) of every patch, (seat_y, seat_x)."""
+        """Worth (``score``) and order (``rank``, -1 not looked at) of every patch, (patch_y, patch_x)."""
         return self.dataset("attention")
 
     @property

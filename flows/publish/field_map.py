@@ -89,27 +89,23 @@ def prior_map(prior: Prior | None, drawn: StageRef, receipt: Receipt) -> PriorMa
     return PriorMapField(prior.run, prior.days, names[before], changed, probabilities.age())
 
 
-def field_map(
-    run: SurveyRun, plan: FinePlan, coarse_prediction: QuicklookData, before: PriorMapField | None
-) -> FieldMap:
-    """Gather the layers of a run; ``coarse_prediction`` is what its quicklook shows."""
-    height, width = coarse_prediction.class_map.shape
+def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: PriorMapField | None) -> FieldMap:
+    """Gather the layers of a run; ``shown`` is what its quicklook shows."""
+    height, width = shown.class_map.shape
     thin = slice(None, None, -(-max(height, width) // MOST_PX))
-    palette = palette_bytes(coarse_prediction.class_names, coarse_prediction.class_colours)
+    palette = palette_bytes(shown.class_names, shown.class_colours)
 
     def classes(image: NDArray[np.integer]) -> str:
         return png_address(image[thin, thin].astype(np.uint8), palette)
 
-    title = choose_bands(coarse_prediction.wavelength_nm)[1].capitalize()
-    colours = np.rint(255 * colours_of(coarse_prediction, coarse_prediction.rectified)).astype(np.uint8)
+    title = choose_bands(shown.wavelength_nm)[1].capitalize()
+    colours = np.rint(255 * colours_of(shown, shown.rectified)).astype(np.uint8)
     layers = [MapLayer(title, jpeg_address(colours[thin, thin]), shown=True)]
-    layers.append(MapLayer("Class map", classes(coarse_prediction.class_map), shown=True))
-    if coarse_prediction.confidence is not None:
-        layers.append(
-            MapLayer("Confidence, dark 0 to bright 1", _ramp_address(coarse_prediction.confidence[thin, thin], 1.0))
-        )
-    if coarse_prediction.truth is not None:
-        layers.append(MapLayer("Truth", classes(coarse_prediction.truth)))
+    layers.append(MapLayer("Class map", classes(shown.class_map), shown=True))
+    if shown.confidence is not None:
+        layers.append(MapLayer("Confidence, dark 0 to bright 1", _ramp_address(shown.confidence[thin, thin], 1.0)))
+    if shown.truth is not None:
+        layers.append(MapLayer("Truth", classes(shown.truth)))
     if before is not None:
         layers.append(MapLayer(f"Before: {format_days(before.days)}", classes(before.classes)))
         oldest = float(np.nanmax(before.age_days)) if np.isfinite(before.age_days).any() else 0.0
@@ -125,18 +121,15 @@ def field_map(
         layers.append(
             MapLayer("Looked at twice", png_address(_on_field(run, patch_index)[thin, thin], table), opacity=0.6)
         )
-    counts = np.bincount(coarse_prediction.class_map.ravel(), minlength=256) / max(coarse_prediction.class_map.size, 1)
-    covered = [
-        *counts[: len(coarse_prediction.class_names)].tolist(),
-        float(counts[len(coarse_prediction.class_names) :].sum()),
-    ]
+    counts = np.bincount(shown.class_map.ravel(), minlength=256) / max(shown.class_map.size, 1)
+    covered = [*counts[: len(shown.class_names)].tolist(), float(counts[len(shown.class_names) :].sum())]
     rows = [
         {
             "name": name.replace("_", " "),
             "fraction": format_percent(fraction),
             "colour": "#" + bytes(colour.tolist()).hex(),
         }
-        for name, fraction, colour in zip((*coarse_prediction.class_names, "no class"), covered, palette, strict=False)
+        for name, fraction, colour in zip((*shown.class_names, "no class"), covered, palette, strict=False)
         if fraction
     ]
     return FieldMap((width, height), layers, rows)

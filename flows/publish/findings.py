@@ -28,7 +28,7 @@ from storage.arrays.ground_maps import GroundMap
 
 OLDER_DAYS = (1, 7, 30)  # since a look, of which the hectares are told
 PLOTS_FILE = "plots.csv"
-STRIP_ROWS = 256  # of a class probabilities that are read at a time
+STRIP_ROWS = 256  # of class probabilities that are read at a time
 
 
 def field_figures(run: SurveyRun, fine: FinePlan | None) -> dict[str, Any]:

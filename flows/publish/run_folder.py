@@ -106,15 +106,15 @@ def _publish(run: SurveyRun, draft: RunDraft, products: Products, plan: FinePlan
         if run.plan.plain
         else float(seen_fractions(run.frame, products.patches).sum()) / len(run.grid.valid_patches())
     )
-    coarse_prediction = quicklook_data(run, products, plan, receipt)
-    draw_quicklook(draft.folder / "quicklook.png", coarse_prediction)
+    shown = quicklook_data(run, products, plan, receipt)
+    draw_quicklook(draft.folder / "quicklook.png", shown)
     draft.write_file("receipt.json", to_json(receipt))
     if "plots" in receipt:
         draft.write_file(PLOTS_FILE, plots_csv(receipt["plots"]))
     picture = (draft.folder / "quicklook.png").read_bytes()
     maps = (load_ground_map(ref.path / STORE) for ref in products.there("ground"))
     pictures = [Picture(draw_ground(drawn), "The map on the ground, north up.") for drawn in maps]
-    field = field_map(run, plan, coarse_prediction, prior_map(run.prior, products["segment"], receipt))
+    field = field_map(run, plan, shown, prior_map(run.prior, products["segment"], receipt))
     page = render_report(receipt, picture, pictures, captured_again=again, field=field)
     (draft.folder / "report.html").write_text(page, encoding="utf-8")
     rests_on = run.archive.manifest_hashes(products.values())

@@ -24,7 +24,7 @@ from storage.arrays.class_maps import ProbabilityStore
 
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float64]
-SWATH_PATCHES = 4  # rows of patches of a class probabilities that are read at a time
+SWATH_PATCHES = 4  # rows of patches whose class probabilities are read at a time
 POORER = 0.05  # of mIoU below the best scan of the record: poorer looks spoil what is remembered better
 DUE = 1e3  # times what looks at all of a field can gain: what is due comes first
 

@@ -76,7 +76,7 @@ class Scoring:
     policy: str
 
     def __call__(self, region: Region) -> NDArray[np.float64]:
-        """Scores of the patches that are kept, (seat_y, seat_x)."""
+        """Scores of the patches that are kept, (patch_y, patch_x)."""
         let_tiles_go()
         weights = self.weights.load()
         scan_pass = coarse_region(weights, self.mosaic, region)
@@ -149,7 +149,7 @@ class FieldWork:
     memory: int  # of this process and those that it starts, together [bytes]
 
     def score(self, policy: str, mosaic: Path, report: Callable[[float], None]) -> NDArray[np.float64]:
-        """Score every patch of the padded grid by the coarse mosaic alone, (seat_y, seat_x).
+        """Score every patch of the padded grid by the coarse mosaic alone, (patch_y, patch_x).
 
         Raises SettingsError: not even one region at a time fits the memory.
         """

@@ -43,7 +43,7 @@ class EarlierRun:
 
 @dataclass(frozen=True)
 class Prior:
-    """The run whose class probabilities is gone on from."""
+    """The earlier run whose class probabilities a visit starts from."""
 
     run: str
     probabilities: StageRef  # the store that holds class probabilities.zarr
@@ -83,7 +83,7 @@ def find_prior(
 
 
 def _before(archive: Archive, settings: Settings, name: str) -> Iterator[Run]:
-    """Newest runs of a field with a class probabilities, those first that were looked at last before this visit."""
+    """Return the newest runs of a field with class probabilities, those first that were captured last before this visit."""
     found: list[tuple[float, int, Run]] = []
     part = run_stem(name)
     for number, folder in enumerate(reversed(published_runs(archive.root))):

@@ -45,6 +45,6 @@ class ReadingCosts:
         holds what map and scores took for it.
         """
         drawn = self.of_map(patch_index)
-        scan_passes = 2 if policy in GLANCING_POLICIES else 1
+        readings = 2 if policy in GLANCING_POLICIES else 1
         score = sum(score_multiply_adds(policy, self.config, region.grid) for region in self._regions)
-        return replace(drawn, coarse_prediction=scan_passes * drawn.coarse_prediction, score=score)
+        return replace(drawn, coarse_prediction=readings * drawn.coarse_prediction, score=score)

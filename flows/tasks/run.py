@@ -78,7 +78,7 @@ else:
 
 
 def check_memory(settings: Settings, source: SimulatedSource, grid: SceneGrid, plan: CapturePlan) -> None:
-    """Refuse memory for not one tile of the mosaic, before anything is captured (SettingsError, with the least)."""
+    """Refuse a memory below one tile of the mosaic before anything is captured (SettingsError, with the least)."""
     pixels, finer = PixelGrid.of_scene(grid, grid.factor), PixelGrid.of_scene(grid, 1) if plan.plain else None
     placed = [place(_PlannedSweep(source, sweep), settings.camera) for sweep in plan.coarse]
     rows, columns = image_spec(("y", "x"), pixels.shape, "<f4").shard or pixels.shape
@@ -162,7 +162,7 @@ class SurveyRun(CaptureRun):
     raster: RasterPixels | None = None  # the pixels of a scene that is a map already: nothing is captured of it
     budget: PatchBudget | None = None  # of patches of a uniform scan, where a part of them alone is kept and read
     extent: ExtentChoice | None = None  # the part of a remembered field that is looked at, where one was chosen
-    prior: Prior | None = None  # the run whose class probabilities is gone on from
+    prior: Prior | None = None  # the run whose class probabilities the visit starts from
     ood_detector: OodPart | None = None  # what is familiar to the weights, where pixels may be called unknown
     notes: tuple[str, ...] = ()
     refused: str | None = None  # why this machine would refuse the survey; it is planned nevertheless
@@ -194,7 +194,7 @@ class SurveyRun(CaptureRun):
 
     @property
     def model_key(self) -> dict[str, Any]:
-        """What is made with the weights depends on: these, and the device, where it is not the processor."""
+        """Return the parameters of stages that use the weights: their key, and a device other than the processor."""
         return {"weights": self.weights_key, **({} if self.device == PROCESSOR else {"device": self.device})}
 
     @property

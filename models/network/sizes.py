@@ -125,9 +125,9 @@ class MultiplyAdds:
 
 
 def multiply_adds(
-    config: SegmenterConfig, grid: SceneGrid, patch_index: int, bands: int, *, score: int = 0
+    config: SegmenterConfig, grid: SceneGrid, patches: int, bands: int, *, score: int = 0
 ) -> MultiplyAdds:
-    """Count a survey with ``patch_index`` fine patches of ``bands`` bands, whose policy took ``score``.
+    """Count a survey with ``patches`` fine patches of ``bands`` bands, whose policy took ``score``.
 
     The coarse prediction is the reading of the coarse pass, counted once: fine patches read what is kept of it.
     """
@@ -138,9 +138,9 @@ def multiply_adds(
     basis = pixels * bands * config.columns
     drawn = _head(config, narrow) + pixels * (9 * narrow**2 + narrow * config.classes)
     coarse_prediction = cells * (basis + _stem(config, narrow) + drawn) + _transformer(config, cells * side, 0)
-    encode = patch_index * (basis + _stem(config, wide)) + _transformer(config, patch_index * side, cells * side)
+    encode = patches * (basis + _stem(config, wide)) + _transformer(config, patches * side, cells * side)
     under = (p // s + 2) ** 2 * narrow * wide
-    decode = patch_index * (_head(config, wide) + under + pixels * (11 * wide**2 + wide * config.classes))
+    decode = patches * (_head(config, wide) + under + pixels * (11 * wide**2 + wide * config.classes))
     return MultiplyAdds(coarse_prediction, score, encode, decode)
 
 

@@ -54,9 +54,9 @@ def score_multiply_adds(policy: str, config: SegmenterConfig, grid: SceneGrid) -
     """Multiply-adds of scoring every patch of a grid."""
     pixels = (grid.padded_shape[0] // config.factor) * (grid.padded_shape[1] // config.factor)
     if policy == "gain":  # entropy and pooling per coarse pixel, then the network per patch
-        inputs, patch_index = scorer_inputs(config), pixels // (config.patch // config.factor) ** 2
+        inputs, patches = scorer_inputs(config), pixels // (config.patch // config.factor) ** 2
         per_patch = SCORER_WIDTH * (inputs + 9 + SCORER_WIDTH + 1) + 1
-        return pixels * (2 + config.classes + inputs) + patch_index * per_patch
+        return pixels * (2 + config.classes + inputs) + patches * per_patch
     score = _PIXEL_SCORES.get(policy)
     if score is None:  # by place, or given
         return 0

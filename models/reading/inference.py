@@ -63,7 +63,7 @@ class CoarsePrediction(CoarsePass):
     """What the coarse pass alone says of a scene, on the padded coarse grid."""
 
     probability: NDArray[np.float32]  # (y, x, class)
-    gain: NDArray[np.float32] | None = field(default=None, kw_only=True)  # (seat_y, seat_x) expected [nat per px]
+    gain: NDArray[np.float32] | None = field(default=None, kw_only=True)  # (patch_y, patch_x) expected [nat per px]
     read: Read | None = field(default=None, kw_only=True, repr=False, compare=False)
 
 

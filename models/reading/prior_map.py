@@ -289,7 +289,7 @@ def changed_from(memory: PriorMap, after: ClassProbabilities) -> NDArray[np.uint
 
 
 def changed_fractions(old: NDArray[np.uint8], patch: int) -> Floats:
-    """Fraction of each patch's pixels that ``old`` of `changed_from` has a class for, (seat_y, seat_x)."""
+    """Fraction of each patch's pixels that ``old`` of `changed_from` has a class for, (patch_y, patch_x)."""
     y, x = (-(-size // patch) * patch for size in old.shape)
     padded = np.pad(old != UNLABELLED, [(0, y - old.shape[0]), (0, x - old.shape[1])])
     fractions: Floats = padded.reshape(y // patch, patch, x // patch, patch).mean(axis=(1, 3), dtype=np.float32)

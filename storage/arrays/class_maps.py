@@ -229,7 +229,7 @@ def write_changes_tile(path: Path, origin: tuple[int, int], old_class: NDArray[n
 
 
 def drop_changes(path: Path) -> None:
-    """Take out of a class probabilities what its pixels were: it goes on from none after all."""
+    """Remove the classes of the earlier visit from stored class probabilities: the visit starts from none."""
     with damage_named(str(path)):
         del zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)[OLD_CLASS]
 

@@ -333,15 +333,17 @@ def open_patches(path: Path) -> PatchStore:
 class Attention:
     """Scores of all patches and the order in which patches were chosen."""
 
-    score: NDArray[np.float64]  # (seat_y, seat_x), NaN where there is none
-    rank: NDArray[np.int32]  # (seat_y, seat_x), 0 = chosen first, -1 = not chosen
+    score: NDArray[np.float64]  # (patch_y, patch_x), NaN where there is none
+    rank: NDArray[np.int32]  # (patch_y, patch_x), 0 = chosen first, -1 = not chosen
     policy: str
 
 
 def write_attention(path: Path, attention: Attention) -> None:
     """Store scores and ranks (ShapeError: they have different shapes)."""
     if attention.score.shape != attention.rank.shape or attention.score.ndim != 2:
-        raise ShapeError(f"score {attention.score.shape} and rank {attention.rank.shape} must both be (seat_y, seat_x)")
+        raise ShapeError(
+            f"score {attention.score.shape} and rank {attention.rank.shape} must both be (patch_y, patch_x)"
+        )
     group = create_group(path, "attention", {"policy": attention.policy})
     write_counts(group, patch_y=attention.score.shape[0], patch_x=attention.score.shape[1])
     dims = ("patch_y", "patch_x")

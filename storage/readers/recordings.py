@@ -176,7 +176,7 @@ def _open_files(path: Path, camera: LineCamera, given: RecordedWith) -> Recordin
     assert bands.wavelength_nm is not None
     for cube in cubes[1:]:
         if not np.array_equal(np.asarray(cube.source.bands.wavelength_nm), bands.wavelength_nm):
-            raise SceneError(f"{cube.path} has other wavelengths than {cubes[0].path}; record them by themselves")
+            raise SceneError(f"{cube.path} has other wavelengths than {cubes[0].path}; survey them one by one")
     notes = [note for cube in cubes for note in (*cube.source.notes, cube.source.bands.origin) if note]
     samples = given.samples or max(cube.source.shape[1] for cube in cubes)
     camera = with_bits(replace(camera, samples=samples), cubes, notes)
@@ -254,7 +254,7 @@ def _without_mirror(
 def _timed(
     camera: LineCamera, cubes: Sequence[RecordedFile], pointing: Sequence[LinePointing | None], notes: list[str]
 ) -> LineCamera:
-    """The camera with the exposure and period of the recording, where these are known and others."""
+    """Return the camera with the exposure and period of the recording, where these are known."""
     exposures, periods = [], []
     for cube, one in zip(cubes, pointing, strict=True):
         known = cube.source.lines.exposure_ms if one is None or one.exposure_ms is None else one.exposure_ms
