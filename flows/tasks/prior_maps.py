@@ -83,7 +83,7 @@ def find_prior(
 
 
 def _before(archive: Archive, settings: Settings, name: str) -> Iterator[Run]:
-    """Return the newest runs of a field with class probabilities, those first that were captured last before this visit."""
+    """Return the newest runs of a field with class probabilities, the last captured before this visit first."""
     found: list[tuple[float, int, Run]] = []
     part = run_stem(name)
     for number, folder in enumerate(reversed(published_runs(archive.root))):

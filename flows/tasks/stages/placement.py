@@ -271,7 +271,7 @@ def extract_patches(
     memory: int,
     report: Report,
 ) -> Wanted:
-    """Bring every chosen patch onto the scene grid, one array (p, p, band) for each; NaN where nothing was seen, or is no scene.
+    """Bring every chosen patch onto the scene grid as one array (p, p, band); NaN where nothing was seen.
 
     ``raw`` are the fine sweeps, or those of a uniform scan.
     """
