@@ -23,8 +23,8 @@ from pipeline.rig.camera.camera_texts import MICROMETRES, NANOMETRES, UNSAID
 from storage.arrays.georeference import find_geobox
 from storage.readers.cube_sources import Bands, CubeSource, unpacked
 
-ROWS = ("y", "line", "lines", "row", "rows", "lat", "latitude", "northing", "downtrack", "along_scan_path")
-_ACROSS = ("crosstrack", "across_scan_path")
+ROWS = ("y", "line", "lines", "row", "rows", "lat", "latitude", "northing", "downtrack", "along_track")
+_ACROSS = ("crosstrack", "across_track")
 COLUMNS = ("x", "sample", "samples", "column", "columns", "col", "lon", "longitude", "easting", *_ACROSS)
 BANDS = ("band", "bands", "wavelength", "wavelengths", "channel", "channels", "spectral")
 TIMES = ("time", "t", "date", "dates", "step", "visit")

@@ -192,7 +192,6 @@ def test_memory_reads_units(text, count):
     [
         ({"memory": "four"}, "such as 4GiB"),
         ({"memory": "4"}, "at least 256MiB"),
-        ({"bytes_kept": "140%"}, "fraction of the bytes of keeping everything, above 0% and at most 100%.* got '140%'"),
         ({"scheduler": "dask"}, "'scheduler': .* threads, processes, or the address of a dask scheduler such as tcp:"),
         ({"workers": 0}, "a whole number from 1 to 1024, got 0; one process or thread each"),
         ({"scheduler": ""}, "^'scheduler' must be text that is not empty"),

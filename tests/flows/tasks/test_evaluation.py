@@ -97,7 +97,7 @@ def test_a_receipt_gives_its_own_figures():
     accuracy["per_class_iou"] = {"wheat": None}
     assert worst_class(accuracy) is None
     accuracy: Any = copy.deepcopy(make_receipt()["accuracy"])
-    accuracy["none"]["false_classes"] = {"wheat": 30, "bare_scan_path": 1}
+    accuracy["none"]["false_classes"] = {"wheat": 30, "bare_track": 1}
     words = "Shown although the truth has none: this survey wheat 2 px; none wheat 30 px, bare track 1 px."
     assert format_false_classes(accuracy) == words
     accuracy["false_classes"] = accuracy["none"]["false_classes"] = {}

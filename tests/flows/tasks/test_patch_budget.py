@@ -136,6 +136,7 @@ def test_numbers_are_limits_too(name: str) -> None:
     [
         ({"macs": "0%"}, BudgetError, "above 0% and at most 100%"),
         ({"macs": "101%"}, BudgetError, "above 0% and at most 100%"),
+        ({"bytes_kept": "140%"}, BudgetError, "above 0% and at most 100%"),
         ({"macs": "0.25"}, BudgetError, "for 25 % write 25%"),
         ({"macs": "nan"}, BudgetError, "such as 25%"),
         ({"macs": "a lot"}, BudgetError, "such as 25%"),
@@ -146,7 +147,7 @@ def test_numbers_are_limits_too(name: str) -> None:
         ({"least_gain": -1}, SettingsError, "from 0 to 100"),
         ({"least_gain": 0.1, "policy": "sobel"}, SettingsError, "scores in a unit of its own"),
         ({"macs": "50%", "scan_step": None}, SettingsError, "is for a raster or a uniform scan.*give --seconds"),
-        ({"macs": "50%", "extent": "0:1-9"}, SettingsError, "a whole field, and 'look' looks at a part"),
+        ({"macs": "50%", "extent": "0:1-9"}, SettingsError, "a whole field, 'extent' covers a part"),
     ],
 )
 def test_what_is_no_budget_is_refused_in_a_sentence(

@@ -17,7 +17,7 @@ from models.reading.prior_map import CurrentVisit, PriorMap, first_probabilities
 from models.training.temporal import PastPass, TemporalTraining, Visit, train_reader
 from models.weights.files import describe_weights, load_reader
 from pipeline.errors import SettingsError
-from pipeline.simulator.effects.registry import USUAL
+from pipeline.simulator.render import USUAL
 
 QUICK = TemporalTraining(minutes=0.5, steps=2, batch=2, crop=64, visits=2)
 
