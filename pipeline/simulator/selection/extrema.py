@@ -255,7 +255,10 @@ class BandTiles:
             beside = (slice(1, None), slice(None)) if axis == 0 else (slice(None), slice(1, None))
             found.append(greatest(step[beside]) / noise)
         found += self._wide_steps(light, starts, greatest, noise)
-        found += self._spectral_steps(inner, greatest, noise)
+        if inner.shape[2] > 1:
+            nm = self._wavelength_nm
+            steps = (steepest_difference(inner, nm), np.abs(second_difference(inner, nm)))
+            found += [greatest(one) / noise for one in steps]
         return found
 
     def _wide_steps(
@@ -273,14 +276,6 @@ class BandTiles:
         aside = np.abs(np.diff(means, axis=1, append=means[:, -1:])).max(axis=0)
         firsts = np.searchsorted(columns, starts + 1, side="right") - 1
         return [span / noise, *(np.maximum.reduceat(step, firsts, axis=0) / noise for step in (ahead, aside))]
-
-    def _spectral_steps(
-        self, inner: Radiance, greatest: Callable[[Radiance], Radiance], noise: Radiance
-    ) -> list[Radiance]:
-        if inner.shape[2] < 2:
-            return []
-        steep = steepest_difference(inner, self._wavelength_nm)
-        return [greatest(one) / noise for one in (steep, np.abs(second_difference(inner, self._wavelength_nm)))]
 
 
 def _halves(size: int, tile: int) -> NDArray[np.intp]:
