@@ -156,7 +156,10 @@ class BandTiles:
         """Take the extremes of a strip of tiles: planes (row, column, band) with the optics' halo about them."""
         halo = self._optics.halo
         light = planes[halo - 1 : 1 - halo, halo - 1 : 1 - halo] * self._spectra
-        measures = [self._worst_of_groups(one) for one in self._measures(light)]
+        measures = []  # of each the greatest worth of every tile in a group of bands, and its band, (group, tile)
+        for one in self._measures(light):
+            bands = np.stack([one[:, some].argmax(axis=1) + some.start for some in self._groups])
+            measures.append((np.take_along_axis(one.T, bands, axis=0), bands))
         for tier, taken in tiers.items():
             held = np.flatnonzero(np.maximum.reduceat(taken.any(axis=0), self._starts(taken.shape[1])))
             for sort, (worst, bands) in enumerate(measures[:2] if tier < 0 else measures):
@@ -164,11 +167,6 @@ class BandTiles:
                 some = (np.take_along_axis(one, columns, axis=1) for one in (worst, bands))
                 rows = np.full(columns.shape, first), columns * self._tile
                 self._found.setdefault((tier, sort), []).append(np.stack([next(some), *rows, next(some)]))
-
-    def _worst_of_groups(self, expected_gain: Radiance) -> tuple[Radiance, NDArray[np.intp]]:
-        """Greatest worth of each tile, of worths (tile, band), and its band, (group, tile) both."""
-        bands = np.stack([expected_gain[:, some].argmax(axis=1) + some.start for some in self._groups])
-        return np.take_along_axis(expected_gain.T, bands, axis=0), bands
 
     def rank(self, ranking: Ranking, cells: ReachedCells, reaches: Sequence[float]) -> None:
         """Measure the worst tiles of every measure and group closely, and offer their best places.
