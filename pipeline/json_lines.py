@@ -70,7 +70,11 @@ def _whole(text: bytes, seed: int) -> dict[str, Any] | None:
     body, check = text[:-_LENGTH], _CHECK.fullmatch(text[-_LENGTH:])
     if check is None or int(check[1], 16) != zlib.crc32(body, seed):
         return None
-    return _object(body + b"}")
+    try:
+        found = json.loads(body + b"}")
+    except (ValueError, RecursionError):
+        return None
+    return found if isinstance(found, dict) else None
 
 
 def _had_check(text: bytes) -> bool:
@@ -78,11 +82,3 @@ def _had_check(text: bytes) -> bool:
     tail = text[-_LENGTH:]
     fixed = tail[: len(_OPENS)] + tail[-len(_CLOSES) :]
     return len(tail) == _LENGTH and sum(a != b for a, b in zip(fixed, _OPENS + _CLOSES, strict=True)) <= 1
-
-
-def _object(text: bytes) -> dict[str, Any] | None:
-    try:
-        found = json.loads(text)
-    except (ValueError, RecursionError):
-        return None
-    return found if isinstance(found, dict) else None

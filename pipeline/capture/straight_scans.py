@@ -106,7 +106,6 @@ class StraightScan:
     sweep: Sweep
     distance_px: float  # of lines that follow each other; ``sweep.step`` is the nearest whole number from 1
     backward: bool  # lines were taken against the scan axis
-    bend_px: float  # by which line centres lie off the strip at most
 
 
 def fit_sweep(
@@ -174,7 +173,7 @@ def fit_sweep(
         step=step,
         binning=binning,
     )
-    return StraightScan(sweep, abs(distance), distance < 0, float(bend.max()))
+    return StraightScan(sweep, abs(distance), distance < 0)
 
 
 def _stated(value: float) -> float:

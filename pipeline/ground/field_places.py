@@ -104,20 +104,14 @@ def footprint_of(view: GroundView, shape: tuple[int, int]) -> GroundFootprint:
     heading = np.deg2rad(view.pose.heading_deg)
     away = corners @ np.array([[np.cos(heading), np.sin(heading)], [-np.sin(heading), np.cos(heading)]])
     width, depth = np.ptp(away, axis=0).tolist()
-    near, middle, far = _ranges(view, shape, least)
+    places = (np.linspace(at[0] - 0.5, at[-1] + 0.5, SAMPLES) for at in pixel_places(shape))
+    points = np.stack(np.meshgrid(*places, indexing="ij"), axis=-1)
+    sink, length = view.sink(points), np.sqrt(1 + np.sum((points * view.ifov_rad) ** 2, axis=-1))
+    ranges = (length * view.height_m)[sink >= least] / sink[sink >= least]  # from the pivot to the ground
+    near, middle, far = float(ranges.min()), float(np.median(ranges)), float(ranges.max())
     x, y = corners.T
     area = float(abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2)  # by the shoelace formula
     return GroundFootprint(corners, width, depth, area, median_footprint_m(view, shape), (near, middle, far))
-
-
-def _ranges(view: GroundView, shape: tuple[int, int], least: float) -> tuple[float, float, float]:
-    """Least, median and greatest distance from the pivot to the ground along rays of the field [m]."""
-    places = (np.linspace(at[0] - 0.5, at[-1] + 0.5, SAMPLES) for at in pixel_places(shape))
-    points = np.stack(np.meshgrid(*places, indexing="ij"), axis=-1)
-    sink = view.sink(points)
-    length = np.sqrt(1 + np.sum((points * view.ifov_rad) ** 2, axis=-1))
-    away = (length * view.height_m)[sink >= least] / sink[sink >= least]
-    return float(away.min()), float(np.median(away)), float(away.max())
 
 
 def areas_by_number(place: FieldPlace, numbers: NDArray[np.integer], count: int) -> Floats | None:
@@ -234,21 +228,6 @@ class PosedField:
         )
         on_plane = shapely.transform(shape, lambda places: self.grid.frame.map_to_ground(places)[:, :2])
         return shapely.transform(shapely.intersection(shapely.make_valid(on_plane), shown), self._pixels)
-
-    def ground_points(self, pixels: Floats) -> Floats:
-        """Metres east and north of the rig's foot (..., 2) under places x, y in pixels; NaN where the map ends."""
-        points = pixels[..., ::-1] - np.array(self.shape) / 2
-        reached = self.view.sink(points) >= self.grid.least_sink
-        ground: Floats = np.where(reached[..., None], self.view.scene_to_ground(points)[..., :2], np.nan)
-        return ground
-
-    def on_ground(self, shape: BaseGeometry) -> BaseGeometry:
-        """Bring a polygon from pixels to metres east and north of the rig's foot, as far as the map reaches."""
-        reached = shapely.affinity.translate(self._seen(0.0), self.shape[1] / 2, self.shape[0] / 2)
-        half = np.array(self.shape) / 2
-        return shapely.transform(
-            shapely.intersection(shape, reached), lambda at: self.view.scene_to_ground(at[:, ::-1] - half)[:, :2]
-        )
 
     def _pixels(self, plane: Floats) -> Floats:
         normal = self.view.normal

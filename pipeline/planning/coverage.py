@@ -143,9 +143,9 @@ def on_scene(shape: tuple[int, int], camera: LineCamera, sweep: Sweep) -> NDArra
     return inside
 
 
-def sweep_outline(sweep: Sweep, camera: LineCamera, *, parts: int = 32) -> NDArray[np.float64]:
+def sweep_outline(sweep: Sweep, camera: LineCamera) -> NDArray[np.float64]:
     """Give what a sweep's lines show as a polygon, (point, 2) x and y from the scene's centre [px]."""
-    scan = np.linspace(sweep.start_px - 0.5, sweep.start_px + sweep.lines * sweep.step - 0.5, parts + 1)
+    scan = np.linspace(sweep.start_px - 0.5, sweep.start_px + sweep.lines * sweep.step - 0.5, 33)
     edges = np.array([-camera.samples / 2, camera.samples / 2]) * camera.ifov_rad
     along, across = points_of_scan(sweep.swath_px, camera, scan[:, None], edges)
     sides = np.stack([along, across] if sweep.along == "x" else [across, along], axis=-1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from math import frexp, isfinite
 from typing import Literal
@@ -18,7 +18,7 @@ from pipeline.geometry.scan import Axis, CostModel, Sweep
 from pipeline.planning.budget_search import cheapest_cover, spend
 from pipeline.planning.coverage import check_reach, full_sweeps
 from pipeline.planning.prices import count_lines, prices_of
-from pipeline.planning.scan_runs import NEGLIGIBLE, Cover, Field, cut_swath
+from pipeline.planning.scan_runs import NEGLIGIBLE, Cover, Field
 from pipeline.planning.swaths import covered_patches, edges_from, swaths_at_patches
 
 MOST_GAIN = 1e100  # of one patch: larger scores are planned in a larger unit
@@ -159,8 +159,12 @@ def _field(
 
 def _sweeps(field: Field, cover: Cover) -> list[Sweep]:
     """Runs as sweeps, strip by strip; a name holds strip and first line, so that names sort in the same order."""
-    swaths = field.views.swaths
-    return [cut_swath(swaths[run.swath], run, swaths[run.swath].name) for run in sorted(cover.runs)]
+    found = []
+    for run in sorted(cover.runs):
+        swath = field.views.swaths[run.swath]
+        name, first = f"{swath.name}-{run.first:05d}", swath.start_px + run.first
+        found.append(replace(swath, name=name, start_px=first, lines=run.stop - run.first))
+    return found
 
 
 def _scale(scores: NDArray[np.floating]) -> float:

@@ -14,7 +14,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.scan import Sweep
 from pipeline.planning.prices import ScanPrices
 from pipeline.planning.swaths import Views
 
@@ -47,12 +46,6 @@ class Tables:
     begun: Floats
     unit: int
     block: int  # borders closer than this hold no view between them
-
-
-def cut_swath(swath: Sweep, run: ScanRun, name: str) -> Sweep:
-    """Give the sweep of a run's lines, named by its first one."""
-    first, lines = swath.start_px + run.first, run.stop - run.first
-    return replace(swath, name=f"{name}-{run.first:05d}", start_px=first, lines=lines)
 
 
 def best_chains(tables: Tables, windows: Ints, line_price: float, run_price: float) -> list[list[ScanRun]]:

@@ -130,16 +130,10 @@ def _summed(
     ).astype(np.int64)
 
 
-def number_regions(classes: Classes) -> NDArray[np.int32]:
-    """Number the regions of a class map from 0, (y, x); what has no class is numbered too."""
-    label: Any = skimage_measure.label
-    found: NDArray[np.int32] = label(classes.astype(np.int16) + 1, connectivity=1, background=0).astype(np.int32)
-    return found - 1
-
-
 def find_regions(classes: Classes) -> tuple[NDArray[np.int32], RegionGraph]:
     """Number the regions of a class map, (y, x), and give their graph."""
-    numbers = number_regions(classes)
+    label: Any = skimage_measure.label
+    numbers: NDArray[np.int32] = label(classes.astype(np.int16) + 1, connectivity=1, background=0).astype(np.int32) - 1
     count = int(numbers.max(initial=-1)) + 1
     sizes = np.bincount(numbers.ravel(), minlength=count).astype(np.int64)
     of_region = np.empty(count, np.uint8)

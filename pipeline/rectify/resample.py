@@ -82,7 +82,11 @@ class LineTable:
         """Write the points' values (n, band), and (n,) the usable fraction of the kernel's weight."""
         whole = _lies_on(placed, self.shape, self.whole)
         if placed.taps == 1:
-            self._copy(placed, whole, out)
+            if whole.any():
+                corner = placed.corner if whole.all() else np.where(whole, placed.corner, 0)
+                index = (corner[0] * self.shape[1] + corner[1]).astype(np.intp)
+                np.take(self.rows, index, axis=0, out=out, mode="clip")  # numpy copies once more in its other modes
+            out[~whole] = np.nan if out.dtype == np.float32 else 0
             fraction[:] = whole
         elif whole.all():
             self._read_whole(placed, out, fraction)
@@ -90,14 +94,6 @@ class LineTable:
             for which, read in ((whole, self._read_whole), (~whole, self._read_partial)):
                 points = np.flatnonzero(which)
                 read(placed.chosen(points), out, fraction, points)
-
-    def _copy(self, placed: Windows, whole: NDArray[np.bool_], out: NDArray[Any]) -> None:
-        if whole.any():
-            corner = placed.corner if whole.all() else np.where(whole, placed.corner, 0)
-            index = (corner[0] * self.shape[1] + corner[1]).astype(np.intp)
-            np.take(self.rows, index, axis=0, out=out, mode="clip")  # numpy copies once more in its other modes
-        if not whole.all():
-            out[~whole] = np.nan if out.dtype == np.float32 else 0
 
     def _read_whole(
         self, placed: Windows, out: NDArray[np.float32], fraction: NDArray[np.float32], at: Rows | None = None

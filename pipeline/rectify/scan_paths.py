@@ -162,7 +162,10 @@ def _scan_path(scan: Floats, across: Floats, lines: NDArray[np.intp], step: floa
     lines, starts = _with_stand_ins(lines, counts, at, seen)
     knot = np.arange(len(seen))
     scan, across = np.interp(knot, at, scan), np.interp(knot, at, across)
-    return ScanPath(scan, across, lines, starts, seen, _width(scan, step))
+    if len(scan) > 1:  # the mean step where all are equal up to rounding
+        mean = float(scan[-1] - scan[0]) / (len(scan) - 1)
+        step = mean if np.abs(scan - scan[0] - mean * knot).max() < EVEN_STEPS * mean else step
+    return ScanPath(scan, across, lines, starts, seen, step)
 
 
 def _dwell_starts(scan: Floats, reach: float) -> NDArray[np.intp]:
@@ -190,15 +193,6 @@ def _with_stand_ins(
     members[real] = lines
     members[~real] = lines[(np.cumsum(counts) - counts)[nearest]]
     return members, np.cumsum(sizes) - sizes
-
-
-def _width(scan: Floats, step: float) -> float:
-    """The mean step where all are equal up to rounding, else the usual one."""
-    if len(scan) == 1:
-        return step
-    mean = float(scan[-1] - scan[0]) / (len(scan) - 1)
-    even = np.abs(scan - scan[0] - mean * np.arange(len(scan))).max() < EVEN_STEPS * mean
-    return mean if even else step
 
 
 @dataclass(frozen=True)

@@ -86,7 +86,13 @@ def judge_elements(references: References) -> Elements:
     samples in which more than half of the bands are bad or without a calibration. A band that no sample is calibrated
     in does not count, and nothing in it is out.
     """
-    gain = _gain(references)
+    span = references.white - references.dark
+    if references.flat is not None:
+        span = np.where(references.flat > 0, span * references.flat, np.nan)
+    gain = np.full(span.shape, np.nan, np.float32)
+    known = np.isfinite(span) & (span > 0)
+    with np.errstate(over="ignore"):
+        np.divide(np.broadcast_to(references.white_reference, span.shape), span, out=gain, where=known)
     bad = np.zeros(gain.shape, np.bool_) if references.bad is None else references.bad
     trusted = np.isfinite(gain) & ~bad
     lit = np.asarray(trusted.any(axis=0))
@@ -96,17 +102,6 @@ def judge_elements(references: References) -> Elements:
     out.flat[fill.element] = False
     gain[~trusted] = np.nan  # what overflowed, and what is bad: those that are filled are written over
     return Elements(references, gain, out, lit, fill)
-
-
-def _gain(references: References) -> Floats32:
-    span = references.white - references.dark
-    if references.flat is not None:
-        span = np.where(references.flat > 0, span * references.flat, np.nan)
-    gain = np.full(span.shape, np.nan, np.float32)
-    known = np.isfinite(span) & (span > 0)
-    with np.errstate(over="ignore"):
-        np.divide(np.broadcast_to(references.white_reference, span.shape), span, out=gain, where=known)
-    return gain
 
 
 def _fill_of(wanted: Bools, good: Bools) -> Fill:

@@ -42,7 +42,7 @@ from pipeline.simulator.effects.mirror_throughput import POLARISATION, VIGNETTIN
 from pipeline.simulator.effects.pointing import HYSTERESIS, JITTER, LAG, STAIRCASE, THERMAL_DRIFT
 from pipeline.simulator.effects.spectrometer import PRNU, RESPONSE, SMILE, STRAY_LIGHT, STRIPING
 from pipeline.simulator.optics.kernel_fit import Footprint, Moments, fold
-from pipeline.simulator.optics.rays import RayViews, exact_views, middle_normal, straight_views
+from pipeline.simulator.optics.rays import RayViews, exact_views, middle_normal
 from pipeline.simulator.optics.scene_radiance import Looker
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
@@ -147,7 +147,10 @@ def _views(block: SweepBlock, choice: Choice, shape: tuple[int, int]) -> Iterato
 def _tangents(position: Floats, slopes: Floats, *, exact: bool) -> RayViews:
     if exact:
         return exact_views(position_to_normal(position), 0.0, slopes)
-    return straight_views(direction_to_scene(position_to_direction(position)), 0.0, slopes)
+    centre = direction_to_scene(position_to_direction(position))
+    along = centre[..., 0] + slopes  # lines lie straight along their axis
+    one, none = np.ones(along.shape), np.zeros(along.shape)
+    return RayViews(along, np.broadcast_to(centre[..., 1], along.shape), one, none, none, one)
 
 
 @lru_cache(maxsize=8)

@@ -17,7 +17,6 @@ from pipeline.rig.camera.headwall_replies import (
     ReplyReader,
     as_folder,
     as_listing,
-    as_stopped,
     as_truth,
     check_repeated,
     check_times_set,
@@ -143,7 +142,7 @@ class HeadwallCamera:
     def stop(self) -> bool:
         """End a capture; False where none ran. Stopping twice does no harm, so it is asked again without a reply."""
         try:
-            return self._ask("stopCapture", None, as_stopped)
+            return self._ask("stopCapture", None, lambda response: response is not False)
         except DeviceRefused:
             if self.is_capturing():
                 raise

@@ -184,11 +184,6 @@ def as_truth(response: Any) -> bool:
     return value
 
 
-def as_stopped(response: Any) -> bool:
-    """Whether something was stopped; success alone counts as that."""
-    return response if isinstance(response, bool) else True
-
-
 def as_listing(response: Any) -> list[RemoteFile]:
     """Entries of a folder, by name; MisfitError where this answers another command, RigError for a name not to use."""
     if not isinstance(response, list):

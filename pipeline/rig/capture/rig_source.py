@@ -33,9 +33,7 @@ from pipeline.rig.camera.camera_cubes import as_references
 from pipeline.rig.camera.camera_files import NOT_LOGGED_IN, Kept
 from pipeline.rig.capture.capture_paths import (
     REFERENCES,
-    CapturePath,
     CaptureRecord,
-    PlacedLines,
     UntiedError,
     can_trigger,
     next_path,
@@ -254,7 +252,7 @@ class RigSource:
         return whole, notes
 
     def _read(self, runner: CaptureRunner, taken: CaptureRecord, line: int) -> Iterator[Line]:
-        """Fetch a capture and give its lines from ``line`` on."""
+        """Fetch a capture and yield its lines from ``line`` on; what was dropped, or nothing places, is not valid."""
         try:
             captured = runner.devices.camera.fetch(
                 taken.folder,
@@ -270,11 +268,7 @@ class RigSource:
         path = path_of(taken.sweep, (taken.first, taken.stop), self.camera, triggered=taken.triggered)
         placed = place_lines(captured, path, taken, self.camera, runner.log_of(taken))
         self._journal.tied(taken, placed.tied, captured.notes)
-        yield from self._given(captured.values, placed, path, line)
-
-    def _given(self, values: NDArray[np.uint16], placed: PlacedLines, path: CapturePath, line: int) -> Iterator[Line]:
-        """Lines from ``line`` on; one that the camera dropped, or that nothing places, is there and not valid."""
-        sweep, exposed = path.sweep, exposing(self.camera, path.sweep)
+        values, sweep = captured.values, path.sweep
         nothing = np.zeros((values.shape[1] // sweep.binning, values.shape[2]), np.uint16)
         for place in range(line - path.first, len(placed.row)):
             row, valid = int(placed.row[place]), placed.is_valid(place)
@@ -285,7 +279,7 @@ class RigSource:
                 mirror_x=float(x),
                 mirror_y=float(y),
                 time_s=self._time_s(sweep, path.first + place, int(placed.stamp_us[row]) if row >= 0 else -1),
-                exposure_ms=exposed.exposure_ms,
+                exposure_ms=exposing(self.camera, sweep).exposure_ms,
                 valid=valid,
             )
 

@@ -29,7 +29,7 @@ from pipeline.simulator.effects.effect import (
     LightChange,
     Radiance,
     SweepBlock,
-    sweep_stream,
+    survey_stream,
 )
 from pipeline.simulator.effects.lighting import BRDF, CLOUD, DRIFT
 from pipeline.simulator.effects.probe import UNITS, GainRange, Probe, lights_within, unit_electrons
@@ -125,7 +125,7 @@ class Wind(Displacement):
         sway, air = sway_px(block.rig), block.rig.air
         if sway == 0 or air.distance_m is None:
             return np.zeros_like(along_px), np.zeros_like(scan_px)
-        phase, heading = sweep_stream(block.seed, "", self.name).uniform(0, 2 * math.pi, 2)
+        phase, heading = survey_stream(block.seed, self.name).uniform(0, 2 * math.pi, 2)
         x, y = (along_px, scan_px) if block.sweep.along == "x" else (scan_px, along_px)
         downwind = (x * math.cos(heading) + y * math.sin(heading)) * block.rig.camera.ifov_rad * air.distance_m
         turns = air.wind_hz * block.time_s[:, None] - downwind / GUST_M

@@ -168,9 +168,9 @@ class SweepBlock:
         return _stream(self.seed, self.sweep.name, effect, number)
 
 
-def sweep_stream(seed: int, sweep: str, effect: str) -> np.random.Generator:
-    """Give the stream of one effect for a whole sweep."""
-    return _stream(seed, sweep, effect)
+def survey_stream(seed: int, effect: str) -> np.random.Generator:
+    """Return the stream of one effect for a whole survey: under no sweep's name."""
+    return _stream(seed, "", effect)
 
 
 def unit_stream(unit: int, effect: str) -> np.random.Generator:

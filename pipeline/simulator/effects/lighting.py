@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, points_of_scan
-from pipeline.simulator.effects.effect import Bound, Gain, Radiance, SweepBlock, sweep_stream
+from pipeline.simulator.effects.effect import Bound, Gain, Radiance, SweepBlock, survey_stream
 from pipeline.simulator.effects.probe import GainRange, Probe
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.daylight import knots_within, relative_daylight, sun_elevation_deg
@@ -100,7 +100,7 @@ class Cloud(Gain):
         sweep = block.sweep
         along, scan = points_of_scan(sweep.swath_px, block.rig.camera, block.scan_px[:, None], block.slopes)
         x, y = (along, scan) if sweep.along == "x" else (scan, along)
-        turn, place = sweep_stream(block.seed, "", self.name).random(2)  # no sweep's name: the whole survey's
+        turn, place = survey_stream(block.seed, self.name).random(2)
         heading, place = 2 * math.pi * float(turn), 2 * sky.cloud_size_px * float(place)
         way = x * math.cos(heading) + y * math.sin(heading) - sky.cloud_px_per_s * block.time_s[:, None] + place
         return (1 - sky.cloud_fraction * shadow(way, sky.cloud_size_px))[..., None].astype(np.float32)

@@ -417,26 +417,18 @@ def responses(time: Floats, damping: float) -> tuple[Floats, Floats]:
     ``time`` (...) is times that frequency, from 0 on [rad]. With g the first and h the second, the matrix exponential
     of the free system is [[1 - h, g], [-g, 1 - h - 2 zeta g]]; by expm1 and sinc right below, at and above damping 1.
     """
-    impulse = _impulse(time, damping)
     with np.errstate(under="ignore"):
         if damping <= 1:
-            turn = math.sqrt((1 - damping) * (1 + damping)) * time
-            rest = np.exp(-damping * time) * np.cos(turn) + damping * impulse
+            turn, decay = math.sqrt((1 - damping) * (1 + damping)) * time, np.exp(-damping * time)
+            impulse = decay * time * np.sinc(turn / np.pi)
+            rest = decay * np.cos(turn) + damping * impulse
         else:
             slow = _slow_rate(damping)
-            rest = np.exp(-slow * time) + slow * impulse
+            apart, decay = 2 * math.sqrt((damping - 1) * (damping + 1)) * time, np.exp(-slow * time)
+            impulse = decay * time * np.where(apart > 0, -np.expm1(-apart) / np.where(apart > 0, apart, 1.0), 1.0)
+            rest = decay + slow * impulse
     early = time * (1 + 2 * damping) < _SERIES_BELOW
     return impulse, np.where(early, _early_rise(np.where(early, time, 0.0), damping), 1 - rest)
-
-
-def _impulse(time: Floats, damping: float) -> Floats:
-    with np.errstate(under="ignore"):
-        if damping <= 1:
-            turn = math.sqrt((1 - damping) * (1 + damping)) * time
-            return np.exp(-damping * time) * time * np.sinc(turn / np.pi)
-        apart = 2 * math.sqrt((damping - 1) * (damping + 1)) * time
-        fraction = np.where(apart > 0, -np.expm1(-apart) / np.where(apart > 0, apart, 1.0), 1.0)
-        return np.exp(-_slow_rate(damping) * time) * time * fraction
 
 
 def _slow_rate(damping: float) -> float:

@@ -16,7 +16,7 @@ from pipeline.lazy import deferred
 from pipeline.simulator.effects.counting import normal_deviates
 from pipeline.simulator.effects.effect import Bound, Gain, LightChange, SweepBlock, unit_stream
 from pipeline.simulator.effects.probe import GainRange, Probe, difference_rates, rising_gaps, rising_runs
-from pipeline.simulator.rig_model import Optics, Rig
+from pipeline.simulator.rig_model import Rig
 
 if TYPE_CHECKING:
     from pipeline.simulator import compiled_loops
@@ -342,10 +342,15 @@ class StrayLight(LightChange):
         optics = block.rig.optics
         if optics.stray_fraction == 0:
             return light
+        along, along_kept = _cosines(light.shape[1], optics.stray_halo_px)
+        across, across_kept = _cosines(light.shape[2], optics.stray_halo_px)
+        kept = np.outer(along_kept, across_kept) * (1 - optics.stray_even)
+        kept[0, 0] = 1
+        weakened = (optics.stray_fraction * kept).astype(np.float32)  # as the kernel f K weakens the slowest cosines
         for line in light:  # line by line: rounding, too, does not depend on the block
-            scattered = _scattered(line, optics)
+            modes = along @ (line @ across.T) * weakened
             line *= np.float32(1 - optics.stray_fraction)
-            line += scattered
+            line += (along.T @ modes) @ across
         return light
 
 
@@ -372,16 +377,6 @@ def _uneven_fraction(counts: tuple[int, ...], sd_px: float) -> float:
         kernel = (waves.T * passed) @ waves
         even *= 1 - float(np.abs(kernel - 1 / count).sum(axis=1).max()) / 2
     return 1 - even
-
-
-def _scattered(line: Radiance, optics: Optics) -> Radiance:
-    """Take a frame to its slowest cosines, weaken them as the kernel f K does, and back: f K S, (sample, band)."""
-    along, along_kept = _cosines(line.shape[0], optics.stray_halo_px)
-    across, across_kept = _cosines(line.shape[1], optics.stray_halo_px)
-    kept = np.outer(along_kept, across_kept) * (1 - optics.stray_even)
-    kept[0, 0] = 1
-    modes = along @ (line @ across.T) * (optics.stray_fraction * kept).astype(np.float32)
-    return np.asarray((along.T @ modes) @ across)
 
 
 @lru_cache(maxsize=16)

@@ -409,15 +409,15 @@ def box_weight(distance: Floats, width: float, held: int = 1) -> Floats:
     return np.maximum(total / held, 0.0)  # differences of integrals round
 
 
-def blurred_weight(width: float, variance: Floats, held: int = 1, per_px: int = PER_PX) -> tuple[Floats, Floats]:
+def blurred_weight(width: float, variance: Floats, held: int = 1) -> tuple[Floats, Floats]:
     """Give distances (place,) from -reach to reach and weights (kernel, place) with Gaussians of variance (kernel,)."""
     reach = math.ceil(1 + width / 2 + (held - 1) / 2 + _SDS * math.sqrt(variance.max(initial=0.0))) + 1
-    distance = np.arange(-reach * per_px, reach * per_px + 1) / per_px
+    distance = np.arange(-reach * PER_PX, reach * PER_PX + 1) / PER_PX
     sharp = box_weight(distance, width, held)
     if not variance.any():
         return distance, np.repeat(sharp[None], len(variance), axis=0)
     length = 2 * len(distance)
-    wave = np.fft.rfftfreq(length, 1 / per_px)
+    wave = np.fft.rfftfreq(length, 1 / PER_PX)
     passed = np.exp(-2 * np.pi**2 * variance[:, None] * wave**2)
     blurred = np.fft.irfft(np.fft.rfft(sharp, length) * passed, length)[:, : len(distance)]
     return distance, np.where(variance[:, None] > 0, np.maximum(blurred, 0.0), sharp)

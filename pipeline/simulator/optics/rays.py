@@ -75,13 +75,6 @@ def exact_views(normal: Floats, across: Floats | float, slopes: Floats) -> RayVi
     )
 
 
-def straight_views(centre: Floats, across: Floats | float, slopes: Floats) -> RayViews:
-    """Give where the same rays would look if lines lay straight along their axis, for line centres (..., 2)."""
-    along = centre[..., 0] + slopes
-    one, none = np.ones(along.shape), np.zeros(along.shape)
-    return RayViews(along, np.broadcast_to(centre[..., 1] + across, along.shape), one, none, none, one)
-
-
 def spread_of_waves(normal: Floats | None = None) -> Floats:
     """Give the variance that diffraction has along (line, scan), over that of a round pupil of the mirror's diameter.
 

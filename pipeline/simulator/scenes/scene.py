@@ -71,11 +71,9 @@ class SceneRaster:
         if level == 1:
             return self.drawn()[0]
         with self._lock:
-            once = self._thinned.setdefault(level, Once(lambda: self._half_of(level // 2)))
+            before = 0 if level == 2 else THINNED_MARGIN
+            once = self._thinned.setdefault(level, Once(lambda: _halved(self.thinned(level // 2), before)))
         return once()
-
-    def _half_of(self, level: int) -> NDArray[np.float32]:
-        return _halved(self.thinned(level), 0 if level == 1 else THINNED_MARGIN)
 
     def _checked(self, planes: NDArray[np.float32], labels: NDArray[np.uint8] | None) -> Drawn:
         size = None if labels is None else labels.shape

@@ -131,7 +131,8 @@ def seen_widely(scene: RasterScene, exposure_ms: float) -> WideLight:
         means = to_bands(parts, spectra)
         low, high = np.minimum(low, means.min(axis=(0, 1))), np.maximum(high, means.max(axis=(0, 1)))
         for axis in (0, 1):
-            ahead, middle, behind = _thirds(means, axis)
+            size, whole = means.shape[axis] - 4, (slice(None),) * axis
+            ahead, middle, behind = (means[(*whole, slice(at, at + size))] for at in (4, 2, 0))
             slope = np.maximum(slope, _largest(ahead - middle))
             curvature = np.maximum(curvature, _largest(ahead + behind - 2 * middle))
         if bands > 1:
@@ -176,13 +177,6 @@ def _means(scene: RasterScene) -> Iterator[Radiance]:
             yield part
 
 
-def _thirds(means: Radiance, axis: int) -> tuple[Radiance, Radiance, Radiance]:
-    """Windows ahead of, at and behind each place, side by side along an axis."""
-    size = means.shape[axis] - 4
-    ahead, middle, behind = (means[(slice(None),) * axis + (slice(at, at + size),)] for at in (4, 2, 0))
-    return ahead, middle, behind
-
-
 _ENDLESS = 1e9  # span and curvature of an image whose shifts show as they are
 
 
@@ -194,7 +188,9 @@ def blended_surroundings(probe: Probe, rig: Rig, moving: Sequence[Effect]) -> Pr
     """
     if probe.anywhere is None:
         return probe
-    probe = _turned(probe, sway_gradient(rig) + greatest_fraction(rig.air))
+    turn = sway_gradient(rig) + greatest_fraction(rig.air)  # what rises along one axis rises along the other
+    turned = tuple(replace(one, slope=one.slope + turn * one.slope[::-1]) for one in probe.beside)
+    probe = replace(probe, slope=probe.slope + turn * probe.slope[::-1], beside=turned)
     blurs = [one for one in moving if hasattr(one, "moments")]
     way, parts = greatest_way_px(probe, rig, moving), _blur_parts(probe, rig, blurs)
     own = _blended(probe, 0.0, way, parts)
@@ -232,19 +228,9 @@ def _seen_through(probe: Probe, beside_px: float, sd_px: float) -> Detail:
     return Detail(beside_px, *(np.min(some, axis=0) for some in zip(*found, strict=True)))
 
 
-def _turned(probe: Probe, turn: float) -> Probe:
-    """The probe of an image that shifts turn a little, so that what rises along one axis rises along the other."""
-    beside = tuple(replace(one, slope=one.slope + turn * one.slope[::-1]) for one in probe.beside)
-    return replace(probe, slope=probe.slope + turn * probe.slope[::-1], beside=beside)
-
-
 def greatest_way_px(probe: Probe, rig: Rig, effects: Sequence[Effect]) -> float:
-    """Give how far all that moves the image moves it together at most. [px]"""
-    return _greatest_way(probe, rig, [one for one in effects if any(hasattr(one, act) for act in ("aim", "displaced"))])
-
-
-def _greatest_way(probe: Probe, rig: Rig, moving: Sequence[Effect]) -> float:
-    """How far all that moves the image moves it together at most, told by its bounds on one that rises evenly. [px]"""
+    """Return how far all effects move the image together at most, by their bounds on one that rises evenly. [px]"""
+    moving = [one for one in effects if any(hasattr(one, act) for act in ("aim", "displaced"))]
     bands = len(probe.wavelength_nm)
     rising = replace(
         probe,

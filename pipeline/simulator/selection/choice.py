@@ -258,19 +258,10 @@ def sum_up(decision: Decision, measured: Mapping[str, float] | None = None) -> d
 
 def explain(one: Treatment, decision: Decision) -> str:
     """Say why an effect is on or off, with the magnitude that its own bound states."""
-    unit = UNIT_NAMES[decision.unit]
-    said = f"{_said_reason(one, decision)}: {one.menu.off.why}"
-    if one.is_on and one.option is not one.menu.exact:
-        off_by = f"{_number(one.option.error)} {unit}"
-        said += f"; {one.option.variant} differs from exact by at most {off_by}: {one.option.why}"
-    return said
-
-
-def _said_reason(one: Treatment, decision: Decision) -> str:
     unit, tolerance = UNIT_NAMES[decision.unit], _number(decision.tolerance)
     left_out = f"left out it could change a stored number by {_number(one.menu.off.error)} {unit}"
     asked = one.name in [word.strip() for word in decision.asked.split(",")]
-    return {
+    reasons = {
         "absent": ("asked for, but " if asked else "") + "the rig has none of it",
         "unseen": "the scene shows nothing of it",
         "small": f"left out it changes a stored number by at most {_number(one.option.error)} {unit}",
@@ -280,7 +271,12 @@ def _said_reason(one: Treatment, decision: Decision) -> str:
         "asked": "asked for",
         "unasked": f"not asked for; {left_out}",
         "always": "always there, for raw lines are whole numbers of limited size",
-    }[one.reason]
+    }
+    said = f"{reasons[one.reason]}: {one.menu.off.why}"
+    if one.is_on and one.option is not one.menu.exact:
+        off_by = f"{_number(one.option.error)} {unit}"
+        said += f"; {one.option.variant} differs from exact by at most {off_by}: {one.option.why}"
+    return said
 
 
 def _number(value: float) -> str:

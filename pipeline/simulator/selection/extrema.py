@@ -156,7 +156,10 @@ class BandTiles:
         """Take the extremes of a strip of tiles: planes (row, column, band) with the optics' halo about them."""
         halo = self._optics.halo
         light = planes[halo - 1 : 1 - halo, halo - 1 : 1 - halo] * self._spectra
-        measures = [self._worst_of_groups(one) for one in self._measures(light)]
+        measures = []  # of each the greatest worth of every tile in a group of bands, and its band, (group, tile)
+        for one in self._measures(light):
+            bands = np.stack([one[:, some].argmax(axis=1) + some.start for some in self._groups])
+            measures.append((np.take_along_axis(one.T, bands, axis=0), bands))
         for tier, taken in tiers.items():
             held = np.flatnonzero(np.maximum.reduceat(taken.any(axis=0), self._starts(taken.shape[1])))
             for sort, (worst, bands) in enumerate(measures[:2] if tier < 0 else measures):
@@ -164,11 +167,6 @@ class BandTiles:
                 some = (np.take_along_axis(one, columns, axis=1) for one in (worst, bands))
                 rows = np.full(columns.shape, first), columns * self._tile
                 self._found.setdefault((tier, sort), []).append(np.stack([next(some), *rows, next(some)]))
-
-    def _worst_of_groups(self, expected_gain: Radiance) -> tuple[Radiance, NDArray[np.intp]]:
-        """Greatest worth of each tile, of worths (tile, band), and its band, (group, tile) both."""
-        bands = np.stack([expected_gain[:, some].argmax(axis=1) + some.start for some in self._groups])
-        return np.take_along_axis(expected_gain.T, bands, axis=0), bands
 
     def rank(self, ranking: Ranking, cells: ReachedCells, reaches: Sequence[float]) -> None:
         """Measure the worst tiles of every measure and group closely, and offer their best places.
@@ -255,7 +253,10 @@ class BandTiles:
             beside = (slice(1, None), slice(None)) if axis == 0 else (slice(None), slice(1, None))
             found.append(greatest(step[beside]) / noise)
         found += self._wide_steps(light, starts, greatest, noise)
-        found += self._spectral_steps(inner, greatest, noise)
+        if inner.shape[2] > 1:
+            nm = self._wavelength_nm
+            steps = (steepest_difference(inner, nm), np.abs(second_difference(inner, nm)))
+            found += [greatest(one) / noise for one in steps]
         return found
 
     def _wide_steps(
@@ -273,14 +274,6 @@ class BandTiles:
         aside = np.abs(np.diff(means, axis=1, append=means[:, -1:])).max(axis=0)
         firsts = np.searchsorted(columns, starts + 1, side="right") - 1
         return [span / noise, *(np.maximum.reduceat(step, firsts, axis=0) / noise for step in (ahead, aside))]
-
-    def _spectral_steps(
-        self, inner: Radiance, greatest: Callable[[Radiance], Radiance], noise: Radiance
-    ) -> list[Radiance]:
-        if inner.shape[2] < 2:
-            return []
-        steep = steepest_difference(inner, self._wavelength_nm)
-        return [greatest(one) / noise for one in (steep, np.abs(second_difference(inner, self._wavelength_nm)))]
 
 
 def _halves(size: int, tile: int) -> NDArray[np.intp]:

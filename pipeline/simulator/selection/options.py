@@ -109,7 +109,6 @@ def list_options(probes: Probe | Sequence[Probe], rig: Rig, effects: Sequence[Ef
 
 
 def _worst_of(menus: Sequence[Menu]) -> Menu:
-
     def worst(options: Iterable[Option]) -> Option:
         return max(options, key=lambda option: option.error)
 

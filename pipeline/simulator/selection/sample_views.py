@@ -49,9 +49,6 @@ class SampleViews:
         some: dict[str, Any] = {name: getattr(self, name)[which] for name in _OF_A_VIEW}
         return replace(self, **some)
 
-    def chosen_sums(self, which: NDArray[np.intp]) -> SampleViews:
-        return self.chosen((which[:, None] * self.binning + np.arange(self.binning)).ravel())
-
 
 _OF_A_VIEW = tuple(one.name for one in fields(SampleViews) if one.name != "binning")
 

@@ -309,14 +309,10 @@ def probe_scene(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Uni
     found = replace(summed, usual_e=usual, places=places.seen)
     if beside:
         found = replace(found, **probes.beside(scene, cells.covers))
-    moved_to = _within(beside, greatest_way_px(found, rig, EFFECTS)) if beside else []
-    found = replace(found, slit_errors=_slit_errors(scene, rig, joined([own, *moved_to]), taken, unit))
+        way_px = greatest_way_px(found, rig, EFFECTS)  # shifts of the image may bring samples to what lies as near
+        beside = [one for one, nearer in zip(beside, (0.0, *REACHES), strict=True) if nearer < way_px]
+    found = replace(found, slit_errors=_slit_errors(scene, rig, joined([own, *beside]), taken, unit))
     return worst_of_groups(found) if scene.electrons.ndim == 1 and bands > CHOSEN_BANDS else found
-
-
-def _within(beside: Sequence[SampleViews], way_px: float) -> list[SampleViews]:
-    """Those of the views beside the sweeps to which shifts of the image may bring its samples."""
-    return [one for one, nearer in zip(beside, (0.0, *REACHES), strict=True) if nearer < way_px]
 
 
 def _views_beside(
@@ -345,7 +341,8 @@ def _slit_errors(
 
     Each sweep is seen through the boxes that a variant takes for it.
     """
-    views = views.chosen_sums(_roughest(scene, rig, views, unit))
+    rough = _roughest(scene, rig, views, unit)
+    views = views.chosen((rough[:, None] * views.binning + np.arange(views.binning)).ravel())
     sweep_of = views.sweep[:: views.binning]
     whole = [views_all_over(rig, sweep, exact=True) for sweep in sweeps]
     errors = dict.fromkeys((*SLIT.variants[1:], OFF), 0.0)

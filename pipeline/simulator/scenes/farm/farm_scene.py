@@ -163,7 +163,7 @@ def paint_borders(work: Painting) -> None:
                     full = half * (0.75 + 1.4 * plan.moisture)
                     _cover(canvas, band, full, {"water": np.ones_like(band.across)}, "water")
                 if kind == "road":
-                    _cover(canvas, band, half, hard_track(here, 0.75), "track")
+                    _cover(canvas, band, half, hard_track(here), "track")
                     if swath:
                         _cover(canvas, band, inner, grass(here, 0.5), "grass")
 

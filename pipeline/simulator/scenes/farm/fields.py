@@ -27,7 +27,6 @@ from pipeline.simulator.scenes.farm.land import (
     Points,
     Sun,
     canopy_cover,
-    crop_height,
     days_since_turned,
     disc_pixels,
     edge,
@@ -38,7 +37,6 @@ from pipeline.simulator.scenes.farm.land import (
     stage_fractions,
     stream,
     stripes,
-    weed_size,
 )
 
 Floats = NDArray[np.float64]
@@ -70,7 +68,10 @@ class Content(NamedTuple):
 def paint_fields(work: Painting) -> None:
     """Draw every field."""
     plan = work.plan
-    lodging = _lodging_field(work)
+    standing = any(one.lodging > 0 and one.land_on(plan.day).phase == "crop" for one in plan.fields)
+    lodging = None  # a random field (y, x) whose highest parts lie first
+    if lodged_fraction(plan.day) > 0 and standing:
+        lodging = smooth_noise(stream(plan.seed, "lodging"), plan.shape, LODGED_PATCH_PX)
     for number, field in enumerate(plan.fields):
         index, cover, centres = parcel_pixels(field.parcel, plan.shape)
         if not index.size:
@@ -113,7 +114,8 @@ def _standing_crop(
     growth = np.clip(1 + 0.32 * np.minimum(here.vigour + 1.9, 0), 0.15, 1)  # bare spots where vigour fails
     plants = growth * np.clip(between + (ON_ROW - between) * row + uneven, 0, 0.99) * (1 - gaps * (1 - 0.6 * closed))
     plants = np.asarray(plants + down * (ON_ROW - plants), np.float32)
-    shaded = row_shadow(work.plan.sun, crop_height(crop, age), rows, period, width)
+    height = float(np.interp(age, *np.array(crop.heights).T))
+    shaded = row_shadow(work.plan.sun, height, rows, period, width)
     dense = np.clip(0.2 + 0.3 * width, 0, 0.75) * (1 - gaps) * (1 - down)  # seedlings let light through
     soil = blend(soil, {"shade": np.ones_like(plants)}, np.asarray(dense * shaded, np.float32))
     deep = np.asarray(0.24 * (1 - row) * closed * (1 - down), np.float32)  # between rows that have closed
@@ -177,15 +179,6 @@ def _bare_field(rows: Rows, field: FieldPlan, here: Ground, soil: Mixture) -> Co
     mixture = blend(soil, {"shade": np.ones_like(furrow)}, 0.15 * furrow)
     content = Content(mixture, {"soil": np.ones_like(furrow)})
     return _with_wheel_marks(content, field, rows, soil) if field.crop is None else content
-
-
-def _lodging_field(work: Painting) -> Field | None:
-    """Random field whose highest parts lie first, (y, x); None where nothing lies on the day."""
-    plan = work.plan
-    standing = any(one.lodging > 0 and one.land_on(plan.day).phase == "crop" for one in plan.fields)
-    if lodged_fraction(plan.day) == 0 or not standing:
-        return None
-    return smooth_noise(stream(plan.seed, "lodging"), plan.shape, LODGED_PATCH_PX)
 
 
 def _lodged(noise: Field, field: FieldPlan, day: int) -> Field:
@@ -313,7 +306,8 @@ def field_weeds(rng: np.random.Generator, field: FieldPlan, day: int) -> dict[st
     age = (day - emergence) % YEAR_DAYS
     land = field.land_on(day)
     cut = np.where((age > land.days) & (land.phase in ("grass", "stubble")), 0.5, 1.0)  # saw mowing or harvest
-    size = radius * weed_size(day, emergence, turned) * cut
+    alive = (age < turned) & (age < 170)  # tillage kills a weed, and so does its age; it grows to 63 % in 22 days
+    size = radius * np.where(alive, 1 - np.exp(-age / 22), 0.0) * cut
     flowers = (kinds == "mustard") & (age >= FLOWERING[0]) & (age < FLOWERING[1])
     spectra = np.where(flowers, "blossom", np.where(kinds == "mustard", "weed_leafy", kinds))
     seen = size > SEEN_PX

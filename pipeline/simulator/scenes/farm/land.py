@@ -374,24 +374,10 @@ def stage_fractions(crop: Crop, age: ArrayLike) -> dict[str, Field]:
     return fractions
 
 
-def crop_height(crop: Crop, age: float) -> float:
-    days, heights = np.array(crop.heights).T
-    return float(np.interp(age, days, heights))
-
-
 def lodged_fraction(day: float) -> float:
     """Fraction of what will lodge in a cereal that lies already: 0 before ``LODGES``, 1 after, smooth between."""
     t = float(np.clip((day - LODGES[0]) / (LODGES[1] - LODGES[0]), 0, 1))
     return t * t * (3 - 2 * t)
-
-
-def weed_size(day: float, emergence: NDArray[np.float64], turned: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Fraction of its full radius that a weed has, by the day it comes up and days since its soil was turned; 0: none.
-
-    It grows to 63 % in 22 days, is killed by tillage, and dies 170 days old.
-    """
-    age = (day - emergence) % YEAR_DAYS
-    return np.where((age < turned) & (age < 170), 1 - np.exp(-age / 22), 0.0)
 
 
 def days_since_turned(use: str, day: float, late: float) -> float:
@@ -407,18 +393,3 @@ def foliage(day: float) -> dict[str, float]:
     out, turn, fall = (float(np.interp(day, ends, (0, 1))) for ends in (LEAF_OUT, LEAF_TURN, LEAF_FALL))
     leaves = out * (1 - fall)
     return {"tree": leaves * (1 - turn), "tree_autumn": leaves * turn, "twigs": 1 - leaves}
-
-
-def soil_moisture(seed: int, day: int) -> float:
-    """Water in the topsoil by volume, 0.05 (dry) to 0.38: rain of a year of this seed, drained day by day.
-
-    An antecedent precipitation index, P + k P', of rain on 32 % of days, 5 mm each on average; k is 0.85 in July and
-    0.95 in January.
-    """
-    rng = stream(seed, "rain")
-    rain = np.where(rng.uniform(size=YEAR_DAYS) < 0.32, rng.exponential(5.0, YEAR_DAYS), 0.0)
-    index = 0.0
-    for date in range(day - 120, day + 1):
-        kept = 0.90 + 0.05 * np.cos(2 * np.pi * (date - 15) / YEAR_DAYS)
-        index = kept * index + rain[date % YEAR_DAYS]
-    return float(0.05 + 0.33 * (1 - np.exp(-index / 26.0)))
