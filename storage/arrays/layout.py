@@ -247,18 +247,16 @@ def damage_named(where: str) -> Iterator[None]:
         raise IncompleteStoreError(f"{where} cannot be read: {error}; run verify on the archive") from error
 
 
-def round_bits(
-    values: NDArray[np.floating], kept: int = KEPT_BITS, *, out: NDArray[np.float32] | None = None
-) -> NDArray[np.float32]:
-    """Round float32 to ``kept`` bits of the mantissa, half to even: the rest is zero and compresses away.
+def round_bits(values: NDArray[np.floating], *, out: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+    """Round float32 to KEPT_BITS of the mantissa, half to even: the rest is zero and compresses away.
 
-    Relative error at most 2^-(kept + 1), 2.4e-4 at 11 bits; rounding again changes nothing. NaN and infinities stay.
+    Relative error at most 2^-(KEPT_BITS + 1), 2.4e-4; rounding again changes nothing. NaN and infinities stay.
     ``out`` is contiguous memory of the same shape to write to, None takes fresh memory.
     """
     source = np.ascontiguousarray(values, np.float32)
     found = np.empty(source.shape, np.float32) if out is None else out
     flat, rounded = source.reshape(-1), found.reshape(-1)
-    drop = np.uint32(23 - kept)
+    drop = np.uint32(23 - KEPT_BITS)
     half_less_one = (np.uint32(1) << (drop - np.uint32(1))) - np.uint32(1)
     for first in range(0, len(flat), BLOCK_VALUES):  # stays in cache: in one go it costs more than the codec
         part = slice(first, first + BLOCK_VALUES)

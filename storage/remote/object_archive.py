@@ -186,13 +186,10 @@ class ObjectArchive(Archive):
             if uri not in there:
                 self._ensure(read_run(self.root / uri, {}).recorded)
                 self._upload(uri, first=True)
-            elif not self._is_dated(uri, there[uri]) and self._has_more(uri):
-                self._upload(uri, first=False)
-
-    def _has_more(self, uri: str) -> bool:
-        """Whether a run here is that of the bucket once something was added to it."""
-        standing = self.objects.read(f"{uri}/{MANIFEST_NAME}") or b""
-        return hashlib.sha256(standing).hexdigest() in manifests_before(read_manifest(self.root / uri), EXTENDED)
+            elif not self._is_dated(uri, there[uri]):
+                standing = hashlib.sha256(self.objects.read(f"{uri}/{MANIFEST_NAME}") or b"").hexdigest()
+                if standing in manifests_before(read_manifest(self.root / uri), EXTENDED):  # something was added to it
+                    self._upload(uri, first=False)
 
     # --- the whole of it ----------------------------------------------------------------------------------------------
 
