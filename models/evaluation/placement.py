@@ -120,10 +120,11 @@ def run_controls(
     *,
     fraction: float,
     seed: int,
+    policies: tuple[str, ...] = ("gain", "entropy", "sobel"),
     among: NDArray[np.bool_] | None = None,
     report: Callable[[str], None] = lambda row: None,
 ) -> Controls:
-    """Segment with no patch, every patch, and ``fraction`` of the valid ones by gain, entropy, Sobel and at random.
+    """Segment with no patch, every patch, and ``fraction`` of the valid patches placed by each policy and at random.
 
     ``fine`` (patch, p, p, column) are normalised columns of every patch of the padded grid, ``labels`` (y, x) class
     indices, 255 unlabelled. ``among`` are the patches (patch,) that may be chosen, None for all.
@@ -144,6 +145,6 @@ def run_controls(
         len(placed("random")),
         counts("none", np.empty(0, np.int64)),
         counts("all", np.flatnonzero(valid)),
-        {policy: counts(policy, placed(policy)) for policy in ("gain", "entropy", "sobel")},
+        {policy: counts(policy, placed(policy)) for policy in policies},
         [counts("random", placed("random", 1000 * (draw + 1))) for draw in range(RANDOM_DRAWS)],
     )
