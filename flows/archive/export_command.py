@@ -34,9 +34,8 @@ from storage.archive.whole_files import remove_leftovers
 from storage.arrays.cubes import open_raw_cube
 from storage.arrays.georeference import load_geobox
 from storage.arrays.ground_maps import load_bands, open_image
-from storage.export.image_files import EnviFile, has_map_info, write_cog, write_envi
+from storage.export.image_files import EnviFile, has_map_info, write_cog, write_envi, write_recorded_files
 from storage.export.map_files import STYLE
-from storage.export.recorded_files import write_recorded_files
 from storage.export.stac_items import COG, ZARR, Item, check_owner, clean_id, footprint, projection, write_stac
 from storage.remote.opening import open_archive
 

@@ -179,15 +179,11 @@ class Normalisation:
         if reached.all() or not reached.any() or not pixels.any():
             return
         rows = known[pixels]
-        rows[:, ~reached] = rows[:, reached] @ self._expectation(reached)
+        rest, whitening = ~reached, self.whitening.astype(np.float64)
+        inverse = whitening @ whitening  # of the covariance of a normal law
+        weights = -np.linalg.solve(inverse[np.ix_(rest, rest)], inverse[np.ix_(rest, reached)]).T
+        rows[:, rest] = rows[:, reached] @ np.asarray(weights, np.float32)  # its conditional mean
         known[pixels] = rows
-
-    def _expectation(self, reached: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """(reached, unreached): the conditional mean of a normal law whose inverse covariance is whitening squared."""
-        whitening = self.whitening.astype(np.float64)
-        inverse = whitening @ whitening
-        rest = ~reached
-        return np.asarray(-np.linalg.solve(inverse[np.ix_(rest, rest)], inverse[np.ix_(rest, reached)]).T, np.float32)
 
     @property
     def most_value(self) -> float:

@@ -97,15 +97,10 @@ class LitDetector:
         found = np.empty(len(flat), np.float32)
         for first in range(0, len(flat), PIXELS_AT_ONCE):
             part = slice(first, first + PIXELS_AT_ONCE)
-            found[part] = self._distance(np.asarray(flat[part], np.float32))
-        return found.reshape(columns.shape[:-1])
-
-    def _distance(self, pixels: Floats) -> Floats:
-        with np.errstate(invalid="ignore", over="ignore"):
-            known = pixels @ self.base
-            found = self._squares(known)
+            with np.errstate(invalid="ignore", over="ignore"):
+                found[part] = self._squares(np.asarray(flat[part], np.float32) @ self.base)
         found[~np.isfinite(found)] = np.nan
-        return found
+        return found.reshape(columns.shape[:-1])
 
     def _squares(self, known: Floats) -> Floats:
         near = (known @ self.centres.T - 0.5 * (self.centres**2).sum(axis=1)).argmax(axis=1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -151,7 +150,12 @@ class CropSampler:
             if (labels != UNLABELLED).any():
                 break
         gain = np.float32(rng.normal(1.0, 0.04))
-        turn = _random_turn(rng)
+        transpose, down, across = rng.integers(0, 2, 3)  # one of the eight symmetries of a square
+
+        def turn(image: NDArray[np.generic]) -> NDArray[np.generic]:
+            turned = image.swapaxes(0, 1) if transpose else image
+            return turned[:: 1 - 2 * down, :: 1 - 2 * across]
+
         coarse = turn(example.coarse[y // s : (y + size) // s, x // s : (x + size) // s]).astype(np.float32) * gain
         fine = turn(example.fine[y : y + size, x : x + size]).astype(np.float32) * gain
         shift = (gain - 1) * gain_shift
@@ -165,14 +169,3 @@ class CropSampler:
             for image, sigma in zip(channels_first, (noise / math.sqrt(s), noise), strict=True):
                 image += np.float32(sigma) * rng.standard_normal(image.shape, np.float32)
         return channels_first[0], channels_first[1], np.ascontiguousarray(turn(labels)).astype(np.int64)
-
-
-def _random_turn(rng: np.random.Generator) -> Callable[[NDArray[np.generic]], NDArray[np.generic]]:
-    """One of the eight symmetries of a square, the same for every array it is applied to."""
-    transpose, down, across = rng.integers(0, 2, 3)
-
-    def turn(image: NDArray[np.generic]) -> NDArray[np.generic]:
-        turned = image.swapaxes(0, 1) if transpose else image
-        return turned[:: 1 - 2 * down, :: 1 - 2 * across]
-
-    return turn

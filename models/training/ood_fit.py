@@ -153,40 +153,24 @@ def measured_limits(
     fine, coarse = np.empty((len(steps), len(light), len(RATES))), np.empty((len(light), len(RATES)))
     for j, fraction in enumerate(light):
         for i, step in enumerate(steps):
-            fine[i, j] = _beyond(
-                [_scan_distance(ood_detector, one, scan_passes, fraction, step, rng) for one in examples]
-            )
+            distances = []
+            for one in examples:
+                pixels = np.asarray(one.fine, np.float32)
+                if one.noise is not None:
+                    pixels, _ = scan_passes.scan(pixels, one.noise, _factor(one), light=fraction, step=step, rng=rng)
+                distances.append(ood_detector.lit(fraction).distance(pixels[one.labels != UNLABELLED]))
+            fine[i, j] = _beyond(distances)
             report((j * len(steps) + i + 1) / (len(steps) * len(light)))
-        coarse[j] = _beyond([_coarse_distance(ood_detector, one, scan_passes, fraction, rng) for one in examples])
+        distances = []
+        for one in examples:
+            pixels = one.coarse
+            if one.noise is not None:
+                pixels = scan_passes.coarse_pass(pixels, one.noise, _factor(one), light=fraction, rng=rng)
+            known = _coarse_labels(one) != UNLABELLED
+            distances.append(ood_detector.lit(fraction, _factor(one)).distance(pixels[known]))
+        coarse[j] = _beyond(distances)
     return Limits(np.array(RATES), np.array(light), steps, fine, coarse)
 
 
 def _beyond(distances: list[NDArray[np.float32]]) -> NDArray[np.float64]:
     return np.asarray(np.quantile(np.concatenate(distances).astype(np.float64), 1 - np.array(RATES)))
-
-
-def _scan_distance(
-    ood_detector: OodDetector,
-    example: Example,
-    scan_passes: CaptureAugmentation,
-    light: float,
-    step: int,
-    rng: np.random.Generator,
-) -> NDArray[np.float32]:
-    fine = np.asarray(example.fine, np.float32)
-    if example.noise is not None:
-        fine, _ = scan_passes.scan(fine, example.noise, _factor(example), light=light, step=step, rng=rng)
-    return ood_detector.lit(light).distance(fine[example.labels != UNLABELLED])
-
-
-def _coarse_distance(
-    ood_detector: OodDetector,
-    example: Example,
-    scan_passes: CaptureAugmentation,
-    light: float,
-    rng: np.random.Generator,
-) -> NDArray[np.float32]:
-    coarse = example.coarse
-    if example.noise is not None:
-        coarse = scan_passes.coarse_pass(coarse, example.noise, _factor(example), light=light, rng=rng)
-    return ood_detector.lit(light, _factor(example)).distance(coarse[_coarse_labels(example) != UNLABELLED])

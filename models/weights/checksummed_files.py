@@ -119,8 +119,9 @@ def _seal(about: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
 
-def key_of(about: Mapping[str, Any], hashes: Mapping[str, str]) -> str:
+def key_of(about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> str:
     """Name a description and its tensors by what they hold, 20 hexadecimal digits."""
+    hashes = {name: hash_of(tensor) for name, tensor in tensors.items()}
     return hashlib.sha256(json.dumps([about, hashes], sort_keys=True).encode()).hexdigest()[:KEY_DIGITS]
 
 

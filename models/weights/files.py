@@ -19,14 +19,7 @@ from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis, check_basis, project
 from models.reading.ood import Limits, OodDetector
 from models.weights import checksummed_files
-from models.weights.checksummed_files import (
-    NotChecksummedError,
-    claimed_shapes,
-    hash_of,
-    key_of,
-    read_about,
-    write_checksummed,
-)
+from models.weights.checksummed_files import NotChecksummedError, claimed_shapes, key_of, read_about, write_checksummed
 from models.weights.parts import OOD, READER, OodPart, ReaderPart, TrainedOn
 from pipeline.errors import WeightsError
 from pipeline.lazy import deferred
@@ -123,12 +116,8 @@ def save_weights(weights: Weights, path: Path) -> None:
         "class_names": list(weights.class_names),
         "record": weights.record,
     }
-    keys = {"weights": _key(about, tensors)}
+    keys = {"weights": key_of(about, tensors)}
     _write(path, {**about, "format": FORMAT, "keys": keys}, tensors)
-
-
-def _key(about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> str:
-    return key_of(about, {name: hash_of(tensor) for name, tensor in tensors.items()})
 
 
 def _write(path: Path, about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
@@ -165,7 +154,7 @@ def _add_part(source: Path, out: Path, part: str, about: Mapping[str, Any], tens
         whole = checksummed_files.read_tensors(source, described.about)
     kept = {name: tensor for name, tensor in whole.items() if not name.startswith(f"{part}.")}
     added = {f"{part}.{name}": tensor for name, tensor in tensors.items()}
-    keys = {**described.about["keys"], part: _key(about, tensors)}
+    keys = {**described.about["keys"], part: key_of(about, tensors)}
     _write(out, {**described.about, "keys": keys, part: about}, kept | added)
 
 

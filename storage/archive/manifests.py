@@ -90,7 +90,12 @@ def parse_manifest(written: bytes) -> tuple[dict[str, Any], str | None]:
         if content.get("seal") != _seal(rest) or text != _text(content):
             raise ValueError("it has changed since it was published: its seal does not fit")
         for name, entry in content["files"].items():
-            _check_entry(name, entry)
+            parts = PurePosixPath(name).parts
+            if not parts or name.startswith("/") or ".." in parts or "\0" in name:
+                raise ValueError(f"it lists {name!r}, which is no file of this folder")
+            size, digest = (entry.get("size"), entry.get("sha256")) if isinstance(entry, dict) else (None, None)
+            if isinstance(size, bool) or not isinstance(size, int) or not isinstance(digest, str):
+                raise ValueError(f"it gives no size and hash of {name!r}")
     except RecursionError:
         return {}, "it is nested too deeply"
     except (ValueError, TypeError) as error:
@@ -136,13 +141,9 @@ def is_cleared(manifest: Mapping[str, Any]) -> bool:
     return CLEARED in manifest
 
 
-def cleared_from(manifest: Mapping[str, Any]) -> list[str]:
-    """SHA-256 of the manifests that a store had before its files were cleared away; none where they were not."""
-    return _manifests_before(manifest.get(CLEARED))
-
-
-def _manifests_before(entry: object) -> list[str]:
-    found = _table(entry).get("manifests")
+def manifests_before(manifest: Mapping[str, Any], change: str) -> list[str]:
+    """Return SHA-256 of a folder's manifests before a ``change``, CLEARED or EXTENDED, oldest first."""
+    found = _table(manifest.get(change)).get("manifests")
     return [one for one in found if isinstance(one, str)] if isinstance(found, list) else []
 
 
@@ -157,18 +158,7 @@ def extended_facts(before: Mapping[str, Any], sha256: str) -> dict[str, Any]:
     """
     at = datetime.now(UTC).isoformat(timespec="milliseconds")
     created = {} if "created" not in before else {"created": before["created"]}
-    return created | {EXTENDED: {"at": at, "manifests": [*extended_from(before), sha256]}}
-
-
-def extended_from(manifest: Mapping[str, Any]) -> list[str]:
-    """SHA-256 of the manifests that a run had before something was added to it, oldest first."""
-    return _manifests_before(manifest.get(EXTENDED))
-
-
-def extended_at(manifest: Mapping[str, Any]) -> str:
-    """When something was last added to a run, ISO 8601 in UTC; empty where nothing was."""
-    found = _table(manifest.get(EXTENDED)).get("at")
-    return found if isinstance(found, str) else ""
+    return created | {EXTENDED: {"at": at, "manifests": [*manifests_before(before, EXTENDED), sha256]}}
 
 
 def check_files(folder: Path, *, hashes: bool) -> None:
@@ -225,15 +215,6 @@ def _text(content: Mapping[str, Any]) -> str:
 
 def _seal(content: Mapping[str, Any]) -> str:
     return hashlib.sha256(_text(content).encode()).hexdigest()
-
-
-def _check_entry(name: str, entry: object) -> None:
-    parts = PurePosixPath(name).parts
-    if not parts or name.startswith("/") or ".." in parts or "\0" in name:
-        raise ValueError(f"it lists {name!r}, which is no file of this folder")
-    size, digest = (entry.get("size"), entry.get("sha256")) if isinstance(entry, dict) else (None, None)
-    if isinstance(size, bool) or not isinstance(size, int) or not isinstance(digest, str):
-        raise ValueError(f"it gives no size and hash of {name!r}")
 
 
 @cache

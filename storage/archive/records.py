@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from storage.archive.keys import StageRef, in_text
-from storage.archive.manifests import extended_at, is_cleared, listed_bytes, try_manifest
+from storage.archive.manifests import EXTENDED, is_cleared, listed_bytes, try_manifest
 from storage.archive.staging import MANIFEST_NAME, file_hash, read_plain
 
 RECEIPT = "receipt.json"
@@ -128,7 +128,7 @@ class Run:
     @property
     def checksummed(self) -> str:
         """When its manifest was written: at its publication, or when something was last added to it; ISO 8601."""
-        return extended_at(self.facts) or self.created
+        return _text(_table(self.facts.get(EXTENDED)).get("at")) or self.created
 
     @property
     def simulated(self) -> bool:

@@ -18,9 +18,10 @@ from typing import Any
 
 from storage.archive.keys import plain, published_runs
 from storage.archive.manifests import (
+    EXTENDED,
     extended_facts,
-    extended_from,
     manifest_sha256,
+    manifests_before,
     read_manifest,
     try_manifest,
     write_manifest,
@@ -176,7 +177,7 @@ def unfinished_extensions(root: Path) -> Iterator[Path]:
     for part in sorted((root / "runs").glob(f"*{PART_SUFFIX}")):
         facts, problem = try_manifest(part)
         named = part.name.removesuffix(PART_SUFFIX)
-        whole = problem is None and bool(extended_from(facts)) and facts.get("run") == named
+        whole = problem is None and bool(manifests_before(facts, EXTENDED)) and facts.get("run") == named
         if whole and not (root / "runs" / named).exists():
             yield part
 

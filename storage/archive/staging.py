@@ -271,8 +271,10 @@ def take_lock(path: Path, *, wait: bool = True, shared: bool = False, words: str
             if _is_still(descriptor, path):
                 if not shared:  # else another may hold it yet
                     held.callback(_drop_name, path)  # called before the lock is let go
-                if words:
-                    _write_words(descriptor, words)
+                if words and os.fstat(descriptor).st_nlink == 1:  # with another name it may be somebody's file
+                    with suppress(OSError):  # a full disk keeps nobody from holding a lock
+                        os.ftruncate(descriptor, 0)
+                        os.pwrite(descriptor, words.encode(), 0)
                 return held.pop_all().close
 
 
@@ -296,14 +298,6 @@ def _misplaced(path: Path, expected: str) -> ArchiveError:
     return ArchiveError(
         f"{path} is a link, expected {expected} of its own; see where it leads and who made it, remove it and run again"
     )
-
-
-def _write_words(descriptor: int, words: str) -> None:
-    """Replace what a lock's file says; one that has another name too may be somebody's file, and is left as it is."""
-    with suppress(OSError):  # a full disk keeps nobody from holding a lock
-        if os.fstat(descriptor).st_nlink == 1:
-            os.ftruncate(descriptor, 0)
-            os.pwrite(descriptor, words.encode(), 0)
 
 
 def _drop_name(path: Path) -> None:

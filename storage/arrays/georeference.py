@@ -52,11 +52,6 @@ _DEGREES = {"x": ("longitude", "degrees_east"), "y": ("latitude", "degrees_north
 _EVEN = 1e-3  # of a step, by which coordinates may differ from an even grid's
 
 
-def geobox_of(grid: AngularGrid, shape: tuple[int, ...]) -> GeoBox | None:
-    """The GeoBox of an image of (y, x) ``shape`` on a scene's grid; None where the scene has none."""
-    return None if grid.geobox is None else zoomed_out(grid.geobox, grid.factor, (shape[0], shape[1]))
-
-
 def create_placed_group(
     path: Path, title: str, grid: AngularGrid | None, shape: tuple[int, ...], attributes: Mapping[str, Any]
 ) -> tuple[zarr.Group, dict[str, Any]]:
@@ -66,7 +61,8 @@ def create_placed_group(
     """
     if grid is None:
         return create_group(path, title, attributes), {}
-    geobox, record = geobox_of(grid, shape), {"angular_grid": grid.record()}
+    geobox = None if grid.geobox is None else zoomed_out(grid.geobox, grid.factor, (shape[0], shape[1]))
+    record = {"angular_grid": grid.record()}
     if geobox is not None:
         place = map_attributes(geobox)
         group = create_group(path, title, {**place, **record, **attributes})
@@ -187,10 +183,16 @@ def find_geobox(
     even coordinates of pixel centres along both axes.
     """
     mapping = _mapping(attributes, arrays)
-    crs = _crs_said(attributes, mapping)
-    if crs is None:
+    places = ((mapping, ("crs_wkt", "spatial_ref")), (attributes, ("proj:wkt2", "proj:code", "proj:projjson")))
+    said = next((about[name] for about, names in places for name in names if about.get(name)), None)
+    if said is None:
         return None
-    transform = _transform_said(attributes, mapping) or _transform_of_axes(arrays, dims)
+    crs, numbers = odc_crs.CRS(said), str(mapping.get("GeoTransform", "")).split()
+    if len(numbers) == 6:
+        return odc_geobox.GeoBox(shape, Affine.from_gdal(*map(float, numbers)), crs)
+    if (stated := attributes.get("spatial:transform")) is not None:
+        return odc_geobox.GeoBox(shape, Affine(*map(float, stated)), crs)
+    transform = _transform_of_axes(arrays, dims)
     return None if transform is None else odc_geobox.GeoBox(shape, transform, crs)
 
 
@@ -204,32 +206,16 @@ def _mapping(attributes: Mapping[str, Any], arrays: Mapping[str, zarr.Array[Any]
     return found[0] if len(found) == 1 else {}
 
 
-def _crs_said(attributes: Mapping[str, Any], mapping: Mapping[str, Any]) -> CRS | None:
-    places = ((mapping, ("crs_wkt", "spatial_ref")), (attributes, ("proj:wkt2", "proj:code", "proj:projjson")))
-    said = next((about[name] for about, names in places for name in names if about.get(name)), None)
-    return None if said is None else odc_crs.CRS(said)
-
-
-def _transform_said(attributes: Mapping[str, Any], mapping: Mapping[str, Any]) -> Affine | None:
-    words = str(mapping.get("GeoTransform", "")).split()
-    if len(words) == 6:
-        return Affine.from_gdal(*map(float, words))
-    said = attributes.get("spatial:transform")
-    return None if said is None else Affine(*map(float, said))
-
-
 def _transform_of_axes(arrays: Mapping[str, zarr.Array[Any]], dims: tuple[str, str]) -> Affine | None:
-    """The same from coordinates of pixel centres, where both axes have even ones of two or more pixels."""
+    """Return the transform by coordinates of pixel centres, where both axes have even ones of two or more pixels."""
     if not all(name in arrays and arrays[name].ndim == 1 and arrays[name].shape[0] > 1 for name in dims):
         return None
     y, x = (np.asarray(arrays[name][...], np.float64) for name in dims)
-    steps = [_even_step(centres) for centres in (y, x)]
-    if steps[0] is None or steps[1] is None:
-        return None
+    steps: list[float] = []
+    for centres in (y, x):
+        step = float(centres[-1] - centres[0]) / (len(centres) - 1)
+        even = np.abs(centres - centres[0] - step * np.arange(len(centres))).max() <= _EVEN * abs(step)
+        if not step or not even:
+            return None
+        steps.append(step)
     return Affine(steps[1], 0.0, float(x[0]) - steps[1] / 2, 0.0, steps[0], float(y[0]) - steps[0] / 2)
-
-
-def _even_step(centres: NDArray[np.float64]) -> float | None:
-    step = float(centres[-1] - centres[0]) / (len(centres) - 1)
-    even = np.abs(centres - centres[0] - step * np.arange(len(centres))).max() <= _EVEN * abs(step)
-    return step if step and even else None

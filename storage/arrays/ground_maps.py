@@ -118,15 +118,19 @@ class GroundMapWriter:
         self._group = create_group(path, "class map on the ground", {**place, **names, **about})
         write_map_coordinates(self._group, geobox)
         self._shape, self._legend = tuple(geobox.shape), legend
-        self._images = {
-            name: self._begin(name, kind, {**words, **place, **ON_THE_MAP})
-            for name, (kind, words) in _images_of(legend, goes_on=goes_on).items()
+        images: dict[str, tuple[str, Mapping[str, Any]]] = {
+            "classes": ("|u1", class_flags(legend.names, legend.colours)),
+            "confidence": ("<f4", CONFIDENCE),
+            PICTURE: ("|u1", {"long_name": "picture for viewers, red green blue; 0 not seen"}),
+            "age": ("<f4", {"long_name": "time since the pixel was looked at", "units": "days"}),
         }
-
-    def _begin(self, name: str, dtype: str, about: Mapping[str, Any]) -> zarr.Array[Any]:
-        rest = {"rgb": 3} if name == PICTURE else {}
-        spec = image_spec(("y", "x", *rest), (*self._shape, *rest.values()), dtype)
-        return create_array(self._group, name, spec, about)
+        if goes_on:
+            images |= {"changed": ("<f4", CHANGED), OLD_CLASS: ("|u1", old_class_flags(legend))}
+        self._images: dict[str, zarr.Array[Any]] = {}
+        for name, (kind, words) in images.items():
+            rest = {"rgb": 3} if name == PICTURE else {}
+            spec = image_spec(("y", "x", *rest), (*self._shape, *rest.values()), kind)
+            self._images[name] = create_array(self._group, name, spec, {**words, **place, **ON_THE_MAP})
 
     def write_block(self, rows: slice, columns: slice, images: Mapping[str, NDArray[np.generic]]) -> None:
         """Store one block of all images, by name.
@@ -151,18 +155,6 @@ class GroundMapWriter:
             name: {"m2": m2, "ha": m2 / M2_PER_HECTARE, "fraction": m2 / total}
             for name, m2 in zip(self._legend.names, areas_m2.tolist(), strict=True)
         }
-
-
-def _images_of(legend: ClassNames, *, goes_on: bool) -> dict[str, tuple[str, Mapping[str, Any]]]:
-    """Type and attributes of every image of a map, by name."""
-    images: dict[str, tuple[str, Mapping[str, Any]]] = {
-        "classes": ("|u1", class_flags(legend.names, legend.colours)),
-        "confidence": ("<f4", CONFIDENCE),
-        PICTURE: ("|u1", {"long_name": "picture for viewers, red green blue; 0 not seen"}),
-        "age": ("<f4", {"long_name": "time since the pixel was looked at", "units": "days"}),
-    }
-    changes = {"changed": ("<f4", CHANGED), OLD_CLASS: ("|u1", old_class_flags(legend))}
-    return images | changes if goes_on else images
 
 
 def load_ground_map(path: Path) -> GroundMap:

@@ -247,37 +247,25 @@ def damage_named(where: str) -> Iterator[None]:
         raise IncompleteStoreError(f"{where} cannot be read: {error}; run verify on the archive") from error
 
 
-def missing_codec(where: str, codec: str) -> str:
-    """What to say of an array whose codec is not installed; its bytes may well be whole."""
-    name = codec.strip("'")  # numcodecs gives it in quotes
-    return f"{where} is packed with {name}, which is not installed; pip install {name} (nothing is damaged)"
+def round_bits(values: NDArray[np.floating], *, out: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+    """Round float32 to KEPT_BITS of the mantissa, half to even: the rest is zero and compresses away.
 
-
-def round_bits(
-    values: NDArray[np.floating], kept: int = KEPT_BITS, *, out: NDArray[np.float32] | None = None
-) -> NDArray[np.float32]:
-    """Round float32 to ``kept`` bits of the mantissa, half to even: the rest is zero and compresses away.
-
-    Relative error at most 2^-(kept + 1), 2.4e-4 at 11 bits; rounding again changes nothing. NaN and infinities stay.
+    Relative error at most 2^-(KEPT_BITS + 1), 2.4e-4; rounding again changes nothing. NaN and infinities stay.
     ``out`` is contiguous memory of the same shape to write to, None takes fresh memory.
     """
     source = np.ascontiguousarray(values, np.float32)
     found = np.empty(source.shape, np.float32) if out is None else out
     flat, rounded = source.reshape(-1), found.reshape(-1)
+    drop = np.uint32(23 - KEPT_BITS)
+    half_less_one = (np.uint32(1) << (drop - np.uint32(1))) - np.uint32(1)
     for first in range(0, len(flat), BLOCK_VALUES):  # stays in cache: in one go it costs more than the codec
         part = slice(first, first + BLOCK_VALUES)
-        rounded[part] = _rounded(flat[part], kept)
+        bits = flat[part].view(np.uint32)
+        nearest = bits + half_less_one + ((bits >> drop) & np.uint32(1))
+        nearest &= ~((np.uint32(1) << drop) - np.uint32(1))
+        as_float = nearest.view(np.float32)
+        rounded[part] = np.where(np.isfinite(flat[part]) & np.isfinite(as_float), as_float, flat[part])
     return found
-
-
-def _rounded(source: NDArray[np.float32], kept: int) -> NDArray[np.float32]:
-    bits = source.view(np.uint32)
-    drop = np.uint32(23 - kept)
-    half_less_one = (np.uint32(1) << (drop - np.uint32(1))) - np.uint32(1)
-    rounded = bits + half_less_one + ((bits >> drop) & np.uint32(1))
-    rounded &= ~((np.uint32(1) << drop) - np.uint32(1))
-    as_float = rounded.view(np.float32)
-    return np.where(np.isfinite(source) & np.isfinite(as_float), as_float, source)
 
 
 BLOSC = {"lz4-5": ("lz4", 5), "zstd-1": ("zstd", 1), "zstd-3": ("zstd", 3), "zstd-5": ("zstd", 5)}

@@ -168,15 +168,8 @@ def _task_file(grid: TaskGrid, words: TaskText, length: int) -> ElementTree.Elem
     for code, name in ((UNTREATED, "no treatment"), (TREATED, "by the grid")):
         zone = ElementTree.SubElement(task, "TZN", {"A": str(code), "B": name})
         ElementTree.SubElement(zone, "PDV", {"A": f"{grid.unit.ddi:04X}", "B": "0", "C": "PDT1", "E": "VPN1"})
-    ElementTree.SubElement(task, "GRD", _grid_fields(grid, length))
-    shown = {"A": "VPN1", "B": "0", "C": f"{1 / grid.unit.per_unit:g}", "D": "2", "E": grid.unit.name}
-    ElementTree.SubElement(root, "VPN", shown)
-    return root
-
-
-def _grid_fields(grid: TaskGrid, length: int) -> dict[str, str]:
     rows, columns = grid.doses.shape
-    return {
+    fields = {
         "A": f"{grid.south_deg:.{DEGREE_DIGITS}f}",
         "B": f"{grid.west_deg:.{DEGREE_DIGITS}f}",
         "C": f"{grid.north_step_deg:.{DEGREE_DIGITS}f}",
@@ -188,6 +181,10 @@ def _grid_fields(grid: TaskGrid, length: int) -> dict[str, str]:
         "I": "2",
         "J": str(TREATED),
     }
+    ElementTree.SubElement(task, "GRD", fields)
+    shown = {"A": "VPN1", "B": "0", "C": f"{1 / grid.unit.per_unit:g}", "D": "2", "E": grid.unit.name}
+    ElementTree.SubElement(root, "VPN", shown)
+    return root
 
 
 def ramp_colour(fraction: float, ramp: Sequence[Colour]) -> Colour:

@@ -19,11 +19,12 @@ from pipeline.rig.capture import JOURNAL
 from storage.archive.keys import without_manifest
 from storage.archive.lineage import Catalogue
 from storage.archive.manifests import (
+    CLEARED,
+    EXTENDED,
     broken_files,
-    cleared_from,
-    extended_from,
     listed_bytes,
     manifest_sha256,
+    manifests_before,
     try_manifest,
 )
 from storage.archive.run_folders import unfinished_extensions
@@ -105,7 +106,10 @@ def verify_everything(
         found += [Finding(uri, problem, "broken") for problem in problems]
         if not problems:
             found.append(Finding(uri, None))
-    return [*found, *_misplaced(catalogue, root), *_missing(catalogue), *_broken_off(root), *verify_growing(root)]
+    found += [*_misplaced(catalogue, root), *_missing(catalogue)]
+    words = "what was added to it lacks its last step, a name; any command that writes into the archive gives it"
+    found += [Finding(f"runs/{part.stem}", words, "stray") for part in unfinished_extensions(root)]
+    return [*found, *verify_growing(root)]
 
 
 def verify_growing(root: Path) -> Iterator[Finding]:
@@ -148,7 +152,9 @@ def _inside(folder: Path) -> list[Path]:
 def _changed_since(catalogue: Catalogue, uri: str) -> bool:
     """Whether something was added to a run after the catalogue was read."""
     run = None if uri in catalogue.stores else next((run for run in catalogue.runs if run.uri == uri), None)
-    return run is not None and extended_from(try_manifest(run.folder)[0]) != extended_from(run.facts)
+    if run is None:
+        return False
+    return manifests_before(try_manifest(run.folder)[0], EXTENDED) != manifests_before(run.facts, EXTENDED)
 
 
 def _problems(folder: Path) -> Iterator[str]:
@@ -170,7 +176,7 @@ def _identity_problems(catalogue: Catalogue, uri: str) -> Iterator[str]:
     if stated != uri:
         yield f"its {MANIFEST_NAME} is that of {stated}; move it back, or take it out of the archive"
     knowing = catalogue.recorded_by.get(uri, [])
-    own = {manifest_sha256(store.ref.path), *cleared_from(store.facts)} if knowing else set()
+    own = {manifest_sha256(store.ref.path), *manifests_before(store.facts, CLEARED)} if knowing else set()
     anew = all(store.created > run.checksummed for run, _ in knowing)
     if not anew and not any(sha256 in own for _, sha256 in knowing):
         yield f"its {MANIFEST_NAME} has changed since {knowing[-1][0].uri} was published (its SHA-256 differs)"
@@ -204,9 +210,3 @@ def _missing(catalogue: Catalogue) -> Iterator[Finding]:
             if given not in there | told:
                 told.add(given)
                 yield Finding(given, f"is not there, but {uri} was made of it", "missing")
-
-
-def _broken_off(root: Path) -> Iterator[Finding]:
-    for part in unfinished_extensions(root):
-        words = "what was added to it lacks its last step, a name; any command that writes into the archive gives it"
-        yield Finding(f"runs/{part.stem}", words, "stray")

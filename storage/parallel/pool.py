@@ -71,10 +71,10 @@ def mib(size: int) -> str:
     return f"{-(-size // 2**20)} MiB"
 
 
-def memory_refusal(least: int, memory: int, why: str, instead: str = "") -> SettingsError:
-    """Return the error of work that takes more than the setting ``memory`` [bytes]: why, the least, what else helps."""
+def memory_refusal(least: int, memory: int, why: str) -> SettingsError:
+    """Return the error of work that takes more than the setting ``memory`` [bytes]: why, and the least."""
     over = f"projected memory {mib(least)} exceeds --memory {mib(memory)}"
-    return SettingsError(f"{over}: {why}; give at least --memory {mib(least)}{instead}")
+    return SettingsError(f"{over}: {why}; give at least --memory {mib(least)}")
 
 
 @dataclass(frozen=True)

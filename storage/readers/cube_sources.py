@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError
 from pipeline.signal.calibrate import calibrate
 from pipeline.source import References
-from storage.arrays.layout import missing_codec
 
 if TYPE_CHECKING:
     from odc.geo.geobox import GeoBox
@@ -67,7 +66,10 @@ def reading(path: Path, kind: str, cure: str = "copy it again") -> Iterator[None
     except SceneError:
         raise
     except UnknownCodecError as error:
-        raise SceneError(missing_codec(str(path), error.codec_id)) from error
+        name = error.codec_id.strip("'")  # numcodecs gives it in quotes
+        raise SceneError(
+            f"{path} is packed with {name}, which is not installed; pip install {name} (nothing is damaged)"
+        ) from error
     except KeyError as error:
         raise SceneError(f"{path} lacks what files of its kind have: {error}; copy it again") from error
     except Exception as error:

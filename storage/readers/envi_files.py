@@ -415,7 +415,14 @@ def _placed(opened: Mapping[int, EnviCube], notes: list[str]) -> dict[int, EnviC
     first: EnviCube | None = None
     for number, cube in opened.items():
         first = first or cube
-        _check_alike(first, cube)
+        if cube.values.shape[1:] != first.values.shape[1:] or cube.values.dtype != first.values.dtype:
+            raise SceneError(
+                f"{cube.path} has frames of {cube.values.shape[1:]} (sample, band) {cube.values.dtype}, "
+                f"{first.path.name} of {first.values.shape[1:]} {first.values.dtype}; ingest them by themselves"
+            )
+        ours, theirs = first.header.wavelength_nm, cube.header.wavelength_nm
+        if ours is not None and theirs is not None and not np.array_equal(ours, theirs):
+            raise SceneError(f"{cube.path} has other wavelengths than {first.path.name}; ingest them by themselves")
         start = number - min(opened)
         if start < end:
             notes.append(f"{cube.path.name} begins {end - start} frames before the part before it ends")
@@ -431,15 +438,3 @@ def _placed(opened: Mapping[int, EnviCube], notes: list[str]) -> dict[int, EnviC
         end = max(start, end) + len(cube.values)
         notes.extend(cube.notes)
     return parts
-
-
-def _check_alike(first: EnviCube, cube: EnviCube) -> None:
-    """Refuse parts of several frame sizes, types or sets of wavelengths (SceneError)."""
-    if cube.values.shape[1:] != first.values.shape[1:] or cube.values.dtype != first.values.dtype:
-        raise SceneError(
-            f"{cube.path} has frames of {cube.values.shape[1:]} (sample, band) {cube.values.dtype}, "
-            f"{first.path.name} of {first.values.shape[1:]} {first.values.dtype}; ingest them by themselves"
-        )
-    ours, theirs = first.header.wavelength_nm, cube.header.wavelength_nm
-    if ours is not None and theirs is not None and not np.array_equal(ours, theirs):
-        raise SceneError(f"{cube.path} has other wavelengths than {first.path.name}; ingest them by themselves")

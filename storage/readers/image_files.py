@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -122,7 +122,13 @@ def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> Cub
             notes=tuple(notes),
         )
     if scaled and void is not None and not void.all():
-        source = replace(source, dtype=np.dtype(np.float32), read=partial(_with_gaps, read, void))
+        source = replace(
+            source,
+            dtype=np.dtype(np.float32),
+            read=lambda first, last: np.where(
+                void[first:last, :, None], np.float32(np.nan), read(first, last).astype(np.float32)
+            ),
+        )
     if scaled and not ((scale == 1).all() and (offset == 0).all()):
         source = rescaled(source, scale, offset, source.nodata)
     return replace(source, read=read_by_chunks(source.read, height, block[0] if driver == "JP2OpenJPEG" else 1))
@@ -154,10 +160,6 @@ def _reader(
         return numbers if colours is None else colours[numbers[..., 0]]
 
     return read
-
-
-def _with_gaps(read: ReadLines, void: NDArray[np.bool_], first: int, last: int) -> NDArray[np.float32]:
-    return np.where(void[first:last, :, None], np.float32(np.nan), read(first, last).astype(np.float32))
 
 
 def rescaled(

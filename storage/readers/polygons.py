@@ -98,8 +98,10 @@ def read_polygons(source: str) -> PolygonLayer:
         if path.suffix.lower() == ".gpkg":
             layer = _layer_of(path, layer)
         about, _, found, values = pyogrio.raw.read(path, layer=layer)
-        # GDAL takes WGS 84 for granted in GeoJSON; whether that is meant is the survey's to say
-        known = about["crs"] is not None and (path.suffix.lower() not in GEOJSON or _names_crs(path))
+        known = about["crs"] is not None
+        if known and path.suffix.lower() in GEOJSON:  # GDAL takes WGS 84 for granted; whether it is, the survey says
+            content = json.loads(path.read_text(encoding="utf-8-sig"))
+            known = isinstance(content, dict) and content.get("crs") is not None
         crs = pyproj.CRS.from_user_input(about["crs"]) if known else None
     except (OSError, ValueError, RuntimeError, pyproj.exceptions.CRSError) as error:  # GDAL's are RuntimeErrors
         raise ZoneError(f"cannot read {source} as polygons: {error}; save it anew from a map program") from None
@@ -138,11 +140,6 @@ def _layer_of(path: Path, layer: str | None) -> str | None:
         asked = "has several layers" if layer is None else f"has no layer {layer!r}"
         raise ZoneError(f"{path} {asked}; name one of {', '.join(layers)}: {path}:{layers[0] if layers else 'LAYER'}")
     return layer
-
-
-def _names_crs(path: Path) -> bool:
-    content = json.loads(path.read_text(encoding="utf-8-sig"))
-    return isinstance(content, dict) and content.get("crs") is not None
 
 
 def _names(content: PolygonLayer, named_by: str | None, source: str) -> list[str]:

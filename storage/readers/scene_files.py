@@ -156,7 +156,9 @@ def _open(
 
     def read(first: int, last: int) -> NDArray[np.float32]:
         """Give rows (y, x, band), NaN where the file has no value."""
-        return as_values(scene_lines(source, first, last), chosen, nodata, gaps(first, last))
+        _, values, _ = _converted(scene_lines(source, first, last), chosen, nodata, gaps(first, last))
+        values[np.isinf(values)] = np.nan
+        return values
 
     if keep:
         check_memory(address, 8 * height * width * count)  # as float32, and once more while the scene is made
@@ -314,15 +316,6 @@ def _digest(*parts: object) -> str:
 
 
 # --- values -----------------------------------------------------------------------------------------------------------
-
-
-def as_values(
-    rows: NDArray[Any], chosen: Sequence[int], nodata: float | None, void: NDArray[np.bool_] | None
-) -> NDArray[np.float32]:
-    """Return the chosen bands of (y, x, band) rows as float32; ``void`` (y, x), no data and infinities are NaN."""
-    _, values, _ = _converted(rows, chosen, nodata, void)
-    values[np.isinf(values)] = np.nan
-    return values
 
 
 def _converted(

@@ -28,10 +28,11 @@ from pipeline.errors import ArchiveError, IncompleteStoreError
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, in_text, open_folder, store_at
 from storage.archive.manifests import (
+    EXTENDED,
     check_files,
-    extended_from,
     file_problem,
     is_cleared,
+    manifests_before,
     parse_manifest,
     read_manifest,
     try_manifest,
@@ -185,13 +186,10 @@ class ObjectArchive(Archive):
             if uri not in there:
                 self._ensure(read_run(self.root / uri, {}).recorded)
                 self._upload(uri, first=True)
-            elif not self._is_dated(uri, there[uri]) and self._has_more(uri):
-                self._upload(uri, first=False)
-
-    def _has_more(self, uri: str) -> bool:
-        """Whether a run here is that of the bucket once something was added to it."""
-        standing = self.objects.read(f"{uri}/{MANIFEST_NAME}") or b""
-        return hashlib.sha256(standing).hexdigest() in extended_from(read_manifest(self.root / uri))
+            elif not self._is_dated(uri, there[uri]):
+                standing = hashlib.sha256(self.objects.read(f"{uri}/{MANIFEST_NAME}") or b"").hexdigest()
+                if standing in manifests_before(read_manifest(self.root / uri), EXTENDED):  # something was added to it
+                    self._upload(uri, first=False)
 
     # --- the whole of it ----------------------------------------------------------------------------------------------
 
@@ -391,7 +389,8 @@ class ObjectArchive(Archive):
         text, files = (folder / MANIFEST_NAME).read_bytes(), read_manifest(folder)["files"]
         check_files(folder, hashes=True)
         place, there = _files_at(uri, text), objects.listing(uri)
-        waiting = [name for name, one in files.items() if _listed_size(there, f"{place}/{name}") != one["size"]]
+        sizes = {path: one.size for path, one in there.items()}
+        waiting = [name for name, one in files.items() if sizes.get(f"{place}/{name}") != one["size"]]
         some_at_a_time(lambda name: objects.write(f"{place}/{name}", folder / name), waiting)
         if not first:
             objects.write(f"{uri}/{MANIFEST_NAME}", text)
@@ -436,12 +435,12 @@ def _files_at(uri: str, manifest: bytes) -> str:
 def _manifests(there: Mapping[str, Listed]) -> dict[str, Listed]:
     """What is published, by address."""
     depths = {"stages": 4, "runs": 3}
-    named = {path.removesuffix(f"/{MANIFEST_NAME}"): one for path, one in there.items() if _ends(path)}
+    named = {
+        path.removesuffix(f"/{MANIFEST_NAME}"): one
+        for path, one in there.items()
+        if path.endswith(f"/{MANIFEST_NAME}") and _is_address(path)
+    }
     return {uri: one for uri, one in named.items() if depths.get(uri.split("/")[0]) == uri.count("/") + 2}
-
-
-def _ends(path: str) -> bool:
-    return path.endswith(f"/{MANIFEST_NAME}") and _is_address(path)
 
 
 def _lost_runs(there: Mapping[str, Listed]) -> list[str]:
@@ -485,10 +484,6 @@ def _problems(objects: Objects, there: Mapping[str, Listed], folder: Path, place
     yield from (f"{name} is not in the manifest: take it out of the archive" for name in sorted(extra))
 
 
-def _listed_size(there: Mapping[str, Listed], name: str) -> int | None:
-    return there[name].size if name in there else None
-
-
 def _size(path: Path) -> int:
     try:
         return path.stat().st_size
@@ -515,11 +510,6 @@ def open_object_archive(text: str | Path, *, create: bool = True, write: bool = 
     if not create:
         archive.mirror()
     return archive
-
-
-def is_object_archive(text: str | Path) -> bool:
-    """Whether there is an archive at ``s3://bucket/prefix`` (UnreachableError: that cannot be told)."""
-    return Objects(parse_place(text)).read(MARK) is not None
 
 
 def _find_mark(objects: Objects, *, create: bool) -> None:

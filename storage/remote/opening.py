@@ -6,8 +6,8 @@ from pathlib import Path
 
 from storage.archive.archive import Archive
 from storage.maintenance.verification import Finding, Progress, verify_everything, verify_growing
-from storage.remote.object_archive import ObjectArchive, is_object_archive, open_object_archive
-from storage.remote.object_stores import is_remote
+from storage.remote.object_archive import MARK, ObjectArchive, open_object_archive
+from storage.remote.object_stores import Objects, is_remote, parse_place
 
 
 def open_archive(address: str | Path, *, create: bool = True, write: bool = True) -> Archive:
@@ -22,9 +22,12 @@ def open_archive(address: str | Path, *, create: bool = True, write: bool = True
 
 
 def is_archive(address: str | Path) -> bool:
-    """Whether there is something to open: an archive, or a file that will be refused."""
+    """Whether there is something to open: an archive, or a file that will be refused.
+
+    Raises UnreachableError: that cannot be told of an address on S3.
+    """
     if is_remote(address):
-        return is_object_archive(address)
+        return Objects(parse_place(address)).read(MARK) is not None
     return (Path(address) / "stages").is_dir() or Path(address).is_file()
 
 

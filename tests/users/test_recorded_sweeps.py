@@ -31,7 +31,7 @@ from storage.archive.keys import array_digest
 from storage.arrays.class_maps import load_class_map
 from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
 from storage.arrays.mosaics import load_mosaic
-from storage.export.recorded_files import write_recorded_files
+from storage.export.image_files import write_recorded_files
 from storage.remote.opening import verify_archive
 from tests.conftest import Survey, WeightsMaker, patchy_scene
 from tests.flows.conftest import CommandLine, be_version, command_line

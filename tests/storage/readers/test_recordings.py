@@ -27,7 +27,7 @@ from pipeline.geometry.scan import Sweep
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive.archive import Archive
 from storage.arrays.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
-from storage.export.recorded_files import write_recorded_files
+from storage.export.image_files import write_recorded_files
 from storage.readers.recordings import RecordedWith, open_recording
 from tests.pipeline.capture.recordings import CAMERA, FULL, simulated
 
