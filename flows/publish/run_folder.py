@@ -32,7 +32,7 @@ from flows.tasks.stages.accuracy import load_accuracy
 from flows.tasks.stages.attention import load_plan
 from flows.tasks.stages.effects import load_manifest
 from flows.tasks.stages.on_ground import STORE
-from flows.tasks.stages.placement import PATCHES_AT_ONCE, line_facts, load_registration, seen_fractions
+from flows.tasks.stages.placement import PATCHES_AT_ONCE, load_registration, seen_fractions
 from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.errors import IncompleteStoreError
 from pipeline.planning.coverage import on_scene
@@ -41,6 +41,7 @@ from pipeline.planning.prices import SavingEntry, capture_savings
 from pipeline.planning.uniform_scans import format_scan
 from pipeline.signal.calibrate import of_bands, reflectance
 from storage.archive.keys import StageRef
+from storage.archive.manifests import read_table
 from storage.archive.records import read_run
 from storage.archive.run_folders import RunDraft
 from storage.archive.whole_files import to_json
@@ -338,7 +339,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
         run, drawn
     )
     found |= find_map(run, class_map, drawn)
-    lines = {} if run.raster is not None else line_facts(products.mosaic)
+    lines = {} if run.raster is not None else read_table(products.mosaic.path / "lines.json")
     troubled = {name: facts for name, facts in lines.items() if any(facts.values())}
     if troubled:
         found["lines"] = troubled

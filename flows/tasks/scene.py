@@ -26,7 +26,7 @@ from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRas
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Source
 from storage.readers.cube_sources import machine_bytes
-from storage.readers.open_cubes import load_labels_array, split_variable
+from storage.readers.open_cubes import split_variable
 from storage.readers.raster_fields import is_glob, open_raster
 from storage.readers.scene_files import SceneFile, load_scene_file
 
@@ -199,13 +199,6 @@ def _some_bands(scene: RasterScene, bands: tuple[int, ...]) -> RasterScene:
         wavelength_nm=scene.wavelength_nm[chosen],
         fwhm_nm=None if scene.fwhm_nm is None else scene.fwhm_nm[chosen],
     )
-
-
-def check_mask(mask: str, shape: tuple[int, int]) -> None:
-    """Refuse a mask file that is no image of this (y, x) size (SceneError)."""
-    values = load_labels_array(mask)
-    if values.shape[:2] != shape:
-        raise SceneError(f"--mask {mask} is {values.shape[:2]} px (y, x), the scene is {shape}; give one of its size")
 
 
 def check_labels(scene: RasterScene, weights: Description) -> tuple[str, ...]:

@@ -69,14 +69,14 @@ class SurveyModel:
             return TrainedOn.read(self.described.record[TRAINED_ON])
         return None if self.described.ood_detector is None else self.described.ood_detector.trained_on
 
-    def asked_ood(self, settings: Settings) -> OodPart | None:
+    def asked_ood(self, unknown: str) -> OodPart | None:
         """What is familiar, where pixels may be called unknown; WeightsError where it is asked and nobody knows it."""
-        if settings.unknown not in (UNKNOWN_AUTO, UNKNOWN_OFF) and self.described.ood_detector is None:
+        if unknown not in (UNKNOWN_AUTO, UNKNOWN_OFF) and self.described.ood_detector is None:
             raise WeightsError(
-                f"--unknown {settings.unknown}: nobody measured what is familiar to {self.path.name}; do so with: "
+                f"--unknown {unknown}: nobody measured what is familiar to {self.path.name}; do so with: "
                 f"spectralzoom train DATASET --fit-ood {self.path} -o {self.path}, or leave --unknown out"
             )
-        return None if settings.unknown == UNKNOWN_OFF else self.described.ood_detector
+        return None if unknown == UNKNOWN_OFF else self.described.ood_detector
 
 
 def weights_path(settings: Settings) -> Path:

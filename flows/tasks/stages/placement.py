@@ -323,8 +323,3 @@ def seen_fractions(frame: FieldFrame, patches: StageRef) -> NDArray[np.float64]:
 
 def _there(registration: StageRef | None) -> list[StageRef]:
     return [] if registration is None else [registration]
-
-
-def line_facts(mosaic: StageRef) -> dict[str, dict[str, Any]]:
-    """Read, by sweep, how many lines were lost, repeated, out of order, late or invalid."""
-    return read_table(mosaic.path / "lines.json")
