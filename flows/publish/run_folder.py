@@ -183,9 +183,12 @@ def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, An
     like, kept = (plan.sweeps, stored[1]) if plan.sweeps else (run.plan.coarse, stored[0])
     of_these = capture_savings(like, run.plan.full, run.camera, run.grid, cost=run.settings.cost, bands=bands)
     full_stored = entries["bytes_raw"].full * kept / of_these["bytes_raw"].done
+    reference = run.scans.reference  # the cheapest scan that is nearly as good as any; without a table, every line
+    full_s = run.plan.full_s if reference is None else reference.seconds
+    capture = SavingEntry(run.plan.coarse_s + plan.seconds, full_s, "predicted").as_dict()
     return {
         **{name: entry.as_dict() for name, entry in entries.items()},
-        "capture_s": _seconds_saved(run, run.plan.coarse_s + plan.seconds),
+        "capture_s": capture if reference is None else capture | {"full_scan": reference.words},
         "bytes_stored": SavingEntry(sum(stored), round(full_stored), "predicted").as_dict(),
         **_model_savings(run, plan),
     }
@@ -208,14 +211,6 @@ def _model_savings(run: SurveyRun, plan: FinePlan) -> dict[str, Any]:
         "tokens": SavingEntry(each * (cells + len(plan.patch_index)), each * (cells + valid), "predicted").as_dict(),
         "multiply_adds": {**SavingEntry(did.total, scan.total, "predicted").as_dict(), **asdict(did)},
     }
-
-
-def _seconds_saved(run: SurveyRun, done: float) -> dict[str, Any]:
-    """Seconds of capture beside the cheapest scan that is nearly as good as any; without a table, every line."""
-    reference = run.scans.reference
-    if reference is None:
-        return SavingEntry(done, run.plan.full_s, "predicted").as_dict()
-    return SavingEntry(done, reference.seconds, "predicted").as_dict() | {"full_scan": reference.words}
 
 
 def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: Receipt) -> QuicklookData:

@@ -20,9 +20,8 @@ from flows.tasks.drawing import UnknownRule
 from flows.tasks.extent_choice import ExtentChoice, choose_extent
 from flows.tasks.field_work import FieldWork, WeightsFile
 from flows.tasks.mosaic_work import tile_budget
-from flows.tasks.patch_budget import PatchBudget
+from flows.tasks.patch_budget import SHARD, PatchBudget, ReadingCosts
 from flows.tasks.prior_maps import AUTO, NONE, Prior, find_prior
-from flows.tasks.reading_costs import SHARD, ReadingCosts
 from flows.tasks.recorded_field import OpenedRecording, open_recorded
 from flows.tasks.scan_choice import ScanChoice, choose_uniform_scan
 from flows.tasks.scene import (
@@ -285,7 +284,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     `pipeline.errors` for the kinds; NothingToMend: what is remembered is sure enough.
     """
     settings = for_rig(settings)
-    check_scene_there(settings)
+    check_scene_there(settings.scene, is_map=settings.is_map)
     recorded = open_recorded(settings) if settings.source == RECORDED else None
     settings = settings if recorded is None else recorded.settings
     settings = replace(settings, device=choose_device(settings.device))
@@ -300,7 +299,7 @@ def _run_by(
     path: Path, settings: Settings, recorded: OpenedRecording | None, *, planning: bool, archive: Archive | None
 ) -> SurveyRun:
     """Open what a survey needs that is read with the weights of a file, as `open_run`."""
-    model = SurveyModel.open(settings, path, planning=planning)
+    model = SurveyModel.open(path, settings.device, settings.unknown, planning=planning)
     described = model.described
     refused = farm_refusal(settings)
     if refused is not None and not planning:

@@ -36,15 +36,15 @@ POSE_WINS = "the scene's own place on the earth is set aside: [pose] says where 
 SAME_HOUR = 0.5  # by which true solar time is at most off mean solar time, and whoever rounds it [h]
 
 
-def check_scene_there(settings: Settings) -> None:
+def check_scene_there(scene: str, *, is_map: bool) -> None:
     """Refuse a scene file that is not there, before anything else is asked for (SceneError)."""
-    path, _ = split_variable(settings.scene)
-    if settings.scene in (RIG_FIELD, *BUILT_IN_SCENES) or (settings.is_map and is_glob(settings.scene)):
+    path, _ = split_variable(scene)
+    if scene in (RIG_FIELD, *BUILT_IN_SCENES) or (is_map and is_glob(scene)):
         return
     try:
         there, what = path.exists(), "a link that leads nowhere," if path.is_symlink() else "no file"
     except OSError as error:  # such as a name longer than any
-        raise SceneError(f"--scene {settings.scene} cannot be the name of a file: {error.strerror}") from error
+        raise SceneError(f"--scene {scene} cannot be the name of a file: {error.strerror}") from error
     if not there:
         raise SceneError(f"there is {what} {path}; check the name of --scene (seen from {Path.cwd()})")
 

@@ -35,19 +35,19 @@ class SurveyModel:
     load: Once[Weights]
 
     @staticmethod
-    def open(settings: Settings, path: Path, *, planning: bool) -> SurveyModel:
+    def open(path: Path, device: str, unknown: str, *, planning: bool) -> SurveyModel:
         """Open the weights of a file; unless for ``planning`` all tensors are read.
 
         Raises WeightsError: what is missing, does not go together, or is not as it was written; SettingsError: the
         machine lacks the device.
         """
-        described, load = describe_weights(path), Once(lambda: load_weights(path).on(choose_device(settings.device)))
+        described, load = describe_weights(path), Once(lambda: load_weights(path).on(choose_device(device)))
         model = SurveyModel(path, described, load)
         if not planning:
             load()
             if described.reader is not None:
                 load_reader(path)
-            if described.ood_detector is not None and settings.unknown != UNKNOWN_OFF:
+            if described.ood_detector is not None and unknown != UNKNOWN_OFF:
                 load_ood(path)
         return model
 
