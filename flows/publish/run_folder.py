@@ -173,9 +173,14 @@ def asked_settings(run: SurveyRun) -> dict[str, object]:
 
 def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, Any]:
     """Everything done against the full scan; stored bytes of the full scan are predicted from the ratio seen here."""
-    if run.raster is not None:
-        return {"bytes_stored": _bytes_saved(run, products, plan), **_model_savings(run, plan)}
     bands = len(run.scene.wavelength_nm)
+    if run.raster is not None:
+        means, detail = (run.archive.stored_bytes(ref) for ref in (products.mosaic, products.patches))
+        valid, kept = len(run.grid.valid_patches()), len(plan.patch_index)
+        # All patches would pack as these do.
+        every = detail * valid / kept if kept else valid * run.grid.patch**2 * bands * BYTES_A_VALUE
+        entry = SavingEntry(means + detail, round(means + every), "predicted")
+        return {"bytes_stored": entry.as_dict(), **_model_savings(run, plan)}
     done = [*run.plan.coarse, *plan.sweeps]
     entries = capture_savings(done, run.plan.full, run.camera, run.grid, cost=run.settings.cost, bands=bands)
     stored = [run.archive.stored_bytes(ref) for ref in products.there("capture_coarse", "capture_fine")]
@@ -192,14 +197,6 @@ def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, An
         "bytes_stored": SavingEntry(sum(stored), round(full_stored), "predicted").as_dict(),
         **_model_savings(run, plan),
     }
-
-
-def _bytes_saved(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, Any]:
-    """Stored bytes of a raster's means and patches beside those of all its patches, which would pack as these do."""
-    means, detail = (run.archive.stored_bytes(ref) for ref in (products.mosaic, products.patches))
-    valid, kept, bands = len(run.grid.valid_patches()), len(plan.patch_index), len(run.scene.wavelength_nm)
-    every = detail * valid / kept if kept else valid * run.grid.patch**2 * bands * BYTES_A_VALUE
-    return SavingEntry(means + detail, round(means + every), "predicted").as_dict()
 
 
 def _model_savings(run: SurveyRun, plan: FinePlan) -> dict[str, Any]:
