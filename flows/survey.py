@@ -18,6 +18,7 @@ from flows.publish.publishing import add_accuracy, publish
 from flows.settings.parameters import SurveySettings
 from flows.tasks.captures import capture_pass, plan_capture
 from flows.tasks.open_survey import JUDGED, OpenSurvey, RunRef
+from flows.tasks.prefect_tasks import as_task
 from flows.tasks.stages.accuracy import evaluate
 from flows.tasks.stages.attention import score
 from flows.tasks.stages.effects import choose_effects
@@ -91,7 +92,7 @@ def judge(plan: OpenSurvey, run: RunRef) -> RunRef:
     """Judge a published class map by the labels, where there are any; none of it counts as the survey's cost."""
     if not run.pending:
         return run
-    return add_accuracy(plan, run, evaluate(plan, *plan.products.there(*JUDGED)))
+    return as_task(add_accuracy, "add_accuracy")(plan, run, evaluate(plan, *plan.products.there(*JUDGED)))
 
 
 @flow(name="capture", flow_run_name="capture-{settings.name_of_run}", validate_parameters=True, persist_result=False)

@@ -26,7 +26,7 @@ from pipeline.lazy import deferred
 from storage.archive.archive import Archive
 from storage.archive.keys import in_text
 from storage.archive.lineage import Catalogue, changes_between, find_product, version_before
-from storage.archive.records import Run, Store
+from storage.archive.records import Run
 from storage.maintenance.garbage import clear_up
 from storage.maintenance.repair import Rerun, plan_repair, repair
 from storage.maintenance.verification import Finding
@@ -238,7 +238,8 @@ def _tree(catalogue: Catalogue, uri: str, shown: set[str], path: tuple[str, ...]
     store = catalogue.stores.get(uri)
     if store is None:
         return {"uri": uri, "problem": "is not there", "inputs": []}
-    wall, cpu = _took(catalogue, store)
+    made = [row for run in catalogue.runs for row in run.stages if row.get("key") == store.ref.key]
+    ran = next((row for row in made if row.get("state") == "ran"), {})  # by the receipt of the run that made it
     node = {
         "uri": uri,
         "stage": store.ref.stage,
@@ -248,8 +249,8 @@ def _tree(catalogue: Catalogue, uri: str, shown: set[str], path: tuple[str, ...]
         "called": sorted(catalogue.roles(uri)),
         "created": store.created,
         "bytes": store.size,
-        "wall_s": wall,
-        "cpu_s": cpu,
+        "wall_s": known_number(ran.get("wall_s")),
+        "cpu_s": known_number(ran.get("cpu_s")),
         "problem": store.problem,
         "inputs": [],
     }
@@ -257,13 +258,6 @@ def _tree(catalogue: Catalogue, uri: str, shown: set[str], path: tuple[str, ...]
         return node | {"see": "in a circle" if uri in path else "above" if uri in shown else "too deep"}
     shown.add(uri)
     return node | {"inputs": [_tree(catalogue, one, shown, (*path, uri)) for one in catalogue.inputs_of(uri)]}
-
-
-def _took(catalogue: Catalogue, store: Store) -> tuple[float | None, float | None]:
-    """Wall and CPU seconds of the making, by the receipt of the run that made it."""
-    rows = [row for run in catalogue.runs for row in run.stages if row.get("key") == store.ref.key]
-    ran = next((row for row in rows if row.get("state") == "ran"), {})
-    return known_number(ran.get("wall_s")), known_number(ran.get("cpu_s"))
 
 
 def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:

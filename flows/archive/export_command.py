@@ -144,7 +144,13 @@ def _export_images(export: Export, layers: Sequence[Layer], console: Console) ->
         path = export.folder / f"{layer.name}.tif"
         with console.status(f"writing {path.name}"):
             write_cog(path, layer.image, layer.rows())
-        fields = {"bands": band_fields(layer), **grid_fields(export.run, layer)}
+        nodata = "nan" if layer.image.nodata != layer.image.nodata else layer.image.nodata
+        about = {"data_type": layer.image.dtype, "nodata": nodata}
+        about |= {} if layer.unit is None else {"unit": layer.unit}
+        fields: dict[str, Any] = {"bands": [{"name": name, **about} for name in layer.image.bands]}
+        if export.run.geobox is not None:
+            geobox = layer.image.place.geobox(layer.image.shape)
+            fields |= {"proj:code": None} if geobox is None else projection(geobox)
         export.add(layer.name, path, layer.title, COG, list(layer.roles), **fields)
         style = write_layer_style(layer, path)
         export.add(f"{layer.name}_style", style, f"QGIS style of {path.name}", STYLE, ["metadata", "style"])
@@ -195,22 +201,6 @@ class Export:
         """Name one file or store to the catalogue, by its address seen from the item."""
         href = Path(os.path.relpath(path.resolve(), self.folder)).as_posix()
         self.assets[key] = {"href": href, "title": title, "type": kind, "roles": roles, **fields}
-
-
-def band_fields(layer: Layer) -> list[Asset]:
-    """STAC's words for the bands of an image, which are called by their wavelengths."""
-    nodata: Any = "nan" if layer.image.nodata != layer.image.nodata else layer.image.nodata
-    unit = {} if layer.unit is None else {"unit": layer.unit}
-    about = {"data_type": layer.image.dtype, "nodata": nodata, **unit}
-    return [{"name": name, **about} for name in layer.image.bands]
-
-
-def grid_fields(run: ExportedRun, layer: Layer) -> dict[str, Any]:
-    """Where an image lies, for surveys that have a place at all."""
-    if run.geobox is None:
-        return {}
-    geobox = layer.image.place.geobox(layer.image.shape)
-    return {"proj:code": None} if geobox is None else projection(geobox)
 
 
 def name_stores(export: Export) -> None:

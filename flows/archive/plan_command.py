@@ -124,21 +124,17 @@ def forecast(settings: Settings, preview: Path | None = None) -> Forecast:
         survey_flow.draw_class_map(planner)
         if run.scene.labelled and run.settings.accuracy:
             evaluate(planner, *planner.products.there(*JUDGED))
-        fine = _planned_fine(planner.products["score"])
+        fine: FinePlan | None = None
+        attention = planner.products["score"]
+        if attention is not None and not isinstance(attention, _Awaited):
+            with suppress(PipelineError, OSError):  # the row of what reads it says why it cannot be read
+                fine = load_plan(attention)
         figures = field_figures(run, fine)
         if preview is not None:
             with refusals(preview.parent, "write the preview"):
                 plan_preview.draw_preview(preview, run, fine, _last_map(run, catalogue), figure_lines(figures))
     kept = None if run.budget is None else run.budget.figures(run.budget.most_patches)
     return Forecast(planner.rows, run.refused, run.scans, figures, kept)
-
-
-def _planned_fine(attention: StageRef | None) -> FinePlan | None:
-    """The fine pass where it is planned already and can be read; the row of what reads it says why it cannot."""
-    if attention is not None and not isinstance(attention, _Awaited):
-        with suppress(PipelineError, OSError):
-            return load_plan(attention)
-    return None
 
 
 def _last_map(run: SurveyRun, catalogue: Catalogue) -> ClassMap | None:

@@ -15,15 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from flows.archive.compare_command import find_run
-from flows.archive.stale_runs import (
-    asked_again,
-    from_raw_cubes,
-    is_called,
-    is_current,
-    newest_runs,
-    renewals,
-    renewed_prior,
-)
+from flows.archive.stale_runs import asked_again, from_raw_cubes, is_called, is_current, newest_runs, renewals
 from flows.cli.app import ArchiveName, AsJson, Scheduler, Switch, Workers, stderr
 from flows.publish.receipt import Receipt
 from flows.publish.run_folder import extend_with_accuracy, load_receipt
@@ -147,7 +139,9 @@ def _asked(
     """
     here: dict[str, Any] = {"scheduler": pool.scheduler, "workers": pool.workers}
     settings = replace(asked_again(run, archive, weights), **here)
-    prior = renewed_prior(settings.prior, renewed)
+    prior = settings.prior
+    while prior in renewed:
+        prior = renewed[prior]
     if prior == settings.prior and is_current(catalogue, run, settings):
         return None
     return replace(from_raw_cubes(catalogue, run, replace(settings, prior=prior)), **here)

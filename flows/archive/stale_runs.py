@@ -65,13 +65,6 @@ def renewals(catalogue: Catalogue) -> dict[str, str]:
     return {earlier: names[-1] for names in scan_passes.values() for earlier in names[:-1]}
 
 
-def renewed_prior(prior: str, renewed: Mapping[str, str]) -> str:
-    """The newest run of the look that a survey goes on from."""
-    while prior in renewed:
-        prior = renewed[prior]
-    return prior
-
-
 def _recorded_run(catalogue: Catalogue, run: Run) -> Run:
     """The run of this archive whose raw cubes a run was surveyed from as a recording; itself for all others."""
     by_name = {one.folder.name: one for one in catalogue.runs}

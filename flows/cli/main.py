@@ -49,7 +49,9 @@ def _run(arguments: list[str]) -> int:
         if (refused := format_refusal(error)) is not None:
             say(refused)
             return 1
-        say(f"{type(error).__name__}: {error}; this is a defect of SpectralZoom: please report {_keep_traceback()}")
+        with tempfile.NamedTemporaryFile("w", prefix="spectralzoom-", suffix=".log", delete=False) as file:
+            traceback.print_exc(file=file)
+        say(f"{type(error).__name__}: {error}; this is a defect of SpectralZoom: please report {file.name}")
         return 1
     return code if isinstance(code, int) else 0
 
@@ -62,13 +64,6 @@ def _usage(error: CycloptsError) -> str:
         now = FLAGS.get(word.removeprefix("--"))
         what = what if now is None else f"Unknown option: {word}; {now}"
     return f"{what.rstrip('.')}; see {verb} --help"
-
-
-def _keep_traceback() -> str:
-    """Write the traceback where it can be sent from, instead of showing it."""
-    with tempfile.NamedTemporaryFile("w", prefix="spectralzoom-", suffix=".log", delete=False) as file:
-        traceback.print_exc(file=file)
-    return file.name
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from flows.cli.app import AsJson, OutFolder, Switch, stderr
-from flows.settings.documents import flag_help
+from flows.settings.documents import about, shown
 from flows.settings.load import SURVEY, TABLES, load_settings
 from flows.terminal.progress import print_json
 from pipeline.errors import NothingToMend
@@ -38,7 +38,8 @@ def _flags(names: Iterable[str]) -> Any:
     for name in names:
         one = _DECLARED[name]
         kind: Any = bool if one.kind is bool else str
-        given.append((name, Annotated[kind | None, Parameter(help=flag_help(one))], None))
+        said = about(one) + ("" if one.item.default is None else f"; {shown(one).strip(chr(34))} by default")
+        given.append((name, Annotated[kind | None, Parameter(help=said)], None))
     return make_dataclass("Flags", given, frozen=True, kw_only=True)
 
 

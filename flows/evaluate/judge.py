@@ -68,6 +68,8 @@ def judge_frame(trial: Trial, scan_pass: ScenePasses, weights: Weights, camera: 
         )
         scored = 0 if policy in (*ENDS, ORACLE) else score_multiply_adds(policy, weights.config, grid)
         bought, best = gain_sums(gain, patch_index, grid.valid_patches())
+        drawn = segment(weights, scan_pass.seen, scan_pass.fine[patch_index], patch_index).classes
+        counts = confusion(scan_pass.labels, drawn, weights.config.classes).tolist()
         row = {
             **{
                 "policy": policy,
@@ -77,7 +79,7 @@ def judge_frame(trial: Trial, scan_pass: ScenePasses, weights: Weights, camera: 
                 "gain": bought,
                 "best_gain": best,
             },
-            **{"counts": _counts(scan_pass, weights, patch_index), "samples": samples},
+            **{"counts": counts, "samples": samples},
             "bytes": samples * scan_pass.bands * BYTES_PER_SAMPLE,
             "multiply_adds": multiply_adds(weights.config, grid, len(patch_index), scan_pass.bands, score=scored).total,
         }
@@ -98,12 +100,6 @@ def _placed(
             scores = gain if policy == ORACLE else score_patches(policy, scan_pass.seen, seed=seed)
             for fraction in trial.fractions:
                 yield policy, draw, fraction, frame_patches(scores, fraction, allowed)
-
-
-def _counts(scan_pass: ScenePasses, weights: Weights, patch_index: PatchIndex) -> list[list[int]]:
-    drawn = segment(weights, scan_pass.seen, scan_pass.fine[patch_index], patch_index).classes
-    counts: list[list[int]] = confusion(scan_pass.labels, drawn, weights.config.classes).tolist()
-    return counts
 
 
 def _seconds_of_patches(scan_pass: ScenePasses, camera: LineCamera) -> Callable[[str, PatchIndex], Record]:

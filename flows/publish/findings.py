@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -15,7 +15,7 @@ from flows.publish.receipt_table import FOREIGN
 from flows.settings.values import EXTENT_WHOLE
 from flows.tasks.prior_maps import prior_map_figures
 from flows.tasks.run import SurveyRun
-from flows.tasks.stages.maps import out_of_range_pixels
+from flows.tasks.stages.maps import OUT_OF_RANGE
 from models.evaluation.expected_scores import expected_counts
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, FieldScale, PlacedPicture, areas_by_number
@@ -23,6 +23,7 @@ from pipeline.ground.georeference import crs_name, pixel_side_m
 from pipeline.ground.zones import figures_of_plots
 from pipeline.planning.fine_pass import FinePlan
 from storage.archive.keys import StageRef
+from storage.archive.manifests import read_table
 from storage.arrays.class_maps import ClassMap, ProbabilityStore
 from storage.arrays.ground_maps import GroundMap
 
@@ -166,11 +167,12 @@ def find_map(run: SurveyRun, ref: StageRef, drawn: ClassMap) -> dict[str, Any]:
         found["unknown"] = {"pixels": count, "fraction": fraction, "rate": rate}
     if run.zones.left_out is not None:
         unclassed &= ~run.zones.left_out
+    no_reading = read_table(path) if (path := ref.path / OUT_OF_RANGE).is_file() else {}
     pixels = {
         "scene_without_a_value": run.scene.filled_px,
         "coarse_px_no_reading": 0,
         "fine_px_no_reading": 0,
-        **{f"{name}_no_reading": count for name, count in out_of_range_pixels(ref).items()},
+        **{f"{name}_no_reading": count for name, count in no_reading.items()},
         "map_without_a_class": int(np.count_nonzero(unclassed)),
     }
     if any(pixels.values()):
@@ -190,14 +192,12 @@ def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
     if run.map_scores is None or step is None or settings.extent != EXTENT_WHOLE or run.budget is not None or remembers:
         return None
     names = run.described.class_names
-    counts = expected_counts(_strips(ProbabilityStore(ref.path / "class_probabilities.zarr")), len(names))
+    store = ProbabilityStore(ref.path / "class_probabilities.zarr")
+    rows = range(0, store.shape[0], STRIP_ROWS)
+    strips = (store.read(slice(top, min(top + STRIP_ROWS, store.shape[0])))[0] for top in rows)
+    counts = expected_counts(strips, len(names))
     score = run.map_scores.expected(counts, step, settings.scan_exposure_ms or run.camera.exposure_ms)
     if score is None or not np.isfinite(score.miou):
         return None
     of_classes = {name: float(iou) for name, iou in zip(names, score.per_class_iou, strict=True) if np.isfinite(iou)}
     return {"miou": score.miou, "error": score.error, "per_class_iou": of_classes}
-
-
-def _strips(probabilities: ProbabilityStore) -> Iterator[NDArray[np.float32]]:
-    for top in range(0, probabilities.shape[0], STRIP_ROWS):
-        yield probabilities.read(slice(top, min(top + STRIP_ROWS, probabilities.shape[0])))[0]

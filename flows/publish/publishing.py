@@ -17,7 +17,6 @@ from flows.publish.receipt_table import cost_rows, finding_rows, headline
 from flows.publish.report import render_markdown
 from flows.publish.run_folder import Published, asked_settings, extend_with_accuracy, publish_run
 from flows.settings.survey_settings import OF_THE_MACHINE
-from flows.tasks.observer import artifact_key
 from flows.tasks.open_survey import JUDGED, STAGES, OpenSurvey, RunRef
 from flows.tasks.prefect_tasks import as_task, inside_flow
 from flows.tasks.stages.accuracy import evaluate
@@ -42,11 +41,6 @@ def publish(plan: OpenSurvey) -> RunRef:
     return as_task(_publish, "publish")(plan, *plan.products.values())
 
 
-def add_accuracy(plan: OpenSurvey, run: RunRef, accuracy: StageRef) -> RunRef:
-    """Publish a run again with its accuracy, in the place of what was published before; in a flow as a task."""
-    return as_task(_add_accuracy, "add_accuracy")(plan, run, accuracy)
-
-
 def _publish(plan: OpenSurvey, *products: StageRef) -> RunRef:
     stopped = _stopped_run(plan)
     if stopped is not None:
@@ -63,7 +57,8 @@ def _publish(plan: OpenSurvey, *products: StageRef) -> RunRef:
     return _ref(published, pending=judged)
 
 
-def _add_accuracy(plan: OpenSurvey, run: RunRef, accuracy: StageRef) -> RunRef:
+def add_accuracy(plan: OpenSurvey, run: RunRef, accuracy: StageRef) -> RunRef:
+    """Publish a run again with its accuracy, in the place of what was published before."""
     draft = plan.run.archive.extend_run(run.name)
     assert draft is not None
     with draft:
@@ -113,30 +108,25 @@ def _show_artifacts(plan: OpenSurvey, published: Published) -> None:
     """Give text, picture and table of a run to the server of the flow that this is called in, and link its report."""
     if not inside_flow():
         return
-    key, where = artifact_key(plan.run.name), f"{plan.run.archive.name}/runs/{published.folder.name}"
+    letters = (letter if letter.isalnum() and letter.isascii() else "-" for letter in plan.run.name.lower())
+    key, where = "".join(letters).strip("-"), f"{plan.run.archive.name}/runs/{published.folder.name}"
     report = (published.folder / "report.html").absolute().as_uri()
+    receipt = published.receipt
     with suppress(Exception):  # a server that is gone: the archive has it all
-        text = survey_markdown(published, where)
-        prefect_artifacts.create_markdown_artifact(text, key=f"survey-{key}", description=where)
-        prefect_artifacts.create_table_artifact(
-            savings_rows(published.receipt), key=f"savings-{key}", description=where
+        rows = savings_rows(receipt)
+        text = render_markdown(
+            "survey.md",
+            survey=receipt["survey"],
+            headline=headline(receipt, published.captured_again),
+            picture=base64.b64encode(small_jpeg((published.folder / "quicklook.png").read_bytes())).decode("ascii"),
+            rows=rows,
+            findings=[f"{name}: {words}" for name, words in finding_rows(receipt)],
+            where=where,
         )
+        prefect_artifacts.create_markdown_artifact(text, key=f"survey-{key}", description=where)
+        prefect_artifacts.create_table_artifact(rows, key=f"savings-{key}", description=where)
         prefect_artifacts.create_link_artifact(report, link_text="report.html", key=f"report-{key}", description=where)
         plan.observer.progress("published", 1.0)
-
-
-def survey_markdown(published: Published, where: str) -> str:
-    """Return headline, quicklook (at most 100 KiB), receipt, and where the report lies."""
-    picture = small_jpeg((published.folder / "quicklook.png").read_bytes())
-    return render_markdown(
-        "survey.md",
-        survey=published.receipt["survey"],
-        headline=headline(published.receipt, published.captured_again),
-        picture=base64.b64encode(picture).decode("ascii"),
-        rows=savings_rows(published.receipt),
-        findings=[f"{name}: {words}" for name, words in finding_rows(published.receipt)],
-        where=where,
-    )
 
 
 def savings_rows(receipt: Receipt) -> list[dict[str, str]]:

@@ -167,15 +167,10 @@ def _score_range(score: NDArray[np.floating]) -> tuple[NDArray[np.float64], floa
 
 def _draw_classes(axes: Axes, data: QuicklookData) -> None:
     _show(axes, class_rgb(data.class_map, _palette(data)), interpolation="nearest")
-    _scale_bar(axes, data.class_map.shape[1])
-    _caption(axes, "3  Class map", "what the model says grows where")
-
-
-def _scale_bar(axes: Axes, width: int) -> None:
-    """Draw a bar of a round number of pixels, at most a quarter of the width."""
-    power = 10 ** int(np.log10(max(width / 4, 1)))
-    length = max(step * power for step in (1, 2, 5) if step * power <= max(width / 4, 1))
+    most = max(data.class_map.shape[1] / 4, 1)  # of a bar of a round number of pixels
+    length = max(step * 10 ** int(np.log10(most)) for step in (1, 2, 5) if step * 10 ** int(np.log10(most)) <= most)
     axes.add_artist(AnchoredSizeBar(axes.transData, length, f"{length} px", "lower left", borderpad=0.5))
+    _caption(axes, "3  Class map", "what the model says grows where")
 
 
 def _draw_truth(axes: Axes, data: QuicklookData) -> None:

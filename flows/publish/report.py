@@ -87,15 +87,11 @@ def _environment(*, markdown: bool) -> Environment:
         "points": format_points,
         "seconds": format_seconds,
         "json": partial(json.dumps, ensure_ascii=False),
-        "data": _data,
+        # for scripts of a page: nothing ends a tag, words are `visible` ones
+        "data": lambda content: htmlsafe_json_dumps(_format_visible(content), separators=(",", ":")),
     }
     found.globals["part"] = lambda name: Markup(part(name))
     return found
-
-
-def _data(content: object) -> Markup:
-    """Content for the scripts of a page, as JSON in which nothing ends a tag; its words are `visible` ones."""
-    return htmlsafe_json_dumps(_format_visible(content), separators=(",", ":"))
 
 
 def _format_visible(content: Any) -> Any:

@@ -32,7 +32,7 @@ from flows.tasks.stages.accuracy import load_accuracy
 from flows.tasks.stages.attention import load_plan
 from flows.tasks.stages.effects import load_manifest
 from flows.tasks.stages.on_ground import STORE
-from flows.tasks.stages.placement import PATCHES_AT_ONCE, line_facts, load_registration, seen_fractions
+from flows.tasks.stages.placement import PATCHES_AT_ONCE, load_registration, seen_fractions
 from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.errors import IncompleteStoreError
 from pipeline.planning.coverage import on_scene
@@ -41,6 +41,7 @@ from pipeline.planning.prices import SavingEntry, capture_savings
 from pipeline.planning.uniform_scans import format_scan
 from pipeline.signal.calibrate import of_bands, reflectance
 from storage.archive.keys import StageRef
+from storage.archive.manifests import read_table
 from storage.archive.records import read_run
 from storage.archive.run_folders import RunDraft
 from storage.archive.whole_files import to_json
@@ -172,9 +173,14 @@ def asked_settings(run: SurveyRun) -> dict[str, object]:
 
 def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, Any]:
     """Everything done against the full scan; stored bytes of the full scan are predicted from the ratio seen here."""
-    if run.raster is not None:
-        return {"bytes_stored": _bytes_saved(run, products, plan), **_model_savings(run, plan)}
     bands = len(run.scene.wavelength_nm)
+    if run.raster is not None:
+        means, detail = (run.archive.stored_bytes(ref) for ref in (products.mosaic, products.patches))
+        valid, kept = len(run.grid.valid_patches()), len(plan.patch_index)
+        # All patches would pack as these do.
+        every = detail * valid / kept if kept else valid * run.grid.patch**2 * bands * BYTES_A_VALUE
+        entry = SavingEntry(means + detail, round(means + every), "predicted")
+        return {"bytes_stored": entry.as_dict(), **_model_savings(run, plan)}
     done = [*run.plan.coarse, *plan.sweeps]
     entries = capture_savings(done, run.plan.full, run.camera, run.grid, cost=run.settings.cost, bands=bands)
     stored = [run.archive.stored_bytes(ref) for ref in products.there("capture_coarse", "capture_fine")]
@@ -182,20 +188,15 @@ def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, An
     like, kept = (plan.sweeps, stored[1]) if plan.sweeps else (run.plan.coarse, stored[0])
     of_these = capture_savings(like, run.plan.full, run.camera, run.grid, cost=run.settings.cost, bands=bands)
     full_stored = entries["bytes_raw"].full * kept / of_these["bytes_raw"].done
+    reference = run.scans.reference  # the cheapest scan that is nearly as good as any; without a table, every line
+    full_s = run.plan.full_s if reference is None else reference.seconds
+    capture = SavingEntry(run.plan.coarse_s + plan.seconds, full_s, "predicted").as_dict()
     return {
         **{name: entry.as_dict() for name, entry in entries.items()},
-        "capture_s": _seconds_saved(run, run.plan.coarse_s + plan.seconds),
+        "capture_s": capture if reference is None else capture | {"full_scan": reference.words},
         "bytes_stored": SavingEntry(sum(stored), round(full_stored), "predicted").as_dict(),
         **_model_savings(run, plan),
     }
-
-
-def _bytes_saved(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, Any]:
-    """Stored bytes of a raster's means and patches beside those of all its patches, which would pack as these do."""
-    means, detail = (run.archive.stored_bytes(ref) for ref in (products.mosaic, products.patches))
-    valid, kept, bands = len(run.grid.valid_patches()), len(plan.patch_index), len(run.scene.wavelength_nm)
-    every = detail * valid / kept if kept else valid * run.grid.patch**2 * bands * BYTES_A_VALUE
-    return SavingEntry(means + detail, round(means + every), "predicted").as_dict()
 
 
 def _model_savings(run: SurveyRun, plan: FinePlan) -> dict[str, Any]:
@@ -207,14 +208,6 @@ def _model_savings(run: SurveyRun, plan: FinePlan) -> dict[str, Any]:
         "tokens": SavingEntry(each * (cells + len(plan.patch_index)), each * (cells + valid), "predicted").as_dict(),
         "multiply_adds": {**SavingEntry(did.total, scan.total, "predicted").as_dict(), **asdict(did)},
     }
-
-
-def _seconds_saved(run: SurveyRun, done: float) -> dict[str, Any]:
-    """Seconds of capture beside the cheapest scan that is nearly as good as any; without a table, every line."""
-    reference = run.scans.reference
-    if reference is None:
-        return SavingEntry(done, run.plan.full_s, "predicted").as_dict()
-    return SavingEntry(done, reference.seconds, "predicted").as_dict() | {"full_scan": reference.words}
 
 
 def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: Receipt) -> QuicklookData:
@@ -338,7 +331,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
         run, drawn
     )
     found |= find_map(run, class_map, drawn)
-    lines = {} if run.raster is not None else line_facts(products.mosaic)
+    lines = {} if run.raster is not None else read_table(products.mosaic.path / "lines.json")
     troubled = {name: facts for name, facts in lines.items() if any(facts.values())}
     if troubled:
         found["lines"] = troubled

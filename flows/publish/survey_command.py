@@ -66,7 +66,7 @@ def _survey(settings: Settings, console: Console) -> RunRef:
     asked = SurveySettings.of(settings)
     if settings.engine != "plain" and not inside_flow():
         try:
-            with _prefect_server(settings):
+            with _prefect_server(settings.out):
                 state = survey_flow.survey(asked, return_state=True)
                 wait_until_recorded(state.state_details.flow_run_id)
                 found: RunRef = state.result()
@@ -78,7 +78,7 @@ def _survey(settings: Settings, console: Console) -> RunRef:
 
 
 @contextmanager
-def _prefect_server(settings: Settings) -> Iterator[None]:
+def _prefect_server(out: str) -> Iterator[None]:
     """Have a server for one survey, its files in the archive; one that PREFECT_API_URL names is used as it is.
 
     A second survey of the archive has a folder of its own, which goes with it. Raises ServerUnavailable.
@@ -87,7 +87,7 @@ def _prefect_server(settings: Settings) -> Iterator[None]:
         check_answers(os.environ["PREFECT_API_URL"])
         yield
         return
-    root = open_archive(settings.out).root
+    root = open_archive(out).root
     home, release = root / ".prefect", take_lock(root / ".locks" / "prefect.lock", wait=False)
     if release is None:
         home = root / f".prefect-{os.getpid()}"

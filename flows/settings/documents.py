@@ -20,11 +20,6 @@ HEAD = """\
 """
 
 
-def flag_help(one: Declared) -> str:
-    """What the command line says of a setting's flag."""
-    return about(one) + ("" if one.item.default is None else f"; {shown(one).strip(chr(34))} by default")
-
-
 def about(one: Declared, *, choices: bool = True) -> str:
     """The line of help of a setting, with its unit, its choices, and whether its default is assumed."""
     unit = f" [{one.about['unit']}]" if one.about["unit"] else ""

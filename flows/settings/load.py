@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import MISSING
 from datetime import datetime
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -254,7 +255,14 @@ def parse_settings(table: Mapping[str, object], origin: Mapping[str, str] | None
     """
     origin = origin or {}
     settings = Settings(**_check_table(table, SURVEY, "", origin))
-    for wrong in _wrongs(settings, origin):
+    for wrong in chain(
+        _policy_wrongs(settings.policy, settings.mask),
+        _scene_wrongs(settings, origin),
+        _rig_wrongs(settings),
+        _recorded_wrongs(settings, origin),
+        _extent_errors(settings, origin),
+        _sparing_wrongs(settings, origin),
+    ):
         raise SettingsError(wrong)
     return settings
 
@@ -341,21 +349,10 @@ CHEAP_POLICY = "sobel"  # of the coarse image alone: gain would have the network
 IN_NAT = ("gain", "entropy")  # policies whose scores are gains, or the most that these can be
 
 
-def _wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
-    """What does not go together, in words that say what to do about it."""
-    yield from _policy_wrongs(settings)
-    yield from _scene_wrongs(settings, origin)
-    yield from _rig_wrongs(settings)
-    yield from _recorded_wrongs(settings, origin)
-    yield from _extent_errors(settings, origin)
-    yield from _sparing_wrongs(settings, origin)
-
-
-def _policy_wrongs(settings: Settings) -> Iterator[str]:
-    policy = settings.policy
-    if (policy == "mask") != (settings.mask is not None):
-        wants = "policy 'mask' needs a mask file" if settings.mask is None else "a mask is used by policy 'mask' only"
-        yield f"{wants}: got policy = {policy!r}, mask = {settings.mask!r}; give both or neither"
+def _policy_wrongs(policy: str, mask: str | None) -> Iterator[str]:
+    if (policy == "mask") != (mask is not None):
+        wants = "policy 'mask' needs a mask file" if mask is None else "a mask is used by policy 'mask' only"
+        yield f"{wants}: got policy = {policy!r}, mask = {mask!r}; give both or neither"
 
 
 def _scene_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:

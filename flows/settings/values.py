@@ -135,11 +135,6 @@ def parse_memory(value: object) -> int:
     return count
 
 
-def parse_scheduler(value: object) -> str:
-    """``threads``, ``processes``, or the address of a dask scheduler."""
-    return WorkerPool(parse_text(value)).scheduler
-
-
 def parse_size(value: object) -> tuple[int, int]:
     """(width, height) in px, from text such as 1280x1024 or from two whole numbers."""
     parts = re.split("[x,]", value.lower()) if isinstance(value, str) else value
@@ -366,7 +361,7 @@ Compute = Annotated[str, PlainValidator(parse_compute)]
 BytesKept = Annotated[str, PlainValidator(parse_bytes_kept)]
 Bytes = Annotated[int, PlainValidator(parse_bytes)]
 Memory = Annotated[int, PlainValidator(parse_memory)]
-Scheduler = Annotated[str, PlainValidator(parse_scheduler)]
+Scheduler = Annotated[str, PlainValidator(lambda value: WorkerPool(parse_text(value)).scheduler)]
 Size = Annotated[tuple[int, int], PlainValidator(parse_size)]
 Effects = Annotated[str, PlainValidator(parse_effects)]
 Bands = Annotated[tuple[int, ...], PlainValidator(parse_bands)]

@@ -179,7 +179,13 @@ def _write_survey(out: Path, settings: Settings, table: dict[str, object]) -> No
     wanted = {name: getattr(settings, name) for name in names}
     wanted |= {"size": size, "tol": str(settings.tol), "source": "rig"}
     given = [f"{key} = {_toml_value(value)}" for key, value in wanted.items() if value is not None]
-    tables = [_toml_table(name, values) for name, values in {**_tables_changed(settings), "rig": table}.items()]
+    changed: dict[str, dict[str, object]] = {}  # what is not usual: a survey has to know the same camera
+    described, usual = settings.to_dict(), Settings().to_dict()
+    for name in EMULATED:
+        own, other = (cast("dict[str, object]", one[name]) for one in (described, usual))
+        if own != other:
+            changed[name] = {key: value for key, value in own.items() if value != other[key] and value is not None}
+    tables = [_toml_table(name, values) for name, values in {**changed, "rig": table}.items()]
     text = "\n".join(["# A survey of an emulated rig, for as long as that runs.", *given, "", *tables])
     try:
         out.write_text(text, encoding="utf-8")
@@ -200,17 +206,6 @@ def _rig_table(served: ServedRig, rig: SurveyRig) -> dict[str, object]:
         "provenance": "emulated",
         **{name: getattr(rig, name) for name in mounted if rig.mounting != STRAIGHT},
     }
-
-
-def _tables_changed(settings: Settings) -> dict[str, dict[str, object]]:
-    """What of the emulated rig is not usual, by table: a survey of it has to know the same camera."""
-    asked, usual = settings.to_dict(), Settings().to_dict()
-    found = {}
-    for name in EMULATED:
-        own, other = (cast("dict[str, object]", one[name]) for one in (asked, usual))
-        if own != other:
-            found[name] = {key: value for key, value in own.items() if value != other[key] and value is not None}
-    return found
 
 
 def _toml_table(name: str, values: dict[str, object]) -> str:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.tasks.reading_costs import SHARD
+from flows.tasks.patch_budget import SHARD
 from models.network.machine import PROCESSOR
 from models.policies.policies import GLANCING_POLICIES, score_patches
 from models.reading.inference import CoarsePass, CoarsePrediction, read_coarse_pass, read_coarse_prediction

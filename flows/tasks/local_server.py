@@ -157,7 +157,9 @@ def _start(listening: socket.socket, *, schedules: bool) -> tuple[uvicorn.Server
     finally:
         if collects:
             gc.enable()
-    app: Any = guarded(made, listening.getsockname()[1])
+    # answers its own address (400 else: foreign DNS may point here) and pages alone
+    pages: Any = OwnPagesOnly(made, own_origins(listening.getsockname()[1]))
+    app: Any = trustedhost.TrustedHostMiddleware(pages, allowed_hosts=list(NAMES), www_redirect=False)
     server = uvicorn.Server(uvicorn.Config(app, log_level="critical", lifespan="on"))
     thread = threading.Thread(
         target=copy_context().run, args=(server.run, [listening]), name="prefect-server", daemon=True
@@ -253,12 +255,6 @@ class OwnPagesOnly:
             text = b"refused: asked for by a page of another address"
             await send({"type": "http.response.start", "status": 403, "headers": [(b"content-type", b"text/plain")]})
             await send({"type": "http.response.body", "body": text})
-
-
-def guarded(app: App, port: int) -> App:
-    """Return an application that answers its own address (400 else: foreign DNS may point here) and pages alone."""
-    pages: Any = OwnPagesOnly(app, own_origins(port))
-    return trustedhost.TrustedHostMiddleware(pages, allowed_hosts=list(NAMES), www_redirect=False)
 
 
 def password_in(path: Path) -> str:

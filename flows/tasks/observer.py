@@ -65,11 +65,6 @@ def log_to_run(words: str) -> None:
         prefect.get_run_logger().info(words)
 
 
-def artifact_key(field: str) -> str:
-    """Return a field's name as Prefect's keys are: small letters, digits and dashes."""
-    return "".join(letter if letter.isalnum() and letter.isascii() else "-" for letter in field.lower()).strip("-")
-
-
 class _ProgressPage:
     """Show on Prefect's pages how far a survey is, every two seconds at most."""
 

@@ -85,29 +85,24 @@ def find_prior(
 def _before(archive: Archive, settings: Settings, name: str) -> Iterator[Run]:
     """Return the newest runs of a field with class probabilities, the last captured before this visit first."""
     found: list[tuple[float, int, Run]] = []
-    part = run_stem(name)
+    part, asked = run_stem(name), anchor_paths(settings.to_dict(), Path.cwd())
+    # Of a survey that leaves it to the memory where to look, that choice says nothing of its light.
+    chosen = ("extent", "scan_step", "scan_exposure_ms") if settings.extent == EXTENT_PART else ()
+    light = [key for key in OF_THE_LIGHT if key not in chosen]
     for number, folder in enumerate(reversed(published_runs(archive.root))):
         if part not in folder.name:  # no receipt has to be read for that
             continue
         run = read_run(folder, {})
-        if run.receipt.get("survey") == name and PROBABILITIES in run.products and not _is_this_visit(run, settings):
-            days = _days_since(run, settings)
+        if run.receipt.get("survey") == name and PROBABILITIES in run.products:
+            before = {"extent": EXTENT_WHOLE, **run.settings}
+            if all(before.get(key) == asked[key] for key in light):
+                continue  # made of the very light that is asked for: what it saw is no earlier look
+            days = _days_since(run, settings.visit, settings.moment)
             if days >= 0:
                 found.append((days, number, run))
             if len(found) >= NEWEST_RUNS:
                 break
     yield from (run for _, _, run in sorted(found, key=lambda one: one[:2]))
-
-
-def _is_this_visit(run: Run, settings: Settings) -> bool:
-    """Whether a run was made of the very light that a survey asks for: what it saw is no earlier look.
-
-    Of a survey that leaves it to the memory where to look, that choice says nothing.
-    """
-    asked = anchor_paths(settings.to_dict(), Path.cwd())
-    chosen = ("extent", "scan_step", "scan_exposure_ms") if settings.extent == EXTENT_PART else ()
-    before = {"extent": EXTENT_WHOLE, **run.settings}
-    return all(before.get(part) == asked[part] for part in OF_THE_LIGHT if part not in chosen)
 
 
 def _usable(
@@ -142,8 +137,9 @@ def _usable(
     classes = tuple(names.index(one) if one in names else -1 for one in class_names)
     if all(number < 0 for number in classes):
         return f"it knows none of the classes of these weights, but {', '.join(names)}"
+    days = max(_days_since(run, settings.visit, settings.moment), 0.0)
     scan_passes = (EarlierRun(mosaic, factor), *_earlier_runs(archive, run, grid))
-    return Prior(run.folder.name, probabilities, scan_passes, max(_days_since(run, settings), 0.0), classes)
+    return Prior(run.folder.name, probabilities, scan_passes, days, classes)
 
 
 def _factor(coarse: tuple[int, int], grid: SceneGrid) -> int | None:
@@ -178,22 +174,21 @@ def _earlier_runs(archive: Archive, run: Run, grid: SceneGrid) -> Iterator[Earli
         yield EarlierRun(mosaic, factor, (down, across))
 
 
-def _days_since(run: Run, settings: Settings) -> float:
-    """Days from a run's look to the one of these settings, below 0 where that came later.
+def _days_since(run: Run, visit: str | None, moment: tuple[int, float] | None) -> float:
+    """Return the days from a run's look to a later one, below 0 where that came first.
 
     By the moments that both visits are called by, else by day and hour of a farm, else by the clock, in whole days.
     """
-    then, now = (_called_moment(visit) for visit in (run.settings.get("visit"), settings.visit))
+    then, now = (_called_moment(one) for one in (run.settings.get("visit"), visit))
     if then is not None and now is not None:
         return (now - then).total_seconds() / 86400
-    farm = settings.moment
-    if farm is not None and run.settings.get("scene") in BUILT_IN_SCENES:
+    if moment is not None and run.settings.get("scene") in BUILT_IN_SCENES:
         before = [run.settings.get("day"), run.settings.get("hour")]
         day, hour = (
             usual if given is None else float(given)
             for given, usual in zip(before, (USUAL_DAY, USUAL_HOUR), strict=True)
         )
-        return farm[0] - day + (farm[1] - hour) / 24
+        return moment[0] - day + (moment[1] - hour) / 24
     created = _called_moment(run.created)
     return 0.0 if created is None else float((datetime.now(UTC).date() - created.date()).days)
 

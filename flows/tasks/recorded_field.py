@@ -16,7 +16,6 @@ from pipeline.capture.recorded import RecordedSource
 from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.capture.straight_scans import covered_field
 from pipeline.errors import SceneError
-from pipeline.geometry.camera import LineCamera
 from pipeline.lazy import Once
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
 from pipeline.source import Source
@@ -101,19 +100,28 @@ def open_recorded(settings: Settings) -> OpenedRecording:
         mounting=settings.rig.mounting,
     )
     recording = open_recording(str(settings.sweeps), settings.camera, given)
-    shape, notes = _field_shape(settings, recording)
+    shape, notes = _field_shape(recording, settings.shape, settings.sweeps)
     source = recording.source(shape)
     settings = replace(settings, camera=recording.camera, size=shape[::-1])
     if settings.scan == RECORDED:
-        settings = replace(settings, scan_step=_step_of(source, recording.camera))
+        step = max(sweep.step for sweep in RecordedPasses(source).uniform_scan())
+        if step > MOST_STEP:
+            raise SceneError(
+                f"the lines of the recording lie {step} px of {recording.camera.ifov_rad * 1e6:.4g} urad apart, and a "
+                f"uniform scan may have up to {MOST_STEP} px between lines; correct the pointing, or "
+                "camera.focal_length_mm"
+            )
+        settings = replace(settings, scan_step=step)
     field = RecordedField(source, recording.key())
     return OpenedRecording(settings, recording, field, (*recording.notes, *notes))
 
 
-def _field_shape(settings: Settings, recording: Recording) -> tuple[tuple[int, int], tuple[str, ...]]:
+def _field_shape(
+    recording: Recording, stated: tuple[int, int] | None, where: str | None
+) -> tuple[tuple[int, int], tuple[str, ...]]:
     """(y, x) size of the field, centred on the undeflected direction: as stated, or what all strips show."""
-    if settings.shape is not None:
-        return settings.shape, ()
+    if stated is not None:
+        return stated, ()
     sweeps, tangents = [one.sweep for one in recording.sweeps], [one.tangents for one in recording.sweeps]
     covered = covered_field(sweeps, tangents, recording.camera)
     height, width = (
@@ -122,7 +130,7 @@ def _field_shape(settings: Settings, recording: Recording) -> tuple[tuple[int, i
     y, x = covered.centre_px
     if min(height, width) < 1:
         raise SceneError(
-            f"the field of {settings.sweeps} lies {x:.4g} px across and {y:.4g} px along the scan beside the direction "
+            f"the field of {where} lies {x:.4g} px across and {y:.4g} px along the scan beside the direction "
             "at rest, so that nothing of it lies around that; correct the pointing, or state --size WIDTHxHEIGHT"
         )
     if max(abs(y), abs(x)) < OFF_CENTRE_PX:
@@ -132,14 +140,3 @@ def _field_shape(settings: Settings, recording: Recording) -> tuple[tuple[int, i
         f"{width} x {height} px around that are surveyed; --size states more"
     )
     return (height, width), (note,)
-
-
-def _step_of(source: RecordedSource, camera: LineCamera) -> int:
-    """Pixels from line to line of the uniform scan that a recording is (SceneError: it is none, or too coarse)."""
-    step = max(sweep.step for sweep in RecordedPasses(source).uniform_scan())
-    if step > MOST_STEP:
-        raise SceneError(
-            f"the lines of the recording lie {step} px of {camera.ifov_rad * 1e6:.4g} urad apart, and a uniform scan "
-            f"may have up to {MOST_STEP} px between lines; correct the pointing, or camera.focal_length_mm"
-        )
-    return step

@@ -20,16 +20,14 @@ from flows.tasks.drawing import UnknownRule
 from flows.tasks.extent_choice import ExtentChoice, choose_extent
 from flows.tasks.field_work import FieldWork, WeightsFile
 from flows.tasks.mosaic_work import tile_budget
-from flows.tasks.patch_budget import PatchBudget
+from flows.tasks.patch_budget import SHARD, PatchBudget, ReadingCosts
 from flows.tasks.prior_maps import AUTO, NONE, Prior, find_prior
-from flows.tasks.reading_costs import SHARD, ReadingCosts
 from flows.tasks.recorded_field import OpenedRecording, open_recorded
 from flows.tasks.scan_choice import ScanChoice, choose_uniform_scan
 from flows.tasks.scene import (
     FieldSource,
     SimulatedField,
     check_labels,
-    check_mask,
     check_scene_there,
     farm_refusal,
     for_rig,
@@ -49,7 +47,7 @@ from models.weights.checksummed_files import SEAL
 from models.weights.files import Description, Weights
 from models.weights.parts import OodPart, ReaderPart
 from pipeline.capture.recorded_passes import RecordedPasses
-from pipeline.errors import NoScanPaidFor, SettingsError
+from pipeline.errors import NoScanPaidFor, SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
@@ -66,6 +64,7 @@ from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from pipeline.source import References
 from storage.archive.archive import Archive
 from storage.arrays.layout import image_spec
+from storage.parallel.pool import WorkerPool
 from storage.readers.open_cubes import load_labels_array
 from storage.readers.raster_fields import RasterPixels
 from storage.readers.scene_files import SceneFile
@@ -77,14 +76,14 @@ else:
     rig_field = deferred("flows.tasks.rig_field")
 
 
-def check_memory(settings: Settings, source: SimulatedSource, grid: SceneGrid, plan: CapturePlan) -> None:
+def check_memory(source: SimulatedSource, grid: SceneGrid, plan: CapturePlan, memory: int, pool: WorkerPool) -> None:
     """Refuse a memory below one tile of the mosaic before anything is captured (SettingsError, with the least)."""
     pixels, finer = PixelGrid.of_scene(grid, grid.factor), PixelGrid.of_scene(grid, 1) if plan.plain else None
-    placed = [place(_PlannedSweep(source, sweep), settings.camera) for sweep in plan.coarse]
+    placed = [place(_PlannedSweep(source, sweep), source.camera) for sweep in plan.coarse]
     rows, columns = image_spec(("y", "x"), pixels.shape, "<f4").shard or pixels.shape
-    tiles = plan_tiles(placed, settings.camera, pixels, (rows, columns))
-    work = MosaicWork(placed, settings.camera, pixels, finer=finer)
-    tile_budget(work, tiles, (rows, columns), memory=settings.memory, pool=replace(settings.pool, workers=1))
+    tiles = plan_tiles(placed, source.camera, pixels, (rows, columns))
+    work = MosaicWork(placed, source.camera, pixels, finer=finer)
+    tile_budget(work, tiles, (rows, columns), memory=memory, pool=replace(pool, workers=1))
 
 
 class _PlannedSweep(SimulatedSweep):
@@ -285,7 +284,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     `pipeline.errors` for the kinds; NothingToMend: what is remembered is sure enough.
     """
     settings = for_rig(settings)
-    check_scene_there(settings)
+    check_scene_there(settings.scene, is_map=settings.is_map)
     recorded = open_recorded(settings) if settings.source == RECORDED else None
     settings = settings if recorded is None else recorded.settings
     settings = replace(settings, device=choose_device(settings.device))
@@ -300,7 +299,7 @@ def _run_by(
     path: Path, settings: Settings, recorded: OpenedRecording | None, *, planning: bool, archive: Archive | None
 ) -> SurveyRun:
     """Open what a survey needs that is read with the weights of a file, as `open_run`."""
-    model = SurveyModel.open(settings, path, planning=planning)
+    model = SurveyModel.open(path, settings.device, settings.unknown, planning=planning)
     described = model.described
     refused = farm_refusal(settings)
     if refused is not None and not planning:
@@ -309,7 +308,7 @@ def _run_by(
     grid = SceneGrid(*scene.shape, described.config.patch, described.config.factor)
     zones = open_zones(settings.zones, place_of_field(settings, scene), grid)
     outside = beyond_training(settings, scene, described, model.trained_on, path)
-    ood_detector = model.asked_ood(settings)
+    ood_detector = model.asked_ood(settings.unknown)
     name, found = settings.name or Path(scene.name).stem, None
     if planning:  # what a look would be, were there one
         settings = replace(settings, skip_below_error=None)
@@ -352,7 +351,7 @@ def _run_by(
     simulated, planned = make_source(scene, settings), (*plan.coarse, *plan.full)
     source = field_source(scene, settings, simulated, planned) if recorded is None else recorded.field
     if raster is None:
-        check_memory(settings, simulated, grid, plan)
+        check_memory(simulated, grid, plan, settings.memory, settings.pool)
     else:
         raster.rows_at_once(settings.memory)  # refuses memory for not one row of patches
     archive = open_archive(settings.out) if archive is None else archive
@@ -404,8 +403,11 @@ def _scene_for(
         scene.light()
     model.check_bands(scene.wavelength_nm)
     label_notes = check_labels(scene, model.described)
-    if settings.mask is not None:
-        check_mask(settings.mask, scene.shape)
+    size = None if settings.mask is None else load_labels_array(settings.mask).shape[:2]
+    if size not in (None, scene.shape):
+        raise SceneError(
+            f"--mask {settings.mask} is {size} px (y, x), the scene is {scene.shape}; give one of its size"
+        )
     return pixels, scene, notes, label_notes
 
 

@@ -26,7 +26,7 @@ from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRas
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Source
 from storage.readers.cube_sources import machine_bytes
-from storage.readers.open_cubes import load_labels_array, split_variable
+from storage.readers.open_cubes import split_variable
 from storage.readers.raster_fields import is_glob, open_raster
 from storage.readers.scene_files import SceneFile, load_scene_file
 
@@ -36,15 +36,15 @@ POSE_WINS = "the scene's own place on the earth is set aside: [pose] says where 
 SAME_HOUR = 0.5  # by which true solar time is at most off mean solar time, and whoever rounds it [h]
 
 
-def check_scene_there(settings: Settings) -> None:
+def check_scene_there(scene: str, *, is_map: bool) -> None:
     """Refuse a scene file that is not there, before anything else is asked for (SceneError)."""
-    path, _ = split_variable(settings.scene)
-    if settings.scene in (RIG_FIELD, *BUILT_IN_SCENES) or (settings.is_map and is_glob(settings.scene)):
+    path, _ = split_variable(scene)
+    if scene in (RIG_FIELD, *BUILT_IN_SCENES) or (is_map and is_glob(scene)):
         return
     try:
         there, what = path.exists(), "a link that leads nowhere," if path.is_symlink() else "no file"
     except OSError as error:  # such as a name longer than any
-        raise SceneError(f"--scene {settings.scene} cannot be the name of a file: {error.strerror}") from error
+        raise SceneError(f"--scene {scene} cannot be the name of a file: {error.strerror}") from error
     if not there:
         raise SceneError(f"there is {what} {path}; check the name of --scene (seen from {Path.cwd()})")
 
@@ -199,13 +199,6 @@ def _some_bands(scene: RasterScene, bands: tuple[int, ...]) -> RasterScene:
         wavelength_nm=scene.wavelength_nm[chosen],
         fwhm_nm=None if scene.fwhm_nm is None else scene.fwhm_nm[chosen],
     )
-
-
-def check_mask(mask: str, shape: tuple[int, int]) -> None:
-    """Refuse a mask file that is no image of this (y, x) size (SceneError)."""
-    values = load_labels_array(mask)
-    if values.shape[:2] != shape:
-        raise SceneError(f"--mask {mask} is {values.shape[:2]} px (y, x), the scene is {shape}; give one of its size")
 
 
 def check_labels(scene: RasterScene, weights: Description) -> tuple[str, ...]:

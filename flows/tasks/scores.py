@@ -28,12 +28,6 @@ def score_of(receipt: Mapping[str, Any]) -> dict[str, float | None]:
     return {name: known_number(accuracy.get(name)) for name in ("miou", "overall_accuracy")}
 
 
-def judged_maps(accuracy: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """This map, `none` and, where it was judged, `all`, under the names that readers see."""
-    found = {name: accuracy if key is None else accuracy.get(key) for name, key in MAPS.items()}
-    return {name: one for name, one in found.items() if isinstance(one, Mapping) and _by_class(one)}
-
-
 def _by_class(one: Mapping[str, Any]) -> dict[str, float | None]:
     table = one.get("per_class_iou")
     return {str(name): known_number(iou) for name, iou in table.items()} if isinstance(table, Mapping) else {}
@@ -67,9 +61,9 @@ def format_worst_class(accuracy: Mapping[str, Any], *, alone: bool = False) -> s
 def format_false_classes(accuracy: Mapping[str, Any]) -> str:
     """Classes that a map shows and the truth lacks, with their pixels; empty where there are none."""
     parts = []
-    for name, one in judged_maps(accuracy).items():
-        false = one.get("false_classes") or {}
-        if false:
+    for name, key in MAPS.items():
+        one = accuracy if key is None else accuracy.get(key)
+        if isinstance(one, Mapping) and _by_class(one) and (false := one.get("false_classes")):
             pixels = ", ".join(f"{kind.replace('_', ' ')} {format_count(count)} px" for kind, count in false.items())
             parts.append(f"{name} {pixels}")
     return f"Shown although the truth has none: {'; '.join(parts)}." if parts else ""

@@ -35,19 +35,19 @@ class SurveyModel:
     load: Once[Weights]
 
     @staticmethod
-    def open(settings: Settings, path: Path, *, planning: bool) -> SurveyModel:
+    def open(path: Path, device: str, unknown: str, *, planning: bool) -> SurveyModel:
         """Open the weights of a file; unless for ``planning`` all tensors are read.
 
         Raises WeightsError: what is missing, does not go together, or is not as it was written; SettingsError: the
         machine lacks the device.
         """
-        described, load = describe_weights(path), Once(lambda: load_weights(path).on(choose_device(settings.device)))
+        described, load = describe_weights(path), Once(lambda: load_weights(path).on(choose_device(device)))
         model = SurveyModel(path, described, load)
         if not planning:
             load()
             if described.reader is not None:
                 load_reader(path)
-            if described.ood_detector is not None and settings.unknown != UNKNOWN_OFF:
+            if described.ood_detector is not None and unknown != UNKNOWN_OFF:
                 load_ood(path)
         return model
 
@@ -69,14 +69,14 @@ class SurveyModel:
             return TrainedOn.read(self.described.record[TRAINED_ON])
         return None if self.described.ood_detector is None else self.described.ood_detector.trained_on
 
-    def asked_ood(self, settings: Settings) -> OodPart | None:
+    def asked_ood(self, unknown: str) -> OodPart | None:
         """What is familiar, where pixels may be called unknown; WeightsError where it is asked and nobody knows it."""
-        if settings.unknown not in (UNKNOWN_AUTO, UNKNOWN_OFF) and self.described.ood_detector is None:
+        if unknown not in (UNKNOWN_AUTO, UNKNOWN_OFF) and self.described.ood_detector is None:
             raise WeightsError(
-                f"--unknown {settings.unknown}: nobody measured what is familiar to {self.path.name}; do so with: "
+                f"--unknown {unknown}: nobody measured what is familiar to {self.path.name}; do so with: "
                 f"spectralzoom train DATASET --fit-ood {self.path} -o {self.path}, or leave --unknown out"
             )
-        return None if settings.unknown == UNKNOWN_OFF else self.described.ood_detector
+        return None if unknown == UNKNOWN_OFF else self.described.ood_detector
 
 
 def weights_path(settings: Settings) -> Path:

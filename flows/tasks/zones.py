@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -134,13 +134,14 @@ def _read(source: str, place: FieldPlace, notes: list[str], named_by: str | None
 def _format_beside(found: ZoneFile, place: FieldPlace) -> str:
     """Where polygons and field lie, of which none lies on it."""
     if found.crs is None or place.crs is None:
-        unit, here, there = "px", _bounds(found), place.outline.bounds
+        unit, here, there = "px", _bounds([one.bounds for one in found.shapes.values()]), place.outline.bounds
         spans = [
             f"x {west:g} to {east:g}, y {south:g} to {north:g} {unit}" for west, south, east, north in (there, here)
         ]
         hint = "are they degrees? then the survey needs a [pose] or a georeferenced scene"
     else:
-        corners = extent_deg(place.outline, place.crs), _extent(found)
+        own = _bounds([extent_deg(one, found.crs) for one in found.shapes.values()])
+        corners = extent_deg(place.outline, place.crs), own
         spans = [
             f"longitude {west:.6g} to {east:.6g}, latitude {south:.6g} to {north:.6g}"
             for west, south, east, north in corners
@@ -149,17 +150,9 @@ def _format_beside(found: ZoneFile, place: FieldPlace) -> str:
     return f"the polygons of {found.path} do not lie on the field: expected some in {spans[0]}, got {spans[1]}; {hint}"
 
 
-def _bounds(found: ZoneFile) -> tuple[float, float, float, float]:
-    """West, south, east and north of all polygons of a file, in its own coordinates."""
-    each = np.array([one.bounds for one in found.shapes.values()])
-    west, south = each[:, :2].min(axis=0).tolist()
-    east, north = each[:, 2:].max(axis=0).tolist()
-    return west, south, east, north
-
-
-def _extent(found: ZoneFile) -> tuple[float, float, float, float]:
-    assert found.crs is not None
-    each = np.array([extent_deg(one, found.crs) for one in found.shapes.values()])
+def _bounds(of_each: Sequence[tuple[float, float, float, float]]) -> tuple[float, float, float, float]:
+    """Return west, south, east and north of all polygons by those of each."""
+    each = np.array(of_each)
     west, south = each[:, :2].min(axis=0).tolist()
     east, north = each[:, 2:].max(axis=0).tolist()
     return west, south, east, north

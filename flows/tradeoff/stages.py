@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.settings.load import CHEAP_POLICY
-from flows.tasks.patch_budget import PatchBudget
-from flows.tasks.reading_costs import ReadingCosts
+from flows.tasks.patch_budget import PatchBudget, ReadingCosts
 from flows.tasks.stages.accuracy import columns_of_all_patches
 from flows.tasks.survey_model import UNIFORM_STEPS, shipped_weights
 from flows.tradeoff.entries import Setting, Tradeoff
@@ -153,10 +152,6 @@ class FarmLines:
     exact: Values  # (line, sample, band) [e-], those of the dark among them
     noise: Values  # one sigma at each
 
-    def simulate(self, setting: Setting) -> tuple[Values, NDArray[np.uint16]]:
-        """Return expected electrons before the readout, and raw numbers, (line, sample, band) each."""
-        return _simulate(self.scene, self.blocks, self.decisions[setting].chosen)
-
     def greatest_change(self, setting: Setting, made: tuple[Values, Any]) -> float:
         """Return the greatest change against everything on, in sigmas of the noise at the sample."""
         shown = made[0] + _dark(self.blocks[0], self.decisions[setting].chosen)
@@ -166,6 +161,7 @@ class FarmLines:
 def _simulate(
     scene: RasterScene, blocks: tuple[SweepBlock, ...], chosen: Mapping[Effect, str]
 ) -> tuple[Values, NDArray[np.uint16]]:
+    """Return expected electrons before the readout, and raw numbers, (line, sample, band) each."""
     light = [expected_light(scene, block, chosen) for block in blocks]
     raw = [read_out(one, block, chosen) for one, block in zip(light, blocks, strict=True)]
     return np.concatenate(light), np.concatenate(raw)
@@ -197,7 +193,7 @@ SIMULATE = Tradeoff(
     reference="everything that the rig has, exact; on average over the noise",
     settings=(EXACT, *TOLERANCES),
     prepare=decide_for_lines,
-    run=FarmLines.simulate,
+    run=lambda state, setting: _simulate(state.scene, state.blocks, state.decisions[setting].chosen),
     judge=FarmLines.greatest_change,
     work=lambda state: float(state.exact.size),
     level=lambda _state: ("0.1 σ of noise", 0.1),  # noqa: RUF001

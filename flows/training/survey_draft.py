@@ -62,7 +62,9 @@ def write_survey_draft(draft: SweepsDraft, *, force: bool = False) -> dict[str, 
             ['source = "recorded"', f'sweeps = "."   # {counted(len(draft.cubes), "cube")}: {_listed(draft)}'],
             _pointing_lines(draft),
             _frame_lines(draft),
-            _band_lines(draft),
+            []
+            if draft.has_wavelengths
+            else [f"# wavelengths = [450.0, ...]   # nothing says those of the {draft.bands} bands: write them [nm]"],
             [
                 "# budget = 0.5   # two passes in half of the seconds of a full scan; without it every line is read",
                 '# weights = "WEIGHTS.safetensors"   # of a network that was trained on such data; "farm" is built in',
@@ -103,12 +105,6 @@ def _frame_lines(draft: SweepsDraft) -> list[str]:
         else f"# the {kind} frame is here"
         for kind in missing
     ]
-
-
-def _band_lines(draft: SweepsDraft) -> list[str]:
-    if draft.has_wavelengths:
-        return []
-    return [f"# wavelengths = [450.0, ...]   # nothing says those of the {draft.bands} bands: write them [nm]"]
 
 
 def _listed(draft: SweepsDraft) -> str:

@@ -14,10 +14,10 @@ from rich.console import Console
 from rich.table import Table
 
 from flows.terminal.progress import one_after_the_other
-from flows.training.data import Report, TrainingData, either_mask, open_training_data
+from flows.training.data import Report, TrainingData, alike_notes, either_mask, open_training_data
 from flows.training.figures import judge_scans, validate
 from flows.training.fit_ood import SeenScenes, measure_and_add, measured_calibration, trained_on
-from flows.training.train_scenes import About, TrainRequest, as_read, network_config, observe_all, question_labels
+from flows.training.train_scenes import About, TrainRequest, as_read, network_config, observe_all
 from models.evaluation.expected_scores import MapScores
 from models.network.machine import choose_device
 from models.network.sizes import SegmenterConfig
@@ -29,7 +29,7 @@ from models.training.train import Progress, train
 from models.weights.checksummed_files import read_checkpoint
 from models.weights.files import CALIBRATION, Weights, save_weights, with_record
 from models.weights.parts import MAP_SCORES, TRAINED_ON
-from pipeline.errors import SettingsError, ShapeError
+from pipeline.errors import SceneError, SettingsError, ShapeError
 from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
 
 Split = dict[str, Any]
@@ -110,7 +110,11 @@ def _lesson(
 ) -> Lesson:
     """Look at the scenes to train on, and lay the start's tensors into the network that is wanted."""
     seen, about = observe_all(request, data, data.train, "looking at scenes", report)
-    question_labels(about, request.dataset, tell)
+    notes = alike_notes(about.alike)
+    if len(about.alike) == len(about.keys) and len(notes) == 1:
+        raise SceneError(f"{request.dataset}: training needs two or more classes, and {notes[0]}")
+    for note in notes:
+        tell(note)
     darkest_ms = request.settings.darkest_ms
     normalisation = measured_normalisation(seen, math.sqrt(darkest_ms * REFERENCE_MS))
     config, begun = network_config(request, about), None

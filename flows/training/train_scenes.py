@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -98,15 +98,6 @@ def as_read(seen: Sequence[Example], normalisation: Normalisation) -> list[Examp
     """What a network reads of looks by a basis that spans their bands, so that these reach every column of it."""
     reached = np.ones(len(normalisation.centre), np.bool_)
     return [normalised(one, normalisation, reached) for one in seen]
-
-
-def question_labels(about: About, dataset: str, tell: Callable[[str], None]) -> None:
-    """Tell which scenes have labels of one class (SceneError: all of them, and of the same)."""
-    notes = alike_notes(about.alike)
-    if len(about.alike) == len(about.keys) and len(notes) == 1:
-        raise SceneError(f"{dataset}: training needs two or more classes, and {notes[0]}")
-    for note in notes:
-        tell(note)
 
 
 def _common(request: TrainRequest, scene: RasterScene) -> About:

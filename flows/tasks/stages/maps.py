@@ -20,7 +20,7 @@ from models.weights.parts import OodPart, ReaderPart
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.rectify.registration.alignment import FieldShift
 from storage.archive.keys import StageRef
-from storage.archive.manifests import read_table, write_table
+from storage.archive.manifests import write_table
 from storage.arrays.class_maps import (
     NOT_BELIEVED,
     OLD_CLASS,
@@ -152,9 +152,3 @@ def _prior_map_figures(
         "changed_px": 0 if put_aside else sum(count for count, _, _ in pairs),
         "changes": [] if put_aside else [list(pair) for pair in sorted(pairs, key=lambda pair: -pair[0])],
     }
-
-
-def out_of_range_pixels(class_map: StageRef) -> dict[str, int]:
-    """Coarse and fine pixels that were left out of a map, as no sensor gives their values; empty without any."""
-    path = class_map.path / OUT_OF_RANGE
-    return dict(read_table(path)) if path.is_file() else {}

@@ -67,7 +67,16 @@ def register_coarse(
         found = register_sweeps(broad, camera, prior_px=pointing_px)
         report(0.8)
         placed = [replace(one, shift=found.of(one.lines.sweep.name)).placed(camera) for one in sweeps]
-        write_table(path / RECORD, _seams_record(found, light_gains(found, placed, camera, frame.wavelength_nm)))
+        gains, names = light_gains(found, placed, camera, frame.wavelength_nm), [shift.name for shift in found.shifts]
+        record = {
+            "method": "seams",
+            "reference": found.reference,
+            "sweeps": {shift.name: _shift_record(shift) | {"gain": gains.get(shift.name)} for shift in found.shifts},
+            "untied": list(found.untied),
+            "narrow": [asdict(narrow) for narrow in found.narrow],
+            "windows": [_window_record(seen, names) for seen in found.windows],
+        }
+        write_table(path / RECORD, record)
 
     return Wanted(build, {"prior_px": pointing_px, "pass": "coarse"}, [raw])
 
@@ -82,18 +91,6 @@ def light_gains(
     lights = solve_lights(overlap_light(placed, camera, windows), len(placed), wavelength_nm)
     tied = [number for number in range(len(placed)) if number not in lights.untied]
     return {placed[number].lines.sweep.name: lights.gain(number).tolist() for number in tied}
-
-
-def _seams_record(found: Registration, gains: dict[str, list[float]]) -> dict[str, Any]:
-    names = [shift.name for shift in found.shifts]
-    return {
-        "method": "seams",
-        "reference": found.reference,
-        "sweeps": {shift.name: _shift_record(shift) | {"gain": gains.get(shift.name)} for shift in found.shifts},
-        "untied": list(found.untied),
-        "narrow": [asdict(narrow) for narrow in found.narrow],
-        "windows": [_window_record(seen, names) for seen in found.windows],
-    }
 
 
 def _shift_record(shift: SweepShift) -> dict[str, Any]:
@@ -323,8 +320,3 @@ def seen_fractions(frame: FieldFrame, patches: StageRef) -> NDArray[np.float64]:
 
 def _there(registration: StageRef | None) -> list[StageRef]:
     return [] if registration is None else [registration]
-
-
-def line_facts(mosaic: StageRef) -> dict[str, dict[str, Any]]:
-    """Read, by sweep, how many lines were lost, repeated, out of order, late or invalid."""
-    return read_table(mosaic.path / "lines.json")

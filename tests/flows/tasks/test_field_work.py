@@ -14,7 +14,7 @@ from flows.settings.load import load_settings
 from flows.tasks.drawing import Drawing, draw_field
 from flows.tasks.field_prior_map import FieldPriorMap
 from flows.tasks.field_work import FieldWork, Scoring, WeightsFile, region_params
-from flows.tasks.reading_costs import SHARD
+from flows.tasks.patch_budget import SHARD
 from flows.tasks.run import SurveyRun, open_run
 from models.reading.regions import Region, plan_regions, whole_field
 from pipeline.errors import SettingsError, WeightsError

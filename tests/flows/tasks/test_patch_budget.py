@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from flows.archive.plan_command import format_kept, plan_content
 from flows.settings.load import load_settings, parse_settings
-from flows.tasks.patch_budget import PatchBudget
-from flows.tasks.reading_costs import ReadingCosts
+from flows.tasks.patch_budget import PatchBudget, ReadingCosts
 from flows.tasks.run import SurveyRun
 from models.network.sizes import SegmenterConfig, multiply_adds
 from models.policies.policies import score_multiply_adds

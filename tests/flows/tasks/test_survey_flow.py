@@ -7,7 +7,6 @@ import os
 import signal
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -270,7 +269,7 @@ def test_a_named_server_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) ->
     """It is named, with its address."""
     monkeypatch.setenv("PREFECT_API_URL", "http://127.0.0.1:9/api")
     with pytest.raises(ServerUnavailable, match=r"no Prefect server answers at http://127\.0\.0\.1:9/api"):  # noqa: SIM117
-        with survey_command._prefect_server(SimpleNamespace(out="x")):  # type: ignore[arg-type]
+        with survey_command._prefect_server("x"):
             pytest.fail("it was taken for one that answers")
 
 
