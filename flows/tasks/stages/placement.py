@@ -61,6 +61,7 @@ def register_coarse(
     """Find pointing and light of the coarse sweeps from what neighbours show twice."""
 
     def build(path: Path) -> None:
+        """Register the sweeps by their seams, and write shifts and gains."""
         sweeps = open_sweeps(raw.path, None, camera)
         broad = [BroadSweep.read(one.lines, camera, usable=one.usable) for one in sweeps]
         report(0.4)
