@@ -9,7 +9,8 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
 from models.network.segmenter import Segmenter
-from models.network.sizes import SegmenterConfig, multiply_adds
+from models.network.sizes import SegmenterConfig, TemporalSizes, multiply_adds
+from models.network.temporal_reader import TemporalReader
 from models.policies.policies import score_multiply_adds
 from pipeline.geometry.grid import SceneGrid
 
@@ -31,6 +32,17 @@ def test_closed_form_equals_the_counter(patch: int, factor: int, patch_index: in
     with torch.inference_mode(), counter:
         model(coarse, torch.zeros(1, patch_index, 6, patch, patch), torch.arange(patch_index)[None])
     assert multiply_adds(config, grid, patch_index, 0).total == counter.get_total_flops() / 2
+
+
+@pytest.mark.parametrize("factor", [2, 4])
+def test_the_temporal_reader_costs_what_the_counter_counts(factor: int) -> None:
+    """Its closed form too, of fine and coarse pixels."""
+    sizes = TemporalSizes(classes=5, columns=6, factor=factor)
+    fine, coarse = torch.zeros(1, 1, 16, 24), torch.zeros(1, 6, 16 // factor, 24 // factor)
+    scores, one, counter = fine.expand(1, 5, 16, 24), torch.ones(1), FlopCounterMode(display=False)
+    with torch.inference_mode(), counter:
+        TemporalReader(sizes).eval()(scores, scores, fine, fine, fine, one, one, coarse, coarse, coarse[:, :1])
+    assert sizes.multiply_adds(16 * 24) == counter.get_total_flops() / 2
 
 
 def test_more_patches_cost_more() -> None:
