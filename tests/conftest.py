@@ -34,9 +34,7 @@ CLASSES = ("class_0", "class_1", "class_2")  # as a label file of the numbers 0.
 
 WeightsMaker = Callable[..., Path]
 Survey = Callable[..., Published]
-os.environ.setdefault(
-    "OMP_NUM_THREADS", "1"
-)  # for what tests start; workers that fraction cores lose most of their time
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # for what tests start; workers that share cores lose most of their time
 torch.set_num_threads(1)
 law_settings.register_profile("anew", deadline=None, max_examples=40)  # a loaded machine is no broken law
 law_settings.register_profile("settled", law_settings.get_profile("anew"), derandomize=True)  # a change alone breaks it

@@ -72,11 +72,9 @@ def headline(receipt: Receipt, captured_again: float | None = None) -> str:
     savings, scan = receipt["savings"], receipt.get("plan", {}).get("kind") in ("scan", "raster")
     words = []
     if captured_again == 0:
-        words.append(
-            "The camera captured again at nothing: no run of fine lines fits into the time left, or is worth it."
-        )
+        words.append("The camera captured nothing again: no run of fine lines fits into the time left, or pays.")
     elif captured_again is not None:
-        words.append(f"The camera captured again at {format_percent(captured_again)} of the field.")
+        words.append(f"The camera captured {format_percent(captured_again)} of the field again.")
     if (capture := savings.get("capture_s")) is None:
         read, stored = (format_percent(savings[name]["ratio"]) for name in ("multiply_adds", "bytes_stored"))
         words.append(

@@ -138,8 +138,8 @@ def _usable(
     if all(number < 0 for number in classes):
         return f"it knows none of the classes of these weights, but {', '.join(names)}"
     days = max(_days_since(run, settings.visit, settings.moment), 0.0)
-    scan_passes = (EarlierRun(mosaic, factor), *_earlier_runs(archive, run, grid))
-    return Prior(run.folder.name, probabilities, scan_passes, days, classes)
+    earlier = (EarlierRun(mosaic, factor), *_earlier_runs(archive, run, grid))
+    return Prior(run.folder.name, probabilities, earlier, days, classes)
 
 
 def _factor(coarse: tuple[int, int], grid: SceneGrid) -> int | None:

@@ -81,33 +81,33 @@ class _JudgedScan:
 def judge_scans(
     weights: Weights,
     examples: Sequence[Example],
-    scan_passes: CaptureAugmentation | None,
+    augmentation: CaptureAugmentation | None,
     seed: int,
     report: Report = lambda what, done, figure: None,
 ) -> ScanFigures | None:
     """What maps of uniform scans that are read whole score on each scene, by step and exposure.
 
-    None without a scene, and without ``scan_passes``: then training saw none but those of the reference. In the record
+    None without a scene, and without ``augmentation``: then training saw none but those of the reference. In the record
     ``miou`` and the IoU of each class are tables (step, exposure) of the scenes' means, ``spread`` the standard
     deviation of their mIoU, ``calibration_error`` that of all pixels together. A scan is shown by the law of noise that
     training shows crops by.
     """
     known = [example for example in examples if example.noise is not None]
-    if not known or scan_passes is None:
+    if not known or augmentation is None:
         return None
     factor = weights.config.factor
-    steps = [step for step in scan_passes.steps if factor % step == 0]
+    steps = [step for step in augmentation.steps if factor % step == 0]
     lighter = [
-        fraction * REFERENCE_MS for fraction in SCAN_EXPOSURES if fraction * REFERENCE_MS > scan_passes.darkest_ms
+        fraction * REFERENCE_MS for fraction in SCAN_EXPOSURES if fraction * REFERENCE_MS > augmentation.darkest_ms
     ]
-    exposures = [*lighter, scan_passes.darkest_ms]
+    exposures = [*lighter, augmentation.darkest_ms]
     miou, spread, calibration = np.zeros((3, len(steps), len(exposures)))
     of_classes = np.zeros((len(weights.class_names), len(steps), len(exposures)))
     maps: dict[tuple[int, float], list[ScoredMap]] = {}
     for i, step in enumerate(steps):
         for j, exposure_ms in enumerate(exposures):
             rng = np.random.default_rng([seed, 0x5CA, i, j])
-            judged = [_scanned(weights, one, scan_passes, step, exposure_ms / REFERENCE_MS, rng) for one in known]
+            judged = [_scanned(weights, one, augmentation, step, exposure_ms / REFERENCE_MS, rng) for one in known]
             counts = [one.counts for one in judged]
             calibration[i, j] = calibration_error(np.sum([one.sure for one in judged], axis=0))
             own = [mean_iou(one) for one in counts]
@@ -136,7 +136,7 @@ def judge_scans(
 def _scanned(
     weights: Weights,
     example: Example,
-    scan_passes: CaptureAugmentation,
+    augmentation: CaptureAugmentation,
     step: int,
     light: float,
     rng: np.random.Generator,
@@ -145,7 +145,7 @@ def _scanned(
     assert example.noise is not None
     grid, _, labels = _parts(weights, example)
     plain, classes = example.fine.astype(np.float32), weights.config.classes
-    fine, means = scan_passes.scan(plain, example.noise, grid.factor, light=light, step=step, rng=rng)
+    fine, means = augmentation.scan(plain, example.noise, grid.factor, light=light, step=step, rng=rng)
     drawn, every_class = map_of_columns(weights, means, fine, grid)
     valid = (labels != UNLABELLED) & np.isfinite(drawn.confidence)
     sure = confidence_counts(drawn.confidence[valid], drawn.classes[valid] == labels[valid])

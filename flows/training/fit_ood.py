@@ -130,12 +130,12 @@ def measure_ood(request: OodRequest, report: Report = lambda what, done, figure:
     seen = _observed(weights, data, request, report)
     report("drawing maps of validation scenes", 0.0, "")
     trained = trained_on(data, seen, weights.class_names)
-    scan_passes = (
+    augmentation = (
         CaptureAugmentation(weights.normalisation, darkest_ms=seen.darkest_ms)
         if seen.darkest_ms < REFERENCE_MS
         else None
     )
-    scans = judge_scans(weights, seen.validation, scan_passes, seen.seed, report)
+    scans = judge_scans(weights, seen.validation, augmentation, seen.seed, report)
     record = {
         "command": request.command,
         "scenes": len(seen.train),
@@ -181,7 +181,7 @@ def _observed(weights: Weights, data: TrainingData, request: OodRequest, report:
         settings=TrainingSettings(seed=seed),
         camera=data.camera,
     )
-    scan_passes: list[list[Example]] = []
+    examples: list[list[Example]] = []
     about = None
     for what, names in (("looking at scenes", data.train), ("looking at validation scenes", data.validation)):
         if not names:
@@ -190,11 +190,11 @@ def _observed(weights: Weights, data: TrainingData, request: OodRequest, report:
                 " that nobody can say how often a known pixel would be unknown; train them with --validation 1 or more"
             )
         found, about = observe_all(how, data, names, what, report, about)
-        scan_passes.append(as_read(found, weights.normalisation))
+        examples.append(as_read(found, weights.normalisation))
         if (about.basis, about.names) != (weights.basis, weights.class_names):
             raise SettingsError(f"{request.dataset} has other bands or classes than {request.weights} was trained on")
     assert about is not None
-    return SeenScenes(scan_passes[0], scan_passes[1], about.wavelength_nm, darkest_ms, seed)
+    return SeenScenes(examples[0], examples[1], about.wavelength_nm, darkest_ms, seed)
 
 
 def run_measure_ood(request: OodRequest, console: Console) -> dict[str, Any]:

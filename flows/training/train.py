@@ -73,7 +73,7 @@ def train_weights(
     frames = as_read(kept, lesson.normalisation)
     whole = SeenScenes(lesson.examples, frames, about.wavelength_nm, request.settings.darkest_ms, request.settings.seed)
     trained = trained_on(data, whole, about.names)
-    figures, scores = _figures(weights, frames, lesson.scan_passes, request.settings.seed, report)
+    figures, scores = _figures(weights, frames, lesson.augmentation, request.settings.seed, report)
     record = {
         "command": request.command,
         "data": data.law,
@@ -101,7 +101,7 @@ class Lesson:
     config: SegmenterConfig
     normalisation: Normalisation
     examples: list[Example]
-    scan_passes: CaptureAugmentation | None  # None where all light is that of the reference
+    augmentation: CaptureAugmentation | None  # None where all light is that of the reference
     begun: Start | None
 
 
@@ -120,8 +120,8 @@ def _lesson(
     config, begun = network_config(request, about), None
     if start is not None:
         begun = start.begin(config, about.basis, normalisation, about.names)
-    scan_passes = CaptureAugmentation(normalisation, darkest_ms=darkest_ms) if darkest_ms < REFERENCE_MS else None
-    return Lesson(about, config, normalisation, as_read(seen, normalisation), scan_passes, begun)
+    augmentation = CaptureAugmentation(normalisation, darkest_ms=darkest_ms) if darkest_ms < REFERENCE_MS else None
+    return Lesson(about, config, normalisation, as_read(seen, normalisation), augmentation, begun)
 
 
 def _learned(
@@ -139,7 +139,7 @@ def _learned(
         request.settings,
         progress,
         start=None if lesson.begun is None else lesson.begun.state,
-        scan_passes=lesson.scan_passes,
+        augmentation=lesson.augmentation,
         checkpoint=checkpoint,
         device=choose_device(request.device),
     )
@@ -148,14 +148,14 @@ def _learned(
 
 
 def _figures(
-    weights: Weights, frames: list[Example], scan_passes: CaptureAugmentation | None, seed: int, report: Report
+    weights: Weights, frames: list[Example], augmentation: CaptureAugmentation | None, seed: int, report: Report
 ) -> tuple[dict[str, Any], MapScores | None]:
     """What the record says of scenes kept for validation; of uniform scans too, where training saw such looks."""
     figures = {"validation": validate(weights, frames, seed, lambda row: report("validating", 0.0, row))}
     if (calibration := measured_calibration(weights, frames, seed)) is not None:
         figures[CALIBRATION] = calibration
         weights = with_record(weights, calibration=calibration)
-    scans = judge_scans(weights, frames, scan_passes, seed, report)
+    scans = judge_scans(weights, frames, augmentation, seed, report)
     return (figures, None) if scans is None else (figures | {"scans": scans.record}, scans.scores)
 
 

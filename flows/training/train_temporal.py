@@ -77,13 +77,13 @@ def train_temporal(request: TemporalRequest, report: Report = lambda what, done,
         raise SettingsError(
             f"--train-temporal {request.weights}: expected weights of the farm's classes, {', '.join(CLASSES)}"
         )
-    scan_passes = CaptureAugmentation(weights.normalisation)
+    augmentation = CaptureAugmentation(weights.normalisation)
     lands = []
     for number in range(request.lands):
         seed = FIRST_SEED + number
         report("visiting lands", number / request.lands, f"land {seed}")
         rng = np.random.default_rng([request.settings.seed, seed])
-        lands.append([_visit(weights, scan_passes, request.shape, seed, *moment, rng) for moment in _moments(rng)])
+        lands.append([_visit(weights, augmentation, request.shape, seed, *moment, rng) for moment in _moments(rng)])
 
     def progress(now: Progress) -> None:
         report("training", now.done, f"step {now.step}, loss {now.loss:.3f}")
@@ -94,7 +94,7 @@ def train_temporal(request: TemporalRequest, report: Report = lambda what, done,
         "lands": [FIRST_SEED + number for number in range(request.lands)],
         "settings": asdict(request.settings),
         "steps": steps,
-        "validation": judge_temporal(weights, scan_passes, reader, request, report),
+        "validation": judge_temporal(weights, augmentation, reader, request, report),
     }
     add_reader(request.weights, request.out, reader, record)
     return record
@@ -110,7 +110,7 @@ def _moments(rng: np.random.Generator) -> list[tuple[int, float]]:
 
 def _visit(
     weights: Weights,
-    scan_passes: CaptureAugmentation,
+    augmentation: CaptureAugmentation,
     shape: tuple[int, int],
     seed: int,
     day: int,
@@ -123,7 +123,7 @@ def _visit(
     for _ in range(PASSES):
         step = drawn_step(STEPS, weights.config.factor, rng)
         exposure_ms = float(np.exp(rng.uniform(np.log(DARKEST_MS), np.log(BRIGHTEST_MS))))
-        observation = seen.observe(weights, scan_passes, step, exposure_ms, rng)
+        observation = seen.observe(weights, augmentation, step, exposure_ms, rng)
         probability = np.exp(observation.log_probability).astype(np.float16)
         drawn.append(PastPass(step, observation.light, probability, observation.coarse.astype(np.float16)))
     return Visit(day + hour / 24, seen.labels, drawn)
@@ -151,20 +151,24 @@ class _Land:
     def observe(
         self,
         weights: Weights,
-        scan_passes: CaptureAugmentation,
+        augmentation: CaptureAugmentation,
         step: int,
         exposure_ms: float,
         rng: np.random.Generator,
     ) -> CurrentVisit:
         """What a uniform scan would have shown, read by the weights."""
         grid, light = self.grid, exposure_ms / REFERENCE_MS
-        fine, means = scan_passes.scan(self.columns, self.noise, grid.factor, light=light, step=step, rng=rng)
+        fine, means = augmentation.scan(self.columns, self.noise, grid.factor, light=light, step=step, rng=rng)
         _, every_class = map_of_columns(weights, means, fine, grid)
         return CurrentVisit(every_class, np.ones(self.labels.shape, np.bool_), means, light, step)
 
 
 def judge_temporal(
-    weights: Weights, scan_passes: CaptureAugmentation, reader: TemporalReader, request: TemporalRequest, report: Report
+    weights: Weights,
+    augmentation: CaptureAugmentation,
+    reader: TemporalReader,
+    request: TemporalRequest,
+    report: Report,
 ) -> list[dict[str, float]] | None:
     """What maps score some days after a first visit, mIoU in the mean of lands that training did not see.
 
@@ -176,13 +180,13 @@ def judge_temporal(
         seed = JUDGED_SEED + number
         rng = np.random.default_rng([request.settings.seed, seed])
         land = _Land.observed(weights, request.shape, seed, JUDGED_DAY, 11.0)
-        before = land.observe(weights, scan_passes, *BEFORE, rng)
+        before = land.observe(weights, augmentation, *BEFORE, rng)
         for days in JUDGED_AFTER:
             report(
                 "judging", (number * len(rows) + JUDGED_AFTER.index(days)) / (len(rows) * request.judged), f"{days} d"
             )
             later = _Land.observed(weights, request.shape, seed, JUDGED_DAY + days, 11.0)
-            now, anew = (later.observe(weights, scan_passes, *how, rng) for how in (NOW, BEFORE))
+            now, anew = (later.observe(weights, augmentation, *how, rng) for how in (NOW, BEFORE))
             prior_map = PriorMap(first_probabilities(before), before.coarse, float(days))
             probabilities = {
                 "kept": first_probabilities(before),

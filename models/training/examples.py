@@ -121,14 +121,14 @@ class CropSampler:
         crop: int,
         *,
         noise: float = 0.0,
-        scan_passes: CaptureAugmentation | None = None,
+        augmentation: CaptureAugmentation | None = None,
     ) -> None:
-        """``noise`` is the most that is added, in spreads of the normalised columns, unless ``scan_passes`` add it."""
+        """``noise`` is the most that is added, in spreads of the normalised columns, unless ``augmentation`` add it."""
         cell = config_patch * factor
         smallest = min(min(example.labels.shape) for example in examples)
         self.size = max(cell, min(crop, smallest) // cell * cell)
         self.examples, self.patch, self.factor, self.noise = examples, config_patch, factor, noise
-        self.scan_passes = scan_passes
+        self.augmentation = augmentation
         areas = np.array([np.count_nonzero(example.labels != UNLABELLED) for example in examples], np.float64)
         if not areas.any():
             raise SceneError(f"none of {len(examples)} scenes has a labelled pixel; training needs some")
@@ -159,8 +159,8 @@ class CropSampler:
         coarse = turn(example.coarse[y // s : (y + size) // s, x // s : (x + size) // s]).astype(np.float32) * gain
         fine = turn(example.fine[y : y + size, x : x + size]).astype(np.float32) * gain
         shift = (gain - 1) * gain_shift
-        if self.scan_passes is not None and example.noise is not None:
-            fine, coarse = self.scan_passes.draw(fine + shift, coarse + shift, example.noise, s, rng)
+        if self.augmentation is not None and example.noise is not None:
+            fine, coarse = self.augmentation.draw(fine + shift, coarse + shift, example.noise, s, rng)
             channels = [np.ascontiguousarray(image.transpose(2, 0, 1)) for image in (coarse, fine)]
             return channels[0], channels[1], np.ascontiguousarray(turn(labels)).astype(np.int64)
         channels_first = [np.ascontiguousarray((image + shift).transpose(2, 0, 1)) for image in (coarse, fine)]

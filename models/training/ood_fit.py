@@ -46,7 +46,7 @@ def fit_ood(
     if not validation:
         raise SceneError("no scene was kept from training, so that nobody can say how often a known pixel is unknown")
     rng = np.random.default_rng([seed, 0xFA3])
-    scan_passes = CaptureAugmentation(
+    augmentation = CaptureAugmentation(
         normalisation, darkest_ms=darkest_ms, steps=STEPS if darkest_ms < REFERENCE_MS else {1: 1.0}
     )
     gathered = []
@@ -61,7 +61,7 @@ def fit_ood(
     shot, read = _noise_of_columns(noise, centres, normalisation)
     none = np.zeros((1, 1, 1))
     draft = OodDetector(centres, covariance, shot, read, Limits(np.ones(1), np.ones(1), (1,), none, none[0]), bands)
-    limits = measured_limits(draft, validation, scan_passes, rng, lambda done: report(0.5 + done / 2))
+    limits = measured_limits(draft, validation, augmentation, rng, lambda done: report(0.5 + done / 2))
     return replace(draft, limits=limits)
 
 
@@ -142,14 +142,14 @@ def components(pixels: Spectra, classes: Classes, seed: int) -> tuple[Exact, Exa
 def measured_limits(
     ood_detector: OodDetector,
     examples: Sequence[Example],
-    scan_passes: CaptureAugmentation,
+    augmentation: CaptureAugmentation,
     rng: np.random.Generator,
     report: Report = lambda done: None,
 ) -> Limits:
     """Distances that fractions of labelled pixels of scenes lie beyond, for each step and light of the looks."""
     noisy = all(example.noise is not None for example in examples)
-    light = [one for one in LIGHT if one * REFERENCE_MS >= scan_passes.darkest_ms] if noisy else [1.0]
-    steps = tuple(sorted(step for step in scan_passes.steps if _factor(examples[0]) % step == 0)) if noisy else (1,)
+    light = [one for one in LIGHT if one * REFERENCE_MS >= augmentation.darkest_ms] if noisy else [1.0]
+    steps = tuple(sorted(step for step in augmentation.steps if _factor(examples[0]) % step == 0)) if noisy else (1,)
     fine, coarse = np.empty((len(steps), len(light), len(RATES))), np.empty((len(light), len(RATES)))
     for j, fraction in enumerate(light):
         for i, step in enumerate(steps):
@@ -157,7 +157,7 @@ def measured_limits(
             for one in examples:
                 pixels = np.asarray(one.fine, np.float32)
                 if one.noise is not None:
-                    pixels, _ = scan_passes.scan(pixels, one.noise, _factor(one), light=fraction, step=step, rng=rng)
+                    pixels, _ = augmentation.scan(pixels, one.noise, _factor(one), light=fraction, step=step, rng=rng)
                 distances.append(ood_detector.lit(fraction).distance(pixels[one.labels != UNLABELLED]))
             fine[i, j] = _beyond(distances)
             report((j * len(steps) + i + 1) / (len(steps) * len(light)))
@@ -165,7 +165,7 @@ def measured_limits(
         for one in examples:
             pixels = one.coarse
             if one.noise is not None:
-                pixels = scan_passes.coarse_pass(pixels, one.noise, _factor(one), light=fraction, rng=rng)
+                pixels = augmentation.coarse_pass(pixels, one.noise, _factor(one), light=fraction, rng=rng)
             known = _coarse_labels(one) != UNLABELLED
             distances.append(ood_detector.lit(fraction, _factor(one)).distance(pixels[known]))
         coarse[j] = _beyond(distances)

@@ -83,7 +83,7 @@ class Trainer:
         gain_shift: NDArray[np.float32],
         settings: TrainingSettings,
         start: Mapping[str, Tensor] | None = None,
-        scan_passes: CaptureAugmentation | None = None,
+        augmentation: CaptureAugmentation | None = None,
         device: str = PROCESSOR,
     ) -> None:
         self.settings, self.gain_shift, self.device = settings, gain_shift, device
@@ -109,7 +109,7 @@ class Trainer:
         for larger in {phase.larger for phase in PHASES}:
             crop = round(settings.crop * math.sqrt(larger))
             self.samplers[larger] = CropSampler(
-                examples, config.patch, config.factor, crop, noise=settings.noise, scan_passes=scan_passes
+                examples, config.patch, config.factor, crop, noise=settings.noise, augmentation=augmentation
             )
         self.weight = class_weights([one.labels for one in examples], config.classes, settings.weight_cap).to(device)
         self.course = Course()
@@ -220,7 +220,7 @@ def train(
     report: Callable[[Progress], None] = lambda progress: None,
     *,
     start: Mapping[str, Tensor] | None = None,
-    scan_passes: CaptureAugmentation | None = None,
+    augmentation: CaptureAugmentation | None = None,
     checkpoint: Path | None = None,
     keep_every_s: float = KEEP_EVERY_S,
     device: str = PROCESSOR,
@@ -239,7 +239,7 @@ def train(
     beside the checkpoint. WeightsError : a tensor of ``start`` that the network has no place for.
     """
     keep_freed_memory()
-    trainer = Trainer(config, examples, gain_shift, settings, start, scan_passes, device)
+    trainer = Trainer(config, examples, gain_shift, settings, start, augmentation, device)
     identity = run_identity(config, examples, settings, start)
     if checkpoint is not None:
         trainer.go_on(checkpoint, identity)

@@ -126,7 +126,7 @@ class Field:
 
     views: Views
     expected_gain: Floats  # (patch,), 0 for patches that are not wanted
-    column: Ints  # (patch,) place along the line: strips that fraction none are planned apart
+    column: Ints  # (patch,) place along the line: swaths that share none are planned apart
     prices: ScanPrices
 
     @cached_property

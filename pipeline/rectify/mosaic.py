@@ -107,9 +107,9 @@ class LocatedSweep:
 
 
 def read_part(
-    observation: LocatedSweep, coordinates: NDArray[np.float64], camera: LineCamera, kernel: Kernel
+    located: LocatedSweep, coordinates: NDArray[np.float64], camera: LineCamera, kernel: Kernel
 ) -> MosaicPart | None:
-    """Resample one track at geolocation grid coordinates (n, 2); None where it reaches none of them.
+    """Resample one scan path at coordinates (n, 2) of the geolocation grid; None where it reaches none of them.
 
     Lines that are not valid or that nothing saw, saturated and uncalibrated elements count nothing; where they leave
     less than half of a kernel's weight the point is NaN with weight 0. The result at a point does not depend on the
@@ -118,11 +118,11 @@ def read_part(
     box = _boxes(coordinates[None])[0]
     if np.isnan(box[0]):
         return None
-    signal, scan_path = observation.placed.signal, observation.scan_path
+    signal, scan_path = located.placed.signal, located.scan_path
     count = signal.samples
     knots, samples = _span(box[0], box[1], len(scan_path)), signal.elements.alone(_span(box[2], box[3], count))
     members = member_lines(scan_path, knots)
-    values, valid = signal.values(observation.read, members, samples, camera.full_scale_dn)
+    values, valid = signal.values(located.read, members, samples, camera.full_scale_dn)
     starts = scan_path.starts[knots] - scan_path.starts[knots.start]
     seen = np.repeat(scan_path.seen[knots], np.diff(starts, append=len(members)))
     if not seen.all():
@@ -133,14 +133,14 @@ def read_part(
     return MosaicPart(values_at, weight, edge_distance(coordinates, len(scan_path), count))
 
 
-def cut_runs(observation: Sequence[NDArray[np.float64]], bands: int) -> list[slice]:
+def cut_runs(located: Sequence[NDArray[np.float64]], bands: int) -> list[slice]:
     """Cut groups of points into runs (slices, in order) such that little is calibrated that no point needs.
 
     Where lines are turned against the grid, the lines and samples behind a long run of pixels are many times as many
-    as the pixels; short runs have less beside, but each has a price of its own. ``observation`` holds the (group, n, 2)
-    geolocation grid coordinates of each track.
+    as the pixels; short runs have less beside, but each has a price of its own. ``located`` holds the (group, n, 2)
+    geolocation grid of each scan path.
     """
-    boxes = np.stack([_boxes(coordinates) for coordinates in observation])
+    boxes = np.stack([_boxes(coordinates) for coordinates in located])
 
     def price(
         run: slice,

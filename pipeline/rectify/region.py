@@ -53,7 +53,7 @@ def mosaic_tile(
     (y, x, band) float32 with NaN where no line reached, (y, x) how many sweeps did (a sweep that turns may count
     once for each of its runs).
     """
-    observation = []
+    located = []
     for one, scan_paths in zip(placed, reach or column_reach(placed, camera, grid, columns), strict=True):
         for number, near in enumerate(scan_paths):
             knots = slice(0, 0) if near is None else near.knots(rows)
@@ -61,17 +61,17 @@ def mosaic_tile(
                 continue
             scan_path = one.scan_paths[number][0]
             coordinates = one.coordinates(number, camera, grid, rows, columns)
-            observation.append(
+            located.append(
                 LocatedSweep(one, scan_path, coordinates, _reader(one, scan_path, coordinates, cache, near.samples))
             )
     shape = rows.stop - rows.start, columns.stop - columns.start
     bands = len(placed[0].lines.references.white_reference)
     values, coverage = np.empty((*shape, bands), np.float32), np.zeros(shape, np.intp)
-    if not observation:
+    if not located:
         values[...] = np.nan
-    for run in cut_runs([_column_groups(one.coordinates) for one in observation], bands) if observation else []:
+    for run in cut_runs([_column_groups(one.coordinates) for one in located], bands) if located else []:
         part = slice(run.start * GROUP_COLUMNS, min(run.stop * GROUP_COLUMNS, shape[1]))
-        seen, counts = _blend([(one, one.coordinates[:, part]) for one in observation], camera, kernel)
+        seen, counts = _blend([(one, one.coordinates[:, part]) for one in located], camera, kernel)
         values[:, part], coverage[:, part] = seen.reshape(shape[0], -1, bands), counts.reshape(shape[0], -1)
     return values, coverage
 
@@ -162,33 +162,33 @@ def read_patches(
     """
     placed = [one if isinstance(one, Placed) else place(one, camera) for one in sweeps]
     points, on_scene = patch_pixels(grid, patch_index)
-    observation = []
+    located = []
     for one in placed:
         for scan_path, _ in one.scan_paths:
             coordinates = one.locate_point(scan_path, camera, points)
             if np.isfinite(coordinates[..., 0]).any():
                 whole = slice(0, len(one.lines.references.dark))
-                observation.append(
+                located.append(
                     LocatedSweep(one, scan_path, coordinates, _reader(one, scan_path, coordinates, cache, whole))
                 )
     bands = len(placed[0].lines.references.white_reference)
     values = np.full((*points.shape[:3], bands), np.nan, np.float32)
     coverage = np.zeros(points.shape[:3], np.intp)
-    for run in cut_runs([one.coordinates for one in observation], bands) if observation else []:
-        seen, counts = _blend([(one, one.coordinates[run]) for one in observation], camera, kernel)
+    for run in cut_runs([one.coordinates for one in located], bands) if located else []:
+        seen, counts = _blend([(one, one.coordinates[run]) for one in located], camera, kernel)
         values[run], coverage[run] = seen.reshape(values[run].shape), counts.reshape(coverage[run].shape)
     return values, on_scene & (coverage > 0)
 
 
 def _blend(
-    observation: Sequence[tuple[LocatedSweep, NDArray[np.float64]]], camera: LineCamera, kernel: Kernel
+    located: Sequence[tuple[LocatedSweep, NDArray[np.float64]]], camera: LineCamera, kernel: Kernel
 ) -> tuple[Values, Counts]:
     """Read every track that reaches some of the points and blend them, (n, band) and (n,)."""
-    read = [read_part(one, coordinates.reshape(-1, 2), camera, kernel) for one, coordinates in observation]
+    read = [read_part(one, coordinates.reshape(-1, 2), camera, kernel) for one, coordinates in located]
     parts = [part for part in read if part is not None]
     if parts:
         return mosaic(parts)
-    count, bands = observation[0][1].size // 2, len(observation[0][0].placed.lines.references.white_reference)
+    count, bands = located[0][1].size // 2, len(located[0][0].placed.lines.references.white_reference)
     return np.full((count, bands), np.nan, np.float32), np.zeros(count, np.intp)
 
 

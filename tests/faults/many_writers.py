@@ -89,7 +89,7 @@ def _left(out: Path, *, killed: bool) -> list[str]:
 
 
 def rows(quick: bool = False) -> list[Row]:
-    """Two and four of the same survey, surveys that fraction stages, and one killed while others wait."""
+    """Two and four of the same survey, surveys that share stages, and one killed while others wait."""
     rounds = 1 if quick else ROUNDS
     with tempfile.TemporaryDirectory(prefix="writers-") as name, Nursery(Path(name)) as nursery:
         subject = prepare(nursery)

@@ -255,10 +255,8 @@ class SceneCamera(CameraDevice):
         if told is None:
             number = ((middle_s - capture.began_s) / capture.period_s).astype(int).tolist()
             names = [f"{capture.folder}-{one}" for one in number]
-            scan_passes = zip(names, positions, strict=True)
-            return np.concatenate(
-                [self.view.alone(name, place, times_ms, capture.began_s) for name, place in scan_passes]
-            )
+            viewed = zip(names, positions, strict=True)
+            return np.concatenate([self.view.alone(name, place, times_ms, capture.began_s) for name, place in viewed])
         step = told.sweep.step  # positions during each exposure
         moments = (np.arange(step) + 0.5) * (capture.exposure_s / step)
         held = self.mirror.sent(middle_s[:, None] - capture.exposure_s / 2 + moments)

@@ -198,10 +198,10 @@ def _printed(receipt: Receipt, width: int = 100) -> str:
 def test_headline_is_one_paragraph_with_the_figures():
     """Where, how long, how well, and the worst class of the truth; what was not judged is not mentioned."""
     text = headline(make_receipt(), 0.23)
-    assert text.startswith("The camera captured again at 23 % of the field. Capture took 104 s instead of 209 s")
+    assert text.startswith("The camera captured 23 % of the field again. Capture took 104 s instead of 209 s")
     assert "75.0 of 100" in text
     assert "93.4 % of its pixels are right" in text
-    assert headline(make_receipt(), 0.0).startswith("The camera captured again at nothing: no run of fine lines fits")
+    assert headline(make_receipt(), 0.0).startswith("The camera captured nothing again: no run of fine lines fits")
     assert "truth" not in headline(make_receipt(labels=False))
     words = "Its worst class is bare weed with 60.0: the coarse pass alone gives 20.0, detail everywhere 80.0."
     assert headline(make_receipt()).endswith(words)

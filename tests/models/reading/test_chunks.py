@@ -20,7 +20,7 @@ Scene = tuple[CoarsePass, np.ndarray, np.ndarray]
 
 
 def _scene(weights: Weights, count: int = 40) -> Scene:
-    """A look, patches and patches of a scene of noise."""
+    """A coarse pass, numbers of patches and their pixels, of a scene of noise."""
     p, s, columns = weights.config.patch, weights.config.factor, weights.config.columns
     rng, grid = np.random.default_rng(0), SceneGrid(60, 90, p, s)
     y, x = (side // s for side in grid.padded_shape)

@@ -58,7 +58,7 @@ def test_whitening_leaves_alone_what_noise_hides() -> None:
     np.testing.assert_allclose(sizes[1], [1, math.sqrt(0.5)], atol=0.02)
 
 
-def _scan_passes() -> tuple[CaptureAugmentation, Normalisation]:
+def _augmentation() -> tuple[CaptureAugmentation, Normalisation]:
     rng = np.random.default_rng(5)
     normalisation = Normalisation.measured(0.3 + 0.05 * rng.normal(size=(4000, 12)))
     return CaptureAugmentation(normalisation), normalisation
@@ -74,10 +74,10 @@ def test_a_scan_is_as_noisy_as_its_light_makes_it(light: float, step: int) -> No
 
     A line of several pixels is read once, for all of them; coarse pixels are means over as many of its readings.
     """
-    scan_passes, normalisation = _scan_passes()
+    augmentation, normalisation = _augmentation()
     noise, unwhiten = _noise(), np.linalg.inv(normalisation.whitening.astype(np.float64))
     plain = _flat(normalisation, 0.3, (256, 256))
-    fine, means = scan_passes.scan(plain, noise, 4, light=light, step=step, rng=np.random.default_rng(6))
+    fine, means = augmentation.scan(plain, noise, 4, light=light, step=step, rng=np.random.default_rng(6))
     spectrum = np.full(12, 0.3)
     added = noise.variance(spectrum, light) - noise.variance(spectrum, 1.0) / step
     for seen, readings in ((means, 16 / step), *(((fine, 1.0),) if step == 1 else ())):
@@ -88,11 +88,11 @@ def test_a_scan_is_as_noisy_as_its_light_makes_it(light: float, step: int) -> No
 @pytest.mark.parametrize("step", [1, 2, 4])
 def test_a_scan_in_full_light_shows_the_scene_as_wide_as_its_lines(step: int) -> None:
     """Ramps stay ramps where light is that of the reference, away from the border; coarse pixels are their means."""
-    scan_passes, normalisation = _scan_passes()
+    augmentation, normalisation = _augmentation()
     ramp = np.broadcast_to(0.2 + 0.001 * np.arange(64)[:, None, None], (64, 8, 12)).astype(np.float32)
     plain = normalisation.apply(ramp, np.ones(12, bool))
     silent = ColumnNoise(np.zeros(12), 1e-18 * np.eye(12))
-    fine, means = scan_passes.scan(plain, silent, 4, light=1.0, step=step, rng=np.random.default_rng(7))
+    fine, means = augmentation.scan(plain, silent, 4, light=1.0, step=step, rng=np.random.default_rng(7))
     inner = slice(2 * step, -2 * step)
     np.testing.assert_allclose(fine[inner], plain[inner], atol=2e-3)
     np.testing.assert_allclose(means, plain.reshape(16, 4, 2, 4, 12).mean(axis=(1, 3)), atol=2e-3)
@@ -100,9 +100,9 @@ def test_a_scan_in_full_light_shows_the_scene_as_wide_as_its_lines(step: int) ->
 
 def test_a_coarse_pass_is_read_as_often_as_it_has_samples() -> None:
     """In the light of the reference nothing is added to a scan of every line, nor to a coarse pass of its own."""
-    _, normalisation = _scan_passes()
-    scan_passes = CaptureAugmentation(normalisation, darkest_ms=100.0, steps={1: 1.0}, own_coarse=1.0)
+    _, normalisation = _augmentation()
+    augmentation = CaptureAugmentation(normalisation, darkest_ms=100.0, steps={1: 1.0}, own_coarse=1.0)
     fine, coarse = _flat(normalisation, 0.3, (16, 16)), _flat(normalisation, 0.25, (4, 4))
-    plain, own = scan_passes.draw(fine, coarse, _noise(), 4, np.random.default_rng(8))
+    plain, own = augmentation.draw(fine, coarse, _noise(), 4, np.random.default_rng(8))
     np.testing.assert_allclose(plain, fine, atol=2e-3)
     np.testing.assert_allclose(own, coarse, atol=2e-3)

@@ -109,9 +109,9 @@ def small_rig(
     Settings and cable have one pulse a held position, and requests to the mirror a CRC, unless ``settings`` differ.
     """
     told = {"pulses": "position", "with_crc": True, **settings}
-    observation = small_source() if source is None else source
+    viewed = small_source() if source is None else source
     rig = FaultyRig(
-        observation,
+        viewed,
         ManualClock(50.0),
         mirror_faults=mirror_faults,
         wired=told["pulses"],
@@ -119,4 +119,4 @@ def small_rig(
         mounting=mounting,
     )
     with InProcessRig(rig) as line:
-        yield SmallRig(line, SurveyRig(**told), vector_pairs, observation.wavelength_nm)
+        yield SmallRig(line, SurveyRig(**told), vector_pairs, viewed.wavelength_nm)

@@ -41,7 +41,7 @@ class Case:
     sweeps: tuple[Sweep, ...]
     seconds: float | None  # from the first line to the last; None is that of the sweeps
     seed: int
-    observation: range | None = None  # lines of every sweep that are measured; None is all
+    measured: range | None = None  # lines of every sweep that are measured; None is all
 
     def stored_in_sums_of(self, binning: int) -> Case:
         """The same, with so many neighbouring samples summed to one number."""
@@ -61,7 +61,7 @@ class Case:
             SweepBlock(
                 rig,
                 sweep,
-                self.observation or range(sweep.lines),
+                self.measured or range(sweep.lines),
                 scene.wavelength_nm,
                 scene.shape,
                 seed=self.seed,

@@ -76,9 +76,9 @@ def test_undeflected_sweep_is_the_operator_on_the_grid(step: int) -> None:
     sweep = replace(SWEEP, lines=40 // step, step=step)
     lines = light_of(scene, sweep, range(sweep.lines))
     exact = replace(CAMERA, electrons_per_dn=1.0, bits=16)  # four of its samples still fit uint16
-    observation = expose(footprint(values.astype(np.float32) * scene.electrons, exact), exact, step=step, rng=None)
+    viewed = expose(footprint(values.astype(np.float32) * scene.electrons, exact), exact, step=step, rng=None)
     binned = lines.reshape(sweep.lines, 640 // step, step, 1).mean(axis=2)
-    assert np.abs(binned - observation).max() < 0.02 * observation.std()
+    assert np.abs(binned - viewed).max() < 0.02 * viewed.std()
 
 
 def test_rays_are_those_of_the_mirror() -> None:

@@ -92,7 +92,7 @@ def test_bounds_hold_where_little_is_seen(number: int) -> None:
 )
 def test_bounds_hold_where_bands_differ(number: int, effect: str, lines: range | None) -> None:
     """Each band counts with its own least light, and by what its neighbours bring from beside that it does not."""
-    found = list(trials(replace(sparse_case(number), observation=lines), (1, 2 + number % 7), effect))
+    found = list(trials(replace(sparse_case(number), measured=lines), (1, 2 + number % 7), effect))
     assert found
     assert [one for one in found if one.is_broken] == []
 
