@@ -14,9 +14,9 @@ No ``from __future__ import annotations`` here: Prefect reads the signatures.
 
 from prefect import flow
 
-from flows.publish.publishing import add_accuracy, publish
+from flows.publish.publishing import add_accuracy, clear_raw, publish
 from flows.settings.parameters import SurveySettings
-from flows.tasks.captures import capture_pass, plan_capture
+from flows.tasks.captures import capture_pass, captured_signal, plan_capture
 from flows.tasks.open_survey import JUDGED, OpenSurvey, RunRef
 from flows.tasks.prefect_tasks import as_task
 from flows.tasks.stages.accuracy import evaluate
@@ -24,8 +24,8 @@ from flows.tasks.stages.attention import score
 from flows.tasks.stages.effects import choose_effects
 from flows.tasks.stages.maps import segment
 from flows.tasks.stages.on_ground import ground
-from flows.tasks.stages.placement import extract_patches, locate, rectify, register_coarse, register_fine
-from flows.tasks.stages.raster import average_raster, take_patches
+from flows.tasks.stages.placement import locate, rectify, rectify_fine, register_coarse, register_fine
+from flows.tasks.stages.raster import condense_raster
 from storage.archive.keys import StageRef
 
 
@@ -56,16 +56,16 @@ def survey(settings: SurveySettings, capture_deployment: str | None = None) -> R
     plan.capture_deployment = capture_deployment
     with plan.at_work():
         draw_class_map(plan)
-        run = publish(plan)
-        return judge(plan, run)
+        run = judge(plan, publish(plan))
+        clear_raw(plan)
+        return run
 
 
 def draw_class_map(plan: OpenSurvey) -> None:
     """Run the stages from the first pass to the class map; their stores are the products of the plan."""
     if plan.is_map:  # the scene's own pixels: nothing is captured
-        mosaic = average_raster(plan)
-        request = score(plan, mosaic)
-        class_map = segment(plan, mosaic, take_patches(plan, request))
+        mosaic = condense_raster(plan)
+        class_map = segment(plan, mosaic, score(plan, mosaic))
     else:
         mosaic, class_map = _draw_captured(plan)
     if plan.on_the_ground:
@@ -75,17 +75,16 @@ def draw_class_map(plan: OpenSurvey) -> None:
 def _draw_captured(plan: OpenSurvey) -> tuple[StageRef, StageRef]:
     """Capture the field, go back for what the plan requests, and draw its map; return mosaic and map."""
     effects = choose_effects(plan)
-    raw = capture_pass(plan, "coarse", effects)
-    seams = register_coarse(plan, raw) if plan.registers else None
-    geolocation = locate(plan, raw, seams)
-    mosaic = rectify(plan, raw, geolocation, seams)
+    signal = captured_signal(plan, "coarse", effects)
+    seams = register_coarse(plan, signal) if plan.registers else None
+    mosaic = rectify(plan, signal, locate(plan, signal, seams), seams)
     request = score(plan, mosaic)
+    fine = None
     if not plan.uniform:  # go back for what the plan requests
-        raw = capture_pass(plan, "fine", request, effects)
-        seams = register_fine(plan, raw, mosaic) if plan.registers else None
-    patches = extract_patches(plan, request, raw, seams)
-    class_map = segment(plan, mosaic, patches)
-    return mosaic, class_map
+        signal = captured_signal(plan, "fine", request, effects)
+        seams = register_fine(plan, signal, mosaic) if plan.registers else None
+        fine = rectify_fine(plan, request, signal, seams)
+    return mosaic, segment(plan, mosaic, request, fine)
 
 
 def judge(plan: OpenSurvey, run: RunRef) -> RunRef:

@@ -201,7 +201,7 @@ def _picture(run: ExportedRun) -> tuple[CogImage, Callable[[], Rows]]:
     image = CogImage((stored.shape[0], stored.shape[1]), "uint8", place, RGB, 0, tags=layer_tags(run, "mosaic", place))
 
     def rows() -> Rows:
-        yield 0, np.nan_to_num(np.rint(coarse_colours(ref))).astype(np.uint8)
+        yield 0, np.nan_to_num(np.rint(coarse_colours(ref, None))).astype(np.uint8)
 
     return image, rows
 

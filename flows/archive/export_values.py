@@ -11,16 +11,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flows.archive.export_layers import ExportedRun, Layer, Rows, layer_tags, place_of
 from flows.archive.product_choice import ProductChoice
-from flows.settings.survey_settings import RASTER
 from pipeline.errors import SettingsError
-from pipeline.geometry.grid import UNLABELLED, SceneGrid
+from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.map_grid import GroundGrid, grid_of_map, image_at, map_blocks
 from pipeline.ground.view import GroundView, RigPose
 from pipeline.products.areas import FractionEstimate, probable_fractions, stratified_fractions
@@ -29,8 +27,8 @@ from storage.archive.whole_files import write_whole
 from storage.arrays.class_maps import ProbabilityStore
 from storage.arrays.georeference import load_geobox
 from storage.arrays.ground_maps import load_bands, open_image
-from storage.arrays.layout import grid_of, read_array
-from storage.arrays.mosaics import PatchStore, open_patches
+from storage.arrays.layout import grid_of
+from storage.arrays.mosaics import Mosaic, open_mosaic
 from storage.export.image_files import CogImage, Place
 
 CSV = "text/csv"
@@ -111,22 +109,30 @@ class MosaicView:
     """A run's mosaic, as an image on the map where the run has a pose, else on its own grid."""
 
     run: ExportedRun
-    words = "Coarse mosaic"
+
+    @cached_property
+    def mosaic(self) -> Mosaic:
+        """The stored mosaic."""
+        return open_mosaic(self.run.path("mosaic"))
+
+    @property
+    def words(self) -> str:
+        """How large its pixels are."""
+        return "Pixels of the field" if self.factor == 1 else f"Pixels of {self.factor} x {self.factor} px"
 
     @cached_property
     def place(self) -> Place:
         """Where the image lies."""
         if self.ground is not None:
             return Place.on_map(self.ground.geobox)
-        return place_of(self.run, open_image(self.run.path("mosaic"), "values"))
+        return place_of(self.run, open_image(self.run.path("mosaic"), "coverage"))
 
     @cached_property
     def shape(self) -> tuple[int, int]:
         """(y, x) of the image [px]."""
         if self.ground is not None:
             return self.ground.shape
-        rows, columns, _ = open_image(self.run.path("mosaic"), "values").shape
-        return rows, columns
+        return self.mosaic.shape
 
     @cached_property
     def ground(self) -> GroundGrid | None:
@@ -141,19 +147,18 @@ class MosaicView:
         coarse = geobox.zoom_out(self.factor)  # finer the mosaic knows nothing
         return grid_of_map(GroundView(pose, scene.ifov_rad), scene.scene_shape, coarse)
 
-    @cached_property
+    @property
     def factor(self) -> int:
         """Fine pixels to a side of the mosaic's."""
-        grid = grid_of(open_image(self.run.path("mosaic"), "values").about)
-        assert grid is not None
-        return grid.factor
+        return self.mosaic.factor
 
     def rows(self, bands: Sequence[int]) -> Rows:
         """Values (row, x, band) of some bands with the number of the first row, from the top down."""
-        group = open_image(self.run.path("mosaic"), "values").group
         if self.ground is None:
-            for first, values in open_image(self.run.path("mosaic"), "values").rows():
-                yield first, values[..., list(bands)]
+            first = 0
+            for strip in self.mosaic.strips():
+                yield first, self.mosaic.spectra(strip, bands)
+                first += len(strip)
             return
         factor = self.factor
         at_once = int(np.clip(BYTES_AT_ONCE // (4 * len(bands) * self.shape[1]), 1, 256))
@@ -162,77 +167,19 @@ class MosaicView:
             out = np.full((last - first, self.shape[1], len(bands)), np.nan, np.float32)
             for _, columns in map_blocks((last - first, self.shape[1]), (last - first, COLUMNS_AT_ONCE)):
                 pixels = self.ground.scene_pixels(slice(first, last), columns)
-                out[:, columns] = _window_at(group, pixels, factor, bands)
+                out[:, columns] = _window_at(self.mosaic, pixels, factor, bands)
             yield first, out
 
 
-@dataclass(frozen=True)
-class RasterView:
-    """A raster's values on its own pixels: patches where the run kept them, elsewhere the coarse means."""
-
-    run: ExportedRun
-
-    @cached_property
-    def place(self) -> Place:
-        """Where the image lies."""
-        return place_of(self.run, open_image(self.run.path("class_map"), "classes"))
-
-    @cached_property
-    def shape(self) -> tuple[int, int]:
-        """(y, x) of the image [px]."""
-        rows, columns = open_image(self.run.path("class_map"), "classes").shape
-        return rows, columns
-
-    @cached_property
-    def grid(self) -> SceneGrid:
-        """The raster's grid, by the parameters of its map."""
-        drawn = self.run.store("class_map")
-        assert drawn is not None
-        return SceneGrid(**self.run.archive.manifest(drawn)["params"]["grid"])
-
-    @cached_property
-    def patches(self) -> PatchStore | None:
-        """The patches that the run kept; None where they were cleared away."""
-        ref = self.run.store("patches")
-        return None if ref is None else open_patches(self.run.path("patches"))
-
-    @property
-    def words(self) -> str:
-        """How much of the image is the raster's own pixels."""
-        kept, every = 0 if self.patches is None else len(self.patches.patch_index), len(self.grid.valid_patches())
-        s = self.grid.factor
-        if kept == every:
-            return "Pixels of the raster"
-        return f"Pixels of the raster in {kept} of {every} patches, means of {s} x {s} px elsewhere"
-
-    def rows(self, bands: Sequence[int]) -> Rows:
-        """Values (row, x, band) of some bands with the number of the first row, from the top down."""
-        grid, chosen = self.grid, list(bands)
-        p, s, (_, across) = grid.patch, grid.factor, grid.patch_shape
-        means = open_image(self.run.path("mosaic"), "values")
-        patch_index = np.empty(0, np.int64) if self.patches is None else self.patches.patch_index
-        for first in range(0, grid.height, p * s):  # rows that hold whole patches and whole means
-            coarse = read_array(means.group, "values", slice(first // s, first // s + p))[..., chosen]
-            rows = np.repeat(np.repeat(coarse, s, axis=0), s, axis=1)[: grid.height - first, : grid.width].copy()
-            entries = np.flatnonzero(patch_index // across // s == first // (p * s))
-            if self.patches is not None and len(entries):
-                for patch, (y, x) in zip(
-                    self.patches.pick(entries), grid.patch_origin(patch_index[entries]), strict=True
-                ):
-                    place = rows[y - first : y - first + p, x : x + p]
-                    place[...] = patch[: place.shape[0], : place.shape[1], chosen]
-            yield first, rows
-
-
-def _window_at(group: Any, pixels: NDArray[np.float64], factor: int, bands: Sequence[int]) -> Floats:
+def _window_at(mosaic: Mosaic, pixels: NDArray[np.float64], factor: int, bands: Sequence[int]) -> Floats:
     """Values at scene places (row, column, 2), of which only the rows and columns around them are read."""
     known = pixels[np.isfinite(pixels).all(axis=-1)]
     if not len(known):
         return np.full((*pixels.shape[:2], len(bands)), np.nan, np.float32)
-    size = group["values"].shape[:2]
+    size = mosaic.shape
     first = np.clip(np.floor(known.min(axis=0) / factor).astype(int) - 2, 0, size)
     last = np.clip(np.ceil(known.max(axis=0) / factor).astype(int) + 2, 0, size)
-    window = read_array(group, "values", np.s_[first[0] : last[0], first[1] : last[1]])[..., list(bands)]
+    window = mosaic.values(slice(first[0], last[0]), slice(first[1], last[1]), bands)
     return image_at(np.ascontiguousarray(window), pixels - factor * first, factor=factor)
 
 
@@ -244,13 +191,9 @@ def spectral_layers(run: ExportedRun, choice: ProductChoice) -> list[Layer]:
     """
     if not (choice.flags.reflectance or choice.indices):
         return []
-    # a raster's own pixels, unless its map is drawn on the ground by a pose; else the coarse mosaic
-    own = run.receipt["source"] == RASTER and run.store("ground_map") is None
-    view: MosaicView | RasterView = RasterView(run) if own else MosaicView(run)
-    wave, _ = load_bands(run.path("mosaic"))
-    picked = [pick_bands(index, wave) for index in choice.indices]
-    blocks = open_image(run.path("mosaic"), "values").rows()
-    white = white_level(np.concatenate([values[::SAMPLED, ::SAMPLED].reshape(-1) for _, values in blocks]))
+    view = MosaicView(run)
+    picked = [pick_bands(index, view.mosaic.wavelength_nm) for index in choice.indices]
+    white = white_level(view.mosaic.thinned(SAMPLED, range(len(view.mosaic.wavelength_nm))).reshape(-1))
     for index in choice.indices:
         if index.wants_reflectance and white != 1.0:
             raise SettingsError(
@@ -261,7 +204,7 @@ def spectral_layers(run: ExportedRun, choice: ProductChoice) -> list[Layer]:
     return layers + [_index(view, index, bands, white) for index, bands in zip(choice.indices, picked, strict=True)]
 
 
-def _reflectance(view: MosaicView | RasterView, white: float) -> Layer:
+def _reflectance(view: MosaicView, white: float) -> Layer:
     wave, width = load_bands(view.run.path("mosaic"))
     image = CogImage(
         view.shape,
@@ -281,7 +224,7 @@ def _format_value(white: float) -> str:
     return "reflectance, 0 to 1" if white == 1.0 else "values of the scene, not reflectance"
 
 
-def _index(view: MosaicView | RasterView, index: SpectralIndex, bands: Sequence[int], white: float) -> Layer:
+def _index(view: MosaicView, index: SpectralIndex, bands: Sequence[int], white: float) -> Layer:
     wave = load_bands(view.run.path("mosaic"))[0][list(bands)].tolist()
     taken = ", ".join(f"{band.symbol} {nm:.1f} nm" for band, nm in zip(index.bands, wave, strict=True))
     tags = {"index": index.name, "bands": taken, "reference": index.reference, "pixels": view.words}

@@ -27,8 +27,6 @@ from flows.tasks.run import SurveyRun, open_run
 from flows.tasks.scene import for_rig
 from flows.tasks.scores import score_of
 from flows.tasks.stages.accuracy import evaluate
-from flows.tasks.stages.placement import extract_patches
-from flows.tasks.stages.raster import take_patches
 from flows.terminal.figures import counted, format_points, format_seconds
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from flows.terminal.progress import StageProgress, put_out
@@ -223,11 +221,6 @@ def run_judge(
             raise ArchiveError(f"{found.uri} is being judged by another process; it adds the accuracy")
         with draft:
             made = survey.products
-            if catalogue.stores[made.patches.uri].cleared and survey.is_map:
-                take_patches(survey, made["score"])
-            elif catalogue.stores[made.patches.uri].cleared:
-                last = "coarse" if survey.uniform else "fine"
-                extract_patches(survey, made["score"], *made.there(f"capture_{last}", f"register_{last}"))
             published = extend_with_accuracy(survey, draft, evaluate(survey, *made.there(*JUDGED)))
     show_published(published, settings.out, console)
     return published.receipt
@@ -236,8 +229,8 @@ def run_judge(
 def _needed(survey: OpenSurvey) -> tuple[str, ...]:
     """Return the stages by whose stores a map is judged."""
     if survey.is_map:
-        return ("average_raster", "take_patches", "segment", "score")
-    return ("rectify", "extract_patches", "segment", "choose_effects", "score")
+        return ("condense_raster", "segment", "score")
+    return ("rectify", "segment", "choose_effects", "score")
 
 
 def _store(catalogue: Catalogue, archive: Archive, what: str, key: str) -> StageRef:

@@ -17,9 +17,12 @@ from flows.publish.receipt_table import cost_rows, finding_rows, headline
 from flows.publish.report import render_markdown
 from flows.publish.run_folder import Published, asked_settings, extend_with_accuracy, publish_run
 from flows.settings.survey_settings import OF_THE_MACHINE
+from flows.settings.values import KEEP_SIGNAL
 from flows.tasks.open_survey import JUDGED, STAGES, OpenSurvey, RunRef
 from flows.tasks.prefect_tasks import as_task, inside_flow
 from flows.tasks.stages.accuracy import evaluate
+from flows.tasks.stages.capture import capture_coarse, capture_fine
+from flows.tasks.stages.condense import condense_coarse, condense_fine, raw_differs
 from flows.terminal.figures import format_percent
 from pipeline.lazy import deferred
 from storage.archive.keys import StageRef, canonical_json
@@ -31,6 +34,7 @@ if TYPE_CHECKING:
 else:
     prefect_artifacts = deferred("prefect.artifacts")
 
+PASSES_OF_SIGNAL = {capture_coarse.name: condense_coarse.name, capture_fine.name: condense_fine.name}
 NOT_ASKED = ("notes", "out", "engine", *OF_THE_MACHINE)  # of a receipt's settings: no byte depends on them
 MOST_BYTES = 100 * 1024  # of the picture, as it stands in the text
 WIDTHS_PX = (1200, 1000, 800, 600, 400, 200)
@@ -65,6 +69,26 @@ def add_accuracy(plan: OpenSurvey, run: RunRef, accuracy: StageRef) -> RunRef:
         published = extend_with_accuracy(plan, draft, accuracy)
     _show_artifacts(plan, published)
     return _ref(published)
+
+
+def clear_raw(plan: OpenSurvey) -> None:
+    """Clear raw lines away that the settings keep no longer, once each was compared; in a flow as a task."""
+    if plan.run.settings.keep == KEEP_SIGNAL and plan.products.there(*PASSES_OF_SIGNAL):
+        as_task(_clear_raw, "clear_raw")(plan)
+
+
+def _clear_raw(plan: OpenSurvey) -> None:
+    for captured, condensed in PASSES_OF_SIGNAL.items():
+        if captured not in plan.products or condensed not in plan.products:
+            continue
+        raw, signal = plan.products[captured], plan.products[condensed]
+        if plan.run.archive.find(raw.stage, raw.key) is None:  # cleared before
+            continue
+        why = raw_differs(raw, signal, plan.run.camera)
+        if why is None:
+            plan.run.archive.clear(raw, wait=False)
+        else:
+            plan.observer.note(f"raw lines stay: {why}")
 
 
 def _ref(published: Published, *, pending: bool = False) -> RunRef:

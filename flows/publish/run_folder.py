@@ -32,24 +32,24 @@ from flows.tasks.stages.accuracy import load_accuracy
 from flows.tasks.stages.attention import load_plan
 from flows.tasks.stages.effects import load_manifest
 from flows.tasks.stages.on_ground import STORE
-from flows.tasks.stages.placement import PATCHES_AT_ONCE, load_registration, seen_fractions
+from flows.tasks.stages.placement import load_registration, pixels_of_patches, seen_fractions
 from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.errors import IncompleteStoreError
 from pipeline.planning.coverage import on_scene
 from pipeline.planning.fine_pass import FinePlan
 from pipeline.planning.prices import SavingEntry, capture_savings
 from pipeline.planning.uniform_scans import format_scan
-from pipeline.signal.calibrate import of_bands, reflectance
 from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table
 from storage.archive.records import read_run
 from storage.archive.run_folders import RunDraft
 from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import ProbabilityStore, load_class_map
-from storage.arrays.cubes import RawCube, open_raw_cubes
-from storage.arrays.ground_maps import load_ground_map, open_image
-from storage.arrays.mosaics import load_attention, open_patches
+from storage.arrays.ground_maps import load_ground_map
+from storage.arrays.layout import SHARD_ROWS
+from storage.arrays.mosaics import load_attention, open_mosaic
 from storage.arrays.quicklooks import choose_bands
+from storage.arrays.signal_cubes import SignalCube, open_signal_cubes
 
 LIBRARIES = ("spectralzoom", "numpy", "numba", "torch", "zarr", "xarray", "prefect")
 
@@ -105,7 +105,7 @@ def _publish(run: SurveyRun, draft: RunDraft, products: Products, plan: FinePlan
     again = (
         None
         if run.plan.plain
-        else float(seen_fractions(run.frame, products.patches).sum()) / len(run.grid.valid_patches())
+        else float(seen_fractions(run.frame, products.detail, plan.patch_index).sum()) / len(run.grid.valid_patches())
     )
     shown = quicklook_data(run, products, plan, receipt)
     draw_quicklook(draft.folder / "quicklook.png", shown)
@@ -175,15 +175,12 @@ def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, An
     """Everything done against the full scan; stored bytes of the full scan are predicted from the ratio seen here."""
     bands = len(run.scene.wavelength_nm)
     if run.raster is not None:
-        means, detail = (run.archive.stored_bytes(ref) for ref in (products.mosaic, products.patches))
-        valid, kept = len(run.grid.valid_patches()), len(plan.patch_index)
-        # All patches would pack as these do.
-        every = detail * valid / kept if kept else valid * run.grid.patch**2 * bands * BYTES_A_VALUE
-        entry = SavingEntry(means + detail, round(means + every), "predicted")
+        every = run.grid.height * run.grid.width * bands * BYTES_A_VALUE
+        entry = SavingEntry(run.archive.stored_bytes(products.mosaic), every, "predicted")
         return {"bytes_stored": entry.as_dict(), **_model_savings(run, plan)}
     done = [*run.plan.coarse, *plan.sweeps]
     entries = capture_savings(done, run.plan.full, run.camera, run.grid, cost=run.settings.cost, bands=bands)
-    stored = [run.archive.stored_bytes(ref) for ref in products.there("capture_coarse", "capture_fine")]
+    stored = [run.archive.stored_bytes(ref) for ref in products.there("condense_coarse", "condense_fine")]
     # Fine lines compress like the full scan's would; without any, the coarse ones have to stand for them.
     like, kept = (plan.sweeps, stored[1]) if plan.sweeps else (run.plan.coarse, stored[0])
     of_these = capture_savings(like, run.plan.full, run.camera, run.grid, cost=run.settings.cost, bands=bands)
@@ -214,8 +211,8 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
     """Gather what the panels show, three bands of it."""
     bands, _ = choose_bands(run.scene.wavelength_nm)
     chosen = list(bands)
-    image = open_image(products.mosaic.path / "mosaic.zarr", "values")
-    coarse = np.concatenate([values[..., chosen] for _, values in image.rows()])
+    mosaic = open_mosaic(products.mosaic.path / "mosaic.zarr")
+    coarse = np.concatenate([mosaic.spectra(strip, chosen) for strip in mosaic.strips(run.factor)])
     attention = load_attention(products["score"].path / "attention.zarr")
     found = load_class_map(products["segment"].path / "class_map.zarr")
     order = np.argsort(attention.rank.ravel(), kind="stable")
@@ -224,7 +221,9 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
     notes = [] if moment is None else [f"day {moment[0]}, {moment[1]:g} h"]
     if accuracy is not None and accuracy["miou"] is not None:
         notes.append(f"mIoU {100 * accuracy['miou']:.1f} %")
-    sweeps = [cube for ref in products.there("capture_coarse") for cube in open_raw_cubes(ref.path)]  # of a raster none
+    sweeps = [
+        cube for ref in products.there("condense_coarse") for cube in open_signal_cubes(ref.path)
+    ]  # of a raster none
     strips = sorted(sweeps, key=lambda cube: cube.sweep.swath_px)  # as they lie there
     return QuicklookData(
         survey=run.name,
@@ -235,7 +234,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
         raster=run.raster is not None,
         raw=(coarse,) if run.raster is not None else tuple(_calibrated(run, cube, chosen) for cube in strips),
         raw_lines=sum(cube.sweep.lines for cube in strips),
-        rectified=_both_scales(run, products, chosen, coarse),
+        rectified=_both_scales(run, products, plan, chosen, coarse),
         wavelength_nm=run.scene.wavelength_nm[chosen],
         score=attention.score,
         patch_px=run.grid.patch,
@@ -260,7 +259,7 @@ def _format_asked(run: SurveyRun) -> str:
     return f"budget {run.settings.budget:g}   ·   policy {run.settings.policy}"
 
 
-def _calibrated(run: SurveyRun, cube: RawCube, bands: list[int]) -> NDArray[np.float32]:
+def _calibrated(run: SurveyRun, cube: SignalCube, bands: list[int]) -> NDArray[np.float32]:
     """Some bands of a sweep in scene values, by its stored picture alone; NaN where a sample looked past the scene."""
     seen = cube.quicklook()
     if seen is not None and list(seen.bands) == bands:
@@ -268,26 +267,22 @@ def _calibrated(run: SurveyRun, cube: RawCube, bands: list[int]) -> NDArray[np.f
         picture = seen.values()
         picture[~on_scene(run.scene.shape, run.camera, cube.sweep)[thin, thin] | ~cube.valid_line[thin, None]] = np.nan
         return picture
-    position = np.where(cube.valid_line[:, None], cube.position, np.nan)  # what an invalid line reports may be anything
-    values = reflectance(cube.read()[..., bands], of_bands(cube.references, bands), position=position)
-    values[~on_scene(run.scene.shape, run.camera, cube.sweep)] = np.nan
+    values = cube.components.of_bands(bands).restore(cube.read() * np.float32(cube.step))
+    values[~on_scene(run.scene.shape, run.camera, cube.sweep) | ~cube.usable | ~cube.valid_line[:, None]] = np.nan
     return values
 
 
 def _both_scales(
-    run: SurveyRun, products: Products, bands: list[int], coarse: NDArray[np.float32]
+    run: SurveyRun, products: Products, plan: FinePlan, bands: list[int], coarse: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """The coarse mosaic at the scene's size with the fine patches laid in, (y, x, 3)."""
-    s, p = run.grid.factor, run.grid.patch
+    """The coarse mosaic at the scene's size with the patches in detail laid in, (y, x, 3)."""
+    s = run.grid.factor
     canvas = np.repeat(np.repeat(coarse, s, axis=0), s, axis=1)[: run.grid.height, : run.grid.width].copy()
-    store = open_patches(products.patches.path / "patches.zarr")
-    for first in range(0, len(store.patch_index), PATCHES_AT_ONCE):
-        values = store.read(first, first + PATCHES_AT_ONCE)[..., bands]
-        for patch, (y, x) in zip(
-            values, run.grid.patch_origin(store.patch_index[first : first + len(values)]), strict=True
-        ):
-            place = canvas[y : y + p, x : x + p]
-            place[...] = patch[: place.shape[0], : place.shape[1]]
+    detail, chosen = open_mosaic(products.detail.path / "mosaic.zarr"), pixels_of_patches(run.grid, plan.patch_index)
+    for first in range(0, run.grid.height, SHARD_ROWS):
+        rows = slice(first, min(first + SHARD_ROWS, run.grid.height))
+        if chosen[rows].any():
+            canvas[rows][chosen[rows]] = detail.values(rows, bands=bands)[chosen[rows]]
     return canvas
 
 
@@ -308,7 +303,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     if run.recorded is not None:
         found["recording"] = _recording(run, run.recorded, plan)
     if run.budget is not None:
-        stored = sum(run.archive.stored_bytes(ref) for ref in (products.mosaic, products.patches))
+        stored = run.archive.stored_bytes(products.mosaic)
         found["kept"] = run.budget.figures(plan.patch_index) | {"stored_bytes": stored}
     if (memory := prior_map_figures(products["segment"].path)) is not None:
         found["memory"] = memory
@@ -321,7 +316,9 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     passes = {"coarse": products.get("register_coarse"), "fine": products.get("register_fine")}
     pointing = {name: _pointing(ref) for name, ref in passes.items() if ref is not None}
     if "fine" in pointing:
-        pointing["fine"]["partly_seen"] = int(np.count_nonzero(seen_fractions(run.frame, products.patches) < 1))
+        pointing["fine"]["partly_seen"] = int(
+            np.count_nonzero(seen_fractions(run.frame, products.detail, plan.patch_index) < 1)
+        )
     if pointing:
         found["pointing"] = {"prior_px": run.settings.pointing_px, **pointing}
     class_map = products["segment"]

@@ -24,6 +24,7 @@ from flows.settings.values import (
     ExpectedError,
     Extent,
     Goal,
+    Keep,
     Memory,
     Name,
     Refresh,
@@ -86,6 +87,20 @@ class MapChoice:
     resolution_m: float | None = stated(
         None, "By default the median footprint of a pixel", "m", 1e-4, 1000, example=0.12
     )
+
+
+@dataclass(frozen=True)
+class SignalChoice:
+    """What of spectra is kept: scores of the components that rise above the noise."""
+
+    step: float = stated(1.0, "Step in which scores are rounded, in standard deviations of the noise", "", 0.01, 10)
+    false_alarm: float = stated(
+        0.01, "Probability that noise alone gives a component, by a test over the whole field", "", 1e-6, 0.2
+    )
+    rare_spectra: float = stated(
+        1.0, "Spectra of a sweep that noise alone may mark as rare; rare ones keep what components leave", "", 1e-6, 1e6
+    )
+    least: int = stated(4, "Components that are kept at any rate", "", 1, 270)
 
 
 @dataclass(frozen=True)
@@ -199,6 +214,12 @@ class Settings:
         example="recorded",
     )
     out: str = stated("archive", "Archive: a folder, or s3://bucket/prefix")
+    keep: Keep = stated(
+        "signal",
+        "What stays of captured lines: signal (raw lines are cleared away once each was compared with what was "
+        "condensed from it), raw (they stay too), or for how long they stay: raw 7d",
+        example="raw 7d",
+    )
     budget: Budget = stated(
         0.5, "Seconds of coarse and fine capture over those of the full scan, above 0 and at most 1"
     )
@@ -321,6 +342,7 @@ class Settings:
     detector: Detector = table("What the sensor adds to the camera's own read noise, gain and well.", Detector)
     air: Air = table("Between rig and scene; without a distance the scene is light at the aperture.", Air)
     sky: Sky = table("The light; without a moment the sun stands still.", Sky)
+    signal: SignalChoice = table("What of the spectra is kept.", SignalChoice)
     cost: CostModel = table("What captures cost in time.", CostModel)
     rig: SurveyRig = table(
         'The rig, for source = "rig". Written for documented protocols and tested against emulators, never run on '

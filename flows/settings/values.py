@@ -320,6 +320,28 @@ def parse_refresh(value: object) -> float:
     return days
 
 
+KEEP_SIGNAL, KEEP_RAW = "signal", "raw"
+
+
+def parse_keep(value: object) -> str:
+    """``signal``, ``raw``, or ``raw`` and for how long: raw 7d."""
+    word, _, age = str(value).strip().lower().partition(" ")
+    if word in (KEEP_SIGNAL, KEEP_RAW) and not age:
+        return word
+    days = _amount(age, {"h": 1 / 24, "d": 1.0, "w": 7.0})
+    if word != KEEP_RAW or days is None or not LEAST_REFRESH <= days <= MOST_REFRESH:
+        raise ValueError(f"must be signal, raw, or raw and a time of 1h to {MOST_REFRESH:g}d: raw 7d; got {value!r}")
+    return f"{KEEP_RAW} {age.strip()}"
+
+
+def raw_days(keep: str) -> float:
+    """Return for how many days raw lines stay: 0 without them, infinite where all stay."""
+    word, _, age = keep.partition(" ")
+    if word == KEEP_SIGNAL:
+        return 0.0
+    return _amount(age, {"h": 1 / 24, "d": 1.0, "w": 7.0}) or float("inf") if age else float("inf")
+
+
 UNKNOWN_AUTO, UNKNOWN_OFF = "auto", "off"
 LEAST_UNKNOWN, MOST_UNKNOWN = 0.05, 5.0  # percent
 
@@ -367,5 +389,6 @@ Effects = Annotated[str, PlainValidator(parse_effects)]
 Bands = Annotated[tuple[int, ...], PlainValidator(parse_bands)]
 Extent = Annotated[str, PlainValidator(parse_extent)]
 Refresh = Annotated[float, PlainValidator(parse_refresh)]
+Keep = Annotated[str, PlainValidator(parse_keep)]
 ExpectedError = Annotated[float, PlainValidator(parse_expected_error)]
 Wavelengths = Annotated[tuple[float, ...], PlainValidator(parse_wavelengths)]

@@ -17,6 +17,7 @@ from flows.tasks.open_survey import OpenSurvey, RunRef
 from flows.tasks.prefect_tasks import as_task, inside_flow
 from flows.tasks.run import SurveyRun, open_run
 from flows.tasks.stages.capture import capture_coarse, capture_fine
+from flows.tasks.stages.condense import condense_coarse, condense_fine
 from pipeline.errors import ArchiveError, NothingToMend, RigError, SettingsError
 from pipeline.lazy import deferred
 from storage.archive.keys import StageRef
@@ -32,6 +33,7 @@ else:
 OPENING = "plan"
 _opened: ContextVar[tuple[Settings, SurveyRun] | None] = ContextVar("opened", default=None)
 PASSES = {"coarse": capture_coarse, "fine": capture_fine}
+CONDENSED = {"coarse": condense_coarse, "fine": condense_fine}
 
 
 def plan_capture(settings: SurveySettings) -> OpenSurvey | RunRef:
@@ -99,6 +101,20 @@ def capture_pass(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRef:
     if plan.capture_deployment is not None:
         as_task(_captured_elsewhere, "capture_elsewhere")(plan, sweeps, *inputs)
     return PASSES[sweeps](plan, *inputs)
+
+
+def captured_signal(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRef:
+    """Return the condensed sweeps of a pass; where the archive has them, nothing is captured.
+
+    Raises as `capture_pass`.
+    """
+    condense, stage = CONDENSED[sweeps], PASSES[sweeps]
+    raw = plan.run.archive.ref(stage.product.name, stage.key(stage.wants(plan.run, *inputs)))
+    if condense.find(plan.run.archive, condense.wants(plan.run, raw)) is None:
+        raw = capture_pass(plan, sweeps, *inputs)
+    elif plan.run.archive.is_known(raw):
+        plan.take_as_found(stage.name, raw)
+    return condense(plan, raw)
 
 
 def _captured_elsewhere(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> str:

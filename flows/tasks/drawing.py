@@ -20,15 +20,13 @@ from models.reading.inference import CoarsePass, segment
 from models.reading.ood import OodDetector
 from models.reading.prior_map import CurrentVisit, TemporalAgreement, changed_from, compare, first_probabilities, fuse
 from models.reading.regions import Region
-from pipeline.geometry.grid import UNLABELLED
+from pipeline.geometry.grid import UNLABELLED, patch_pixels
 from pipeline.rectify.tiles import let_tiles_go
 from storage.arrays.class_maps import write_changes_tile, write_class_tile, write_probabilities_tile
-from storage.arrays.layout import read_array
-from storage.arrays.mosaics import PatchStore, open_patches
+from storage.arrays.mosaics import Mosaic, chosen_patches, open_mosaic
 from storage.parallel.pool import run_blocks
 
 ENOUGH_SEEN = 0.5  # of a patch at the edge of a look at a part, so that what it shows is read
-OutOfRange = tuple[int, int]  # coarse pixels, and fine ones, with a value that is no reading
 
 
 @dataclass(frozen=True)
@@ -37,7 +35,8 @@ class Drawing:
 
     weights: WeightsFile
     mosaic: Path
-    patches: Path
+    detail: Path  # mosaic of the field's own pixels
+    attention: Path  # whose ranks say which patches are read in detail
     out: Path  # of the class map
     probabilities: Path
     light: float  # exposure of a line that is read in detail, as a fraction of the reference
@@ -47,23 +46,18 @@ class Drawing:
     unknown: UnknownRule | None = None  # which pixels are called unknown
     part: bool = False  # of the field was looked at: of the rest today's look says nothing
 
-    def __call__(self, region: Region) -> Drawn:
+    def __call__(self, region: Region) -> TemporalAgreement | None:
         """Read what was seen of the region coarsely and finely, and store the part of the map that is kept."""
         let_tiles_go()
-        weights, store = self.weights.load(), open_patches(self.patches)
-        seen = coarse_region(weights, self.mosaic, region)
-        out_of_range = np.zeros(region.grid.patch_shape, np.int64)
-        patch_index, columns = patch_features(
-            weights, store, store.wavelength_nm, seen, region, out_of_range=out_of_range.ravel()
-        )
-        drawn, shown = (
-            segment(weights, seen, columns, patch_index, every_class=True),
-            self._shown(region, store, patch_index),
-        )
+        weights, detail = self.weights.load(), open_mosaic(self.detail)
+        seen, chosen = coarse_region(weights, self.mosaic, region), chosen_patches(self.attention)
+        patch_index, columns = patch_features(weights, detail, chosen, seen, region)
+        drawn = segment(weights, seen, columns, patch_index, every_class=True)
+        shown = self._shown(region, detail, patch_index)
         assert drawn.log_probability is not None
         unknown = None
         if self.unknown is not None:
-            ood_detector, bands = self.weights.load_ood(), len(store.wavelength_nm)
+            ood_detector, bands = self.weights.load_ood(), len(detail.wavelength_nm)
             unknown = self.unknown.pixels(ood_detector, seen, columns, patch_index, bands) & (
                 drawn.classes != UNLABELLED
             )
@@ -92,8 +86,7 @@ class Drawing:
         write_probabilities_tile(
             self.probabilities, origin, *map(region.crop, (after.log_probability, after.age_days, after.light))
         )
-        coarse = 0 if seen.out_of_range is None else int(np.count_nonzero(region.crop_coarse(seen.out_of_range)))
-        return Drawn((coarse, int(region.crop_patches(out_of_range).sum())), comparison)
+        return comparison
 
     def _within_zones(self, region: Region, log_probability: NDArray[np.float32]) -> NDArray[np.float32]:
         """Today's look, (y, x, class), with nothing said of pixels that zones leave out: a memory of them stays."""
@@ -109,7 +102,7 @@ class Drawing:
             log_probability = np.where(shown[..., None], log_probability, np.float32(np.nan))
         return CurrentVisit(log_probability, shown, seen.seen_columns, self.light, self.step)
 
-    def _shown(self, region: Region, store: PatchStore, patch_index: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def _shown(self, region: Region, detail: Mosaic, patch_index: NDArray[np.int64]) -> NDArray[np.bool_]:
         """(y, x) pixels of a region that were looked at in detail.
 
         Of a look at a part only what lines reached, in patches of which they reached enough: what is filled in beside
@@ -119,10 +112,8 @@ class Drawing:
         detailed = np.zeros((int(np.prod(grid.patch_shape)), p, p), np.bool_)
         detailed[patch_index] = True
         if self.part:
-            numbers = region.numbers_here(store.patch_index)
-            here = np.flatnonzero(numbers >= 0)
-            reached = read_array(store.group, "valid")[here]
-            detailed[numbers[here]] &= reached & (reached.mean(axis=(1, 2), keepdims=True) >= ENOUGH_SEEN)
+            reached = patch_pixels(grid, detail.coverage(region.read.rows, region.read.columns) > 0)
+            detailed &= reached & (reached.mean(axis=(1, 2), keepdims=True) >= ENOUGH_SEEN)
         rows, columns = grid.patch_shape
         pixels = detailed.reshape(rows, columns, p, p).swapaxes(1, 2).reshape(rows * p, columns * p)
         return np.ascontiguousarray(pixels[: grid.height, : grid.width])
@@ -160,33 +151,15 @@ class UnknownRule:
         return found[: grid.height, : grid.width]
 
 
-@dataclass(frozen=True)
-class Drawn:
-    """What a worker says of a region that it drew."""
+def draw_field(field: FieldWork, work: Drawing, report: Callable[[float], None]) -> TemporalAgreement | None:
+    """Draw class map and class probabilities into stores that were created for them.
 
-    out_of_range: OutOfRange
-    comparison: TemporalAgreement | None  # with what was remembered
-
-
-@dataclass(frozen=True)
-class DrawnField:
-    """What was found while a map was drawn."""
-
-    out_of_range: OutOfRange
-    comparison: TemporalAgreement | None  # with what was remembered; None of a field's first look
-
-
-def draw_field(field: FieldWork, work: Drawing, report: Callable[[float], None]) -> DrawnField:
-    """Draw class map and class probabilities into stores that were created for them; count the pixels left out.
-
-    These are the coarse pixels, and the fine ones, with a value that the weights take for no reading. Raises
-    SettingsError: not even one region at a time fits the memory.
+    Returns how they agree with what was remembered, None of a field's first visit. Raises SettingsError: not even one
+    region at a time fits the memory.
     """
-    store = open_patches(work.patches)
-    pool = field.pool_for(store.patch_index, len(store.wavelength_nm))
+    pool = field.pool_for(chosen_patches(work.attention), len(open_mosaic(work.detail).components))
     prior_map = () if work.memory is None else (work.memory.probabilities, work.memory.mosaic)
-    paths = (work.mosaic, work.patches, work.out, work.probabilities, *prior_map)
-    parts: list[Drawn] = run_blocks(work, field.regions, pool, report=report, paths=paths)
-    out_of_range = sum(part.out_of_range[0] for part in parts), sum(part.out_of_range[1] for part in parts)
-    compared = [part.comparison for part in parts if part.comparison is not None]
-    return DrawnField(out_of_range, reduce(add, compared) if compared else None)
+    paths = (work.mosaic, work.detail, work.attention, work.out, work.probabilities, *prior_map)
+    parts: list[TemporalAgreement | None] = run_blocks(work, field.regions, pool, report=report, paths=paths)
+    compared = [part for part in parts if part is not None]
+    return reduce(add, compared) if compared else None

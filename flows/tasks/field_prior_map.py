@@ -17,7 +17,7 @@ from models.reading.regions import Region
 from models.weights.files import Weights
 from pipeline.rectify.registration.alignment import FieldShift, field_shift
 from storage.arrays.class_maps import ProbabilityStore
-from storage.arrays.mosaics import mosaic_brightness
+from storage.arrays.mosaics import open_mosaic
 
 REACH_PX = 64.0  # within which a memory that lies beside today's look is found
 LEAST_SHIFT_PX = 2.0  # less is how well two looks can be laid on each other
@@ -81,23 +81,15 @@ def prior_map_lies(before: Sequence[EarlierRun], now: Path, factor: int) -> Fiel
     """
     cell = math.lcm(factor, *(scan_pass.factor for scan_pass in before))
 
-    def picture(mosaic: Path, own: int) -> NDArray[np.float32]:
-        return coarser(mosaic_brightness(mosaic), cell // own)
+    def picture(mosaic: Path) -> NDArray[np.float32]:
+        return open_mosaic(mosaic).brightness(cell)
 
     pictures = (
-        shifted(picture(scan_pass.mosaic.path / "mosaic.zarr", scan_pass.factor), _cells(scan_pass.shift_px, cell))
+        shifted(picture(scan_pass.mosaic.path / "mosaic.zarr"), _cells(scan_pass.shift_px, cell))
         for scan_pass in before
     )
-    found = field_shift(picture(now, factor), laid_together(pictures), reach_px=REACH_PX / cell)
+    found = field_shift(picture(now), laid_together(pictures), reach_px=REACH_PX / cell)
     return replace(found, shift=(cell * found.shift[0], cell * found.shift[1]))
-
-
-def coarser(image: NDArray[np.float32], times: int) -> NDArray[np.float32]:
-    """An image (y, x) in pixels ``times`` as wide: means of them, the last repeated where there are too few."""
-    whole = np.pad(image, [(0, -size % times) for size in image.shape], mode="edge")
-    y, x = (size // times for size in whole.shape)
-    means: NDArray[np.float32] = whole.reshape(y, times, x, times).mean(axis=(1, 3))
-    return means
 
 
 def whole_pixels(lies: FieldShift) -> tuple[int, int]:

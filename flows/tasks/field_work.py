@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from flows.tasks.patch_budget import SHARD
 from models.network.machine import PROCESSOR
+from models.network.spectral import dead_pixels
 from models.policies.policies import GLANCING_POLICIES, score_patches
 from models.reading.inference import CoarsePass, CoarsePrediction, read_coarse_pass, read_coarse_prediction
 from models.reading.ood import OodDetector
@@ -24,9 +25,8 @@ from models.weights.checksummed_files import SEAL
 from models.weights.files import Weights, describe_weights, load_ood, load_reader, load_weights
 from pipeline.errors import WeightsError
 from pipeline.geometry.grid import SceneGrid
-from pipeline.readings import beyond_range, readings_alone
 from pipeline.rectify.tiles import let_tiles_go
-from storage.arrays.mosaics import PATCHES_A_SHARD, PatchStore, mosaic_rows, mosaic_wavelengths
+from storage.arrays.mosaics import Mosaic, open_mosaic, patch_scores
 from storage.parallel.pool import RESERVED_BYTES, WorkerPool, memory_refusal, mib, run_blocks
 
 if TYPE_CHECKING:
@@ -90,45 +90,37 @@ class Scoring:
 
 
 def coarse_region(weights: Weights, mosaic: Path, region: Region) -> CoarsePass:
-    """Read the part of a stored coarse mosaic that a region needs, some rows at a time."""
-    strips = mosaic_rows(mosaic, region.coarse.rows, region.coarse.columns)
-    return read_coarse_pass(weights, strips, mosaic_wavelengths(mosaic), region.grid, origin=region.origin)
+    """Read the part of a stored mosaic that a region needs in coarse pixels, some rows at a time."""
+    seen = open_mosaic(mosaic)
+    strips = seen.strips(region.grid.factor, region.coarse.rows, region.coarse.columns)
+    return read_coarse_pass(
+        weights, strips, seen.wavelength_nm, region.grid, origin=region.origin, components=seen.components
+    )
 
 
 def patch_features(
-    weights: Weights,
-    store: PatchStore,
-    wavelength_nm: NDArray[np.float64],
-    seen: CoarsePass,
-    region: Region,
-    *,
-    out_of_range: NDArray[np.int64] | None = None,
+    weights: Weights, detail: Mosaic, field_index: NDArray[np.integer], seen: CoarsePass, region: Region
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Numbers and normalised spectral columns (patch, p, p, column) of a region's patches, some read at a time.
 
-    A mirror that looks beside the plan leaves pixels of a patch unseen: they take the columns of the coarse pixel over
-    them, and so do those with a number that is no reading in every band. A patch of which nothing was seen is left out.
-    Pixels with such a number are counted in ``out_of_range``, (patch,) of the region's scene.
+    ``field_index`` are those of the field that were chosen, ``detail`` the mosaic of its own pixels. A mirror that
+    looks beside the plan leaves pixels of a patch unseen: they take the columns of the coarse pixel over them. A patch
+    of which nothing was seen is left out.
     """
-    numbers = region.numbers_here(store.patch_index)
+    numbers = region.numbers_here(field_index)
     here = np.flatnonzero(numbers >= 0)
-    p, count, kept = region.field.patch, len(here), 0
-    patch_index, columns = np.empty(count, np.int64), np.empty((count, p, p, weights.basis.columns), np.float32)
-    for first in range(0, count, PATCHES_A_SHARD):
-        entries = here[first : first + PATCHES_A_SHARD]
-        values, most = store.pick(entries), weights.normalisation.most_value
-        if (wild := beyond_range(values, most)) is not None and out_of_range is not None:
-            out_of_range[numbers[entries]] = wild.any(axis=-1).sum(axis=(1, 2))
-        values = readings_alone(values, most)
-        reached = np.asarray(np.isfinite(values).any(axis=-1), np.bool_)
+    p, kept = region.field.patch, 0
+    patch_index = np.empty(len(here), np.int64)
+    columns = np.empty((len(here), p, p, weights.basis.columns), np.float32)
+    for entries, scores in patch_scores(detail, region.field, field_index[here]):
+        given = weights.columns_of_scores(scores, detail.components, detail.wavelength_nm)
+        reached = ~dead_pixels(given)
         some = np.asarray(reached.any(axis=(1, 2)), np.bool_)
         part = slice(kept, kept := kept + int(some.sum()))
-        patch_index[part] = numbers[entries][some]
-        columns[part] = weights.columns(values[some], wavelength_nm)
-        pixel = np.arange(p)
+        patch_index[part], columns[part] = numbers[here[entries[some]]], given[some]
         for patch, patch_number, there in zip(columns[part], patch_index[part], reached[some], strict=True):
             if not there.all():  # where no line reached a pixel of a patch
-                y, x = seen.grid.patch_origin(patch_number)[..., None] + pixel
+                y, x = seen.grid.patch_origin(patch_number)[..., None] + np.arange(p)
                 coarse = seen.columns[np.ix_(y // seen.grid.factor, x // seen.grid.factor)]
                 patch[~there] = coarse[~there]
     return patch_index[:kept], columns[:kept]
@@ -153,7 +145,7 @@ class FieldWork:
 
         Raises SettingsError: not even one region at a time fits the memory.
         """
-        pool = self.pool_for(np.empty(0, np.int64), len(mosaic_wavelengths(mosaic)))
+        pool = self.pool_for(np.empty(0, np.int64), len(open_mosaic(mosaic).components))
         path = mosaic.resolve()
         parts = run_blocks(Scoring(self.weights, path, policy), self.regions, pool, report=report, paths=[path])
         scores = np.zeros(self.regions[0].field.patch_shape)
@@ -177,7 +169,7 @@ class FieldWork:
             raise memory_refusal(
                 least,
                 self.memory,
-                f"reading a region of {y} x {x} px and {bands} bands with the fine patches that lie there takes "
+                f"reading a region of {y} x {x} px and {bands} components with the fine patches that lie there takes "
                 f"{mib(region)}, {'each of two processes' if apart else 'the process itself'} {mib(RESERVED_BYTES)}",
             )
         fits = (self.memory - RESERVED_BYTES) // each

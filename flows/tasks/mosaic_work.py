@@ -9,6 +9,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pipeline.geometry.camera import LineCamera
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.placed import PixelGrid, Placed
@@ -16,40 +19,38 @@ from pipeline.rectify.region import Tile, plan_tiles
 from pipeline.rectify.sweep_paths import SweepPath, sweep_paths
 from pipeline.rectify.tiles import MosaicWork, TileMaker, let_tiles_go, opened_tiles, opened_work
 from storage.archive.manifests import read_table
-from storage.arrays.cubes import open_raw_cubes
 from storage.arrays.geolocation import Tables, open_geolocation
 from storage.arrays.mosaics import MosaicWriter, write_tiles
-from storage.arrays.quicklooks import Thumbnail
+from storage.arrays.signal_cubes import open_signal_cubes
 from storage.parallel.pool import RESERVED_BYTES, THREADS, WorkerPool, memory_refusal, mib
 
 
-def open_sweeps(raw: Path, registration: Path | None, camera: LineCamera) -> list[SweepPath]:
-    """Open the raw cubes of a folder, in the order of their names, with the corrections that registration recorded."""
+def open_sweeps(signal: Path, registration: Path | None, camera: LineCamera) -> list[SweepPath]:
+    """Open the condensed sweeps of a folder, in the order of their names, with the corrections that registration recorded."""
     found = None if registration is None else read_table(registration)["sweeps"]
-    return sweep_paths(open_raw_cubes(raw), camera, found)
+    return sweep_paths(open_signal_cubes(signal), camera, found)
 
 
 @dataclass(frozen=True)
 class MosaicRecipe:
     """What a mosaic is made of, by absolute paths: small, hashable, and good in every process that sees them."""
 
-    raw: Path  # folder of raw cubes
+    signal: Path  # folder of condensed sweeps
     camera: LineCamera
     grid: PixelGrid
     kernel: Kernel = "catmull-rom"
     geolocation: Path | None = None  # tables of the sweeps; None looks lines up directly
     registration: Path | None = None  # record of the corrections
-    finer: PixelGrid | None = None
 
     @property
     def folders(self) -> list[Path]:
         """What has to be seen by whoever makes tiles."""
-        given = (self.raw, self.geolocation, None if self.registration is None else self.registration.parent)
+        given = (self.signal, self.geolocation, None if self.registration is None else self.registration.parent)
         return [path for path in given if path is not None]
 
     def sweeps(self) -> list[SweepPath]:
         """Open the sweeps, in the order of their names (IncompleteStoreError: one is missing or damaged)."""
-        return open_sweeps(self.raw, self.registration, self.camera)
+        return open_sweeps(self.signal, self.registration, self.camera)
 
     def open(self) -> MosaicWork:
         """Open the sweeps and find where their lines lie, from stored tables where there are some.
@@ -61,7 +62,7 @@ class MosaicRecipe:
         for one in self.sweeps():  # without tables where its lines lie too unevenly for one
             stored = tables.get(one.lines.sweep.name)
             placed.append(Placed(one.lines, tuple(stored), one.gain) if stored else one.placed(self.camera))
-        return MosaicWork(placed, self.camera, self.grid, self.kernel, self.finer)
+        return MosaicWork(placed, self.camera, self.grid, self.kernel)
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class TileBudget:
     """How many tiles are made at a time, and the memory that this takes [bytes]."""
 
     workers: int
-    cache: int  # raw lines kept; by each process where there are several
+    cache: int  # lines kept; by each process where there are several
     tile: int  # one tile in the making
     processes: bool = False
 
@@ -87,17 +88,19 @@ def write_mosaic(
     *,
     memory: int,
     pool: WorkerPool = THREADS,
-    seen: Thumbnail | None = None,
+    wanted: NDArray[np.bool_] | None = None,
     report: Callable[[float], None] = lambda done: None,
 ) -> TileBudget:
     """Rectify and blend sweeps into a stored mosaic; return how. Whoever makes the tiles, the same bytes come out.
 
-    Fewer tiles are made at a time where ``memory`` [bytes] of this process and those that it starts, not of workers
+    ``wanted`` are (y, x) pixels without which a tile is left out. Fewer tiles are made at a time where ``memory`` [bytes] of this process and those that it starts, not of workers
     elsewhere, holds fewer. Raises SettingsError: not even one tile fits the memory, or the worker pool cannot work
     here. WorkerError: processes that made tiles were lost.
     """
     work = opened_work(recipe.open)
     tiles = plan_tiles(work.placed, work.camera, work.grid, writer.tile_shape)
+    if wanted is not None:
+        tiles = [tile for tile in tiles if wanted[tile.rows, tile.columns].any()]
     budget = tile_budget(work, tiles, writer.tile_shape, memory=memory, pool=pool)
     maker = TileMaker(recipe.open, budget.cache)
     if pool.shares_memory:
@@ -105,7 +108,7 @@ def write_mosaic(
     if not pool.elsewhere and budget.workers < min(pool.count, len(tiles)):
         pool = WorkerPool(pool.scheduler, budget.workers)
     places = [(tile.rows, tile.columns) for tile in tiles]
-    write_tiles(writer, maker, places, pool, paths=recipe.folders, seen=seen, report=report)
+    write_tiles(writer, maker, places, pool, paths=recipe.folders, report=report)
     let_tiles_go()
     return budget
 
@@ -124,10 +127,10 @@ def tile_budget(
         budget = TileBudget(count, lines, one, processes)
         if pool.elsewhere or budget.projected <= memory:
             return budget
-    bands = len(work.placed[0].lines.references.white_reference) if work.placed else 1
+    bands = work.placed[0].signal.bands if work.placed else 1
     raise memory_refusal(
         budget.projected,
         memory,
-        f"one tile of {tile_shape[0]} x {tile_shape[1]} px and {bands} bands takes {mib(one)}, the raw lines behind it "
+        f"one tile of {tile_shape[0]} x {tile_shape[1]} px and {bands} bands takes {mib(one)}, the lines behind it "
         f"{mib(lines)}, {'each of two processes' if processes else 'the process itself'} {mib(RESERVED_BYTES)}",
     )

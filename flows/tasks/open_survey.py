@@ -18,11 +18,12 @@ from flows.tasks.stage import Stage
 from flows.tasks.stages.accuracy import evaluate
 from flows.tasks.stages.attention import score
 from flows.tasks.stages.capture import capture_coarse, capture_fine
+from flows.tasks.stages.condense import condense_coarse, condense_fine
 from flows.tasks.stages.effects import choose_effects
 from flows.tasks.stages.maps import segment
 from flows.tasks.stages.on_ground import ground
-from flows.tasks.stages.placement import extract_patches, locate, rectify, register_coarse, register_fine
-from flows.tasks.stages.raster import average_raster, take_patches
+from flows.tasks.stages.placement import locate, rectify, rectify_fine, register_coarse, register_fine
+from flows.tasks.stages.raster import condense_raster
 from pipeline.lazy import deferred
 from storage.archive.keys import StageRef
 from storage.archive.records import StageRecord
@@ -34,11 +35,11 @@ else:
 
 RIG_LIMIT = "rig"  # Prefect's global concurrency limit, where the server has one of that name
 OF_THE_SURVEY = (
-    *(choose_effects, capture_coarse, register_coarse, locate, rectify, average_raster, score),
-    *(capture_fine, register_fine, extract_patches, take_patches, segment, ground, evaluate),
+    *(choose_effects, capture_coarse, condense_coarse, register_coarse, locate, rectify, condense_raster, score),
+    *(capture_fine, condense_fine, register_fine, rectify_fine, segment, ground, evaluate),
 )
-COARSE, DETAIL = ("rectify", "average_raster"), ("extract_patches", "take_patches")  # of a capture, of a raster
-JUDGED = (*COARSE, *DETAIL, "segment", "choose_effects", "register_coarse")  # whose stores `evaluate` takes
+FIRST = ("rectify", "condense_raster")  # of a capture, of a raster
+JUDGED = (*FIRST, "score", "segment", "choose_effects", "register_coarse")  # whose stores `evaluate` takes
 STAGES: dict[str, Stage] = {one.name: one for one in OF_THE_SURVEY}
 TITLES = {"plan": "scene, weights and plan", **{name: one.title for name, one in STAGES.items()}}
 
@@ -74,13 +75,13 @@ class Products(dict[str, StageRef]):
 
     @property
     def mosaic(self) -> StageRef:
-        """Return the store of the coarse mosaic."""
-        return self.there(*COARSE)[0]
+        """Return the store of the first pass's mosaic, or of the raster's."""
+        return self.there(*FIRST)[0]
 
     @property
-    def patches(self) -> StageRef:
-        """Return the store of the patches in detail."""
-        return self.there(*DETAIL)[0]
+    def detail(self) -> StageRef:
+        """Return the store of the mosaic in the scene's own pixels."""
+        return self.there("rectify_fine", *FIRST)[0]
 
     def there(self, *stages: str) -> list[StageRef]:
         """Return the stores of those of these stages that ran."""
@@ -168,6 +169,13 @@ class OpenSurvey:
         watch(stage, state, 1.0)
         self.observer.log(self._summary(stage, ref))
         return ref
+
+    def take_as_found(self, stage: str, ref: StageRef) -> None:
+        """Note a store that was made before, whose files may have been cleared since what followed was made of them."""
+        size, known = self.run.archive.stored_bytes(ref), self.run.archive.manifest_hash(ref)
+        self.records[stage] = StageRecord(stage, ref.key, "cached", None, None, None, 0, size, known)
+        self.products[stage] = ref
+        self.observer.watch(stage, "cached", 1.0)
 
     def _summary(self, stage: str, ref: StageRef) -> str:
         record, title = self.records[stage], TITLES[stage]

@@ -19,7 +19,7 @@ from storage.archive.keys import StageRef, published_runs
 from storage.archive.manifests import read_table
 from storage.archive.records import Run, read_run
 from storage.arrays.class_maps import ProbabilityStore
-from storage.arrays.mosaics import mosaic_shape
+from storage.arrays.mosaics import Mosaic, open_mosaic
 
 NONE, LATEST, AUTO = "none", "latest", "auto"
 NEWEST_RUNS = 60  # newest runs of a field among which the visit before is looked for
@@ -119,15 +119,14 @@ def _usable(
         if probabilities is None or mosaic is None:
             return "what it left was cleared; reprocess makes it again"
         store = ProbabilityStore(probabilities.path / "class_probabilities.zarr")
-        names, coarse = store.legend.names, mosaic_shape(mosaic.path / "mosaic.zarr")
+        names, seen = store.legend.names, open_mosaic(mosaic.path / "mosaic.zarr")
     except IncompleteStoreError as error:
         return f"{error}"
     if store.shape != (grid.height, grid.width):
         return f"it is of {store.shape[1]} x {store.shape[0]} px, this field has {grid.width} x {grid.height}"
-    factor = _factor(coarse, grid)
+    factor = _factor(seen, grid)
     if factor is None:
-        rows, columns = grid.coarse_shape
-        return f"its coarse pass has {coarse[1]} x {coarse[0]} px, these weights read {columns} x {rows}"
+        return f"its first pass has {seen.shape[1]} x {seen.shape[0]} px, no division of {grid.width} x {grid.height}"
     camera = run.settings.get("camera")
     same = not isinstance(camera, Mapping) or all(
         camera.get(part) == getattr(settings.camera, part) for part in ("pitch_um", "focal_length_mm")
@@ -142,10 +141,15 @@ def _usable(
     return Prior(run.folder.name, probabilities, earlier, days, classes)
 
 
-def _factor(coarse: tuple[int, int], grid: SceneGrid) -> int | None:
-    """How many fine px a pixel of an earlier coarse pass (y, x) is wide; None where the field has no such grid."""
-    offered = (factor for factor in range(1, grid.patch + 1) if grid.patch % factor == 0)
-    return next((factor for factor in offered if replace(grid, factor=factor).coarse_shape == coarse), None)
+def _factor(seen: Mosaic, grid: SceneGrid) -> int | None:
+    """How many fine px a pixel of an earlier mosaic is wide; None where the field has no such grid."""
+    fits = grid.patch % seen.factor == 0
+    rows, columns = (-(-size // seen.factor) for size in (grid.height, grid.width))
+    return (
+        seen.factor
+        if fits and seen.shape in ((rows, columns), replace(grid, factor=seen.factor).coarse_shape)
+        else None
+    )
 
 
 def _earlier_runs(archive: Archive, run: Run, grid: SceneGrid) -> Iterator[EarlierRun]:
@@ -166,7 +170,7 @@ def _earlier_runs(archive: Archive, run: Run, grid: SceneGrid) -> Iterator[Earli
             return
         try:
             mosaic = archive.find(parts[1], parts[2])
-            factor = None if mosaic is None else _factor(mosaic_shape(mosaic.path / "mosaic.zarr"), grid)
+            factor = None if mosaic is None else _factor(open_mosaic(mosaic.path / "mosaic.zarr"), grid)
         except IncompleteStoreError:
             return
         if mosaic is None or factor is None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.survey_settings import RECORDED, RIG, MapChoice, Settings
+from flows.settings.survey_settings import RECORDED, RIG, SIM, MapChoice, Settings
 from flows.settings.values import EXTENT_PART, EXTENT_WHOLE
 from flows.tasks.capture_plan import CapturePlan, PassLayout
 from flows.tasks.drawing import UnknownRule
@@ -76,13 +76,16 @@ else:
     rig_field = deferred("flows.tasks.rig_field")
 
 
+USUAL_COMPONENTS = 32  # of condensed lines, before they are known
+
+
 def check_memory(source: SimulatedSource, grid: SceneGrid, plan: CapturePlan, memory: int, pool: WorkerPool) -> None:
     """Refuse a memory below one tile of the mosaic before anything is captured (SettingsError, with the least)."""
-    pixels, finer = PixelGrid.of_scene(grid, grid.factor), PixelGrid.of_scene(grid, 1) if plan.plain else None
+    pixels = PixelGrid.of_scene(grid, 1 if plan.plain else grid.factor)
     placed = [place(_PlannedSweep(source, sweep), source.camera) for sweep in plan.coarse]
     rows, columns = image_spec(("y", "x"), pixels.shape, "<f4").shard or pixels.shape
     tiles = plan_tiles(placed, source.camera, pixels, (rows, columns))
-    work = MosaicWork(placed, source.camera, pixels, finer=finer)
+    work = MosaicWork(placed, source.camera, pixels)
     tile_budget(work, tiles, (rows, columns), memory=memory, pool=replace(pool, workers=1))
 
 
@@ -92,7 +95,8 @@ class _PlannedSweep(SimulatedSweep):
     @property
     def references(self) -> References:
         """Frames of a detector without a fault, as the simulated one is."""
-        white = np.ones((self.source.camera.samples // self.sweep.binning, len(self.source.wavelength_nm)), np.float32)
+        components = min(len(self.source.wavelength_nm), USUAL_COMPONENTS)
+        white = np.ones((self.source.camera.samples // self.sweep.binning, components), np.float32)
         return References(dark=np.zeros_like(white), white=white, white_reference=white[0])
 
 
@@ -135,6 +139,11 @@ class CaptureRun:
             **({} if self.settings.visit is None else {"visit": self.settings.visit}),
             **self.source.key(self.name),
         }
+
+    @property
+    def noise_known(self) -> bool:
+        """Whether the camera of the settings took the lines, so that its model tells their noise."""
+        return self.settings.source in (SIM, RIG)
 
     @property
     def recorder(self) -> SweepRecorder:

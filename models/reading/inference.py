@@ -15,7 +15,7 @@ from models.weights.files import Weights
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
 from pipeline.lazy import deferred
-from pipeline.readings import beyond_range
+from pipeline.signal.components import Components
 
 if TYPE_CHECKING:
     import torch
@@ -34,9 +34,6 @@ class CoarsePass:
     columns: NDArray[np.float32]  # (y, x, column) normalised
     origin: tuple[int, int] = field(default=(0, 0), kw_only=True)  # row and column of the field's patch it begins at
     living: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (token,) which are read; None: all
-    out_of_range: NDArray[np.bool_] | None = field(
-        default=None, kw_only=True
-    )  # (y, x) of the scene: a value is no reading
     filled: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (y, x) nothing was seen of; None: of all was
 
     @property
@@ -100,30 +97,28 @@ def read_coarse_pass(
     grid: SceneGrid,
     *,
     origin: tuple[int, int] = (0, 0),
+    components: Components | None = None,
 ) -> CoarsePass:
     """Bring the coarse mosaic to the spectral columns of the weights, some rows at a time.
 
-    ``strips`` are (y, x, band) parts of the mosaic from the top down, together of the shape ``grid.coarse_shape``;
-    ``origin`` is the row and column of the patch of a larger field in which the grid begins.
+    ``strips`` are (y, x, band) parts of the mosaic from the top down, together of the shape ``grid.coarse_shape``, or
+    (y, x, component) scores of ``components``; ``origin`` is the row and column of the patch of a larger field in which
+    the grid begins.
     """
-    config = weights.config
     rows, width = grid.coarse_shape
-    columns, filled = np.empty((rows, width, config.columns), np.float32), 0
-    out_of_range: NDArray[np.bool_] | None = None
+    columns, filled = np.empty((rows, width, weights.config.columns), np.float32), 0
     for strip in strips:
         last = filled + len(strip)
-        columns[filled:last] = weights.columns(strip, wavelength_nm)
-        if (wild := beyond_range(strip, weights.normalisation.most_value)) is not None:
-            out_of_range = np.zeros((rows, width), np.bool_) if out_of_range is None else out_of_range
-            out_of_range[filled:last] = wild.any(axis=-1)
+        if components is None:
+            columns[filled:last] = weights.columns(strip, wavelength_nm)
+        else:
+            columns[filled:last] = weights.columns_of_scores(strip, components, wavelength_nm)
         filled = last
     y, x = grid.padded_shape
     columns = np.ascontiguousarray(pad_by_reflection(columns, (y // grid.factor, x // grid.factor)), np.float32)
     dead = dead_pixels(columns)
-    living = _mend(columns, config)
-    return CoarsePass(
-        grid, columns, origin=origin, living=living, out_of_range=out_of_range, filled=dead if dead.any() else None
-    )
+    living = _mend(columns, weights.config)
+    return CoarsePass(grid, columns, origin=origin, living=living, filled=dead if dead.any() else None)
 
 
 def _mend(columns: NDArray[np.float32], config: SegmenterConfig) -> NDArray[np.bool_] | None:

@@ -24,6 +24,7 @@ from models.weights.parts import OOD, READER, OodPart, ReaderPart, TrainedOn
 from pipeline.errors import WeightsError
 from pipeline.lazy import deferred
 from pipeline.readings import readings_alone
+from pipeline.signal.components import Components
 
 if TYPE_CHECKING:
     import torch
@@ -91,6 +92,25 @@ class Weights:
         values = readings_alone(values, self.normalisation.most_value)
         matrix, reached = self.basis.matrix(wavelength_nm)
         seen = project(values, matrix)
+        columns = self.normalisation.apply(seen, reached)
+        columns[~np.isfinite(seen[..., reached]).any(axis=-1)] = np.nan
+        return columns
+
+    def columns_of_scores(
+        self, scores: NDArray[np.floating], components: Components, wavelength_nm: NDArray[np.floating]
+    ) -> NDArray[np.float32]:
+        """Normalised spectral columns of pixels given by scores of components, (..., component) -> (..., column).
+
+        They are linear in scores. A column that is no reading by `Normalisation.most_value` is completed as one that no
+        band reaches; a pixel without scores is NaN.
+        """
+        lit = np.isfinite(components.mean)
+        matrix, reached = np.zeros((components.bands, self.config.columns), np.float32), np.zeros(0)
+        matrix[lit], reached = self.basis.matrix(np.asarray(wavelength_nm)[lit])
+        weights, offset = components.onto(matrix)
+        with np.errstate(invalid="ignore", over="ignore"):
+            seen = np.asarray(scores, np.float32) @ weights + offset
+        seen = readings_alone(seen, self.normalisation.most_value)
         columns = self.normalisation.apply(seen, reached)
         columns[~np.isfinite(seen[..., reached]).any(axis=-1)] = np.nan
         return columns

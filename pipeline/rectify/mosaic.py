@@ -120,7 +120,7 @@ def read_part(
         return None
     signal, scan_path = located.placed.signal, located.scan_path
     count = signal.samples
-    knots, samples = _span(box[0], box[1], len(scan_path)), signal.elements.alone(_span(box[2], box[3], count))
+    knots, samples = _span(box[0], box[1], len(scan_path)), signal.alone(_span(box[2], box[3], count))
     members = member_lines(scan_path, knots)
     values, valid = signal.values(located.read, members, samples, camera.full_scale_dn)
     starts = scan_path.starts[knots] - scan_path.starts[knots.start]

@@ -16,7 +16,7 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, points_of_scan
 from pipeline.rectify.geolocation import KnotCurve, drop_unseen, grid_points, knots_of_points, path_geolocation
 from pipeline.rectify.scan_paths import ScanPath, make_scan_paths
-from pipeline.signal.lines import Signal
+from pipeline.signal.lines import CondensedSignal, Signal, signal_of
 from pipeline.source import SweepLines
 
 SAFETY = 1.05  # on the bound of ties, which holds to the second order
@@ -216,9 +216,9 @@ class Placed:
     gain: NDArray[np.float32] | None = None  # (band,) what the sweep's values are multiplied by
 
     @cached_property
-    def signal(self) -> Signal:
-        """Return its lines in scene values."""
-        return Signal(self.lines, self.gain)
+    def signal(self) -> Signal | CondensedSignal:
+        """Return its lines in scene values, or in scores of components."""
+        return signal_of(self.lines, self.gain)
 
     def coordinates(
         self, number: int, camera: LineCamera, grid: PixelGrid, rows: slice, columns: slice
@@ -319,7 +319,7 @@ class ScanPathReach:
         return ColumnReach(
             top=np.where(hit, self._top, np.inf).min(axis=1),
             bottom=np.where(hit, self._bottom, -np.inf).max(axis=1),
-            samples=self._placed.signal.elements.alone(slice(max(first - TAPS, 0), min(last + TAPS, self._count))),
+            samples=self._placed.signal.alone(slice(max(first - TAPS, 0), min(last + TAPS, self._count))),
         )
 
 

@@ -65,7 +65,7 @@ def mosaic_tile(
                 LocatedSweep(one, scan_path, coordinates, _reader(one, scan_path, coordinates, cache, near.samples))
             )
     shape = rows.stop - rows.start, columns.stop - columns.start
-    bands = len(placed[0].lines.references.white_reference)
+    bands = placed[0].signal.bands
     values, coverage = np.empty((*shape, bands), np.float32), np.zeros(shape, np.intp)
     if not located:
         values[...] = np.nan
@@ -167,11 +167,11 @@ def read_patches(
         for scan_path, _ in one.scan_paths:
             coordinates = one.locate_point(scan_path, camera, points)
             if np.isfinite(coordinates[..., 0]).any():
-                whole = slice(0, len(one.lines.references.dark))
+                whole = slice(0, one.signal.samples)
                 located.append(
                     LocatedSweep(one, scan_path, coordinates, _reader(one, scan_path, coordinates, cache, whole))
                 )
-    bands = len(placed[0].lines.references.white_reference)
+    bands = placed[0].signal.bands
     values = np.full((*points.shape[:3], bands), np.nan, np.float32)
     coverage = np.zeros(points.shape[:3], np.intp)
     for run in cut_runs([one.coordinates for one in located], bands) if located else []:
@@ -188,7 +188,7 @@ def _blend(
     parts = [part for part in read if part is not None]
     if parts:
         return mosaic(parts)
-    count, bands = located[0][1].size // 2, len(located[0][0].placed.lines.references.white_reference)
+    count, bands = located[0][1].size // 2, located[0][0].placed.signal.bands
     return np.full((count, bands), np.nan, np.float32), np.zeros(count, np.intp)
 
 
@@ -260,7 +260,7 @@ def _blocks_of(placed: Sequence[Placed], tile: Tile) -> dict[tuple[int, int, int
     """Sizes of the blocks of raw lines behind a tile, by sweep, block and samples."""
     blocks = {}
     for sweep, (one, scan_paths) in enumerate(zip(placed, tile.reach, strict=True)):
-        bands = len(one.lines.references.white_reference)
+        bands = one.signal.bands
         for (scan_path, _), near in zip(one.scan_paths, scan_paths, strict=True):
             knots = slice(0, 0) if near is None else near.knots(tile.rows)
             if near is None or knots.start == knots.stop:

@@ -10,13 +10,14 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
 from pipeline.signal.calibrate import Elements, calibrate, judge_elements, of_bands
+from pipeline.signal.components import Components
 from pipeline.source import References, SweepLines
 
 BLOCK_LINES = 64  # a shard of a stored sweep: reading one line of it costs as much as reading all
@@ -24,7 +25,7 @@ CHUNK_SAMPLES = 32  # likewise across
 BROAD_BANDS = 16
 
 _Key = tuple[int, int, int, int]  # sweep, block, samples held
-Raw = NDArray[np.uint16]
+Raw = NDArray[np.integer[Any]]  # numbers of the camera, or scores in steps
 ReadWindow = Callable[[slice, slice], Raw]  # (lines, samples) -> (line, sample, band)
 
 
@@ -57,6 +58,14 @@ class Signal:
                 f"{self.gain.shape}"
             )
         return judge_elements(replace(plain, white_reference=(plain.white_reference * self.gain).astype(np.float32)))
+
+    def spectra(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the scene values of resampled ones: these are."""
+        return values
+
+    def alone(self, samples: slice) -> slice:
+        """Grow a run of samples by those that its bad elements are filled from."""
+        return self.elements.alone(samples)
 
     def values(
         self, read: ReadWindow, numbers: NDArray[np.intp], samples: slice, full_scale_dn: float
@@ -91,14 +100,109 @@ class Signal:
         return image
 
 
+@runtime_checkable
+class CondensedLines(Protocol):
+    """The lines of a sweep as scores of components, wherever they are."""
+
+    @property
+    def components(self) -> Components:
+        """The law that gives spectra back."""
+
+    @property
+    def step(self) -> float:
+        """What one step of a stored score counts."""
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """(line, sample) spectra that may be used."""
+
+    def read(self, start: int, stop: int) -> Raw:
+        """Scores of the lines ``start`` to ``stop`` in steps, (line, sample, component)."""
+
+
+@dataclass(frozen=True)
+class CondensedSignal:
+    """A condensed sweep's lines in scores: they are resampled and blended as scene values are."""
+
+    lines: SweepLines
+    gain: NDArray[np.float32] | None = None  # (band,) what the sweep's values are multiplied by
+
+    @cached_property
+    def _condensed(self) -> CondensedLines:
+        assert isinstance(self.lines, CondensedLines)
+        return self.lines
+
+    @property
+    def samples(self) -> int:
+        """Return the samples of a line."""
+        return self._condensed.usable.shape[1]
+
+    @property
+    def bands(self) -> int:
+        """Return the components of a line."""
+        return len(self._condensed.components)
+
+    @cached_property
+    def _gain(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+        return None if self.gain is None else self._condensed.components.scaled(self.gain)
+
+    def spectra(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the scene values (..., band) of resampled scores (..., component)."""
+        return self._condensed.components.restore(values)
+
+    def alone(self, samples: slice) -> slice:
+        """Return the run of samples: what was bad was mended as lines were condensed."""
+        return samples
+
+    def values(
+        self, read: ReadWindow, numbers: NDArray[np.intp], samples: slice, full_scale_dn: float
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Read (line, sample, component) scores of some lines, and which (line, sample) may be used."""
+        scores = _raw_of(read, numbers, samples).astype(np.float32) * np.float32(self._condensed.step)
+        if self._gain is not None:
+            matrix, shift = self._gain
+            scores = scores @ matrix + shift
+        return scores, self._condensed.usable[numbers, samples] & self.lines.valid_line[numbers, None]
+
+    def broad_image(
+        self, usable: NDArray[np.bool_], full_scale_dn: float, bands: int = BROAD_BANDS
+    ) -> NDArray[np.float32]:
+        """Return the mean of ``bands`` bands spread over all, (line, sample); NaN where one is not valid."""
+        weights, offset = broad_weights(self._condensed.components, bands)
+        image = np.full((len(usable), self.samples), np.nan, np.float32)
+        for first in range(0, len(usable), BLOCK_LINES):
+            part = slice(first, min(first + BLOCK_LINES, len(usable)))
+            scores = self.lines.read(part.start, part.stop).astype(np.float32) * np.float32(self._condensed.step)
+            seen = self._condensed.usable[part] & usable[part, None]
+            image[part] = np.where(seen, scores @ weights + offset, np.nan)
+        return image
+
+
+def broad_weights(components: Components, bands: int = BROAD_BANDS) -> tuple[NDArray[np.float32], np.float32]:
+    """Weights (component,) and offset by which scores give the mean of some bands spread over all that have values."""
+    known = np.flatnonzero(np.isfinite(components.mean))
+    chosen = _spread(known, bands) if len(known) else known
+    matrix = np.zeros((components.bands, 1))
+    matrix[chosen] = 1 / max(len(chosen), 1)
+    weights, offset = components.onto(matrix)
+    return weights[:, 0], offset[0]
+
+
+def signal_of(lines: SweepLines, gain: NDArray[np.float32] | None = None) -> Signal | CondensedSignal:
+    """Return how a sweep's lines give values: raw numbers by its references, condensed ones as they are."""
+    return CondensedSignal(lines, gain) if isinstance(lines, CondensedLines) else Signal(lines, gain)
+
+
 def broad_bands(references: References, bands: int = BROAD_BANDS) -> NDArray[np.intp]:
     """Choose the bands of a broad-band image: spread over those that nine samples in ten are calibrated in."""
     good = references.white > references.dark
     if references.bad is not None:
         good = good & ~references.bad
     known = np.flatnonzero(good.mean(axis=0) >= 0.9)
-    if not len(known):
-        known = np.arange(len(references.white_reference))
+    return _spread(known if len(known) else np.arange(len(references.white_reference)), bands)
+
+
+def _spread(known: NDArray[np.intp], bands: int) -> NDArray[np.intp]:
     return known[np.unique(np.linspace(0, len(known) - 1, max(bands, 1)).round().astype(np.intp))]
 
 
@@ -177,7 +281,7 @@ def line_blocks(lines: slice) -> range:
 
 def held_samples(lines: SweepLines, samples: slice, likely: slice | None = None) -> slice:
     """Samples to read and hold: those wanted and likely, in whole chunks; all of a sweep read by whole lines."""
-    count = lines.references.dark.shape[0]
+    count = signal_of(lines).samples
     if not isinstance(lines, WindowedLines):
         return slice(0, count)
     other = samples if likely is None else likely

@@ -134,6 +134,10 @@ class Archive:
         check_files(ref.path, hashes=False)
         return None if is_cleared(read_manifest(ref.path)) else ref
 
+    def is_known(self, ref: StageRef) -> bool:
+        """Whether a store was published here, also where its files were cleared away since."""
+        return (self.root / ref.uri).is_dir()
+
     @contextmanager
     def publish(
         self,

@@ -85,7 +85,7 @@ class RawCubeWriter:
         spec = image_spec(("line", "sample", "band"), header.shape, "<u2")
         self._dn = create_array(self._group, "dn", spec, about, packing=RAW_PACKING)
         known = header.references
-        _write_references(self._group, known)
+        write_references(self._group, known)
         self._seen = LineThumbnail(
             header.shape,
             header.wavelength_nm,
@@ -135,7 +135,7 @@ class RawCubeWriter:
                 f"capture the rest before closing the cube"
             )
         self._flush()
-        _write_line_facts(self._group, self._facts, self._header.started)
+        write_line_facts(self._group, self._facts, self._header.started)
         write_quicklook(self._group, self._seen.finish())
 
     def _flush(self) -> None:
@@ -147,7 +147,8 @@ class RawCubeWriter:
             self._waiting.clear()
 
 
-def _write_references(group: zarr.Group, references: References) -> None:
+def write_references(group: zarr.Group, references: References) -> None:
+    """Store the frames of a sweep."""
     about = {"units": "1", "coordinates": "wavelength"}
     frames: dict[str, tuple[tuple[str, ...], Any, type[np.generic], str]] = {
         "dark": (("sample", "band"), references.dark, np.float32, "dark reference frame"),
@@ -161,9 +162,10 @@ def _write_references(group: zarr.Group, references: References) -> None:
             write_small(group, name, dims, np.asarray(values, kind), {"long_name": title, **about})
 
 
-def _write_line_facts(
+def write_line_facts(
     group: zarr.Group, facts: Sequence[tuple[float, float, float, float, bool]], started: str | None
 ) -> None:
+    """Store time, mirror position X and Y, exposure and validity of every line."""
     times, x, y, exposures, valid = (np.array(column) for column in zip(*facts, strict=True))
     since = {"units": "s"} if started is None else {"units": f"seconds since {started}", "standard_name": "time"}
     about_time = {"long_name": "mid exposure, since the start of the sweep", **since}

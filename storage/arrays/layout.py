@@ -49,7 +49,6 @@ _SPATIAL_CONVENTION = {
 }
 # of each kind of store: its images, and the number that stands for nothing in them
 NO_CLASS = {"classes": UNLABELLED, "confidence": np.nan}
-NO_VALUE = {"values": np.nan, "coverage": 0}
 
 
 @dataclass(frozen=True)
@@ -312,12 +311,14 @@ def blank_pixels(path: Path, where: NDArray[np.bool_], images: Mapping[str, floa
         group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
         arrays = {name: array for name in images if isinstance(array := group[name], zarr.Array)}
     for name, array in arrays.items():
-        sizes = (array.shards or array.chunks)[:2]
+        cubes = array.ndim - 2 if array.metadata.dimension_names[-1] == "x" else 0  # type: ignore[union-attr, index]
+        sizes = (array.shards or array.chunks)[cubes : cubes + 2]
         for top, left in product(*(range(0, size, step) for size, step in zip(where.shape, sizes, strict=True))):
-            place = np.s_[top : top + sizes[0], left : left + sizes[1]]
-            if (gaps := where[place]).any():
+            here = np.s_[top : top + sizes[0], left : left + sizes[1]]
+            if (gaps := where[here]).any():
+                place = (slice(None),) * cubes + here
                 values = read_array(group, name, place).copy()
-                values[gaps] = images[name]
+                values[(slice(None),) * cubes + (gaps,)] = images[name]
                 array[place] = values
 
 

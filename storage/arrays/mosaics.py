@@ -1,8 +1,7 @@
-"""The mosaic, (y, x, band) float32 on the scene grid; fine patches, and the scores that chose them."""
+"""The mosaic: scores of a field's pixels, (component, y, x) on the scene grid; and the scores that chose patches."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -14,12 +13,13 @@ import zarr
 from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
-from storage.arrays.georeference import create_placed_group, write_corners
+from pipeline.geometry.grid import SceneGrid, block_means
+from pipeline.signal.components import Components
+from pipeline.signal.lines import broad_weights
+from storage.arrays.georeference import create_placed_group
 from storage.arrays.layout import (
-    QUICK_PACKING,
     SHARD_ROWS,
     AngularGrid,
-    ArraySpec,
     create_array,
     create_group,
     damage_named,
@@ -28,54 +28,46 @@ from storage.arrays.layout import (
     open_group,
     read_array,
     read_bands,
-    round_bits,
     whole_shards,
     write_bands,
     write_counts,
     write_image,
-    write_small,
 )
-from storage.arrays.quicklooks import Quicklook, Thumbnail, ThumbnailCut, write_quicklook
+from storage.arrays.quicklooks import Quicklook, write_quicklook
+from storage.arrays.signal_cubes import LARGEST_SHORT, read_components, score_spec, write_components
 from storage.parallel.pool import WorkerPool, run_blocks
 
-
-@dataclass(frozen=True)
-class Mosaic:
-    """A stored mosaic, in memory."""
-
-    values: NDArray[np.float32]  # (y, x, band), NaN where no line reached
-    coverage: NDArray[np.float32]  # (y, x) weight of what was seen, 0 where nothing
-    wavelength_nm: NDArray[np.float64]
-    fwhm_nm: NDArray[np.float64] | None = None
-    grid: AngularGrid | None = None
-    quicklook: NDArray[np.uint8] | None = None  # (y, x, 3) at any smaller size, for viewers
+HALF = 0.5  # of a pixel's finer ones: of fewer seen it has no value
 
 
 class MosaicWriter:
-    """Write a mosaic in tiles of whole shards, so that it never has to be in memory as a whole.
-
-    Values are rounded to 11 bits.
-    """
+    """Write scores of a field's pixels in tiles of whole shards, so that they never have to be in memory together."""
 
     def __init__(
         self,
         path: Path,
         shape: tuple[int, int],
+        components: Components,
         wavelength_nm: NDArray[np.float64],
         *,
+        step: float = 1.0,
+        largest: float = LARGEST_SHORT,
         fwhm_nm: NDArray[np.float64] | None = None,
         grid: AngularGrid | None = None,
         simulation: Mapping[str, Any] | None = None,
     ) -> None:
+        """Begin a mosaic of (y, x) ``shape``; ``largest`` is the size that no score exceeds."""
         simulated = {} if simulation is None else {"simulation": dict(simulation)}
         self.path = path
         self.group, place = create_placed_group(path, "mosaic", grid, shape, simulated)
-        bands = " ".join(filter(None, [write_bands(self.group, wavelength_nm, fwhm_nm), place.get("coordinates")]))
-        self._shape = (*shape, len(wavelength_nm))
-        about = {"long_name": "scene value", "units": "1", **place, "coordinates": bands}
-        self._values = create_array(self.group, "values", image_spec(("y", "x", "band"), self._shape, "<f4"), about)
-        about = {"long_name": "weight of the samples seen", "units": "1", **place}
-        self._coverage = create_array(self.group, "coverage", image_spec(("y", "x"), shape, "<f4"), about)
+        write_bands(self.group, wavelength_nm, fwhm_nm)
+        write_counts(self.group, component=len(components))
+        write_components(self.group, components)
+        about = {"long_name": "score of a component", "units": "1", "scale_factor": step, **place}
+        spec = score_spec(("component", "y", "x"), (len(components), *shape), largest / step)
+        self._scores = create_array(self.group, "scores", spec, about | {"_FillValue": _unseen(spec.dtype)})
+        about = {"long_name": "sweeps that saw a pixel", "units": "1", **place}
+        self._coverage = create_array(self.group, "coverage", image_spec(("y", "x"), shape, "|u1"), about)
 
     @classmethod
     def reopen(cls, path: Path) -> MosaicWriter:
@@ -87,41 +79,67 @@ class MosaicWriter:
         writer.path = path
         with damage_named(str(path)):
             writer.group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
-            values, coverage = (writer.group[name] for name in ("values", "coverage"))
-            if not isinstance(values, zarr.Array) or not isinstance(coverage, zarr.Array):
-                raise KeyError("values and coverage are no arrays")
-            y, x, bands = values.shape
-        writer._values, writer._coverage, writer._shape = values, coverage, (y, x, bands)
+            scores, coverage = (writer.group[name] for name in ("scores", "coverage"))
+            if not isinstance(scores, zarr.Array) or not isinstance(coverage, zarr.Array):
+                raise KeyError("scores and coverage are no arrays")
+        writer._scores, writer._coverage = scores, coverage
         return writer
 
     @property
     def tile_shape(self) -> tuple[int, int]:
         """(y, x) of a shard, the least that can be written by itself: 64 rows of at most 640 columns."""
-        rows, columns = image_spec(("y", "x"), self._shape[:2], "<f4").shard or self._shape[:2]
+        _, rows, columns = self._scores.shards or self._scores.chunks
         return rows, columns
 
     def write_tile(
-        self, first_row: int, first_column: int, values: NDArray[np.floating], coverage: NDArray[np.generic]
+        self, first_row: int, first_column: int, scores: NDArray[np.floating], coverage: NDArray[np.generic]
     ) -> None:
-        """Store (y, x, band) values and (y, x) coverage of whole shards; threads may write different ones at once.
+        """Store (y, x, component) scores, NaN where nothing was seen, and (y, x) coverage of whole shards.
 
-        Raises ChunkError: the tile splits a shard. ShapeError: the tile does not fit the mosaic.
+        Threads may write different tiles at once. Raises ChunkError: the tile splits a shard. ShapeError: the tile does
+        not fit the mosaic.
         """
-        rows = slice(first_row, first_row + values.shape[0])
-        columns = slice(first_column, first_column + values.shape[1])
-        beyond = rows.stop > self._shape[0] or columns.stop > self._shape[1]
-        if values.shape[2:] != self._shape[2:] or coverage.shape != values.shape[:2] or beyond:
+        count, *shape = self._scores.shape
+        rows = slice(first_row, first_row + scores.shape[0])
+        columns = slice(first_column, first_column + scores.shape[1])
+        beyond = rows.stop > shape[0] or columns.stop > shape[1]
+        if scores.shape[2:] != (count,) or coverage.shape != scores.shape[:2] or beyond:
             raise ShapeError(
-                f"the tile at row {first_row}, column {first_column} has shapes {values.shape} and {coverage.shape}; "
-                f"the mosaic is {self._shape}"
+                f"the tile at row {first_row}, column {first_column} has shapes {scores.shape} and {coverage.shape}; "
+                f"the mosaic is {(*shape, count)}"
             )
-        whole_shards("the mosaic", (rows, columns), self._shape[:2], self.tile_shape)
-        self._values[rows, columns] = round_bits(values)
-        self._coverage[rows, columns] = coverage.astype(np.float32)
+        whole_shards("the mosaic", (rows, columns), shape, self.tile_shape)
+        seen = coverage > 0
+        if count:
+            steps = np.rint(scores / np.float32(self._scores.attrs["scale_factor"]))
+            seen = seen & np.isfinite(steps).all(axis=2)
+            steps = np.where(seen[..., None], steps, np.float32(_unseen(self._scores.dtype.str)))
+            self._scores[:, rows, columns] = np.ascontiguousarray(steps.transpose(2, 0, 1)).astype(self._scores.dtype)
+        self._coverage[rows, columns] = np.where(seen, coverage, 0).astype(np.uint8)
+
+    def write_rows(self, first: int, scores: NDArray[np.floating], seen: NDArray[np.bool_]) -> None:
+        """Store whole rows of scores (y, x, component) from a row on, a multiple of 64, and which (y, x) were seen."""
+        deep, wide = self.tile_shape
+        for top in range(0, len(scores), deep):
+            for left in range(0, scores.shape[1], wide):
+                part = np.s_[top : top + deep, left : left + wide]
+                self.write_tile(first + top, left, scores[part], seen[part])
 
     def write_quicklook(self, image: NDArray[np.uint8]) -> None:
         """Store a small colour picture, (y, x, 3) uint8, beside the mosaic."""
         write_quicklook(self.group, Quicklook(image))
+
+
+def nothing_seen(path: Path) -> dict[str, float]:
+    """What stands in the images of a mosaic for a pixel that shows no scene, by their names."""
+    scores = open_group(path)["scores"]
+    assert isinstance(scores, zarr.Array)
+    return {"scores": _unseen(scores.dtype.str), "coverage": 0}
+
+
+def _unseen(dtype: str) -> int:
+    """What stands for a pixel without a score, by CF's ``_FillValue``."""
+    return int(np.iinfo(np.dtype(dtype)).min)
 
 
 MakeTile = Callable[[slice, slice], tuple[NDArray[np.float32], NDArray[np.generic]]]  # (rows, columns) of a mosaic
@@ -134,26 +152,16 @@ def write_tiles(
     pool: WorkerPool,
     *,
     paths: Sequence[Path] = (),
-    seen: Thumbnail | None = None,
     report: Callable[[float], None] = lambda done: None,
 ) -> None:
     """Store what ``make`` gives for the rows and columns of ``places``, each in a task of its own.
 
-    Whoever makes the tiles, the same bytes come out. ``seen`` is filled with the pixels that it shows; see `run_blocks`
-    for the others and for what is raised.
+    Whoever makes the tiles, the same bytes come out. See `run_blocks` for what is raised.
     """
-    task = _TileTask(make, writer.path.absolute(), None if seen is None else seen.cut)
+    task = _TileTask(make, writer.path.absolute())
     if pool.shares_memory:
         _reopened(task.out)  # before several threads ask for it
-    run_blocks(
-        task,
-        places,
-        pool,
-        keep=False,
-        report=report,
-        paths=[*paths, task.out],
-        each=lambda place, part: None if seen is None or part is None else seen.put(*place, part),
-    )
+    run_blocks(task, places, pool, keep=False, report=report, paths=[*paths, task.out])
     _reopened.cache_clear()
 
 
@@ -163,14 +171,11 @@ class _TileTask:
 
     make: MakeTile
     out: Path  # the mosaic, begun
-    cut: ThumbnailCut | None
 
-    def __call__(self, place: tuple[slice, slice]) -> NDArray[np.float32] | None:
-        """Make and write the tile of some rows and columns; return what a thumbnail shows of it."""
-        (rows, columns), (values, coverage) = place, self.make(*place)
-        part = None if self.cut is None else self.cut(rows, columns, values).copy()
-        _reopened(self.out).write_tile(rows.start, columns.start, values, coverage)
-        return part
+    def __call__(self, place: tuple[slice, slice]) -> None:
+        """Make and write the tile of some rows and columns."""
+        scores, coverage = self.make(*place)
+        _reopened(self.out).write_tile(place[0].start, place[1].start, scores, coverage)
 
 
 @lru_cache(maxsize=1)
@@ -178,155 +183,137 @@ def _reopened(path: Path) -> MosaicWriter:
     return MosaicWriter.reopen(path)
 
 
-def load_mosaic(path: Path) -> Mosaic:
-    """Read a mosaic. Raises IncompleteStoreError where it is missing or damaged."""
-    group = open_group(path)
-    wavelength, fwhm = read_bands(group)
-    return Mosaic(
-        values=read_array(group, "values"),
-        coverage=read_array(group, "coverage"),
-        wavelength_nm=wavelength,
-        fwhm_nm=fwhm,
-        grid=grid_of(dict(group.attrs)),
-        quicklook=read_array(group, "quicklook") if "quicklook" in group else None,
-    )
-
-
-def mosaic_rows(path: Path, rows: slice = slice(None), columns: slice = slice(None)) -> Iterator[NDArray[np.float32]]:
-    """Read a window of a mosaic from the top down, (y, x, band) strips that end where shards do.
-
-    Raises IncompleteStoreError: the mosaic is missing or damaged.
-    """
-    group = open_group(path)
-    with damage_named(f"{path}/values"):
-        first, last, _ = rows.indices(group["values"].shape[0])  # type: ignore[union-attr]
-    while first < last:
-        below = min((first // SHARD_ROWS + 1) * SHARD_ROWS, last)
-        yield read_array(group, "values", (slice(first, below), columns))
-        first = below
-
-
-def mosaic_wavelengths(path: Path) -> NDArray[np.float64]:
-    """(band,) wavelengths of a mosaic [nm]. Raises IncompleteStoreError where it is missing or damaged."""
-    return read_bands(open_group(path))[0]
-
-
-def mosaic_brightness(path: Path) -> NDArray[np.float32]:
-    """Mean over the bands, (y, x). Raises IncompleteStoreError where the mosaic is missing or damaged."""
-    return np.concatenate([strip.mean(axis=-1) for strip in mosaic_rows(path)])
-
-
-PATCHES_A_SHARD = 64
-CHUNK_BYTES = 1 << 22  # smaller ones cost more calls than they save in reading single patches
-
-
-class PatchWriter:
-    """Write patches in order, a few at a time, so that they never have to be in memory together.
-
-    Values are rounded to 11 bits.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        patch_index: NDArray[np.integer],
-        origin_px: NDArray[np.integer],
-        patch_px: int,
-        wavelength_nm: NDArray[np.float64],
-        *,
-        fwhm_nm: NDArray[np.float64] | None = None,
-        grid: AngularGrid | None = None,
-    ) -> None:
-        count, bands = len(patch_index), len(wavelength_nm)
-        if patch_index.shape != (count,) or origin_px.shape != (count, 2):
-            raise ShapeError(
-                f"patches {patch_index.shape} and origins {origin_px.shape} must be (patch,) and (patch, 2)"
-            )
-        group = create_group(path, "fine patches", {} if grid is None else {"angular_grid": grid.record()})
-        names = write_bands(group, wavelength_nm, fwhm_nm)
-        for name, values, meaning in (
-            ("patch_index", patch_index, "number of the patch on the padded grid"),
-            ("patch_y", origin_px[:, 0], "row of the patch's first pixel"),
-            ("patch_x", origin_px[:, 1], "column of the patch's first pixel"),
-        ):
-            write_small(group, name, ("patch",), np.asarray(values, np.int64), {"long_name": meaning, "units": "1"})
-        write_counts(group, patch=count, y=patch_px, x=patch_px)
-        coordinates = " ".join(["patch_index patch_y patch_x", *write_corners(group, grid, origin_px)])
-        self._count = count
-        shape = (count, patch_px, patch_px)
-        about = {"long_name": "scene value", "units": "1", "coordinates": f"{names} {coordinates}"}
-        self._values = _create_stack(group, "values", ("patch", "y", "x", "band"), (*shape, bands), "<f4", about)
-        about = {"long_name": "pixel was seen and lies on the scene", "coordinates": coordinates}
-        self._valid = _create_stack(group, "valid", ("patch", "y", "x"), shape, "|b1", about)
-        self._next = 0  # patch that comes
-        shard = min(PATCHES_A_SHARD, max(count, 1))
-        # the shard that it lies in: memory that was used before, where fresh memory would cost more than the rounding
-        self._held = np.empty((shard, *shape[1:], bands), np.float32), np.empty((shard, *shape[1:]), np.bool_)
-
-    def write(self, values: NDArray[np.floating], valid: NDArray[np.bool_]) -> None:
-        """Store the next (patch, y, x, band) values and (patch, y, x) validity, any number of patches.
-
-        A shard of 64 is written once it is full, the last one once all patches are there. Raises ShapeError: they do
-        not fit the store.
-        """
-        count, (rounded, seen) = len(values), self._held
-        last = self._next + count
-        if values.shape[1:] != self._values.shape[1:] or valid.shape != values.shape[:3] or last > self._count:
-            raise ShapeError(
-                f"patches {self._next}:{last} are {values.shape} and {valid.shape} in {self._values.shape}"
-            )
-        taken = 0
-        while taken < count:
-            at = self._next % PATCHES_A_SHARD
-            some = slice(taken, min(taken + PATCHES_A_SHARD - at, count))
-            end = at + some.stop - some.start
-            round_bits(values[some], out=rounded[at:end])
-            seen[at:end] = valid[some]
-            first, taken, self._next = self._next - at, some.stop, self._next - at + end
-            if end == PATCHES_A_SHARD or self._next == self._count:
-                self._values[first : self._next], self._valid[first : self._next] = rounded[:end], seen[:end]
-
-
-def _create_stack(
-    group: zarr.Group, name: str, dims: tuple[str, ...], shape: tuple[int, ...], dtype: str, about: dict[str, Any]
-) -> zarr.Array[Any]:
-    """64 entries of the first axis a file, in equal chunks of up to 4 MB."""
-    shard = min(PATCHES_A_SHARD, max(shape[0], 1))
-    fits = CHUNK_BYTES // max(math.prod(shape[1:]) * np.dtype(dtype).itemsize, 1)
-    chunk = max(count for count in range(1, shard + 1) if shard % count == 0 and count <= max(fits, 1))
-    spec = ArraySpec(dims, shape, dtype, (chunk, *shape[1:]), (shard, *shape[1:]))
-    return create_array(group, name, spec, about, packing=QUICK_PACKING)
-
-
 @dataclass(frozen=True)
-class PatchStore:
-    """Stored patches, opened; values are read when asked for."""
+class Mosaic:
+    """A stored mosaic, opened: scores of a field's pixels, and the law that gives their spectra. Read when asked for."""
 
-    patch_index: NDArray[np.int64]  # (patch,)
     group: zarr.Group
-
-    def read(self, start: int, stop: int) -> NDArray[np.float32]:
-        """Values of some patches, (patch, y, x, band) float32."""
-        return read_array(self.group, "values", slice(start, stop))
-
-    def pick(self, entries: NDArray[np.integer]) -> NDArray[np.float32]:
-        """Values of the patches with these numbers in the store, ascending, (patch, y, x, band) float32."""
-        runs = np.split(entries, np.flatnonzero(np.diff(entries) != 1) + 1) if len(entries) else []
-        parts = [self.read(int(run[0]), int(run[-1]) + 1) for run in runs]
-        if len(parts) == 1:
-            return parts[0]
-        return np.concatenate(parts) if parts else self.read(0, 0)
+    components: Components
+    step: float
+    wavelength_nm: NDArray[np.float64]  # (band,)
+    fwhm_nm: NDArray[np.float64] | None
+    grid: AngularGrid | None
 
     @property
-    def wavelength_nm(self) -> NDArray[np.float64]:
-        """(band,) wavelengths of the values."""
-        return read_bands(self.group)[0]
+    def shape(self) -> tuple[int, int]:
+        """(y, x) [px]."""
+        y, x = self.group["coverage"].shape  # type: ignore[union-attr]
+        return int(y), int(x)
+
+    @property
+    def factor(self) -> int:
+        """Pixels of the fine grid to a side of its own."""
+        return 1 if self.grid is None else self.grid.factor
+
+    def scores(self, rows: slice = slice(None), columns: slice = slice(None)) -> NDArray[np.float32]:
+        """Scores of some pixels, (y, x, component) float32, NaN where nothing was seen.
+
+        Raises IncompleteStoreError: a checksum says that the bytes have changed.
+        """
+        steps = read_array(self.group, "scores", (slice(None), rows, columns)).transpose(1, 2, 0)
+        found = steps.astype(np.float32) * np.float32(self.step)
+        if steps.shape[2]:
+            found[steps[..., 0] == np.iinfo(steps.dtype).min] = np.nan
+        return found
+
+    def coverage(self, rows: slice = slice(None), columns: slice = slice(None)) -> NDArray[np.uint8]:
+        """How many sweeps saw some pixels, (y, x)."""
+        return read_array(self.group, "coverage", (rows, columns))
+
+    def values(
+        self, rows: slice = slice(None), columns: slice = slice(None), bands: Sequence[int] | None = None
+    ) -> NDArray[np.float32]:
+        """Scene values of some pixels and bands (None: all), (y, x, band) float32, NaN where nothing was seen."""
+        found = self.spectra(self.scores(rows, columns), bands)
+        if not len(self.components):
+            found[self.coverage(rows, columns) == 0] = np.nan
+        return found
+
+    def spectra(self, scores: NDArray[np.float32], bands: Sequence[int] | None = None) -> NDArray[np.float32]:
+        """Scene values (..., band) of some bands of scores (..., component)."""
+        return (self.components if bands is None else self.components.of_bands(bands)).restore(scores)
+
+    def thinned(self, step: int, bands: Sequence[int]) -> NDArray[np.float32]:
+        """Scene values of every ``step``-th pixel in some bands, (y, x, band), read a shard's rows at a time."""
+        starts = range(0, self.shape[0], SHARD_ROWS)
+        strips = (
+            self.scores(slice(first, min(first + SHARD_ROWS, self.shape[0])))[-first % step :: step, ::step]
+            for first in starts
+        )
+        return np.concatenate([self.spectra(strip, bands) for strip in strips])
+
+    def brightness(self, factor: int | None = None, bands: int | None = None) -> NDArray[np.float32]:
+        """Mean over the bands, or over so many of them spread over all, (y, x) in pixels of ``factor`` fine ones."""
+        weights, offset = broad_weights(self.components, bands or self.components.bands)
+        return np.concatenate([strip @ weights + offset for strip in self.strips(factor)])
+
+    def strips(
+        self, factor: int | None = None, rows: slice = slice(None), columns: slice = slice(None)
+    ) -> Iterator[NDArray[np.float32]]:
+        """Scores of a window from the top down, (y, x, component), that end where shards do.
+
+        ``factor`` are the fine pixels to a side of those wanted, a multiple of its own: means of what was seen, NaN
+        where that is less than half; rows and columns count such pixels. None: its own pixels.
+        """
+        times = 1 if factor is None else factor // self.factor
+        (first, last, _), (left, right, _) = (
+            part.indices(-(-size // times)) for part, size in zip((rows, columns), self.shape, strict=True)
+        )
+        while first < last:
+            below = min((first * times // SHARD_ROWS + 1) * SHARD_ROWS // times, last)
+            below = max(below, first + 1)
+            scores = self.scores(slice(first * times, below * times), slice(left * times, right * times))
+            if times > 1:
+                seen = np.isfinite(scores[..., :1]).astype(np.float32)
+                none = np.zeros(seen.shape[:2], np.intp)
+                fraction, (scores, _) = block_means(seen, none, times)[0], block_means(scores, none, times)
+                scores[fraction[..., 0] < HALF] = np.nan
+            yield scores
+            first = below
 
 
-def open_patches(path: Path) -> PatchStore:
-    """Open stored patches. Raises IncompleteStoreError where they are missing or damaged."""
+def open_mosaic(path: Path) -> Mosaic:
+    """Open a mosaic. Raises IncompleteStoreError where it is missing or damaged."""
     group = open_group(path)
-    return PatchStore(read_array(group, "patch_index"), group)
+    wavelength, fwhm = read_bands(group)
+    with damage_named(str(path)):
+        step = float(group["scores"].attrs["scale_factor"])  # type: ignore[arg-type]
+    return Mosaic(group, read_components(group), step, wavelength, fwhm, grid_of(dict(group.attrs)))
+
+
+def patch_scores(
+    mosaic: Mosaic, grid: SceneGrid, patch_index: NDArray[np.integer]
+) -> Iterator[tuple[NDArray[np.intp], NDArray[np.float32]]]:
+    """Cut patches out of a mosaic of the fine grid, the patches of some rows at a time.
+
+    Yields entries of ``patch_index`` and their scores (n, p, p, component), NaN where nothing was seen. Beyond the
+    scene's border a patch repeats its pixels by reflection.
+    """
+    p, (_, across) = grid.patch, grid.patch_shape
+    row, column = np.divmod(np.asarray(patch_index, np.intp), across)
+    deep = max(SHARD_ROWS // p, 1)
+    for group in np.unique(row // deep):
+        entries = np.flatnonzero(row // deep == group)
+        first, left, right = int(row[entries].min()), int(column[entries].min()), int(column[entries].max()) + 1
+        last = int(row[entries].max()) + 1
+        window = mosaic.scores(
+            slice(first * p, min(last * p, grid.height)), slice(left * p, min(right * p, grid.width))
+        )
+        whole = _reflected(_reflected(window, p, (last - first) * p, 0), p, (right - left) * p, 1)
+        cut = whole.reshape(last - first, p, right - left, p, -1).swapaxes(1, 2)
+        yield entries, cut[row[entries] - first, column[entries] - left]
+
+
+def _reflected(window: NDArray[np.float32], patch: int, size: int, axis: int) -> NDArray[np.float32]:
+    """Fill an axis up to ``size``, a multiple of a patch, within the last patch by reflection, else by the border."""
+    have = window.shape[axis]
+    if have == size:
+        return window
+    place = np.arange(size)
+    mirrored = 2 * (have - 1) - place
+    return np.take(
+        window, np.where(place < have, place, np.where(mirrored >= size - patch, mirrored, have - 1)), axis=axis
+    )
 
 
 @dataclass(frozen=True)
@@ -359,11 +346,6 @@ def load_attention(path: Path) -> Attention:
     return Attention(read_array(group, "score"), read_array(group, "rank"), str(group.attrs.get("policy", "")))
 
 
-def mosaic_shape(path: Path) -> tuple[int, int]:
-    """(y, x) of a stored mosaic. Raises IncompleteStoreError where there is none, or it is damaged."""
-    group = open_group(path)
-    with damage_named(str(path)):
-        array = group["coverage"]
-        if not isinstance(array, zarr.Array):
-            raise KeyError("coverage is no array")
-        return int(array.shape[0]), int(array.shape[1])
+def chosen_patches(path: Path) -> NDArray[np.int64]:
+    """Numbers of the patches that an attention store chose, ascending (IncompleteStoreError: missing or damaged)."""
+    return np.flatnonzero(load_attention(path).rank.ravel() >= 0)

@@ -17,11 +17,8 @@ from affine import Affine
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.geometry.grid import UNLABELLED, SceneGrid, block_means
+from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.lazy import deferred
-from storage.arrays.layout import SHARD_ROWS
-from storage.arrays.mosaics import PATCHES_A_SHARD, MosaicWriter, PatchWriter
-from storage.arrays.quicklooks import Thumbnail
 from storage.parallel.pool import RESERVED_BYTES, memory_refusal
 from storage.readers.envi_files import is_headwall_folder
 from storage.readers.label_files import (
@@ -276,58 +273,11 @@ class RasterPixels:
         """Return how many rows are read at a time: whole rows of patches, at least one (SettingsError: too many)."""
         grid = self.grid
         deep, row = grid.patch * grid.factor, COPIES * grid.width * self.bands * 4
-        means = SHARD_ROWS * grid.coarse_shape[1] * self.bands * 4
-        patches = PATCHES_A_SHARD * grid.patch**2 * self.bands * 4
-        least = RESERVED_BYTES + max(means, patches) + deep * row
+        least = RESERVED_BYTES + deep * row
         if least > memory:
             why = f"{deep} rows of a raster of {grid.width} px and {self.bands} bands are read at a time"
             raise memory_refusal(least, memory, why)
         return deep * max(1, (memory - RESERVED_BYTES) // FRACTION // (deep * row))
-
-
-def write_means(
-    raster: RasterPixels, writer: MosaicWriter, *, memory: int, seen: Thumbnail, report: Report = lambda done: None
-) -> None:
-    """Store the mean of every factor x factor pixels that have a value, with coverage 1 where one has.
-
-    Raises SettingsError: not even one row of patches fits the memory.
-    """
-    grid, factor = raster.grid, raster.grid.factor
-    at_once, (height, width) = raster.rows_at_once(memory) // factor, grid.coarse_shape
-    every = slice(0, width)
-    for top in range(0, height, SHARD_ROWS):
-        below = min(top + SHARD_ROWS, height)
-        values = np.empty((below - top, width, raster.bands), np.float32)
-        coverage = np.empty((below - top, width), np.intp)
-        for first in range(top, below, at_once):
-            last = min(first + at_once, below)
-            part = slice(first - top, last - top)
-            pixels = raster.rows(first * factor, min(last * factor, grid.height))
-            known = np.asarray(np.isfinite(pixels).any(axis=-1), np.intp)
-            values[part], coverage[part] = block_means(pixels, known, factor)
-        writer.write_tile(top, 0, values, coverage)
-        rows = slice(top, below)
-        seen.put(rows, every, seen.cut(rows, every, values).copy())
-        report(below / height)
-
-
-def write_patches(
-    raster: RasterPixels,
-    writer: PatchWriter,
-    patch_index: NDArray[np.integer],
-    *,
-    memory: int,
-    report: Report = lambda done: None,
-) -> None:
-    """Store the patches of ascending ``patch_index`` at the raster's own pixels; beyond its edge that is repeated.
-
-    Raises SettingsError: not even one row of patches fits the memory.
-    """
-    done = 0
-    for values, valid in patches_of(raster, patch_index, memory=memory):
-        writer.write(values, valid)
-        done += len(values)
-        report(done / len(patch_index))
 
 
 def patches_of(

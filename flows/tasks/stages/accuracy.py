@@ -20,6 +20,7 @@ from flows.tasks.capture_plan import CapturePlan
 from flows.tasks.field_work import coarse_region
 from flows.tasks.patch_budget import PatchBudget
 from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
+from flows.tasks.stages.attention import load_plan
 from flows.tasks.stages.effects import source_with
 from flows.tasks.stages.placement import load_registration
 from flows.tasks.zones import SurveyZones
@@ -47,7 +48,6 @@ from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table
 from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import load_class_map
-from storage.arrays.mosaics import open_patches
 from storage.readers.raster_fields import RasterPixels, patches_of
 
 RECORD = "accuracy.json"
@@ -57,7 +57,7 @@ ACCURACY = Product("evaluate", version=10, files=(RECORD,), by_weights=True)
 @stage("evaluate", "accuracy (not part of the survey)", ACCURACY)
 def evaluate(
     mosaic: StageRef,
-    patches: StageRef,
+    attention: StageRef,
     class_map: StageRef,
     *captures: StageRef,
     frame: FieldFrame,
@@ -106,7 +106,7 @@ def evaluate(
                 )
             fraction = CONTROL_FRACTION
             if budget is not None:  # as many as were kept of a uniform scan
-                fraction = len(open_patches(patches.path / "patches.zarr").patch_index) / len(budget.patch_index)
+                fraction = len(load_plan(attention).patch_index) / len(budget.patch_index)
             rows, among = count(1), None if zones.fractions is None else zones.fractions > 0
             found = run_controls(
                 weights,
@@ -128,7 +128,7 @@ def evaluate(
         report(0.6 * done)
 
     params = {**model_key, "labels": array_digest(labels), "controls": controls, "resampling": resampling, **source_key}
-    return Wanted(build, params, [mosaic, patches, class_map, *captures])
+    return Wanted(build, params, [mosaic, attention, class_map, *captures])
 
 
 def map_offset(simulated: SimulatedSource, pointing: Sequence[StageRef]) -> NDArray[np.float64]:

@@ -28,7 +28,7 @@ from pipeline.planning.fine_pass import FinePlan, plan_fine
 from pipeline.planning.uniform_scans import format_scan
 from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table, write_table
-from storage.arrays.mosaics import Attention, write_attention
+from storage.arrays.mosaics import Attention, open_mosaic, write_attention
 from storage.readers.raster_fields import RasterPixels
 
 ATTENTION = Product("score", version=8, files=("attention.zarr", "plan.json"), by_weights=True)
@@ -86,7 +86,9 @@ def score(
         scores, found = planned()
         if fractions is not None:  # patches of which zones leave something
             found = replace(found, patch_index=found.patch_index[fractions[found.patch_index] > 0])
-        work.pool_for(found.patch_index, len(frame.wavelength_nm))  # refuses what does not fit before the rig goes back
+        work.pool_for(
+            found.patch_index, len(open_mosaic(mosaic.path / "mosaic.zarr").components)
+        )  # refuses what does not fit before the rig goes back
         rank = np.full(scores.shape, -1, np.int32)
         rank[found.patch_index[np.argsort(-scores[found.patch_index], kind="stable")]] = np.arange(
             len(found.patch_index)

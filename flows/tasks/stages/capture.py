@@ -21,6 +21,8 @@ from flows.tasks.stages.attention import load_plan
 from flows.tasks.stages.effects import chosen_effects, load_manifest
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel, Sweep
+from pipeline.signal.subspace import SignalStatistics
+from pipeline.signal.sweep_signal import LineStatistics
 from pipeline.simulator.simulated import BLOCK_LINES, SimulatedSource, sweep_starts
 from pipeline.source import Line, Source
 from storage.archive.archive import Archive
@@ -30,7 +32,8 @@ from storage.arrays.cubes import RawCubeWriter, SweepHeader
 from storage.arrays.spool import Spool
 from storage.parallel.pool import WorkerPool
 
-RAW = Product("capture", version=10)
+RAW = Product("capture", version=11)
+STATISTICS = "statistics.npz"  # beside the cubes: second moments of their spectra, for condensing
 RIG_RECORD = "rig.json"  # beside the cubes: what a rig's captures were like
 
 
@@ -72,6 +75,7 @@ class SweepRecorder:
 
         def build(path: Path) -> None:
             """Take the sweeps one after the other, and write what the source recorded beside their cubes."""
+            found = SignalStatistics(len(self.wavelength_nm), sum(one.lines for one in sweeps) * self.camera.samples)
             before, manifest = 0, load_manifest(inputs[-1]) if self.source.simulates else None
             report(0.0)  # a rig is at work long before its first line is here
             folder, lit = self.archive.spool_folder(key), self.source.lit(chosen_effects(inputs[-1]), clock)
@@ -81,8 +85,9 @@ class SweepRecorder:
                     def taken(count: int, before: int = before) -> None:
                         report((before + count) / total)
 
-                    self._capture(source, sweep, path, folder, manifest, taken)
+                    self._capture(source, sweep, path, folder, manifest, found, taken)
                     before += sweep.lines
+                found.save(path / STATISTICS)
                 if source.record is not None:
                     write_table(path / RIG_RECORD, source.record)
 
@@ -95,6 +100,7 @@ class SweepRecorder:
         path: Path,
         folder: Path,
         effects: Mapping[str, Any] | None,
+        found: SignalStatistics,
         taken: Callable[[int], None],
     ) -> None:
         """Take lines into the spool and then the cube, one by one, from where a broken capture stopped.
@@ -110,17 +116,22 @@ class SweepRecorder:
             Spool.open(folder, samples, bands, header=about, name=sweep.name) as spool,
             RawCubeWriter(path / f"{sweep.name}.zarr", header) as cube,
         ):
+            statistics = LineStatistics(found, sweep, references, self.camera)
 
             def take(line: Line) -> None:
                 spool.append(line)
                 cube.write([line])
+                statistics.add(line)
                 taken(spool.count)
 
             spool.mend(source.lines_again(sweep, spool.lost))
             for block in spool.blocks():
                 cube.write(block)
+                for line in block:
+                    statistics.add(line)
             taken(spool.count)
             take_lines(source, sweep, take, self.pool, first=spool.count)
+            statistics.flush()
 
 
 Take = Callable[[Line], None]

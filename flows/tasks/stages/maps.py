@@ -1,4 +1,4 @@
-"""The stage that draws the class map, from coarse and fine patches and from what is remembered of the field."""
+"""The stage that draws the class map, from the mosaics of a field and from what is remembered of the field."""
 
 from __future__ import annotations
 
@@ -34,8 +34,7 @@ from storage.arrays.class_maps import (
 )
 from storage.arrays.layout import NO_CLASS, blank_pixels
 
-CLASS_MAP = Product("segment", version=10, files=("class_map.zarr", "class_probabilities.zarr"), by_weights=True)
-OUT_OF_RANGE = "out_of_range.json"  # beside a map, where values were no readings
+CLASS_MAP = Product("segment", version=11, files=("class_map.zarr", "class_probabilities.zarr"), by_weights=True)
 LEFT_OUT = "left_out.npy"  # beside a map while it is drawn: the pixels of which none is
 MOST_TURN_PX = 12.0  # that a field's corners may lie off by, as it is turned, so that its memory is of use
 
@@ -43,7 +42,8 @@ MOST_TURN_PX = 12.0  # that a field's corners may lie off by, as it is turned, s
 @stage("segment", "class map", CLASS_MAP)
 def segment(
     mosaic: StageRef,
-    patches: StageRef,
+    attention: StageRef,
+    fine: StageRef | None = None,
     *,
     frame: FieldFrame,
     work: FieldWork,
@@ -57,12 +57,13 @@ def segment(
     model_key: dict[str, Any],
     report: Report,
 ) -> Wanted:
-    """Draw the class map from coarse and fine patches, region by region; no class where the scene has no value.
+    """Draw the class map region by region, in detail where patches were chosen; no class where the scene has no value.
 
+    ``fine`` is the mosaic of the second pass, where there is one: else the first shows the field's own pixels.
     ``light`` is the exposure of a line that is read in detail as a fraction of the reference, and the pixels to the
     next.
     """
-    grid, left_out = frame.grid, zones.left_out
+    grid, left_out, inputs = frame.grid, zones.left_out, [mosaic, attention, *([] if fine is None else [fine])]
 
     def build(path: Path) -> None:
         """Draw the map and what is believed; once more without the memory, where that is put aside."""
@@ -79,23 +80,22 @@ def segment(
         legend, shape = ClassNames(weights.class_names, weights.class_colours), (grid.height, grid.width)
         create_class_map(out, shape, legend if unknown is None else with_unknown(legend), grid=frame.angular_grid())
         create_probabilities(probabilities, shape, legend, grid=frame.angular_grid(), goes_on=memory is not None)
-        seen = (mosaic.path / "mosaic.zarr").resolve(), (patches.path / "patches.zarr").resolve()
+        seen = [(ref.path / "mosaic.zarr").resolve() for ref in (mosaic, fine or mosaic)]
+        chosen = (attention.path / "attention.zarr").resolve()
         away = None if left_out is None else (path / LEFT_OUT).resolve()
         drawing = Drawing(
-            work.weights, *seen, out.resolve(), probabilities.resolve(), *light, memory, away, unknown, part
+            work.weights, *seen, chosen, out.resolve(), probabilities.resolve(), *light, memory, away, unknown, part
         )
-        drawn = draw_field(work, drawing, report)
+        comparison = draw_field(work, drawing, report)
         if prior is not None:
-            figures = _prior_map_figures(prior, reader, legend.names, lies, drawn.comparison)
+            figures = _prior_map_figures(prior, reader, legend.names, lies, comparison)
             write_table(path / MEMORY, figures)
-            if figures["put_aside"] is not None and drawn.comparison is not None:
+            if figures["put_aside"] is not None and comparison is not None:
                 drop_changes(probabilities)
-                drawn = draw_field(work, replace(drawing, memory=None), report)
-        if any(drawn.out_of_range):
-            write_table(path / OUT_OF_RANGE, dict(zip(("coarse_px", "fine_px"), drawn.out_of_range, strict=True)))
+                comparison = draw_field(work, replace(drawing, memory=None), report)
         if frame.missing is not None:
             blank_pixels(out, frame.missing, NO_CLASS)
-            changes = {} if drawn.comparison is None else {OLD_CLASS: UNLABELLED}
+            changes = {} if comparison is None else {OLD_CLASS: UNLABELLED}
             blank_pixels(probabilities, frame.missing, NOT_BELIEVED | changes)
         if left_out is not None:
             blank_pixels(out, left_out, NO_CLASS)
@@ -109,14 +109,12 @@ def segment(
     if part:
         params["part"] = True
     if prior is None:
-        return Wanted(build, params, [mosaic, patches])
+        return Wanted(build, params, inputs)
     key = None if reader is None else reader.key
     params |= {"days": prior.days, "classes": list(prior.classes), "reader": key, "light": light}
     if len(prior.scan_passes) > 1:
         params["shifts"] = [list(scan_pass.shift_px) for scan_pass in prior.scan_passes]
-    return Wanted(
-        build, params, [mosaic, patches, prior.probabilities, *(scan_pass.mosaic for scan_pass in prior.scan_passes)]
-    )
+    return Wanted(build, params, [*inputs, prior.probabilities, *(one.mosaic for one in prior.scan_passes)])
 
 
 def memory_of(prior: Prior, lies: FieldShift, grid: SceneGrid) -> FieldPriorMap | None:
@@ -124,7 +122,7 @@ def memory_of(prior: Prior, lies: FieldShift, grid: SceneGrid) -> FieldPriorMap 
     if lies.edge_px((grid.height, grid.width)) > MOST_TURN_PX:
         return None
     last, probabilities = prior.scan_passes[0], (prior.probabilities.path / "class_probabilities.zarr").resolve()
-    coarse = (last.mosaic.path / "mosaic.zarr").resolve() if last.factor == grid.factor else None
+    coarse = (last.mosaic.path / "mosaic.zarr").resolve() if grid.factor % last.factor == 0 else None
     return FieldPriorMap(probabilities, coarse, prior.days, prior.classes, whole_pixels(lies))
 
 

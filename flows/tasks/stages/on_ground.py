@@ -16,7 +16,7 @@ from pipeline.ground.map_grid import GroundGrid, image_at, map_blocks, nearest_a
 from storage.archive.keys import StageRef
 from storage.arrays.class_maps import OLD_CLASS, ClassNames, ProbabilityStore, load_class_map
 from storage.arrays.ground_maps import BLOCK, GroundMapWriter
-from storage.arrays.layout import SHARD_ROWS, open_group, read_array, read_bands
+from storage.arrays.mosaics import open_mosaic
 from storage.arrays.quicklooks import choose_bands, develop, stretch
 
 STORE = "ground_map.zarr"
@@ -42,7 +42,10 @@ def ground(
     def build(path: Path) -> None:
         """Write the map block by block, then the area of each class."""
         found = load_class_map(class_map.path / "class_map.zarr")
-        probabilities, colours = ProbabilityStore(class_map.path / "class_probabilities.zarr"), coarse_colours(mosaic)
+        probabilities, colours = (
+            ProbabilityStore(class_map.path / "class_probabilities.zarr"),
+            coarse_colours(mosaic, factor),
+        )
         unsure, age_days = np.isnan(found.confidence), probabilities.age()
         fractions, old_class = probabilities.changed(), probabilities.old_class()  # none of a first look
 
@@ -85,13 +88,14 @@ def ground(
     return Wanted(build, params, [class_map, mosaic])
 
 
-def coarse_colours(mosaic: StageRef) -> NDArray[np.float32]:
-    """Three bands of the coarse mosaic in a photograph's tones, (y, x, 3) in 1..255; NaN where nothing was captured."""
-    group = open_group(mosaic.path / "mosaic.zarr")
-    bands, words = choose_bands(read_bands(group)[0])
-    height = len(read_array(group, "coverage"))
-    rows = (slice(first, min(first + SHARD_ROWS, height)) for first in range(0, height, SHARD_ROWS))
-    values = np.concatenate([read_array(group, "values", block)[..., list(bands)] for block in rows])
+def coarse_colours(mosaic: StageRef, factor: int | None) -> NDArray[np.float32]:
+    """Three bands of a mosaic in a photograph's tones, (y, x, 3) in 1..255; NaN where nothing was captured.
+
+    Its pixels have ``factor`` fine ones a side; None: those of the mosaic.
+    """
+    seen = open_mosaic(mosaic.path / "mosaic.zarr")
+    bands, words = choose_bands(seen.wavelength_nm)
+    values = np.concatenate([seen.spectra(strip, bands) for strip in seen.strips(factor)])
     tones = develop(values, values) if words.startswith("true colour") else stretch(values)
     picture: NDArray[np.float32] = np.where(np.isfinite(values), 1 + 254 * tones, np.nan).astype(np.float32)
     return picture

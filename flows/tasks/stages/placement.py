@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -15,38 +15,35 @@ from flows.tasks.mosaic_work import MosaicRecipe, open_sweeps, write_mosaic
 from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
 from flows.tasks.stages.attention import load_plan
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import patch_pixels
+from pipeline.geometry.grid import SceneGrid, patch_pixels
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.placed import PixelGrid, Placed, TieTable
-from pipeline.rectify.region import read_every_patch, read_patches
 from pipeline.rectify.registration.alignment import SweepShift
 from pipeline.rectify.registration.illumination import overlap_light, solve_lights
 from pipeline.rectify.registration.overlaps import BroadSweep
 from pipeline.rectify.registration.seams import Anchor, Registration, SeamWindow, anchor_sweep, register_sweeps
 from pipeline.rectify.scan_paths import ScanPath
-from pipeline.rectify.sweep_paths import SweepPath
-from pipeline.signal.lines import LineCache, broad_bands
+from pipeline.signal.components import Components
+from pipeline.signal.lines import BROAD_BANDS
 from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table, write_table
-from storage.arrays.cubes import open_raw_cubes
 from storage.arrays.geolocation import path_digest, write_geolocation
-from storage.arrays.layout import NO_VALUE, blank_coarse, blank_pixels, read_array
-from storage.arrays.mosaics import MosaicWriter, PatchWriter, load_mosaic, open_patches
-from storage.arrays.quicklooks import Thumbnail, choose_bands, stretched
+from storage.arrays.layout import blank_coarse, blank_pixels
+from storage.arrays.mosaics import MosaicWriter, nothing_seen, open_mosaic
+from storage.arrays.quicklooks import choose_bands, stretched
+from storage.arrays.signal_cubes import open_signal_cubes
 from storage.parallel.pool import WorkerPool
 
-Values = NDArray[np.float32]
 Valid = NDArray[np.bool_]
 RECORD = "registration.json"
 POINTING = Product("register", version=2, files=(RECORD,))
 
 
 GEOLOCATION = Product("locate", version=3, files=("geolocation.zarr",))
-MOSAIC = Product("rectify", version=4, files=("mosaic.zarr",))
-PATCHES = Product("patches", version=5, files=("patches.zarr",), made_again=True)
+MOSAIC = Product("rectify", version=5, files=("mosaic.zarr",))
 QUICKLOOK_PX = 512
-PATCHES_AT_ONCE = 64
-CACHE_FRACTION = 8  # raw lines kept for the next patches may take this part of the memory
+MOSAIC_STEP = 0.5  # of resampled scores, over that of the sweeps: what is read between samples is less noisy
+KERNEL_GAIN = 2.0  # by which kernels overshoot, at most
 
 
 def record_of(registration: StageRef | None) -> Path | None:
@@ -56,13 +53,13 @@ def record_of(registration: StageRef | None) -> Path | None:
 
 @stage("register_coarse", "seams of the coarse sweeps", POINTING, inputs=1, named="coarse_pointing")
 def register_coarse(
-    raw: StageRef, *, camera: LineCamera, pointing_px: float, frame: FieldFrame, report: Report
+    signal: StageRef, *, camera: LineCamera, pointing_px: float, frame: FieldFrame, report: Report
 ) -> Wanted:
     """Find pointing and light of the coarse sweeps from what neighbours show twice."""
 
     def build(path: Path) -> None:
         """Register the sweeps by their seams, and write shifts and gains."""
-        sweeps = open_sweeps(raw.path, None, camera)
+        sweeps = open_sweeps(signal.path, None, camera)
         broad = [BroadSweep.read(one.lines, camera, usable=one.usable) for one in sweeps]
         report(0.4)
         found = register_sweeps(broad, camera, prior_px=pointing_px)
@@ -79,7 +76,7 @@ def register_coarse(
         }
         write_table(path / RECORD, record)
 
-    return Wanted(build, {"prior_px": pointing_px, "pass": "coarse"}, [raw])
+    return Wanted(build, {"prior_px": pointing_px, "pass": "coarse"}, [signal])
 
 
 def light_gains(
@@ -114,17 +111,17 @@ def _window_record(seen: SeamWindow, names: Sequence[str]) -> dict[str, Any]:
 
 @stage("register_fine", "fine sweeps on the mosaic", POINTING, inputs=2, named="fine_pointing")
 def register_fine(
-    raw: StageRef, mosaic: StageRef, *, camera: LineCamera, pointing_px: float, frame: FieldFrame, report: Report
+    signal: StageRef, mosaic: StageRef, *, camera: LineCamera, pointing_px: float, frame: FieldFrame, report: Report
 ) -> Wanted:
     """Find where each fine sweep lies on the coarse mosaic, which itself may be off by as much."""
 
     def build(path: Path) -> None:
         """Lay each sweep onto the mean of the mosaic's bands, and write where it lies."""
-        sweeps = open_sweeps(raw.path, None, camera)
+        sweeps = open_sweeps(signal.path, None, camera)
         anchors: list[Anchor] = []
-        values = load_mosaic(mosaic.path / "mosaic.zarr").values if sweeps else np.empty((0, 0, 0), np.float32)
+        seen = open_mosaic(mosaic.path / "mosaic.zarr")
+        under = seen.brightness(bands=BROAD_BANDS) if sweeps else np.empty((0, 0), np.float32)
         for number, one in enumerate(sweeps):
-            under = np.asarray(values[..., broad_bands(one.lines.references)].mean(axis=-1), np.float32)
             broad = BroadSweep.read(one.lines, camera, usable=one.usable)
             anchors.append(anchor_sweep(broad, camera, frame.grid, under, prior_px=2 * pointing_px))
             report((number + 1) / len(sweeps))
@@ -138,7 +135,7 @@ def register_fine(
         }
         write_table(path / RECORD, record)
 
-    return Wanted(build, {"prior_px": pointing_px, "pass": "fine", "grid": asdict(frame.grid)}, [raw, mosaic])
+    return Wanted(build, {"prior_px": pointing_px, "pass": "fine", "grid": asdict(frame.grid)}, [signal, mosaic])
 
 
 def load_registration(registration: StageRef) -> dict[str, Any]:
@@ -148,7 +145,7 @@ def load_registration(registration: StageRef) -> dict[str, Any]:
 
 @stage("locate", "lookup", GEOLOCATION)
 def locate(
-    raw: StageRef,
+    signal: StageRef,
     registration: StageRef | None = None,
     *,
     camera: LineCamera,
@@ -158,7 +155,7 @@ def locate(
 ) -> Wanted:
     """Look up where each coarse pixel was seen: a table that every survey along the same path shares."""
     grid = PixelGrid.of_scene(frame.grid, 1 if plan.plain else frame.grid.factor)
-    sweeps = open_sweeps(raw.path, record_of(registration), camera)
+    sweeps = open_sweeps(signal.path, record_of(registration), camera)
     params = {
         "camera": {name: getattr(camera, name) for name in ("samples", "pitch_um", "focal_length_mm")},
         "grid": asdict(grid),
@@ -185,9 +182,9 @@ def locate(
     return Wanted(build, params)  # keyed by the paths, not by what was seen along them
 
 
-@stage("rectify", "mosaic", MOSAIC)
+@stage("rectify", "mosaic", MOSAIC, inputs=2)
 def rectify(
-    raw: StageRef,
+    signal: StageRef,
     geolocation: StageRef,
     registration: StageRef | None = None,
     *,
@@ -199,123 +196,104 @@ def rectify(
     pool: WorkerPool,
     report: Report,
 ) -> Wanted:
-    """Bring the coarse sweeps onto the scene grid and blend them into one mosaic, tile by tile."""
+    """Bring the sweeps of the first pass onto the scene grid and blend them into one mosaic, tile by tile.
+
+    Its pixels are the scene's own of a uniform scan, else the coarse ones.
+    """
 
     def build(path: Path) -> None:
-        """Write mosaic and quicklook tile by tile, and what became of each sweep's lines."""
+        """Write mosaic and quicklook, and what became of each sweep's lines."""
+        factor = 1 if plan.plain else frame.grid.factor
         recipe = MosaicRecipe(
-            raw.path,
+            signal.path,
             camera,
-            PixelGrid.of_scene(frame.grid, frame.grid.factor),
+            PixelGrid.of_scene(frame.grid, factor),
             resampling,
             geolocation=geolocation.path / "geolocation.zarr",
             registration=record_of(registration),
-            finer=PixelGrid.of_scene(frame.grid, 1) if plan.plain else None,
         )
-        writer = MosaicWriter(
-            path / "mosaic.zarr",
-            frame.grid.coarse_shape,
-            frame.wavelength_nm,
-            fwhm_nm=frame.fwhm_nm,
-            grid=frame.angular_grid(frame.grid.factor),
-            simulation=open_raw_cubes(raw.path)[0].simulation,
-        )
-        picture = thumbnail_of(frame)
-        write_mosaic(recipe, writer, memory=memory, pool=pool, seen=picture, report=report)
-        finish_mosaic(writer, picture, frame)
+        writer = mosaic_of_sweeps(path, signal, frame, factor)
+        write_mosaic(recipe, writer, memory=memory, pool=pool, report=report)
+        finish_mosaic(writer, frame, factor)
         write_table(path / "lines.json", {one.lines.sweep.name: one.facts() for one in recipe.sweeps()})
 
     params = {"grid": asdict(frame.grid), "resampling": resampling, **frame.key}
-    return Wanted(build, params, [raw, geolocation, *_there(registration)])
+    return Wanted(build, params, [signal, geolocation, *_there(registration)])
 
 
-def thumbnail_of(frame: FieldFrame) -> Thumbnail:
-    """Return an empty picture of a mosaic on the coarse pixels."""
-    return Thumbnail(frame.grid.coarse_shape, choose_bands(frame.wavelength_nm)[0], QUICKLOOK_PX)
-
-
-def finish_mosaic(writer: MosaicWriter, picture: Thumbnail, frame: FieldFrame) -> None:
-    """Take out what is no scene, and store the picture of the rest."""
-    if frame.missing is not None:
-        gaps = blank_coarse(frame.missing, frame.grid.factor)
-        blank_pixels(writer.path, gaps, NO_VALUE)
-        picture.blank(gaps)
-    writer.write_quicklook(stretched(picture.image).image)
-
-
-def patch_writer(path: Path, frame: FieldFrame, patch_index: NDArray[np.integer]) -> PatchWriter:
-    """Begin the store of these patches, in their order."""
-    return PatchWriter(
-        path / "patches.zarr",
-        patch_index,
-        frame.grid.patch_origin(patch_index),
-        frame.grid.patch,
-        frame.wavelength_nm,
-        fwhm_nm=frame.fwhm_nm,
-        grid=frame.angular_grid(),
-    )
-
-
-@stage("extract_patches", "fine patches", PATCHES)
-def extract_patches(
+@stage("rectify_fine", "mosaic of the fine sweeps", MOSAIC, inputs=2, named="detail")
+def rectify_fine(
     attention: StageRef,
-    raw: StageRef,
+    signal: StageRef,
     registration: StageRef | None = None,
     *,
     camera: LineCamera,
     frame: FieldFrame,
-    plan: CapturePlan,
     resampling: Kernel,
     memory: int,
+    pool: WorkerPool,
     report: Report,
 ) -> Wanted:
-    """Bring every chosen patch onto the scene grid as one array (p, p, band); NaN where nothing was seen.
-
-    ``raw`` are the fine sweeps, or those of a uniform scan.
-    """
-    grid, most_bytes = frame.grid, memory // CACHE_FRACTION
-
-    def in_order(patch_index: NDArray[np.integer]) -> NDArray[np.integer]:
-        """Return patches as the sweeps pass them, so that a few of them need few lines at a time."""
-        row, column = np.divmod(patch_index, grid.patch_shape[1])
-        return patch_index[np.lexsort((column, row) if plan.along == "x" else (row, column))]
-
-    def everything(sweeps: Sequence[SweepPath], wanted: NDArray[np.integer]) -> Iterator[tuple[Values, Valid]]:
-        """Yield the wanted patches of a uniform scan by tables of its pixels: faster than locating each of them."""
-        placed = [one.placed(camera, PixelGrid.of_scene(grid, 1)) for one in sweeps]
-        among, first = np.isin(in_order(grid.valid_patches()), wanted), 0
-        for values, seen in read_every_patch(placed, camera, grid, resampling, most_bytes=most_bytes):
-            kept = among[first : (first := first + len(values))]
-            yield (values, seen) if kept.all() else (values[kept], seen[kept])
-
-    def some(sweeps: Sequence[SweepPath], wanted: NDArray[np.integer]) -> Iterator[tuple[Values, Valid]]:
-        placed, cache = [one.placed(camera) for one in sweeps], LineCache(most_bytes)
-        for first in range(0, len(wanted), PATCHES_AT_ONCE):
-            yield read_patches(placed, camera, grid, wanted[first : first + PATCHES_AT_ONCE], resampling, cache=cache)
+    """Bring the fine sweeps onto the scene's own pixels where patches were chosen; what lies beside them is not made."""
 
     def build(path: Path) -> None:
-        """Write the patches in the order in which sweeps pass them, a batch of patches at a time."""
-        patch_index, done = in_order(load_plan(attention).patch_index), 0
-        writer, sweeps = patch_writer(path, frame, patch_index), open_sweeps(raw.path, record_of(registration), camera)
-        for values, seen in (everything if plan.plain and len(patch_index) else some)(sweeps, patch_index):
-            here = patch_index[done : (done := done + len(values))]
-            if frame.missing is not None:  # no value, and no validity, where the scene has none
-                gaps = patch_pixels(grid, frame.missing)[here]
-                values, seen = np.where(gaps[..., None], np.float32(np.nan), values), seen & ~gaps
-            writer.write(values, seen)
-            report(done / len(patch_index))
+        """Write the tiles that hold chosen patches."""
+        recipe = MosaicRecipe(
+            signal.path, camera, PixelGrid.of_scene(frame.grid, 1), resampling, registration=record_of(registration)
+        )
+        writer, chosen = mosaic_of_sweeps(path, signal, frame, 1), load_plan(attention).patch_index
+        if len(chosen):
+            there = pixels_of_patches(frame.grid, chosen)
+            write_mosaic(recipe, writer, memory=memory, pool=pool, wanted=there, report=report)
+        finish_mosaic(writer, frame, 1)
 
-    params = {"grid": asdict(grid), "resampling": resampling, **frame.key}
-    return Wanted(build, params, [attention, raw, *_there(registration)])
+    params = {"grid": asdict(frame.grid), "resampling": resampling, **frame.key}
+    return Wanted(build, params, [attention, signal, *_there(registration)])
 
 
-def seen_fractions(frame: FieldFrame, patches: StageRef) -> NDArray[np.float64]:
-    """How much of each patch was seen, (patch,) 0..1 of its pixels on the scene; 1 where it has none there."""
-    store = open_patches(patches.path / "patches.zarr")
-    seen: NDArray[np.float64] = read_array(store.group, "valid").mean(axis=(1, 2))
-    there = frame.grid.valid_fraction().ravel()[store.patch_index]
+def pixels_of_patches(grid: SceneGrid, patch_index: NDArray[np.integer]) -> Valid:
+    """(y, x) pixels of the scene that lie in some patches."""
+    chosen = np.zeros(int(np.prod(grid.patch_shape)), np.bool_)
+    chosen[patch_index] = True
+    pixels = np.kron(chosen.reshape(grid.patch_shape), np.ones((grid.patch, grid.patch), np.bool_))
+    return np.asarray(pixels[: grid.height, : grid.width], np.bool_)
+
+
+def mosaic_of_sweeps(path: Path, signal: StageRef, frame: FieldFrame, factor: int) -> MosaicWriter:
+    """Begin the mosaic of condensed sweeps, in pixels of ``factor`` fine ones."""
+    sweeps = open_signal_cubes(signal.path)
+    components = sweeps[0].components if sweeps else Components.empty(len(frame.wavelength_nm))
+    return MosaicWriter(
+        path / "mosaic.zarr",
+        frame.grid.coarse_shape if factor > 1 else (frame.grid.height, frame.grid.width),
+        components,
+        frame.wavelength_nm,
+        step=MOSAIC_STEP * sweeps[0].step if sweeps else 1.0,
+        largest=max((sweep.largest for sweep in sweeps), default=0.0) * KERNEL_GAIN,
+        fwhm_nm=frame.fwhm_nm,
+        grid=frame.angular_grid(factor),
+        simulation=sweeps[0].simulation if sweeps else None,
+    )
+
+
+def finish_mosaic(writer: MosaicWriter, frame: FieldFrame, factor: int) -> None:
+    """Take out what is no scene, and store a picture of the rest."""
     if frame.missing is not None:
-        there = there - patch_pixels(frame.grid, frame.missing)[store.patch_index].mean(axis=(1, 2))
+        gaps = frame.missing if factor == 1 else blank_coarse(frame.missing, factor)
+        blank_pixels(writer.path, gaps, nothing_seen(writer.path))
+    mosaic = open_mosaic(writer.path)
+    step, bands = -(-max(mosaic.shape) // QUICKLOOK_PX), choose_bands(frame.wavelength_nm)[0]
+    writer.write_quicklook(stretched(mosaic.thinned(step, bands)).image)
+
+
+def seen_fractions(frame: FieldFrame, detail: StageRef, patch_index: NDArray[np.integer]) -> NDArray[np.float64]:
+    """How much of each patch was seen, (patch,) 0..1 of its pixels on the scene; 1 where it has none there."""
+    grid = frame.grid
+    covered = patch_pixels(grid, open_mosaic(detail.path / "mosaic.zarr").coverage() > 0)[patch_index]
+    seen: NDArray[np.float64] = covered.mean(axis=(1, 2))
+    there = grid.valid_fraction().ravel()[patch_index]
+    if frame.missing is not None:
+        there = there - patch_pixels(grid, frame.missing)[patch_index].mean(axis=(1, 2))
     return np.divide(seen, there, out=np.ones_like(seen), where=there > 0)
 
 

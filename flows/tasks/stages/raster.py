@@ -1,51 +1,64 @@
-"""The stages of a raster, whose pixels are taken as they are: coarse means, and patches at the file's own pixels."""
+"""The stage of a raster, whose pixels are taken as they are: they are condensed, and nothing is captured."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
-from flows.settings.survey_settings import RASTER
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.settings.survey_settings import RASTER, SignalChoice
 from flows.tasks.stage import FieldFrame, Report, Wanted, stage
-from flows.tasks.stages.attention import load_plan
-from flows.tasks.stages.placement import MOSAIC, PATCHES, finish_mosaic, patch_writer, thumbnail_of
-from storage.archive.keys import StageRef
+from flows.tasks.stages.placement import MOSAIC, finish_mosaic
+from pipeline.readings import MOST_VALUE, readings_alone
+from pipeline.signal.condense import UNUSABLE, score_lines
+from pipeline.signal.subspace import SignalStatistics, find_components
+from storage.arrays.layout import SHARD_ROWS
 from storage.arrays.mosaics import MosaicWriter
-from storage.readers.raster_fields import RasterPixels, write_means, write_patches
+from storage.readers.raster_fields import RasterPixels
+
+Strip = tuple[int, NDArray[np.float32], NDArray[np.bool_]]
 
 
-@stage("average_raster", "coarse means of the raster", MOSAIC, inputs=0)
-def average_raster(*, raster: RasterPixels, frame: FieldFrame, scene_key: str, memory: int, report: Report) -> Wanted:
-    """Store the means of factor x factor pixels of a raster: what attention looks at first."""
-
-    def build(path: Path) -> None:
-        """Write mosaic and quicklook some rows at a time; where most of a pixel has no value, it has none."""
-        grid, place = frame.grid, frame.angular_grid(frame.grid.factor)
-        wave, fwhm = frame.wavelength_nm, frame.fwhm_nm
-        writer = MosaicWriter(path / "mosaic.zarr", grid.coarse_shape, wave, fwhm_nm=fwhm, grid=place)
-        picture = thumbnail_of(frame)
-        write_means(raster, writer, memory=memory, seen=picture, report=report)
-        finish_mosaic(writer, picture, frame)
-
-    return Wanted(build, _params(frame, scene_key))
-
-
-@stage("take_patches", "patches of the raster", PATCHES, inputs=1)
-def take_patches(
-    attention: StageRef, *, raster: RasterPixels, frame: FieldFrame, scene_key: str, memory: int, report: Report
+@stage("condense_raster", "signal of the raster", MOSAIC, inputs=0)
+def condense_raster(
+    *, raster: RasterPixels, frame: FieldFrame, signal: SignalChoice, scene_key: str, memory: int, report: Report
 ) -> Wanted:
-    """Store the patches that attention asks for, at the raster's own pixels; NaN where it has no value."""
+    """Condense the pixels of a raster into the mosaic of its field."""
+
+    def strips() -> Iterator[Strip]:
+        """Yield the first row, values and validity of some rows at a time."""
+        deep = max(raster.rows_at_once(memory) // SHARD_ROWS, 1) * SHARD_ROWS
+        for first in range(0, frame.grid.height, deep):
+            values = readings_alone(raster.rows(first, min(first + deep, frame.grid.height)), MOST_VALUE)
+            valid = np.isfinite(values)
+            yield first, values, valid.all(axis=2) if valid.all() else valid
 
     def build(path: Path) -> None:
-        """Write the patches in the order of their numbers, some rows of the raster at a time."""
-        patch_index = load_plan(attention).patch_index
-        write_patches(raster, patch_writer(path, frame, patch_index), patch_index, memory=memory, report=report)
+        """Read the raster twice: for its components, and for its scores."""
+        found = SignalStatistics(raster.bands, frame.grid.height * frame.grid.width)
+        for first, values, valid in strips():
+            found.add(values, valid)
+            report(0.5 * first / frame.grid.height)
+        components = find_components(found, false_alarm=signal.false_alarm, least=signal.least)
+        origin = np.zeros(raster.bands) if found.origin is None else found.origin
+        writer = MosaicWriter(
+            path / "mosaic.zarr",
+            (frame.grid.height, frame.grid.width),
+            components,
+            frame.wavelength_nm,
+            step=signal.step,
+            largest=components.largest(found.largest + np.abs(origin - np.nan_to_num(components.mean))),
+            fwhm_nm=frame.fwhm_nm,
+            grid=frame.angular_grid(),
+        )
+        for first, values, valid in strips():
+            seen = score_lines(values, valid, components)
+            writer.write_rows(first, seen.scores, seen.quality != UNUSABLE)
+            report(0.5 + 0.5 * (first + len(values)) / frame.grid.height)
+        finish_mosaic(writer, frame, 1)
 
-    return Wanted(build, _params(frame, scene_key), [attention])
-
-
-def _params(frame: FieldFrame, scene_key: str) -> dict[str, Any]:
-    """Return what pixels of a raster depend on: the content of its files, and the grid."""
-    bands = len(frame.wavelength_nm)
-    return {"source": RASTER, "scene": scene_key, "bands": bands, "grid": asdict(frame.grid), **frame.key}
+    params = {"source": RASTER, "scene": scene_key, "grid": asdict(frame.grid), **asdict(signal), **frame.key}
+    return Wanted(build, params | {"bands": raster.bands})

@@ -121,6 +121,7 @@ def _probe(placed: Placed, camera: LineCamera, window: Window) -> NDArray[np.flo
     turned = sweep.along == "y"
     grid = PixelGrid(start[::-1] if turned else start, spacing, (columns, rows) if turned else (rows, columns))
     values, _ = mosaic_tile([placed], camera, grid, slice(0, grid.shape[0]), slice(0, grid.shape[1]), kernel="bilinear")
+    values = placed.signal.spectra(values)
     return values.swapaxes(0, 1) if turned else values
 
 

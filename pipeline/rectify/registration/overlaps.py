@@ -19,7 +19,7 @@ from pipeline.geometry.scan import Sweep, shifted_position
 from pipeline.rectify.geolocation import path_geolocation
 from pipeline.rectify.resample import resample
 from pipeline.rectify.scan_paths import ScanPath, make_scan_paths
-from pipeline.signal.lines import BROAD_BANDS, Signal
+from pipeline.signal.lines import BROAD_BANDS, signal_of
 from pipeline.source import SweepLines
 
 Floats = NDArray[np.float64]
@@ -47,7 +47,7 @@ class BroadSweep:
         """
         position = np.asarray(lines.position, np.float64)
         usable = (lines.valid_line if usable is None else usable) & np.isfinite(position).all(axis=1)
-        return cls(lines.sweep, position, usable, Signal(lines).broad_image(usable, camera.full_scale_dn, bands))
+        return cls(lines.sweep, position, usable, signal_of(lines).broad_image(usable, camera.full_scale_dn, bands))
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,138 @@
+"""The stage that condenses lines: to the components of the field's spectra that rise above the noise."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flows.settings.survey_settings import SignalChoice
+from flows.tasks.stage import Product, Report, Wanted, stage
+from flows.tasks.stages.capture import STATISTICS
+from pipeline.geometry.camera import LineCamera
+from pipeline.signal.components import Components
+from pipeline.signal.condense import RESIDUAL_STEP, ResidualLaw
+from pipeline.signal.subspace import FEW_BANDS, SignalStatistics, find_components, with_shared
+from pipeline.signal.sweep_signal import CondensedSweep, Condenser, camera_noise, differing_lines
+from storage.archive.keys import StageRef
+from storage.archive.manifests import read_table, write_table
+from storage.arrays.cubes import RawCube, SweepHeader, open_raw_cubes
+from storage.arrays.signal_cubes import LineFacts, SignalCubeWriter, open_signal_cubes
+from storage.arrays.spool import line_values
+
+SIGNAL = Product("condense", version=1, files=("signal.json",))
+RECORD = "signal.json"
+SHARED_FRACTION = 2e-3  # of all spectra: of more rare ones, a component is cheaper than their residuals
+MOST_RARE = 0.05  # of spectra: more are no exceptions, and raw lines stay
+
+
+@stage("condense_coarse", "signal of the sweeps", SIGNAL, inputs=1, named="signal_coarse")
+def condense_coarse(
+    raw: StageRef, *, camera: LineCamera, signal: SignalChoice, noise_known: bool, report: Report
+) -> Wanted:
+    """Condense the sweeps of the first pass, or of a uniform scan."""
+    return _condensed(raw, camera, signal, noise_known, report)
+
+
+@stage("condense_fine", "signal of the fine sweeps", SIGNAL, inputs=1, named="signal_fine")
+def condense_fine(
+    raw: StageRef, *, camera: LineCamera, signal: SignalChoice, noise_known: bool, report: Report
+) -> Wanted:
+    """Condense the sweeps of the second pass."""
+    return _condensed(raw, camera, signal, noise_known, report)
+
+
+def _condensed(raw: StageRef, camera: LineCamera, choice: SignalChoice, noise_known: bool, report: Report) -> Wanted:
+    """Want the condensed sweeps of a capture. ``noise_known``: the camera's model holds for its lines."""
+
+    def build(path: Path) -> None:
+        """Find the components of the pass, and write every sweep's scores; once more where rare spectra share some."""
+        cubes = open_raw_cubes(raw.path)
+        found = SignalStatistics.load(raw.path / STATISTICS)
+        components = components_of(found, cubes, camera, choice, noise_known)
+        condenser = Condenser(
+            components, ResidualLaw.learned(found.spectra, components), camera, choice.rare_spectra, choice.step
+        )
+        done = _write_sweeps(path, cubes, condenser, found, report)
+        rare, spectra = sum(len(one.rare) for one in done), sum(one.known for one in done)
+        if rare > max(2 * components.bands, SHARED_FRACTION * spectra):
+            residuals = np.concatenate([one.residuals for one in done]) * np.float32(RESIDUAL_STEP)
+            shared = with_shared(components, residuals, choice.false_alarm)
+            if len(shared) > len(components):
+                condenser = replace(condenser, components=shared, law=ResidualLaw.learned(found.spectra, shared))
+                done = _write_sweeps(path, cubes, condenser, found, report)
+        write_table(path / RECORD, _record(condenser, done))
+
+    return Wanted(build, {"camera": _camera_key(camera), **asdict(choice)}, [raw])
+
+
+def _camera_key(camera: LineCamera) -> dict[str, Any]:
+    """Return what scores depend on of a camera: where samples saturate, and the noise of few bands."""
+    return {name: getattr(camera, name) for name in ("bits", "electrons_per_dn", "read_noise_e")}
+
+
+def components_of(
+    found: SignalStatistics, cubes: Sequence[RawCube], camera: LineCamera, choice: SignalChoice, noise_known: bool
+) -> Components:
+    """Find the components of a pass; few bands take their noise from the camera's model, where that is known."""
+    noise = None
+    if noise_known and found.bands <= FEW_BANDS and found.count and found.origin is not None:
+        mean = found.origin + found.total / found.count
+        noise = camera_noise(mean, cubes[0].references, camera, cubes[0].sweep.binning)
+    return find_components(found, false_alarm=choice.false_alarm, least=choice.least, noise=noise)
+
+
+def _write_sweeps(
+    path: Path, cubes: Sequence[RawCube], condenser: Condenser, found: SignalStatistics, report: Report
+) -> list[CondensedSweep]:
+    """Store the scores of every sweep, and what components do not hold."""
+    origin = np.zeros(found.bands) if found.origin is None else found.origin
+    largest = condenser.components.largest(found.largest + np.abs(origin - np.nan_to_num(condenser.components.mean)))
+    done = []
+    for number, cube in enumerate(cubes):
+        out = path / f"{cube.sweep.name}.zarr"
+        shutil.rmtree(out, ignore_errors=True)
+        writer = SignalCubeWriter(out, header_of(cube), condenser.components, step=condenser.step, largest=largest)
+
+        def part(fraction: float, number: int = number) -> None:
+            report((number + fraction) / len(cubes))
+
+        done.append(condenser.sweep(cube, writer.write, part))
+        x, y = cube.position.T
+        facts = LineFacts(cube.time_s, x, y, cube.exposure_ms, cube.valid_line)
+        writer.close(facts, done[-1].rare, done[-1].residuals, cube.quicklook())
+    return done
+
+
+def header_of(cube: RawCube) -> SweepHeader:
+    """Return what was known of a stored sweep before its first line."""
+    bands = cube.wavelength_nm, cube.fwhm_nm
+    return SweepHeader(cube.sweep, cube.references, *bands, cube.source, cube.started, cube.simulation)
+
+
+def _record(condenser: Condenser, done: Sequence[CondensedSweep]) -> dict[str, Any]:
+    """Return what receipts and checks want to know of a condensed pass."""
+    return {
+        "components": len(condenser.components),
+        "bands": condenser.components.bands,
+        "step": condenser.step,
+        "spectra": sum(one.known for one in done),
+        "rare": sum(len(one.rare) for one in done),
+    }
+
+
+def raw_differs(raw: StageRef, signal: StageRef, camera: LineCamera) -> str | None:
+    """Compare every raw line with what was condensed from it; say why raw lines are to stay, None where they may go."""
+    record = read_table(signal.path / RECORD)
+    if record["rare"] > MOST_RARE * max(record["spectra"], 1):
+        fraction = 100 * record["rare"] / record["spectra"]
+        return f"{fraction:.1f} % of the spectra have more than noise beside {record['components']} components"
+    for cube, stored in zip(open_raw_cubes(raw.path), open_signal_cubes(signal.path), strict=True):
+        wrong = differing_lines(cube, stored, camera)
+        if wrong:
+            return f"sweep {cube.sweep.name}: {line_values(wrong)} of the signal are not those of the raw lines"
+    return None

@@ -1,0 +1,82 @@
+"""Components: the few numbers that hold the signal of a spectrum, and the linear law by which they give it back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Scores = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Components:
+    """Directions of whitened spectra: ``spectrum = scores @ axes * noise + mean``. Scores count in noise's deviations.
+
+    A band without any value is NaN in ``mean`` and ``noise``, and 0 in ``axes``.
+    """
+
+    mean: Floats  # (band,) scene value
+    axes: Floats  # (component, band) orthonormal rows
+    noise: Floats  # (band,) standard deviation of one spectrum's noise [scene value]
+
+    @classmethod
+    def empty(cls, bands: int) -> Components:
+        """Of lines without a single value: no component."""
+        return cls(np.full(bands, np.nan), np.zeros((0, bands)), np.full(bands, np.nan))
+
+    def __len__(self) -> int:
+        return len(self.axes)
+
+    @property
+    def bands(self) -> int:
+        """Bands of a spectrum."""
+        return len(self.mean)
+
+    def white(self, values: NDArray[np.floating]) -> Scores:
+        """Return whitened spectra of scene values (..., band); 0 in bands without a value anywhere."""
+        lit = np.isfinite(self.mean)
+        scale = np.where(lit, 1 / np.where(lit, self.noise, 1), 0).astype(np.float32)
+        found = np.asarray(values - np.nan_to_num(self.mean).astype(np.float32), np.float32)
+        found *= scale
+        if not lit.all():
+            found[..., ~lit] = 0
+        return found
+
+    def restore(self, scores: NDArray[np.floating]) -> Scores:
+        """Return scene values (..., band) of scores (..., component); NaN where a score is NaN, or a band has none."""
+        return np.asarray(scores, np.float32) @ self._rows + self.mean.astype(np.float32)
+
+    def of_bands(self, bands: Sequence[int]) -> Components:
+        """Return the law of some bands alone; its axes are no longer orthonormal."""
+        chosen = list(bands)
+        return Components(self.mean[chosen], self.axes[:, chosen], self.noise[chosen])
+
+    def largest(self, values: Floats) -> float:
+        """Size that no score of spectra exceeds whose bands lie within (band,) ``values`` of the mean."""
+        lit = np.isfinite(self.mean)
+        return float(np.linalg.norm(np.where(lit, values, 0) / np.where(lit, self.noise, 1)))
+
+    @property
+    def _rows(self) -> Scores:
+        return np.asarray(self.axes * np.nan_to_num(self.noise), np.float32)
+
+    def onto(self, matrix: NDArray[np.floating]) -> tuple[Scores, Scores]:
+        """Weights (component, n) and offset (n,) that give ``spectrum @ matrix`` of scores, for a (band, n) matrix.
+
+        Bands without a value count nothing.
+        """
+        exact = np.asarray(matrix, np.float64)
+        weights = (self.axes * np.nan_to_num(self.noise)) @ exact
+        return weights.astype(np.float32), (np.nan_to_num(self.mean) @ exact).astype(np.float32)
+
+    def scaled(self, gain: NDArray[np.floating]) -> tuple[Scores, Scores]:
+        """Matrix (component, component) and offset (component,) that multiply spectra by a (band,) gain, in scores."""
+        lit = np.isfinite(self.mean)
+        factor = np.where(lit, gain, 0).astype(np.float64)
+        matrix = (self.axes * factor) @ self.axes.T
+        shift = np.where(lit, (factor - 1) * np.nan_to_num(self.mean) / np.where(lit, self.noise, 1), 0) @ self.axes.T
+        return matrix.astype(np.float32), shift.astype(np.float32)

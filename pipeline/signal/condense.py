@@ -1,0 +1,161 @@
+"""Condensing: spectra to scores of the field's components, and the rare spectra that components do not hold.
+
+A spectrum whose residual is more than noise by a chi-square test, alone or with its neighbours, keeps its residual.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
+from scipy.special import ndtri
+
+from pipeline.readings import SIGMA_OF_MEDIAN
+from pipeline.signal.components import Components
+
+WHOLE, PARTIAL, UNUSABLE = 0, 1, 2  # all bands seen; some restored from the others; less than half of the bands seen
+JOINT = ((2, 2), (1, 8), (8, 1))  # (line, sample) of neighbours whose residuals are tested together
+LAW_ROUNDS, LAW_CLIP = 4, 4.0
+LEAST_EXPECTED = 0.2  # of the mean residual, whatever the law says of dark or bright spectra
+RESIDUAL_STEP = 0.5  # in which residuals of rare spectra are kept [noise's deviations]
+
+Scores = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class ScoredLines:
+    """Some lines in components: scores before rounding, what can be said of each spectrum, and what is left of it."""
+
+    scores: Scores  # (line, sample, component) in noise's deviations; 0 where nothing was seen
+    quality: NDArray[np.uint8]  # (line, sample) WHOLE, PARTIAL or UNUSABLE
+    residual: Scores  # (line, sample) mean square a degree of freedom, in the noise's variance; NaN where unusable
+
+
+def score_lines(values: NDArray[np.float32], valid: Bools, components: Components) -> ScoredLines:
+    """Project (line, sample, band) scene values onto components, by the bands that `calibrate` calls valid.
+
+    Where bands of a spectrum are missing the scores are those of least squares over the others. ``valid`` is (line,
+    sample) or (line, sample, band).
+    """
+    axes = components.axes.T.astype(np.float32)
+    lit = np.isfinite(components.mean)
+    bands, count = int(lit.sum()), len(components)
+    white = components.white(values)
+    there = None
+    if valid.ndim == 3 or not np.isfinite(values[..., lit] if not lit.all() else values).all():
+        there = np.isfinite(values) & (valid if valid.ndim == 3 else valid[..., None])
+        there[..., ~lit] = False
+        white = np.where(there, white, np.float32(0))
+    scores = white @ axes
+    left = np.einsum("lsb,lsb->ls", white, white) - np.einsum("lsk,lsk->ls", scores, scores)
+    residual = np.maximum(left, 0) / np.float32(max(bands - count, 1))
+    quality = np.where(valid if valid.ndim == 2 else valid.any(axis=2), WHOLE, UNUSABLE).astype(np.uint8)
+    if there is not None:
+        seen = there.sum(axis=2)
+        quality[2 * seen < bands] = UNUSABLE
+        some = (quality == WHOLE) & (seen < bands)
+        quality[some] = PARTIAL
+        if some.any():
+            scores[some], residual[some] = _least_squares(white[some], there[some], axes)
+    unusable = quality == UNUSABLE
+    if count and unusable.any():
+        scores[unusable] = 0
+    residual[unusable] = np.nan
+    return ScoredLines(scores, quality, residual.astype(np.float32))
+
+
+def _least_squares(white: Scores, there: Bools, axes: Scores) -> tuple[Scores, Scores]:
+    """Scores (n, component) and residuals (n,) of whitened spectra (n, band), by the bands that are there."""
+    count = axes.shape[1]
+    products = (axes[:, :, None] * axes[:, None, :]).reshape(len(axes), -1)
+    scores, residual = np.empty((len(white), count), np.float32), np.empty(len(white), np.float32)
+    for first in range(0, len(white), 4096):
+        part = slice(first, first + 4096)
+        gram = (there[part].astype(np.float32) @ products).reshape(-1, count, count).astype(np.float64)
+        gram += 1e-6 * np.eye(count)
+        found = np.linalg.solve(gram, (white[part] @ axes).astype(np.float64)[..., None])[..., 0]
+        scores[part] = found
+        rest = np.where(there[part], white[part] - scores[part] @ axes.T, 0)
+        residual[part] = np.einsum("nb,nb->n", rest, rest) / np.maximum(there[part].sum(axis=1) - count, 1)
+    return scores, residual
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualLaw:
+    """The mean square residual to expect of a spectrum: affine in its scores, for shot noise grows with the signal."""
+
+    constant: float
+    slope: NDArray[np.float64]  # (component,)
+    freedom: float  # degrees of freedom that the residuals of single spectra spread by
+
+    @classmethod
+    def learned(cls, spectra: NDArray[np.float32], components: Components) -> ResidualLaw:
+        """Learn it of (n, band) spectra, outliers left out."""
+        freedom = max(int(np.isfinite(components.mean).sum()) - len(components), 1)
+        if len(spectra) < 8 * (len(components) + 1):
+            return cls(1.0, np.zeros(len(components)), float(freedom))
+        seen = score_lines(spectra[None], np.ones((1, len(spectra)), np.bool_), components)
+        known = np.isfinite(seen.residual[0])
+        scores, residual = seen.scores[0][known].astype(np.float64), seen.residual[0][known].astype(np.float64)
+        design = np.concatenate([np.ones((len(scores), 1)), scores], axis=1)
+        kept = residual <= np.median(residual) * 4
+        for _ in range(LAW_ROUNDS):
+            law = np.linalg.lstsq(design[kept], residual[kept], rcond=None)[0]
+            floor = LEAST_EXPECTED * float(residual[kept].mean())
+            ratio = residual / np.maximum(design @ law, max(floor, 1e-12))
+            spread = SIGMA_OF_MEDIAN * float(np.median(np.abs(ratio - np.median(ratio))))
+            kept = np.abs(ratio - 1) <= LAW_CLIP * max(spread, 1e-6)
+        return cls(float(law[0]), law[1:], float(np.clip(2 / max(spread, 1e-6) ** 2, 1.0, freedom)))
+
+    def expected(self, scores: Scores) -> Scores:
+        """(...) mean square residual to expect of (..., component) scores."""
+        least = max(LEAST_EXPECTED * self.constant, 1e-12)
+        return np.maximum(self.constant + scores @ self.slope.astype(np.float32), np.float32(least))
+
+
+def find_rare(ratio: NDArray[np.float32], law: ResidualLaw, false_alarm: float) -> Bools:
+    """Which (line, sample) spectra have more residual than noise gives, alone or with their neighbours.
+
+    ``ratio`` is the residual over the expected one, NaN where unusable; ``false_alarm`` the number of spectra of the
+    whole image that noise alone may mark, over all tests together.
+    """
+    known = np.isfinite(ratio)
+    count = max(int(known.sum()), 1)
+    limit = float(ndtri(1 - min(false_alarm / (1 + len(JOINT)) / count, 0.5)))
+    rare = known & (_deviations(np.where(known, ratio, 1), law.freedom) > limit)
+    filled = np.where(known, ratio, 1).astype(np.float64)
+    for lines, samples in JOINT:
+        if lines > ratio.shape[0] or samples > ratio.shape[1]:
+            continue
+        mean = uniform_filter(filled, (lines, samples), mode="nearest")
+        high = _deviations(mean, law.freedom * lines * samples) > limit
+        if high.any():  # all spectra of the window
+            reach = uniform_filter(
+                high.astype(np.float32), (lines, samples), mode="constant", origin=_back(lines, samples)
+            )
+            rare |= known & (reach > 0.5 / (lines * samples))
+    return rare
+
+
+def _back(lines: int, samples: int) -> tuple[int, int]:
+    """Origin of the filter that spreads a mark over the window that it came from."""
+    return tuple(-1 if size % 2 == 0 else 0 for size in (lines, samples))  # type: ignore[return-value]
+
+
+def _deviations(ratio: NDArray[np.floating], freedom: float) -> NDArray[np.floating]:
+    """Deviations from normal of a mean square over its expectation (Wilson & Hilferty 1931)."""
+    width = 2 / (9 * freedom)
+    return (np.cbrt(ratio) - (1 - width)) / np.sqrt(width)
+
+
+def residual_steps(
+    values: NDArray[np.float32], scores: Scores, components: Components, valid: Bools | None = None
+) -> NDArray[np.int16]:
+    """What (n, component) scores leave of (n, band) spectra, in half deviations of the noise; 0 where a band has none."""
+    left = components.white(values) - scores @ components.axes.astype(np.float32)
+    there = np.isfinite(left) if valid is None else np.isfinite(left) & valid
+    steps = np.rint(np.where(there, left, 0) / RESIDUAL_STEP)
+    return np.clip(steps, -32767, 32767).astype(np.int16)

@@ -1,0 +1,302 @@
+"""The signal subspace of a field: which directions of spectra rise above the noise, tested over the whole field.
+
+Second moments are accumulated while lines arrive. Means over 4 x 4 spectra carry 1/16 of the noise variance, so that a
+weak signal that neighbours share stands out of their covariance where single spectra hide it (a minimum noise fraction
+transform: Green et al. 1988). Eigenvalues of noise alone end at the edge of the Marchenko-Pastur law, and beyond it
+they fluctuate by the Tracy-Widom law (Johnstone 2001): that is the test.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.readings import SIGMA_OF_MEDIAN
+from pipeline.signal.components import Components
+
+BLOCK = 4  # spectra a side of a mean
+SPECTRA_A_BAND = 200  # single spectra that a covariance is estimated from, for each band; more cost and tell little
+FEW_BANDS = 8  # fewer cannot predict each other: the noise comes from neighbouring pixels, and all bands are kept
+KEPT_SPECTRA = 8192  # of which the law of residuals is learned
+NOISE_ROUNDS = 6
+MOST_SHARED = 32  # directions of rare spectra that become components
+LEAST_NOISE = 1e-6  # of a band's largest value: values that never change have no noise to divide by
+NEIGHBOURS = 4  # bands to either side that predict a band, where spectra are too few for all
+# 1 - probability of the Tracy-Widom law (real matrices), and its quantiles
+TRACY_WIDOM = (
+    (0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 1e-3, 1e-4, 1e-6),
+    (-0.1653, 0.4501, 0.9793, 1.6017, 2.0234, 2.4224, 3.2724, 4.3549, 6.27),
+)
+
+SUMS = ("lit", "total", "single", "block", "block_total", "largest")
+
+Floats = NDArray[np.float64]
+Values = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+
+@dataclass
+class SignalStatistics:
+    """Second moments of spectra, of their means over 4 x 4 and of neighbours' differences, and some spectra as such.
+
+    Spectra are centred on a mean of the first ones, so that nothing cancels. Those with less than half of their bands
+    are left out; where single bands are missing they count as the mean.
+    """
+
+    bands: int
+    expected: int  # spectra that will come, about
+    count: int = 0
+    means: int = 0
+    origin: Values | None = None  # (band,)
+    lit: Bools = field(init=False)  # (band,) with a value anywhere
+    total: Floats = field(init=False)  # (band,) sum of the single spectra counted, from the origin
+    single: Floats = field(init=False)  # (band, band) sum of their products
+    block: Floats = field(init=False)  # (band, band) the same of means
+    block_total: Floats = field(init=False)
+    largest: Floats = field(init=False)  # (band,) farthest value from the origin
+    rough: list[Values] = field(default_factory=list)  # (n, band) second differences of neighbours
+    kept: list[Values] = field(default_factory=list)  # (n, band) spectra, from the origin
+
+    def __post_init__(self) -> None:
+        self.lit = np.zeros(self.bands, np.bool_)
+        self.total, self.block_total, self.largest = np.zeros((3, self.bands))
+        self.single, self.block = np.zeros((2, self.bands, self.bands))
+        wanted = max(SPECTRA_A_BAND * self.bands, 4 * KEPT_SPECTRA)
+        self._stride = int(np.clip(np.sqrt(self.expected / wanted), 1, BLOCK))
+        self._thin = max(1, round(self.expected / self._stride**2 / KEPT_SPECTRA))
+
+    def add(self, values: Values, valid: Bools) -> None:
+        """Take some neighbouring lines: (line, sample, band) scene values, and `calibrate`'s validity of them."""
+        if not values.size or not valid.any():
+            return
+        spectra, whole = self._centred(values, valid)
+        np.maximum(self.largest, np.maximum(spectra.max(axis=(0, 1)), -spectra.min(axis=(0, 1))), out=self.largest)
+        lines, samples = (size // BLOCK for size in whole.shape)
+        if lines and samples:
+            cut = np.s_[: lines * BLOCK, : samples * BLOCK]
+            shape = (lines, BLOCK, samples, BLOCK)
+            every = whole[cut].reshape(shape).all(axis=(1, 3))
+            rows = spectra[cut].reshape(lines, BLOCK, samples * BLOCK, -1).sum(axis=1)
+            means = rows.reshape(lines, samples, BLOCK, -1).sum(axis=2)[every] / np.float32(BLOCK * BLOCK)
+            self.block += means.T @ means
+            self.block_total += means.sum(axis=0, dtype=np.float64)
+            self.means += len(means)
+        thin = np.s_[:: self._stride, :: self._stride]
+        some = spectra[thin][whole[thin]]
+        self.single += some.T @ some
+        self.total += some.sum(axis=0, dtype=np.float64)
+        self.kept.append(some[:: self._thin].copy())
+        self.count += len(some)
+        if self.bands <= FEW_BANDS:
+            self._add_rough(spectra, whole)
+
+    def _centred(self, values: Values, valid: Bools) -> tuple[Values, Bools]:
+        """Return spectra from the origin with 0 for what is missing, and which of them count."""
+        by_band = valid if valid.ndim == 3 else valid[..., None]
+        if self.origin is None or not self.lit.all():
+            seen = (by_band & np.isfinite(values)).any(axis=(0, 1))
+            first = np.nan_to_num(np.nanmean(np.where(by_band, values, np.nan), axis=(0, 1))) if seen.any() else 0.0
+            before = np.zeros(self.bands, np.float32) if self.origin is None else self.origin
+            self.origin = np.where(self.lit, before, np.where(seen, first, 0)).astype(np.float32)
+            self.lit |= seen
+        spectra = values - self.origin
+        if valid.ndim == 2 and valid.all() and self.lit.all():
+            if np.isfinite(spectra).all():
+                return spectra, valid
+        there = np.isfinite(spectra) & by_band
+        spectra = np.where(there, spectra, np.float32(0))
+        return spectra, np.asarray(2 * there.sum(axis=2) >= max(self.lit.sum(), 1))
+
+    @property
+    def spectra(self) -> Values:
+        """(n, band) some spectra of all over the field, scene values."""
+        if self.origin is None or not self.kept:
+            return np.zeros((0, self.bands), np.float32)
+        return np.concatenate(self.kept) + self.origin
+
+    def save(self, path: Path) -> None:
+        """Write all of it into a file of numpy."""
+        rough = np.concatenate(self.rough) if self.rough else np.zeros((0, self.bands), np.float32)
+        origin = np.full(self.bands, np.nan) if self.origin is None else self.origin
+        kept = np.concatenate(self.kept) if self.kept else np.zeros((0, self.bands), np.float32)
+        sums = {name: getattr(self, name) for name in SUMS}
+        counts = np.array([self.expected, self.count, self.means])
+        np.savez(path, counts=counts, origin=origin, rough=rough, kept=kept, **sums)
+
+    @classmethod
+    def load(cls, path: Path) -> SignalStatistics:
+        """Read what `save` wrote."""
+        with np.load(path) as stored:
+            expected, count, means = stored["counts"].tolist()
+            found = cls(len(stored["origin"]), expected, count, means)
+            found.origin = None if np.isnan(stored["origin"]).all() else stored["origin"].astype(np.float32)
+            found.rough, found.kept = [stored["rough"]], [stored["kept"]]
+            for name in SUMS:
+                setattr(found, name, stored[name])
+        return found
+
+    def _add_rough(self, spectra: Values, whole: Bools) -> None:
+        """Keep second differences in both directions: of a smooth field they hold noise alone, 36 times its variance."""
+        if min(whole.shape) < 3:
+            return
+        across = spectra[:, :-2] - 2 * spectra[:, 1:-1] + spectra[:, 2:]
+        both = across[:-2] - 2 * across[1:-1] + across[2:]
+        self.rough.append(both.reshape(-1, self.bands)[:: self._thin * self._stride**2].copy())
+
+
+def find_components(
+    found: SignalStatistics, *, false_alarm: float = 0.01, least: int = 4, noise: Floats | None = None
+) -> Components:
+    """Return the components of a field: directions whose variance exceeds that of noise, as the whole field shows.
+
+    ``false_alarm`` is the probability that noise alone gives a component, ``least`` how many are kept at any rate,
+    ``noise`` (band,) the standard deviation by the camera's model, which few bands need; many tell it themselves. Bands
+    without a value anywhere are NaN in the mean and have no part in a component.
+    """
+    lit = np.flatnonzero(found.lit)
+    mean = np.full(found.bands, np.nan)
+    if found.count == 0 or found.origin is None:
+        return Components.empty(found.bands)
+    single, own = _covariance(found.single, found.total, found.count)
+    mean[lit] = (found.origin + own)[lit]
+    covariance = single[np.ix_(lit, lit)]
+    model = None if noise is None else noise[lit]
+    sigma = _noise(found, covariance, lit, mean[lit], model)
+    loadings, deviations = np.zeros((0, found.bands)), np.full(found.bands, np.nan)
+    for _ in range(NOISE_ROUNDS if len(lit) > FEW_BANDS and found.count >= 4 * len(lit) else 1):
+        white = np.outer(sigma, sigma)
+        axes = _axes(found, covariance / white, lit, white, false_alarm, least)
+        if len(lit) > FEW_BANDS and found.count >= 4 * len(lit):
+            sigma = sigma * _left_over(covariance / white, axes)
+    loadings = np.zeros((axes.shape[1], found.bands))
+    loadings[:, lit] = axes.T
+    deviations[lit] = sigma
+    return Components(mean, loadings, deviations)
+
+
+def _covariance(products: Floats, total: Floats, count: int) -> tuple[Floats, Floats]:
+    mean = total / count
+    covariance: Floats = products / count - np.outer(mean, mean)
+    return (covariance + covariance.T) / 2, mean
+
+
+def _noise(
+    found: SignalStatistics, covariance: Floats, lit: NDArray[np.intp], mean: Floats, model: Floats | None
+) -> Floats:
+    """First estimate of the noise's standard deviation, (band,): what the other bands, or neighbours, leave open."""
+    variance = np.diag(covariance)
+    floor = LEAST_NOISE * np.maximum(np.sqrt(variance), np.abs(mean)).max(initial=0.0) or 1.0
+    if len(lit) <= FEW_BANDS:
+        rough = np.concatenate(found.rough)[:, lit] if found.rough else np.zeros((0, len(lit)))
+        sigma = SIGMA_OF_MEDIAN * np.median(np.abs(rough), axis=0) / 6 if len(rough) else np.sqrt(variance)
+        sigma = sigma if model is None else model
+    elif found.count >= 4 * len(lit):
+        with np.errstate(divide="ignore"):
+            sigma = 1 / np.sqrt(np.abs(np.diag(np.linalg.pinv(covariance, hermitian=True))))
+    else:
+        sigma = np.array([_unpredicted(covariance, band) for band in range(len(lit))])
+    sigma = np.minimum(np.where(np.isfinite(sigma), sigma, 0), np.sqrt(np.maximum(variance, 0)))
+    return np.maximum(sigma, floor)
+
+
+def _unpredicted(covariance: Floats, band: int) -> float:
+    """Standard deviation that a band's neighbours do not predict by a linear law."""
+    near = np.arange(max(band - NEIGHBOURS, 0), min(band + NEIGHBOURS + 1, len(covariance)))
+    near = near[near != band]
+    weights = np.linalg.lstsq(covariance[np.ix_(near, near)], covariance[near, band], rcond=1e-10)[0]
+    return float(np.sqrt(max(covariance[band, band] - covariance[band, near] @ weights, 0.0)))
+
+
+def _left_over(white: Floats, axes: Floats) -> Floats:
+    """Standard deviation of what components leave of whitened bands, over what they leave of unit noise."""
+    rest = np.eye(len(white)) - axes @ axes.T
+    left = np.einsum("ij,jk,ik->i", rest, white, rest)
+    open_to = np.maximum(np.diag(rest), 1e-3)
+    return np.sqrt(np.clip(left / open_to, 0.25, 4.0))
+
+
+def _axes(
+    found: SignalStatistics, white: Floats, lit: NDArray[np.intp], scale: Floats, false_alarm: float, least: int
+) -> Floats:
+    """Orthonormal directions (band, component) of whitened spectra: of their means first, then of single spectra."""
+    bands = len(white)
+    if bands <= FEW_BANDS:
+        return np.linalg.eigh(white)[1][:, ::-1]
+    axes = np.zeros((bands, 0))
+    if found.means >= 2 * bands:
+        means, _ = _covariance(found.block, found.block_total, found.means)
+        axes = significant_axes(BLOCK**2 * means[np.ix_(lit, lit)] / scale, found.means, false_alarm)
+    rest = np.eye(bands) - axes @ axes.T
+    more = significant_axes(rest @ white @ rest, found.count, false_alarm, known=axes.shape[1])
+    axes = np.concatenate([axes, more], axis=1)
+    if axes.shape[1] < min(least, bands):
+        rest = np.eye(bands) - axes @ axes.T
+        largest = np.linalg.eigh(rest @ white @ rest)[1][:, ::-1]
+        axes = np.concatenate([axes, largest[:, : min(least, bands) - axes.shape[1]]], axis=1)
+    turned = np.linalg.eigh(axes.T @ white @ axes)[1][:, ::-1]  # by falling variance
+    return np.linalg.qr(axes @ turned)[0]
+
+
+def significant_axes(covariance: Floats, spectra: int, false_alarm: float, *, known: int = 0) -> Floats:
+    """Eigenvectors (band, n) of a covariance whose eigenvalues noise alone does not reach, by falling eigenvalue.
+
+    The noise's own variance, and how many spectra there are in effect, are read off the lower half of the eigenvalues:
+    neighbours share a part of their noise. ``known`` directions have been taken out of the covariance.
+    """
+    bands = len(covariance)
+    values, vectors = np.linalg.eigh(covariance)
+    noise = np.maximum(values[known:], 0)
+    edge = noise_edge(noise, min(1.0, bands / max(spectra, 1)), false_alarm)
+    count = int(np.count_nonzero(values > edge))
+    return vectors[:, ::-1][:, : min(count, bands - known, max(spectra - 1, 0))]
+
+
+def with_shared(components: Components, residuals: Values, false_alarm: float) -> Components:
+    """Return components with the directions that residuals of rare spectra share (MOCA: Kuybeda, Malah & Barzohar 2007).
+
+    ``residuals`` are (rare, band) in deviations of the noise.
+    """
+    lit = np.flatnonzero(np.isfinite(components.mean))
+    exact = residuals[:, lit].astype(np.float64)
+    axes = components.axes[:, lit].T
+    exact -= (exact @ axes) @ axes.T
+    found = significant_axes(exact.T @ exact / max(len(exact), 1), len(exact), false_alarm, known=len(components))
+    every = np.linalg.qr(np.concatenate([axes, found[:, :MOST_SHARED]], axis=1))[0]
+    every[:, : axes.shape[1]] = axes
+    rows = np.zeros((every.shape[1], components.bands))
+    rows[:, lit] = every.T
+    return Components(components.mean, rows, components.noise)
+
+
+def noise_edge(values: Floats, ratio: float, false_alarm: float) -> float:
+    """Least eigenvalue that noise does not reach but with probability ``false_alarm``; ``values`` ascend.
+
+    ``ratio`` is bands over spectra; more where the lower half of the eigenvalues spreads farther than it lets expect.
+    """
+    count = len(values)
+    middle, low = float(np.median(values)), float(values[count // 10])
+    spread = np.sqrt(ratio)
+    if middle > 0 and spread < 1:
+        observed = max(middle - low, 0.0) / middle
+        tries = np.geomspace(spread, 1.0, 60)
+        expected = np.array([_law_spread(one) for one in tries])
+        spread = float(np.interp(observed, expected, tries)) if observed > expected[0] else spread
+    variance = middle / max(1 - spread**2 / 3, 0.5)
+    edge = variance * (1 + spread) ** 2
+    width = variance * spread * (1 + spread) ** (4 / 3) * (count ** (-2 / 3))
+    quantile = float(np.interp(-np.log(false_alarm), -np.log(TRACY_WIDOM[0]), TRACY_WIDOM[1]))
+    return edge + quantile * width
+
+
+def _law_spread(spread: float) -> float:
+    """How far the tenth part lies below the median of the Marchenko-Pastur law, over the median."""
+    low, high = (1 - spread) ** 2, (1 + spread) ** 2
+    angle = (np.arange(2000) + 0.5) / 2000 * np.pi
+    at = (low + high) / 2 - (high - low) / 2 * np.cos(angle)
+    mass = np.cumsum(np.sin(angle) ** 2 / at)
+    part = mass / mass[-1]
+    middle, tenth = (float(np.interp(share, part, at)) for share in (0.5, 0.1))
+    return (middle - tenth) / middle

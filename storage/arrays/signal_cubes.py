@@ -1,0 +1,246 @@
+"""A condensed sweep: scores of every spectrum, (component, line, sample), and all that gives its raw lines back.
+
+    spectrum = scores * step @ axes + mean          # axes in the unit of scene values
+
+Arrays ``scores``, ``axes``, ``mean`` and ``noise`` are read by any Zarr v3 reader; ``scale_factor`` of ``scores`` is the
+step. ``quality`` says of a spectrum whether all bands were seen (0), some were restored from the others (1) or less than
+half were seen (2). ``rare_*`` hold the residuals of spectra that components do not hold. Dark and white frames are those
+of the sweep, so that a later calibration can take their place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from pipeline.geometry.scan import Sweep
+from pipeline.signal.components import Components
+from pipeline.signal.condense import RESIDUAL_STEP, UNUSABLE
+from pipeline.source import References
+from storage.arrays.cubes import SweepHeader, write_line_facts, write_references
+from storage.arrays.layout import (
+    SHARD_ROWS,
+    ArraySpec,
+    create_array,
+    create_group,
+    damage_named,
+    open_group,
+    read_array,
+    read_bands,
+    write_bands,
+    write_counts,
+    write_small,
+)
+from storage.arrays.quicklooks import Quicklook, quicklook_of, write_quicklook
+
+CHUNK = 64  # lines and samples of a chunk of scores, all components of them: what lies together packs together
+SHARD_SAMPLES = 640
+LARGEST_SHORT = 32_000  # of scores in steps; larger ones are stored in 32 bits
+
+
+@dataclass(frozen=True)
+class LineFacts:
+    """What is known of every line beside its light, (line,) each."""
+
+    time_s: NDArray[np.float64]
+    mirror_x: NDArray[np.float64]
+    mirror_y: NDArray[np.float64]
+    exposure_ms: NDArray[np.float64]
+    valid: NDArray[np.bool_]
+
+    def rows(self) -> list[tuple[float, float, float, float, bool]]:
+        """Return them line by line."""
+        columns = (self.time_s, self.mirror_x, self.mirror_y, self.exposure_ms, self.valid)
+        return list(zip(*(column.tolist() for column in columns), strict=True))
+
+
+def score_spec(dims: tuple[str, str, str], shape: tuple[int, int, int], largest: float) -> ArraySpec:
+    """Layout of scores (component, row, column), whose size in steps is at most ``largest``."""
+    count, rows, columns = shape
+    chunk = (max(count, 1), min(CHUNK, max(rows, 1)), min(CHUNK, max(columns, 1)))
+    whole = (
+        -(-min(size, most) // part) * part
+        for size, most, part in zip((rows, columns), (SHARD_ROWS, SHARD_SAMPLES), chunk[1:], strict=True)
+    )
+    return ArraySpec(dims, shape, "<i2" if largest <= LARGEST_SHORT else "<i4", chunk, (chunk[0], *whole))
+
+
+def write_components(group: zarr.Group, components: Components) -> None:
+    """Store the linear law that gives spectra back."""
+    about = {"coordinates": "wavelength", "units": "1"}
+    rows = components.axes * np.nan_to_num(components.noise)
+    write_small(group, "axes", ("component", "band"), rows, {"long_name": "scene value of a score of 1", **about})
+    write_small(group, "mean", ("band",), components.mean, {"long_name": "mean scene value", **about})
+    write_small(
+        group,
+        "noise",
+        ("band",),
+        components.noise,
+        {"long_name": "standard deviation of one spectrum's noise", **about},
+    )
+
+
+def read_components(group: zarr.Group) -> Components:
+    """Read what `write_components` stored."""
+    rows, mean, noise = (read_array(group, name).astype(np.float64) for name in ("axes", "mean", "noise"))
+    lit = np.isfinite(noise)
+    axes = np.where(lit, rows / np.where(lit, noise, 1), 0) if len(rows) else rows
+    return Components(mean, axes, noise)
+
+
+class SignalCubeWriter:
+    """Write a sweep's scores, some lines at a time."""
+
+    def __init__(self, path: Path, header: SweepHeader, components: Components, *, step: float, largest: float) -> None:
+        lines, samples, _ = header.shape
+        self._header, self._step = header, step
+        facts: dict[str, Any] = {"sweep": asdict(header.sweep), "source": header.source}
+        facts |= {} if header.started is None else {"started": header.started}
+        facts |= {"by_mirror": True} if header.references.by_mirror else {}
+        facts |= {} if header.simulation is None else {"simulation": dict(header.simulation)}
+        self.group = create_group(path, f"condensed sweep {header.sweep.name}", facts)
+        write_bands(self.group, header.wavelength_nm, header.fwhm_nm)
+        write_counts(self.group, line=lines, sample=samples, component=len(components))
+        write_components(self.group, components)
+        write_references(self.group, header.references)
+        about = {"long_name": "score of a component", "units": "1", "scale_factor": step, "largest": largest}
+        shape = (len(components), lines, samples)
+        spec = score_spec(("component", "line", "sample"), shape, largest / step)
+        self._scores = create_array(self.group, "scores", spec, about)
+        about = {"long_name": "0 all bands seen, 1 some restored from the others, 2 less than half seen", "units": "1"}
+        spec = ArraySpec(("line", "sample"), shape[1:], "|u1", (min(512, lines), samples))
+        self._quality = create_array(self.group, "quality", spec, about)
+        self._seen: NDArray[np.uint8] = np.zeros(shape[1:], np.uint8)
+
+    def write(self, first: int, scores: NDArray[np.floating], quality: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Store (line, sample, component) scores from a line on, a multiple of 64; return them as they are stored."""
+        steps = np.rint(scores / np.float32(self._step))
+        stop = first + len(scores)
+        if steps.shape[2]:
+            self._scores[:, first:stop] = np.ascontiguousarray(steps.transpose(2, 0, 1)).astype(self._scores.dtype)
+        self._seen[first:stop] = quality
+        kept: NDArray[np.float32] = steps.astype(np.float32) * np.float32(self._step)
+        return kept
+
+    def close(
+        self, facts: LineFacts, rare: NDArray[np.intp], residuals: NDArray[np.int16], picture: Quicklook | None
+    ) -> None:
+        """Store quality, what is known of lines, and (rare, 2) lines and samples with (rare, band) residual steps."""
+        self._quality[...] = self._seen
+        write_line_facts(self.group, facts.rows(), self._header.started)
+        for name, column in (("rare_line", 0), ("rare_sample", 1)):
+            write_small(self.group, name, ("rare",), rare[:, column].astype(np.int32), {"units": "1"})
+        about = {"long_name": "residual of a rare spectrum", "units": "1", "scale_factor": RESIDUAL_STEP}
+        spec = ArraySpec(
+            ("rare", "band"), residuals.shape, "<i2", (min(1024, max(len(residuals), 1)), residuals.shape[1])
+        )
+        array = create_array(self.group, "rare_residual", spec, about)
+        if residuals.size:
+            array[...] = residuals
+        if picture is not None:
+            write_quicklook(self.group, picture)
+
+
+@dataclass(frozen=True)
+class SignalCube:
+    """A condensed sweep, opened. Scores are read when asked for."""
+
+    sweep: Sweep
+    components: Components
+    step: float
+    largest: float  # size that no score exceeds
+    wavelength_nm: NDArray[np.float64]  # (band,)
+    fwhm_nm: NDArray[np.float64] | None
+    position: NDArray[np.float64]  # (line, 2) mirror X and Y at mid exposure
+    time_s: NDArray[np.float64]  # (line,)
+    exposure_ms: NDArray[np.float64]  # (line,)
+    valid_line: NDArray[np.bool_]  # (line,)
+    source: str
+    started: str | None
+    group: zarr.Group
+
+    @property
+    def simulation(self) -> Any:
+        """What was simulated and what left out; None of a rig's lines."""
+        return self.group.attrs.get("simulation")
+
+    @cached_property
+    def usable(self) -> NDArray[np.bool_]:
+        """(line, sample) spectra of which at least half of the bands were seen."""
+        return read_array(self.group, "quality") != UNUSABLE
+
+    @cached_property
+    def references(self) -> References:
+        """Dark and white frames."""
+        dark, white, white_reference = (read_array(self.group, name) for name in ("dark", "white", "white_reference"))
+        bad, flat = (read_array(self.group, name) if name in self.group else None for name in ("bad", "flat"))
+        return References(dark, white, white_reference, bad, flat, bool(self.group.attrs.get("by_mirror", False)))
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(line, sample, component)."""
+        return (*self.usable.shape, len(self.components))  # type: ignore[return-value]
+
+    def read_window(self, lines: slice, samples: slice) -> NDArray[np.signedinteger[Any]]:
+        """Scores of some lines and samples in steps, (line, sample, component)."""
+        return read_array(self.group, "scores", (slice(None), lines, samples)).transpose(1, 2, 0)
+
+    def read(self, start: int = 0, stop: int | None = None) -> NDArray[np.signedinteger[Any]]:
+        """Scores of the lines ``start`` to ``stop`` in steps, (line, sample, component)."""
+        return self.read_window(slice(start, stop), slice(None))
+
+    @cached_property
+    def rare(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """Lines and samples of rare spectra, (rare,) each, by line."""
+        return read_array(self.group, "rare_line"), read_array(self.group, "rare_sample")
+
+    def spectra(self, start: int, stop: int) -> NDArray[np.float32]:
+        """Scene values of the lines ``start`` to ``stop``, (line, sample, band), NaN where unusable; rare ones as such."""
+        scores = self.read(start, stop).astype(np.float32) * np.float32(self.step)
+        values = self.components.restore(scores)
+        line, sample = self.rare
+        here = slice(*np.searchsorted(line, (start, start + len(values))))
+        if here.stop > here.start:
+            steps = read_array(self.group, "rare_residual", here).astype(np.float32) * np.float32(RESIDUAL_STEP)
+            values[line[here] - start, sample[here]] += steps * np.nan_to_num(self.components.noise).astype(np.float32)
+        values[~self.usable[start:stop]] = np.nan
+        return values
+
+    def quicklook(self) -> Quicklook | None:
+        """A small picture of the sweep."""
+        return quicklook_of(self.group)
+
+
+def open_signal_cube(path: Path) -> SignalCube:
+    """Open a condensed sweep (IncompleteStoreError: there is none, it was not closed, or it is damaged)."""
+    group = open_group(path)
+    wavelength, fwhm = read_bands(group)
+    with damage_named(str(path)):
+        sweep = Sweep(**dict(group.attrs)["sweep"])  # type: ignore[arg-type]
+        step, largest = (float(group["scores"].attrs[name]) for name in ("scale_factor", "largest"))  # type: ignore[arg-type]
+    return SignalCube(
+        sweep=sweep,
+        components=read_components(group),
+        step=step,
+        largest=largest,
+        wavelength_nm=wavelength,
+        fwhm_nm=fwhm,
+        position=np.stack([read_array(group, "mirror_x"), read_array(group, "mirror_y")], axis=-1),
+        time_s=read_array(group, "time"),
+        exposure_ms=read_array(group, "exposure_ms"),
+        valid_line=read_array(group, "valid_line"),
+        source=str(group.attrs.get("source", "")),
+        started=None if "started" not in group.attrs else str(group.attrs["started"]),
+        group=group,
+    )
+
+
+def open_signal_cubes(folder: Path) -> list[SignalCube]:
+    """Open the condensed sweeps of a pass, in the order of their names; raises as `open_signal_cube`."""
+    return [open_signal_cube(path) for path in sorted(folder.glob("*.zarr"))]
