@@ -101,5 +101,5 @@ class SweepLines(Protocol):
     def valid_line(self) -> NDArray[np.bool_]:
         """(line,) lines that can be used."""
 
-    def read(self, start: int, stop: int) -> NDArray[np.uint16]:
-        """Raw numbers of the lines ``start`` to ``stop``, (line, sample, band)."""
+    def read(self, start: int, stop: int) -> NDArray[np.integer[Any]]:
+        """Numbers of the lines ``start`` to ``stop``: raw, (line, sample, band), or scores in steps of components."""

@@ -26,7 +26,7 @@ from storage.parallel.pool import RESERVED_BYTES, THREADS, WorkerPool, memory_re
 
 
 def open_sweeps(signal: Path, registration: Path | None, camera: LineCamera) -> list[SweepPath]:
-    """Open the condensed sweeps of a folder, in the order of their names, with the corrections that registration recorded."""
+    """Open the condensed sweeps of a folder, by name, with the corrections that registration recorded."""
     found = None if registration is None else read_table(registration)["sweeps"]
     return sweep_paths(open_signal_cubes(signal), camera, found)
 
@@ -93,9 +93,10 @@ def write_mosaic(
 ) -> TileBudget:
     """Rectify and blend sweeps into a stored mosaic; return how. Whoever makes the tiles, the same bytes come out.
 
-    ``wanted`` are (y, x) pixels without which a tile is left out. Fewer tiles are made at a time where ``memory`` [bytes] of this process and those that it starts, not of workers
-    elsewhere, holds fewer. Raises SettingsError: not even one tile fits the memory, or the worker pool cannot work
-    here. WorkerError: processes that made tiles were lost.
+    ``wanted`` are (y, x) pixels without which a tile is left out. Fewer tiles are made at a time where ``memory``
+    [bytes] of this process and those that it starts, not of workers elsewhere, holds fewer. Raises SettingsError: not
+    even one tile fits the memory, or the worker pool cannot work here. WorkerError: processes that made tiles were
+    lost.
     """
     work = opened_work(recipe.open)
     tiles = plan_tiles(work.placed, work.camera, work.grid, writer.tile_shape)

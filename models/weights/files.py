@@ -105,7 +105,7 @@ class Weights:
         band reaches; a pixel without scores is NaN.
         """
         lit = np.isfinite(components.mean)
-        matrix, reached = np.zeros((components.bands, self.config.columns), np.float32), np.zeros(0)
+        matrix = np.zeros((components.bands, self.config.columns), np.float32)
         matrix[lit], reached = self.basis.matrix(np.asarray(wavelength_nm)[lit])
         weights, offset = components.onto(matrix)
         with np.errstate(invalid="ignore", over="ignore"):

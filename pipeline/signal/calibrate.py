@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -121,7 +122,9 @@ def _fill_of(wanted: Bools, good: Bools) -> Fill:
     return Fill(sample * width + band, before * width + band, after * width + band, fraction.astype(np.float32))
 
 
-def reflectance(raw: NDArray[np.uint16], references: References, *, position: ArrayLike | None = None) -> Floats32:
+def reflectance(
+    raw: NDArray[np.integer[Any]], references: References, *, position: ArrayLike | None = None
+) -> Floats32:
     """Turn raw lines into scene values, ``(raw - dark) / (white - dark) * white_reference / flat / throughput``.
 
     A bad element takes the value between the nearest good samples of its line and band, at most 8 away, linear in
@@ -140,7 +143,7 @@ def reflectance(raw: NDArray[np.uint16], references: References, *, position: Ar
 
 
 def calibrate(
-    raw: NDArray[np.uint16],
+    raw: NDArray[np.integer[Any]],
     references: References | Elements,
     *,
     saturated_dn: float,
@@ -183,7 +186,7 @@ def of_bands(references: References, bands: Sequence[int]) -> References:
     )
 
 
-def _line_gain(raw: NDArray[np.uint16], references: References, position: ArrayLike | None) -> Floats32 | None:
+def _line_gain(raw: NDArray[np.integer[Any]], references: References, position: ArrayLike | None) -> Floats32 | None:
     """One over the mirror's throughput of each line, (line,), where the references ask for it."""
     if not references.by_mirror:
         return None
@@ -198,12 +201,12 @@ def _line_gain(raw: NDArray[np.uint16], references: References, position: ArrayL
     return gain
 
 
-def _blocks(raw: NDArray[np.uint16]) -> Iterator[slice]:
+def _blocks(raw: NDArray[np.integer[Any]]) -> Iterator[slice]:
     lines = max(1, BLOCK_ELEMENTS // max(raw[0].size, 1)) if len(raw) else 1
     return (slice(first, first + lines) for first in range(0, len(raw), lines))
 
 
-def _scene_values(raw: NDArray[np.uint16], elements: Elements, line_gain: Floats32 | None) -> Floats32:
+def _scene_values(raw: NDArray[np.integer[Any]], elements: Elements, line_gain: Floats32 | None) -> Floats32:
     values = np.empty(raw.shape, np.float32)
     dark, fill = elements.references.dark, elements.fill
     for block in _blocks(raw):
@@ -220,7 +223,7 @@ def _scene_values(raw: NDArray[np.uint16], elements: Elements, line_gain: Floats
     return values
 
 
-def _valid(raw: NDArray[np.uint16], elements: Elements, saturated_dn: float) -> Bools:
+def _valid(raw: NDArray[np.integer[Any]], elements: Elements, saturated_dn: float) -> Bools:
     """(line, sample), or (line, sample, band) where only some bands of a sample are out."""
     out, lit = elements.out, elements.lit
     found = [_saturated(raw, block, elements, saturated_dn) for block in _blocks(raw)]
@@ -239,7 +242,7 @@ def _valid(raw: NDArray[np.uint16], elements: Elements, saturated_dn: float) -> 
 
 
 def _saturated(
-    raw: NDArray[np.uint16], block: slice, elements: Elements, saturated_dn: float
+    raw: NDArray[np.integer[Any]], block: slice, elements: Elements, saturated_dn: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], Bools]:
     """Lines and samples with elements at or above the limit, or filled from them, and which, (n, band)."""
     part = raw[block]
@@ -256,7 +259,7 @@ def _saturated(
     return line + block.start, sample, hot[line, sample]
 
 
-def _judged(raw: NDArray[np.uint16], references: References | Elements) -> Elements:
+def _judged(raw: NDArray[np.integer[Any]], references: References | Elements) -> Elements:
     """Elements judged already or now, once they are known to fit the lines."""
     plain = references.references if isinstance(references, Elements) else references
     if raw.ndim != 3:

@@ -113,7 +113,8 @@ class ResidualLaw:
     def expected(self, scores: Scores) -> Scores:
         """(...) mean square residual to expect of (..., component) scores."""
         least = max(LEAST_EXPECTED * self.constant, 1e-12)
-        return np.maximum(self.constant + scores @ self.slope.astype(np.float32), np.float32(least))
+        expected: Scores = np.maximum(self.constant + scores @ self.slope.astype(np.float32), np.float32(least))
+        return expected
 
 
 def find_rare(ratio: NDArray[np.float32], law: ResidualLaw, false_alarm: float) -> Bools:
@@ -148,13 +149,14 @@ def _back(lines: int, samples: int) -> tuple[int, int]:
 def _deviations(ratio: NDArray[np.floating], freedom: float) -> NDArray[np.floating]:
     """Deviations from normal of a mean square over its expectation (Wilson & Hilferty 1931)."""
     width = 2 / (9 * freedom)
-    return (np.cbrt(ratio) - (1 - width)) / np.sqrt(width)
+    deviations: NDArray[np.floating] = (np.cbrt(ratio) - (1 - width)) / np.sqrt(width)
+    return deviations
 
 
 def residual_steps(
     values: NDArray[np.float32], scores: Scores, components: Components, valid: Bools | None = None
 ) -> NDArray[np.int16]:
-    """What (n, component) scores leave of (n, band) spectra, in half deviations of the noise; 0 where a band has none."""
+    """What (n, component) scores leave of (n, band) spectra, in half deviations of the noise; 0 in missing bands."""
     left = components.white(values) - scores @ components.axes.astype(np.float32)
     there = np.isfinite(left) if valid is None else np.isfinite(left) & valid
     steps = np.rint(np.where(there, left, 0) / RESIDUAL_STEP)

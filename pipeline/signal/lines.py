@@ -135,7 +135,7 @@ class CondensedSignal:
     @property
     def samples(self) -> int:
         """Return the samples of a line."""
-        return self._condensed.usable.shape[1]
+        return int(self._condensed.usable.shape[1])
 
     @property
     def bands(self) -> int:

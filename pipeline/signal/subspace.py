@@ -103,9 +103,8 @@ class SignalStatistics:
             self.origin = np.where(self.lit, before, np.where(seen, first, 0)).astype(np.float32)
             self.lit |= seen
         spectra = values - self.origin
-        if valid.ndim == 2 and valid.all() and self.lit.all():
-            if np.isfinite(spectra).all():
-                return spectra, valid
+        if valid.ndim == 2 and valid.all() and self.lit.all() and np.isfinite(spectra).all():
+            return spectra, valid
         there = np.isfinite(spectra) & by_band
         spectra = np.where(there, spectra, np.float32(0))
         return spectra, np.asarray(2 * there.sum(axis=2) >= max(self.lit.sum(), 1))
@@ -139,7 +138,7 @@ class SignalStatistics:
         return found
 
     def _add_rough(self, spectra: Values, whole: Bools) -> None:
-        """Keep second differences in both directions: of a smooth field they hold noise alone, 36 times its variance."""
+        """Keep second differences in both directions: of a smooth field they hold 36 times the noise's variance."""
         if min(whole.shape) < 3:
             return
         across = spectra[:, :-2] - 2 * spectra[:, 1:-1] + spectra[:, 2:]
@@ -215,7 +214,8 @@ def _left_over(white: Floats, axes: Floats) -> Floats:
     rest = np.eye(len(white)) - axes @ axes.T
     left = np.einsum("ij,jk,ik->i", rest, white, rest)
     open_to = np.maximum(np.diag(rest), 1e-3)
-    return np.sqrt(np.clip(left / open_to, 0.25, 4.0))
+    factor: Floats = np.sqrt(np.clip(left / open_to, 0.25, 4.0))
+    return factor
 
 
 def _axes(
@@ -255,9 +255,9 @@ def significant_axes(covariance: Floats, spectra: int, false_alarm: float, *, kn
 
 
 def with_shared(components: Components, residuals: Values, false_alarm: float) -> Components:
-    """Return components with the directions that residuals of rare spectra share (MOCA: Kuybeda, Malah & Barzohar 2007).
+    """Return components with the directions that residuals of rare spectra share.
 
-    ``residuals`` are (rare, band) in deviations of the noise.
+    The law of Kuybeda, Malah & Barzohar 2007 (MOCA). ``residuals`` are (rare, band) in deviations of the noise.
     """
     lit = np.flatnonzero(np.isfinite(components.mean))
     exact = residuals[:, lit].astype(np.float64)
@@ -288,7 +288,7 @@ def noise_edge(values: Floats, ratio: float, false_alarm: float) -> float:
     edge = variance * (1 + spread) ** 2
     width = variance * spread * (1 + spread) ** (4 / 3) * (count ** (-2 / 3))
     quantile = float(np.interp(-np.log(false_alarm), -np.log(TRACY_WIDOM[0]), TRACY_WIDOM[1]))
-    return edge + quantile * width
+    return float(edge + quantile * width)
 
 
 def _law_spread(spread: float) -> float:
@@ -299,4 +299,4 @@ def _law_spread(spread: float) -> float:
     mass = np.cumsum(np.sin(angle) ** 2 / at)
     part = mass / mass[-1]
     middle, tenth = (float(np.interp(share, part, at)) for share in (0.5, 0.1))
-    return (middle - tenth) / middle
+    return float((middle - tenth) / middle)

@@ -67,6 +67,7 @@ class MosaicWriter:
         spec = score_spec(("component", "y", "x"), (len(components), *shape), largest / step)
         self._scores = create_array(self.group, "scores", spec, about | {"_FillValue": _unseen(spec.dtype)})
         about = {"long_name": "sweeps that saw a pixel", "units": "1", **place}
+        self._step = step
         self._coverage = create_array(self.group, "coverage", image_spec(("y", "x"), shape, "|u1"), about)
 
     @classmethod
@@ -82,7 +83,8 @@ class MosaicWriter:
             scores, coverage = (writer.group[name] for name in ("scores", "coverage"))
             if not isinstance(scores, zarr.Array) or not isinstance(coverage, zarr.Array):
                 raise KeyError("scores and coverage are no arrays")
-        writer._scores, writer._coverage = scores, coverage
+            step = float(scores.attrs["scale_factor"])  # type: ignore[arg-type]
+        writer._scores, writer._coverage, writer._step = scores, coverage, step
         return writer
 
     @property
@@ -92,7 +94,11 @@ class MosaicWriter:
         return rows, columns
 
     def write_tile(
-        self, first_row: int, first_column: int, scores: NDArray[np.floating], coverage: NDArray[np.generic]
+        self,
+        first_row: int,
+        first_column: int,
+        scores: NDArray[np.floating],
+        coverage: NDArray[np.integer[Any]] | NDArray[np.bool_],
     ) -> None:
         """Store (y, x, component) scores, NaN where nothing was seen, and (y, x) coverage of whole shards.
 
@@ -111,7 +117,7 @@ class MosaicWriter:
         whole_shards("the mosaic", (rows, columns), shape, self.tile_shape)
         seen = coverage > 0
         if count:
-            steps = np.rint(scores / np.float32(self._scores.attrs["scale_factor"]))
+            steps = np.rint(scores / np.float32(self._step))
             seen = seen & np.isfinite(steps).all(axis=2)
             steps = np.where(seen[..., None], steps, np.float32(_unseen(self._scores.dtype.str)))
             self._scores[:, rows, columns] = np.ascontiguousarray(steps.transpose(2, 0, 1)).astype(self._scores.dtype)
@@ -142,7 +148,7 @@ def _unseen(dtype: str) -> int:
     return int(np.iinfo(np.dtype(dtype)).min)
 
 
-MakeTile = Callable[[slice, slice], tuple[NDArray[np.float32], NDArray[np.generic]]]  # (rows, columns) of a mosaic
+MakeTile = Callable[[slice, slice], tuple[NDArray[np.float32], NDArray[np.integer[Any]]]]  # (rows, columns) of a mosaic
 
 
 def write_tiles(
@@ -185,7 +191,7 @@ def _reopened(path: Path) -> MosaicWriter:
 
 @dataclass(frozen=True)
 class Mosaic:
-    """A stored mosaic, opened: scores of a field's pixels, and the law that gives their spectra. Read when asked for."""
+    """A stored mosaic, opened: scores of a field's pixels, read when asked for, and the law that gives spectra."""
 
     group: zarr.Group
     components: Components

@@ -2,10 +2,10 @@
 
     spectrum = scores * step @ axes + mean          # axes in the unit of scene values
 
-Arrays ``scores``, ``axes``, ``mean`` and ``noise`` are read by any Zarr v3 reader; ``scale_factor`` of ``scores`` is the
-step. ``quality`` says of a spectrum whether all bands were seen (0), some were restored from the others (1) or less than
-half were seen (2). ``rare_*`` hold the residuals of spectra that components do not hold. Dark and white frames are those
-of the sweep, so that a later calibration can take their place.
+Any Zarr v3 reader opens the arrays ``scores`` (``scale_factor`` is the step), ``axes``, ``mean`` and ``noise``.
+``quality`` says of a spectrum whether all bands were seen (0), some were restored from the others (1) or less than half
+were seen (2). ``rare_*`` hold the residuals of spectra that components do not hold. Dark and white frames are those of
+the sweep, so that a later calibration can take their place.
 """
 
 from __future__ import annotations
@@ -173,7 +173,8 @@ class SignalCube:
     @cached_property
     def usable(self) -> NDArray[np.bool_]:
         """(line, sample) spectra of which at least half of the bands were seen."""
-        return read_array(self.group, "quality") != UNUSABLE
+        usable: NDArray[np.bool_] = read_array(self.group, "quality") != UNUSABLE
+        return usable
 
     @cached_property
     def references(self) -> References:
@@ -185,7 +186,8 @@ class SignalCube:
     @property
     def shape(self) -> tuple[int, int, int]:
         """(line, sample, component)."""
-        return (*self.usable.shape, len(self.components))  # type: ignore[return-value]
+        lines, samples = self.usable.shape
+        return lines, samples, len(self.components)
 
     def read_window(self, lines: slice, samples: slice) -> NDArray[np.signedinteger[Any]]:
         """Scores of some lines and samples in steps, (line, sample, component)."""
@@ -201,7 +203,7 @@ class SignalCube:
         return read_array(self.group, "rare_line"), read_array(self.group, "rare_sample")
 
     def spectra(self, start: int, stop: int) -> NDArray[np.float32]:
-        """Scene values of the lines ``start`` to ``stop``, (line, sample, band), NaN where unusable; rare ones as such."""
+        """Scene values of the lines ``start`` to ``stop``, (line, sample, band), rare ones too; NaN where unusable."""
         scores = self.read(start, stop).astype(np.float32) * np.float32(self.step)
         values = self.components.restore(scores)
         line, sample = self.rare

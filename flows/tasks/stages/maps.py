@@ -80,11 +80,21 @@ def segment(
         legend, shape = ClassNames(weights.class_names, weights.class_colours), (grid.height, grid.width)
         create_class_map(out, shape, legend if unknown is None else with_unknown(legend), grid=frame.angular_grid())
         create_probabilities(probabilities, shape, legend, grid=frame.angular_grid(), goes_on=memory is not None)
-        seen = [(ref.path / "mosaic.zarr").resolve() for ref in (mosaic, fine or mosaic)]
+        seen, detail = ((ref.path / "mosaic.zarr").resolve() for ref in (mosaic, fine or mosaic))
         chosen = (attention.path / "attention.zarr").resolve()
         away = None if left_out is None else (path / LEFT_OUT).resolve()
         drawing = Drawing(
-            work.weights, *seen, chosen, out.resolve(), probabilities.resolve(), *light, memory, away, unknown, part
+            work.weights,
+            seen,
+            detail,
+            chosen,
+            out.resolve(),
+            probabilities.resolve(),
+            *light,
+            memory,
+            away,
+            unknown,
+            part,
         )
         comparison = draw_field(work, drawing, report)
         if prior is not None:

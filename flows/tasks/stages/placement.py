@@ -234,7 +234,7 @@ def rectify_fine(
     pool: WorkerPool,
     report: Report,
 ) -> Wanted:
-    """Bring the fine sweeps onto the scene's own pixels where patches were chosen; what lies beside them is not made."""
+    """Bring the fine sweeps onto the scene's own pixels, in the tiles in which patches were chosen."""
 
     def build(path: Path) -> None:
         """Write the tiles that hold chosen patches."""
@@ -294,7 +294,8 @@ def seen_fractions(frame: FieldFrame, detail: StageRef, patch_index: NDArray[np.
     there = grid.valid_fraction().ravel()[patch_index]
     if frame.missing is not None:
         there = there - patch_pixels(grid, frame.missing)[patch_index].mean(axis=(1, 2))
-    return np.divide(seen, there, out=np.ones_like(seen), where=there > 0)
+    fractions: NDArray[np.float64] = np.divide(seen, there, out=np.ones_like(seen), where=there > 0)
+    return fractions
 
 
 def _there(registration: StageRef | None) -> list[StageRef]:
