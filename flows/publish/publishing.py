@@ -12,9 +12,10 @@ import json
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
+from flows.publish.byte_account import recount_bytes
 from flows.publish.receipt import Receipt, is_pending
-from flows.publish.receipt_table import cost_rows, finding_rows, headline
-from flows.publish.report import render_markdown
+from flows.publish.receipt_table import byte_rows, cost_rows, finding_rows, headline
+from flows.publish.report import render_markdown, replace_bytes
 from flows.publish.run_folder import Published, asked_settings, extend_with_accuracy, publish_run
 from flows.settings.survey_settings import OF_THE_MACHINE
 from flows.tasks.open_survey import JUDGED, STAGES, OpenSurvey, RunRef
@@ -65,6 +66,13 @@ def add_accuracy(plan: OpenSurvey, run: RunRef, accuracy: StageRef) -> RunRef:
         published = extend_with_accuracy(plan, draft, accuracy)
     _show_artifacts(plan, published)
     return _ref(published)
+
+
+def recount(plan: OpenSurvey, run: RunRef) -> RunRef:
+    """Publish a run again with its bytes as they are now, once stores were cleared away."""
+    receipt = recount_bytes(plan.run.archive, run.name, replace_bytes)
+    _show_artifacts(plan, Published(receipt, run.folder, run.captured_again))
+    return run
 
 
 def _ref(published: Published, *, pending: bool = False) -> RunRef:
@@ -130,7 +138,7 @@ def _show_artifacts(plan: OpenSurvey, published: Published) -> None:
 
 
 def savings_rows(receipt: Receipt) -> list[dict[str, str]]:
-    """Return the receipt's savings, a row each, in words."""
+    """Return the receipt's savings and bytes, a row each, in words."""
     return [
         {
             "cost": row["label"],
@@ -138,7 +146,7 @@ def savings_rows(receipt: Receipt) -> list[dict[str, str]]:
             "everything": row["full"],
             "fraction": format_percent(row["ratio"]),
         }
-        for row in cost_rows(receipt["savings"])
+        for row in [*cost_rows(receipt["savings"]), *byte_rows(receipt)]
     ]
 
 
