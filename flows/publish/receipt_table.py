@@ -77,7 +77,7 @@ def format_reused(receipt: Mapping[str, Any]) -> str:
     if not reused:
         return ""
     size = format_megabytes(sum(reused.values()))
-    return f"Of the bytes kept, {size} in {counted(len(reused), 'store')} were reused: found, and not written again."
+    return f"Reused, found and not written again: {counted(len(reused), 'store')}, {size} of the bytes kept."
 
 
 def print_table(receipt: Receipt, console: Console) -> None:
