@@ -56,9 +56,7 @@ def survey(settings: SurveySettings, capture_deployment: str | None = None) -> R
     plan.capture_deployment = capture_deployment
     with plan.at_work():
         draw_class_map(plan)
-        run = judge(plan, publish(plan))
-        clear_raw(plan)
-        return run
+        return clear_raw(plan, judge(plan, publish(plan)))
 
 
 def draw_class_map(plan: OpenSurvey) -> None:

@@ -15,8 +15,8 @@ OF_ONE_RUN = ("wall_s", "cpu_s", "peak_rss_bytes", "state", "manifest_sha256")
 def comparable(receipt: Receipt) -> dict[str, Any]:
     """Return what two runs of the same seed and settings must agree on.
 
-    Without times, memory, the archive's place, whether a stage was read or made, hashes of manifests (which hold their
-    times), and the addresses of the products (their names stay).
+    Without times, memory, the archive's place, bytes of files that hold times, whether a stage was read or made, hashes
+    of manifests (which hold their times), and the addresses of the products (their names stay).
     """
     same = _without(receipt, ("started", "finished", "judged"))
     same["settings"] = _without(receipt["settings"], ("out",))
@@ -24,6 +24,7 @@ def comparable(receipt: Receipt) -> dict[str, Any]:
         _without(stage, (*OF_ONE_RUN, *(("bytes_out",) if stage["name"] == JUDGING else ())))
         for stage in receipt["stages"]
     ]
+    same["data_bytes"] = {name: receipt["data_bytes"][name] for name in ("captured", "reference")}
     return same | {"products": sorted(receipt["products"])}
 
 

@@ -24,6 +24,7 @@ from flows.terminal.processes import DONE, FAILED, PARTLY
 from flows.terminal.progress import StageProgress, put_out, table
 from pipeline.lazy import deferred
 from storage.archive.archive import Archive
+from storage.archive.kept_bytes import all_sizes, kept_by_runs, kept_bytes
 from storage.archive.keys import in_text
 from storage.archive.lineage import Catalogue, changes_between, find_product, version_before
 from storage.archive.records import Run
@@ -156,6 +157,8 @@ def run_verify(
 def contents(archive: Archive, now: datetime | None = None) -> dict[str, Any]:
     """Runs, newest last, and stores by stage, oldest first, of an archive."""
     catalogue, moment = Catalogue.read(archive.root), now or datetime.now(UTC)
+    sizes = all_sizes(archive, catalogue)
+    kept = kept_by_runs(catalogue, sizes)
     stages: dict[str, list[dict[str, Any]]] = {}
     for store in sorted(catalogue.stores.values(), key=lambda store: (store.ref.stage, store.created, store.ref.key)):
         row = {
@@ -171,14 +174,16 @@ def contents(archive: Archive, now: datetime | None = None) -> dict[str, Any]:
         stages.setdefault(store.ref.stage, []).append(row)
     return {
         "archive": archive.name,
-        "runs": [{**_run_row(catalogue, run), "age_s": _age_s(run.created, moment)} for run in catalogue.runs],
+        "runs": [
+            {**_run_row(catalogue, run, kept[run.uri]), "age_s": _age_s(run.created, moment)} for run in catalogue.runs
+        ],
         "stages": stages,
-        "bytes": sum(store.size for store in catalogue.stores.values()),
+        "bytes": sum(sizes.values()),
         "lost": list(catalogue.lost),
     }
 
 
-def _run_row(catalogue: Catalogue, run: Run) -> dict[str, Any]:
+def _run_row(catalogue: Catalogue, run: Run, kept: int) -> dict[str, Any]:
     receipt, settings = run.receipt, run.settings
     below = catalogue.named_and_below[run.uri]
     return {
@@ -190,7 +195,7 @@ def _run_row(catalogue: Catalogue, run: Run) -> dict[str, Any]:
         "budget": settings.get("budget"),
         **score_of(receipt),
         "accuracy_is": receipt.get("accuracy_is"),
-        "bytes": sum(catalogue.stores[uri].size for uri in below if uri in catalogue.stores),
+        "bytes": kept,
         "state": _run_state(catalogue, run, below),
     }
 
@@ -220,7 +225,12 @@ def explanation(archive: Archive, product: str) -> dict[str, Any]:
         below = set[str]().union(*(catalogue.ancestors([uri]) for uri in found.names))
         shown: set[str] = set()
         trees = [_tree(catalogue, uri, shown, ()) for uri in sorted(found.names - below)]
-        row = {**_run_row(catalogue, found), "problem": found.problem, "command": command(found.settings, archive.name)}
+        kept = kept_bytes(archive, found, catalogue)
+        row = {
+            **_run_row(catalogue, found, kept),
+            "problem": found.problem,
+            "command": command(found.settings, archive.name),
+        }
         return {"archive": archive.name, "product": found.uri, "run": row, "lineage": trees}
     this, before = catalogue.stores[found], version_before(catalogue, found)
     return {

@@ -12,10 +12,17 @@ from rich.markup import escape
 
 from flows.cli.app import ArchiveName, AsJson, OutFolder, check_outside
 from flows.publish.receipt import areas_on_ground
-from flows.publish.receipt_table import COST_LABELS
+from flows.publish.receipt_table import BYTE_LABELS, COST_LABELS
 from flows.settings.survey_settings import BUILT_IN_SCENES
 from flows.tasks.scores import score_of
-from flows.terminal.figures import format_area, format_count, format_percent, format_points, known_number
+from flows.terminal.figures import (
+    format_area,
+    format_count,
+    format_megabytes,
+    format_percent,
+    format_points,
+    known_number,
+)
 from flows.terminal.processes import DONE
 from flows.terminal.progress import put_out, table
 from pipeline.errors import ArchiveError, SceneError, ShapeError
@@ -171,6 +178,7 @@ def _comparison(runs: tuple[Run, Run], maps: list[ClassMap]) -> dict[str, Any]:
         "settings": _changes(*asked),
         "made": _changes(*made),
         "savings": {name: [_spent(run.receipt, name) for run in runs] for name in COST_LABELS},
+        "data_bytes": {name: [_bytes(run.receipt, name) for run in runs] for name in BYTE_LABELS},
     }
 
 
@@ -201,11 +209,17 @@ def _spent(receipt: Mapping[str, Any], name: str) -> float | None:
     return known_number(entry.get("done")) if isinstance(entry, Mapping) else None
 
 
+def _bytes(receipt: Mapping[str, Any], name: str) -> float | None:
+    told = receipt.get("data_bytes")
+    return known_number(told.get(name)) if isinstance(told, Mapping) else None
+
+
 def show_comparison(content: dict[str, Any], console: Console) -> None:
     """Print what `compare` found."""
     figures = (("run", str), ("miou", format_points), ("overall_accuracy", format_points))
     rows = [[name.replace("_", " "), *(escape(show(content[side][name])) for side in "ab")] for name, show in figures]
     rows += [[label, *map(cost, content["savings"][name])] for name, (label, cost) in COST_LABELS.items()]
+    rows += [[label, *map(format_megabytes, content["data_bytes"][name])] for name, label in BYTE_LABELS.items()]
     changed = [*content["settings"], *content["made"]]
     rows += [[escape(str(row[part])) for part in ("name", "old", "new")] for row in changed]
     console.print(table(("", "A", "B"), rows))

@@ -30,6 +30,7 @@ from pipeline.errors import ArchiveError, SettingsError, visible
 from pipeline.lazy import deferred
 from pipeline.simulator.scenes.farm.farm_scene import USUAL_HOUR
 from storage.archive.archive import Archive
+from storage.archive.kept_bytes import all_sizes, kept_by_runs
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run
 from storage.archive.whole_files import write_whole
@@ -54,7 +55,7 @@ MOST_PX = 400  # of a visit's picture
 MOST_CLASSES = 128  # that are told apart, the last of them standing for none
 CHANGED_FRACTION = 0.25  # of a patch's pixels, from which it is said to have changed
 PALE = 0.8  # of what did not change
-SAVINGS = {"capture_s": "time at the camera", "lines": "lines", "bytes_stored": "stored data", "multiply_adds": "model"}
+SAVINGS = {"capture_s": "time at the camera", "lines": "lines", "bytes_kept": "bytes kept", "multiply_adds": "model"}
 SCORES = {"miou": "mIoU", "overall_accuracy": "overall"}
 DRAWN_YEARS = range(1900, 2200)
 _MOST_VALUE = 1e100  # that can be drawn; receipts may claim anything
@@ -109,7 +110,8 @@ def read_history(archive: Archive, field: str | None = None) -> FieldHistory:
         raise ArchiveError(f"{which}; give --field with one of: {', '.join(names) or 'none'}")
     own = sorted((run for run in catalogue.runs if called(run) == name), key=lambda run: str(time_of_visit(run) or ""))
     maps = {run.uri: shown for run in own if (shown := _map_of(archive, catalogue, run)) is not None}
-    rows = [_row(run, maps.get(run.uri)) for run in own]
+    kept = kept_by_runs(catalogue, all_sizes(archive, catalogue))
+    rows = [_row(run, maps.get(run.uri), kept[run.uri]) for run in own]
     mapped = [(run, row) for run, row in zip(own, rows, strict=True) if run.uri in maps][-MOST_VISITS:]
     visits = [_visit(archive, run, row, maps[run.uri]) for run, row in mapped]
     colours = {
@@ -130,9 +132,12 @@ def _map_of(archive: Archive, catalogue: Catalogue, run: Run) -> ClassMap | None
     return None
 
 
-def _row(run: Run, shown: ClassMap | None) -> Row:
+def _row(run: Run, shown: ClassMap | None, kept: int) -> Row:
     savings = found if isinstance(found := run.receipt.get("savings"), Mapping) else {}
     entries = {name: one if isinstance(one := savings.get(name), Mapping) else {} for name in SAVINGS}
+    told = found if isinstance(found := run.receipt.get("data_bytes"), Mapping) else {}
+    if reference := known_number(told.get("reference")):
+        entries["bytes_kept"] = {"ratio": kept / reference}
     hectares, areas = areas_on_ground(run.receipt), dict[str, float]()
     if hectares is not None:
         areas = {str(name): float(area) for name, area in hectares.items() if known_number(area) is not None}

@@ -12,9 +12,10 @@ import json
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
+from flows.publish.byte_account import recount_bytes
 from flows.publish.receipt import Receipt, is_pending
-from flows.publish.receipt_table import cost_rows, finding_rows, headline
-from flows.publish.report import render_markdown
+from flows.publish.receipt_table import byte_rows, cost_rows, finding_rows, headline
+from flows.publish.report import render_markdown, replace_bytes
 from flows.publish.run_folder import Published, asked_settings, extend_with_accuracy, publish_run
 from flows.settings.survey_settings import OF_THE_MACHINE
 from flows.settings.values import KEEP_SIGNAL
@@ -71,13 +72,18 @@ def add_accuracy(plan: OpenSurvey, run: RunRef, accuracy: StageRef) -> RunRef:
     return _ref(published)
 
 
-def clear_raw(plan: OpenSurvey) -> None:
-    """Clear raw lines away that the settings keep no longer, once each was compared; in a flow as a task."""
-    if plan.run.settings.keep == KEEP_SIGNAL and plan.products.there(*PASSES_OF_SIGNAL):
-        as_task(_clear_raw, "clear_raw")(plan)
+def clear_raw(plan: OpenSurvey, run: RunRef) -> RunRef:
+    """Clear raw lines away that the settings do not keep, once each was compared; in a flow as a task.
+
+    The run is published again with the bytes that stay.
+    """
+    if plan.run.settings.keep != KEEP_SIGNAL or not plan.products.there(*PASSES_OF_SIGNAL):
+        return run
+    return as_task(_clear_raw, "clear_raw")(plan, run)
 
 
-def _clear_raw(plan: OpenSurvey) -> None:
+def _clear_raw(plan: OpenSurvey, run: RunRef) -> RunRef:
+    cleared = False
     for captured, condensed in PASSES_OF_SIGNAL.items():
         if captured not in plan.products or condensed not in plan.products:
             continue
@@ -86,9 +92,17 @@ def _clear_raw(plan: OpenSurvey) -> None:
             continue
         why = raw_differs(raw, signal, plan.run.camera)
         if why is None:
-            plan.run.archive.clear(raw, wait=False)
+            cleared |= plan.run.archive.clear(raw, wait=False)
         else:
             plan.observer.note(f"raw lines stay: {why}")
+    return recount(plan, run) if cleared else run
+
+
+def recount(plan: OpenSurvey, run: RunRef) -> RunRef:
+    """Publish a run again with its bytes as they are now, once stores were cleared away."""
+    receipt = recount_bytes(plan.run.archive, run.name, replace_bytes)
+    _show_artifacts(plan, Published(receipt, run.folder, run.captured_again))
+    return run
 
 
 def _ref(published: Published, *, pending: bool = False) -> RunRef:
@@ -154,7 +168,7 @@ def _show_artifacts(plan: OpenSurvey, published: Published) -> None:
 
 
 def savings_rows(receipt: Receipt) -> list[dict[str, str]]:
-    """Return the receipt's savings, a row each, in words."""
+    """Return the receipt's savings and bytes, a row each, in words."""
     return [
         {
             "cost": row["label"],
@@ -162,7 +176,7 @@ def savings_rows(receipt: Receipt) -> list[dict[str, str]]:
             "everything": row["full"],
             "fraction": format_percent(row["ratio"]),
         }
-        for row in cost_rows(receipt["savings"])
+        for row in [*cost_rows(receipt["savings"]), *byte_rows(receipt)]
     ]
 
 

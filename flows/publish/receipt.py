@@ -21,7 +21,7 @@ from storage.archive.whole_files import to_json
 Receipt = dict[str, Any]
 AccuracyIs = Literal["judged", "pending", "left out", "without labels"]  # pending: it is worked out after the map
 Facts = dict[str, Any]
-COSTS = ("lines", "samples", "bytes_raw", "bytes_stored", "capture_s", "tokens", "multiply_adds")
+COSTS = ("lines", "samples", "capture_s", "tokens", "multiply_adds")
 
 
 class _Part(BaseModel):
@@ -60,11 +60,25 @@ class Savings(_Part):
 
     lines: Saving | None = None
     samples: Saving | None = None
-    bytes_raw: Saving | None = None
-    bytes_stored: Saving
     capture_s: CaptureSaving | None = None
     tokens: Saving
     multiply_adds: MultiplyAddsSaving
+
+
+class DataBytes(_Part):
+    """Bytes of a run, each counted over whole files and told against ``reference``.
+
+    The reference is every line at the camera's own exposure as it is captured (uint16, uncompressed), of a raster every
+    pixel as uint16.
+    """
+
+    captured: int  # as the camera delivers them, of all passes
+    written: int  # stores that were built, also those cleared since, spools of their lines, and the run's folder
+    kept: int  # all files of the archive that the run names or rests on, and its folder
+    moved_bucket: int  # to and from a bucket, 0 without one
+    moved_workers: int | None  # to workers that share no memory, 0 without any; None: not counted
+    reference: int
+    reused: dict[str, int]  # of ``kept``, stores that were found and not built, by address
 
 
 class Score(_Part):
@@ -108,6 +122,7 @@ class ReceiptFields(_Part):
     settings: Facts
     stages: list[StageRecord]
     savings: Savings
+    data_bytes: DataBytes | None = None  # earlier versions did not count them
     accuracy_is: AccuracyIs | None = None
     judged: str | None = None  # when accuracy was added
     accuracy: Accuracy | None = None

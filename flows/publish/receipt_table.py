@@ -14,8 +14,8 @@ from flows.tasks.scores import format_worst_class
 from flows.terminal.figures import (
     counted,
     format_area,
-    format_bytes,
     format_count,
+    format_megabytes,
     format_metres,
     format_percent,
     format_points,
@@ -30,10 +30,15 @@ COST_LABELS = {
     "capture_s": ("time at the camera", format_seconds),
     "lines": ("lines", format_count),
     "samples": ("samples on the field", format_count),
-    "bytes_raw": ("raw data", format_bytes),
-    "bytes_stored": ("stored data", format_bytes),
     "tokens": ("model's tokens", format_count),
     "multiply_adds": ("model's multiply-adds", format_count),
+}
+BYTE_LABELS = {
+    "captured": "bytes captured",
+    "written": "bytes written",
+    "kept": "bytes kept",
+    "moved_bucket": "bytes moved, bucket",
+    "moved_workers": "bytes moved, workers",
 }
 MOST_CHANGES = 4  # in words
 LEADING = 3  # classes of a plot in words
@@ -53,12 +58,36 @@ def cost_rows(savings: Mapping[str, Any]) -> list[dict[str, Any]]:
     ]
 
 
+def byte_rows(receipt: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the bytes of a run against the reference, a row each; dashes where an earlier version did not count."""
+    told = receipt.get("data_bytes")
+    full = None if told is None else told["reference"]
+    rows = []
+    for name, label in BYTE_LABELS.items():
+        done = None if told is None else told[name]
+        words = "not counted" if told is not None and done is None else format_megabytes(done)
+        ratio = None if done is None or not full else done / full
+        rows.append({"label": label, "done": words, "full": format_megabytes(full), "ratio": ratio})
+    return rows
+
+
+def format_reused(receipt: Mapping[str, Any]) -> str:
+    """Return what of the bytes kept was found in the archive and not built; empty where all was built."""
+    reused = receipt.get("data_bytes", {}).get("reused", {})
+    if not reused:
+        return ""
+    size = format_megabytes(sum(reused.values()))
+    return f"Reused, found and not written again: {counted(len(reused), 'store')}, {size} of the bytes kept."
+
+
 def print_table(receipt: Receipt, console: Console) -> None:
     """Print the savings to the terminal, and what became of a prior map or of weights that do not know the field."""
     columns = ("cost", "this survey", "everything", "ratio")
-    costs = cost_rows(receipt["savings"])
+    costs = [*cost_rows(receipt["savings"]), *byte_rows(receipt)]
     rows = [[row["label"], row["done"], row["full"], format_percent(row["ratio"])] for row in costs]
     console.print(table(columns, rows, whole=columns[1:]))
+    if reused := format_reused(receipt):
+        console.print(escape(reused))
     for name, words in finding_rows({name: receipt[name] for name in ("memory", "unknown") if name in receipt}):
         if name != "unknown" or receipt["unknown"]["fraction"] > FOREIGN:
             console.print(escape(f"{name}: {words}"))
@@ -76,10 +105,10 @@ def headline(receipt: Receipt, captured_again: float | None = None) -> str:
     elif captured_again is not None:
         words.append(f"The camera captured {format_percent(captured_again)} of the field again.")
     if (capture := savings.get("capture_s")) is None:
-        read, stored = (format_percent(savings[name]["ratio"]) for name in ("multiply_adds", "bytes_stored"))
+        read = format_percent(savings["multiply_adds"]["ratio"])
         words.append(
             f"The raster's pixels were taken as they are: its map took {read} of the multiply-adds of reading every "
-            f"pixel, and {stored} of the bytes of keeping them."
+            "pixel."
         )
     else:
         usual = f"every line of {receipt['settings']['camera']['exposure_ms']:g} ms" if scan else "a scan of everything"

@@ -21,7 +21,7 @@ from markupsafe import Markup
 from flows.publish.effects_table import format_change, format_total
 from flows.publish.field_map import FieldMap
 from flows.publish.receipt import Receipt
-from flows.publish.receipt_table import cost_rows, finding_rows, headline, plot_rows
+from flows.publish.receipt_table import byte_rows, cost_rows, finding_rows, format_reused, headline, plot_rows
 from flows.tasks.scores import format_false_classes
 from flows.terminal.figures import format_bytes, format_percent, format_points, format_seconds
 from pipeline.errors import visible
@@ -33,6 +33,7 @@ SHA256 = {
     f"{LEAFLET}/LICENSE": "53e8dc25862014e4324741ca18fbe3611e11d42ef69f59f86ea8c5389647d4cb",
 }
 MAP_SCRIPTS = (f"{LEAFLET}/leaflet.js", "scripts/field_map.js")
+BYTES_SECTION = '<section id="bytes">'  # of a report, which ends with it
 _MARKDOWN = "\\`*_{}[]<>#|"
 
 
@@ -62,6 +63,11 @@ def render_page(template: str, carries: tuple[str, ...] = (), **facts: Any) -> s
     scripts = Markup("\n").join(Markup("<script>{}</script>").format(Markup(part(name))) for name in carries)
     own = {"policy": policy(carries), "scripts": scripts}
     return visible(_environment(markdown=False).get_template(template).render(facts | own))
+
+
+def render_markup(template: str, **facts: Any) -> str:
+    """Fill in an HTML template that is a part of a page, as `render_page`."""
+    return visible(_environment(markdown=False).get_template(template).render(facts))
 
 
 def render_markdown(template: str, **facts: Any) -> str:
@@ -150,6 +156,8 @@ def render_report(
         leaflet=LEAFLET,
         pictures=[{"data": base64.b64encode(one.png).decode("ascii"), "caption": one.caption} for one in shown],
         costs=cost_rows(receipt["savings"]),
+        byte_rows=byte_rows(receipt),
+        reused=format_reused(receipt),
         fractions={name: split[name] / split["done"] for name in parts},
         findings=finding_rows(receipt),
         plots=plot_rows(receipt.get("plots", [])),
@@ -166,3 +174,11 @@ def render_report(
             "Files of this survey": receipt["products"],
         },
     )
+
+
+def replace_bytes(page: str, receipt: Receipt) -> str:
+    """Return a report with the bytes of a receipt in the place of those that it tells."""
+    begin, end = BYTES_SECTION, "</section>"
+    head, there, rest = page.partition(begin)
+    rows = render_markup("bytes.html", byte_rows=byte_rows(receipt), reused=format_reused(receipt))
+    return f"{head}{rows.rstrip()}{rest.partition(end)[2]}" if there else page

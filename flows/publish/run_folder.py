@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.publish.byte_account import open_account, publish_counted
 from flows.publish.field_map import block_of, field_map, prior_map
 from flows.publish.findings import PLOTS_FILE, field_figures, find_ground, find_map, find_zones, plots_csv
 from flows.publish.panels import draw_ground
@@ -24,7 +25,6 @@ from flows.publish.report import Picture, render_report
 from flows.settings.load import anchor_paths
 from flows.settings.values import EXTENT_WHOLE
 from flows.tasks.open_survey import STAGES, OpenSurvey, Products
-from flows.tasks.patch_budget import BYTES_A_VALUE
 from flows.tasks.prior_maps import prior_map_figures
 from flows.tasks.run import SurveyRun, now
 from flows.tasks.scan_choice import as_figures
@@ -43,7 +43,6 @@ from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table
 from storage.archive.records import read_run
 from storage.archive.run_folders import RunDraft
-from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import ProbabilityStore, load_class_map
 from storage.arrays.ground_maps import load_ground_map
 from storage.arrays.layout import SHARD_ROWS
@@ -65,11 +64,10 @@ class Published:
 
 def publish_run(survey: OpenSurvey) -> Published:
     """Write receipt.json, quicklook.png and report.html into a run folder and publish it as a whole."""
-    run, products = survey.run, survey.products
-    plan = load_plan(products["score"])
-    with run.archive.new_run(run.name) as draft:
+    plan = load_plan(survey.products["score"])
+    with survey.run.archive.new_run(survey.run.name) as draft:
         receipt = make_receipt(survey, plan, f"runs/{draft.id}")
-        return _publish(run, draft, products, plan, receipt)
+        return _publish(survey, draft, plan, receipt)
 
 
 def extend_with_accuracy(survey: OpenSurvey, draft: RunDraft, accuracy: StageRef) -> Published:
@@ -78,8 +76,7 @@ def extend_with_accuracy(survey: OpenSurvey, draft: RunDraft, accuracy: StageRef
     ``draft`` is of `Archive.extend_run`, ``accuracy`` the store of the judging. All that the receipt says of the
     survey itself stays as it is.
     """
-    run, products, judge = survey.run, survey.products, STAGES["evaluate"]
-    before, asked = load_receipt(draft.published), asked_settings(run)
+    judge, before, asked = STAGES["evaluate"], load_receipt(draft.published), asked_settings(survey.run)
     other_labels = asked["labels"] != before["settings"].get("labels")
     names = ("accuracy", "controls", *(("labels", "notes") if other_labels else ()))
     receipt = with_accuracy(
@@ -90,7 +87,7 @@ def extend_with_accuracy(survey: OpenSurvey, draft: RunDraft, accuracy: StageRef
         settings={name: asked[name] for name in names},
         judged=now(),
     )
-    return _publish(run, draft, products, load_plan(products["score"]), receipt)
+    return _publish(survey, draft, load_plan(survey.products["score"]), receipt)
 
 
 def load_receipt(folder: Path) -> Receipt:
@@ -101,7 +98,8 @@ def load_receipt(folder: Path) -> Receipt:
     return check_receipt(found.receipt)
 
 
-def _publish(run: SurveyRun, draft: RunDraft, products: Products, plan: FinePlan, receipt: Receipt) -> Published:
+def _publish(survey: OpenSurvey, draft: RunDraft, plan: FinePlan, receipt: Receipt) -> Published:
+    run, products = survey.run, survey.products
     again = (
         None
         if run.plan.plain
@@ -109,18 +107,21 @@ def _publish(run: SurveyRun, draft: RunDraft, products: Products, plan: FinePlan
     )
     shown = quicklook_data(run, products, plan, receipt)
     draw_quicklook(draft.folder / "quicklook.png", shown)
-    draft.write_file("receipt.json", to_json(receipt))
     if "plots" in receipt:
         draft.write_file(PLOTS_FILE, plots_csv(receipt["plots"]))
     picture = (draft.folder / "quicklook.png").read_bytes()
     maps = (load_ground_map(ref.path / STORE) for ref in products.there("ground"))
     pictures = [Picture(draw_ground(drawn), "The map on the ground, north up.") for drawn in maps]
     field = field_map(run, plan, shown, prior_map(run.prior, products["segment"], receipt))
-    page = render_report(receipt, picture, pictures, captured_again=again, field=field)
-    (draft.folder / "report.html").write_text(page, encoding="utf-8")
-    rests_on = run.archive.manifest_hashes(products.values())
-    folder = draft.publish(survey=receipt["survey"], settings=receipt["settings"], rests_on=rests_on)
-    return Published(receipt, folder, again)
+    receipt = publish_counted(
+        run.archive,
+        draft,
+        receipt,
+        lambda told: render_report(told, picture, pictures, captured_again=again, field=field),
+        rests_on=run.archive.manifest_hashes(products.values()),
+        written=survey.take_written(),
+    )
+    return Published(receipt, draft.published, again)
 
 
 def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
@@ -154,7 +155,8 @@ def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
         versions=versions,
         settings=asked_settings(run),
         stages=[asdict(one) for one in survey.records.values()],
-        savings=_savings(run, products, plan),
+        savings=_savings(run, plan),
+        data_bytes=open_account(run, plan),
         accuracy_is=accuracy_is,
         judged=None if accuracy is None else now(),
         accuracy=accuracy,
@@ -171,27 +173,18 @@ def asked_settings(run: SurveyRun) -> dict[str, object]:
     return {**anchor_paths(run.settings.to_dict(), Path.cwd()), "notes": list(run.notes)}
 
 
-def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, Any]:
-    """Everything done against the full scan; stored bytes of the full scan are predicted from the ratio seen here."""
-    bands = len(run.scene.wavelength_nm)
+def _savings(run: SurveyRun, plan: FinePlan) -> dict[str, Any]:
+    """Everything done against the full scan; of a raster, of which nothing is captured, what the model reads."""
     if run.raster is not None:
-        every = run.grid.height * run.grid.width * bands * BYTES_A_VALUE
-        entry = SavingEntry(run.archive.stored_bytes(products.mosaic), every, "predicted")
-        return {"bytes_stored": entry.as_dict(), **_model_savings(run, plan)}
+        return _model_savings(run, plan)
     done = [*run.plan.coarse, *plan.sweeps]
-    entries = capture_savings(done, run.plan.full, run.camera, run.grid, cost=run.settings.cost, bands=bands)
-    stored = [run.archive.stored_bytes(ref) for ref in products.there("condense_coarse", "condense_fine")]
-    # Fine lines compress like the full scan's would; without any, the coarse ones have to stand for them.
-    like, kept = (plan.sweeps, stored[1]) if plan.sweeps else (run.plan.coarse, stored[0])
-    of_these = capture_savings(like, run.plan.full, run.camera, run.grid, cost=run.settings.cost, bands=bands)
-    full_stored = entries["bytes_raw"].full * kept / of_these["bytes_raw"].done
+    entries = capture_savings(done, run.plan.full, run.camera, run.grid, cost=run.settings.cost)
     reference = run.scans.reference  # the cheapest scan that is nearly as good as any; without a table, every line
     full_s = run.plan.full_s if reference is None else reference.seconds
     capture = SavingEntry(run.plan.coarse_s + plan.seconds, full_s, "predicted").as_dict()
     return {
         **{name: entry.as_dict() for name, entry in entries.items()},
         "capture_s": capture if reference is None else capture | {"full_scan": reference.words},
-        "bytes_stored": SavingEntry(sum(stored), round(full_stored), "predicted").as_dict(),
         **_model_savings(run, plan),
     }
 
@@ -303,8 +296,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     if run.recorded is not None:
         found["recording"] = _recording(run, run.recorded, plan)
     if run.budget is not None:
-        stored = run.archive.stored_bytes(products.mosaic)
-        found["kept"] = run.budget.figures(plan.patch_index) | {"stored_bytes": stored}
+        found["kept"] = run.budget.figures(plan.patch_index)
     if (memory := prior_map_figures(products["segment"].path)) is not None:
         found["memory"] = memory
     if run.settings.extent != EXTENT_WHOLE:

@@ -27,6 +27,7 @@ from flows.tasks.stages.raster import condense_raster
 from pipeline.lazy import deferred
 from storage.archive.keys import StageRef
 from storage.archive.records import StageRecord
+from storage.archive.staging import bytes_below
 
 if TYPE_CHECKING:
     import prefect.concurrency.sync as prefect_concurrency
@@ -97,6 +98,7 @@ class OpenSurvey:
         self.capture_deployment: str | None = None  # which takes the sweeps, on the rig's machine
         self.products = Products()
         self.records: dict[str, StageRecord] = {}
+        self._written = 0
 
     @property
     def name_of_run(self) -> str:
@@ -166,6 +168,8 @@ class OpenSurvey:
         bytes_in = sum(size(given) for given in inputs)
         self.records[stage] = StageRecord(stage, ref.key, state, wall, cpu, peak, bytes_in, size(ref), known)
         self.products[stage] = ref
+        if built:
+            self._written += bytes_below(self.run.archive.root / ref.uri)
         watch(stage, state, 1.0)
         self.observer.log(self._summary(stage, ref))
         return ref
@@ -176,6 +180,11 @@ class OpenSurvey:
         self.records[stage] = StageRecord(stage, ref.key, "cached", None, None, None, 0, size, known)
         self.products[stage] = ref
         self.observer.watch(stage, "cached", 1.0)
+
+    def take_written(self) -> int:
+        """Return bytes of the stores built, and of the spools of their lines, since this was asked last."""
+        taken, self._written = self._written + self.run.archive.take_spooled(), 0
+        return taken
 
     def _summary(self, stage: str, ref: StageRef) -> str:
         record, title = self.records[stage], TITLES[stage]

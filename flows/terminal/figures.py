@@ -33,6 +33,11 @@ def format_bytes(count: float | None) -> str:
     return f"{size:.3g} {units[-1]}"
 
 
+def format_megabytes(count: float | None) -> str:
+    """Bytes in MB, whatever their number, so that a column of them compares."""
+    return f"{three_digits(count / 1e6)} MB" if _known(count) else DASH
+
+
 def format_count(count: float | None) -> str:
     """Whole numbers with thin spaces by thousands up to ten million, then million, billion, 10^12."""
     if not _known(count):

@@ -133,15 +133,13 @@ def capture_savings(
     grid: SceneGrid,
     *,
     cost: CostModel,
-    bands: int,
     full_is: FullIs = "predicted",
 ) -> dict[str, SavingEntry]:
-    """Compare sweeps with those of a full scan: lines, samples on the scene, raw bytes, seconds by the cost model."""
+    """Compare sweeps with those of a full scan: lines, samples on the scene, seconds by the cost model."""
     both = (done, full)
     counted: dict[str, list[float]] = {
         "lines": [count_lines(sweeps) for sweeps in both],
         "samples": [count_samples(sweeps, camera, grid) for sweeps in both],
-        "bytes_raw": [raw_bytes(sweeps, camera, bands) for sweeps in both],
         "capture_s": [cost.seconds(list(sweeps), camera) for sweeps in both],
     }
     return {name: SavingEntry(of_done, of_full, full_is) for name, (of_done, of_full) in counted.items()}

@@ -76,6 +76,7 @@ class Archive:
 
     def __init__(self, root: Path, *, writes: bool = True) -> None:
         self.root, self.writes = root, writes
+        self._spooled = 0
 
     @classmethod
     def open(cls, root: str | Path, *, create: bool = True, write: bool = True) -> Archive:
@@ -282,8 +283,16 @@ class Archive:
         return datetime.now(UTC)
 
     def size_of(self, uri: str) -> int:
-        """Bytes of all files of a store."""
+        """Bytes of all files of a store or run, manifest included, as they are there now."""
         return bytes_below(self.root / uri)
+
+    def sizes(self, uris: Iterable[str]) -> dict[str, int]:
+        """`size_of` stores and runs, by address."""
+        return {uri: self.size_of(uri) for uri in uris}
+
+    def take_moved(self) -> int:
+        """Bytes that went to and from a bucket since this was asked last, or the archive was opened."""
+        return 0
 
     def lost_runs(self) -> list[str]:
         """Addresses of runs whose manifest is gone, so that nothing tells what they name."""
@@ -370,7 +379,13 @@ class Archive:
         """Remove a spool whose lines are published; an archive opened for reading keeps it."""
         check_name(key)
         if self.writes:
+            self._spooled += bytes_below(self.root / "spool" / key)
             remove_tree(self.root / "spool" / key)
+
+    def take_spooled(self) -> int:
+        """Bytes of the spools that were removed since this was asked last, or the archive was opened."""
+        taken, self._spooled = self._spooled, 0
+        return taken
 
     def _lock_path(self, name: str) -> Path:
         return self.root / ".locks" / f"{name}.lock"

@@ -30,6 +30,7 @@ from storage.archive.records import read_run
 from storage.archive.staging import (
     MANIFEST_NAME,
     PART_SUFFIX,
+    bytes_below,
     check_name,
     refusals,
     remove_tree,
@@ -112,18 +113,30 @@ class RunDraft:
         manifests, too, are as they were, and `gc` what to keep, even where the receipt is damaged.
         """
         final = self.published
-        content = {"run": self.id, "rests_on": dict(rests_on or {}), **plain(facts)}
         with refusals(self._root, "write to the archive"):
+            self._write_manifest(rests_on, facts)
             if self.extends:
-                write_manifest(self.folder, content | extended_facts(read_manifest(final), manifest_sha256(final)))
                 take_its_place(self.folder, final)
             else:
-                write_manifest(self.folder, content)
                 rename_into_place(self.folder, final)
         self._release()
         if self.send is not None:
             self.send(f"runs/{self.id}")
         return final
+
+    def bytes_published(self, *, rests_on: Mapping[str, str] | None = None, **facts: Any) -> int:
+        """Bytes of the folder, manifest included, were it published now with these facts; see `publish`."""
+        with refusals(self._root, "write to the archive"):
+            self._write_manifest(rests_on, facts)
+            return bytes_below(self.folder)
+
+    def _write_manifest(self, rests_on: Mapping[str, str] | None, facts: Mapping[str, Any]) -> None:
+        """Write the manifest; with the same files and facts one of later has the same size."""
+        final = self.published
+        content = {"run": self.id, "rests_on": dict(rests_on or {}), **plain(facts)}
+        if self.extends:
+            content |= extended_facts(read_manifest(final), manifest_sha256(final))
+        write_manifest(self.folder, content)
 
     def abandon(self) -> None:
         """Remove what is not published; harmless afterwards."""

@@ -223,8 +223,17 @@ class ObjectArchive(Archive):
         return super().now() if dated is None else dated[1] + timedelta(seconds=1)
 
     def size_of(self, uri: str) -> int:
-        """Bytes of all objects of a store."""
+        """Bytes of all objects of a store or run."""
         return sum(one.size for one in self.objects.listing(uri).values())
+
+    def sizes(self, uris: Iterable[str]) -> dict[str, int]:
+        """`size_of` stores and runs, by address."""
+        names = list(uris)
+        return dict(zip(names, some_at_a_time(self.size_of, names), strict=True))
+
+    def take_moved(self) -> int:
+        """Bytes of objects sent and brought since this was asked last, or the archive was opened."""
+        return self.objects.take_moved()
 
     def lost_runs(self) -> list[str]:
         """Addresses of runs in the bucket of which there are files, but no manifest, neither there nor here."""

@@ -15,6 +15,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING, TypeVar
 from urllib.parse import urlsplit
 
@@ -190,6 +191,17 @@ class Objects:
 
     def __init__(self, place: ObjectPlace) -> None:
         self.place, self.store = place, connect(place)
+        self._moved, self._counting = 0, Lock()
+
+    def take_moved(self) -> int:
+        """Bytes of objects written and read since this was asked last; names, listings and headers do not count."""
+        with self._counting:
+            taken, self._moved = self._moved, 0
+        return taken
+
+    def _count(self, size: int) -> None:
+        with self._counting:
+            self._moved += size
 
     def read(self, name: str) -> bytes | None:
         """Content of a small object, None where there is none."""
@@ -200,7 +212,9 @@ class Objects:
         with answers_of(self.place):
             try:
                 answer = self.store.get(name)
-                return bytes(answer.bytes()), answer.meta["last_modified"]
+                content = bytes(answer.bytes())
+                self._count(len(content))
+                return content, answer.meta["last_modified"]
             except FileNotFoundError as error:
                 if "NoSuchBucket" in str(error):
                     raise
@@ -215,18 +229,23 @@ class Objects:
                 self.store.put(name, content, mode="create", use_multipart=False)
             except AlreadyExistsError:
                 return False
+            finally:
+                self._count(len(content))
         return True
 
     def write(self, name: str, source: Path | bytes) -> None:
         """Write an object from a file, whatever was there; nobody sees a part of it."""
         with answers_of(self.place):
             self.store.put(name, source, chunk_size=PART_BYTES, max_concurrency=2)
+        self._count(len(source) if isinstance(source, bytes) else source.stat().st_size)
 
     def blocks(self, name: str) -> Iterator[memoryview]:
         """Content of an object, some MB at a time (FileNotFoundError: there is none)."""
         with answers_of(self.place):
             for block in self.store.get(name).stream(PART_BYTES):
-                yield memoryview(block)
+                found = memoryview(block)
+                self._count(len(found))
+                yield found
 
     def save(self, name: str, path: Path) -> str:
         """Write an object into a new file; gives its SHA-256 (FileNotFoundError: there is none)."""

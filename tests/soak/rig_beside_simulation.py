@@ -140,6 +140,7 @@ def side_by_side(one: Surveyed, other: Surveyed) -> str:
 
     for name, (label, show) in COST_LABELS.items():
         add(label, lambda found, name=name, show=show: show(found.receipt["savings"][name]["done"]))  # type: ignore[misc]
+    add("bytes captured", lambda found: format_bytes(found.receipt["data_bytes"]["captured"]))
     add("fine sweeps", lambda found: format_count(len(found.sweeps("raw_fine"))))
     add("patches seen twice", _patches)
     add("mIoU", lambda found: f"{100 * found.receipt['accuracy']['miou']:.2f} %")

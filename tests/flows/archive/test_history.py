@@ -102,7 +102,7 @@ def test_whatever_a_receipt_claims_is_drawn_or_left_out(moment: str, fractions: 
     """Dates of any year and numbers of any size make no chart that fails or warns; equal rows give equal pages."""
     rows = [
         {"run": "runs/x", "created": moment, "visited": moment, "unit": "fraction", "areas": {"so$il": fraction},
-         "savings": dict.fromkeys(("capture_s", "lines", "bytes_stored", "multiply_adds")), "miou": None,
+         "savings": dict.fromkeys(("capture_s", "lines", "bytes_kept", "multiply_adds")), "miou": None,
          "overall_accuracy": None}
         for fraction in fractions
     ]  # fmt: skip

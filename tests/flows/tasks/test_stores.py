@@ -91,24 +91,6 @@ def test_raw_is_stored_once_and_as_uint16(surveyed: tuple[Path, Published]) -> N
     assert mosaics[0].size * 2 <= largest
 
 
-def test_both_sides_of_the_ledger_count_one_representation(surveyed: tuple[Path, Published]) -> None:
-    """Stored bytes of a full scan are its raw bytes at the ratio at which this survey's own fine lines were stored."""
-    root, published = surveyed
-    archive, savings = Archive.open(root, create=False, write=False), published.receipt["savings"]
-    size: dict[str, int] = {}
-    raw: dict[str, int] = {}
-    for name in ("raw_coarse", "raw_fine"):
-        _, stage, key = published.receipt["products"][name].split("/")
-        ref = archive.find(stage, key)
-        assert ref is not None
-        size[name] = archive.stored_bytes(ref)
-        raw[name] = sum(open_raw_cube(path).read().nbytes for path in ref.path.glob("*.zarr"))
-    assert savings["bytes_raw"]["done"] == sum(raw.values())
-    assert savings["bytes_stored"]["done"] == sum(size.values())
-    ratio = size["raw_fine"] / raw["raw_fine"]
-    assert savings["bytes_stored"]["full"] == round(savings["bytes_raw"]["full"] * ratio)
-
-
 def test_the_picture_of_raw_lines_reads_no_raw_line(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A warm survey draws it from the quicklooks alone."""
 

@@ -62,11 +62,11 @@ def test_the_ledger_compares_like_with_like():
     """The full scan against itself is 1 in every entry; nothing against it is 0."""
     grid = SceneGrid(100, 700, 16, 4)
     full = full_sweeps(grid, CAMERA, "x")
-    same = capture_savings(full, full, CAMERA, grid, cost=COST, bands=5)
-    assert list(same) == ["lines", "samples", "bytes_raw", "capture_s"]
-    assert [entry.ratio for entry in same.values()] == [1, 1, 1, 1]
-    none = capture_savings([], full, CAMERA, grid, cost=COST, bands=5, full_is="measured")
-    assert [entry.ratio for entry in none.values()] == [0, 0, 0, 0]
+    same = capture_savings(full, full, CAMERA, grid, cost=COST)
+    assert list(same) == ["lines", "samples", "capture_s"]
+    assert [entry.ratio for entry in same.values()] == [1, 1, 1]
+    none = capture_savings([], full, CAMERA, grid, cost=COST, full_is="measured")
+    assert [entry.ratio for entry in none.values()] == [0, 0, 0]
     assert none["lines"].full_is == "measured"
 
 

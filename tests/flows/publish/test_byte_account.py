@@ -1,0 +1,238 @@
+"""The account of bytes of a run: each figure is counted again by walking folders, and shown where people look."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from flows.archive.commands import contents
+from flows.archive.compare_command import compare
+from flows.archive.history import read_history
+from flows.publish import byte_account
+from flows.publish.byte_account import publish_counted, recount_bytes
+from flows.publish.receipt import Receipt, check_receipt
+from flows.publish.receipt_table import byte_rows, print_table
+from flows.publish.report import render_report, replace_bytes
+from flows.publish.run_folder import Published
+from flows.terminal.figures import DASH, format_megabytes
+from storage.archive.archive import Archive
+from storage.archive.kept_bytes import kept_bytes
+from storage.archive.records import read_run
+from tests.conftest import Survey
+from tests.flows.conftest import Page, problems
+from tests.flows.publish.test_receipt import make_receipt
+
+pytestmark = pytest.mark.usefixtures("no_effects")
+
+PNG = b"\x89PNG\r\n\x1a\nnot a real picture"
+
+
+def walked(*folders: Path) -> int:
+    """Bytes of all files in folders, as `find -type f` lists them."""
+    return sum(path.stat().st_size for folder in folders for path in folder.rglob("*") if path.is_file())
+
+
+def told(folder: Path) -> dict[str, Any]:
+    """The account in the receipt of a run's folder."""
+    account: dict[str, Any] = json.loads((folder / "receipt.json").read_text())["data_bytes"]
+    return account
+
+
+@pytest.fixture
+def spooled(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Bytes of each spool when it is removed."""
+    found: list[int] = []
+    drop = Archive.drop_spool
+
+    def drop_measured(self: Archive, key: str) -> None:
+        found.append(walked(self.root / "spool" / key))
+        drop(self, key)
+
+    monkeypatch.setattr(Archive, "drop_spool", drop_measured)
+    return found
+
+
+@pytest.fixture
+def published(survey_png: Survey, tmp_path: Path) -> Published:
+    """A survey of the small picture into an archive of its own."""
+    return survey_png(tmp_path / "archive", accuracy=False)
+
+
+def test_the_account_of_a_survey_is_what_lies_in_its_folders(
+    spooled: list[int], survey_png: Survey, tmp_path: Path
+) -> None:
+    """Kept and written by walking the archive, captured by the lines; nothing is moved, and nothing reused."""
+    root = tmp_path / "archive"
+    published = survey_png(root, accuracy=False)
+    account = told(published.folder)
+    assert account == published.receipt["data_bytes"]
+    assert account["kept"] == walked(root / "stages", root / "runs")
+    assert sum(spooled) > 0
+    assert account["written"] == account["kept"] + sum(spooled)
+    assert (account["moved_bucket"], account["moved_workers"], account["reused"]) == (0, 0, {})
+    assert account["reference"] >= 96 * 128 * 3 * 2  # a line has all samples of the camera
+    assert 0 < account["captured"] < sum(spooled)  # a spool has numbers, times and checksums beside the lines
+    assert account["captured"] > 0.9 * sum(spooled)
+    run = read_run(published.folder, {})
+    assert kept_bytes(Archive.open(root), run) == account["kept"]
+    (listed,) = contents(Archive.open(root))["runs"]
+    assert listed["bytes"] == account["kept"]
+    (row,) = read_history(Archive.open(root)).runs
+    assert row["savings"]["bytes_kept"] == account["kept"] / account["reference"]
+    assert problems(root) == []
+
+
+def test_an_accuracy_that_is_added_is_in_the_account(survey_png: Survey, tmp_path: Path) -> None:
+    """The published run is counted again: with its stores of the judging, and all files of the folder as it is then."""
+    root = tmp_path / "archive"
+    account = told(survey_png(root).folder)
+    assert account["kept"] == walked(root / "stages", root / "runs")
+    assert account["written"] > account["kept"]  # the folder was written twice
+    assert account["reused"] == {}
+
+
+def test_what_is_found_counts_as_kept_and_not_as_written(
+    published: Published, survey_png: Survey, tmp_path: Path
+) -> None:
+    """A second run of the same survey writes its folder alone, and names all stores as reused."""
+    root = tmp_path / "archive"
+    again = survey_png(root, accuracy=False)
+    assert again.folder != published.folder
+    account, first = told(again.folder), told(published.folder)
+    assert account["written"] == walked(again.folder)
+    assert account["kept"] == walked(root / "stages", again.folder)
+    assert account["reused"] == {ref.uri: walked(ref.path) for ref in Archive.open(root).refs()}
+    assert account["captured"] == first["captured"]  # its passes are the same
+    assert "Reused, found" in _printed(again.receipt)
+    assert "Reused, found" in (again.folder / "report.html").read_text()
+
+
+def test_a_recount_after_clearing_tells_what_is_left(published: Published, tmp_path: Path) -> None:
+    """Only the bytes change in receipt and page, and the run is whole; it may be counted as often as one likes."""
+    root = tmp_path / "archive"
+    archive, before = Archive.open(root), (published.folder / "report.html").read_text()
+    first = told(published.folder)
+    for stage in ("capture", "patches"):
+        for ref in archive.refs(stage):
+            assert archive.clear(ref)
+    receipt = recount_bytes(archive, published.folder.name, replace_bytes)
+    account = told(published.folder)
+    assert account == receipt["data_bytes"]
+    assert account["kept"] == walked(root / "stages", root / "runs") < first["kept"]
+    assert account["written"] == first["written"] + walked(published.folder)
+    assert receipt | {"data_bytes": None} == published.receipt | {"data_bytes": None}
+    page = (published.folder / "report.html").read_text()
+    Page(page)
+    assert format_megabytes(account["kept"]) in page
+    section = re.compile('<section id="bytes">.*?</section>', re.DOTALL)
+    assert section.sub("", page).rstrip() == section.sub("", before).rstrip()
+    assert section.findall(page) != section.findall(before)
+    assert problems(root) == []
+    recount_bytes(archive, published.folder.name, replace_bytes)
+    assert told(published.folder)["kept"] == walked(root / "stages", root / "runs")
+
+
+def test_a_run_in_a_bucket_counts_its_objects(
+    bucket: str, survey_png: Survey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Kept are the objects in the bucket; moved what went there, and on another machine what it had to fetch."""
+    from storage.remote.object_stores import Objects, parse_place
+
+    account = told(survey_png(bucket, accuracy=False).folder)
+    sizes = {path: one.size for path, one in Objects(parse_place(bucket)).listing().items()}
+    stores = sum(size for path, size in sizes.items() if path.startswith("stages/"))
+    assert account["kept"] == stores + sum(size for path, size in sizes.items() if path.startswith("runs/"))
+    assert account["kept"] <= account["moved_bucket"] < 1.2 * account["kept"]  # manifests are read besides
+    monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / "elsewhere"))
+    other = survey_png(bucket, accuracy=False)
+    again = told(other.folder)
+    listed = Objects(parse_place(bucket)).listing(f"runs/{other.folder.name}")
+    assert again["kept"] == stores + sum(one.size for one in listed.values())
+    assert again["written"] == again["kept"] - stores
+    assert sum(again["reused"].values()) == stores
+    assert again["written"] < again["moved_bucket"] < again["written"] + 1.2 * stores
+
+
+def test_what_goes_to_worker_processes_is_not_counted(survey_png: Survey, tmp_path: Path) -> None:
+    """The receipt has no number of it, and the table says so."""
+    receipt = survey_png(tmp_path / "archive", accuracy=False, scheduler="processes", workers="2").receipt
+    assert receipt["data_bytes"]["moved_workers"] is None
+    assert "not counted" in _printed(receipt)
+
+
+@pytest.mark.parametrize("stores", [899, 99_000, 999_400, 9_999_999_000])
+def test_the_figure_of_a_folder_that_holds_the_figure(
+    stores: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where a digit more of it makes the folder larger, or shorter words make the page smaller, it holds as well."""
+    archive = Archive.open(tmp_path / "archive")
+    monkeypatch.setattr(byte_account, "_reused", lambda receipt, stores: {})
+    monkeypatch.setattr(archive, "sizes", lambda uris: {"stages/a/b": stores})
+    widths = iter(range(100_000, 0, -1))  # a page that gets shorter whenever it is asked for
+    with archive.new_run("north") as draft:
+        publish_counted(archive, draft, make_receipt(), lambda receipt: "x" * next(widths), rests_on={})
+    (folder,) = archive.runs()
+    assert told(folder)["kept"] == stores + walked(folder)
+    assert told(folder)["written"] == 7_000_000 + walked(folder)
+
+
+def _printed(receipt: Receipt, width: int = 80) -> str:
+    console = Console(file=io.StringIO(), width=width)
+    print_table(receipt, console)
+    return " ".join(console.file.getvalue().split())  # type: ignore[attr-defined]
+
+
+def test_terminal_and_page_show_megabytes_against_one_reference() -> None:
+    """A row each, with its fraction of the reference; what was reused stands below."""
+    rows = byte_rows(make_receipt())
+    assert [(row["label"], row["done"], row["full"], row["ratio"]) for row in rows] == [
+        ("bytes captured", "2 MB", "4 MB", 0.5),
+        ("bytes written", "7 MB", "4 MB", 1.75),
+        ("bytes kept", "1.5 MB", "4 MB", 0.375),
+        ("bytes moved, bucket", "0 MB", "4 MB", 0),
+        ("bytes moved, workers", "0 MB", "4 MB", 0),
+    ]
+    words = "Reused, found and not written again: 1 store, 0.25 MB of the bytes kept."
+    page = render_report(make_receipt(), PNG)
+    Page(page)
+    for text in (_printed(make_receipt()), page):
+        assert words in text
+        for figure in ("bytes kept", "1.5 MB", "38 %", "4 MB"):
+            assert figure in text, figure
+
+
+def test_a_receipt_of_an_earlier_version_shows_dashes(published: Published, tmp_path: Path) -> None:
+    """Table, page and history take one without the account; a recount leaves its run as it is."""
+    receipt = {name: value for name, value in make_receipt().items() if name != "data_bytes"}
+    assert check_receipt(receipt) == receipt
+    assert {row["done"] for row in byte_rows(receipt)} == {DASH}
+    assert f"bytes kept {DASH} {DASH} {DASH}" in _printed(receipt)
+    assert "bytes kept" in render_report(receipt, PNG)
+    archive = Archive.open(tmp_path / "archive")
+    earlier = {name: value for name, value in published.receipt.items() if name != "data_bytes"}
+    with archive.new_run("earlier") as draft:
+        publish_counted(archive, draft, earlier, lambda told: render_report(told, PNG), rests_on={})
+    folder = archive.runs()[-1]
+    known = (folder / "manifest.json").read_bytes()
+    assert recount_bytes(archive, folder.name, replace_bytes) == earlier
+    assert (folder / "manifest.json").read_bytes() == known
+    ratios = [row["savings"]["bytes_kept"] for row in read_history(archive).runs]
+    assert sorted(ratio is None for ratio in ratios) == [False, True]
+
+
+def test_compare_has_the_bytes_of_both(published: Published, survey_png: Survey, capsys: Any, tmp_path: Path) -> None:
+    """Each figure of both runs beside the other's."""
+    other = survey_png(tmp_path / "archive", accuracy=False, budget="0.7")
+    capsys.readouterr()
+    names = (published.folder.name, other.folder.name)
+    compare(tmp_path / "archive", *names, out=tmp_path, as_json=True)
+    found = json.loads(capsys.readouterr().out)["data_bytes"]
+    accounts = [told(one.folder) for one in (published, other)]
+    assert found["kept"] == [account["kept"] for account in accounts]
+    assert found["captured"] == [account["captured"] for account in accounts]
