@@ -31,9 +31,10 @@ from pipeline.errors import ArchiveError, PipelineError
 from pipeline.ground.georeference import pixel_side_m
 from storage.archive.staging import take_lock
 from storage.archive.whole_files import remove_leftovers
-from storage.arrays.cubes import open_raw_cube
 from storage.arrays.georeference import load_geobox
-from storage.arrays.ground_maps import load_bands, open_image
+from storage.arrays.ground_maps import open_image
+from storage.arrays.mosaics import open_mosaic
+from storage.arrays.signal_cubes import open_lines
 from storage.export.image_files import EnviFile, has_map_info, write_cog, write_envi, write_recorded_files
 from storage.export.map_files import STYLE
 from storage.export.stac_items import COG, ZARR, Item, check_owner, clean_id, footprint, projection, write_stac
@@ -158,13 +159,12 @@ def _export_images(export: Export, layers: Sequence[Layer], console: Console) ->
 
 def _export_cubes(export: Export, console: Console) -> None:
     run = export.run
-    mosaic = open_image(run.path("mosaic"), "values")
-    rows, columns, bands = mosaic.shape
-    wave, width = load_bands(run.path("mosaic"))
-    geobox = mosaic.geobox if mosaic.geobox is not None and has_map_info(mosaic.geobox) else None
+    mosaic, image = open_mosaic(run.path("mosaic")), open_image(run.path("mosaic"), "coverage")
+    (rows, columns), wave, width = mosaic.shape, mosaic.wavelength_nm, mosaic.fwhm_nm
+    geobox = image.geobox if image.geobox is not None and has_map_info(image.geobox) else None
     place = NOT_PLACED if run.geobox is None else "camera grid, no CRS" if geobox is None else "on the scene's map"
-    text = f"coarse mosaic of {run.id}, scene values; {place}"
-    file = EnviFile((rows, columns, bands), "f4", wave, width, text, float("nan"), geobox)
+    text = f"mosaic of {run.id}, scene values; {place}"
+    file = EnviFile((rows, columns, len(wave)), "f4", wave, width, text, float("nan"), geobox)
     header = export.folder / "envi" / "mosaic.hdr"
     with console.status("writing mosaic.img"):
         data = write_envi(header, file, mosaic.rows())
@@ -173,7 +173,7 @@ def _export_cubes(export: Export, console: Console) -> None:
     for path in run.sweeps():
         name = path.stem
         with console.status(f"writing {name}.bil"):
-            header = write_recorded_files(open_raw_cube(path), export.folder / "sweeps")
+            header = write_recorded_files(open_lines(path), export.folder / "sweeps")
         data, table = header.with_suffix(".bil"), header.with_name(f"{name}.pointing.csv")
         export.add(f"{name}_envi", data, f"Raw numbers of sweep {name}", ENVI_NUMBERS, ["data"], **export.nowhere)
         export.add(f"{name}_envi_header", header, f"{name} as ENVI, header", "text/plain", ["metadata"])

@@ -27,6 +27,7 @@ from storage.arrays.layout import grid_of, open_group
 from storage.arrays.quicklooks import choose_bands
 from storage.export.image_files import ANGULAR, CogImage, Place, value_span
 from storage.export.map_files import GREENS, GREYS, write_class_style, write_colour_style, write_ramp_style
+from storage.readers.recordings import stores_of_lines
 
 Rows = Iterator[tuple[int, NDArray[Any]]]
 RGB = ("red", "green", "blue")
@@ -72,8 +73,8 @@ class ExportedRun:
         return self.archive.locate(self.receipt["products"][product])
 
     def sweeps(self) -> list[Path]:
-        refs = [self.store(product) for product in ("raw_coarse", "raw_fine")]
-        return [path for ref in refs if ref is not None for path in sorted(ref.path.glob("*.zarr"))]
+        stores = [self.archive.locate(uri) for uri in stores_of_lines(self.receipt["products"], self.archive.is_there)]
+        return [path for store in stores for path in sorted(store.glob("*.zarr"))]
 
     @cached_property
     def geobox(self) -> GeoBox | None:

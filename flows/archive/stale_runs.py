@@ -21,7 +21,7 @@ from storage.archive.keys import canonical_json
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run, Store
 from storage.readers.open_cubes import split_variable
-from storage.readers.recordings import RAW_PRODUCTS, find_raw_cubes
+from storage.readers.recordings import find_raw_cubes, stores_of_lines
 
 OF_THE_SURVEY = ("labels", "weights", "memory", "accuracy", "prior")  # settings that its raw cubes do not bring
 # what the light of a field depends on; surveys that agree in these are generations of one
@@ -83,7 +83,7 @@ def from_raw_cubes(catalogue: Catalogue, run: Run, settings: Settings) -> Settin
     recording or of a simulated scene are gone. Else, and where the raw cubes are gone too, the settings stay. Raises
     SettingsError, BudgetError: as `asked_again`.
     """
-    raw = {uri for name, uri in run.products.items() if name in RAW_PRODUCTS}
+    raw = set(stores_of_lines(run.products, lambda uri: uri in catalogue.stores and not catalogue.stores[uri].cleared))
     stores = [catalogue.stores.get(uri) for uri in raw]
     if not stores or any(one is None or one.problem is not None or one.cleared for one in stores):
         return settings

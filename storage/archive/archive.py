@@ -135,6 +135,11 @@ class Archive:
         check_files(ref.path, hashes=False)
         return None if is_cleared(read_manifest(ref.path)) else ref
 
+    def is_there(self, uri: str) -> bool:
+        """Whether a store's files are there, not only what tells of them."""
+        path = self.root / uri
+        return path.is_dir() and not is_cleared(read_manifest(path))
+
     def is_known(self, ref: StageRef) -> bool:
         """Whether a store was published here, also where its files were cleared away since."""
         return (self.root / ref.uri).is_dir()

@@ -239,6 +239,11 @@ class Mosaic:
         """Scene values (..., band) of some bands of scores (..., component)."""
         return (self.components if bands is None else self.components.of_bands(bands)).restore(scores)
 
+    def rows(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
+        """Scene values (y, x, band) with the number of the first row, as many rows at a time as a shard has."""
+        for first in range(0, self.shape[0], SHARD_ROWS):
+            yield first, self.values(slice(first, min(first + SHARD_ROWS, self.shape[0])))
+
     def thinned(self, step: int, bands: Sequence[int]) -> NDArray[np.float32]:
         """Scene values of every ``step``-th pixel in some bands, (y, x, band), read a shard's rows at a time."""
         starts = range(0, self.shape[0], SHARD_ROWS)

@@ -19,11 +19,13 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
+from pipeline.geometry.mirror import mirror_throughput
 from pipeline.geometry.scan import Sweep
+from pipeline.signal.calibrate import judge_elements
 from pipeline.signal.components import Components
 from pipeline.signal.condense import RESIDUAL_STEP, UNUSABLE
 from pipeline.source import References
-from storage.arrays.cubes import SweepHeader, write_line_facts, write_references
+from storage.arrays.cubes import RawCube, SweepHeader, open_raw_cube, write_line_facts, write_references
 from storage.arrays.layout import (
     SHARD_ROWS,
     ArraySpec,
@@ -41,6 +43,7 @@ from storage.arrays.quicklooks import Quicklook, quicklook_of, write_quicklook
 
 CHUNK = 64  # lines and samples of a chunk of scores, all components of them: what lies together packs together
 SHARD_SAMPLES = 640
+MOST_DN = np.iinfo(np.uint16).max
 LARGEST_SHORT = 32_000  # of scores in steps; larger ones are stored in 32 bits
 
 
@@ -246,3 +249,40 @@ def open_signal_cube(path: Path) -> SignalCube:
 def open_signal_cubes(folder: Path) -> list[SignalCube]:
     """Open the condensed sweeps of a pass, in the order of their names; raises as `open_signal_cube`."""
     return [open_signal_cube(path) for path in sorted(folder.glob("*.zarr"))]
+
+
+@dataclass(frozen=True)
+class RestoredCube(RawCube):
+    """Raw lines as their components give them back: their signal, rounded to whole numbers; the noise is gone.
+
+    What was unusable comes back as the largest number, which counts as saturated.
+    """
+
+    signal: SignalCube
+
+    def read(self, start: int = 0, stop: int | None = None) -> NDArray[np.uint16]:
+        """Numbers of the lines ``start`` to ``stop``, (line, sample, band) uint16."""
+        first, last, _ = slice(start, stop).indices(len(self.time_s))
+        values = self.signal.spectra(first, last)
+        if self.references.by_mirror:
+            values *= mirror_throughput(np.nan_to_num(self.position[first:last])).astype(np.float32)[:, None, None]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            numbers = np.rint(values / self._gain + self.references.dark)
+        return np.where(np.isfinite(numbers), np.clip(numbers, 0, MOST_DN), MOST_DN).astype(np.uint16)
+
+    @cached_property
+    def _gain(self) -> NDArray[np.float32]:
+        return judge_elements(self.references).gain
+
+    def read_window(self, lines: slice, samples: slice) -> NDArray[np.uint16]:
+        """Numbers of some lines and samples, (line, sample, band) uint16."""
+        return self.read(lines.start, lines.stop)[:, samples]
+
+
+def open_lines(path: Path) -> RawCube:
+    """Open a sweep as raw lines, whether it was stored as such or condensed; raises as `open_raw_cube`."""
+    if "dn" in open_group(path):
+        return open_raw_cube(path)
+    one = open_signal_cube(path)
+    facts = (one.position, one.time_s, one.exposure_ms, one.valid_line, one.source, one.started, one.group)
+    return RestoredCube(one.sweep, one.references, one.wavelength_nm, one.fwhm_nm, *facts, signal=one)

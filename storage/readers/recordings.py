@@ -17,7 +17,7 @@ band, and ``mirror at rest = 1`` where it was taken so.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -37,8 +37,8 @@ from storage.archive.keys import array_digest
 from storage.archive.manifests import manifest_sha256
 from storage.archive.records import Run, read_run, read_store
 from storage.archive.staging import MANIFEST_NAME
-from storage.arrays.cubes import open_raw_cube
 from storage.arrays.layout import open_group
+from storage.arrays.signal_cubes import open_lines
 from storage.readers.cube_sources import CubeSource
 from storage.readers.envi_files import find_envi_pair, load_envi_header
 from storage.readers.open_cubes import reader_of
@@ -58,7 +58,13 @@ from storage.remote.opening import is_archive, open_archive
 Floats = NDArray[np.float64]
 
 SAME_PERIOD = 0.01
-RAW_PRODUCTS = ("raw_coarse", "raw_fine", "raw_again")  # of a run
+LINE_PRODUCTS = {"raw_coarse": "signal_coarse", "raw_fine": "signal_fine"}  # of a run: raw lines, and condensed ones
+
+
+def stores_of_lines(products: Mapping[str, str], is_there: Callable[[str], bool]) -> list[str]:
+    """Addresses of the stores that hold a run's lines: raw ones, or condensed ones where those were cleared away."""
+    pairs = [(products[raw], products.get(signal)) for raw, signal in LINE_PRODUCTS.items() if raw in products]
+    return [raw if signal is None or is_there(raw) else signal for raw, signal in pairs]
 
 
 @dataclass(frozen=True)
@@ -137,7 +143,7 @@ def open_recording(
             raise SettingsError(
                 f"--{name} is for files, and {address} holds raw cubes, which bring their own; leave --{name} out"
             )
-    cubes = [open_raw_cube(path) for path in stores]
+    cubes = [open_lines(path) for path in stores]
     first = cubes[0]
     for path, cube in zip(stores, cubes, strict=True):
         if not np.array_equal(cube.wavelength_nm, first.wavelength_nm):
@@ -428,7 +434,7 @@ def _run_with_cubes(address: str, name: str | None) -> tuple[Archive, Run, list[
     for folder in reversed(folders):
         if name in (None, folder.name):
             run = read_run(folder, {})
-            stores = [archive.locate(run.products[product]) for product in RAW_PRODUCTS if product in run.products]
+            stores = [archive.locate(uri) for uri in stores_of_lines(run.products, archive.is_there)]
             cubes = [path for store in stores for path in sorted(store.glob("*.zarr"))]
             if cubes:
                 return archive, run, cubes

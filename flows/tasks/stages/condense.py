@@ -24,7 +24,7 @@ from storage.arrays.cubes import RawCube, SweepHeader, open_raw_cubes
 from storage.arrays.signal_cubes import LineFacts, SignalCubeWriter, open_signal_cubes
 from storage.arrays.spool import line_values
 
-SIGNAL = Product("condense", version=1, files=("signal.json",))
+SIGNAL = Product("condense", version=1)
 RECORD = "signal.json"
 SHARED_FRACTION = 2e-3  # of all spectra: of more rare ones, a component is cheaper than their residuals
 MOST_RARE = 0.05  # of spectra: more are no exceptions, and raw lines stay
