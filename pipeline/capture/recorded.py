@@ -400,12 +400,3 @@ def _same_lines(one: Sweep, other: Sweep) -> bool:
         other.step,
         other.binning,
     )
-
-
-def _equal(one: References, other: References) -> bool:
-    """Whether all frames of two references are the same, bit for bit."""
-    frames = ("dark", "white", "white_reference", "bad", "flat")
-    pairs = [(getattr(one, name), getattr(other, name)) for name in frames]
-    return one.by_mirror == other.by_mirror and all(
-        (left is None) == (right is None) and (left is None or np.array_equal(left, right)) for left, right in pairs
-    )

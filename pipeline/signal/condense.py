@@ -19,6 +19,7 @@ WHOLE, PARTIAL, UNUSABLE = 0, 1, 2  # all bands seen; some restored from the oth
 JOINT = ((2, 2), (1, 8), (8, 1))  # (line, sample) of neighbours whose residuals are tested together
 LAW_ROUNDS, LAW_CLIP = 4, 4.0
 LEAST_EXPECTED = 0.2  # of the mean residual, whatever the law says of dark or bright spectra
+SPECTRA_AT_ONCE = 1024  # projected at a time: they stay in cache
 RESIDUAL_STEP = 0.5  # in which residuals of rare spectra are kept [noise's deviations]
 
 Scores = NDArray[np.float32]
@@ -40,31 +41,37 @@ def score_lines(values: NDArray[np.float32], valid: Bools, components: Component
     Where bands of a spectrum are missing the scores are those of least squares over the others. ``valid`` is (line,
     sample) or (line, sample, band).
     """
-    axes = components.axes.T.astype(np.float32)
-    lit = np.isfinite(components.mean)
-    bands, count = int(lit.sum()), len(components)
-    white = components.white(values)
-    there = None
-    if valid.ndim == 3 or not np.isfinite(values[..., lit] if not lit.all() else values).all():
-        there = np.isfinite(values) & (valid if valid.ndim == 3 else valid[..., None])
-        there[..., ~lit] = False
-        white = np.where(there, white, np.float32(0))
-    scores = white @ axes
-    left = np.einsum("lsb,lsb->ls", white, white) - np.einsum("lsk,lsk->ls", scores, scores)
-    residual = np.maximum(left, 0) / np.float32(max(bands - count, 1))
+    lit, count = np.isfinite(components.mean), len(components)
+    bands = int(lit.sum())
+    scores, left = _projected(values, components)
     quality = np.where(valid if valid.ndim == 2 else valid.any(axis=2), WHOLE, UNUSABLE).astype(np.uint8)
-    if there is not None:
-        seen = there.sum(axis=2)
-        quality[2 * seen < bands] = UNUSABLE
-        some = (quality == WHOLE) & (seen < bands)
-        quality[some] = PARTIAL
-        if some.any():
-            scores[some], residual[some] = _least_squares(white[some], there[some], axes)
+    residual = np.maximum(left, 0) / np.float32(max(bands - count, 1))
+    broken = ~np.isfinite(left) if valid.ndim == 2 else ~np.isfinite(left) | ~valid[..., lit].all(axis=2)
+    if (broken & (quality == WHOLE)).any():
+        there = np.isfinite(values[broken]) & lit & (valid[broken] if valid.ndim == 3 else valid[broken][:, None])
+        white = np.where(there, components.white(values[broken]), np.float32(0))
+        scores[broken], residual[broken] = _least_squares(white, there, components.axes.T.astype(np.float32))
+        seen = there.sum(axis=1)
+        quality[broken] = np.where(2 * seen < bands, UNUSABLE, np.where(seen < bands, PARTIAL, quality[broken]))
     unusable = quality == UNUSABLE
     if count and unusable.any():
         scores[unusable] = 0
     residual[unusable] = np.nan
     return ScoredLines(scores, quality, residual.astype(np.float32))
+
+
+def _projected(values: NDArray[np.float32], components: Components) -> tuple[Scores, Scores]:
+    """Scores (..., component) of spectra (..., band), and the square of what they leave, (...); NaN of broken spectra."""
+    axes, flat = components.axes.T.astype(np.float32), values.reshape(-1, components.bands)
+    scores, left = np.empty((len(flat), len(components)), np.float32), np.empty(len(flat), np.float32)
+    with np.errstate(invalid="ignore", over="ignore"):
+        for first in range(0, len(flat), SPECTRA_AT_ONCE):
+            part = slice(first, first + SPECTRA_AT_ONCE)
+            white = components.white(flat[part])
+            scores[part] = white @ axes
+            np.einsum("nb,nb->n", white, white, out=left[part])
+    left -= np.einsum("nk,nk->n", scores, scores)
+    return scores.reshape(*values.shape[:-1], -1), left.reshape(values.shape[:-1])
 
 
 def _least_squares(white: Scores, there: Bools, axes: Scores) -> tuple[Scores, Scores]:

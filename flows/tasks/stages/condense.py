@@ -96,7 +96,10 @@ def _write_sweeps(
     for number, cube in enumerate(cubes):
         out = path / f"{cube.sweep.name}.zarr"
         shutil.rmtree(out, ignore_errors=True)
-        writer = SignalCubeWriter(out, header_of(cube), condenser.components, step=condenser.step, largest=largest)
+        shared = cubes[0].sweep.name if number and cube.references.same_as(cubes[0].references) else None
+        writer = SignalCubeWriter(
+            out, header_of(cube), condenser.components, step=condenser.step, largest=largest, frames_of=shared
+        )
 
         def part(fraction: float, number: int = number) -> None:
             report((number + fraction) / len(cubes))
