@@ -61,7 +61,7 @@ def score_lines(values: NDArray[np.float32], valid: Bools, components: Component
 
 
 def _projected(values: NDArray[np.float32], components: Components) -> tuple[Scores, Scores]:
-    """Scores (..., component) of spectra (..., band), and the square of what they leave, (...); NaN of broken spectra."""
+    """Scores (..., component) of spectra (..., band), and the square of what they leave; NaN of broken spectra."""
     axes, flat = components.axes.T.astype(np.float32), values.reshape(-1, components.bands)
     scores, left = np.empty((len(flat), len(components)), np.float32), np.empty(len(flat), np.float32)
     with np.errstate(invalid="ignore", over="ignore"):
