@@ -1,4 +1,4 @@
-"""Mosaics and condensed sweeps whose components are the bands themselves, so that values go in and come out as they are."""
+"""Mosaics and condensed sweeps whose components are the bands: values go in and come out as they are."""
 
 from __future__ import annotations
 
