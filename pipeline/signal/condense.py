@@ -110,18 +110,18 @@ class ResidualLaw:
         freedom = max(int(np.isfinite(components.mean).sum()) - len(components), 1)
         seen = score_lines(spectra[None], np.ones((1, len(spectra)), np.bool_), components)
         known = np.isfinite(seen.residual[0])
-        if np.count_nonzero(known) < 8 * (len(components) + 1):
-            return cls(1.0, np.zeros(len(components)), float(freedom))
         scores, residual = seen.scores[0][known].astype(np.float64), seen.residual[0][known].astype(np.float64)
+        if len(residual) < 8 * (len(components) + 1) or np.median(residual) < LEAST_RESIDUAL:
+            return cls(1.0, np.zeros(len(components)), float(freedom))
         design = np.concatenate([np.ones((len(scores), 1)), scores], axis=1)
         kept = residual <= np.median(residual) * 4
-        spread = 0.0
         for _ in range(LAW_ROUNDS):
             law = np.linalg.lstsq(design[kept], residual[kept], rcond=None)[0]
             floor = LEAST_EXPECTED * float(residual[kept].mean())
             ratio = residual / np.maximum(design @ law, max(floor, LEAST_RESIDUAL))
             spread = SIGMA_OF_MEDIAN * float(np.median(np.abs(ratio - np.median(ratio))))
-            kept = np.abs(ratio - 1) <= LAW_CLIP * max(spread, 1e-6)
+            near = np.abs(ratio - 1) <= LAW_CLIP * spread
+            kept = near if 2 * np.count_nonzero(near) >= len(near) else kept
         return cls(float(law[0]), law[1:], float(np.clip(2 / max(spread, 1e-6) ** 2, 1.0, freedom)))
 
     def expected(self, scores: Scores) -> Scores:
