@@ -205,7 +205,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
     bands, _ = choose_bands(run.scene.wavelength_nm)
     chosen = list(bands)
     mosaic = open_mosaic(products.mosaic.path / "mosaic.zarr")
-    coarse = np.concatenate([mosaic.spectra(strip, chosen) for strip in mosaic.strips(run.factor)])
+    coarse = np.concatenate([mosaic.spectra(strip, chosen) for strip in mosaic.row_blocks(run.factor)])
     attention = load_attention(products["score"].path / "attention.zarr")
     found = load_class_map(products["segment"].path / "class_map.zarr")
     order = np.argsort(attention.rank.ravel(), kind="stable")
