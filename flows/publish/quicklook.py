@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Patch, Rectangle
 from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 from numpy.typing import NDArray
+from PIL import Image
 
 from flows.publish.panels import MUTED, STYLE, UNLABELLED_COLOUR, class_palette, class_rgb, grey_of, outline, save_png
 from pipeline.geometry.grid import UNLABELLED
@@ -23,6 +25,7 @@ from pipeline.geometry.scan import Axis
 from storage.arrays.quicklooks import choose_bands, develop, stretch
 
 Box = tuple[int, int, int, int]
+COLOURS = 256  # of the picture
 
 
 @dataclass(frozen=True)
@@ -53,9 +56,20 @@ class QuicklookData:
 
 
 def draw_quicklook(path: str | Path, panels: QuicklookData) -> None:
-    """Draw the four panels as a PNG of about 1800 x 1400 px (flatter or taller for fields that are); OSError."""
+    """Draw the four panels as a PNG of about 1800 x 1400 px (flatter or taller for fields that are); OSError.
+
+    It has 256 colours, those of the classes among them: a third of the bytes.
+    """
+    drawn = io.BytesIO()
     with mpl.rc_context(_STYLE):
-        save_png(_compose(panels), path)
+        save_png(_compose(panels), drawn)
+    with Image.open(drawn) as opened:
+        picture = opened.convert("RGB")
+    kept = np.rint(255 * _palette(panels)).astype(np.uint8)[: COLOURS // 2]
+    others = picture.quantize(COLOURS - len(kept), dither=Image.Dither.NONE).getpalette() or []
+    table = Image.new("P", (1, 1))
+    table.putpalette(kept.tobytes() + bytes(others))
+    picture.quantize(palette=table, dither=Image.Dither.NONE).save(path, "PNG", optimize=True)
 
 
 _STYLE: Any = {**STYLE, "axes.titlesize": 14, "axes.titleweight": "bold", "axes.titlelocation": "left"}
