@@ -14,6 +14,8 @@ from scipy.ndimage import convolve1d
 
 from flows.tasks.stages import effects as effect_choice
 from pipeline.geometry.camera import LineCamera, footprint_kernel
+from storage.arrays.mosaics import Mosaic, open_mosaic
+from storage.arrays.signal_cubes import open_signal_cubes
 
 SLIT_PX = LineCamera().slit_px
 SAMPLES = 192  # of a line; a narrow camera is quick to simulate

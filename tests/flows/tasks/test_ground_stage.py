@@ -153,7 +153,7 @@ def test_map_and_picture_lie_where_the_rays_end(run: Run, stores: tuple[StageRef
     assert sure[wanted == 1] == pytest.approx(0.75)
     ref = draw(run, stores)
     found = load_ground_map(ref.path / STORE)
-    tones = coarse_colours(stores[1])
+    tones = coarse_colours(stores[1], None)
     assert np.nanmin(tones) >= 1
     assert np.isnan(tones[:5, :5]).all()
     seen = found.picture.max(axis=2) > 0

@@ -261,7 +261,7 @@ def test_a_served_field_of_which_a_stage_fails(
 
     out, file = tmp_path / "archive", field_file("north")
     with monkeypatch.context() as broken:
-        broken.setitem(STAGES, "extract_patches", failing("extract_patches", refusal("extract_patches")))
+        broken.setitem(STAGES, "rectify", failing("rectify", refusal("rectify")))
         state = survey(SurveySettings(settings_file=str(file), name="north"), return_state=True)
     assert (state.is_failed(), FULL_DISK in str(state.message)) == (True, True)
     assert (Archive.open(out).runs(), problems(out)) == ([], [])
