@@ -65,7 +65,8 @@ class SignalStatistics:
         self.total, self.block_total, self.largest = np.zeros((3, self.bands))
         self.single, self.block = np.zeros((2, self.bands, self.bands))
         wanted = max(SPECTRA_A_BAND * self.bands, 4 * KEPT_SPECTRA)
-        self._stride = int(np.clip(np.sqrt(self.expected / wanted), 1, BLOCK))
+        sides = 2 ** round(np.log2(max(self.expected / wanted, 1)) / 2)  # they divide a block's: blocks all begin alike
+        self._stride = min(sides, BLOCK)
         self._thin = max(1, round(self.expected / self._stride**2 / KEPT_SPECTRA))
 
     def add(self, values: Values, valid: Bools) -> None:
@@ -80,15 +81,16 @@ class SignalStatistics:
             shape = (lines, BLOCK, samples, BLOCK)
             every = whole[cut].reshape(shape).all(axis=(1, 3))
             rows = spectra[cut].reshape(lines, BLOCK, samples * BLOCK, -1).sum(axis=1)
-            means = rows.reshape(lines, samples, BLOCK, -1).sum(axis=2)[every] / np.float32(BLOCK * BLOCK)
-            self.block += means.T @ means
-            self.block_total += means.sum(axis=0, dtype=np.float64)
+            means = (rows.reshape(lines, samples, BLOCK, -1).sum(axis=2)[every] / BLOCK**2).astype(np.float64)
+            self.block += means.T @ means  # float32 would round off the noise below a signal of 300 deviations
+            self.block_total += means.sum(axis=0)
             self.means += len(means)
         thin = np.s_[:: self._stride, :: self._stride]
         some = spectra[thin][whole[thin]]
-        self.single += some.T @ some
-        self.total += some.sum(axis=0, dtype=np.float64)
-        self.kept.append(some[:: self._thin].copy())
+        exact = some.astype(np.float64)
+        self.single += exact.T @ exact
+        self.total += exact.sum(axis=0)
+        self.kept.append(some[-self.count % self._thin :: self._thin].copy())
         self.count += len(some)
         if self.bands <= FEW_BANDS:
             self._add_rough(spectra, whole)
@@ -97,11 +99,12 @@ class SignalStatistics:
         """Return spectra from the origin with 0 for what is missing, and which of them count."""
         by_band = valid if valid.ndim == 3 else valid[..., None]
         if self.origin is None or not self.lit.all():
-            seen = (by_band & np.isfinite(values)).any(axis=(0, 1))
-            first = np.nan_to_num(np.nanmean(np.where(by_band, values, np.nan), axis=(0, 1))) if seen.any() else 0.0
+            known = by_band & np.isfinite(values)
+            seen = known.sum(axis=(0, 1))
+            first = np.where(known, values, 0).sum(axis=(0, 1), dtype=np.float64) / np.maximum(seen, 1)
             before = np.zeros(self.bands, np.float32) if self.origin is None else self.origin
-            self.origin = np.where(self.lit, before, np.where(seen, first, 0)).astype(np.float32)
-            self.lit |= seen
+            self.origin = np.where(self.lit, before, first).astype(np.float32)
+            self.lit |= seen > 0
         spectra = values - self.origin
         if valid.ndim == 2 and valid.all() and self.lit.all() and np.isfinite(spectra).all():
             return spectra, valid
@@ -165,11 +168,12 @@ def find_components(
     model = None if noise is None else noise[lit]
     sigma = _noise(found, covariance, lit, mean[lit], model)
     loadings, deviations = np.zeros((0, found.bands)), np.full(found.bands, np.nan)
-    for _ in range(NOISE_ROUNDS if len(lit) > FEW_BANDS and found.count >= 4 * len(lit) else 1):
-        white = np.outer(sigma, sigma)
-        axes = _axes(found, covariance / white, lit, white, false_alarm, least)
-        if len(lit) > FEW_BANDS and found.count >= 4 * len(lit):
-            sigma = sigma * _left_over(covariance / white, axes)
+    for _ in range(NOISE_ROUNDS if len(lit) > FEW_BANDS and found.count >= 4 * len(lit) else 0):
+        scale = np.outer(sigma, sigma)
+        axes = _axes(found, covariance / scale, lit, scale, false_alarm, least)
+        sigma = sigma * _left_over(covariance / scale, axes)
+    scale = np.outer(sigma, sigma)
+    axes = _axes(found, covariance / scale, lit, scale, false_alarm, least)
     loadings = np.zeros((axes.shape[1], found.bands))
     loadings[:, lit] = axes.T
     deviations[lit] = sigma
@@ -228,9 +232,9 @@ def _axes(
     axes = np.zeros((bands, 0))
     if found.means >= 2 * bands:
         means, _ = _covariance(found.block, found.block_total, found.means)
-        axes = significant_axes(BLOCK**2 * means[np.ix_(lit, lit)] / scale, found.means, false_alarm)
+        axes = significant_axes(BLOCK**2 * means[np.ix_(lit, lit)] / scale, found.means, false_alarm / 2)
     rest = np.eye(bands) - axes @ axes.T
-    more = significant_axes(rest @ white @ rest, found.count, false_alarm, known=axes.shape[1])
+    more = significant_axes(rest @ white @ rest, found.count, false_alarm / 2, known=axes.shape[1])
     axes = np.concatenate([axes, more], axis=1)
     if axes.shape[1] < min(least, bands):
         rest = np.eye(bands) - axes @ axes.T
