@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
-from scipy.special import ndtri
+from scipy.special import chdtri
 
 from pipeline.readings import SIGMA_OF_MEDIAN
 from pipeline.signal.components import Components
@@ -19,6 +19,7 @@ WHOLE, PARTIAL, UNUSABLE = 0, 1, 2  # all bands seen; some restored from the oth
 JOINT = ((2, 2), (1, 8), (8, 1))  # (line, sample) of neighbours whose residuals are tested together
 LAW_ROUNDS, LAW_CLIP = 4, 4.0
 LEAST_EXPECTED = 0.2  # of the mean residual, whatever the law says of dark or bright spectra
+BRIGHT = 1e4  # mean square of a whitened spectrum above which a difference of float32 sums says nothing of residuals
 RESIDUAL_STEP = 0.5  # in which residuals of rare spectra are kept [noise's deviations]
 
 Scores = NDArray[np.float32]
@@ -50,8 +51,7 @@ def score_lines(values: NDArray[np.float32], valid: Bools, components: Component
         there[..., ~lit] = False
         white = np.where(there, white, np.float32(0))
     scores = white @ axes
-    left = np.einsum("lsb,lsb->ls", white, white) - np.einsum("lsk,lsk->ls", scores, scores)
-    residual = np.maximum(left, 0) / np.float32(max(bands - count, 1))
+    residual = _residual(white, scores, components.axes, bands - count)
     quality = np.where(valid if valid.ndim == 2 else valid.any(axis=2), WHOLE, UNUSABLE).astype(np.uint8)
     if there is not None:
         seen = there.sum(axis=2)
@@ -59,7 +59,7 @@ def score_lines(values: NDArray[np.float32], valid: Bools, components: Component
         some = (quality == WHOLE) & (seen < bands)
         quality[some] = PARTIAL
         if some.any():
-            scores[some], residual[some] = _least_squares(white[some], there[some], axes)
+            scores[some], residual[some] = _least_squares(white[some], there[some], axes, bands)
     unusable = quality == UNUSABLE
     if count and unusable.any():
         scores[unusable] = 0
@@ -67,8 +67,25 @@ def score_lines(values: NDArray[np.float32], valid: Bools, components: Component
     return ScoredLines(scores, quality, residual.astype(np.float32))
 
 
-def _least_squares(white: Scores, there: Bools, axes: Scores) -> tuple[Scores, Scores]:
-    """Scores (n, component) and residuals (n,) of whitened spectra (n, band), by the bands that are there."""
+def _residual(white: Scores, scores: Scores, axes: NDArray[np.float64], freedom: int) -> Scores:
+    """Mean square (line, sample) a degree of freedom that scores leave of whitened spectra; 0 where none is left."""
+    if freedom < 1:
+        return np.zeros(scores.shape[:2], np.float32)
+    square = np.einsum("lsb,lsb->ls", white, white)
+    left = square - np.einsum("lsk,lsk->ls", scores, scores)
+    bright = square > BRIGHT * freedom
+    if bright.any():
+        some = white[bright].astype(np.float64)
+        rest = some - (some @ axes.T) @ axes
+        left[bright] = np.einsum("nb,nb->n", rest, rest)
+    return np.maximum(left, 0) / np.float32(freedom)
+
+
+def _least_squares(white: Scores, there: Bools, axes: Scores, bands: int) -> tuple[Scores, Scores]:
+    """Scores (n, component) and residuals (n,) of whitened spectra (n, band), by those of ``bands`` that are there.
+
+    Missing bands count as noise in the residual: it spreads no more than that of a whole spectrum.
+    """
     count = axes.shape[1]
     products = (axes[:, :, None] * axes[:, None, :]).reshape(len(axes), -1)
     scores, residual = np.empty((len(white), count), np.float32), np.empty(len(white), np.float32)
@@ -79,7 +96,8 @@ def _least_squares(white: Scores, there: Bools, axes: Scores) -> tuple[Scores, S
         found = np.linalg.solve(gram, (white[part] @ axes).astype(np.float64)[..., None])[..., 0]
         scores[part] = found
         rest = np.where(there[part], white[part] - scores[part] @ axes.T, 0)
-        residual[part] = np.einsum("nb,nb->n", rest, rest) / np.maximum(there[part].sum(axis=1) - count, 1)
+        left = np.einsum("nb,nb->n", rest, rest) + np.minimum(bands - there[part].sum(axis=1), bands - count)
+        residual[part] = left / max(bands - count, 1)
     return scores, residual
 
 
@@ -95,7 +113,8 @@ class ResidualLaw:
     def learned(cls, spectra: NDArray[np.float32], components: Components) -> ResidualLaw:
         """Learn it of (n, band) spectra, outliers left out."""
         freedom = max(int(np.isfinite(components.mean).sum()) - len(components), 1)
-        if len(spectra) < 8 * (len(components) + 1):
+        every = len(components) >= np.isfinite(components.mean).sum()
+        if every or len(spectra) < 8 * (len(components) + 1):
             return cls(1.0, np.zeros(len(components)), float(freedom))
         seen = score_lines(spectra[None], np.ones((1, len(spectra)), np.bool_), components)
         known = np.isfinite(seen.residual[0])
@@ -108,6 +127,8 @@ class ResidualLaw:
             ratio = residual / np.maximum(design @ law, max(floor, 1e-12))
             spread = SIGMA_OF_MEDIAN * float(np.median(np.abs(ratio - np.median(ratio))))
             kept = np.abs(ratio - 1) <= LAW_CLIP * max(spread, 1e-6)
+            if not kept.any():  # values without noise leave nothing
+                break
         return cls(float(law[0]), law[1:], float(np.clip(2 / max(spread, 1e-6) ** 2, 1.0, freedom)))
 
     def expected(self, scores: Scores) -> Scores:
@@ -124,21 +145,27 @@ def find_rare(ratio: NDArray[np.float32], law: ResidualLaw, false_alarm: float) 
     whole image that noise alone may mark, over all tests together.
     """
     known = np.isfinite(ratio)
-    count = max(int(known.sum()), 1)
-    limit = float(ndtri(1 - min(false_alarm / (1 + len(JOINT)) / count, 0.5)))
-    rare = known & (_deviations(np.where(known, ratio, 1), law.freedom) > limit)
-    filled = np.where(known, ratio, 1).astype(np.float64)
+    share = false_alarm / (1 + len(JOINT)) / max(int(known.sum()), 1)
+    limit = _limit(law.freedom, share)
+    rare = known & (ratio > limit)
+    filled = np.where(known, np.minimum(ratio, limit), 1).astype(np.float64)  # no window is rare by one spectrum alone
     for lines, samples in JOINT:
         if lines > ratio.shape[0] or samples > ratio.shape[1]:
             continue
-        mean = uniform_filter(filled, (lines, samples), mode="nearest")
-        high = _deviations(mean, law.freedom * lines * samples) > limit
+        size = lines * samples
+        mean = uniform_filter(filled, (lines, samples))
+        high = np.zeros(ratio.shape, np.float32)
+        within = tuple(slice(side // 2, (side // 2 - side + 1) or None) for side in (lines, samples))
+        high[within] = mean[within] > _limit(law.freedom * size, share / size)
         if high.any():  # all spectra of the window
-            reach = uniform_filter(
-                high.astype(np.float32), (lines, samples), mode="constant", origin=_back(lines, samples)
-            )
-            rare |= known & (reach > 0.5 / (lines * samples))
+            reach = uniform_filter(high, (lines, samples), mode="constant", origin=_back(lines, samples))
+            rare |= known & (reach > 0.5 / size)
     return rare
+
+
+def _limit(freedom: float, false_alarm: float) -> float:
+    """Mean square of noise, over its expectation, that is exceeded with a probability."""
+    return float(chdtri(freedom, min(false_alarm, 0.5)) / freedom)
 
 
 def _back(lines: int, samples: int) -> tuple[int, int]:
@@ -146,18 +173,10 @@ def _back(lines: int, samples: int) -> tuple[int, int]:
     return tuple(-1 if size % 2 == 0 else 0 for size in (lines, samples))  # type: ignore[return-value]
 
 
-def _deviations(ratio: NDArray[np.floating], freedom: float) -> NDArray[np.floating]:
-    """Deviations from normal of a mean square over its expectation (Wilson & Hilferty 1931)."""
-    width = 2 / (9 * freedom)
-    deviations: NDArray[np.floating] = (np.cbrt(ratio) - (1 - width)) / np.sqrt(width)
-    return deviations
-
-
 def residual_steps(
     values: NDArray[np.float32], scores: Scores, components: Components, valid: Bools | None = None
-) -> NDArray[np.int16]:
+) -> NDArray[np.int32]:
     """What (n, component) scores leave of (n, band) spectra, in half deviations of the noise; 0 in missing bands."""
     left = components.white(values) - scores @ components.axes.astype(np.float32)
     there = np.isfinite(left) if valid is None else np.isfinite(left) & valid
-    steps = np.rint(np.where(there, left, 0) / RESIDUAL_STEP)
-    return np.clip(steps, -32767, 32767).astype(np.int16)
+    return np.rint(np.where(there, left, 0) / RESIDUAL_STEP).astype(np.int32)

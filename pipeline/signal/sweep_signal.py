@@ -67,7 +67,7 @@ class CondensedSweep:
     """What is known of a sweep once its scores are stored."""
 
     rare: NDArray[np.intp]  # (rare, 2) line and sample, by line
-    residuals: NDArray[np.int16]  # (rare, band) in half deviations of the noise
+    residuals: NDArray[np.int32]  # (rare, band) in half deviations of the noise
     known: int  # spectra of which enough bands were seen
 
 
@@ -93,9 +93,9 @@ class Condenser:
         rare = find_rare(ratio, self.law, self.false_alarm)
         return CondensedSweep(np.argwhere(rare), self._residuals(lines, rare), int(np.isfinite(ratio).sum()))
 
-    def _residuals(self, lines: SweepLines, rare: NDArray[np.bool_]) -> NDArray[np.int16]:
+    def _residuals(self, lines: SweepLines, rare: NDArray[np.bool_]) -> NDArray[np.int32]:
         """Return the (rare, band) residuals of rare spectra from their rounded scores; their lines are read again."""
-        found = [np.zeros((0, self.components.bands), np.int16)]
+        found = [np.zeros((0, self.components.bands), np.int32)]
         blocks = set((np.flatnonzero(rare.any(axis=1)) // BLOCK_LINES).tolist())
         for first, values, valid in calibrated_blocks(lines, self.camera, blocks):
             here = rare[first : first + len(values)]

@@ -44,7 +44,11 @@ from storage.arrays.quicklooks import Quicklook, quicklook_of, write_quicklook
 CHUNK = 64  # lines and samples of a chunk of scores, all components of them: what lies together packs together
 SHARD_SAMPLES = 640
 MOST_DN = np.iinfo(np.uint16).max
-LARGEST_SHORT = 32_000  # of scores in steps; larger ones are stored in 32 bits
+LARGEST_SHORT = 32_000  # of scores and residuals in steps; larger ones are stored in 32 bits
+
+
+def _kind(largest: float) -> str:
+    return "<i2" if largest <= LARGEST_SHORT else "<i4"
 
 
 @dataclass(frozen=True)
@@ -71,7 +75,7 @@ def score_spec(dims: tuple[str, str, str], shape: tuple[int, int, int], largest:
         -(-min(size, most) // part) * part
         for size, most, part in zip((rows, columns), (SHARD_ROWS, SHARD_SAMPLES), chunk[1:], strict=True)
     )
-    return ArraySpec(dims, shape, "<i2" if largest <= LARGEST_SHORT else "<i4", chunk, (chunk[0], *whole))
+    return ArraySpec(dims, shape, _kind(largest), chunk, (chunk[0], *whole))
 
 
 def write_components(group: zarr.Group, components: Components) -> None:
@@ -124,6 +128,8 @@ class SignalCubeWriter:
     def write(self, first: int, scores: NDArray[np.floating], quality: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Store (line, sample, component) scores from a line on, a multiple of 64; return them as they are stored."""
         steps = np.rint(scores / np.float32(self._step))
+        most = float(np.iinfo(self._scores.dtype).max) / 2
+        np.clip(steps, -most, most, out=steps)  # few bands of a spectrum may tell a component badly
         stop = first + len(scores)
         if steps.shape[2]:
             self._scores[:, first:stop] = np.ascontiguousarray(steps.transpose(2, 0, 1)).astype(self._scores.dtype)
@@ -132,7 +138,7 @@ class SignalCubeWriter:
         return kept
 
     def close(
-        self, facts: LineFacts, rare: NDArray[np.intp], residuals: NDArray[np.int16], picture: Quicklook | None
+        self, facts: LineFacts, rare: NDArray[np.intp], residuals: NDArray[np.int32], picture: Quicklook | None
     ) -> None:
         """Store quality, what is known of lines, and (rare, 2) lines and samples with (rare, band) residual steps."""
         self._quality[...] = self._seen
@@ -140,9 +146,9 @@ class SignalCubeWriter:
         for name, column in (("rare_line", 0), ("rare_sample", 1)):
             write_small(self.group, name, ("rare",), rare[:, column].astype(np.int32), {"units": "1"})
         about = {"long_name": "residual of a rare spectrum", "units": "1", "scale_factor": RESIDUAL_STEP}
-        spec = ArraySpec(
-            ("rare", "band"), residuals.shape, "<i2", (min(1024, max(len(residuals), 1)), residuals.shape[1])
-        )
+        kind = _kind(float(np.abs(residuals).max(initial=0)))
+        chunk = (min(1024, max(len(residuals), 1)), residuals.shape[1])
+        spec = ArraySpec(("rare", "band"), residuals.shape, kind, chunk)
         array = create_array(self.group, "rare_residual", spec, about)
         if residuals.size:
             array[...] = residuals
