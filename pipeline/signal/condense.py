@@ -78,7 +78,8 @@ def _residual(white: Scores, scores: Scores, axes: NDArray[np.float64], freedom:
         some = white[bright].astype(np.float64)
         rest = some - (some @ axes.T) @ axes
         left[bright] = np.einsum("nb,nb->n", rest, rest)
-    return np.maximum(left, 0) / np.float32(freedom)
+    residual: Scores = np.maximum(left, 0) / np.float32(freedom)
+    return residual
 
 
 def _least_squares(white: Scores, there: Bools, axes: Scores, bands: int) -> tuple[Scores, Scores]:

@@ -9,6 +9,7 @@ they fluctuate by the Tracy-Widom law (Johnstone 2001): that is the test.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -284,15 +285,19 @@ def noise_edge(values: Floats, ratio: float, false_alarm: float) -> float:
     middle, low = float(np.median(values)), float(values[count // 10])
     spread = np.sqrt(ratio)
     if middle > 0 and spread < 1:
-        observed = max(middle - low, 0.0) / middle
-        tries = np.geomspace(spread, 1.0, 60)
-        expected = np.array([_law_spread(one) for one in tries])
-        spread = float(np.interp(observed, expected, tries)) if observed > expected[0] else spread
+        tries, expected = _law_spreads()
+        spread = max(spread, float(np.interp(max(middle - low, 0.0) / middle, expected, tries)))
     variance = middle / max(1 - spread**2 / 3, 0.5)
     edge = variance * (1 + spread) ** 2
     width = variance * spread * (1 + spread) ** (4 / 3) * (count ** (-2 / 3))
     quantile = float(np.interp(-np.log(false_alarm), -np.log(TRACY_WIDOM[0]), TRACY_WIDOM[1]))
     return float(edge + quantile * width)
+
+
+@cache
+def _law_spreads() -> tuple[Floats, Floats]:
+    tries = np.geomspace(1e-3, 1.0, 200)
+    return tries, np.array([_law_spread(one) for one in tries])
 
 
 def _law_spread(spread: float) -> float:

@@ -128,8 +128,8 @@ class SignalCubeWriter:
     def write(self, first: int, scores: NDArray[np.floating], quality: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Store (line, sample, component) scores from a line on, a multiple of 64; return them as they are stored."""
         steps = np.rint(scores / np.float32(self._step))
-        most = float(np.iinfo(self._scores.dtype).max) / 2
-        np.clip(steps, -most, most, out=steps)  # few bands of a spectrum may tell a component badly
+        most = np.iinfo(self._scores.dtype).max & ~127  # a float32; few bands of a spectrum may tell a component badly
+        np.clip(steps, -most, most, out=steps)
         stop = first + len(scores)
         if steps.shape[2]:
             self._scores[:, first:stop] = np.ascontiguousarray(steps.transpose(2, 0, 1)).astype(self._scores.dtype)
