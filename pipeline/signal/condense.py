@@ -17,6 +17,7 @@ from pipeline.signal.components import Components
 
 WHOLE, PARTIAL, UNUSABLE = 0, 1, 2  # all bands seen; some restored from the others; less than half of the bands seen
 JOINT = ((2, 2), (1, 8), (8, 1))  # (line, sample) of neighbours whose residuals are tested together
+ALONE = 1e-3  # what one spectrum of noise exceeds so rarely is the most that it counts beside its neighbours
 LAW_ROUNDS, LAW_CLIP = 4, 4.0
 LEAST_EXPECTED = 0.2  # of the mean residual, whatever the law says of dark or bright spectra
 BRIGHT = 1e4  # mean square of a whitened spectrum above which a difference of float32 sums says nothing of residuals
@@ -147,9 +148,8 @@ def find_rare(ratio: NDArray[np.float32], law: ResidualLaw, false_alarm: float) 
     """
     known = np.isfinite(ratio)
     share = false_alarm / (1 + len(JOINT)) / max(int(known.sum()), 1)
-    limit = _limit(law.freedom, share)
-    rare = known & (ratio > limit)
-    filled = np.where(known, np.minimum(ratio, limit), 1).astype(np.float64)  # no window is rare by one spectrum alone
+    rare = known & (ratio > _limit(law.freedom, share))
+    filled = np.where(known, np.minimum(ratio, _limit(law.freedom, ALONE)), 1).astype(np.float64)
     for lines, samples in JOINT:
         if lines > ratio.shape[0] or samples > ratio.shape[1]:
             continue

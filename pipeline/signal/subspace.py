@@ -43,8 +43,8 @@ Bools = NDArray[np.bool_]
 class SignalStatistics:
     """Second moments of spectra, of their means over 4 x 4 and of neighbours' differences, and some spectra as such.
 
-    Spectra are centred on a mean of the first ones, so that nothing cancels. Those with less than half of their bands
-    are left out; where single bands are missing they count as the mean.
+    Spectra are centred on a mean of the first ones, so that nothing cancels. Those that miss bands are left out: they
+    would count as the mean there, and make a direction of it. Where most miss some, those with half of them count so.
     """
 
     bands: int
@@ -111,7 +111,9 @@ class SignalStatistics:
             return spectra, valid
         there = np.isfinite(spectra) & by_band
         spectra = np.where(there, spectra, np.float32(0))
-        return spectra, np.asarray(2 * there.sum(axis=2) >= max(self.lit.sum(), 1))
+        seen, bands = there.sum(axis=2), max(int(self.lit.sum()), 1)
+        whole, usable = seen == bands, 2 * seen >= bands
+        return spectra, np.asarray(whole if 2 * whole.sum() >= usable.sum() else usable)
 
     @property
     def spectra(self) -> Values:

@@ -54,12 +54,15 @@ def camera_noise(
 ) -> NDArray[np.float64]:
     """Standard deviation of a sample's noise by the camera's model, (band,) scene value, at the mean of a band.
 
-    Read noise, shot noise of the signal and rounding to DN, for sums of ``binning`` neighbours.
+    NaN in bands without light. Read noise, shot noise of the signal and rounding, for sums of ``binning`` neighbours.
     """
-    gain = np.nanmedian(judge_elements(references).gain, axis=0).astype(np.float64)
+    elements = judge_elements(references)
+    gain = np.full(len(elements.lit), np.nan)
+    gain[elements.lit] = np.nanmedian(elements.gain[:, elements.lit], axis=0)
     signal_dn = np.maximum(np.nan_to_num(components_mean / gain), 0)
     read = binning * (camera.read_noise_e / camera.electrons_per_dn) ** 2
-    return np.abs(gain) * np.sqrt(read + signal_dn / camera.electrons_per_dn + 1 / 12)
+    noise: NDArray[np.float64] = np.abs(gain) * np.sqrt(read + signal_dn / camera.electrons_per_dn + 1 / 12)
+    return noise
 
 
 @dataclass(frozen=True, eq=False)
