@@ -43,6 +43,7 @@ from storage.arrays.quicklooks import Quicklook, quicklook_of, write_quicklook
 
 CHUNK = 64  # lines and samples of a chunk of scores, all components of them: what lies together packs together
 SHARD_SAMPLES = 640
+FRAMES_OF = "frames_of"  # attribute: the sweep beside it that holds the dark and white frames of both
 MOST_DN = np.iinfo(np.uint16).max
 LARGEST_SHORT = 32_000  # of scores and residuals in steps; larger ones are stored in 32 bits
 
@@ -52,7 +53,7 @@ def _kind(largest: float) -> str:
 
 
 @dataclass(frozen=True)
-class LineFacts:
+class LineRows:
     """What is known of every line beside its light, (line,) each."""
 
     time_s: NDArray[np.float64]
@@ -104,18 +105,30 @@ def read_components(group: zarr.Group) -> Components:
 class SignalCubeWriter:
     """Write a sweep's scores, some lines at a time."""
 
-    def __init__(self, path: Path, header: SweepHeader, components: Components, *, step: float, largest: float) -> None:
+    def __init__(
+        self,
+        path: Path,
+        header: SweepHeader,
+        components: Components,
+        *,
+        step: float,
+        largest: float,
+        frames_of: str | None = None,
+    ) -> None:
+        """Begin a sweep; ``largest`` is the size that no score exceeds, ``frames_of`` a sweep with the same frames."""
         lines, samples, _ = header.shape
         self._header, self._step = header, step
         facts: dict[str, Any] = {"sweep": asdict(header.sweep), "source": header.source}
         facts |= {} if header.started is None else {"started": header.started}
+        facts |= {} if frames_of is None else {FRAMES_OF: frames_of}
         facts |= {"by_mirror": True} if header.references.by_mirror else {}
         facts |= {} if header.simulation is None else {"simulation": dict(header.simulation)}
         self.group = create_group(path, f"condensed sweep {header.sweep.name}", facts)
         write_bands(self.group, header.wavelength_nm, header.fwhm_nm)
         write_counts(self.group, line=lines, sample=samples, component=len(components))
         write_components(self.group, components)
-        write_references(self.group, header.references)
+        if frames_of is None:
+            write_references(self.group, header.references)
         about = {"long_name": "score of a component", "units": "1", "scale_factor": step, "largest": largest}
         shape = (len(components), lines, samples)
         spec = score_spec(("component", "line", "sample"), shape, largest / step)
@@ -138,7 +151,7 @@ class SignalCubeWriter:
         return kept
 
     def close(
-        self, facts: LineFacts, rare: NDArray[np.intp], residuals: NDArray[np.int32], picture: Quicklook | None
+        self, facts: LineRows, rare: NDArray[np.intp], residuals: NDArray[np.int32], picture: Quicklook | None
     ) -> None:
         """Store quality, what is known of lines, and (rare, 2) lines and samples with (rare, band) residual steps."""
         self._quality[...] = self._seen
@@ -173,6 +186,7 @@ class SignalCube:
     source: str
     started: str | None
     group: zarr.Group
+    path: Path
 
     @property
     def simulation(self) -> Any:
@@ -188,8 +202,10 @@ class SignalCube:
     @cached_property
     def references(self) -> References:
         """Dark and white frames."""
-        dark, white, white_reference = (read_array(self.group, name) for name in ("dark", "white", "white_reference"))
-        bad, flat = (read_array(self.group, name) if name in self.group else None for name in ("bad", "flat"))
+        shared = self.group.attrs.get(FRAMES_OF)
+        group = self.group if shared is None else open_group(self.path.with_name(f"{shared}.zarr"))
+        dark, white, white_reference = (read_array(group, name) for name in ("dark", "white", "white_reference"))
+        bad, flat = (read_array(group, name) if name in group else None for name in ("bad", "flat"))
         return References(dark, white, white_reference, bad, flat, bool(self.group.attrs.get("by_mirror", False)))
 
     @property
@@ -249,6 +265,7 @@ def open_signal_cube(path: Path) -> SignalCube:
         source=str(group.attrs.get("source", "")),
         started=None if "started" not in group.attrs else str(group.attrs["started"]),
         group=group,
+        path=path,
     )
 
 

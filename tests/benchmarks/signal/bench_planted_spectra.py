@@ -85,9 +85,8 @@ def _condensed(name: str, values: Values) -> Condensed:
         ratio[part] = np.where(seen.quality == UNUSABLE, np.nan, seen.residual / law.expected(seen.scores))
     mean = found.total / found.count
     power, axes = np.linalg.eigh(found.single / found.count - np.outer(mean, mean))
-    return Condensed(
-        name, values, components, law, ratio, axes / np.sqrt(np.maximum(power, power[-1] * 1e-12)) @ axes.T
-    )
+    whitening = axes / np.sqrt(np.maximum(power, power[-1] * 1e-12)) @ axes.T
+    return Condensed(name, values, components, law, ratio, whitening)
 
 
 def _table(field: Condensed) -> Iterator[Row]:

@@ -22,7 +22,7 @@ from pipeline.signal.sweep_signal import CondensedSweep, Condenser, differing_li
 from storage.arrays.cubes import SweepHeader
 from storage.arrays.signal_cubes import (
     LARGEST_SHORT,
-    LineFacts,
+    LineRows,
     RestoredCube,
     SignalCube,
     SignalCubeWriter,
@@ -61,7 +61,7 @@ def store(
     law = ResidualLaw.learned(found.spectra, components)
     done = Condenser(components, law, CAMERA, 1e-3, step).sweep(lines, writer.write)
     x, y = lines.position.T
-    facts = LineFacts(lines.time_s, x, y, np.full(len(x), 100.0), lines.valid_line)
+    facts = LineRows(lines.time_s, x, y, np.full(len(x), 100.0), lines.valid_line)
     writer.close(facts, done.rare, done.residuals, None)
     return open_signal_cube(path), done
 
@@ -242,7 +242,7 @@ def test_scores_beyond_16_bits_are_stored_in_32(tmp_path: Path, largest: float, 
     kept = writer.write(0, scores, np.zeros(SHAPE, np.uint8))
     steps = np.array([[70_000, -3], [0, 9]]).repeat(BANDS // 2, axis=1).astype(np.int32)
     x, y = lines.position.T
-    facts = LineFacts(lines.time_s, x, y, np.full(len(x), 100.0), lines.valid_line)
+    facts = LineRows(lines.time_s, x, y, np.full(len(x), 100.0), lines.valid_line)
     writer.close(facts, np.array([[0, 1], [5, 6]]), steps, None)
     cube = open_signal_cube(tmp_path / "a.zarr")
     assert cube.read().dtype == kind
@@ -280,7 +280,7 @@ def test_full_scale_lines_are_stored_in_32_bits_and_come_back(tmp_path: Path) ->
     assert largest > LARGEST_SHORT
     kept = writer.write(0, scores, np.zeros(SHAPE, np.uint8))
     x, y = lines.position.T
-    facts = LineFacts(lines.time_s, x, y, np.full(len(x), 100.0), lines.valid_line)
+    facts = LineRows(lines.time_s, x, y, np.full(len(x), 100.0), lines.valid_line)
     writer.close(facts, np.zeros((0, 2), np.intp), np.zeros((0, BANDS), np.int32), None)
     cube = open_signal_cube(tmp_path / "a.zarr")
     np.testing.assert_array_equal(cube.read(), kept)
