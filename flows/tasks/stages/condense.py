@@ -24,7 +24,7 @@ from storage.arrays.signal_cubes import LineRows, SignalCubeWriter, open_signal_
 from storage.arrays.spool import line_values
 from storage.arrays.statistics import read_statistics
 
-SIGNAL = Product("condense", version=1)
+SIGNAL = Product("condense", version=2)
 RECORD = "signal.json"
 SHARED_FRACTION = 2e-3  # of all spectra: of more rare ones, a component is cheaper than their residuals
 MOST_RARE = 0.05  # of spectra: more are no exceptions, and raw lines stay

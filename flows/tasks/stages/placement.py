@@ -39,7 +39,7 @@ POINTING = Product("register", version=2, files=(RECORD,))
 
 
 GEOLOCATION = Product("locate", version=3, files=("geolocation.zarr",))
-MOSAIC = Product("rectify", version=5, files=("mosaic.zarr",))
+MOSAIC = Product("rectify", version=6, files=("mosaic.zarr",))
 QUICKLOOK_PX = 512
 MOSAIC_STEP = 0.5  # of resampled scores, over that of the sweeps: what is read between samples is less noisy
 KERNEL_GAIN = 2.0  # by which kernels overshoot, at most
