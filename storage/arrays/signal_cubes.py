@@ -79,6 +79,13 @@ def score_spec(dims: tuple[str, str, str], shape: tuple[int, int, int], largest:
     return ArraySpec(dims, shape, _kind(largest), chunk, (chunk[0], *whole))
 
 
+def whole_steps(scores: NDArray[np.floating], step: float, kind: np.dtype[Any]) -> NDArray[np.floating]:
+    """Scores in steps, at most what a type of integers holds: few bands of a spectrum may tell a component badly."""
+    most = np.iinfo(kind).max & ~127  # a float32
+    steps: NDArray[np.floating] = np.clip(np.rint(scores / np.float32(step)), -most, most)
+    return steps
+
+
 def write_components(group: zarr.Group, components: Components) -> None:
     """Store the linear law that gives spectra back."""
     about = {"coordinates": "wavelength", "units": "1"}
@@ -140,9 +147,7 @@ class SignalCubeWriter:
 
     def write(self, first: int, scores: NDArray[np.floating], quality: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Store (line, sample, component) scores from a line on, a multiple of 64; return them as they are stored."""
-        steps = np.rint(scores / np.float32(self._step))
-        most = np.iinfo(self._scores.dtype).max & ~127  # a float32; few bands of a spectrum may tell a component badly
-        np.clip(steps, -most, most, out=steps)
+        steps = whole_steps(scores, self._step, self._scores.dtype)
         stop = first + len(scores)
         if steps.shape[2]:
             self._scores[:, first:stop] = np.ascontiguousarray(steps.transpose(2, 0, 1)).astype(self._scores.dtype)
