@@ -16,7 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import spectralzoom
-from spectralzoom.opened import NoRunError, OpenedRun, by_wavelength
+from spectralzoom.opened import NoRunError, OpenedRun
+from spectralzoom.spectra import by_wavelength
 from storage.archive.archive import Archive
 from storage.arrays.class_maps import load_class_map
 from storage.arrays.ground_maps import load_geobox
@@ -121,7 +122,7 @@ def test_a_coarse_pixel_lies_on_its_fine_ones(run: OpenedRun) -> None:
 
 def test_a_band_is_found_by_its_wavelength(run: OpenedRun) -> None:
     """By the nearest, in every product that has bands, and by its number still."""
-    for one in (run.mosaic, run.patches["values"], run.sweeps["coarse-0"]["dn"]):
+    for one in (run.mosaic, run.cube, run.lines["coarse-0"]):
         red = one.sel(wavelength=660, method="nearest")
         assert float(red.wavelength) == 640
         xr.testing.assert_identical(red, one.isel(band=0))
