@@ -100,11 +100,10 @@ class ResidualLaw:
 
     @classmethod
     def learned(cls, spectra: NDArray[np.float32], components: Components) -> ResidualLaw:
-        """Learn it of (n, band) spectra, outliers left out; components of all bands leave nothing to expect."""
-        freedom = int(np.isfinite(components.mean).sum()) - len(components)
-        if freedom < 1:
-            return cls(np.inf, np.zeros(len(components)), 1.0)
-        if len(spectra) < 8 * (len(components) + 1):
+        """Learn it of (n, band) spectra, outliers left out."""
+        freedom = max(int(np.isfinite(components.mean).sum()) - len(components), 1)
+        every = len(components) >= np.isfinite(components.mean).sum()
+        if every or len(spectra) < 8 * (len(components) + 1):
             return cls(1.0, np.zeros(len(components)), float(freedom))
         seen = score_lines(spectra[None], np.ones((1, len(spectra)), np.bool_), components)
         known = np.isfinite(seen.residual[0])
