@@ -197,8 +197,8 @@ class OpenedRun:
         for name in names:
             if not self._archive.is_there("/".join(self.receipt["products"][name].split("/")[:3])):
                 raise IncompleteStoreError(
-                    f"the raw lines of {self.name} were cleared away once they were condensed; `lines` has their signal."
-                    " A survey with keep = raw keeps them"
+                    f"the raw lines of {self.name} were cleared away once they were condensed; `lines` has their"
+                    " signal. A survey with keep = raw keeps raw lines"
                 )
         folders = [self._place(name) for name in names]
         return {one.stem: open_labelled(one) for folder in folders for one in sorted(folder.glob("*.zarr"))}

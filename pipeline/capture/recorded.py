@@ -251,9 +251,8 @@ class RecordedSource:
         for number, one in enumerate(self.sweeps):
             for group in groups:
                 other = self.sweeps[group[0]]
-                if (one.sweep.along, one.sweep.binning) == (other.sweep.along, other.sweep.binning) and _equal(
-                    one.references, other.references
-                ):
+                alike = (one.sweep.along, one.sweep.binning) == (other.sweep.along, other.sweep.binning)
+                if alike and one.references.same_as(other.references):
                     group.append(number)
                     break
             else:

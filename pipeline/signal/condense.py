@@ -18,7 +18,9 @@ from pipeline.signal.components import Components
 WHOLE, PARTIAL, UNUSABLE = 0, 1, 2  # all bands seen; some restored from the others; less than half of the bands seen
 JOINT = ((2, 2), (1, 8), (8, 1))  # (line, sample) of neighbours whose residuals are tested together
 LAW_ROUNDS, LAW_CLIP = 4, 4.0
-LEAST_EXPECTED = 0.2  # of the mean residual, whatever the law says of dark or bright spectra
+LEAST_EXPECTED = 0.2  # of the mean residual, whatever the law says of dark or bright spectra ...
+LEAST_RESIDUAL = 0.02  # ... and of the noise's variance: less is rounding
+CANCELLED = 1e-4  # of a spectrum's square: a smaller difference of squares has lost digits of float32
 SPECTRA_AT_ONCE = 1024  # projected at a time: they stay in cache
 RESIDUAL_STEP = 0.5  # in which residuals of rare spectra are kept [noise's deviations]
 
@@ -61,7 +63,7 @@ def score_lines(values: NDArray[np.float32], valid: Bools, components: Component
 
 
 def _projected(values: NDArray[np.float32], components: Components) -> tuple[Scores, Scores]:
-    """Scores (..., component) of spectra (..., band), and the square of what they leave, (...); NaN of broken spectra."""
+    """Scores (..., component) of spectra (..., band), and the square of what they leave; NaN of broken spectra."""
     axes, flat = components.axes.T.astype(np.float32), values.reshape(-1, components.bands)
     scores, left = np.empty((len(flat), len(components)), np.float32), np.empty(len(flat), np.float32)
     with np.errstate(invalid="ignore", over="ignore"):
@@ -69,8 +71,12 @@ def _projected(values: NDArray[np.float32], components: Components) -> tuple[Sco
             part = slice(first, first + SPECTRA_AT_ONCE)
             white = components.white(flat[part])
             scores[part] = white @ axes
-            np.einsum("nb,nb->n", white, white, out=left[part])
-    left -= np.einsum("nk,nk->n", scores, scores)
+            square = np.einsum("nb,nb->n", white, white)
+            left[part] = square - np.einsum("nk,nk->n", scores[part], scores[part])
+            close = left[part] < CANCELLED * square
+            if close.any():
+                rest = white[close] - scores[part][close] @ axes.T
+                left[part][close] = np.einsum("nb,nb->n", rest, rest)
     return scores.reshape(*values.shape[:-1], -1), left.reshape(values.shape[:-1])
 
 
@@ -102,25 +108,25 @@ class ResidualLaw:
     def learned(cls, spectra: NDArray[np.float32], components: Components) -> ResidualLaw:
         """Learn it of (n, band) spectra, outliers left out."""
         freedom = max(int(np.isfinite(components.mean).sum()) - len(components), 1)
-        every = len(components) >= np.isfinite(components.mean).sum()
-        if every or len(spectra) < 8 * (len(components) + 1):
-            return cls(1.0, np.zeros(len(components)), float(freedom))
         seen = score_lines(spectra[None], np.ones((1, len(spectra)), np.bool_), components)
         known = np.isfinite(seen.residual[0])
         scores, residual = seen.scores[0][known].astype(np.float64), seen.residual[0][known].astype(np.float64)
+        if len(residual) < 8 * (len(components) + 1) or np.median(residual) < LEAST_RESIDUAL:
+            return cls(1.0, np.zeros(len(components)), float(freedom))
         design = np.concatenate([np.ones((len(scores), 1)), scores], axis=1)
         kept = residual <= np.median(residual) * 4
         for _ in range(LAW_ROUNDS):
             law = np.linalg.lstsq(design[kept], residual[kept], rcond=None)[0]
             floor = LEAST_EXPECTED * float(residual[kept].mean())
-            ratio = residual / np.maximum(design @ law, max(floor, 1e-12))
+            ratio = residual / np.maximum(design @ law, max(floor, LEAST_RESIDUAL))
             spread = SIGMA_OF_MEDIAN * float(np.median(np.abs(ratio - np.median(ratio))))
-            kept = np.abs(ratio - 1) <= LAW_CLIP * max(spread, 1e-6)
+            near = np.abs(ratio - 1) <= LAW_CLIP * spread
+            kept = near if 2 * np.count_nonzero(near) >= len(near) else kept
         return cls(float(law[0]), law[1:], float(np.clip(2 / max(spread, 1e-6) ** 2, 1.0, freedom)))
 
     def expected(self, scores: Scores) -> Scores:
         """(...) mean square residual to expect of (..., component) scores."""
-        least = max(LEAST_EXPECTED * self.constant, 1e-12)
+        least = max(LEAST_EXPECTED * self.constant, LEAST_RESIDUAL)
         expected: Scores = np.maximum(self.constant + scores @ self.slope.astype(np.float32), np.float32(least))
         return expected
 

@@ -97,8 +97,9 @@ class SignalStatistics:
         """Return spectra from the origin with 0 for what is missing, and which of them count."""
         by_band = valid if valid.ndim == 3 else valid[..., None]
         if self.origin is None or not self.lit.all():
-            seen = (by_band & np.isfinite(values)).any(axis=(0, 1))
-            first = np.nan_to_num(np.nanmean(np.where(by_band, values, np.nan), axis=(0, 1))) if seen.any() else 0.0
+            there = by_band & np.isfinite(values)
+            counts, seen = there.sum(axis=(0, 1)), there.any(axis=(0, 1))
+            first = np.where(there, values, 0).sum(axis=(0, 1), dtype=np.float64) / np.maximum(counts, 1)
             before = np.zeros(self.bands, np.float32) if self.origin is None else self.origin
             self.origin = np.where(self.lit, before, np.where(seen, first, 0)).astype(np.float32)
             self.lit |= seen

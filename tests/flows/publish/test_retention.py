@@ -1,4 +1,4 @@
-"""Raw lines go when the settings of their runs say so, once each was compared; killed anywhere, the archive is whole."""
+"""Raw lines go when the settings of their runs say so, once each was compared; killed anywhere, nothing is lost."""
 
 from __future__ import annotations
 
