@@ -253,7 +253,7 @@ class SignalCube:
 
 def check_condensed(group: zarr.Group, path: Path) -> None:
     """Refuse a store of spectra that an earlier version wrote band by band (OldStoreError)."""
-    if "scores" not in group and ("values" in group or "dn" in group):
+    if "scores" not in group and "values" in group:
         raise OldStoreError(f"{path} holds spectra band by band, as earlier versions stored them; {REPROCESS}")
 
 

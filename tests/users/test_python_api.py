@@ -89,7 +89,7 @@ def test_runs_are_found_by_name_and_the_latest_comes_first(run: OpenedRun, tmp_p
 
 def test_every_axis_of_every_product_has_a_coordinate(run: OpenedRun) -> None:
     """Whatever a run has left, nothing has to be counted by hand, and nothing warns."""
-    opened = [run.dataset(name) for name in run.products] + list(run.sweeps.values())
+    opened = [*(run.dataset(name) for name in run.products), *run.lines.values(), run.mosaic, run.cube]
     assert len(opened) > 6
     for one in opened:
         assert set(one.sizes) <= set(one.indexes)
