@@ -15,6 +15,7 @@ from flows.publish.receipt_table import FOREIGN
 from flows.settings.values import EXTENT_WHOLE
 from flows.tasks.prior_maps import prior_map_figures
 from flows.tasks.run import SurveyRun
+from flows.tasks.stages.maps import OUT_OF_RANGE
 from models.evaluation.expected_scores import expected_counts
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, FieldScale, PlacedPicture, areas_by_number
@@ -22,6 +23,7 @@ from pipeline.ground.georeference import crs_name, pixel_side_m
 from pipeline.ground.zones import figures_of_plots
 from pipeline.planning.fine_pass import FinePlan
 from storage.archive.keys import StageRef
+from storage.archive.manifests import read_table
 from storage.arrays.class_maps import ClassMap, ProbabilityStore
 from storage.arrays.ground_maps import GroundMap
 
@@ -165,7 +167,12 @@ def find_map(run: SurveyRun, ref: StageRef, drawn: ClassMap) -> dict[str, Any]:
         found["unknown"] = {"pixels": count, "fraction": fraction, "rate": rate}
     if run.zones.left_out is not None:
         unclassed &= ~run.zones.left_out
-    pixels = {"scene_without_a_value": run.scene.filled_px, "map_without_a_class": int(np.count_nonzero(unclassed))}
+    unread = read_table(path)["coarse_px"] if (path := ref.path / OUT_OF_RANGE).is_file() else 0
+    pixels = {
+        "scene_without_a_value": run.scene.filled_px,
+        "coarse_px_no_reading": unread,
+        "map_without_a_class": int(np.count_nonzero(unclassed)),
+    }
     if any(pixels.values()):
         found["pixels"] = pixels
     expected = None if fraction > FOREIGN else _expected(run, ref)

@@ -46,7 +46,7 @@ class Drawing:
     unknown: UnknownRule | None = None  # which pixels are called unknown
     part: bool = False  # of the field was looked at: of the rest today's look says nothing
 
-    def __call__(self, region: Region) -> TemporalAgreement | None:
+    def __call__(self, region: Region) -> Drawn:
         """Read what was seen of the region coarsely and finely, and store the part of the map that is kept."""
         let_tiles_go()
         weights, detail = self.weights.load(), open_mosaic(self.detail)
@@ -86,7 +86,8 @@ class Drawing:
         write_probabilities_tile(
             self.probabilities, origin, *map(region.crop, (after.log_probability, after.age_days, after.light))
         )
-        return comparison
+        unread = 0 if seen.out_of_range is None else int(np.count_nonzero(region.crop_coarse(seen.out_of_range)))
+        return Drawn(unread, comparison)
 
     def _within_zones(self, region: Region, log_probability: NDArray[np.float32]) -> NDArray[np.float32]:
         """Today's look, (y, x, class), with nothing said of pixels that zones leave out: a memory of them stays."""
@@ -151,15 +152,22 @@ class UnknownRule:
         return found[: grid.height, : grid.width]
 
 
-def draw_field(field: FieldWork, work: Drawing, report: Callable[[float], None]) -> TemporalAgreement | None:
+@dataclass(frozen=True)
+class Drawn:
+    """What was found while a region, or a field, was drawn."""
+
+    unread_px: int  # coarse pixels that were seen, with values that the weights take for no reading
+    comparison: TemporalAgreement | None  # with what was remembered; None of a field's first visit
+
+
+def draw_field(field: FieldWork, work: Drawing, report: Callable[[float], None]) -> Drawn:
     """Draw class map and class probabilities into stores that were created for them.
 
-    Returns how they agree with what was remembered, None of a field's first visit. Raises SettingsError: not even one
-    region at a time fits the memory.
+    Raises SettingsError: not even one region at a time fits the memory.
     """
     pool = field.pool_for(chosen_patches(work.attention), len(open_mosaic(work.detail).components))
     prior_map = () if work.memory is None else (work.memory.probabilities, work.memory.mosaic)
     paths = (work.mosaic, work.detail, work.attention, work.out, work.probabilities, *prior_map)
-    parts: list[TemporalAgreement | None] = run_blocks(work, field.regions, pool, report=report, paths=paths)
-    compared = [part for part in parts if part is not None]
-    return reduce(add, compared) if compared else None
+    parts: list[Drawn] = run_blocks(work, field.regions, pool, report=report, paths=paths)
+    compared = [part.comparison for part in parts if part.comparison is not None]
+    return Drawn(sum(part.unread_px for part in parts), reduce(add, compared) if compared else None)

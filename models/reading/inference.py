@@ -34,6 +34,7 @@ class CoarsePass:
     columns: NDArray[np.float32]  # (y, x, column) normalised
     origin: tuple[int, int] = field(default=(0, 0), kw_only=True)  # row and column of the field's patch it begins at
     living: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (token,) which are read; None: all
+    out_of_range: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (y, x) of the scene: seen, and unread
     filled: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (y, x) nothing was seen of; None: of all was
 
     @property
@@ -107,18 +108,27 @@ def read_coarse_pass(
     """
     rows, width = grid.coarse_shape
     columns, filled = np.empty((rows, width, weights.config.columns), np.float32), 0
+    known = np.zeros((rows, width), np.bool_)
     for strip in strips:
         last = filled + len(strip)
         if components is None:
             columns[filled:last] = weights.columns(strip, wavelength_nm)
         else:
             columns[filled:last] = weights.columns_of_scores(strip, components, wavelength_nm)
+        known[filled:last] = ~np.isnan(strip).all(axis=-1)
         filled = last
     y, x = grid.padded_shape
     columns = np.ascontiguousarray(pad_by_reflection(columns, (y // grid.factor, x // grid.factor)), np.float32)
     dead = dead_pixels(columns)
-    living = _mend(columns, weights.config)
-    return CoarsePass(grid, columns, origin=origin, living=living, filled=dead if dead.any() else None)
+    wild = dead[:rows, :width] & known
+    return CoarsePass(
+        grid,
+        columns,
+        origin=origin,
+        living=_mend(columns, weights.config),
+        out_of_range=wild if wild.any() else None,
+        filled=dead if dead.any() else None,
+    )
 
 
 def _mend(columns: NDArray[np.float32], config: SegmenterConfig) -> NDArray[np.bool_] | None:

@@ -52,7 +52,7 @@ LARGEST_SHORT = 32_000  # of scores in steps; larger ones are stored in 32 bits
 
 
 @dataclass(frozen=True)
-class LineFacts:
+class LineRows:
     """What is known of every line beside its light, (line,) each."""
 
     time_s: NDArray[np.float64]
@@ -148,7 +148,7 @@ class SignalCubeWriter:
         return kept
 
     def close(
-        self, facts: LineFacts, rare: NDArray[np.intp], residuals: NDArray[np.int16], picture: Quicklook | None
+        self, facts: LineRows, rare: NDArray[np.intp], residuals: NDArray[np.int16], picture: Quicklook | None
     ) -> None:
         """Store quality, what is known of lines, and (rare, 2) lines and samples with (rare, band) residual steps."""
         self._quality[...] = self._seen

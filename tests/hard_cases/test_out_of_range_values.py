@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cache
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,6 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from flows.tasks.field_work import patch_features
 from models.network.spectral import MOST_COLUMN
 from models.policies.policies import score_patches
 from models.reading.inference import (
@@ -25,7 +23,6 @@ from models.reading.inference import (
     read_coarse_pass,
     segment,
 )
-from models.reading.regions import whole_field
 from models.weights.files import Weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
@@ -50,9 +47,7 @@ OUT_OF_RANGE = st.one_of(
 
 def _drawn(coarse: NDArray[np.float32], fine: NDArray[np.float32]) -> tuple[CoarsePrediction, DrawnMap]:
     seen = coarse_prediction(WEIGHTS, coarse, NM, GRID)
-    store: Any = SimpleNamespace(patch_index=PATCHES, pick=lambda entries: fine[entries])
-    patch_index, columns = patch_features(WEIGHTS, store, NM, seen, whole_field(GRID))
-    return seen, segment(WEIGHTS, seen, columns, patch_index)
+    return seen, segment(WEIGHTS, seen, WEIGHTS.columns(fine, NM), PATCHES)
 
 
 def _alike(one: tuple[CoarsePrediction, DrawnMap], other: tuple[CoarsePrediction, DrawnMap]) -> bool:
@@ -89,17 +84,12 @@ def test_a_out_of_range_value_is_as_if_it_had_not_been_captured(
 
 
 def test_out_of_range_pixels_are_counted() -> None:
-    """By the pixel, whatever the number of bands; NaN is none of them."""
-    coarse, fine = COARSE.copy(), FINE.copy()
-    coarse[2, 5], coarse[7, 1, 3], coarse[0, 0] = 1e30, -1e20, np.nan
-    fine[1, 2, 3], fine[1, 2, 4, 0], fine[3, 0, 0], fine[0, 0, 0] = 1e18, np.inf, FAR, np.nan
+    """By the pixel, where no band is a reading; NaN is none of them."""
+    coarse = COARSE.copy()
+    coarse[2, 5], coarse[7, 1], coarse[0, 0] = 1e30, -1e20, np.nan
     scan_pass = read_coarse_pass(WEIGHTS, [coarse[:10], coarse[10:]], NM, GRID)
     assert scan_pass.out_of_range is not None
     assert np.argwhere(scan_pass.out_of_range).tolist() == [[2, 5], [7, 1]]
-    store: Any = SimpleNamespace(patch_index=PATCHES, pick=lambda entries: fine[entries])
-    counts = np.zeros(GRID.patch_shape, np.int64).ravel()
-    patch_features(WEIGHTS, store, NM, scan_pass, whole_field(GRID), out_of_range=counts)
-    assert counts[PATCHES].tolist() == [0, 2, 0, 1]
     assert read_coarse_pass(WEIGHTS, [COARSE], NM, GRID).out_of_range is None
 
 

@@ -14,7 +14,7 @@ from pipeline.signal.components import Components
 from storage.arrays.cubes import SweepHeader
 from storage.arrays.layout import AngularGrid
 from storage.arrays.mosaics import MosaicWriter
-from storage.arrays.signal_cubes import LineFacts, SignalCubeWriter
+from storage.arrays.signal_cubes import LineRows, SignalCubeWriter
 
 STEP = 2.0**-12  # of values: powers of two, so that what is a multiple of them comes back exactly
 
@@ -54,6 +54,6 @@ def write_plain_sweep(path: Path, header: SweepHeader, values: NDArray[np.floati
         part = values[first : first + 64]
         writer.write(first, part, np.zeros(part.shape[:2], np.uint8))
     count, x_y = len(values), line_positions(header.sweep, LineCamera())
-    facts = LineFacts(np.arange(count) * 0.1, *x_y.T, np.full(count, 100.0), np.ones(count, np.bool_))
+    facts = LineRows(np.arange(count) * 0.1, *x_y.T, np.full(count, 100.0), np.ones(count, np.bool_))
     none = np.zeros((0, values.shape[2]), np.int16)
     writer.close(facts, np.zeros((0, 2), np.intp), none, None)

@@ -12,7 +12,6 @@ import numpy as np
 
 from flows.settings.survey_settings import SignalChoice
 from flows.tasks.stage import Product, Report, Wanted, stage
-from flows.tasks.stages.capture import STATISTICS
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.camera import LineCamera
 from pipeline.signal.components import Components
@@ -22,8 +21,9 @@ from pipeline.signal.sweep_signal import CondensedSweep, Condenser, camera_noise
 from storage.archive.keys import StageRef
 from storage.archive.manifests import check_files, read_table, write_table
 from storage.arrays.cubes import RawCube, SweepHeader, open_raw_cubes
-from storage.arrays.signal_cubes import LineFacts, SignalCubeWriter, open_signal_cubes
+from storage.arrays.signal_cubes import LineRows, SignalCubeWriter, open_signal_cubes
 from storage.arrays.spool import line_values
+from storage.arrays.statistics import read_statistics
 
 SIGNAL = Product("condense", version=1)
 RECORD = "signal.json"
@@ -53,7 +53,7 @@ def _condensed(raw: StageRef, camera: LineCamera, choice: SignalChoice, noise_kn
     def build(path: Path) -> None:
         """Find the components of the pass, and write every sweep's scores; once more where rare spectra share some."""
         cubes = open_raw_cubes(raw.path)
-        found = SignalStatistics.load(raw.path / STATISTICS)
+        found = read_statistics(raw.path)
         components = components_of(found, cubes, camera, choice, noise_known)
         condenser = Condenser(
             components, ResidualLaw.learned(found.spectra, components), camera, choice.rare_spectra, choice.step
@@ -112,7 +112,7 @@ def _write_sweeps(
 
         done.append(condenser.sweep(cube, writer.write, part))
         x, y = cube.position.T
-        facts = LineFacts(cube.time_s, x, y, cube.exposure_ms, cube.valid_line)
+        facts = LineRows(cube.time_s, x, y, cube.exposure_ms, cube.valid_line)
         writer.close(facts, done[-1].rare, done[-1].residuals, cube.quicklook())
     return done
 

@@ -34,7 +34,8 @@ from storage.arrays.class_maps import (
 )
 from storage.arrays.layout import NO_CLASS, blank_pixels
 
-CLASS_MAP = Product("segment", version=11, files=("class_map.zarr", "class_probabilities.zarr"), by_weights=True)
+CLASS_MAP = Product("segment", version=12, files=("class_map.zarr", "class_probabilities.zarr"), by_weights=True)
+OUT_OF_RANGE = "out_of_range.json"  # beside a map, where values were no readings
 LEFT_OUT = "left_out.npy"  # beside a map while it is drawn: the pixels of which none is
 MOST_TURN_PX = 12.0  # that a field's corners may lie off by, as it is turned, so that its memory is of use
 
@@ -96,16 +97,18 @@ def segment(
             unknown,
             part,
         )
-        comparison = draw_field(work, drawing, report)
+        drawn = draw_field(work, drawing, report)
         if prior is not None:
-            figures = _prior_map_figures(prior, reader, legend.names, lies, comparison)
+            figures = _prior_map_figures(prior, reader, legend.names, lies, drawn.comparison)
             write_table(path / MEMORY, figures)
-            if figures["put_aside"] is not None and comparison is not None:
+            if figures["put_aside"] is not None and drawn.comparison is not None:
                 drop_changes(probabilities)
-                comparison = draw_field(work, replace(drawing, memory=None), report)
+                drawn = draw_field(work, replace(drawing, memory=None), report)
+        if drawn.unread_px:
+            write_table(path / OUT_OF_RANGE, {"coarse_px": drawn.unread_px})
         if frame.missing is not None:
             blank_pixels(out, frame.missing, NO_CLASS)
-            changes = {} if comparison is None else {OLD_CLASS: UNLABELLED}
+            changes = {} if drawn.comparison is None else {OLD_CLASS: UNLABELLED}
             blank_pixels(probabilities, frame.missing, NOT_BELIEVED | changes)
         if left_out is not None:
             blank_pixels(out, left_out, NO_CLASS)

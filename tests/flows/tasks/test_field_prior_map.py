@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from flows.tasks.field_prior_map import coarser, laid_together, shifted
+from flows.tasks.field_prior_map import laid_together, shifted
 
 Image = NDArray[np.float32]
 
@@ -42,17 +42,6 @@ def test_older_looks_are_read_only_where_newer_ones_lack_something() -> None:
         raise AssertionError("read although nothing was missing")
 
     np.testing.assert_array_equal(laid_together(images()), whole)
-
-
-@given(times=st.integers(1, 5), seed=st.integers(0, 99))
-def test_pixels_of_pixels_are_their_means(times: int, seed: int) -> None:
-    """What is cut into equal ones comes back, and one that is unknown makes the whole unknown."""
-    image = _image(seed, told=0.8)[..., 0]
-    cut = image.repeat(times, axis=0).repeat(times, axis=1)
-    np.testing.assert_allclose(coarser(cut, times), image, rtol=1e-6)
-    np.testing.assert_allclose(coarser(cut[: -(times - 1) or None], times), image, rtol=1e-6)
-    cut[::times, ::times] = np.nan
-    assert np.isnan(coarser(cut, times)).all()
 
 
 @given(down=st.integers(-9, 9), across=st.integers(-9, 9), seed=st.integers(0, 9))

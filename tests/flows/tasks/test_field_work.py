@@ -21,7 +21,7 @@ from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from storage.arrays.class_maps import ClassNames, create_class_map, create_probabilities, load_class_map
 from storage.arrays.layout import consolidate_stores
-from storage.arrays.mosaics import load_attention
+from storage.arrays.mosaics import load_attention, open_mosaic
 from storage.parallel.pool import WorkerPool
 
 Survey = Callable[..., object]
@@ -51,6 +51,11 @@ def _store(stages: Path, name: str) -> Path:
     return path
 
 
+def _mosaics(stages: Path) -> list[Path]:
+    """The mosaics of both passes, the coarse one first."""
+    return sorted(stages.glob("rectify/*/mosaic.zarr"), key=lambda path: -open_mosaic(path).factor)
+
+
 def _work(run: SurveyRun, pool: WorkerPool, halo: int) -> FieldWork:
     return replace(run.work, regions=plan_regions(run.grid, SHARD, most_px=MOST_PX, halo=halo), pool=pool)
 
@@ -62,8 +67,9 @@ def _draw(work: FieldWork, run: SurveyRun, stages: Path, out: Path) -> dict[str,
     create_probabilities(
         out.with_suffix(".class_probabilities"), run.scene.shape, legend, grid=run.frame.angular_grid()
     )
-    mosaic, patches = _store(stages, "rectify/*/mosaic.zarr"), _store(stages, "patches/*/patches.zarr")
-    drawing = Drawing(work.weights, mosaic, patches, out, out.with_suffix(".class_probabilities"), 1.0, 1)
+    mosaic, detail = _mosaics(stages)
+    attention = _store(stages, "score/*/attention.zarr")
+    drawing = Drawing(work.weights, mosaic, detail, attention, out, out.with_suffix(".class_probabilities"), 1.0, 1)
     draw_field(work, drawing, lambda done: None)
     consolidate_stores(out.parent)  # as a store is published
     return _contents(out)
@@ -100,7 +106,7 @@ def test_every_pool_draws_the_same_regions(surveyed: tuple[SurveyRun, Path], tmp
 def test_scores_of_regions_make_those_of_the_field(surveyed: tuple[SurveyRun, Path], policy: str) -> None:
     """With a halo over everything they are equal, patch by patch, and the stage's own where it used that policy."""
     run, stages = surveyed
-    mosaic = _store(stages, "rectify/*/mosaic.zarr")
+    mosaic = _mosaics(stages)[0]
     whole = run.work.score(policy, mosaic, lambda done: None)
     assert (_work(run, WorkerPool(workers=2), ALL_CELLS).score(policy, mosaic, lambda done: None) == whole).all()
     if policy == run.settings.policy:
@@ -110,12 +116,12 @@ def test_scores_of_regions_make_those_of_the_field(surveyed: tuple[SurveyRun, Pa
 def test_edges_need_one_patch_of_halo_and_work_travels_as_paths(surveyed: tuple[SurveyRun, Path]) -> None:
     """With one coarse patch regions give the field's own edges; what another process gets is small."""
     run, stages = surveyed
-    mosaic = _store(stages, "rectify/*/mosaic.zarr")
+    mosaic = _mosaics(stages)[0]
     whole = run.work.score("sobel", mosaic, lambda done: None)
     np.testing.assert_allclose(_work(run, WorkerPool(), 1).score("sobel", mosaic, lambda done: None), whole, rtol=1e-5)
     run, stages = surveyed
     work = run.work
-    scoring = Scoring(work.weights, _store(stages, "rectify/*/mosaic.zarr"), "entropy")
+    scoring = Scoring(work.weights, _mosaics(stages)[0], "entropy")
     sent = pickle.dumps((scoring, work.regions[0]))
     there, region = pickle.loads(sent)
     assert len(sent) < 2000
@@ -131,14 +137,14 @@ def test_a_worker_goes_region_by_region(
     for module in ("field_work", "drawing"):
         monkeypatch.setattr(f"flows.tasks.{module}.let_tiles_go", lambda: let_go.append(True))
     work = _work(run, WorkerPool(workers=1), 1)
-    work.score("entropy", _store(stages, "rectify/*/mosaic.zarr"), lambda done: None)
+    work.score("entropy", _mosaics(stages)[0], lambda done: None)
     assert len(let_go) == 2
     _draw(work, run, stages, tmp_path / "m.zarr")
     assert len(let_go) == 4
     run, stages = surveyed
     told: list[float] = []
     work = _work(run, WorkerPool(workers=1), 1)
-    work.score("entropy", _store(stages, "rectify/*/mosaic.zarr"), told.append)
+    work.score("entropy", _mosaics(stages)[0], told.append)
     assert told == [0.5, 1.0]
     regions: Sequence[Region] = work.regions
     assert sum(region.kept.shape[0] for region in regions) == 96
@@ -185,10 +191,7 @@ def test_only_keys_of_fields_that_are_cut_know_of_regions(size: tuple[int, int])
 def test_a_memory_is_moved_and_leaves_nothing_behind(surveyed: tuple[SurveyRun, Path], shift: tuple[int, int]) -> None:
     """What lay at a pixel lies ``shift`` further, in fine and coarse pixels alike, and nothing where it came from."""
     run, stages = surveyed
-    probabilities, mosaic = (
-        _store(stages, "segment/*/class_probabilities.zarr"),
-        _store(stages, "rectify/*/mosaic.zarr"),
-    )
+    probabilities, mosaic = (_store(stages, "segment/*/class_probabilities.zarr"), _mosaics(stages)[0])
     region = whole_field(run.grid)
     classes = tuple(range(len(run.weights.class_names)))
     still = FieldPriorMap(probabilities, mosaic, 1.0, classes).of(region, run.weights)

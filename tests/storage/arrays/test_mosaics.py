@@ -94,7 +94,7 @@ def test_strips_make_the_window(
 ) -> None:
     """They end where shards do, and together are what is stored there."""
     mosaic = open_mosaic(stored[0])
-    strips = [mosaic.spectra(strip) for strip in mosaic.strips(None, rows, columns)]
+    strips = [mosaic.spectra(strip) for strip in mosaic.row_blocks(None, rows, columns)]
     assert [len(strip) for strip in strips] == heights
     np.testing.assert_array_equal(np.concatenate(strips), stored[1][rows, columns])
 
@@ -107,7 +107,7 @@ def test_coarser_pixels_are_means(stored: tuple[Path, NDArray[np.float32]], fact
     rows, columns = slice(top, -(-height // factor)), slice(left, -(-width // factor))
     if rows.start >= rows.stop or columns.start >= columns.stop:
         return
-    found = np.concatenate(list(mosaic.strips(factor, rows, columns)))
+    found = np.concatenate(list(mosaic.row_blocks(factor, rows, columns)))
     for y, x in ((0, 0), (found.shape[0] - 1, found.shape[1] - 1), (found.shape[0] // 2, found.shape[1] // 3)):
         cell = stored[1][(top + y) * factor : (top + y + 1) * factor, (left + x) * factor : (left + x + 1) * factor]
         seen = np.isfinite(cell[..., 0])
