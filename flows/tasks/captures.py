@@ -4,7 +4,7 @@ No ``from __future__ import annotations`` here: Prefect reads signatures.
 """
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import replace
 from datetime import datetime
@@ -18,7 +18,7 @@ from flows.tasks.prefect_tasks import as_task, inside_flow
 from flows.tasks.run import SurveyRun, open_run
 from flows.tasks.stages.capture import capture_coarse, capture_fine
 from flows.tasks.stages.condense import condense_coarse, condense_fine
-from pipeline.errors import ArchiveError, NothingToMend, RigError, SettingsError
+from pipeline.errors import ArchiveError, IncompleteStoreError, NothingToMend, RigError, SettingsError
 from pipeline.lazy import deferred
 from storage.archive.keys import StageRef
 from storage.remote.opening import open_archive
@@ -108,11 +108,14 @@ def captured_signal(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRe
 
     Raises as `capture_pass`.
     """
-    condense, stage = CONDENSED[sweeps], PASSES[sweeps]
-    raw = plan.run.archive.ref(stage.product.name, stage.key(stage.wants(plan.run, *inputs)))
-    if condense.find(plan.run.archive, condense.wants(plan.run, raw)) is None:
+    condense, stage, archive = CONDENSED[sweeps], PASSES[sweeps], plan.run.archive
+    raw, found = None, None
+    with suppress(IncompleteStoreError):  # an input is not there yet, or is damaged: the pass itself says so
+        raw = archive.ref(stage.product.name, stage.key(stage.wants(plan.run, *inputs)))
+        found = condense.find(archive, condense.wants(plan.run, raw))
+    if raw is None or found is None:
         raw = capture_pass(plan, sweeps, *inputs)
-    elif plan.run.archive.is_known(raw):
+    elif archive.is_known(raw):
         plan.take_as_found(stage.name, raw, *inputs)
     return condense(plan, raw)
 
