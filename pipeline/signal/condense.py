@@ -77,7 +77,7 @@ def _projected(values: NDArray[np.float32], components: Components) -> tuple[Sco
             if close.any():
                 rest = white[close] - scores[part][close] @ axes.T
                 left[part][close] = np.einsum("nb,nb->n", rest, rest)
-    return scores.reshape(*values.shape[:-1], -1), left.reshape(values.shape[:-1])
+    return scores.reshape(*values.shape[:-1], len(components)), left.reshape(values.shape[:-1])
 
 
 def _least_squares(white: Scores, there: Bools, axes: Scores) -> tuple[Scores, Scores]:
