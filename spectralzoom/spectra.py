@@ -10,15 +10,14 @@ from typing import Any
 
 import numpy as np
 import xarray
-import zarr
 from numpy.typing import NDArray
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
 from storage.arrays.georeference import GRID_MAPPING
-from storage.arrays.layout import damage_named, open_group, read_array
+from storage.arrays.layout import open_group
 from storage.arrays.mosaics import Mosaic, open_mosaic
-from storage.arrays.signal_cubes import SignalCube, check_condensed, open_signal_cube
+from storage.arrays.signal_cubes import SignalCube, check_condensed, open_signal_cube, read_coordinates, score_layout
 
 Restore = Callable[[slice, slice, Sequence[int]], NDArray[np.float32]]  # rows, columns, bands: (row, column, band)
 OF_BANDS = ("band", "wavelength", "fwhm")
@@ -99,25 +98,14 @@ def _open(path: Path, dims: tuple[str, str, str], places: Sequence[str], restore
     """Return spectra with the coordinates of their store, in dask's blocks of whole shards of scores."""
     group = open_group(path)
     check_condensed(group, path)
-    with damage_named(str(path)):
-        scores = group["scores"]
-        if not isinstance(scores, zarr.Array):
-            raise TypeError("scores are no array")
-        arrays = dict(group.arrays())
-        coords = {name: _variable(group, arrays[name]) for name in (*places, *OF_BANDS) if name in arrays}
-    size = coords["wavelength"].sizes["band"]
-    blocks = dict(zip(dims, (*(scores.shards or scores.chunks)[1:], size), strict=True))
-    array = indexing.LazilyIndexedArray(RestoredArray((*scores.shape[1:], size), restore))
-    bare = {name: np.arange(length) for name, length in zip(dims, array.shape, strict=True) if name not in coords}
+    size, block = score_layout(group)
+    coords = {name: xarray.Variable(*one) for name, one in read_coordinates(group, (*places, *OF_BANDS)).items()}
+    shape = (*size, coords["wavelength"].sizes["band"])
+    bare = {name: np.arange(length) for name, length in zip(dims, shape, strict=True) if name not in coords}
     mapped = {"grid_mapping": GRID_MAPPING} if GRID_MAPPING in coords else {}
-    found = xarray.Dataset({"spectra": xarray.Variable(dims, array, VALUE | mapped).chunk(blocks)}, coords | bare)
+    spectra = xarray.Variable(dims, indexing.LazilyIndexedArray(RestoredArray(shape, restore)), VALUE | mapped)
+    found = xarray.Dataset({"spectra": spectra.chunk(dict(zip(dims, (*block, -1), strict=True)))}, coords | bare)
     return by_wavelength(xarray.decode_cf(found, mask_and_scale=False))["spectra"]
-
-
-def _variable(group: zarr.Group, stored: zarr.Array[Any]) -> xarray.Variable:
-    """Read a coordinate of a store."""
-    dims = [str(name) for name in getattr(stored.metadata, "dimension_names", None) or ()]
-    return xarray.Variable(dims, read_array(group, stored.basename), dict(stored.attrs))
 
 
 def by_wavelength(opened: xarray.Dataset) -> xarray.Dataset:

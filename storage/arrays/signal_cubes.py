@@ -257,6 +257,26 @@ def check_condensed(group: zarr.Group, path: Path) -> None:
         raise OldStoreError(f"{path} holds spectra band by band, as earlier versions stored them; {REPROCESS}")
 
 
+def score_layout(group: zarr.Group) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Rows and columns of a store of scores, and of what is one file of them (IncompleteStoreError: damaged)."""
+    with damage_named(str(group.store_path)):
+        scores = group["scores"]
+        if not isinstance(scores, zarr.Array):
+            raise TypeError("scores are no array")
+    (_, rows, columns), (_, deep, wide) = scores.shape, scores.shards or scores.chunks
+    return (rows, columns), (deep, wide)
+
+
+def read_coordinates(
+    group: zarr.Group, names: Sequence[str]
+) -> dict[str, tuple[tuple[str, ...], NDArray[Any], dict[str, Any]]]:
+    """Read dimensions, values and attributes of those of some arrays that are there (IncompleteStoreError: damaged)."""
+    with damage_named(str(group.store_path)):
+        there = {name: one for name, one in group.arrays() if name in names}
+    dims = {name: getattr(one.metadata, "dimension_names", None) or () for name, one in there.items()}
+    return {name: (dims[name], read_array(group, name), dict(there[name].attrs)) for name in names if name in there}
+
+
 def open_signal_cube(path: Path) -> SignalCube:
     """Open a condensed sweep.
 

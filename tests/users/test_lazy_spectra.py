@@ -127,7 +127,7 @@ def test_nothing_is_read_before_it_is_asked_for(
 ) -> None:
     """Opening reads coordinates alone, in less than .2 s."""
     names: list[str] = []
-    for module in ("spectralzoom.spectra", "storage.arrays.mosaics", "storage.arrays.signal_cubes"):
+    for module in ("storage.arrays.mosaics", "storage.arrays.signal_cubes"):
 
         def heard(group: Any, name: str, *place: Any) -> Any:
             names.append(name)
