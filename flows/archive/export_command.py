@@ -213,7 +213,6 @@ def name_stores(export: Export) -> None:
         "mosaic": ("Coarse mosaic", places["mosaic"]),
         "class_map": ("Class map and confidence on the camera's grid", places["class_map"]),
         "attention": ("Score and rank of the patches", nowhere),
-        "patches": ("Fine patches", nowhere),
     }
     if run.geobox is not None and run.map_product == "ground_map":
         stores["ground_map"] = ("Class map, picture and what is remembered, on the map", projection(run.geobox))

@@ -171,6 +171,11 @@ class Planner(OpenSurvey):
         self.products[stage] = ref
         return ref
 
+    def take_as_found(self, stage: str, ref: StageRef, *inputs: StageRef) -> None:
+        """Note a store that is not made again, since what follows was made of it."""
+        self.rows.append(StageForecast(stage, "cached", ref.key, "condensed"))
+        self.products[stage] = ref
+
     def _forecast(self, stage: Stage, wanted: Wanted) -> tuple[StageForecast, StageRef]:
         key = stage.key(wanted)
         found = stage.find(self.run.archive, wanted)

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from flows.publish.byte_account import recount_bytes
 from flows.publish.report import replace_bytes
 from flows.settings.values import parse_keep, raw_days
-from flows.tasks.stages.condense import SIGNAL, camera_of, raw_differs
+from flows.tasks.stages.condense import SIGNAL, SIGNAL_FINE, camera_of, raw_differs
 from storage.archive.archive import Archive
 from storage.archive.kept_bytes import kept_bytes
 from storage.archive.lineage import Catalogue
@@ -22,6 +22,7 @@ from storage.maintenance.garbage import IN_USE, Removal
 from storage.readers.recordings import LINE_PRODUCTS
 
 DAY_S = 86400.0
+PRESENT = {one.name: str(one.version) for one in (SIGNAL, SIGNAL_FINE)}
 
 
 @dataclass
@@ -79,7 +80,9 @@ def outlived_lines(catalogue: Catalogue, now: datetime) -> Iterator[OutlivedLine
             if raw is None or signal is None or raw.ref.uri in found:
                 continue
             runs = catalogue.named_by(raw.ref.uri)
-            condensed = raw.ref.uri in catalogue.inputs_of(signal.ref.uri) and signal.version == str(SIGNAL.version)
+            condensed = (
+                raw.ref.uri in catalogue.inputs_of(signal.ref.uri) and PRESENT.get(signal.ref.stage) == signal.version
+            )
             if condensed and all(is_outlived(one, now) for one in runs):
                 found.add(raw.ref.uri)
                 keeps = sorted({str(one.settings["keep"]) for one in runs})

@@ -109,13 +109,13 @@ def captured_signal(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRe
     Raises as `capture_pass`.
     """
     condense, stage, archive = CONDENSED[sweeps], PASSES[sweeps], plan.run.archive
-    raw, found = None, None
-    with suppress(IncompleteStoreError):  # an input is not there yet, or is damaged: the pass itself says so
+    found = None
+    with suppress(IncompleteStoreError):  # of an input, which the capture itself names
         raw = archive.ref(stage.product.name, stage.key(stage.wants(plan.run, *inputs)))
         found = condense.find(archive, condense.wants(plan.run, raw))
-    if raw is None or found is None:
-        raw = capture_pass(plan, sweeps, *inputs)
-    elif archive.is_known(raw):
+    if found is None:
+        return condense(plan, capture_pass(plan, sweeps, *inputs))
+    if archive.is_known(raw):
         plan.take_as_found(stage.name, raw, *inputs)
     return condense(plan, raw)
 

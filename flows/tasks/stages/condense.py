@@ -26,12 +26,13 @@ from storage.arrays.spool import line_values
 from storage.arrays.statistics import read_statistics
 
 SIGNAL = Product("condense", version=1)
+SIGNAL_FINE = Product("condense_fine", version=1)
 RECORD = "signal.json"
 SHARED_FRACTION = 2e-3  # of all spectra: of more rare ones, a component is cheaper than their residuals
 MOST_RARE = 0.05  # of spectra: more are no exceptions, and raw lines stay
 
 
-@stage("condense_coarse", "signal of the sweeps", SIGNAL, inputs=1, named="signal_coarse")
+@stage("condense_coarse", "signal of the sweeps", SIGNAL, named="signal_coarse")
 def condense_coarse(
     raw: StageRef, *, camera: LineCamera, signal: SignalChoice, noise_known: bool, report: Report
 ) -> Wanted:
@@ -39,7 +40,7 @@ def condense_coarse(
     return _condensed(raw, camera, signal, noise_known, report)
 
 
-@stage("condense_fine", "signal of the fine sweeps", SIGNAL, inputs=1, named="signal_fine")
+@stage("condense_fine", "signal of the fine sweeps", SIGNAL_FINE, named="signal_fine")
 def condense_fine(
     raw: StageRef, *, camera: LineCamera, signal: SignalChoice, noise_known: bool, report: Report
 ) -> Wanted:

@@ -40,6 +40,7 @@ POINTING = Product("register", version=2, files=(RECORD,))
 
 GEOLOCATION = Product("locate", version=3, files=("geolocation.zarr",))
 MOSAIC = Product("rectify", version=5, files=("mosaic.zarr",))
+DETAIL = Product("rectify_fine", version=1, files=("mosaic.zarr",))
 QUICKLOOK_PX = 512
 MOSAIC_STEP = 0.5  # of resampled scores, over that of the sweeps: what is read between samples is less noisy
 KERNEL_GAIN = 2.0  # by which kernels overshoot, at most
@@ -181,7 +182,7 @@ def locate(
     return Wanted(build, params)  # keyed by the paths, not by what was seen along them
 
 
-@stage("rectify", "mosaic", MOSAIC, inputs=2)
+@stage("rectify", "mosaic", MOSAIC)
 def rectify(
     signal: StageRef,
     geolocation: StageRef,
@@ -220,7 +221,7 @@ def rectify(
     return Wanted(build, params, [signal, geolocation, *_there(registration)])
 
 
-@stage("rectify_fine", "mosaic of the fine sweeps", MOSAIC, inputs=2, named="detail")
+@stage("rectify_fine", "mosaic of the fine sweeps", DETAIL, named="detail")
 def rectify_fine(
     attention: StageRef,
     signal: StageRef,

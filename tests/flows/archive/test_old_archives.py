@@ -60,7 +60,7 @@ def old(surveyed_png: Survey, tmp_path: Path) -> Archive:
         ref.path.rename(place)
         remake(place, lambda place=place: name_values(place / "mosaic.zarr"), version=4, key=key)  # type: ignore[misc]
         text = text.replace(ref.key, key)
-    for ref in archive.refs("condense"):
+    for ref in (*archive.refs("condense"), *archive.refs("condense_fine")):
         shutil.rmtree(ref.path)
     text = json.dumps(without_signal(json.loads(text)))
     remake(folder, lambda: (folder / "receipt.json").write_text(text), rests_on={})

@@ -68,7 +68,7 @@ def later(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def raw_uris(archive: Archive) -> set[str]:
     """Addresses of raw lines that are there."""
-    return {ref.uri for ref in archive.refs("capture") if archive.is_there(ref.uri)}
+    return {ref.uri for ref in archive.refs() if ref.stage.startswith("capture") and archive.is_there(ref.uri)}
 
 
 def of_gc(capsys: pytest.CaptureFixture[str], root: Path, **flags: Any) -> tuple[int, dict[str, Any]]:
@@ -147,7 +147,7 @@ def test_what_a_killed_survey_did_not_clear_goes(
 @pytest.mark.usefixtures("later")
 def test_lines_that_were_not_condensed_are_never_touched(archive: Archive) -> None:
     """As those of a rig whose survey broke off, or of an earlier version."""
-    for ref in archive.refs("condense"):
+    for ref in (*archive.refs("condense"), *archive.refs("condense_fine")):
         shutil.rmtree(ref.path)
     there = raw_uris(archive)
     assert clear_raw_lines(archive).removals == []

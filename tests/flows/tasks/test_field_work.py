@@ -21,7 +21,7 @@ from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from storage.arrays.class_maps import ClassNames, create_class_map, create_probabilities, load_class_map
 from storage.arrays.layout import consolidate_stores
-from storage.arrays.mosaics import load_attention, open_mosaic
+from storage.arrays.mosaics import load_attention
 from storage.parallel.pool import WorkerPool
 
 Survey = Callable[..., object]
@@ -53,7 +53,7 @@ def _store(stages: Path, name: str) -> Path:
 
 def _mosaics(stages: Path) -> list[Path]:
     """The mosaics of both passes, the coarse one first."""
-    return sorted(stages.glob("rectify/*/mosaic.zarr"), key=lambda path: -open_mosaic(path).factor)
+    return [_store(stages, f"{name}/*/mosaic.zarr") for name in ("rectify", "rectify_fine")]
 
 
 def _work(run: SurveyRun, pool: WorkerPool, halo: int) -> FieldWork:
