@@ -12,17 +12,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import ArchiveError, IncompleteStoreError
+from pipeline.errors import ArchiveError, IncompleteStoreError, OldStoreError
 from pipeline.lazy import deferred
 from storage.archive.archive import Archive
 from storage.archive.records import Run, read_run
 from storage.arrays.layout import damage_named
+from storage.arrays.signal_cubes import REPROCESS
+from storage.readers.recordings import LINE_PRODUCTS
 
 if TYPE_CHECKING:
     import xarray
 
+    import spectralzoom.spectra as spectra
     import storage.remote.opening as opening
 else:
+    spectra = deferred("spectralzoom.spectra")
     opening = deferred("storage.remote.opening")
     xarray = deferred("xarray")  # a second, which most commands do without
 
@@ -144,13 +148,30 @@ class OpenedRun:
 
     @property
     def mosaic(self) -> xarray.DataArray:
-        """(y, x, band) float32 values of the coarse pass, NaN where nothing was seen; indexed by ``wavelength`` too."""
-        return self.dataset("mosaic")["values"]
+        """(y, x, band) float32 values of the first pass, NaN where nothing was seen; indexed by ``wavelength`` too."""
+        return spectra.open_lazy_mosaic(self._place("mosaic"))
 
     @property
-    def patches(self) -> xarray.Dataset:
-        """Fine patches: ``values`` (patch, y, x, band), ``valid`` (patch, y, x), and the pixel where each begins."""
-        return self.dataset("patches")
+    def cube(self) -> xarray.DataArray:
+        """(y, x, band) float32 values in the finest pixels that were captured: those of the fine pass, if there is one.
+
+        NaN where that pass saw nothing. Spectra are restored from their components when they are used.
+        """
+        name = "detail" if "detail" in self.receipt["products"] else "mosaic"
+        return spectra.open_lazy_mosaic(self._place(name))
+
+    @property
+    def lines(self) -> dict[str, xarray.DataArray]:
+        """Calibrated lines by the sweep's name: (line, sample, band) float32, NaN where a spectrum was unusable.
+
+        They are restored from their components when they are used, with what was kept of rare spectra; time, mirror
+        and exposure of each line are coordinates.
+        """
+        names = [name for name in LINE_PRODUCTS.values() if name in self.receipt["products"]]
+        if not names and any(name in self.receipt["products"] for name in LINE_PRODUCTS):
+            raise OldStoreError(f"the run {self.name} of {self.archive_name} has no condensed lines; {REPROCESS}")
+        stores = [path for name in names for path in sorted(self._place(name).glob("*.zarr"))]
+        return {path.stem: spectra.open_lazy_lines(path) for path in stores}
 
     @property
     def attention(self) -> xarray.Dataset:
@@ -168,9 +189,19 @@ class OpenedRun:
 
     @property
     def sweeps(self) -> dict[str, xarray.Dataset]:
-        """Raw lines by the sweep's name: ``dn`` (line, sample, band), with time and mirror of each line."""
-        raw = (self._place(name) for name in ("raw_coarse", "raw_fine") if name in self.receipt["products"])
-        return {one.stem: open_labelled(one) for folder in raw for one in sorted(folder.glob("*.zarr"))}
+        """Raw lines by the sweep's name: ``dn`` (line, sample, band), with time and mirror of each line.
+
+        Raises IncompleteStoreError: they were cleared away, see ``keep`` in the settings; `lines` stay.
+        """
+        names = [name for name in LINE_PRODUCTS if name in self.receipt["products"]]
+        for name in names:
+            if not self._archive.is_there("/".join(self.receipt["products"][name].split("/")[:3])):
+                raise IncompleteStoreError(
+                    f"the raw lines of {self.name} were cleared away once they were condensed; `lines` has their"
+                    " signal. A survey with keep = raw keeps raw lines"
+                )
+        folders = [self._place(name) for name in names]
+        return {one.stem: open_labelled(one) for folder in folders for one in sorted(folder.glob("*.zarr"))}
 
     @property
     def products(self) -> tuple[str, ...]:
@@ -210,7 +241,7 @@ def open_labelled(path: Path) -> xarray.Dataset:
         )
         opened = _in_shards(opened.drop_vars([name for name in PICTURES if name in opened]))
     bare = {name: np.arange(size) for name, size in opened.sizes.items() if name not in opened.variables}  # as rgb
-    return by_wavelength(opened.assign_coords(bare))
+    return spectra.by_wavelength(opened.assign_coords(bare))
 
 
 def _in_shards(opened: xarray.Dataset) -> xarray.Dataset:
@@ -221,17 +252,3 @@ def _in_shards(opened: xarray.Dataset) -> xarray.Dataset:
         return one.chunk(dict(zip(one.dims, blocks, strict=True)))
 
     return opened.assign({name: split(one) for name, one in opened.data_vars.items()})
-
-
-def by_wavelength(opened: xarray.Dataset) -> xarray.Dataset:
-    """Make ``wavelength`` an index of its bands, so that ``.sel(wavelength=660, method="nearest")`` finds one.
-
-    Where wavelengths rise or fall without a break, slices work as well; else (two spectrometers that overlap) only the
-    nearest can be asked for.
-    """
-    if "wavelength" not in opened.coords or opened["wavelength"].ndim != 1:
-        return opened
-    steps = np.diff(opened["wavelength"].values)
-    if (steps > 0).all() or (steps < 0).all():
-        return opened.set_xindex("wavelength")
-    return opened.set_xindex("wavelength", xarray.indexes.NDPointIndex)

@@ -15,6 +15,7 @@ from rich.tree import Tree
 
 from flows.cli.app import ArchiveName, AsJson, Switch, stderr
 from flows.publish.receipt import is_pending
+from flows.publish.retention import RawClearance, clear_raw_lines
 from flows.settings.load import of_this_version, parse_settings
 from flows.settings.survey_settings import OF_THE_MACHINE, Settings
 from flows.tasks.open_survey import versions, versions_made_again
@@ -85,7 +86,10 @@ def gc(
     dry_run: Switch = False,
     as_json: AsJson = False,
 ) -> int:
-    """Remove what no run names and no named product rests on.
+    """Remove what no run names and no named product rests on, and raw lines that no run keeps any longer.
+
+    Raw lines of published runs go by the setting `keep` of these runs, once each line was compared with what was
+    condensed from it.
 
     Parameters
     ----------
@@ -109,16 +113,21 @@ def gc(
             dry_run=dry_run,
             progress=lambda removal, fraction: bars.show("gc", fraction, removal.uri),
         )
+        raw = RawClearance(obstacle=done.obstacle)
+        if done.obstacle is None:
+            raw = clear_raw_lines(opened, dry_run=dry_run, progress=lambda uri, part: bars.show("gc", part, uri))
+    removals = [*done.removals, *raw.removals]
     content = {
         "archive": opened.name,
         "dry_run": dry_run,
-        "bytes": done.size,
-        "removals": [asdict(removal) for removal in done.removals],
+        "bytes": sum(removal.size for removal in removals),
+        "removals": [asdict(removal) for removal in removals],
         "kept": done.kept,
-        "obstacle": done.obstacle,
+        "raw_kept": raw.kept,
+        "obstacle": raw.obstacle,
     }
     put_out(content, show_clearance, as_json=as_json)
-    return DONE if done.obstacle is None else PARTLY
+    return DONE if raw.obstacle is None and not raw.kept else PARTLY
 
 
 def run_verify(
@@ -354,6 +363,8 @@ def show_clearance(content: dict[str, Any], console: Console) -> None:
     for reason in dict.fromkeys(content["kept"].values()):
         count = sum(why == reason for why in content["kept"].values())
         _say(console, f"{counted(count, 'store')} that no run names {'stays' if count == 1 else 'stay'}: {reason}")
+    for uri, why in content["raw_kept"].items():
+        console.print(f"[bold yellow]{escape(f'raw lines stay: {uri}: {why}')}[/]", soft_wrap=True)
     if content["obstacle"] is not None:
         console.print(f"[bold yellow]{escape(content['obstacle'])}[/]", soft_wrap=True)
     _say(console, f"{len(content['removals'])} things {verb}, {format_bytes(content['bytes'])}")

@@ -242,7 +242,7 @@ def _store(catalogue: Catalogue, archive: Archive, what: str, key: str) -> Stage
     if store.version != str(now):
         raise ArchiveError(
             f"the {what} was made by version {store.version} of the stage {store.ref.stage}, which is now {now}:"
-            " reprocess makes a new run, with its accuracy"
+            f" `spectralzoom reprocess {archive.name}` makes a new run, with its accuracy"
         )
     return archive.ref(store.ref.stage, store.ref.key)
 

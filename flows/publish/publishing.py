@@ -16,6 +16,7 @@ from flows.publish.byte_account import recount_bytes
 from flows.publish.receipt import Receipt, is_pending
 from flows.publish.receipt_table import byte_rows, cost_rows, finding_rows, headline
 from flows.publish.report import render_markdown, replace_bytes
+from flows.publish.retention import is_outlived
 from flows.publish.run_folder import Published, asked_settings, extend_with_accuracy, publish_run
 from flows.settings.survey_settings import OF_THE_MACHINE
 from flows.settings.values import KEEP_SIGNAL
@@ -27,6 +28,7 @@ from flows.tasks.stages.condense import condense_coarse, condense_fine, raw_diff
 from flows.terminal.figures import format_percent
 from pipeline.lazy import deferred
 from storage.archive.keys import StageRef, canonical_json
+from storage.archive.lineage import Catalogue
 from storage.archive.records import Run, read_run
 from storage.archive.whole_files import to_json
 
@@ -90,12 +92,21 @@ def _clear_raw(plan: OpenSurvey, run: RunRef) -> RunRef:
         raw, signal = plan.products[captured], plan.products[condensed]
         if plan.run.archive.find(raw.stage, raw.key) is None:  # cleared before
             continue
-        why = raw_differs(raw, signal, plan.run.camera)
+        why = _kept_by_others(plan, captured, raw) or raw_differs(raw, signal, plan.run.camera)
         if why is None:
             cleared |= plan.run.archive.clear(raw, wait=False)
         else:
             plan.observer.note(f"raw lines stay: {why}")
     return recount(plan, run) if cleared else run
+
+
+def _kept_by_others(plan: OpenSurvey, stage: str, raw: StageRef) -> str | None:
+    """Say which other run keeps raw lines that were there before this survey; None where no other does."""
+    if plan.records[stage].state == "ran":
+        return None
+    archive = plan.run.archive
+    runs = Catalogue.read(archive.root).named_by(raw.uri)
+    return next((f"{one.uri} keeps them" for one in runs if not is_outlived(one, archive.now())), None)
 
 
 def recount(plan: OpenSurvey, run: RunRef) -> RunRef:

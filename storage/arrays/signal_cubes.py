@@ -10,6 +10,7 @@ the sweep, so that a later calibration can take their place.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +20,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
+from pipeline.errors import OldStoreError
 from pipeline.geometry.mirror import mirror_throughput
 from pipeline.geometry.scan import Sweep
 from pipeline.signal.calibrate import judge_elements
@@ -44,6 +46,7 @@ from storage.arrays.quicklooks import Quicklook, quicklook_of, write_quicklook
 CHUNK = 64  # lines and samples of a chunk of scores, all components of them: what lies together packs together
 SHARD_SAMPLES = 640
 FRAMES_OF = "frames_of"  # attribute: the sweep beside it that holds the dark and white frames of both
+REPROCESS = "`spectralzoom reprocess ARCHIVE` makes its run anew"
 MOST_DN = np.iinfo(np.uint16).max
 LARGEST_SHORT = 32_000  # of scores and residuals in steps; larger ones are stored in 32 bits
 
@@ -232,16 +235,26 @@ class SignalCube:
         """Lines and samples of rare spectra, (rare,) each, by line."""
         return read_array(self.group, "rare_line"), read_array(self.group, "rare_sample")
 
-    def spectra(self, start: int, stop: int) -> NDArray[np.float32]:
-        """Scene values of the lines ``start`` to ``stop``, (line, sample, band), rare ones too; NaN where unusable."""
-        scores = self.read(start, stop).astype(np.float32) * np.float32(self.step)
-        values = self.components.restore(scores)
+    def spectra(
+        self, start: int, stop: int, samples: slice = slice(None), bands: Sequence[int] | None = None
+    ) -> NDArray[np.float32]:
+        """Scene values of the lines ``start`` to ``stop`` and some samples and bands (None: all), rare ones too.
+
+        (line, sample, band) float32, NaN where unusable.
+        """
+        chosen = slice(None) if bands is None else list(bands)
+        law = self.components if bands is None else self.components.of_bands(bands)
+        first, last, _ = samples.indices(self.usable.shape[1])
+        scores = self.read_window(slice(start, stop), slice(first, last)).astype(np.float32) * np.float32(self.step)
+        values = law.restore(scores)
         line, sample = self.rare
         here = slice(*np.searchsorted(line, (start, start + len(values))))
-        if here.stop > here.start:
-            steps = read_array(self.group, "rare_residual", here).astype(np.float32) * np.float32(RESIDUAL_STEP)
-            values[line[here] - start, sample[here]] += steps * np.nan_to_num(self.components.noise).astype(np.float32)
-        values[~self.usable[start:stop]] = np.nan
+        inside = (sample[here] >= first) & (sample[here] < last)
+        if inside.any():
+            steps = read_array(self.group, "rare_residual", here)[inside][:, chosen].astype(np.float32)
+            steps *= np.float32(RESIDUAL_STEP) * np.nan_to_num(law.noise).astype(np.float32)
+            values[line[here][inside] - start, sample[here][inside] - first] += steps
+        values[~self.usable[start:stop, first:last]] = np.nan
         return values
 
     def quicklook(self) -> Quicklook | None:
@@ -249,10 +262,40 @@ class SignalCube:
         return quicklook_of(self.group)
 
 
+def check_condensed(group: zarr.Group, path: Path) -> None:
+    """Refuse a store of spectra that an earlier version wrote band by band (OldStoreError)."""
+    if "scores" not in group and "values" in group:
+        raise OldStoreError(f"{path} holds spectra band by band, as earlier versions stored them; {REPROCESS}")
+
+
+def score_layout(group: zarr.Group) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Rows and columns of a store of scores, and of what is one file of them (IncompleteStoreError: damaged)."""
+    with damage_named(str(group.store_path)):
+        scores = group["scores"]
+        if not isinstance(scores, zarr.Array):
+            raise TypeError("scores are no array")
+    (_, rows, columns), (_, deep, wide) = scores.shape, scores.shards or scores.chunks
+    return (rows, columns), (deep, wide)
+
+
+def read_coordinates(
+    group: zarr.Group, names: Sequence[str]
+) -> dict[str, tuple[tuple[str, ...], NDArray[Any], dict[str, Any]]]:
+    """Read dimensions, values and attributes of those of some arrays that are there (IncompleteStoreError: damaged)."""
+    with damage_named(str(group.store_path)):
+        there = {name: one for name, one in group.arrays() if name in names}
+    dims = {name: getattr(one.metadata, "dimension_names", None) or () for name, one in there.items()}
+    return {name: (dims[name], read_array(group, name), dict(there[name].attrs)) for name in names if name in there}
+
+
 def open_signal_cube(path: Path) -> SignalCube:
-    """Open a condensed sweep (IncompleteStoreError: there is none, it was not closed, or it is damaged)."""
+    """Open a condensed sweep.
+
+    Raises IncompleteStoreError: there is none, it was not closed, it is damaged, or of an earlier version.
+    """
     group = open_group(path)
     wavelength, fwhm = read_bands(group)
+    check_condensed(group, path)
     with damage_named(str(path)):
         sweep = Sweep(**dict(group.attrs)["sweep"])  # type: ignore[arg-type]
         step, largest = (float(group["scores"].attrs[name]) for name in ("scale_factor", "largest"))  # type: ignore[arg-type]

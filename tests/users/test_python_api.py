@@ -16,7 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import spectralzoom
-from spectralzoom.opened import NoRunError, OpenedRun, by_wavelength
+from spectralzoom.opened import NoRunError, OpenedRun
+from spectralzoom.spectra import by_wavelength
 from storage.archive.archive import Archive
 from storage.arrays.class_maps import load_class_map
 from storage.arrays.ground_maps import load_geobox
@@ -88,7 +89,7 @@ def test_runs_are_found_by_name_and_the_latest_comes_first(run: OpenedRun, tmp_p
 
 def test_every_axis_of_every_product_has_a_coordinate(run: OpenedRun) -> None:
     """Whatever a run has left, nothing has to be counted by hand, and nothing warns."""
-    opened = [run.dataset(name) for name in run.products] + list(run.sweeps.values())
+    opened = [*(run.dataset(name) for name in run.products), *run.lines.values(), run.mosaic, run.cube]
     assert len(opened) > 6
     for one in opened:
         assert set(one.sizes) <= set(one.indexes)
@@ -121,7 +122,7 @@ def test_a_coarse_pixel_lies_on_its_fine_ones(run: OpenedRun) -> None:
 
 def test_a_band_is_found_by_its_wavelength(run: OpenedRun) -> None:
     """By the nearest, in every product that has bands, and by its number still."""
-    for one in (run.mosaic, run.patches["values"], run.sweeps["coarse-0"]["dn"]):
+    for one in (run.mosaic, run.cube, run.lines["coarse-0"]):
         red = one.sel(wavelength=660, method="nearest")
         assert float(red.wavelength) == 640
         xr.testing.assert_identical(red, one.isel(band=0))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -12,13 +12,14 @@ import numpy as np
 
 from flows.settings.survey_settings import SignalChoice
 from flows.tasks.stage import Product, Report, Wanted, stage
+from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.camera import LineCamera
 from pipeline.signal.components import Components
 from pipeline.signal.condense import RESIDUAL_STEP, ResidualLaw
 from pipeline.signal.subspace import FEW_BANDS, SignalStatistics, find_components, with_shared
 from pipeline.signal.sweep_signal import CondensedSweep, Condenser, camera_noise, differing_lines
 from storage.archive.keys import StageRef
-from storage.archive.manifests import read_table, write_table
+from storage.archive.manifests import check_files, read_table, write_table
 from storage.arrays.cubes import RawCube, SweepHeader, open_raw_cubes
 from storage.arrays.signal_cubes import LineRows, SignalCubeWriter, open_signal_cubes
 from storage.arrays.spool import line_values
@@ -76,6 +77,11 @@ def _camera_key(camera: LineCamera) -> dict[str, Any]:
     return {name: getattr(camera, name) for name in ("bits", "electrons_per_dn", "read_noise_e")}
 
 
+def camera_of(params: Mapping[str, Any]) -> LineCamera:
+    """Return a camera with those values of which the scores of a condensed pass depend, by the pass's parameters."""
+    return LineCamera(**params["camera"])
+
+
 def components_of(
     found: SignalStatistics, cubes: Sequence[RawCube], camera: LineCamera, choice: SignalChoice, noise_known: bool
 ) -> Components:
@@ -130,12 +136,26 @@ def _record(condenser: Condenser, done: Sequence[CondensedSweep]) -> dict[str, A
 
 
 def raw_differs(raw: StageRef, signal: StageRef, camera: LineCamera) -> str | None:
-    """Compare every raw line with what was condensed from it; say why raw lines are to stay, None where they may go."""
+    """Compare every raw line with what was condensed from it; say why raw lines are to stay, None where they may go.
+
+    Every byte of the condensed store is read again before, so that rare spectra and components are as published.
+    """
+    try:
+        check_files(signal.path, hashes=True)
+        return _lines_differ(raw, signal, camera)
+    except IncompleteStoreError as error:
+        return f"{error}"
+
+
+def _lines_differ(raw: StageRef, signal: StageRef, camera: LineCamera) -> str | None:
     record = read_table(signal.path / RECORD)
     if record["rare"] > MOST_RARE * max(record["spectra"], 1):
         fraction = 100 * record["rare"] / record["spectra"]
         return f"{fraction:.1f} % of the spectra have more than noise beside {record['components']} components"
-    for cube, stored in zip(open_raw_cubes(raw.path), open_signal_cubes(signal.path), strict=True):
+    cubes, condensed = open_raw_cubes(raw.path), open_signal_cubes(signal.path)
+    if [cube.sweep for cube in cubes] != [stored.sweep for stored in condensed]:
+        return "the sweeps of the signal are not those of the raw lines"
+    for cube, stored in zip(cubes, condensed, strict=True):
         wrong = differing_lines(cube, stored, camera)
         if wrong:
             return f"sweep {cube.sweep.name}: {line_values(wrong)} of the signal are not those of the raw lines"

@@ -254,7 +254,7 @@ REFUSED: dict[str, tuple[Refuse, str]] = {
     "a store that is gone": (_mosaic_gone, "the mosaic of runs/.* is missing or damaged; run verify --repair"),
     "an older version": (
         lambda scene, out, patch: be_version(patch, "segment", 99),
-        r"version \d+ of the stage segment, which is now 99: reprocess makes a new run",
+        r"version \d+ of the stage segment, which is now 99: `spectralzoom reprocess .*` makes a new run",
     ),
     "other weights": (
         _other_weights,

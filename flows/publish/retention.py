@@ -1,0 +1,121 @@
+"""Retention of raw lines: those whose time is over go, once each was compared with what was condensed from it.
+
+A run's setting ``keep`` says for how long its raw lines stay. Lines that several runs name stay as long as one of them
+keeps them. A killed clearing leaves a store either whole or cleared; the next one counts the bytes of its runs again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+
+from flows.publish.byte_account import recount_bytes
+from flows.publish.report import replace_bytes
+from flows.settings.values import parse_keep, raw_days
+from flows.tasks.stages.condense import SIGNAL, SIGNAL_FINE, camera_of, raw_differs
+from storage.archive.archive import Archive
+from storage.archive.kept_bytes import kept_bytes
+from storage.archive.lineage import Catalogue
+from storage.archive.records import Run, Store
+from storage.maintenance.garbage import IN_USE, Removal
+from storage.readers.recordings import LINE_PRODUCTS
+
+DAY_S = 86400.0
+PRESENT = {one.name: str(one.version) for one in (SIGNAL, SIGNAL_FINE)}
+
+
+@dataclass
+class RawClearance:
+    """Raw lines that go, by address why others of those stay whose time is over, and why none goes."""
+
+    removals: list[Removal] = field(default_factory=list)
+    kept: dict[str, str] = field(default_factory=dict)
+    obstacle: str | None = None
+
+
+@dataclass(frozen=True)
+class OutlivedLines:
+    """Raw lines whose time is over, the store condensed from them, and the words of the settings."""
+
+    raw: Store
+    signal: Store
+    why: str
+
+
+def clear_raw_lines(
+    archive: Archive, *, dry_run: bool = False, progress: Callable[[str, float], None] | None = None
+) -> RawClearance:
+    """Clear raw lines whose time is over by the settings of every run that names them; receipts count bytes again.
+
+    Every line is compared first; lines that differ, or cannot be read, stay. With ``dry_run`` nothing is compared or
+    removed. Raises ArchiveError: the disk refuses.
+    """
+    found = list(outlived_lines(Catalogue.read(archive.root), archive.now()))
+    if dry_run:
+        return RawClearance([_removal(one) for one in found])
+    done = RawClearance()
+    with archive.in_use(alone=True) as alone:
+        if not alone:
+            return RawClearance(obstacle=IN_USE if found else None)
+        for number, one in enumerate(found):
+            if progress is not None:
+                progress(one.raw.ref.uri, number / len(found))
+            raw, signal = (archive.ref(store.ref.stage, store.ref.key) for store in (one.raw, one.signal))
+            why = raw_differs(raw, signal, camera_of(one.signal.params))
+            if why is not None:
+                done.kept[raw.uri] = why
+            elif archive.clear(raw, wait=False):
+                done.removals.append(_removal(one))
+        _recount(archive)
+    return done
+
+
+def outlived_lines(catalogue: Catalogue, now: datetime) -> Iterator[OutlivedLines]:
+    """Yield the raw lines of published runs that no run keeps any longer, and that were condensed."""
+    found = set[str]()
+    for run in catalogue.runs:
+        for names in LINE_PRODUCTS.items():
+            raw, signal = (_whole(catalogue, run, name) for name in names)
+            if raw is None or signal is None or raw.ref.uri in found:
+                continue
+            runs = catalogue.named_by(raw.ref.uri)
+            condensed = (
+                raw.ref.uri in catalogue.inputs_of(signal.ref.uri) and PRESENT.get(signal.ref.stage) == signal.version
+            )
+            if condensed and all(is_outlived(one, now) for one in runs):
+                found.add(raw.ref.uri)
+                keeps = sorted({str(one.settings["keep"]) for one in runs})
+                yield OutlivedLines(raw, signal, f"keep = {', '.join(keeps)}, and they were condensed")
+
+
+def _whole(catalogue: Catalogue, run: Run, product: str) -> Store | None:
+    """Return the store of a product, None where it or its files are gone."""
+    store = catalogue.stores.get(run.products.get(product, ""))
+    return None if store is None or store.problem is not None or store.cleared else store
+
+
+def is_outlived(run: Run, now: datetime) -> bool:
+    """Return whether the time is over for which a run keeps its raw lines; no, where it does not tell that time."""
+    try:
+        days = raw_days(parse_keep(run.settings["keep"]))
+        made = datetime.fromisoformat(run.created)
+    except (KeyError, ValueError):
+        return False
+    made = made if made.tzinfo else made.replace(tzinfo=UTC)
+    return run.problem is None and (now - made).total_seconds() >= days * DAY_S
+
+
+def _removal(one: OutlivedLines) -> Removal:
+    return Removal(one.raw.ref.uri, "files", one.raw.size, one.why)
+
+
+def _recount(archive: Archive) -> None:
+    """Publish runs again whose receipts count raw lines that were cleared, now or by a clearing that was killed."""
+    catalogue = Catalogue.read(archive.root)
+    cleared = {uri for uri, store in catalogue.stores.items() if store.cleared}
+    for run in catalogue.runs:
+        account = run.receipt.get("data_bytes")
+        named = any(run.products.get(name) in cleared for name in LINE_PRODUCTS)
+        if named and isinstance(account, dict) and account.get("kept") != kept_bytes(archive, run, catalogue):
+            recount_bytes(archive, run.folder.name, replace_bytes)

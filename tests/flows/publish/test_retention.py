@@ -1,0 +1,218 @@
+"""Raw lines go when the settings of their runs say so, once each was compared; killed anywhere, nothing is lost."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import spectralzoom
+from flows.archive.commands import gc
+from flows.publish.retention import clear_raw_lines
+from flows.terminal.processes import DONE, PARTLY
+from storage.archive.archive import Archive
+from storage.archive.kept_bytes import kept_bytes
+from storage.archive.records import read_run
+from storage.arrays import signal_cubes
+from storage.maintenance.garbage import IN_USE
+from tests.conftest import Survey
+from tests.flows.conftest import problems
+from tests.prior_work import without_effects
+from tests.storage.small_archive import flip
+
+KILLED = """
+import importlib, os, signal, sys
+from datetime import UTC, datetime, timedelta
+from storage.archive.archive import Archive
+from flows.publish.retention import clear_raw_lines
+module, name, when, root = sys.argv[1:]
+place = importlib.import_module(module)
+real = getattr(place, name)
+def killed(*given, **more):
+    if when == "after":
+        real(*given, **more)
+    os.kill(os.getpid(), signal.SIGKILL)
+setattr(place, name, killed)
+Archive.now = lambda self: datetime.now(UTC) + timedelta(days=8)
+clear_raw_lines(Archive.open(root))
+"""
+
+
+@pytest.fixture(scope="module")
+def surveyed(survey_png: Survey, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An archive of one survey that keeps its raw lines for a week; not to be changed."""
+    root = tmp_path_factory.mktemp("retention") / "archive"
+    with without_effects():
+        survey_png(root, keep="raw 7d", accuracy=False)
+    return root
+
+
+@pytest.fixture
+def archive(surveyed: Path, tmp_path: Path) -> Archive:
+    """A copy of it."""
+    return Archive.open(shutil.copytree(surveyed, tmp_path / "archive"))
+
+
+@pytest.fixture
+def later(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock of the archive is eight days ahead."""
+    monkeypatch.setattr(Archive, "now", lambda self: datetime.now(UTC) + timedelta(days=8))
+
+
+def raw_uris(archive: Archive) -> set[str]:
+    """Addresses of raw lines that are there."""
+    return {ref.uri for ref in archive.refs() if ref.stage.startswith("capture") and archive.is_there(ref.uri)}
+
+
+def of_gc(capsys: pytest.CaptureFixture[str], root: Path, **flags: Any) -> tuple[int, dict[str, Any]]:
+    """Exit code and content of `gc --json`."""
+    code = gc(root, as_json=True, **flags)
+    return code, json.loads(capsys.readouterr().out)
+
+
+def is_counted(archive: Archive) -> bool:
+    """Whether the newest receipt tells the bytes that are kept now."""
+    run = read_run(archive.runs()[-1], {})
+    return bool(run.receipt["data_bytes"]["kept"] == kept_bytes(archive, run))
+
+
+def test_lines_stay_for_their_time(archive: Archive, capsys: pytest.CaptureFixture[str]) -> None:
+    """Within the week nothing goes, and nothing would."""
+    there = raw_uris(archive)
+    assert len(there) == 2
+    for dry_run in (True, False):
+        assert of_gc(capsys, archive.root, dry_run=dry_run)[1]["removals"] == []
+    assert raw_uris(archive) == there
+
+
+@pytest.mark.usefixtures("later")
+def test_outlived_lines_go_and_the_receipt_counts_again(archive: Archive, capsys: pytest.CaptureFixture[str]) -> None:
+    """A dry run tells them with bytes and reason; then they go, the archive is whole, and lines are read as before."""
+    run = spectralzoom.open(archive.root).latest
+    before, there, size = {n: one.values for n, one in run.lines.items()}, raw_uris(archive), kept_size(archive)
+    code, planned = of_gc(capsys, archive.root, dry_run=True)
+    assert (code, raw_uris(archive)) == (DONE, there)
+    assert {row["uri"] for row in planned["removals"]} == there
+    assert {row["why"] for row in planned["removals"]} == {"keep = raw 7d, and they were condensed"}
+    code, done = of_gc(capsys, archive.root)
+    assert (code, done["removals"], raw_uris(archive)) == (DONE, planned["removals"], set())
+    assert size - kept_size(archive) > 0.9 * done["bytes"] > 0
+    assert is_counted(archive)
+    assert problems(archive.root) == []
+    again = spectralzoom.open(archive.root).latest
+    for name, values in before.items():
+        np.testing.assert_array_equal(again.lines[name].values, values)
+    with pytest.raises(spectralzoom.Error, match="`lines` has their signal"):
+        _ = again.sweeps
+    assert of_gc(capsys, archive.root)[1]["removals"] == []
+
+
+def kept_size(archive: Archive) -> int:
+    """Bytes of the newest run by its receipt."""
+    return int(read_run(archive.runs()[-1], {}).receipt["data_bytes"]["kept"])
+
+
+@pytest.mark.usefixtures("no_effects", "later")
+def test_lines_that_another_run_keeps_stay(archive: Archive, survey_png: Survey) -> None:
+    """The strictest of the runs that name them counts, for gc and for a survey that finds them."""
+    there = raw_uris(archive)
+    survey_png(archive.root, keep="raw", accuracy=False)
+    assert clear_raw_lines(archive).removals == []
+    survey_png(archive.root, keep="signal", accuracy=False)
+    assert raw_uris(archive) == there
+
+
+@pytest.mark.usefixtures("no_effects")
+def test_what_a_killed_survey_did_not_clear_goes(
+    survey_png: Survey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With `keep = signal` at once, whatever the age."""
+    with monkeypatch.context() as patch:
+        patch.setattr("flows.survey.clear_raw", lambda plan, run: run)
+        survey_png(tmp_path / "archive", accuracy=False)
+    archive = Archive.open(tmp_path / "archive")
+    there = raw_uris(archive)
+    assert there
+    assert {one.uri for one in clear_raw_lines(archive).removals} == there
+    assert raw_uris(archive) == set()
+
+
+@pytest.mark.usefixtures("later")
+def test_lines_that_were_not_condensed_are_never_touched(archive: Archive) -> None:
+    """As those of a rig whose survey broke off, or of an earlier version."""
+    for ref in (*archive.refs("condense"), *archive.refs("condense_fine")):
+        shutil.rmtree(ref.path)
+    there = raw_uris(archive)
+    assert clear_raw_lines(archive).removals == []
+    assert raw_uris(archive) == there
+
+
+@pytest.mark.usefixtures("later")
+@pytest.mark.parametrize("part", ["scores", "rare_residual", "axes"])
+def test_a_flipped_bit_keeps_raw_lines(archive: Archive, part: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """What was condensed is read to its last byte before: the damaged store keeps its lines, others go."""
+    files = [path for path in archive.root.glob(f"stages/condense/*/coarse-0.zarr/{part}/**/*") if path.is_file()]
+    chunks = [path for path in files if "/c/" in path.as_posix()]
+    flip(max(chunks or files, key=lambda path: path.stat().st_size), at=5)
+    code, done = of_gc(capsys, archive.root)
+    assert code == PARTLY
+    (why,) = done["raw_kept"].values()
+    assert "has changed since it was published" in why
+    assert len(raw_uris(archive)) == 1
+
+
+@pytest.mark.usefixtures("later")
+def test_lines_that_differ_stay(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One score that is off by one step: the reason names the sweep and its line."""
+    read = signal_cubes.SignalCube.read
+
+    def off(self: signal_cubes.SignalCube, start: int = 0, stop: int | None = None) -> Any:
+        found = read(self, start, stop).copy()
+        if start == 0 and self.sweep.name == "coarse-0":
+            found[3, 7, 0] += 2
+        return found
+
+    monkeypatch.setattr(signal_cubes.SignalCube, "read", off)
+    done = clear_raw_lines(archive)
+    assert list(done.kept.values()) == ["sweep coarse-0: line 3 of the signal are not those of the raw lines"]
+    assert set(done.kept) == raw_uris(archive)
+
+
+@pytest.mark.usefixtures("later")
+def test_nothing_goes_while_a_survey_works(archive: Archive) -> None:
+    """It may be reading the very lines."""
+    there = raw_uris(archive)
+    with archive.in_use():
+        assert clear_raw_lines(archive).obstacle == IN_USE
+    assert raw_uris(archive) == there
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "when", "left"),
+    [
+        ("storage.archive.archive", "take_its_place", "before", 2),
+        ("storage.archive.archive", "take_its_place", "after", 1),
+        ("flows.publish.retention", "recount_bytes", "before", 0),
+        ("flows.publish.byte_account", "publish_counted", "after", 0),
+    ],
+)
+@pytest.mark.usefixtures("later")
+def test_killed_it_leaves_either(archive: Archive, module: str, name: str, when: str, left: int) -> None:
+    """A store is whole or cleared, and the next gc does the rest, receipt included."""
+    command = [sys.executable, "-c", KILLED, module, name, when, str(archive.root)]
+    assert subprocess.run(command, check=False).returncode == -9
+    assert len(raw_uris(archive)) == left
+    again = Archive.open(archive.root)
+    again.reclaim()
+    assert problems(archive.root) == []
+    clear_raw_lines(again)
+    assert raw_uris(again) == set()
+    assert is_counted(again)
+    assert problems(archive.root) == []

@@ -1,0 +1,159 @@
+"""Lines and cubes as xarray: what is asked for is restored, chunk by chunk, and nothing is read before."""
+
+from __future__ import annotations
+
+import time
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from pipeline.geometry.scan import Sweep
+from pipeline.signal.components import Components
+from pipeline.signal.condense import RESIDUAL_STEP, UNUSABLE
+from pipeline.source import References
+from spectralzoom.spectra import open_lazy_lines, open_lazy_mosaic
+from storage.arrays import layout
+from storage.arrays.cubes import SweepHeader
+from storage.arrays.mosaics import MosaicWriter
+from storage.arrays.signal_cubes import LineRows, SignalCubeWriter
+
+LINES, SAMPLES, BANDS, COUNT, STEP = 70, 90, 12, 4, 0.5
+WAVELENGTHS = np.linspace(400, 900, BANDS)
+RARE = np.array([[3, 5], [66, 80]])
+
+
+def law() -> Components:
+    """Four components of twelve bands."""
+    rng = np.random.default_rng(5)
+    axes = np.linalg.qr(rng.normal(size=(BANDS, COUNT)))[0].T
+    return Components(rng.uniform(1, 2, BANDS), axes, rng.uniform(0.01, 0.02, BANDS))
+
+
+def restored(scores: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Spectra by the words of the page: scores * step @ axes + mean."""
+    components = law()
+    return np.rint(scores / STEP) * STEP @ (components.axes * components.noise) + components.mean
+
+
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, NDArray[np.float64]]:
+    """A condensed sweep with two rare spectra and one that is unusable, and what it is to give."""
+    path = tmp_path_factory.mktemp("sweep") / "coarse-0.zarr"
+    rng = np.random.default_rng(1)
+    frames = References(np.zeros((SAMPLES, BANDS)), np.ones((SAMPLES, BANDS)), np.ones(BANDS))
+    header = SweepHeader(Sweep("coarse-0", "coarse", "x", 0.0, 0.0, LINES), frames, WAVELENGTHS, None, "test")
+    scores = rng.normal(0, 20, (LINES, SAMPLES, COUNT)).astype(np.float32)
+    quality = np.zeros((LINES, SAMPLES), np.uint8)
+    quality[10, 20] = UNUSABLE
+    writer = SignalCubeWriter(path, header, law(), step=STEP, largest=200)
+    for first in (0, 64):
+        writer.write(first, scores[first : first + 64], quality[first : first + 64])
+    left = rng.integers(-50, 50, (2, BANDS)).astype(np.int16)
+    column = np.arange(LINES, dtype=float)
+    writer.close(LineRows(column * 0.02, column / 100, column * 0, column * 0 + 20, column >= 0), RARE, left, None)
+    values = restored(scores)
+    values[RARE[:, 0], RARE[:, 1]] += left * RESIDUAL_STEP * law().noise
+    values[10, 20] = np.nan
+    return path, values
+
+
+@pytest.fixture(scope="module")
+def mosaic(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, NDArray[np.float64]]:
+    """A mosaic of two shards across, a corner of which nothing saw, and what it is to give."""
+    path = tmp_path_factory.mktemp("mosaic") / "mosaic.zarr"
+    scores = np.random.default_rng(2).normal(0, 20, (70, 700, COUNT)).astype(np.float32)
+    seen = np.ones((70, 700), np.bool_)
+    seen[:5, :9] = False
+    MosaicWriter(path, seen.shape, law(), WAVELENGTHS, step=STEP, largest=200).write_rows(0, scores, seen)
+    return path, np.where(seen[..., None], restored(scores), np.nan)
+
+
+def test_lines_are_restored_with_rare_spectra(sweep: tuple[Path, NDArray[np.float64]]) -> None:
+    """Every line and band, NaN where unusable, with what is known of each line beside it."""
+    path, values = sweep
+    lines = open_lazy_lines(path)
+    assert (lines.dims, lines.dtype) == (("line", "sample", "band"), np.float32)
+    np.testing.assert_allclose(lines.values, values, rtol=1e-5)
+    assert {"time", "mirror_x", "mirror_y", "exposure_ms", "valid_line", "wavelength"} <= set(lines.coords)
+    assert (lines.time.attrs["units"], lines.wavelength.attrs["units"], lines.attrs["units"]) == ("s", "nm", "1")
+    red = lines.sel(wavelength=660, method="nearest")
+    np.testing.assert_allclose(red.values, values[..., np.abs(WAVELENGTHS - 660).argmin()], rtol=1e-5)
+
+
+def test_a_cube_is_restored(mosaic: tuple[Path, NDArray[np.float64]]) -> None:
+    """In blocks of whole shards, NaN where nothing was seen, a coordinate on every axis."""
+    path, values = mosaic
+    cube = open_lazy_mosaic(path)
+    assert (cube.dims, cube.chunks) == (("y", "x", "band"), ((64, 6), (640, 60), (BANDS,)))
+    np.testing.assert_allclose(cube.values, values, rtol=1e-5)
+    assert set(cube.dims) <= set(cube.indexes)
+
+
+PLACES = st.one_of(
+    st.integers(-60, 59),
+    st.builds(
+        slice, st.none() | st.integers(-80, 80), st.none() | st.integers(-80, 80), st.sampled_from([None, 1, 3, -2])
+    ),
+    st.lists(st.integers(-60, 59), max_size=4),
+)
+
+
+@settings(max_examples=40)
+@given(st.sampled_from(["sweep", "mosaic"]), PLACES, PLACES, st.integers(0, BANDS - 1) | st.just(slice(None, None, -1)))
+def test_any_selection_is_that_of_all_values(
+    sweep: tuple[Path, NDArray[np.float64]],
+    mosaic: tuple[Path, NDArray[np.float64]],
+    which: str,
+    row: Any,
+    column: Any,
+    band: Any,
+) -> None:
+    """Numbers, slices of any step and lists of places, before dask and through it."""
+    path, values = sweep if which == "sweep" else mosaic
+    opened = (open_lazy_lines if which == "sweep" else open_lazy_mosaic)(path)
+    wanted = dict(zip(opened.dims, (row, column, band), strict=True))
+    expected = opened.copy(data=values).isel(wanted)
+    np.testing.assert_allclose(opened.isel(wanted).values, expected.values, rtol=1e-5)
+
+
+def test_nothing_is_read_before_it_is_asked_for(
+    sweep: tuple[Path, NDArray[np.float64]], mosaic: tuple[Path, NDArray[np.float64]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Opening reads coordinates alone, in less than .2 s."""
+    names: list[str] = []
+    for module in ("storage.arrays.mosaics", "storage.arrays.signal_cubes"):
+
+        def heard(group: Any, name: str, *place: Any) -> Any:
+            names.append(name)
+            return layout.read_array(group, name, *place)
+
+        monkeypatch.setattr(f"{module}.read_array", heard)
+    begun = time.process_time()
+    lines, cube = open_lazy_lines(sweep[0]), open_lazy_mosaic(mosaic[0])
+    assert time.process_time() - begun < 0.2
+    assert not {"scores", "quality", "coverage", "rare_residual"} & set(names)
+    assert lines[0, 0, 0].values.size == cube[0, 0, 0].values.size == 1
+    assert names.count("scores") == 2
+
+
+def test_a_selection_takes_the_memory_of_a_selection(tmp_path: Path) -> None:
+    """One band of a cube of 48 MB, and one spectrum, restore no other."""
+    side, bands = 640, 30
+    components = Components(np.ones(bands), np.eye(bands)[:2], np.ones(bands))
+    writer = MosaicWriter(tmp_path / "mosaic.zarr", (side, side), components, np.linspace(400, 900, bands), largest=9)
+    writer.write_rows(0, np.ones((side, side, 2), np.float32), np.ones((side, side), np.bool_))
+    cube = open_lazy_mosaic(tmp_path / "mosaic.zarr")
+    assert cube[0, 0].values.shape == (bands,)
+    for chosen, most in ((cube[..., 3], 3), (cube[5, 7], 0.3), (cube[100:110, 50:60], 0.3)):
+        tracemalloc.start()
+        values = chosen.values
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < values.nbytes + most * 1e6
+    assert cube.nbytes == side * side * bands * 4
