@@ -122,6 +122,25 @@ class SignalStatistics:
             return np.zeros((0, self.bands), np.float32)
         return np.concatenate(self.kept) + self.origin
 
+    def completed(self, values: Values) -> Values:
+        """Return (..., band) spectra with what the bands that are there let expect of those that are not.
+
+        For few bands: every pattern of missing bands is solved by itself. A spectrum without a band stays without.
+        """
+        there = np.isfinite(values)
+        some = there.any(axis=-1) & ~there.all(axis=-1)
+        if self.origin is None or not some.any():
+            return values
+        covariance, mean = _covariance(self.single, self.total, self.count)
+        spectra, known = values[some].astype(np.float64) - self.origin - mean, there[some]
+        for pattern in np.unique(known, axis=0):
+            rows, have, lack = (known == pattern).all(axis=1), np.flatnonzero(pattern), np.flatnonzero(~pattern)
+            weights = np.linalg.lstsq(covariance[np.ix_(have, have)], covariance[np.ix_(have, lack)], rcond=1e-9)[0]
+            spectra[np.ix_(rows, lack)] = spectra[np.ix_(rows, have)] @ weights
+        found = values.copy()
+        found[some] = spectra + self.origin + mean
+        return found
+
     def arrays(self) -> dict[str, NDArray[np.generic]]:
         """All of it by names, to be stored."""
         none = np.zeros((0, self.bands), np.float32)

@@ -30,7 +30,7 @@ from storage.archive.archive import Archive
 from storage.archive.keys import array_digest
 from storage.arrays.class_maps import load_class_map
 from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
-from storage.arrays.mosaics import load_mosaic
+from storage.arrays.mosaics import open_mosaic
 from storage.export.image_files import write_recorded_files
 from storage.remote.opening import verify_archive
 from tests.conftest import Survey, WeightsMaker, patchy_scene
@@ -254,7 +254,8 @@ def test_a_straight_scan_is_a_recording(
     assert ("scan has no pointing: taken as an even straight scan" in notes) == (column is None)
     width, height = published.receipt["settings"]["size"]
     assert (width, height) == (64, 96)
-    mosaic = load_mosaic(tmp_path / "a" / published.receipt["products"]["mosaic"]).values
+    seen = open_mosaic(tmp_path / "a" / published.receipt["products"]["mosaic"])
+    mosaic = np.concatenate([seen.spectra(block) for block in seen.row_blocks(4)])
     light = (values.astype(np.float64) - 60) / (3500 - 60)
     light = light[::-1] if column == "position_px" else light
     coarse = light.reshape(24, 4, 16, 4, 3).mean(axis=(1, 3))
@@ -478,7 +479,7 @@ def test_swaths_of_ones_own_are_surveyed_in_two_passes(tmp_path: Path, weights: 
     assert {round(sweep.swath_px) for sweep in raw.values() if sweep.step == 4} == {-35, 4, 38}
     assert {round(sweep.swath_px) for sweep in raw.values()} == {-35, 4, 38}
     assert published.receipt["recording"]["lines_read"] < 318
-    assert np.isfinite(load_mosaic(tmp_path / "a" / published.receipt["products"]["mosaic"]).values).mean() > 0.99
+    assert np.isfinite(open_mosaic(tmp_path / "a" / published.receipt["products"]["mosaic"]).values()).mean() > 0.99
 
 
 def test_numbers_of_sixteen_bits_are_surveyed_and_found_again(tmp_path: Path, weights: Path) -> None:

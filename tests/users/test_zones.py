@@ -21,7 +21,7 @@ from pipeline.errors import SettingsError, ZoneError
 from pipeline.geometry.grid import UNLABELLED
 from storage.archive.archive import Archive
 from storage.arrays.class_maps import ClassMap, ProbabilityStore, load_class_map
-from storage.arrays.mosaics import load_attention, open_patches
+from storage.arrays.mosaics import chosen_patches, load_attention, open_mosaic
 from tests.conftest import Survey
 from tests.prior_work import without_effects
 from tests.users.zone_sketches import sketch
@@ -105,7 +105,7 @@ def test_no_patch_outside_or_in_a_no_go_zone_is_asked_for(kept_to: tuple[Path, P
     barred = np.array(
         [not patch_number.intersects(AREA) or patch_number.intersection(NO_GO).area > 0 for patch_number in patch_index]
     )
-    cut = open_patches(out / products["patches"]).patch_index
+    cut = chosen_patches(out / products["attention"])
     assert len(cut) > 10
     assert not barred[cut].any()
     assert (attention.rank.ravel()[barred] == -1).all()
@@ -161,12 +161,14 @@ def test_a_plain_scan_cuts_the_patches_of_the_area(survey_png: Survey, zones: di
     """Each patch shows the picture where it lies; no patch outside is cut, and the map keeps to the area as well."""
     plain = {"scan_step": 1, "budget": None, "camera.samples": 64, "accuracy": False}
     published = survey_png(tmp_path, **plain, **zones)
-    store = open_patches(tmp_path / published.receipt["products"]["patches"])
-    values, (row, column) = store.read(0, len(store.patch_index)), np.divmod(store.patch_index, 16)
+    products = published.receipt["products"]
+    chosen, seen = chosen_patches(tmp_path / products["attention"]), open_mosaic(tmp_path / products["mosaic"]).values()
+    row, column = np.divmod(chosen, 16)
+    values = np.array([seen[8 * y : 8 * y + 8, 8 * x : 8 * x + 8] for y, x in zip(row, column, strict=True)])
     with Image.open(published.receipt["settings"]["scene"]) as found:
         picture = np.asarray(found, np.float64)
     there = [picture[8 * y : 8 * y + 8, 8 * x : 8 * x + 8] for y, x in zip(row, column, strict=True)]
-    assert 20 < len(store.patch_index) < 16 * 12
+    assert 20 < len(chosen) < 16 * 12
     assert np.abs(np.nan_to_num(values - there)).mean() < 2
     boxes = shapely.box(8 * column, 8 * row, 8 * column + 8, 8 * row + 8)
     assert shapely.intersects(boxes, AREA).all()

@@ -26,9 +26,10 @@ from pipeline.geometry.scan import Sweep
 from pipeline.planning.coverage import coarse_sweeps, full_sweeps, reach_px
 from pipeline.simulator.effects.pointing import PointingErrors
 from storage.arrays.layout import open_group, read_array
-from storage.arrays.mosaics import PatchWriter, open_patches
+from storage.arrays.mosaics import open_mosaic
 from tests.flows.conftest import FEW_BANDS
 from tests.prior_work import without_effects
+from tests.storage.plain_mosaic import write_values
 
 OFF_PX, SEED = 6.0, 0
 
@@ -86,24 +87,22 @@ def test_what_the_mirror_missed_is_told_and_detail_still_helps(surveyed: tuple[d
 def test_unseen_pixels_take_the_coarse_look(tmp_path: Path) -> None:
     """What no line reached of a patch has the columns of the coarse pixel over it; a patch never seen is left out."""
     grid = SceneGrid(12, 16, 4, 2)
-    weights = SimpleNamespace(
-        basis=SpectralBasis(500, 700, 2), columns=lambda v, nm: v, normalisation=SimpleNamespace(most_value=np.inf)
-    )
+    weights = SimpleNamespace(basis=SpectralBasis(500, 700, 2), columns_of_scores=lambda scores, law, nm: scores)
     patch_index = np.array([1, 6, 7])
     values = np.random.default_rng(0).normal(size=(3, 4, 4, 2)).astype(np.float16)
     values[0, :3, 1:], values[1] = np.nan, np.nan
     coarse = np.random.default_rng(1).normal(size=(*np.array(grid.padded_shape) // 2, 2)).astype(np.float32)
-    writer = PatchWriter(
-        tmp_path / "patches.zarr", patch_index, grid.patch_origin(patch_index), 4, np.array([500.0, 700.0])
-    )
-    writer.write(values, np.asarray(np.isfinite(values).all(axis=-1), np.bool_))
+    image = np.full((12, 16, 2), np.nan)
+    for patch, (y, x) in zip(values, grid.patch_origin(patch_index), strict=True):
+        image[y : y + 4, x : x + 4] = patch
+    write_values(tmp_path / "m.zarr", image, np.array([500.0, 700.0]))
     seen = CoarsePrediction(grid, coarse, np.empty(0, np.float32))
-    store, nm = open_patches(tmp_path / "patches.zarr"), np.array([500.0, 700.0])
-    told, columns = patch_features(weights, store, nm, seen, whole_field(grid))  # type: ignore[arg-type]
+    detail = open_mosaic(tmp_path / "m.zarr")
+    told, columns = patch_features(weights, detail, patch_index, seen, whole_field(grid))  # type: ignore[arg-type]
     assert told.tolist() == [1, 7]
-    np.testing.assert_allclose(columns[1], values[2], rtol=1e-3)
-    np.testing.assert_allclose(columns[0][:, 0], values[0][:, 0], rtol=1e-3)
-    np.testing.assert_allclose(columns[0][3], values[0][3], rtol=1e-3)
+    np.testing.assert_allclose(columns[1], values[2], atol=1e-3)
+    np.testing.assert_allclose(columns[0][:, 0], values[0][:, 0], atol=1e-3)
+    np.testing.assert_allclose(columns[0][3], values[0][3], atol=1e-3)
     over = coarse[:2, 2:4].repeat(2, axis=0).repeat(2, axis=1)  # patch 1 begins at row 0, column 4
     np.testing.assert_array_equal(columns[0][:3, 1:], over[:3, 1:])
 
