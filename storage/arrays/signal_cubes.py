@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import zarr
 from numpy.typing import NDArray
+from zarr.storage import MemoryStore
 
 from pipeline.geometry.mirror import mirror_throughput
 from pipeline.geometry.scan import Sweep
@@ -29,6 +30,8 @@ from storage.arrays.cubes import RawCube, SweepHeader, open_raw_cube, write_line
 from storage.arrays.layout import (
     SHARD_ROWS,
     ArraySpec,
+    StorePlace,
+    bytes_held,
     create_array,
     create_group,
     damage_named,
@@ -97,10 +100,15 @@ def read_components(group: zarr.Group) -> Components:
     return Components(mean, axes, noise)
 
 
+SIGNAL_ARRAYS = ("scores", "quality", "axes", "mean", "noise", "rare_line", "rare_sample", "rare_residual")
+
+
 class SignalCubeWriter:
     """Write a sweep's scores, some lines at a time."""
 
-    def __init__(self, path: Path, header: SweepHeader, components: Components, *, step: float, largest: float) -> None:
+    def __init__(
+        self, path: StorePlace, header: SweepHeader, components: Components, *, step: float, largest: float
+    ) -> None:
         lines, samples, _ = header.shape
         self._header, self._step = header, step
         facts: dict[str, Any] = {"sweep": asdict(header.sweep), "source": header.source}
@@ -222,7 +230,7 @@ class SignalCube:
         return quicklook_of(self.group)
 
 
-def open_signal_cube(path: Path) -> SignalCube:
+def open_signal_cube(path: StorePlace) -> SignalCube:
     """Open a condensed sweep (IncompleteStoreError: there is none, it was not closed, or it is damaged)."""
     group = open_group(path)
     wavelength, fwhm = read_bands(group)
@@ -286,3 +294,21 @@ def open_lines(path: Path) -> RawCube:
     one = open_signal_cube(path)
     facts = (one.position, one.time_s, one.exposure_ms, one.valid_line, one.source, one.started, one.group)
     return RestoredCube(one.sweep, one.references, one.wavelength_nm, one.fwhm_nm, *facts, signal=one)
+
+
+class SignalCubeInMemory:
+    """A condensed sweep that is written to memory, by the writer of files and read by their reader."""
+
+    def __init__(self, header: SweepHeader, components: Components, *, step: float, largest: float) -> None:
+        self._held: dict[str, Any] = {}
+        self._store = MemoryStore(store_dict=self._held)
+        self.writer = SignalCubeWriter(self._store, header, components, step=step, largest=largest)
+
+    @property
+    def size(self) -> int:
+        """Bytes of the signal: scores, their law and rare spectra, without what stores of raw lines hold as well."""
+        return bytes_held(self._held, *SIGNAL_ARRAYS)
+
+    def open(self) -> SignalCube:
+        """Open what was written."""
+        return open_signal_cube(self._store)
