@@ -25,7 +25,7 @@ from flows.tradeoff.store import STORE, store_tradeoff
 from pipeline.errors import SettingsError
 from storage.archive.whole_files import to_json
 
-_COLOURS = ("#0072B2", "#007A5A", "#8a6d00", "#D55E00", "#A23B72")
+_COLOURS = ("#0072B2", "#007A5A", "#8a6d00", "#D55E00", "#A23B72", "#333333", "#5B3FA0", "#00798C", "#9B2226")
 _LEVEL = "#D55E00"
 _ACROSS = 3  # panels in a row
 _UNITS = ((1e6, "ms"), (1e3, "µs"), (1.0, "ns"))
