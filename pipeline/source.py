@@ -44,6 +44,14 @@ class References:
     flat: NDArray[np.float32] | None = None  # (sample, band) relative response left over by the white frame
     by_mirror: bool = False  # white was taken at rest; away from it the mirror passes another fraction of the light
 
+    def same_as(self, other: References) -> bool:
+        """Whether all frames of two references are the same, bit for bit."""
+        frames = ("dark", "white", "white_reference", "bad", "flat")
+        pairs = [(getattr(self, name), getattr(other, name)) for name in frames]
+        return self.by_mirror == other.by_mirror and all(
+            (left is None) == (right is None) and (left is None or np.array_equal(left, right)) for left, right in pairs
+        )
+
 
 class Source(Protocol):
     """Something that can look at a field line by line."""

@@ -156,9 +156,9 @@ class MosaicView:
         """Values (row, x, band) of some bands with the number of the first row, from the top down."""
         if self.ground is None:
             first = 0
-            for strip in self.mosaic.strips():
-                yield first, self.mosaic.spectra(strip, bands)
-                first += len(strip)
+            for block in self.mosaic.row_blocks():
+                yield first, self.mosaic.spectra(block, bands)
+                first += len(block)
             return
         factor = self.factor
         at_once = int(np.clip(BYTES_AT_ONCE // (4 * len(bands) * self.shape[1]), 1, 256))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import io
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -13,7 +12,7 @@ from matplotlib import colormaps
 from numpy.typing import NDArray
 from PIL import Image
 
-from flows.publish.panels import UNLABELLED_COLOUR, class_palette
+from flows.publish.panels import UNLABELLED_COLOUR, class_palette, data_address, webp
 from flows.publish.quicklook import QuicklookData, colours_of
 from flows.publish.receipt import Receipt
 from flows.publish.receipt_table import format_days
@@ -29,8 +28,8 @@ from storage.arrays.layout import open_group, read_array
 from storage.arrays.quicklooks import choose_bands
 
 MOST_PX = 2048  # of a map's longer side; of larger ones every n-th pixel is shown
-QUALITY = 84  # of JPEG
-LEVELS = 100  # of a ramp of colours; the next number is see-through
+QUALITY = 80  # of a photograph as WebP
+LEVELS = 50  # of a ramp of colours; the next number is see-through
 CHANGED_RGB, PATCH_RGB = (196, 38, 46), (0, 190, 200)
 Bytes = NDArray[np.uint8]
 
@@ -96,11 +95,11 @@ def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: Prio
     palette = palette_bytes(shown.class_names, shown.class_colours)
 
     def classes(image: NDArray[np.integer]) -> str:
-        return png_address(image[thin, thin].astype(np.uint8), palette)
+        return layer_address(image[thin, thin].astype(np.uint8), palette)
 
     title = choose_bands(shown.wavelength_nm)[1].capitalize()
     colours = np.rint(255 * colours_of(shown, shown.rectified)).astype(np.uint8)
-    layers = [MapLayer(title, jpeg_address(colours[thin, thin]), shown=True)]
+    layers = [MapLayer(title, photo_address(colours[thin, thin]), shown=True)]
     layers.append(MapLayer("Class map", classes(shown.class_map), shown=True))
     if shown.confidence is not None:
         layers.append(MapLayer("Confidence, dark 0 to bright 1", _ramp_address(shown.confidence[thin, thin], 1.0)))
@@ -113,13 +112,15 @@ def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: Prio
         layers.append(MapLayer(f"Days since it was captured, 0 to {oldest:.2g}", ages, opacity=0.8))
         table = np.array([(*CHANGED_RGB, round(255 * fraction / LEVELS)) for fraction in range(LEVELS + 1)], np.uint8)
         fractions = np.rint(LEVELS * np.clip(np.nan_to_num(before.changed), 0, 1)).astype(np.uint8)
-        layers.append(MapLayer("Changed since", png_address(_on_field(run, fractions)[thin, thin], table), opacity=0.8))
+        layers.append(
+            MapLayer("Changed since", layer_address(_on_field(run, fractions)[thin, thin], table), opacity=0.8)
+        )
     if not run.plan.plain:
         patch_index = np.zeros(run.grid.patch_shape, np.uint8)
         patch_index.ravel()[plan.patch_index] = 1
         table = np.array([(0, 0, 0, 0), (*PATCH_RGB, 255)], np.uint8)
         layers.append(
-            MapLayer("Looked at twice", png_address(_on_field(run, patch_index)[thin, thin], table), opacity=0.6)
+            MapLayer("Looked at twice", layer_address(_on_field(run, patch_index)[thin, thin], table), opacity=0.6)
         )
     counts = np.bincount(shown.class_map.ravel(), minlength=256) / max(shown.class_map.size, 1)
     covered = [*counts[: len(shown.class_names)].tolist(), float(counts[len(shown.class_names) :].sum())]
@@ -142,22 +143,29 @@ def palette_bytes(names: Sequence[str], colours: NDArray[np.integer] | None) -> 
     return palette
 
 
+def layer_address(numbers: Bytes, colours: Bytes) -> str:
+    """Return the data address of a picture of (y, x) numbers, each in its row of ``colours`` (number, 3 or 4)."""
+    return data_address(webp(Image.fromarray(_table(colours)[numbers]), lossless=True))
+
+
 def png_address(numbers: Bytes, colours: Bytes) -> str:
-    """Return the data address of a PNG of (y, x) numbers, each in its row of ``colours`` (number, 3 or 4)."""
-    picture, table = Image.fromarray(np.ascontiguousarray(numbers)), np.zeros((256, 4), np.uint8)
+    """Return that of a PNG, from which the numbers can be read again."""
+    picture, table, file = Image.fromarray(np.ascontiguousarray(numbers)), _table(colours), io.BytesIO()
+    picture.putpalette(table[:, :3].tobytes())
+    picture.save(file, "PNG", transparency=table[:, 3].tobytes())
+    return data_address(file.getvalue())
+
+
+def _table(colours: Bytes) -> Bytes:
+    table = np.zeros((256, 4), np.uint8)
     table[:, 3] = 255
     table[: len(colours), : colours.shape[1]] = colours
-    picture.putpalette(table[:, :3].tobytes())
-    file = io.BytesIO()
-    picture.save(file, "PNG", transparency=table[:, 3].tobytes())
-    return f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode('ascii')}"
+    return table
 
 
-def jpeg_address(picture: Bytes) -> str:
-    """Return the data address of a JPEG of a (y, x, 3) photograph."""
-    file = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(picture)).save(file, "JPEG", quality=QUALITY)
-    return f"data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode('ascii')}"
+def photo_address(picture: Bytes) -> str:
+    """Return the data address of a (y, x, 3) photograph."""
+    return data_address(webp(Image.fromarray(np.ascontiguousarray(picture)), quality=QUALITY))
 
 
 def _ramp_address(values: NDArray[np.floating], most: float) -> str:
@@ -166,7 +174,7 @@ def _ramp_address(values: NDArray[np.floating], most: float) -> str:
     table[: LEVELS + 1] = np.rint(255 * colormaps["viridis"](np.linspace(0, 1, LEVELS + 1)))
     known = np.isfinite(values)
     levels = np.rint(LEVELS * np.clip(np.where(known, values, 0) / (most or 1.0), 0, 1))
-    return png_address(np.where(known, levels, LEVELS + 1).astype(np.uint8), table)
+    return layer_address(np.where(known, levels, LEVELS + 1).astype(np.uint8), table)
 
 
 def _on_field(run: SurveyRun, patches: Bytes) -> Bytes:

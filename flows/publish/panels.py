@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,6 +15,7 @@ from matplotlib.colors import hsv_to_rgb, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
+from PIL import Image
 
 from flows.terminal.figures import format_area
 from pipeline.geometry.grid import UNLABELLED
@@ -48,6 +50,19 @@ def save_png(figure: Figure, file: str | Path | IO[bytes], **choices: Any) -> No
     """Write a figure as PNG, into a file or a buffer."""
     FigureCanvasAgg(figure)
     figure.savefig(file, format="png", **choices)
+
+
+def webp(picture: Image.Image, **choices: Any) -> bytes:
+    """Pack a picture as Pillow's ``choices`` say: a tenth to a third shorter than PNG and JPEG that look the same."""
+    file = io.BytesIO()
+    picture.save(file, "WEBP", **choices)
+    return file.getvalue()
+
+
+def data_address(content: bytes) -> str:
+    """Return a PNG or WebP as an address of data, for a page."""
+    kind = "webp" if content.startswith(b"RIFF") else "png"
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
 def grey_of(image: NDArray[np.floating]) -> NDArray[np.float32]:

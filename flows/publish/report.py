@@ -20,6 +20,7 @@ from markupsafe import Markup
 
 from flows.publish.effects_table import format_change, format_total
 from flows.publish.field_map import FieldMap
+from flows.publish.panels import data_address
 from flows.publish.receipt import Receipt
 from flows.publish.receipt_table import byte_rows, cost_rows, finding_rows, format_reused, headline, plot_rows
 from flows.tasks.scores import format_false_classes
@@ -119,15 +120,15 @@ def _plain(value: object) -> object:
 
 @dataclass(frozen=True)
 class Picture:
-    """A PNG with the words below it."""
+    """A PNG or WebP with the words below it."""
 
-    png: bytes
+    content: bytes
     caption: str
 
 
 def render_report(
     receipt: Receipt,
-    quicklook_png: bytes,
+    quicklook: bytes,
     pictures: Iterable[Picture] = (),
     *,
     captured_again: float | None = None,
@@ -138,7 +139,7 @@ def render_report(
     ``captured_again`` is the fraction of the field captured in detail, 0..1, for the first sentence; None leaves it
     out. ``field`` is the map to move in, above all pictures; None leaves it out, with all scripts.
     """
-    shown = [Picture(quicklook_png, "The survey at a glance."), *pictures]
+    shown = [Picture(quicklook, "The survey at a glance."), *pictures]
     split: Mapping[str, Any] = receipt["savings"]["multiply_adds"]
     parts = [
         name for name in ("coarse_prediction", "score", "encode", "decode") if split["done"] and split[name] is not None
@@ -154,7 +155,7 @@ def render_report(
         receipt=receipt,
         field=field,
         leaflet=LEAFLET,
-        pictures=[{"data": base64.b64encode(one.png).decode("ascii"), "caption": one.caption} for one in shown],
+        pictures=[{"address": data_address(one.content), "caption": one.caption} for one in shown],
         costs=cost_rows(receipt["savings"]),
         byte_rows=byte_rows(receipt),
         reused=format_reused(receipt),

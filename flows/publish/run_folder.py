@@ -14,11 +14,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from flows.publish.byte_account import open_account, publish_counted
 from flows.publish.field_map import block_of, field_map, prior_map
 from flows.publish.findings import PLOTS_FILE, field_figures, find_ground, find_map, find_zones, plots_csv
-from flows.publish.panels import draw_ground
+from flows.publish.panels import draw_ground, webp
 from flows.publish.quicklook import QuicklookData, draw_quicklook
 from flows.publish.receipt import AccuracyIs, Receipt, build_receipt, check_receipt, with_accuracy
 from flows.publish.report import Picture, render_report
@@ -109,7 +110,8 @@ def _publish(survey: OpenSurvey, draft: RunDraft, plan: FinePlan, receipt: Recei
     draw_quicklook(draft.folder / "quicklook.png", shown)
     if "plots" in receipt:
         draft.write_file(PLOTS_FILE, plots_csv(receipt["plots"]))
-    picture = (draft.folder / "quicklook.png").read_bytes()
+    with Image.open(draft.folder / "quicklook.png") as opened:
+        picture = webp(opened.convert("RGB"), lossless=True)
     maps = (load_ground_map(ref.path / STORE) for ref in products.there("ground"))
     pictures = [Picture(draw_ground(drawn), "The map on the ground, north up.") for drawn in maps]
     field = field_map(run, plan, shown, prior_map(run.prior, products["segment"], receipt))
@@ -205,7 +207,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
     bands, _ = choose_bands(run.scene.wavelength_nm)
     chosen = list(bands)
     mosaic = open_mosaic(products.mosaic.path / "mosaic.zarr")
-    coarse = np.concatenate([mosaic.spectra(strip, chosen) for strip in mosaic.strips(run.factor)])
+    coarse = np.concatenate([mosaic.spectra(strip, chosen) for strip in mosaic.row_blocks(run.factor)])
     attention = load_attention(products["score"].path / "attention.zarr")
     found = load_class_map(products["segment"].path / "class_map.zarr")
     order = np.argsort(attention.rank.ravel(), kind="stable")

@@ -113,7 +113,7 @@ def captured_signal(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRe
     if condense.find(plan.run.archive, condense.wants(plan.run, raw)) is None:
         raw = capture_pass(plan, sweeps, *inputs)
     elif plan.run.archive.is_known(raw):
-        plan.take_as_found(stage.name, raw)
+        plan.take_as_found(stage.name, raw, *inputs)
     return condense(plan, raw)
 
 

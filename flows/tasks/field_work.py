@@ -92,7 +92,7 @@ class Scoring:
 def coarse_region(weights: Weights, mosaic: Path, region: Region) -> CoarsePass:
     """Read the part of a stored mosaic that a region needs in coarse pixels, some rows at a time."""
     seen = open_mosaic(mosaic)
-    strips = seen.strips(region.grid.factor, region.coarse.rows, region.coarse.columns)
+    strips = seen.row_blocks(region.grid.factor, region.coarse.rows, region.coarse.columns)
     return read_coarse_pass(
         weights, strips, seen.wavelength_nm, region.grid, origin=region.origin, components=seen.components
     )

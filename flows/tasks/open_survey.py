@@ -174,10 +174,11 @@ class OpenSurvey:
         self.observer.log(self._summary(stage, ref))
         return ref
 
-    def take_as_found(self, stage: str, ref: StageRef) -> None:
-        """Note a store that was made before, whose files may have been cleared since what followed was made of them."""
-        size, known = self.run.archive.stored_bytes(ref), self.run.archive.manifest_hash(ref)
-        self.records[stage] = StageRecord(stage, ref.key, "cached", None, None, None, 0, size, known)
+    def take_as_found(self, stage: str, ref: StageRef, *inputs: StageRef) -> None:
+        """Note a store made of ``inputs`` before, whose files may have been cleared once what followed was made."""
+        size, known = self.run.archive.stored_bytes, self.run.archive.manifest_hash(ref)
+        bytes_in = sum(size(given) for given in inputs)
+        self.records[stage] = StageRecord(stage, ref.key, "cached", None, None, None, bytes_in, size(ref), known)
         self.products[stage] = ref
         self.observer.watch(stage, "cached", 1.0)
 

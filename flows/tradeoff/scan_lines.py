@@ -107,9 +107,9 @@ def block_means_of(values: Values, side: int) -> NDArray[np.float32]:
     return means
 
 
-def scan_farm(seed: int, shape: tuple[int, int] = FIELD_SHAPE) -> ScanLines:
+def scan_farm(seed: int, shape: tuple[int, int] = FIELD_SHAPE, camera: LineCamera | None = None) -> ScanLines:
     """Scan a farm of one swath, every line at 10 ms, with the light that the lines had before it was read out."""
-    camera, weights = LineCamera(), load_weights(shipped_weights(plain=True))
+    camera, weights = camera or LineCamera(), load_weights(shipped_weights(plain=True))
     grid = SceneGrid(*shape, weights.config.patch, weights.config.factor)
     source = SimulatedSource(farm_scene(seed, shape, camera=camera), Rig(camera), seed)
     along, _, _ = cheapest_full(grid, camera, CostModel())

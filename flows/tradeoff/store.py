@@ -29,7 +29,7 @@ from pipeline.signal.subspace import SignalStatistics, find_components
 from pipeline.signal.sweep_signal import CondensedSweep, Condenser, calibrated_blocks
 from storage.arrays.cubes import SweepHeader
 from storage.arrays.layout import numbers_in_memory
-from storage.arrays.signal_cubes import LineFacts, SignalCubeInMemory
+from storage.arrays.signal_cubes import LineRows, SignalCubeInMemory
 
 STEPS = (0.5, 1.0, 2.0, 3.0)  # deviations of the noise
 FEWER = (8, 6, 4)  # components
@@ -45,20 +45,20 @@ EXTRA = {"pcodec": "pcodec", "ZFP": "zfpy"}  # packages by family
 
 
 @dataclass(frozen=True, eq=False)
-class StoredLines:
+class KeptLines:
     """What a way of storing keeps: its bytes, and how they give scene values (line, sample, band) back."""
 
     size: int
     restore: Callable[[], Values]
 
 
-def keep_raw(scan: ScanLines) -> StoredLines:
+def keep_raw(scan: ScanLines) -> KeptLines:
     """Store raw lines as an archive does."""
     size, array = numbers_in_memory(scan.lines.data)
-    return StoredLines(size, lambda: scan.calibrated(np.asarray(array[...])))
+    return KeptLines(size, lambda: scan.calibrated(np.asarray(array[...])))
 
 
-def condense(scan: ScanLines, step: float, most: int | None = None) -> StoredLines:
+def condense(scan: ScanLines, step: float, most: int | None = None) -> KeptLines:
     """Condense the lines as a survey does; with ``most`` by the leading components alone."""
     choice, found = SignalChoice(), _statistics(scan)
     components = find_components(found, false_alarm=choice.false_alarm, least=choice.least)
@@ -96,7 +96,7 @@ def _scores(scan: ScanLines, components: Components, raw: bool) -> Iterator[tupl
         yield first, score_lines(values, valid, components).scores
 
 
-def _condensed(scan: ScanLines, condenser: Condenser, found: SignalStatistics) -> tuple[StoredLines, CondensedSweep]:
+def _condensed(scan: ScanLines, condenser: Condenser, found: SignalStatistics) -> tuple[KeptLines, CondensedSweep]:
     """Store the scores of all lines and the residuals of rare spectra."""
     components = condenser.components
     cube = _new_cube(scan, components, condenser.step, found)
@@ -113,14 +113,14 @@ def _new_cube(scan: ScanLines, components: Components, step: float, found: Signa
 
 def _closed(
     scan: ScanLines, cube: SignalCubeInMemory, rare: NDArray[np.intp], residuals: NDArray[np.int16]
-) -> StoredLines:
+) -> KeptLines:
     lines, (x, y) = scan.lines, scan.lines.position.T
     exposure_ms = np.full(len(lines.data), scan.camera.exposure_ms)
-    cube.writer.close(LineFacts(lines.time_s, x, y, exposure_ms, lines.valid_line), rare, residuals, None)
-    return StoredLines(cube.size, lambda: cube.open().spectra(0, len(lines.data)))
+    cube.writer.close(LineRows(lines.time_s, x, y, exposure_ms, lines.valid_line), rare, residuals, None)
+    return KeptLines(cube.size, lambda: cube.open().spectra(0, len(lines.data)))
 
 
-def bin_bands(scan: ScanLines, width: int) -> StoredLines:
+def bin_bands(scan: ScanLines, width: int) -> KeptLines:
     """Store the means of neighbouring bands as whole numbers; linear between their middles when they come back."""
     bands = scan.values.shape[2]
     first = np.arange(0, bands, width)
@@ -129,14 +129,14 @@ def bin_bands(scan: ScanLines, width: int) -> StoredLines:
     size, array = numbers_in_memory(np.rint(sums / count.astype(np.float32)).astype(np.uint16))
     middle, each = first + (count - 1) / 2, np.eye(len(first))
     weights = np.stack([np.interp(np.arange(bands), middle, one) for one in each]).astype(np.float32)
-    return StoredLines(size, lambda: scan.calibrated(np.asarray(array[...], np.float32) @ weights))
+    return KeptLines(size, lambda: scan.calibrated(np.asarray(array[...], np.float32) @ weights))
 
 
-def round_numbers(scan: ScanLines, step: float) -> StoredLines:
+def round_numbers(scan: ScanLines, step: float) -> KeptLines:
     """Store raw numbers in steps of a part of each band's noise, by the codec of raw lines."""
     unit, steps = _in_steps(scan, step)
     size, array = numbers_in_memory(steps)
-    return StoredLines(size + unit.nbytes, lambda: scan.calibrated(np.asarray(array[...]) * unit))
+    return KeptLines(size + unit.nbytes, lambda: scan.calibrated(np.asarray(array[...]) * unit))
 
 
 def _in_steps(scan: ScanLines, step: float) -> tuple[Values, NDArray[np.unsignedinteger[Any]]]:
@@ -146,7 +146,7 @@ def _in_steps(scan: ScanLines, step: float) -> tuple[Values, NDArray[np.unsigned
     return unit, steps.astype(np.uint16) if steps.max() <= np.iinfo(np.uint16).max else steps
 
 
-def pack_pcodec(scan: ScanLines, step: float | None) -> StoredLines:
+def pack_pcodec(scan: ScanLines, step: float | None) -> KeptLines:
     """Store raw numbers, or steps of a part of each band's noise, by pcodec."""
     pcodec = importlib.import_module("pcodec")
     unit, numbers = (np.ones(1, np.float32), scan.lines.data) if step is None else _in_steps(scan, step)
@@ -155,18 +155,18 @@ def pack_pcodec(scan: ScanLines, step: float | None) -> StoredLines:
     def restore() -> Values:
         return scan.calibrated(pcodec.standalone.simple_decompress(packed).reshape(numbers.shape) * unit)
 
-    return StoredLines(len(packed) + unit.nbytes, restore)
+    return KeptLines(len(packed) + unit.nbytes, restore)
 
 
-def compress_zfp(scan: ScanLines, tolerance: float) -> StoredLines:
+def compress_zfp(scan: ScanLines, tolerance: float) -> KeptLines:
     """Store raw numbers over each band's noise by ZFP, none off by more than a tolerance."""
     zfpy = importlib.import_module("zfpy")
     unit = scan.noise_dn.astype(np.float32)
     packed: bytes = zfpy.compress_numpy(scan.lines.data / unit, tolerance=tolerance)
-    return StoredLines(len(packed) + unit.nbytes, lambda: scan.calibrated(zfpy.decompress_numpy(packed) * unit))
+    return KeptLines(len(packed) + unit.nbytes, lambda: scan.calibrated(zfpy.decompress_numpy(packed) * unit))
 
 
-def keep_principal(scan: ScanLines, step: float) -> StoredLines:
+def keep_principal(scan: ScanLines, step: float) -> KeptLines:
     """Store as many principal components of raw numbers as condensing keeps, not whitened, none rare."""
     found = _statistics(scan, raw=True)
     components = _principal(scan, found)
@@ -175,7 +175,7 @@ def keep_principal(scan: ScanLines, step: float) -> StoredLines:
         cube.writer.write(first, scores, np.zeros(scores.shape[:2], np.uint8))
     nothing = np.zeros((0, components.bands), np.int16)
     stored = _closed(scan, cube, np.zeros((0, 2), np.intp), nothing)
-    return StoredLines(stored.size, lambda: scan.calibrated(stored.restore()))
+    return KeptLines(stored.size, lambda: scan.calibrated(stored.restore()))
 
 
 def _principal(scan: ScanLines, found: SignalStatistics) -> Components:
@@ -187,7 +187,7 @@ def _principal(scan: ScanLines, found: SignalStatistics) -> Components:
     return Components(found.origin + mean, axes[:, : scan.rank].T, noise)
 
 
-def compress_jpeg2000(scan: ScanLines, rate: float, raw: bool) -> StoredLines:
+def compress_jpeg2000(scan: ScanLines, rate: float, raw: bool) -> KeptLines:
     """Store components as the bands of a JPEG 2000 image of ``rate`` bytes a spectrum, which it shares out.
 
     Of ``raw`` numbers they are principal components (Du & Fowler 2007), else those that condensing finds.
@@ -208,7 +208,7 @@ def compress_jpeg2000(scan: ScanLines, rate: float, raw: bool) -> StoredLines:
         restored = components.restore(back.transpose(1, 2, 0))
         return scan.calibrated(restored) if raw else restored
 
-    return StoredLines(len(packed) + law, restore)
+    return KeptLines(len(packed) + law, restore)
 
 
 def _to_jpeg2000(numbers: NDArray[np.uint16], percent: float) -> bytes:
@@ -233,7 +233,7 @@ def _from_jpeg2000(packed: bytes) -> NDArray[np.uint16]:
     return numbers
 
 
-WAYS: Mapping[Setting, Callable[[ScanLines], StoredLines]] = {
+WAYS: Mapping[Setting, Callable[[ScanLines], KeptLines]] = {
     "raw": keep_raw,
     **{f"condensed, step {step:g}": partial(condense, step=step) for step in STEPS},
     **{f"fewer components, {most}": partial(condense, step=1.0, most=most) for most in FEWER},
@@ -264,7 +264,7 @@ def _writes_jpeg2000() -> bool:
         return JP2_DRIVER in env.drivers()
 
 
-def judge(scan: ScanLines, setting: Setting, stored: StoredLines) -> float:
+def judge(scan: ScanLines, setting: Setting, stored: KeptLines) -> float:
     """Restore the lines, note all that is said of them, and return their spectral error."""
     scan.judged[setting] = scan.fidelity(stored.restore())
     return scan.judged[setting].error

@@ -251,9 +251,8 @@ class RecordedSource:
         for number, one in enumerate(self.sweeps):
             for group in groups:
                 other = self.sweeps[group[0]]
-                if (one.sweep.along, one.sweep.binning) == (other.sweep.along, other.sweep.binning) and _equal(
-                    one.references, other.references
-                ):
+                alike = (one.sweep.along, one.sweep.binning) == (other.sweep.along, other.sweep.binning)
+                if alike and one.references.same_as(other.references):
                     group.append(number)
                     break
             else:
@@ -399,13 +398,4 @@ def _same_lines(one: Sweep, other: Sweep) -> bool:
         other.lines,
         other.step,
         other.binning,
-    )
-
-
-def _equal(one: References, other: References) -> bool:
-    """Whether all frames of two references are the same, bit for bit."""
-    frames = ("dark", "white", "white_reference", "bad", "flat")
-    pairs = [(getattr(one, name), getattr(other, name)) for name in frames]
-    return one.by_mirror == other.by_mirror and all(
-        (left is None) == (right is None) and (left is None or np.array_equal(left, right)) for left, right in pairs
     )

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+BROAD_BANDS = 16
+
 Floats = NDArray[np.float64]
 Scores = NDArray[np.float32]
 
@@ -80,3 +82,18 @@ class Components:
         matrix = (self.axes * factor) @ self.axes.T
         shift = np.where(lit, (factor - 1) * np.nan_to_num(self.mean) / np.where(lit, self.noise, 1), 0) @ self.axes.T
         return matrix.astype(np.float32), shift.astype(np.float32)
+
+
+def broad_weights(components: Components, bands: int = BROAD_BANDS) -> tuple[NDArray[np.float32], np.float32]:
+    """Weights (component,) and offset by which scores give the mean of some bands spread over all that have values."""
+    known = np.flatnonzero(np.isfinite(components.mean))
+    chosen = spread_bands(known, bands) if len(known) else known
+    matrix = np.zeros((components.bands, 1))
+    matrix[chosen] = 1 / max(len(chosen), 1)
+    weights, offset = components.onto(matrix)
+    return weights[:, 0], offset[0]
+
+
+def spread_bands(known: NDArray[np.intp], bands: int) -> NDArray[np.intp]:
+    """Choose so many of some ascending bands, evenly spread."""
+    return known[np.unique(np.linspace(0, len(known) - 1, max(bands, 1)).round().astype(np.intp))]

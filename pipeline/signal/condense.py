@@ -18,7 +18,10 @@ from pipeline.signal.components import Components
 WHOLE, PARTIAL, UNUSABLE = 0, 1, 2  # all bands seen; some restored from the others; less than half of the bands seen
 JOINT = ((2, 2), (1, 8), (8, 1))  # (line, sample) of neighbours whose residuals are tested together
 LAW_ROUNDS, LAW_CLIP = 4, 4.0
-LEAST_EXPECTED = 0.2  # of the mean residual, whatever the law says of dark or bright spectra
+LEAST_EXPECTED = 0.2  # of the mean residual, whatever the law says of dark or bright spectra ...
+LEAST_RESIDUAL = 0.02  # ... and of the noise's variance: less is rounding
+CANCELLED = 1e-4  # of a spectrum's square: a smaller difference of squares has lost digits of float32
+SPECTRA_AT_ONCE = 1024  # projected at a time: they stay in cache
 RESIDUAL_STEP = 0.5  # in which residuals of rare spectra are kept [noise's deviations]
 
 Scores = NDArray[np.float32]
@@ -40,31 +43,41 @@ def score_lines(values: NDArray[np.float32], valid: Bools, components: Component
     Where bands of a spectrum are missing the scores are those of least squares over the others. ``valid`` is (line,
     sample) or (line, sample, band).
     """
-    axes = components.axes.T.astype(np.float32)
-    lit = np.isfinite(components.mean)
-    bands, count = int(lit.sum()), len(components)
-    white = components.white(values)
-    there = None
-    if valid.ndim == 3 or not np.isfinite(values[..., lit] if not lit.all() else values).all():
-        there = np.isfinite(values) & (valid if valid.ndim == 3 else valid[..., None])
-        there[..., ~lit] = False
-        white = np.where(there, white, np.float32(0))
-    scores = white @ axes
-    left = np.einsum("lsb,lsb->ls", white, white) - np.einsum("lsk,lsk->ls", scores, scores)
-    residual = np.maximum(left, 0) / np.float32(max(bands - count, 1))
+    lit, count = np.isfinite(components.mean), len(components)
+    bands = int(lit.sum())
+    scores, left = _projected(values, components)
     quality = np.where(valid if valid.ndim == 2 else valid.any(axis=2), WHOLE, UNUSABLE).astype(np.uint8)
-    if there is not None:
-        seen = there.sum(axis=2)
-        quality[2 * seen < bands] = UNUSABLE
-        some = (quality == WHOLE) & (seen < bands)
-        quality[some] = PARTIAL
-        if some.any():
-            scores[some], residual[some] = _least_squares(white[some], there[some], axes)
+    residual = np.maximum(left, 0) / np.float32(max(bands - count, 1))
+    broken = ~np.isfinite(left) if valid.ndim == 2 else ~np.isfinite(left) | ~valid[..., lit].all(axis=2)
+    if (broken & (quality == WHOLE)).any():
+        there = np.isfinite(values[broken]) & lit & (valid[broken] if valid.ndim == 3 else valid[broken][:, None])
+        white = np.where(there, components.white(values[broken]), np.float32(0))
+        scores[broken], residual[broken] = _least_squares(white, there, components.axes.T.astype(np.float32))
+        seen = there.sum(axis=1)
+        quality[broken] = np.where(2 * seen < bands, UNUSABLE, np.where(seen < bands, PARTIAL, quality[broken]))
     unusable = quality == UNUSABLE
     if count and unusable.any():
         scores[unusable] = 0
     residual[unusable] = np.nan
     return ScoredLines(scores, quality, residual.astype(np.float32))
+
+
+def _projected(values: NDArray[np.float32], components: Components) -> tuple[Scores, Scores]:
+    """Scores (..., component) of spectra (..., band), and the square of what they leave; NaN of broken spectra."""
+    axes, flat = components.axes.T.astype(np.float32), values.reshape(-1, components.bands)
+    scores, left = np.empty((len(flat), len(components)), np.float32), np.empty(len(flat), np.float32)
+    with np.errstate(invalid="ignore", over="ignore"):
+        for first in range(0, len(flat), SPECTRA_AT_ONCE):
+            part = slice(first, first + SPECTRA_AT_ONCE)
+            white = components.white(flat[part])
+            scores[part] = white @ axes
+            square = np.einsum("nb,nb->n", white, white)
+            left[part] = square - np.einsum("nk,nk->n", scores[part], scores[part])
+            close = left[part] < CANCELLED * square
+            if close.any():
+                rest = white[close] - scores[part][close] @ axes.T
+                left[part][close] = np.einsum("nb,nb->n", rest, rest)
+    return scores.reshape(*values.shape[:-1], -1), left.reshape(values.shape[:-1])
 
 
 def _least_squares(white: Scores, there: Bools, axes: Scores) -> tuple[Scores, Scores]:
@@ -95,24 +108,25 @@ class ResidualLaw:
     def learned(cls, spectra: NDArray[np.float32], components: Components) -> ResidualLaw:
         """Learn it of (n, band) spectra, outliers left out."""
         freedom = max(int(np.isfinite(components.mean).sum()) - len(components), 1)
-        if len(spectra) < 8 * (len(components) + 1):
-            return cls(1.0, np.zeros(len(components)), float(freedom))
         seen = score_lines(spectra[None], np.ones((1, len(spectra)), np.bool_), components)
         known = np.isfinite(seen.residual[0])
         scores, residual = seen.scores[0][known].astype(np.float64), seen.residual[0][known].astype(np.float64)
+        if len(residual) < 8 * (len(components) + 1) or np.median(residual) < LEAST_RESIDUAL:
+            return cls(1.0, np.zeros(len(components)), float(freedom))
         design = np.concatenate([np.ones((len(scores), 1)), scores], axis=1)
         kept = residual <= np.median(residual) * 4
         for _ in range(LAW_ROUNDS):
             law = np.linalg.lstsq(design[kept], residual[kept], rcond=None)[0]
             floor = LEAST_EXPECTED * float(residual[kept].mean())
-            ratio = residual / np.maximum(design @ law, max(floor, 1e-12))
+            ratio = residual / np.maximum(design @ law, max(floor, LEAST_RESIDUAL))
             spread = SIGMA_OF_MEDIAN * float(np.median(np.abs(ratio - np.median(ratio))))
-            kept = np.abs(ratio - 1) <= LAW_CLIP * max(spread, 1e-6)
+            near = np.abs(ratio - 1) <= LAW_CLIP * spread
+            kept = near if 2 * np.count_nonzero(near) >= len(near) else kept
         return cls(float(law[0]), law[1:], float(np.clip(2 / max(spread, 1e-6) ** 2, 1.0, freedom)))
 
     def expected(self, scores: Scores) -> Scores:
         """(...) mean square residual to expect of (..., component) scores."""
-        least = max(LEAST_EXPECTED * self.constant, 1e-12)
+        least = max(LEAST_EXPECTED * self.constant, LEAST_RESIDUAL)
         expected: Scores = np.maximum(self.constant + scores @ self.slope.astype(np.float32), np.float32(least))
         return expected
 

@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
 from pipeline.signal.calibrate import Elements, calibrate, judge_elements, of_bands
-from pipeline.signal.components import Components
+from pipeline.signal.components import BROAD_BANDS, Components, broad_weights, spread_bands
 from pipeline.source import References, SweepLines
 
 BLOCK_LINES = 64  # a shard of a stored sweep: reading one line of it costs as much as reading all
 CHUNK_SAMPLES = 32  # likewise across
-BROAD_BANDS = 16
 
 _Key = tuple[int, int, int, int]  # sweep, block, samples held
 Raw = NDArray[np.integer[Any]]  # numbers of the camera, or scores in steps
@@ -178,16 +177,6 @@ class CondensedSignal:
         return image
 
 
-def broad_weights(components: Components, bands: int = BROAD_BANDS) -> tuple[NDArray[np.float32], np.float32]:
-    """Weights (component,) and offset by which scores give the mean of some bands spread over all that have values."""
-    known = np.flatnonzero(np.isfinite(components.mean))
-    chosen = _spread(known, bands) if len(known) else known
-    matrix = np.zeros((components.bands, 1))
-    matrix[chosen] = 1 / max(len(chosen), 1)
-    weights, offset = components.onto(matrix)
-    return weights[:, 0], offset[0]
-
-
 def signal_of(lines: SweepLines, gain: NDArray[np.float32] | None = None) -> Signal | CondensedSignal:
     """Return how a sweep's lines give values: raw numbers by its references, condensed ones as they are."""
     return CondensedSignal(lines, gain) if isinstance(lines, CondensedLines) else Signal(lines, gain)
@@ -199,11 +188,7 @@ def broad_bands(references: References, bands: int = BROAD_BANDS) -> NDArray[np.
     if references.bad is not None:
         good = good & ~references.bad
     known = np.flatnonzero(good.mean(axis=0) >= 0.9)
-    return _spread(known if len(known) else np.arange(len(references.white_reference)), bands)
-
-
-def _spread(known: NDArray[np.intp], bands: int) -> NDArray[np.intp]:
-    return known[np.unique(np.linspace(0, len(known) - 1, max(bands, 1)).round().astype(np.intp))]
+    return spread_bands(known if len(known) else np.arange(len(references.white_reference)), bands)
 
 
 @runtime_checkable

@@ -8,8 +8,8 @@ they fluctuate by the Tracy-Widom law (Johnstone 2001): that is the test.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,8 +97,9 @@ class SignalStatistics:
         """Return spectra from the origin with 0 for what is missing, and which of them count."""
         by_band = valid if valid.ndim == 3 else valid[..., None]
         if self.origin is None or not self.lit.all():
-            seen = (by_band & np.isfinite(values)).any(axis=(0, 1))
-            first = np.nan_to_num(np.nanmean(np.where(by_band, values, np.nan), axis=(0, 1))) if seen.any() else 0.0
+            there = by_band & np.isfinite(values)
+            counts, seen = there.sum(axis=(0, 1)), there.any(axis=(0, 1))
+            first = np.where(there, values, 0).sum(axis=(0, 1), dtype=np.float64) / np.maximum(counts, 1)
             before = np.zeros(self.bands, np.float32) if self.origin is None else self.origin
             self.origin = np.where(self.lit, before, np.where(seen, first, 0)).astype(np.float32)
             self.lit |= seen
@@ -116,25 +117,26 @@ class SignalStatistics:
             return np.zeros((0, self.bands), np.float32)
         return np.concatenate(self.kept) + self.origin
 
-    def save(self, path: Path) -> None:
-        """Write all of it into a file of numpy."""
-        rough = np.concatenate(self.rough) if self.rough else np.zeros((0, self.bands), np.float32)
-        origin = np.full(self.bands, np.nan) if self.origin is None else self.origin
-        kept = np.concatenate(self.kept) if self.kept else np.zeros((0, self.bands), np.float32)
-        sums = {name: getattr(self, name) for name in SUMS}
-        counts = np.array([self.expected, self.count, self.means])
-        np.savez(path, counts=counts, origin=origin, rough=rough, kept=kept, **sums)
+    def arrays(self) -> dict[str, NDArray[np.generic]]:
+        """All of it by names, to be stored."""
+        none = np.zeros((0, self.bands), np.float32)
+        return {
+            "counts": np.array([self.expected, self.count, self.means]),
+            "origin": np.full(self.bands, np.nan) if self.origin is None else self.origin,
+            "rough": np.concatenate(self.rough) if self.rough else none,
+            "kept": np.concatenate(self.kept) if self.kept else none,
+            **{name: getattr(self, name) for name in SUMS},
+        }
 
     @classmethod
-    def load(cls, path: Path) -> SignalStatistics:
-        """Read what `save` wrote."""
-        with np.load(path) as stored:
-            expected, count, means = stored["counts"].tolist()
-            found = cls(len(stored["origin"]), expected, count, means)
-            found.origin = None if np.isnan(stored["origin"]).all() else stored["origin"].astype(np.float32)
-            found.rough, found.kept = [stored["rough"]], [stored["kept"]]
-            for name in SUMS:
-                setattr(found, name, stored[name])
+    def of_arrays(cls, stored: Mapping[str, NDArray[np.generic]]) -> SignalStatistics:
+        """Make statistics of what `arrays` gave."""
+        expected, count, means = stored["counts"].tolist()
+        found = cls(len(stored["origin"]), expected, count, means)
+        found.origin = None if np.isnan(stored["origin"]).all() else stored["origin"].astype(np.float32)
+        found.rough, found.kept = [stored["rough"].astype(np.float32)], [stored["kept"].astype(np.float32)]
+        for name in SUMS:
+            setattr(found, name, stored[name])
         return found
 
     def _add_rough(self, spectra: Values, whole: Bools) -> None:
@@ -298,5 +300,5 @@ def _law_spread(spread: float) -> float:
     at = (low + high) / 2 - (high - low) / 2 * np.cos(angle)
     mass = np.cumsum(np.sin(angle) ** 2 / at)
     part = mass / mass[-1]
-    middle, tenth = (float(np.interp(share, part, at)) for share in (0.5, 0.1))
+    middle, tenth = (float(np.interp(level, part, at)) for level in (0.5, 0.1))
     return float((middle - tenth) / middle)

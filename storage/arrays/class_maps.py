@@ -2,7 +2,8 @@
 
 Names of classes are CF flags. Of a pixel log-probabilities of its classes, how long ago it was looked at and by what
 light are kept, packed by CF's rules (scale_factor, add_offset), so that any reader of netCDF or Zarr gets numbers: a
-twentieth of a nat in a byte, an eighth of a day in two, a sixteenth of an octave of light in one.
+twentieth of a nat in a byte, an eighth of a day in two, a sixteenth of an octave of light in one. Classes less likely
+than one in 1100 are all stored as equally unlikely, and confidence as floats in steps of 1/256.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from pipeline.errors import ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.georeference import create_placed_group
 from storage.arrays.layout import (
+    MAP_PACKING,
     SHARD_ROWS,
     AngularGrid,
     create_array,
@@ -34,7 +36,9 @@ from storage.arrays.layout import (
 )
 
 CONFIDENCE = {"long_name": "probability of the class given", "units": "1", "valid_range": [0.0, 1.0]}
+CONFIDENCE_STEP = 1 / 256
 STEP, FAINTEST, NOTHING = 0.05, -12.7, 255  # nats; 254 is certainty, 255 that nothing is known
+LEAST, UNLIKELY = -7.0, -11.0  # nats: what is less is stored as the mean of such, in a tenth of the bytes
 DAY_STEP, NEVER = 0.125, 65535
 OCTAVE_STEP, DARKEST, DARK = 0.0625, -10.0, 255  # log2 of reference exposures; 255 where there was no light
 # what the images of a pixel hold of which nothing is known
@@ -86,8 +90,15 @@ def create_class_map(
     names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
     group, place = create_placed_group(path, "class map", grid, shape, names)
     about = {**class_flags(legend.names, legend.colours), **place}
-    create_array(group, "classes", image_spec(("y", "x"), shape, "|u1"), about)
-    create_array(group, "confidence", image_spec(("y", "x"), shape, "<f4"), {**CONFIDENCE, **place})
+    _create_flat(group, "classes", ("y", "x"), shape, "|u1", about)
+    _create_flat(group, "confidence", ("y", "x"), shape, "<f4", {**CONFIDENCE, **place})
+
+
+def _create_flat(
+    group: zarr.Group, name: str, dims: tuple[str, ...], shape: tuple[int, ...], dtype: str, about: dict[str, Any]
+) -> None:
+    spec = image_spec(dims, shape, dtype, whole=True)
+    create_array(group, name, spec, about, packing=MAP_PACKING, flat=True)
 
 
 def write_class_tile(
@@ -115,7 +126,8 @@ def write_class_tile(
         raise ShapeError(
             f"classes {classes.shape} and confidence {confidence.shape} do not fit; give both of each pixel"
         )
-    for array, values in zip(arrays, (classes, confidence), strict=True):
+    rounded = np.rint(np.asarray(confidence) / CONFIDENCE_STEP) * CONFIDENCE_STEP
+    for array, values in zip(arrays, (classes, rounded), strict=True):
         array[place] = np.asarray(values, array.dtype)
 
 
@@ -169,15 +181,14 @@ def create_probabilities(
         "_FillValue": NOTHING,
         **place,
     }
-    spec = image_spec(("y", "x", "class"), (*shape, len(legend.names)), "|u1", whole=True)
-    create_array(group, "log_probability", spec, about)
+    _create_flat(group, "log_probability", ("y", "x", "class"), (*shape, len(legend.names)), "|u1", about)
     about = {"long_name": "time since the pixel was looked at", "units": "days", "scale_factor": DAY_STEP, **place}
-    create_array(group, "age", image_spec(("y", "x"), shape, "<u2"), {**about, "_FillValue": NEVER})
+    _create_flat(group, "age", ("y", "x"), shape, "<u2", {**about, "_FillValue": NEVER})
     about = {"long_name": "log2 of the reference exposures that it rests on", "units": "1", "_FillValue": DARK, **place}
     packing = {"scale_factor": OCTAVE_STEP, "add_offset": DARKEST}
-    create_array(group, "log2_light", image_spec(("y", "x"), shape, "|u1"), {**about, **packing})
+    _create_flat(group, "log2_light", ("y", "x"), shape, "|u1", {**about, **packing})
     if goes_on:
-        create_array(group, OLD_CLASS, image_spec(("y", "x"), shape, "|u1"), {**old_class_flags(legend), **place})
+        _create_flat(group, OLD_CLASS, ("y", "x"), shape, "|u1", {**old_class_flags(legend), **place})
 
 
 def old_class_flags(legend: ClassNames) -> dict[str, Any]:
@@ -191,7 +202,9 @@ def write_probabilities_tile(
 ) -> None:
     """Store (y, x, class) log-probabilities, (y, x) ages and light of whole shards from row and column ``origin`` on.
 
-    NaN is what nothing is known of. Raises ShapeError: they differ in size; ChunkError: the tile splits a shard;
+    NaN is what nothing is known of; what is less than `LEAST` becomes `UNLIKELY`.
+
+    Raises ShapeError: they differ in size; ChunkError: the tile splits a shard;
     IncompleteStoreError: there is no store.
     """
     if not log_probability.shape[:2] == age_days.shape == light.shape:
@@ -205,7 +218,8 @@ def write_probabilities_tile(
     whole_shards("the class probabilities", place, arrays[1].shape, arrays[1].shards or ())
     for top in range(0, len(age_days), SHARD_ROWS):  # what is packed never lies there for all rows at once
         part = log_probability[top : top + SHARD_ROWS]
-        packed = np.rint((np.clip(part, FAINTEST, 0) - FAINTEST) / STEP)
+        likely = np.where(part < LEAST, UNLIKELY, np.minimum(part, 0))
+        packed = np.rint((likely - FAINTEST) / STEP)
         rows = slice(place[0].start + top, place[0].start + top + len(part))
         arrays[0][rows, place[1]] = np.where(np.isnan(part), NOTHING, np.minimum(packed, NOTHING - 1)).astype(np.uint8)
     days = np.rint(np.clip(age_days, 0, DAY_STEP * (NEVER - 1)) / DAY_STEP)

@@ -82,7 +82,7 @@ class RawCubeWriter:
         bands = write_bands(self._group, header.wavelength_nm, header.fwhm_nm)
         about = {"long_name": "raw numbers of the camera", "units": "1", "coordinates": f"{bands} {_LINE_COORDINATES}"}
         write_counts(self._group, line=header.shape[0], sample=header.shape[1])
-        spec = image_spec(("line", "sample", "band"), header.shape, "<u2")
+        spec = image_spec(("line", "sample", "band"), header.shape, "<u2", whole=True)
         self._dn = create_array(self._group, "dn", spec, about, packing=RAW_PACKING)
         known = header.references
         write_references(self._group, known)

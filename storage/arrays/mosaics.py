@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid, block_means
-from pipeline.signal.components import Components
-from pipeline.signal.lines import broad_weights
+from pipeline.signal.components import Components, broad_weights
 from storage.arrays.georeference import create_placed_group
 from storage.arrays.layout import (
     SHARD_ROWS,
@@ -247,18 +246,18 @@ class Mosaic:
     def thinned(self, step: int, bands: Sequence[int]) -> NDArray[np.float32]:
         """Scene values of every ``step``-th pixel in some bands, (y, x, band), read a shard's rows at a time."""
         starts = range(0, self.shape[0], SHARD_ROWS)
-        strips = (
+        blocks = (
             self.scores(slice(first, min(first + SHARD_ROWS, self.shape[0])))[-first % step :: step, ::step]
             for first in starts
         )
-        return np.concatenate([self.spectra(strip, bands) for strip in strips])
+        return np.concatenate([self.spectra(block, bands) for block in blocks])
 
     def brightness(self, factor: int | None = None, bands: int | None = None) -> NDArray[np.float32]:
         """Mean over the bands, or over so many of them spread over all, (y, x) in pixels of ``factor`` fine ones."""
         weights, offset = broad_weights(self.components, bands or self.components.bands)
-        return np.concatenate([strip @ weights + offset for strip in self.strips(factor)])
+        return np.concatenate([block @ weights + offset for block in self.row_blocks(factor)])
 
-    def strips(
+    def row_blocks(
         self, factor: int | None = None, rows: slice = slice(None), columns: slice = slice(None)
     ) -> Iterator[NDArray[np.float32]]:
         """Scores of a window from the top down, (y, x, component), that end where shards do.

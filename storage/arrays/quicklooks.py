@@ -11,7 +11,6 @@ of them and they are near red, green and blue, else one each.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -176,37 +175,6 @@ class LineThumbnail:
     def finish(self) -> Quicklook:
         """The picture of all lines taken so far."""
         return stretched(np.concatenate(self._rows), step=self._step, bands=self._bands, together=self._together)
-
-
-@dataclass(frozen=True)
-class ThumbnailCut:
-    """Which pixels and bands of a tile a thumbnail shows. Goes to whoever makes tiles."""
-
-    steps: tuple[int, ...]  # (y, x) [px]
-    bands: tuple[int, ...]
-
-    def __call__(self, rows: slice, columns: slice, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """What falls on the thumbnail's pixels, (y, x, band), of the (y, x, band) values of a tile."""
-        part = values[-rows.start % self.steps[0] :: self.steps[0], -columns.start % self.steps[1] :: self.steps[1]]
-        return part[..., list(self.bands)]
-
-
-class Thumbnail:
-    """Every n-th pixel of a mosaic in a few bands, filled as tiles are made: ``write_mosaic(..., seen=thumbnail)``."""
-
-    def __init__(self, shape: tuple[int, int], bands: Sequence[int], most_px: int) -> None:
-        self.cut = ThumbnailCut(tuple(-(-size // most_px) for size in shape), tuple(bands))
-        size = [-(-side // step) for side, step in zip(shape, self.cut.steps, strict=True)]
-        self.image: NDArray[np.float32] = np.full((*size, len(bands)), np.nan, np.float32)  # (y, x, band)
-
-    def put(self, rows: slice, columns: slice, part: NDArray[np.float32]) -> None:
-        """Take what ``cut`` gave for a tile."""
-        y, x = (-(-one.start // step) for one, step in zip((rows, columns), self.cut.steps, strict=True))
-        self.image[y : y + part.shape[0], x : x + part.shape[1]] = part
-
-    def blank(self, where: NDArray[np.bool_]) -> None:
-        """Leave (y, x) pixels of the mosaic out of the picture."""
-        self.image[where[:: self.cut.steps[0], :: self.cut.steps[1]]] = np.nan
 
 
 def write_quicklook(group: zarr.Group, found: Quicklook) -> None:

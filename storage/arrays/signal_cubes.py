@@ -46,12 +46,14 @@ from storage.arrays.quicklooks import Quicklook, quicklook_of, write_quicklook
 
 CHUNK = 64  # lines and samples of a chunk of scores, all components of them: what lies together packs together
 SHARD_SAMPLES = 640
+FRAMES_OF = "frames_of"  # attribute: the sweep beside it that holds the dark and white frames of both
 MOST_DN = np.iinfo(np.uint16).max
+SIGNAL_ARRAYS = ("scores", "quality", "axes", "mean", "noise", "rare_line", "rare_sample", "rare_residual")
 LARGEST_SHORT = 32_000  # of scores in steps; larger ones are stored in 32 bits
 
 
 @dataclass(frozen=True)
-class LineFacts:
+class LineRows:
     """What is known of every line beside its light, (line,) each."""
 
     time_s: NDArray[np.float64]
@@ -100,26 +102,33 @@ def read_components(group: zarr.Group) -> Components:
     return Components(mean, axes, noise)
 
 
-SIGNAL_ARRAYS = ("scores", "quality", "axes", "mean", "noise", "rare_line", "rare_sample", "rare_residual")
-
-
 class SignalCubeWriter:
     """Write a sweep's scores, some lines at a time."""
 
     def __init__(
-        self, path: StorePlace, header: SweepHeader, components: Components, *, step: float, largest: float
+        self,
+        path: StorePlace,
+        header: SweepHeader,
+        components: Components,
+        *,
+        step: float,
+        largest: float,
+        frames_of: str | None = None,
     ) -> None:
+        """Begin a sweep; ``largest`` is the size that no score exceeds, ``frames_of`` a sweep with the same frames."""
         lines, samples, _ = header.shape
         self._header, self._step = header, step
         facts: dict[str, Any] = {"sweep": asdict(header.sweep), "source": header.source}
         facts |= {} if header.started is None else {"started": header.started}
+        facts |= {} if frames_of is None else {FRAMES_OF: frames_of}
         facts |= {"by_mirror": True} if header.references.by_mirror else {}
         facts |= {} if header.simulation is None else {"simulation": dict(header.simulation)}
         self.group = create_group(path, f"condensed sweep {header.sweep.name}", facts)
         write_bands(self.group, header.wavelength_nm, header.fwhm_nm)
         write_counts(self.group, line=lines, sample=samples, component=len(components))
         write_components(self.group, components)
-        write_references(self.group, header.references)
+        if frames_of is None:
+            write_references(self.group, header.references)
         about = {"long_name": "score of a component", "units": "1", "scale_factor": step, "largest": largest}
         shape = (len(components), lines, samples)
         spec = score_spec(("component", "line", "sample"), shape, largest / step)
@@ -140,7 +149,7 @@ class SignalCubeWriter:
         return kept
 
     def close(
-        self, facts: LineFacts, rare: NDArray[np.intp], residuals: NDArray[np.int16], picture: Quicklook | None
+        self, facts: LineRows, rare: NDArray[np.intp], residuals: NDArray[np.int16], picture: Quicklook | None
     ) -> None:
         """Store quality, what is known of lines, and (rare, 2) lines and samples with (rare, band) residual steps."""
         self._quality[...] = self._seen
@@ -175,6 +184,7 @@ class SignalCube:
     source: str
     started: str | None
     group: zarr.Group
+    path: Path | None  # None: in memory
 
     @property
     def simulation(self) -> Any:
@@ -190,8 +200,12 @@ class SignalCube:
     @cached_property
     def references(self) -> References:
         """Dark and white frames."""
-        dark, white, white_reference = (read_array(self.group, name) for name in ("dark", "white", "white_reference"))
-        bad, flat = (read_array(self.group, name) if name in self.group else None for name in ("bad", "flat"))
+        shared = self.group.attrs.get(FRAMES_OF)
+        group = self.group
+        if shared is not None and self.path is not None:
+            group = open_group(self.path.with_name(f"{shared}.zarr"))
+        dark, white, white_reference = (read_array(group, name) for name in ("dark", "white", "white_reference"))
+        bad, flat = (read_array(group, name) if name in group else None for name in ("bad", "flat"))
         return References(dark, white, white_reference, bad, flat, bool(self.group.attrs.get("by_mirror", False)))
 
     @property
@@ -251,6 +265,7 @@ def open_signal_cube(path: StorePlace) -> SignalCube:
         source=str(group.attrs.get("source", "")),
         started=None if "started" not in group.attrs else str(group.attrs["started"]),
         group=group,
+        path=path if isinstance(path, Path) else None,
     )
 
 

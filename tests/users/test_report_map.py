@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flows.publish.field_map import FieldMap, MapLayer, png_address
+from flows.publish.field_map import FieldMap, MapLayer, layer_address
 from flows.publish.report import LEAFLET, SHA256, Picture, render_report
 from tests.flows.publish.test_receipt import make_receipt
 from tests.users.browser import Tab, chromium, needs_browser
@@ -29,7 +29,7 @@ def known_map() -> FieldMap:
     """Three pictures, with words that mean no good."""
     numbers = np.zeros((HEIGHT, WIDTH), np.uint8)
     numbers[:, WIDTH // 2 :] = 1
-    picture = png_address(numbers, np.array([[120, 80, 40], [20, 200, 60]], np.uint8))
+    picture = layer_address(numbers, np.array([[120, 80, 40], [20, 200, 60]], np.uint8))
     layers = [
         MapLayer("True colour", picture, shown=True),
         MapLayer("Class map", picture, shown=True),

@@ -30,10 +30,10 @@ from storage.archive.keys import StageRef, stage_key
 from storage.archive.manifests import write_table
 from storage.arrays.cubes import RawCubeWriter, SweepHeader
 from storage.arrays.spool import Spool
+from storage.arrays.statistics import write_statistics
 from storage.parallel.pool import WorkerPool
 
 RAW = Product("capture", version=11)
-STATISTICS = "statistics.npz"  # beside the cubes: second moments of their spectra, for condensing
 RIG_RECORD = "rig.json"  # beside the cubes: what a rig's captures were like
 
 
@@ -87,7 +87,7 @@ class SweepRecorder:
 
                     self._capture(source, sweep, path, folder, manifest, found, taken)
                     before += sweep.lines
-                found.save(path / STATISTICS)
+                write_statistics(path, found)
                 if source.record is not None:
                     write_table(path / RIG_RECORD, source.record)
 

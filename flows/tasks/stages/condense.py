@@ -12,7 +12,6 @@ import numpy as np
 
 from flows.settings.survey_settings import SignalChoice
 from flows.tasks.stage import Product, Report, Wanted, stage
-from flows.tasks.stages.capture import STATISTICS
 from pipeline.geometry.camera import LineCamera
 from pipeline.signal.components import Components
 from pipeline.signal.condense import RESIDUAL_STEP, ResidualLaw
@@ -21,8 +20,9 @@ from pipeline.signal.sweep_signal import CondensedSweep, Condenser, camera_noise
 from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table, write_table
 from storage.arrays.cubes import RawCube, SweepHeader, open_raw_cubes
-from storage.arrays.signal_cubes import LineFacts, SignalCubeWriter, open_signal_cubes
+from storage.arrays.signal_cubes import LineRows, SignalCubeWriter, open_signal_cubes
 from storage.arrays.spool import line_values
+from storage.arrays.statistics import read_statistics
 
 SIGNAL = Product("condense", version=1)
 RECORD = "signal.json"
@@ -52,7 +52,7 @@ def _condensed(raw: StageRef, camera: LineCamera, choice: SignalChoice, noise_kn
     def build(path: Path) -> None:
         """Find the components of the pass, and write every sweep's scores; once more where rare spectra share some."""
         cubes = open_raw_cubes(raw.path)
-        found = SignalStatistics.load(raw.path / STATISTICS)
+        found = read_statistics(raw.path)
         components = components_of(found, cubes, camera, choice, noise_known)
         condenser = Condenser(
             components, ResidualLaw.learned(found.spectra, components), camera, choice.rare_spectra, choice.step
@@ -107,14 +107,17 @@ def _write_sweeps(
     for number, cube in enumerate(cubes):
         out = path / f"{cube.sweep.name}.zarr"
         shutil.rmtree(out, ignore_errors=True)
-        writer = SignalCubeWriter(out, header_of(cube), condenser.components, step=condenser.step, largest=largest)
+        shared = cubes[0].sweep.name if number and cube.references.same_as(cubes[0].references) else None
+        writer = SignalCubeWriter(
+            out, header_of(cube), condenser.components, step=condenser.step, largest=largest, frames_of=shared
+        )
 
         def part(fraction: float, number: int = number) -> None:
             report((number + fraction) / len(cubes))
 
         done.append(condenser.sweep(cube, writer.write, part))
         x, y = cube.position.T
-        facts = LineFacts(cube.time_s, x, y, cube.exposure_ms, cube.valid_line)
+        facts = LineRows(cube.time_s, x, y, cube.exposure_ms, cube.valid_line)
         writer.close(facts, done[-1].rare, done[-1].residuals, cube.quicklook())
     return done
 

@@ -23,8 +23,7 @@ from pipeline.rectify.registration.illumination import overlap_light, solve_ligh
 from pipeline.rectify.registration.overlaps import BroadSweep
 from pipeline.rectify.registration.seams import Anchor, Registration, SeamWindow, anchor_sweep, register_sweeps
 from pipeline.rectify.scan_paths import ScanPath
-from pipeline.signal.components import Components
-from pipeline.signal.lines import BROAD_BANDS
+from pipeline.signal.components import BROAD_BANDS, Components
 from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table, write_table
 from storage.arrays.geolocation import path_digest, write_geolocation

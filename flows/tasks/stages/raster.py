@@ -19,7 +19,7 @@ from storage.arrays.layout import SHARD_ROWS
 from storage.arrays.mosaics import MosaicWriter
 from storage.readers.raster_fields import RasterPixels
 
-Strip = tuple[int, NDArray[np.float32], NDArray[np.bool_]]
+Rows = tuple[int, NDArray[np.float32], NDArray[np.bool_]]
 
 
 @stage("condense_raster", "signal of the raster", MOSAIC, inputs=0)
@@ -28,7 +28,7 @@ def condense_raster(
 ) -> Wanted:
     """Condense the pixels of a raster into the mosaic of its field."""
 
-    def strips() -> Iterator[Strip]:
+    def blocks() -> Iterator[Rows]:
         """Yield the first row, values and validity of some rows at a time."""
         deep = max(raster.rows_at_once(memory) // SHARD_ROWS, 1) * SHARD_ROWS
         for first in range(0, frame.grid.height, deep):
@@ -39,7 +39,7 @@ def condense_raster(
     def build(path: Path) -> None:
         """Read the raster twice: for its components, and for its scores."""
         found = SignalStatistics(raster.bands, frame.grid.height * frame.grid.width)
-        for first, values, valid in strips():
+        for first, values, valid in blocks():
             found.add(values, valid)
             report(0.5 * first / frame.grid.height)
         components = find_components(found, false_alarm=signal.false_alarm, least=signal.least)
@@ -54,7 +54,7 @@ def condense_raster(
             fwhm_nm=frame.fwhm_nm,
             grid=frame.angular_grid(),
         )
-        for first, values, valid in strips():
+        for first, values, valid in blocks():
             seen = score_lines(values, valid, components)
             writer.write_rows(first, seen.scores, seen.quality != UNUSABLE)
             report(0.5 + 0.5 * (first + len(values)) / frame.grid.height)

@@ -19,7 +19,8 @@ from pipeline.geometry.scan import Sweep, shifted_position
 from pipeline.rectify.geolocation import path_geolocation
 from pipeline.rectify.resample import resample
 from pipeline.rectify.scan_paths import ScanPath, make_scan_paths
-from pipeline.signal.lines import BROAD_BANDS, signal_of
+from pipeline.signal.components import BROAD_BANDS
+from pipeline.signal.lines import signal_of
 from pipeline.source import SweepLines
 
 Floats = NDArray[np.float64]

@@ -13,7 +13,7 @@ from PIL import Image
 
 from flows.publish import quicklook
 from flows.publish.panels import class_palette, class_rgb, outline
-from flows.publish.quicklook import QuicklookData, _draw_attention, _draw_raw, draw_quicklook
+from flows.publish.quicklook import QuicklookData, _draw_attention, _draw_raw, _in_colours, draw_quicklook
 from storage.arrays.quicklooks import choose_bands
 
 WAVES = np.linspace(400, 1000, 61)
@@ -93,6 +93,19 @@ def test_pictures_of_less_and_of_the_same(tmp_path: Path):
     draw_quicklook(tmp_path / "empty.png", empty)
     draw_quicklook(tmp_path / "confidence.png", replace(data, truth=None))
     assert (tmp_path / "empty.png").stat().st_size > 10_000
+
+
+def test_colours_that_are_kept_stay_as_they_are():
+    """A class of one pixel in a noisy photograph has its own colour; all others have one that is near."""
+    noise = np.random.default_rng(0).integers(60, 200, (200, 300, 3), dtype=np.uint8)
+    kept = np.array([[227, 26, 28], [251, 250, 247], [100, 101, 102]], np.uint8)
+    noise[5, 7], noise[100:120], noise[9, 9] = kept
+    found = _in_colours(Image.fromarray(noise), kept)
+    shown = np.asarray(found.convert("RGB"))
+    assert found.mode == "P"
+    for place, colour in (((5, 7), kept[0]), ((110, 20), kept[1]), ((9, 9), kept[2])):
+        np.testing.assert_array_equal(shown[place], colour)
+    assert np.sqrt(np.mean((shown.astype(float) - noise) ** 2)) < 12
 
 
 def test_colours_of_bands_and_of_pixels_without_a_class():

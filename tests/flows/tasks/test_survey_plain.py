@@ -238,7 +238,7 @@ def test_products_are_where_the_receipt_says_and_open_from_disk(farm: Done) -> N
     page = Page(html)
     assert all(one.startswith("data:image/") for one in page.loaded)
     assert not re.search(r"@import|url\(", html.partition("<script>")[0])
-    assert "data:image/png;base64," in html
+    assert "data:image/webp;base64," in html
     with Image.open(farm.archive / farm.receipt["products"]["quicklook.png"]) as image:
         assert image.format == "PNG"
         assert min(image.size) >= 600

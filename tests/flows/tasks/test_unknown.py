@@ -54,7 +54,7 @@ def _stored(out: Path, name: str) -> xr.Dataset:
 
 def _files(out: Path, kind: str) -> dict[str, bytes]:
     (store,) = out.glob(f"stages/{kind}/*")
-    return {str(path.relative_to(store.parent)): path.read_bytes() for path in store.rglob("c/*") if path.is_file()}
+    return {str(path.relative_to(store.parent)): path.read_bytes() for path in store.rglob("c*") if path.is_file()}
 
 
 @pytest.fixture(scope="module")

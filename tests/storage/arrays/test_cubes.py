@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 import zarr
+from numpy.typing import NDArray
 
 from pipeline.errors import IncompleteStoreError, ShapeError
 from pipeline.geometry.scan import Sweep
@@ -17,17 +18,9 @@ from pipeline.source import Line, References
 from storage.archive.archive import Archive
 from storage.archive.manifests import check_files
 from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
-from storage.arrays.layout import AngularGrid, round_bits
-from storage.arrays.mosaics import (
-    Attention,
-    Mosaic,
-    MosaicWriter,
-    PatchWriter,
-    load_attention,
-    load_mosaic,
-    open_patches,
-    write_attention,
-)
+from storage.arrays.layout import AngularGrid
+from storage.arrays.mosaics import Attention, load_attention, open_mosaic, write_attention
+from tests.storage.plain_mosaic import plain_writer, write_values
 
 GRID = AngularGrid(1.057e-4, (100, 70))
 
@@ -139,56 +132,46 @@ def test_lines_are_read_as_they_are_asked_for(tmp_path: Path) -> None:
         cube.read(100, 101)
 
 
-def test_layout_is_one_range_read_a_patch(tmp_path: Path) -> None:
-    """Shards of 64 lines, chunks of 32 x 32 x all bands, each with blosc and crc32c inside the shard."""
+def test_raw_lines_are_packed_64_at_a_time(tmp_path: Path) -> None:
+    """A chunk is 64 lines of up to 640 samples with all bands, with blosc and crc32c: they are read as a whole."""
     header = _header(130, 100, 6)
     with RawCubeWriter(tmp_path / "raw.zarr", header) as cube:
         cube.write(_lines(header))
     meta = json.loads((tmp_path / "raw.zarr" / "dn" / "zarr.json").read_text())
     (sharding,) = meta["codecs"]
     assert meta["chunk_grid"]["configuration"]["chunk_shape"] == [64, 128, 6]
-    assert sharding["configuration"]["chunk_shape"] == [32, 32, 6]
+    assert sharding["configuration"]["chunk_shape"] == [64, 128, 6]
     assert [codec["name"] for codec in sharding["configuration"]["codecs"]] == ["bytes", "blosc", "crc32c"]
     assert len([path for path in (tmp_path / "raw.zarr" / "dn" / "c").rglob("*") if path.is_file()]) == 3
 
 
 def test_an_image_without_bands_has_a_chunk_a_file(tmp_path: Path) -> None:
     """Calls for chunks of a few kilobytes would cost more than unpacking them."""
-    coverage = MosaicWriter(tmp_path / "m.zarr", (130, 700), np.array([500.0, 700.0])).group["coverage"]
+    coverage = plain_writer(tmp_path / "m.zarr", (130, 700), np.array([500.0, 700.0])).group["coverage"]
     assert isinstance(coverage, zarr.Array)
     assert coverage.chunks == coverage.shards == (64, 640)
 
 
-def _mosaic(bands: int, shape: tuple[int, int] = (100, 70)) -> Mosaic:
-    rng = np.random.default_rng(bands)
-    values = rng.lognormal(size=(*shape, bands)).astype(np.float32)
+NM = np.linspace(400, 900, 270)
+
+
+def _values(bands: int) -> NDArray[np.float32]:
+    values = np.random.default_rng(bands).random((100, 70, bands)).astype(np.float32)
     values[:5, 3:8] = np.nan
-    coverage = np.where(np.isnan(values[..., 0]), 0, 1.5).astype(np.float32)
-    return Mosaic(values, coverage, np.linspace(400, 900, bands), None, GRID, np.full((25, 17, 3), 9, np.uint8))
-
-
-def write_mosaic(path: Path, mosaic: Mosaic) -> None:
-    """Store a mosaic in one block of rows, with its quicklook."""
-    writer = MosaicWriter(path, mosaic.values.shape[:2], mosaic.wavelength_nm, grid=mosaic.grid)
-    writer.write_tile(0, 0, mosaic.values, mosaic.coverage)
-    assert mosaic.quicklook is not None
-    writer.write_quicklook(mosaic.quicklook)
+    return values
 
 
 @pytest.mark.parametrize("bands", [1, 4, 270])
 def test_mosaic_round_trip(tmp_path: Path, bands: int) -> None:
-    """Values come back rounded to 11 bits, missing ones as NaN, all else exactly; xarray sees the same."""
-    mosaic = _mosaic(bands)
-    write_mosaic(tmp_path / "m.zarr", mosaic)
-    found = load_mosaic(tmp_path / "m.zarr")
-    np.testing.assert_array_equal(found.values, round_bits(mosaic.values))
-    np.testing.assert_allclose(found.values, mosaic.values, rtol=2.5e-4)
-    np.testing.assert_array_equal(found.coverage, mosaic.coverage)
+    """Values come back but for rounding, missing ones as NaN; plain xarray masks and scales the same scores."""
+    stored = write_values(tmp_path / "m.zarr", _values(bands), NM[:bands], GRID)
+    found = open_mosaic(tmp_path / "m.zarr")
+    np.testing.assert_array_equal(found.values(), stored)
     assert found.grid == GRID
+    assert found.shape == (100, 70)
     with xr.open_zarr(tmp_path / "m.zarr", consolidated=False) as data:
-        np.testing.assert_array_equal(data["values"].values, found.values)
-        assert data["values"].dims == ("y", "x", "band")
-        assert data["quicklook"].shape == (25, 17, 3)
+        assert data["scores"].dims == ("component", "y", "x")
+        np.testing.assert_allclose(data["scores"].values.transpose(1, 2, 0), found.scores())
 
 
 def test_mosaic_says_where_its_pixels_lie(tmp_path: Path) -> None:
@@ -198,56 +181,10 @@ def test_mosaic_says_where_its_pixels_lie(tmp_path: Path) -> None:
         a, _, c, _, e, f = grid.attributes(shape)["spatial:transform"]
         assert a * 35 / grid.factor + c == pytest.approx(0, abs=1e-12)
         assert e * 50 / grid.factor + f == pytest.approx(0, abs=1e-12)
-    write_mosaic(tmp_path / "m.zarr", _mosaic(2))
+    write_values(tmp_path / "m.zarr", _values(2), NM[:2], GRID)
     with xr.open_zarr(tmp_path / "m.zarr", consolidated=False) as data:
         assert data.attrs["spatial:dimensions"] == ["y", "x"]
         assert data.attrs["zarr_conventions"][0]["uuid"].startswith("689b58e2")
-
-
-@pytest.mark.parametrize(("count", "at_once"), [(0, 64), (1, 64), (5, 2), (70, 64), (70, 70), (150, 40), (128, 1)])
-def test_patches_round_trip(tmp_path: Path, count: int, at_once: int) -> None:
-    """Any number of patches, none included, however many are written at once."""
-    rng = np.random.default_rng(count)
-    patch_index, origin = np.arange(count, dtype=np.int64)[::-1].copy(), rng.integers(0, 900, (count, 2))
-    values, valid = rng.random((count, 8, 8, 15)).astype(np.float32), rng.random((count, 8, 8)) > 0.3
-    writer = PatchWriter(
-        tmp_path / "p.zarr", patch_index, origin, 8, np.linspace(400, 900, 15), fwhm_nm=np.full(15, 4.0)
-    )
-    for first in range(0, max(count, 1), at_once):
-        writer.write(values[first : first + at_once], valid[first : first + at_once])
-    found = open_patches(tmp_path / "p.zarr")
-    np.testing.assert_array_equal(found.patch_index, patch_index)
-    np.testing.assert_array_equal(found.read(0, count), round_bits(values))
-    np.testing.assert_array_equal(found.read(1, 3), round_bits(values)[1:3])
-    with xr.open_zarr(tmp_path / "p.zarr", consolidated=False) as data:
-        assert data["values"].dims == ("patch", "y", "x", "band")
-        assert {"patch_index", "patch_y", "patch_x", "wavelength", "fwhm"} <= set(data.coords)
-        np.testing.assert_array_equal(data["valid"].values, valid)
-        np.testing.assert_array_equal(np.stack([data["patch_y"], data["patch_x"]], axis=-1), origin)
-
-
-@pytest.mark.parametrize(("count", "bands", "chunk"), [(70, 1, 64), (70, 270, 8), (6, 900, 3), (7, 900, 1)])
-def test_chunks_of_patches_have_up_to_4_mb(tmp_path: Path, count: int, bands: int, chunk: int) -> None:
-    """As many patches of 16 x 16 px make a chunk as fit 4 MB and part the file evenly, and one at the least."""
-    origin = np.zeros((count, 2), np.int64)
-    PatchWriter(tmp_path / "p.zarr", np.arange(count), origin, 16, np.linspace(400, 900, bands))
-    chunks = zarr.open_group(tmp_path / "p.zarr", mode="r")["values"].chunks  # type: ignore[union-attr]
-    assert chunks == (chunk, 16, 16, bands)
-
-
-def test_patches_that_do_not_fit_are_refused(tmp_path: Path) -> None:
-    """More than there are patches, of another size, or with the validity of others: nothing of them is kept."""
-    writer = PatchWriter(tmp_path / "p.zarr", np.arange(70), np.zeros((70, 2), np.int64), 2, np.array([500.0]))
-    values, valid = np.zeros((70, 2, 2, 1), np.float32), np.ones((70, 2, 2), bool)
-    writer.write(values[:10], valid[:10])
-    with pytest.raises(ShapeError, match="patches 10:80"):
-        writer.write(values, valid)
-    with pytest.raises(ShapeError, match="patches 10:11"):
-        writer.write(values[:1, :1], valid[:1, :1])
-    with pytest.raises(ShapeError, match="patches 10:12"):
-        writer.write(values[:2], valid[:1])
-    writer.write(values[10:], valid[10:])
-    assert open_patches(tmp_path / "p.zarr").read(0, 70).max() == 0
 
 
 def test_attention_round_trip(tmp_path: Path) -> None:
@@ -266,24 +203,24 @@ def test_attention_round_trip(tmp_path: Path) -> None:
 def test_a_flipped_bit_is_an_error_and_is_named(archive: Archive) -> None:
     """crc32c stops the reader, here and in plain xarray; verify names the shard."""
     with archive.publish("mosaic", "k") as staged:
-        write_mosaic(staged.path / "m.zarr", _mosaic(15))
+        write_values(staged.path / "m.zarr", _values(15), NM[:15], GRID)
     ref = archive.refs()[0]
-    shard = ref.path / "m.zarr" / "values" / "c" / "0" / "0" / "0"
+    shard = ref.path / "m.zarr" / "scores" / "c" / "0" / "0" / "0"
     content = bytearray(shard.read_bytes())
     content[len(content) // 3] ^= 1
     shard.write_bytes(content)
-    with pytest.raises(IncompleteStoreError, match=r"values cannot be read.*run verify"):
-        load_mosaic(ref.path / "m.zarr")
+    with pytest.raises(IncompleteStoreError, match=r"scores cannot be read.*run verify"):
+        open_mosaic(ref.path / "m.zarr").scores()
     with xr.open_zarr(ref.path / "m.zarr", consolidated=False) as data, pytest.raises(ValueError, match="checksum"):
-        data["values"].load()
-    with pytest.raises(IncompleteStoreError, match=r"values/c/0/0/0 has changed"):
+        data["scores"].load()
+    with pytest.raises(IncompleteStoreError, match=r"scores/c/0/0/0 has changed"):
         check_files(ref.path, hashes=True)
 
 
 def test_what_is_no_store(tmp_path: Path) -> None:
     """A missing folder and one without the arrays are incomplete stores."""
     with pytest.raises(IncompleteStoreError, match="no readable Zarr store"):
-        load_mosaic(tmp_path / "none.zarr")
+        open_mosaic(tmp_path / "none.zarr")
     write_attention(tmp_path / "a.zarr", Attention(np.zeros((1, 1)), np.zeros((1, 1), np.int32), "x"))
     with pytest.raises(IncompleteStoreError, match="wavelength cannot be read"):
         open_raw_cube(tmp_path / "a.zarr")

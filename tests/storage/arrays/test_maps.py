@@ -14,7 +14,14 @@ from pyproj import CRS
 
 from pipeline.errors import ChunkError, IncompleteStoreError, PoseError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
-from storage.arrays.class_maps import ClassMap, ClassNames, create_class_map, load_class_map, write_class_tile
+from storage.arrays.class_maps import (
+    CONFIDENCE_STEP,
+    ClassMap,
+    ClassNames,
+    create_class_map,
+    load_class_map,
+    write_class_tile,
+)
 from storage.arrays.georeference import ON_THE_MAP, load_geobox, map_attributes, write_map_coordinates
 from storage.arrays.ground_maps import BLOCK, GroundMapWriter, load_ground_map
 from storage.arrays.layout import (
@@ -312,7 +319,7 @@ def test_classes_are_taken_from_pixels_and_from_no_other(tmp_path: Path) -> None
     blank_pixels(tmp_path / "m.zarr", where, NO_CLASS)
     found = load_class_map(tmp_path / "m.zarr")
     np.testing.assert_array_equal(found.classes, np.where(where, 255, classes))
-    np.testing.assert_array_equal(found.confidence, np.where(where, np.nan, confidence))
+    np.testing.assert_allclose(found.confidence, np.where(where, np.nan, confidence), atol=CONFIDENCE_STEP / 2)
 
 
 def test_class_map_round_trip(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The stored mosaic: rows and tiles of whole shards, rounding, refusals."""
+"""The stored mosaic: tiles of whole shards, scores and their spectra, coarser pixels, patches, refusals."""
 
 from __future__ import annotations
 
@@ -12,48 +12,36 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
 from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError
-from storage.arrays.layout import round_bits
-from storage.arrays.mosaics import (
-    MosaicWriter,
-    PatchWriter,
-    load_mosaic,
-    mosaic_brightness,
-    mosaic_rows,
-    mosaic_wavelengths,
-    open_patches,
-)
+from pipeline.geometry.grid import SceneGrid
+from storage.arrays.layout import AngularGrid, round_bits
+from storage.arrays.mosaics import MosaicWriter, open_mosaic, patch_scores
+from tests.storage.plain_mosaic import plain_writer, write_values
 
 SHAPE = (100, 1300)
+NM = np.linspace(400, 1000, 17)
 
 
 def writer(path: Path) -> MosaicWriter:
     """An empty mosaic of two bands, two shards down and three across."""
-    return MosaicWriter(path, SHAPE, np.array([500.0, 600.0]))
-
-
-def image() -> tuple[np.ndarray, np.ndarray]:
-    """Values with some NaN, and coverage."""
-    rng = np.random.default_rng(3)
-    values = rng.normal(size=(*SHAPE, 2)).astype(np.float32)
-    values[rng.random(SHAPE) < 0.1] = np.nan
-    return values, rng.integers(0, 3, SHAPE)
+    return plain_writer(path, SHAPE, np.array([500.0, 600.0]))
 
 
 def test_tiles_and_rows_store_the_same(tmp_path: Path) -> None:
-    """Written in tiles, last ones first, or in rows, a mosaic reads back the same, rounded to 11 bits."""
-    values, coverage = image()
+    """Written in tiles, last ones first, or in rows, a mosaic reads back the same; shards that never came are NaN."""
+    rng = np.random.default_rng(3)
+    values, coverage = rng.normal(size=(*SHAPE, 2)).astype(np.float32), rng.integers(0, 3, SHAPE)
     rows, tiles = writer(tmp_path / "rows.zarr"), writer(tmp_path / "tiles.zarr")
-    for first in (0, 64):
-        rows.write_tile(first, 0, values[first : first + 64], coverage[first : first + 64])
+    rows.write_rows(0, values, coverage)
     assert tiles.tile_shape == (64, 640)
-    assert np.isnan(load_mosaic(tmp_path / "tiles.zarr").values).all()  # shards that never came
+    assert np.isnan(open_mosaic(tmp_path / "tiles.zarr").values()).all()
     for y, x in [(64, 1280), (64, 640), (64, 0), (0, 1280), (0, 640), (0, 0)]:
         part = slice(y, y + 64), slice(x, x + 640)
         tiles.write_tile(y, x, values[part], coverage[part])
-    for path in ("rows.zarr", "tiles.zarr"):
-        stored = load_mosaic(tmp_path / path)
-        np.testing.assert_array_equal(stored.values, round_bits(values))
-        np.testing.assert_array_equal(stored.coverage, coverage)
+    one, other = (open_mosaic(tmp_path / name) for name in ("rows.zarr", "tiles.zarr"))
+    np.testing.assert_array_equal(one.values(), other.values())
+    np.testing.assert_array_equal(other.coverage(), coverage)
+    np.testing.assert_allclose(other.values()[coverage > 0], values[coverage > 0], atol=2**-13)
+    assert np.isnan(other.values()[coverage == 0]).all()
 
 
 @pytest.mark.parametrize(
@@ -69,11 +57,11 @@ def test_a_tile_that_splits_shards_is_refused(
 ) -> None:
     """Two writers of one shard would lose each other's part, so only whole ones are taken."""
     with pytest.raises(ChunkError, match=words):
-        writer(tmp_path / "m.zarr").write_tile(*at, np.zeros((*size, 2), np.float32), np.zeros(size))
+        writer(tmp_path / "m.zarr").write_tile(*at, np.zeros((*size, 2), np.float32), np.zeros(size, np.intp))
 
 
 def test_a_tile_that_does_not_fit_is_refused(tmp_path: Path) -> None:
-    """Beyond the mosaic, with other bands, or with a coverage of another shape."""
+    """Beyond the mosaic, with other components, or with a coverage of another shape."""
     mosaic = writer(tmp_path / "m.zarr")
     for at, shape, coverage in (
         ((64, 0), (64, 640, 2), (64, 640)),
@@ -81,20 +69,16 @@ def test_a_tile_that_does_not_fit_is_refused(tmp_path: Path) -> None:
         ((0, 0), (64, 640, 2), (64, 639)),
     ):
         with pytest.raises(ShapeError, match="the mosaic is"):
-            mosaic.write_tile(*at, np.zeros(shape, np.float32), np.zeros(coverage))
-
-
-NM = np.linspace(400, 1000, 17)
+            mosaic.write_tile(*at, np.zeros(shape, np.float32), np.zeros(coverage, np.intp))
 
 
 @pytest.fixture(scope="module")
-def mosaic(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A stored mosaic of 150 x 90 px, a part of it not seen."""
+def stored(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, NDArray[np.float32]]:
+    """A stored mosaic of 150 x 90 px, a part of it not seen, and its values."""
     path = tmp_path_factory.mktemp("mosaic") / "mosaic.zarr"
     values = np.random.default_rng(0).random((150, 90, len(NM)), np.float32)
     values[:20, :30] = np.nan
-    MosaicWriter(path, (150, 90), NM).write_tile(0, 0, values, np.ones((150, 90), np.float32))
-    return path
+    return path, write_values(path, values, NM, AngularGrid(1e-4, (150, 90)))
 
 
 @pytest.mark.parametrize(
@@ -105,30 +89,56 @@ def mosaic(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (slice(70, 71), slice(0, 1), [1]),
     ],
 )
-def test_swaths_make_the_window(mosaic: Path, rows: slice, columns: slice, heights: list[int]) -> None:
+def test_strips_make_the_window(
+    stored: tuple[Path, NDArray[np.float32]], rows: slice, columns: slice, heights: list[int]
+) -> None:
     """They end where shards do, and together are what is stored there."""
-    swaths = list(mosaic_rows(mosaic, rows, columns))
-    assert [len(strip) for strip in swaths] == heights
-    np.testing.assert_array_equal(np.concatenate(swaths), load_mosaic(mosaic).values[rows, columns])
+    mosaic = open_mosaic(stored[0])
+    strips = [mosaic.spectra(strip) for strip in mosaic.row_blocks(None, rows, columns)]
+    assert [len(strip) for strip in strips] == heights
+    np.testing.assert_array_equal(np.concatenate(strips), stored[1][rows, columns])
 
 
-def test_brightness_is_the_mean_over_bands(mosaic: Path) -> None:
-    """To the last bit that of the mosaic in memory; NaN where nothing was seen."""
-    np.testing.assert_array_equal(mosaic_brightness(mosaic), load_mosaic(mosaic).values.mean(axis=-1))
-    assert (mosaic_wavelengths(mosaic) == NM).all()
+@given(st.sampled_from([1, 2, 3, 4, 8]), st.integers(0, 30), st.integers(0, 12))
+@settings(max_examples=30, deadline=None)
+def test_coarser_pixels_are_means(stored: tuple[Path, NDArray[np.float32]], factor: int, top: int, left: int) -> None:
+    """Of the pixels that were seen; NaN where these are less than half, at the borders of those that there are."""
+    mosaic, (height, width) = open_mosaic(stored[0]), stored[1].shape[:2]
+    rows, columns = slice(top, -(-height // factor)), slice(left, -(-width // factor))
+    if rows.start >= rows.stop or columns.start >= columns.stop:
+        return
+    found = np.concatenate(list(mosaic.row_blocks(factor, rows, columns)))
+    for y, x in ((0, 0), (found.shape[0] - 1, found.shape[1] - 1), (found.shape[0] // 2, found.shape[1] // 3)):
+        cell = stored[1][(top + y) * factor : (top + y + 1) * factor, (left + x) * factor : (left + x + 1) * factor]
+        seen = np.isfinite(cell[..., 0])
+        mean = cell[seen].mean(axis=0) if seen.mean() >= 0.5 else np.full(len(NM), np.nan)
+        np.testing.assert_allclose(found[y, x], mean, atol=1e-5)
+
+
+def test_brightness_is_the_mean_over_bands(stored: tuple[Path, NDArray[np.float32]]) -> None:
+    """NaN where nothing was seen; a folder that is no mosaic is refused."""
+    np.testing.assert_allclose(open_mosaic(stored[0]).brightness(), stored[1].mean(axis=-1), atol=1e-5)
     with pytest.raises(IncompleteStoreError, match="no readable Zarr store"):
-        next(mosaic_rows(mosaic / "none.zarr"))
+        open_mosaic(stored[0] / "none.zarr")
 
 
-@pytest.mark.parametrize("entries", [[], [0], [3, 4, 5], [0, 2, 3, 9], list(range(10))])
-def test_patches_are_picked_by_their_numbers(tmp_path: Path, entries: list[int]) -> None:
-    """Runs and single ones come in the order asked for."""
-    values = np.random.default_rng(1).random((10, 4, 4, 2)).astype(np.float16).astype(np.float32)
-    writer = PatchWriter(tmp_path / "p.zarr", np.arange(10), np.zeros((10, 2), int), 4, NM[:2])
-    writer.write(values, np.ones((10, 4, 4), np.bool_))
-    store = open_patches(tmp_path / "p.zarr")
-    np.testing.assert_allclose(store.pick(np.array(entries, np.int64)), values[entries], rtol=3e-4)
-    assert (store.wavelength_nm == NM[:2]).all()
+@pytest.mark.parametrize("chosen", [[], [0], [3, 4, 5], [59, 2, 31, 30], list(range(60))])
+def test_patches_are_cut_from_the_mosaic(stored: tuple[Path, NDArray[np.float32]], chosen: list[int]) -> None:
+    """In any order; beyond the scene's border a patch repeats its own pixels by reflection."""
+    grid = SceneGrid(150, 90, 16, 2)
+    patches = np.array(chosen, np.intp)
+    padded = np.full((*grid.padded_shape, len(NM)), np.nan, np.float32)
+    padded[:150, :90] = stored[1]
+    padded[150:160] = padded[[148, 147, 146, 145, 144, 149, 149, 149, 149, 149]]  # the last patch begins at 144
+    padded[:, 90:96] = padded[:, 89 - np.arange(1, 7)]
+    found = {}
+    for entries, scores in patch_scores(open_mosaic(stored[0]), grid, patches):
+        found |= dict(zip(patches[entries].tolist(), scores, strict=True))
+    assert sorted(found) == sorted(chosen)
+    for number, patch in found.items():
+        y, x = grid.patch_origin(np.array(number))
+        if y < 150 and x < 90:
+            np.testing.assert_array_equal(patch, padded[y : y + 16, x : x + 16])
 
 
 FLOATS = hnp.arrays(np.float32, st.integers(1, 20), elements=st.floats(width=32))

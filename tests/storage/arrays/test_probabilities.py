@@ -15,8 +15,10 @@ from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError
 from storage.arrays.class_maps import (
     DAY_STEP,
     FAINTEST,
+    LEAST,
     NOTHING,
     STEP,
+    UNLIKELY,
     ClassNames,
     ProbabilityStore,
     create_probabilities,
@@ -66,7 +68,9 @@ def test_what_is_read_is_what_was_written_within_half_a_step(
     first, second = np.sort(values[known], axis=-1)[..., -1], np.sort(values[known], axis=-1)[..., -2]
     clear = first - second > STEP
     np.testing.assert_array_equal(found[known].argmax(axis=-1)[clear], values[known].argmax(axis=-1)[clear])
-    assert np.abs(found[known] - values[known])[values[known] > -12].max() < 1.5 * STEP
+    told = values[known] > LEAST
+    assert np.abs(found[known] - values[known])[told].max() < 1.5 * STEP
+    np.testing.assert_allclose(found[known][~told], UNLIKELY, atol=STEP)
 
 
 def test_the_faintest_probabilities_is_the_faintest_that_is_stored() -> None:
@@ -94,7 +98,8 @@ def test_xarray_unpacks_it(tmp_path: Path) -> None:
     assert opened.log_probability.dims == ("y", "x", "class")
     assert opened.age.attrs["units"] == "days"
     assert np.isnan(opened.log_probability.values[:3]).all()
-    np.testing.assert_allclose(opened.log_probability.values[3:], np.maximum(values[3:], -12.7), atol=STEP / 2 + 1e-4)
+    told = np.where(values[3:] < LEAST, UNLIKELY, values[3:])
+    np.testing.assert_allclose(opened.log_probability.values[3:], told, atol=STEP / 2 + 1e-4)
     np.testing.assert_allclose(opened.age.values[3:].astype(float), ages[3:], atol=DAY_STEP / 2 + 1e-4)
 
 

@@ -14,8 +14,8 @@ from pipeline.geometry.scan import Sweep
 from pipeline.source import Line, References
 from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
 from storage.arrays.layout import open_group
-from storage.arrays.mosaics import MosaicWriter
 from storage.arrays.quicklooks import LineThumbnail, picture_bands, picture_step, quicklook_of, stretched
+from tests.storage.plain_mosaic import plain_writer
 
 WAVES = np.linspace(400, 900, 12)
 LINES = np.random.default_rng(5).integers(100, 4000, (150, 600, 12), dtype=np.uint16)
@@ -153,14 +153,14 @@ def test_stores_of_before_open_without_a_picture(tmp_path: Path) -> None:
     cube = open_raw_cube(path)
     assert cube.quicklook() is None
     np.testing.assert_array_equal(cube.read(0, 3), LINES[:3])
-    MosaicWriter(tmp_path / "m.zarr", (8, 8), WAVES)
+    plain_writer(tmp_path / "m.zarr", (8, 8), WAVES)
     assert quicklook_of(open_group(tmp_path / "m.zarr")) is None
 
 
 def test_a_mosaic_has_its_picture_as_it_was_given(tmp_path: Path) -> None:
     """Of a picture that was made elsewhere nothing but its colours is known."""
     image = np.random.default_rng(1).integers(0, 255, (20, 30, 3), dtype=np.uint8)
-    MosaicWriter(tmp_path / "m.zarr", (80, 120), WAVES).write_quicklook(image)
+    plain_writer(tmp_path / "m.zarr", (80, 120), WAVES).write_quicklook(image)
     seen = quicklook_of(open_group(tmp_path / "m.zarr"))
     assert seen is not None
     np.testing.assert_array_equal(seen.image, image)

@@ -1,0 +1,59 @@
+"""Mosaics and condensed sweeps whose components are the bands: values go in and come out as they are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import line_positions
+from pipeline.signal.components import Components
+from storage.arrays.cubes import SweepHeader
+from storage.arrays.layout import AngularGrid
+from storage.arrays.mosaics import MosaicWriter
+from storage.arrays.signal_cubes import LineRows, SignalCubeWriter
+
+STEP = 2.0**-12  # of values: powers of two, so that what is a multiple of them comes back exactly
+
+
+def band_components(bands: int) -> Components:
+    """A component a band, of mean 0 and noise 1."""
+    return Components(np.zeros(bands), np.eye(bands), np.ones(bands))
+
+
+def plain_writer(
+    path: Path, shape: tuple[int, int], wavelength_nm: NDArray[np.float64], grid: AngularGrid | None = None, **more: Any
+) -> MosaicWriter:
+    """Begin a mosaic of scene values, in steps of 2^-12."""
+    components = band_components(len(wavelength_nm))
+    return MosaicWriter(path, shape, components, wavelength_nm, step=STEP, largest=1e3, grid=grid, **more)
+
+
+def write_values(
+    path: Path,
+    values: NDArray[np.floating],
+    wavelength_nm: NDArray[np.float64],
+    grid: AngularGrid | None = None,
+    **more: Any,
+) -> NDArray[np.float32]:
+    """Store (y, x, band) values, NaN where nothing was seen, and return them as they are stored."""
+    writer = plain_writer(path, values.shape[:2], wavelength_nm, grid, **more)
+    writer.write_rows(0, values, np.isfinite(values).all(axis=2))
+    stored: NDArray[np.float32] = (np.rint(values / STEP) * STEP).astype(np.float32)
+    stored[~np.isfinite(values).all(axis=2)] = np.nan
+    return stored
+
+
+def write_plain_sweep(path: Path, header: SweepHeader, values: NDArray[np.floating], step: float) -> None:
+    """Store a condensed sweep of (line, sample, band) values that are multiples of ``step``; its path is exact."""
+    writer = SignalCubeWriter(path, header, band_components(values.shape[2]), step=step, largest=1e3)
+    for first in range(0, len(values), 64):
+        part = values[first : first + 64]
+        writer.write(first, part, np.zeros(part.shape[:2], np.uint8))
+    count, x_y = len(values), line_positions(header.sweep, LineCamera())
+    facts = LineRows(np.arange(count) * 0.1, *x_y.T, np.full(count, 100.0), np.ones(count, np.bool_))
+    none = np.zeros((0, values.shape[2]), np.int16)
+    writer.close(facts, np.zeros((0, 2), np.intp), none, None)
