@@ -1,6 +1,6 @@
 """The trade-off of storing lines: components of whitened spectra beside what else may be kept of raw lines.
 
-Opponents: binned bands, rounded numbers (each by the codec of raw lines), pcodec, principal components without
+Opponents: binned bands, rounded numbers (each by the codec of scores), pcodec, principal components without
 whitening, those as JPEG 2000 (Du & Fowler 2007), and ZFP. All come back as scene values, which are rectified and read
 as a survey reads them.
 """
@@ -53,7 +53,7 @@ class KeptLines:
 
 
 def keep_raw(scan: ScanLines) -> KeptLines:
-    """Store raw lines as an archive does."""
+    """Store raw lines as they are, by the codec of scores, which packs them closer than that of raw lines on disk."""
     size, array = numbers_in_memory(scan.lines.data)
     return KeptLines(size, lambda: scan.calibrated(np.asarray(array[...])))
 
@@ -133,7 +133,7 @@ def bin_bands(scan: ScanLines, width: int) -> KeptLines:
 
 
 def round_numbers(scan: ScanLines, step: float) -> KeptLines:
-    """Store raw numbers in steps of a part of each band's noise, by the codec of raw lines."""
+    """Store raw numbers in steps of a part of each band's noise, by the codec of scores."""
     unit, steps = _in_steps(scan, step)
     size, array = numbers_in_memory(steps)
     return KeptLines(size + unit.nbytes, lambda: scan.calibrated(np.asarray(array[...]) * unit))

@@ -280,11 +280,11 @@ def round_bits(values: NDArray[np.floating], *, out: NDArray[np.float32] | None 
 
 
 def numbers_in_memory(values: NDArray[Any]) -> tuple[int, zarr.Array[Any]]:
-    """Store whole numbers (line, sample, band) in memory as raw ones are on disk; the bytes taken, and the array."""
+    """Store whole numbers (line, sample, band) in memory, in chunks of raw lines; the bytes taken, and the array."""
     held: dict[str, Any] = {}
     group = zarr.create_group(MemoryStore(store_dict=held), zarr_format=3)
     spec = image_spec(("line", "sample", "band"), values.shape, values.dtype.str)
-    array = create_array(group, "dn", spec, {}, packing=RAW_PACKING)
+    array = create_array(group, "dn", spec, {})
     array[...] = values
     return bytes_held(held, "dn"), array
 
