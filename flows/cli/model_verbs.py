@@ -29,26 +29,32 @@ from pipeline.errors import SettingsError
 def tradeoff(
     stage: str | None = None,
     *,
+    scene: str | None = None,
+    weights: Path | None = None,
     out: OutFile = Path("tradeoff"),
-    repeats: int = 5,
+    repeats: int | None = None,
     seed: int = 0,
     as_json: AsJson = False,
 ) -> int:
-    """Measure what accuracy costs in time, for STAGE or for every stage that has a choice.
+    """Measure what accuracy costs in time, or in bytes, for STAGE or for every stage that has a choice.
 
     Parameters
     ----------
     stage
         rectify, segment, simulate, store or survey; all without one.
+    scene
+        For store: a cube of raw numbers, whose pixels are taken in place of a farm's lines.
+    weights
+        For store: weights that read the scene; without them no map of it is drawn.
     out
         Folder for tradeoff.json and tradeoff.png.
     repeats
-        Rounds in which every setting is timed once.
+        Rounds in which every setting is timed once; without it 5, for store 1.
     seed
         Of the scenes that are measured on.
     """
 
-    content = run_tradeoff(stage, out, repeats, seed, stderr)
+    content = run_tradeoff(stage, out, repeats, seed, stderr, scene=scene, weights=weights)
     if as_json:
         print_json(content)
     return 0

@@ -21,22 +21,42 @@ from flows.terminal.processes import writing
 from flows.terminal.progress import table
 from flows.tradeoff.entries import Point, Result, measure_tradeoff
 from flows.tradeoff.stages import TRADEOFFS, find_tradeoff
+from flows.tradeoff.store import STORE, store_tradeoff
 from pipeline.errors import SettingsError
 from storage.archive.whole_files import to_json
 
-_COLOURS = ("#0072B2", "#007A5A", "#8a6d00", "#D55E00", "#A23B72")
+_COLOURS = ("#0072B2", "#007A5A", "#8a6d00", "#D55E00", "#A23B72", "#333333", "#5B3FA0", "#00798C", "#9B2226")
 _LEVEL = "#D55E00"
 _ACROSS = 3  # panels in a row
 _UNITS = ((1e6, "ms"), (1e3, "µs"), (1.0, "ns"))
 
 
-def run_tradeoff(stage: str | None, out: Path, repeats: int, seed: int, console: Console) -> dict[str, Any]:
-    """Measure the trade-off of one stage, or all; write tradeoff.json and .png into ``out`` and print the tables."""
-    if repeats < 1:
+def run_tradeoff(
+    stage: str | None,
+    out: Path,
+    repeats: int | None,
+    seed: int,
+    console: Console,
+    *,
+    scene: str | None = None,
+    weights: Path | None = None,
+) -> dict[str, Any]:
+    """Measure the trade-off of one stage, or all; write tradeoff.json and .png into ``out`` and print the tables.
+
+    ``scene`` is a raster whose pixels `store` takes in place of a farm's lines, ``weights`` those that read it.
+    """
+    if repeats is not None and repeats < 1:
         raise SettingsError(f"--repeats must be at least 1, got {repeats}")
     if seed < 0:
         raise SettingsError(f"--seed must be 0 or more, got {seed}")
+    if (scene or weights) and (stage != STORE.stage or not scene):
+        raise SettingsError(
+            f"--scene, and --weights with it, are for the stage store alone: spectralzoom tradeoff {STORE.stage} "
+            "--scene FILE --weights FILE"
+        )
     wanted = [find_tradeoff(stage)] if stage else list(TRADEOFFS.values())
+    if scene:
+        wanted = [store_tradeoff(scene, weights)]
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)  # before minutes are spent on what cannot be kept
     results = []
@@ -56,7 +76,8 @@ def print_tradeoff(result: Result, console: Console) -> None:
     """Print the settings from the most to the least exact; those that no other beats are marked."""
     points = sorted(result.points, key=lambda point: point.error)
     rows, figures = [_row(point) for point in points], ("error", *result.points[0].beside)
-    headings = [name.replace(" ", "\n") for name in (*figures, f"per {result.unit}", "price", "x first")]
+    times = ("time",) if result.paid else (f"per {result.unit}", "price", "x first")
+    headings = [name.replace(" ", "\n") for name in (*figures, *times)]
     pairs = zip(rows, points, strict=True)
     shown = [[f"{'' if point.pareto else '[dim]'}{escape(cell)}" for cell in row] for row, point in pairs]
     title = f"{escape(result.stage)}, {escape(result.knob)}: to be right to ... you pay ..."
@@ -66,7 +87,8 @@ def print_tradeoff(result: Result, console: Console) -> None:
 
 def _row(point: Point) -> list[str]:
     times = [_short(point.ns_per_unit * 1e-9), _short(point.price_s), f"{point.ratio:.2f}"]
-    further = [f"{one:.2g}" for one in point.beside.values()]
+    times = times if point.paid is None else times[1:2]  # what is paid stands among the figures
+    further = [f"{one:.2g}" if abs(one) < 10 else f"{one:.1f}" for one in point.beside.values()]
     return ["●" if point.pareto else "○", str(point.setting), f"{point.error:.3g}", *further, *times]
 
 
@@ -82,13 +104,15 @@ def _caption(result: Result) -> str:
     if result.level is not None:
         name, error = result.level
         good = [point for point in result.points if point.error <= error]
-        best = min(good, key=lambda point: point.price_s, default=None)
+        best = min(good, key=lambda point: point.cost, default=None)
         found = "no setting" if best is None else f"{best.setting}, {_short(best.ns_per_unit * 1e-9)}"
         within = f"within {name} ({error:.2g}): {found}\n"
-    priced = "the cost model" if result.modelled else "processor time"
+    priced = result.paid or ("the cost model" if result.modelled else "processor time")
+    without = "".join(f"{name} did not run: {why}\n" for name, why in result.missing.items())
     rounds = f"{result.repeats} repeat{'s' if result.repeats > 1 else ''} in turn"
     return escape(
-        f"error: {result.error}, against {result.reference}; price: {priced}; ● no other setting beats it\n{within}"
+        f"error: {result.error}, against {result.reference}; price: {priced}; ● no other setting beats it\n"
+        f"{within}{without}"
         f"{rounds}, {machine['threads']} thread, load {machine['load_before']} to {machine['load_after']}, "
         f"{machine['processor']}"
     )
@@ -114,7 +138,7 @@ def _draw_tradeoff(axes: Axes, result: Result) -> None:
     families: dict[str, list[tuple[float, float, Point]]] = {}
     for point in result.points:
         if math.isfinite(point.error):
-            x = point.price_s if result.modelled else point.ns_per_unit / size
+            x = point.cost if result.modelled or result.paid else point.ns_per_unit / size
             families.setdefault(str(point.setting).rpartition(", ")[0], []).append((x, point.error, point))
     for (name, members), colour in zip(families.items(), cycle(_COLOURS), strict=False):
         members.sort(key=lambda one: one[:2])
@@ -144,7 +168,8 @@ def _draw_tradeoff(axes: Axes, result: Result) -> None:
         smallest = min((point.error for point in result.points if point.error > 0), default=1.0)
         axes.set_yscale("symlog", linthresh=smallest)
     axes.set_title(f"{result.stage}: {result.knob}", loc="left", weight="bold", color=INK, size=13)
-    axes.set_xlabel("seconds by the cost model" if result.modelled else f"{unit} / {result.unit}", color=INK)
+    time = "seconds by the cost model" if result.modelled else f"{unit} / {result.unit}"
+    axes.set_xlabel(result.paid or time, color=INK)
     axes.set_ylabel(result.error, color=INK)
     axes.set_facecolor(PAPER)
     axes.grid(visible=True, which="major", color=GRID, linewidth=0.8)

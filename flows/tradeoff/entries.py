@@ -108,7 +108,8 @@ class Tradeoff:
 
     A stage whose time is not spent on this machine (capture) gives it by ``modelled_s``; it then counts as the price.
     ``level`` is an error below which more exactness is lost in something else, and its name; ``beside`` are more
-    figures. All functions take what ``prepare`` gave for a seed, then a setting, then what ``run`` gave.
+    figures, of which ``paid`` names the one that counts as the price in place of time. All functions take what
+    ``prepare`` gave for a seed, then a setting, then what ``run`` gave. ``missing`` says why a setting cannot run here.
     """
 
     stage: str
@@ -124,6 +125,9 @@ class Tradeoff:
     modelled_s: Callable[[Any, Setting, Any], float] | None = None
     level: Callable[[Any], tuple[str, float]] | None = None
     beside: Mapping[str, Callable[[Any, Setting, Any], float]] = field(default_factory=dict, hash=False)
+    paid: str | None = None
+    missing: Callable[[Setting], str | None] = lambda setting: None
+    repeats: int = 5  # unless others are asked for
 
 
 @dataclass(frozen=True)
@@ -135,9 +139,15 @@ class Point:
     price_s: float  # of the model where the stage has one, else the least processor time
     wall_min_s: float
     ns_per_unit: float
-    ratio: float  # of the price to the first setting's; of processor time its median over the rounds
+    ratio: float  # of what is paid to the first setting's; of processor time its median over the rounds
     pareto: bool = False
     beside: Mapping[str, float] = field(default_factory=dict, hash=False)
+    paid: float | None = None  # in place of ``price_s``, of the result's unit
+
+    @property
+    def cost(self) -> float:
+        """What settings are compared by beside their error."""
+        return self.price_s if self.paid is None else self.paid
 
 
 @dataclass(frozen=True)
@@ -155,32 +165,44 @@ class Result:
     points: tuple[Point, ...]
     modelled: bool
     level: tuple[str, float] | None = None
+    paid: str | None = None  # what is paid; None: time
+    missing: Mapping[str, str] = field(default_factory=dict, hash=False)  # settings that did not run, and why
 
 
-def measure_tradeoff(tradeoff: Tradeoff, *, repeats: int = 5, seed: int = 0) -> Result:
+def measure_tradeoff(tradeoff: Tradeoff, *, repeats: int | None = None, seed: int = 0) -> Result:
     """Judge every setting by one run, then time ``repeats`` of each in turn, on one thread."""
+    repeats = tradeoff.repeats if repeats is None else repeats
     if repeats < 1:
         raise SettingsError(f"repeats must be at least 1, got {repeats}")
+    why = {setting: tradeoff.missing(setting) for setting in tradeoff.settings}
+    settings = [setting for setting, reason in why.items() if reason is None]
     state = tradeoff.prepare(seed)
     with one_thread() as threads:
         load_before = mean_load()
-        made = [tradeoff.run(state, setting) for setting in tradeoff.settings]
-        errors = [float(tradeoff.judge(state, *pair)) for pair in zip(tradeoff.settings, made, strict=True)]
-        clocks = time_in_turn({one: partial(tradeoff.run, state, one) for one in tradeoff.settings}, repeats)
+        made = [tradeoff.run(state, setting) for setting in settings]
+        errors = [float(tradeoff.judge(state, *pair)) for pair in zip(settings, made, strict=True)]
+        clocks = time_in_turn({one: partial(tradeoff.run, state, one) for one in settings}, repeats)
         machine = describe_machine(threads) | {"load_before": load_before, "load_after": mean_load()}
-    points, first = [], tradeoff.settings[0]
-    for setting, out, error in zip(tradeoff.settings, made, errors, strict=True):
-        price_s, beside = clocks[setting].cpu_min_s, {}
+    points, first = list[Point](), settings[0]
+    for setting, out, error in zip(settings, made, errors, strict=True):
+        price_s = clocks[setting].cpu_min_s
         relative = ratio(clocks, setting, first)
         if tradeoff.modelled_s is not None:
             price_s = tradeoff.modelled_s(state, setting, out)
             relative = price_s / tradeoff.modelled_s(state, first, made[0])
         beside = {name: float(figure(state, setting, out)) for name, figure in tradeoff.beside.items()}
+        paid = None if tradeoff.paid is None else beside[tradeoff.paid]
+        if paid is not None:
+            relative = paid / (paid if not points else points[0].cost)
         ns = 1e9 * price_s / tradeoff.work(state)
-        points.append(Point(setting, error, price_s, clocks[setting].wall_min_s, ns, relative, beside=beside))
+        wall = clocks[setting].wall_min_s
+        points.append(Point(setting, error, price_s, wall, ns, relative, beside=beside, paid=paid))
     named = (tradeoff.stage, tradeoff.knob, tradeoff.error, tradeoff.unit, tradeoff.reference)
     level = None if tradeoff.level is None else tradeoff.level(state)
-    return Result(*named, repeats, seed, machine, mark_pareto(points), tradeoff.modelled_s is not None, level)
+    return Result(
+        *(*named, repeats, seed, machine, mark_pareto(points), tradeoff.modelled_s is not None, level, tradeoff.paid),
+        missing={str(setting): reason for setting, reason in why.items() if reason is not None},
+    )
 
 
 def mark_pareto(points: Sequence[Point]) -> tuple[Point, ...]:
@@ -191,8 +213,8 @@ def mark_pareto(points: Sequence[Point]) -> tuple[Point, ...]:
             pareto=math.isfinite(point.error)
             and not any(
                 other.error <= point.error
-                and other.price_s <= point.price_s
-                and (other.error, other.price_s) != (point.error, point.price_s)
+                and other.cost <= point.cost
+                and (other.error, other.cost) != (point.error, point.cost)
                 for other in points
             ),
         )

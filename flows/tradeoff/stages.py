@@ -1,4 +1,4 @@
-"""The measure of each stage: kernel, tolerance of effects, plan, fraction of patches, codec.
+"""The measure of each stage: kernel, tolerance of effects, plan, fraction of patches, what is kept of lines.
 
 `tests/benchmarks` measures plans and kernels with the same scenes and readers.
 """
@@ -17,6 +17,7 @@ from flows.tasks.patch_budget import PatchBudget, ReadingCosts
 from flows.tasks.stages.accuracy import columns_of_all_patches
 from flows.tasks.survey_model import UNIFORM_STEPS, shipped_weights
 from flows.tradeoff.entries import Setting, Tradeoff
+from flows.tradeoff.store import STORE
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.machine import keep_freed_memory
 from models.network.sizes import multiply_adds
@@ -25,7 +26,7 @@ from models.reading.inference import (
     CoarsePrediction,
     DrawnMap,
     coarse_prediction,
-    coarse_prediction_of_columns,
+    coarse_prediction_of_patches,
     segment,
 )
 from models.weights.files import Weights, load_weights
@@ -51,7 +52,6 @@ from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.selection.choice import Decision, decide
 from pipeline.simulator.selection.survey_probe import probe_scene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_block
-from storage.arrays.layout import CODECS, store_in_memory
 
 Values = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -255,15 +255,10 @@ def uniform_pass(
 ) -> PlannedPass:
     """Read a uniform scan whole; its coarse pass are the means of its own pixels, on a field of whole cells."""
     columns = columns_of_all_patches(source, sweeps, grid, weights, memory=MEMORY, resampling="catmull-rom")
-    down, across = grid.patch_shape
-    p, s, camera = grid.patch, grid.factor, source.camera
-    cells = columns.reshape(down, across, p // s, s, p // s, s, -1).mean(axis=(3, 5), dtype=np.float32)
-    small = cells.swapaxes(1, 2).reshape(down * p // s, across * p // s, -1)
-    patch_index, size = grid.valid_patches(), raw_bytes(sweeps, camera, len(source.wavelength_nm))
-    seconds = cost.seconds(sweeps, camera)
-    return PlannedPass(
-        coarse_prediction_of_columns(weights, small, grid), patch_index, columns[patch_index], weights, seconds, size
-    )
+    patch_index, size = grid.valid_patches(), raw_bytes(sweeps, source.camera, len(source.wavelength_nm))
+    seconds = cost.seconds(sweeps, source.camera)
+    seen = coarse_prediction_of_patches(weights, columns, grid)
+    return PlannedPass(seen, patch_index, columns[patch_index], weights, seconds, size)
 
 
 def part_of(scan_pass: PlannedPass, bands: int, compute: str) -> PlannedPass:
@@ -327,12 +322,11 @@ SURVEY = Tradeoff(
 )
 
 
-# segment and store: a farm seen coarsely and finely
+# segment: a farm seen coarsely and finely
 
 FARM_SHAPE = (384, 480)
 FRACTIONS = (1.0, 0.35, 0.2, 0.15, 0.1, 0.05, 0.0)
 POLICY = "gain"
-RAW_LINES = 96
 
 
 def sources_of_farm(seed: int) -> tuple[Weights, SceneGrid, SimulatedSource, Axis, list[Sweep]]:
@@ -371,25 +365,6 @@ SEGMENT = Tradeoff(
     work=lambda state: float(state.labels.size),
 )
 
-
-def capture_raw(seed: int) -> NDArray[np.uint16]:
-    """Take some raw lines (line, sample, band) of a farm."""
-    _, _, source, _, full = sources_of_farm(seed)
-    return SimulatedSweep(source, full[0]).read(0, RAW_LINES)
-
-
-STORE = Tradeoff(
-    stage="store",
-    knob="codec",
-    error="bytes stored a sample",
-    unit="sample",
-    reference=f"{RAW_LINES} raw lines of a farm, uint16, given back exactly",
-    settings=CODECS,
-    prepare=capture_raw,
-    run=lambda raw, codec: store_in_memory(raw, str(codec)),
-    judge=lambda raw, _codec, made: made[0] / raw.size if np.array_equal(made[1], raw) else np.inf,
-    work=lambda raw: float(raw.size),
-)
 
 TRADEOFFS = {one.stage: one for one in (RECTIFY, SEGMENT, SIMULATE, STORE, SURVEY)}
 

@@ -150,6 +150,15 @@ def coarse_prediction_of_columns(weights: Weights, columns: NDArray[np.generic],
     return read_coarse_prediction(weights, CoarsePass(grid, mended, living=_mend(mended, weights.config)))
 
 
+def coarse_prediction_of_patches(weights: Weights, columns: NDArray[np.float32], grid: SceneGrid) -> CoarsePrediction:
+    """Read the means over coarse pixels of all patches of the padded grid, (patch, p, p, column), as a uniform scan."""
+    down, across = grid.patch_shape
+    p, s = grid.patch, grid.factor
+    cells = columns.reshape(down, across, p // s, s, p // s, s, -1).mean(axis=(3, 5), dtype=np.float32)
+    small = cells.swapaxes(1, 2).reshape(down * p // s, across * p // s, -1)
+    return coarse_prediction_of_columns(weights, small, grid)
+
+
 def read_coarse_prediction(weights: Weights, coarse_pass: CoarsePass) -> CoarsePrediction:
     """Read a coarse pass alone."""
     with torch.inference_mode():

@@ -21,15 +21,16 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import zarr
 from numpy.typing import NDArray
-from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec, TransposeCodec, ZstdCodec
+from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec, TransposeCodec
 from zarr.storage import MemoryStore
 
-from pipeline.errors import ChunkError, IncompleteStoreError, SettingsError, ShapeError, WavelengthError
+from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError, WavelengthError
 from pipeline.geometry.grid import UNLABELLED
 
 if TYPE_CHECKING:
     from odc.geo.geobox import GeoBox
 
+StorePlace = Path | MemoryStore  # where a store lies
 CHUNK_PX = 32
 SHARD_ROWS = 64
 SHARD_COLUMNS = 640
@@ -88,9 +89,10 @@ def grid_of(attributes: Mapping[str, Any]) -> AngularGrid | None:
     return AngularGrid(float(record["ifov_rad"]), (int(y), int(x)), int(record["factor"]))
 
 
-def create_group(path: Path, title: str, attributes: Mapping[str, Any]) -> zarr.Group:
+def create_group(path: StorePlace, title: str, attributes: Mapping[str, Any]) -> zarr.Group:
     """Begin a Zarr v3 store at ``path``, which must not exist."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    if isinstance(path, Path):
+        path.parent.mkdir(parents=True, exist_ok=True)
     return zarr.create_group(path, zarr_format=3, attributes={"Conventions": "CF-1.12", "title": title, **attributes})
 
 
@@ -222,7 +224,7 @@ def consolidate_stores(folder: Path) -> None:
                 zarr.consolidate_metadata(path)
 
 
-def open_group(path: Path) -> zarr.Group:
+def open_group(path: StorePlace) -> zarr.Group:
     """Open a store for reading (IncompleteStoreError: there is none, or its metadata is damaged)."""
     try:
         return zarr.open_group(path, mode="r", zarr_format=3, use_consolidated=False)
@@ -277,39 +279,19 @@ def round_bits(values: NDArray[np.floating], *, out: NDArray[np.float32] | None 
     return found
 
 
-BLOSC = {"lz4-5": ("lz4", 5), "zstd-1": ("zstd", 1), "zstd-3": ("zstd", 3), "zstd-5": ("zstd", 5)}
-CODECS = ("none", *BLOSC, "zstd-3 bytes in order")
-
-
-def store_in_memory(values: NDArray[Any], codec: str) -> tuple[int, NDArray[Any]]:
-    """Write an image (y, x, band) with one codec and read it back; gives the bytes stored and what was read.
-
-    Raises SettingsError: the codec is none of ``CODECS``.
-    """
+def numbers_in_memory(values: NDArray[Any]) -> tuple[int, zarr.Array[Any]]:
+    """Store whole numbers (line, sample, band) in memory, in chunks of raw lines; the bytes taken, and the array."""
     held: dict[str, Any] = {}
-    spec = image_spec(("y", "x", "band"), values.shape, values.dtype.str)
-    array = zarr.create_array(
-        MemoryStore(store_dict=held),
-        shape=spec.shape,
-        dtype=values.dtype,
-        chunks=spec.chunk,
-        shards=spec.shard,
-        compressors=(*_compressors(codec, values.dtype.itemsize), Crc32cCodec()),
-    )
+    group = zarr.create_group(MemoryStore(store_dict=held), zarr_format=3)
+    spec = image_spec(("line", "sample", "band"), values.shape, values.dtype.str)
+    array = create_array(group, "dn", spec, {})
     array[...] = values
-    size = sum(len(part) for name, part in held.items() if not name.endswith("zarr.json"))
-    return size, np.asarray(array[...])
+    return bytes_held(held, "dn"), array
 
 
-def _compressors(codec: str, size: int) -> tuple[Any, ...]:
-    if codec == "none":
-        return ()
-    if codec == "zstd-3 bytes in order":
-        return (ZstdCodec(level=3),)
-    if codec not in BLOSC:
-        raise SettingsError(f"the codec must be one of {', '.join(CODECS)}, got {codec!r}")
-    name, level = BLOSC[codec]
-    return (BloscCodec(cname=name, clevel=level, shuffle=BloscShuffle.bitshuffle, typesize=size),)  # type: ignore[arg-type]
+def bytes_held(held: Mapping[str, Any], *names: str) -> int:
+    """Return what some arrays of a store in memory take, without their metadata."""
+    return sum(len(part) for key, part in held.items() if key.split("/")[0] in names and not key.endswith("zarr.json"))
 
 
 def blank_pixels(path: Path, where: NDArray[np.bool_], images: Mapping[str, float]) -> None:

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import zarr
 from numpy.typing import NDArray
+from zarr.storage import MemoryStore
 
 from pipeline.errors import OldStoreError
 from pipeline.geometry.mirror import mirror_throughput
@@ -31,6 +32,8 @@ from storage.arrays.cubes import RawCube, SweepHeader, open_raw_cube, write_line
 from storage.arrays.layout import (
     SHARD_ROWS,
     ArraySpec,
+    StorePlace,
+    bytes_held,
     create_array,
     create_group,
     damage_named,
@@ -48,6 +51,7 @@ SHARD_SAMPLES = 640
 FRAMES_OF = "frames_of"  # attribute: the sweep beside it that holds the dark and white frames of both
 REPROCESS = "`spectralzoom reprocess ARCHIVE` makes its run anew"
 MOST_DN = np.iinfo(np.uint16).max
+SIGNAL_ARRAYS = ("scores", "quality", "axes", "mean", "noise", "rare_line", "rare_sample", "rare_residual")
 LARGEST_SHORT = 32_000  # of scores and residuals in steps; larger ones are stored in 32 bits
 
 
@@ -117,7 +121,7 @@ class SignalCubeWriter:
 
     def __init__(
         self,
-        path: Path,
+        path: StorePlace,
         header: SweepHeader,
         components: Components,
         *,
@@ -194,7 +198,7 @@ class SignalCube:
     source: str
     started: str | None
     group: zarr.Group
-    path: Path
+    path: Path | None  # None: in memory
 
     @property
     def simulation(self) -> Any:
@@ -211,7 +215,9 @@ class SignalCube:
     def references(self) -> References:
         """Dark and white frames."""
         shared = self.group.attrs.get(FRAMES_OF)
-        group = self.group if shared is None else open_group(self.path.with_name(f"{shared}.zarr"))
+        group = self.group
+        if shared is not None and self.path is not None:
+            group = open_group(self.path.with_name(f"{shared}.zarr"))
         dark, white, white_reference = (read_array(group, name) for name in ("dark", "white", "white_reference"))
         bad, flat = (read_array(group, name) if name in group else None for name in ("bad", "flat"))
         return References(dark, white, white_reference, bad, flat, bool(self.group.attrs.get("by_mirror", False)))
@@ -262,7 +268,7 @@ class SignalCube:
         return quicklook_of(self.group)
 
 
-def check_condensed(group: zarr.Group, path: Path) -> None:
+def check_condensed(group: zarr.Group, path: StorePlace) -> None:
     """Refuse a store of spectra that an earlier version wrote band by band (OldStoreError)."""
     if "scores" not in group and "values" in group:
         raise OldStoreError(f"{path} holds spectra band by band, as earlier versions stored them; {REPROCESS}")
@@ -288,7 +294,7 @@ def read_coordinates(
     return {name: (dims[name], read_array(group, name), dict(there[name].attrs)) for name in names if name in there}
 
 
-def open_signal_cube(path: Path) -> SignalCube:
+def open_signal_cube(path: StorePlace) -> SignalCube:
     """Open a condensed sweep.
 
     Raises IncompleteStoreError: there is none, it was not closed, it is damaged, or of an earlier version.
@@ -313,7 +319,7 @@ def open_signal_cube(path: Path) -> SignalCube:
         source=str(group.attrs.get("source", "")),
         started=None if "started" not in group.attrs else str(group.attrs["started"]),
         group=group,
-        path=path,
+        path=path if isinstance(path, Path) else None,
     )
 
 
@@ -357,3 +363,21 @@ def open_lines(path: Path) -> RawCube:
     one = open_signal_cube(path)
     facts = (one.position, one.time_s, one.exposure_ms, one.valid_line, one.source, one.started, one.group)
     return RestoredCube(one.sweep, one.references, one.wavelength_nm, one.fwhm_nm, *facts, signal=one)
+
+
+class SignalCubeInMemory:
+    """A condensed sweep that is written to memory, by the writer of files and read by their reader."""
+
+    def __init__(self, header: SweepHeader, components: Components, *, step: float, largest: float) -> None:
+        self._held: dict[str, Any] = {}
+        self._store = MemoryStore(store_dict=self._held)
+        self.writer = SignalCubeWriter(self._store, header, components, step=step, largest=largest)
+
+    @property
+    def size(self) -> int:
+        """Bytes of the signal: scores, their law and rare spectra, without what stores of raw lines hold as well."""
+        return bytes_held(self._held, *SIGNAL_ARRAYS)
+
+    def open(self) -> SignalCube:
+        """Open what was written."""
+        return open_signal_cube(self._store)

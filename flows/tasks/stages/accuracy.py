@@ -37,6 +37,7 @@ from models.evaluation.placement import CONTROL_FRACTION, run_controls
 from models.reading.inference import read_coarse_prediction, segment
 from models.reading.regions import whole_field
 from models.weights.files import Weights
+from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.geometry.scan import Axis, Sweep
 from pipeline.lazy import Once
@@ -44,6 +45,7 @@ from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.region import read_patches
 from pipeline.simulator.effects.pointing import CommonOffset, PointingErrors
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+from pipeline.source import SweepLines
 from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table
 from storage.archive.whole_files import to_json
@@ -220,17 +222,35 @@ def columns_of_all_patches(
     Gives (patch, p, p, column) float32 of the padded grid; patches beyond the scene are 0. ``memory`` is in bytes.
     """
     sweeps = [SimulatedSweep(source, sweep) for sweep in full]
+    bands = source.wavelength_nm
+    return columns_of_sweeps(
+        sweeps, source.camera, bands, grid, weights, memory=memory, resampling=resampling, report=report
+    )
+
+
+def columns_of_sweeps(
+    sweeps: Sequence[SweepLines],
+    camera: LineCamera,
+    wavelength_nm: NDArray[np.floating],
+    grid: SceneGrid,
+    weights: Weights,
+    *,
+    memory: int,
+    resampling: Kernel,
+    report: Report = lambda done: None,
+) -> NDArray[np.float32]:
+    """Rectify sweeps over a whole scene, a band of patches at a time; see `columns_of_all_patches`."""
     p, valid = grid.patch, grid.valid_patches()
     columns = np.zeros((int(np.prod(grid.patch_shape)), p, p, weights.basis.columns), np.float32)
     row, column = np.divmod(valid, grid.patch_shape[1])
-    place = row if full[0].along == "x" else column  # bands lie across the scan, as deep as fits
-    one = int(np.count_nonzero(place == 0)) * p**2 * len(source.wavelength_nm) * 4
+    place = row if sweeps[0].sweep.along == "x" else column  # bands lie across the scan, as deep as fits
+    one = int(np.count_nonzero(place == 0)) * p**2 * len(wavelength_nm) * 4
     deep = max(1, memory // MEMORY_FRACTION // one)
     done = 0
     for band in range(int(place.max()) // deep + 1):
         patch_index = valid[place // deep == band]
-        values, _ = read_patches(sweeps, source.camera, grid, patch_index, resampling)
-        columns[patch_index] = weights.columns(values, source.wavelength_nm)
+        values, _ = read_patches(sweeps, camera, grid, patch_index, resampling)
+        columns[patch_index] = weights.columns(values, wavelength_nm)
         done += len(patch_index)
         report(done / len(valid))
     return columns

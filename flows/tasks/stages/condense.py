@@ -60,16 +60,27 @@ def _condensed(raw: StageRef, camera: LineCamera, choice: SignalChoice, noise_kn
             components, ResidualLaw.learned(found.spectra, components), camera, choice.rare_spectra, choice.step
         )
         done = _write_sweeps(path, cubes, condenser, found, report)
-        rare, spectra = sum(len(one.rare) for one in done), sum(one.known for one in done)
-        if rare > max(2 * components.bands, SHARED_FRACTION * spectra):
-            residuals = np.concatenate([one.residuals for one in done]) * np.float32(RESIDUAL_STEP)
-            shared = with_shared(components, residuals, choice.false_alarm)
-            if len(shared) > len(components):
-                condenser = replace(condenser, components=shared, law=ResidualLaw.learned(found.spectra, shared))
-                done = _write_sweeps(path, cubes, condenser, found, report)
+        better = with_shared_directions(condenser, done, found, choice.false_alarm)
+        if better is not None:
+            condenser, done = better, _write_sweeps(path, cubes, better, found, report)
         write_table(path / RECORD, _record(condenser, done))
 
     return Wanted(build, {"camera": _camera_key(camera), **asdict(choice)}, [raw])
+
+
+def with_shared_directions(
+    condenser: Condenser, done: Sequence[CondensedSweep], found: SignalStatistics, false_alarm: float
+) -> Condenser | None:
+    """Return a condenser with the directions too that many rare spectra share; None where there are none."""
+    rare, spectra = sum(len(one.rare) for one in done), sum(one.known for one in done)
+    components = condenser.components
+    if rare <= max(2 * components.bands, SHARED_FRACTION * spectra):
+        return None
+    residuals = np.concatenate([one.residuals for one in done]) * np.float32(RESIDUAL_STEP)
+    shared = with_shared(components, residuals, false_alarm)
+    if len(shared) == len(components):
+        return None
+    return replace(condenser, components=shared, law=ResidualLaw.learned(found.spectra, shared))
 
 
 def _camera_key(camera: LineCamera) -> dict[str, Any]:

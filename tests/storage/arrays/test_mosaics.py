@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from pipeline.errors import ChunkError, IncompleteStoreError, SettingsError, ShapeError
+from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError
 from pipeline.geometry.grid import SceneGrid
-from storage.arrays.layout import CODECS, AngularGrid, round_bits, store_in_memory
+from storage.arrays.layout import AngularGrid, round_bits
 from storage.arrays.mosaics import MosaicWriter, open_mosaic, patch_scores
 from tests.storage.plain_mosaic import plain_writer, write_values
 
@@ -167,20 +167,3 @@ def test_halves_are_rounded_to_even() -> None:
     """1 + 2^-12 lies in the middle between two numbers of 11 bits, as 1 + 3 * 2^-12 does."""
     halves = np.array([1 + 2.0**-12, 1 + 3 * 2.0**-12, -1 - 2.0**-12], np.float32)
     assert round_bits(halves).tolist() == [1.0, 1 + 2.0**-10, -1.0]
-
-
-LINES = np.random.default_rng(0).poisson(300, (40, 70, 9)).astype(np.uint16)
-
-
-@pytest.mark.parametrize("codec", CODECS)
-def test_numbers_come_back(codec: str) -> None:
-    """No codec changes a number; one that is not known is refused with those there are."""
-    _, back = store_in_memory(LINES, codec)
-    np.testing.assert_array_equal(back, LINES)
-    with pytest.raises(SettingsError, match="one of none, lz4-5"):
-        store_in_memory(LINES, "brotli")
-
-
-def test_bit_planes_compress_better_than_bytes_in_order() -> None:
-    """The default codec holds counts with noise in fewer bytes than plain zstd."""
-    assert store_in_memory(LINES, "zstd-3")[0] < store_in_memory(LINES, "zstd-3 bytes in order")[0] < LINES.nbytes

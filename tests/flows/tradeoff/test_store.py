@@ -1,0 +1,121 @@
+"""Ways to keep the lines of a scan: what each gives back, in how many bytes, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from flows.tradeoff import store
+from flows.tradeoff.command import run_tradeoff
+from flows.tradeoff.entries import Point, measure_tradeoff
+from flows.tradeoff.scan_lines import ScanLines, block_means_of, scan_farm, scan_raster
+from flows.tradeoff.store import STORE, WAYS, not_here, store_tradeoff
+from pipeline.errors import SceneError, SettingsError
+from pipeline.geometry.camera import LineCamera
+
+SMALL = (96, 160)
+BYTES, BLOCK, MIOU = STORE.beside  # a spectrum, of means, of the map
+STEPS = tuple(f"condensed, step {step:g}" for step in store.STEPS)
+
+
+@pytest.fixture(scope="module")
+def farm() -> ScanLines:
+    """Lines of a small farm."""
+    return scan_farm(3, SMALL, LineCamera(samples=192))
+
+
+@pytest.fixture(scope="module")
+def points(farm: ScanLines) -> dict[str, Point]:
+    """Every way on those lines, by its name."""
+    found = measure_tradeoff(replace(STORE, prepare=lambda seed: farm), repeats=1)
+    assert {*found.missing} == {str(one) for one in WAYS if not_here(one)}
+    return {str(point.setting): point for point in found.points}
+
+
+def cube_of(path: Path, shape: tuple[int, int, int] = (24, 24, 12), offset: float = 0.0) -> str:
+    """Write whole numbers of two materials with noise, as a raster without labels."""
+    rng = np.random.default_rng(0)
+    spectra = np.linspace(800, 2000, shape[2])[None] * np.array([[1.0], [1.4]])
+    values = spectra[(np.arange(shape[0]) > 9).astype(int)][:, None] + rng.normal(0, 9, shape)
+    np.save(path, np.rint(values) + offset)
+    (path.parent / "scene.toml").write_text(f"wavelengths_nm = {np.linspace(400, 900, shape[2]).tolist()}\n")
+    return str(path)
+
+
+def test_bytes_fall_with_the_step_and_the_error_grows(points: dict[str, Point]) -> None:
+    """Of components, of rounded numbers and of principal components alike; a step of nothing is the raw error."""
+    for family in (STEPS, [f"rounded, {step:g}" for step in store.ROUNDED], [f"PCA, step {s:g}" for s in store.STEPS]):
+        rows = [points[name] for name in family]
+        sizes, errors = [row.beside[BYTES] for row in rows], [row.error for row in rows]
+        assert sizes == sorted(sizes, reverse=True)
+        assert errors == sorted(errors)
+        assert len({*sizes}) == len({*errors}) == len(rows)
+
+
+def test_raw_lines_err_by_their_noise_and_components_by_little_of_it(points: dict[str, Point]) -> None:
+    """One deviation, by the light of the simulator; ten components of 270 hold a twentieth of the noise's variance."""
+    assert points["raw"].error == pytest.approx(1, abs=0.01)
+    fine = points[STEPS[0]]
+    assert fine.error < 0.3
+    assert fine.paid == fine.beside[BYTES] < points["raw"].beside[BYTES] / 10
+    assert points["binned, 17 bands"].beside[BLOCK] > 1 > points["raw"].beside[BLOCK]
+
+
+def test_the_map_is_drawn_of_what_comes_back(points: dict[str, Point]) -> None:
+    """Nearly that of raw lines from fine components, a poorer one of wide bins."""
+    assert 0 < points["binned, 17 bands"].beside[MIOU] < points["raw"].beside[MIOU] - 5
+    assert points[STEPS[0]].beside[MIOU] == pytest.approx(points["raw"].beside[MIOU], abs=5)
+
+
+def test_lossless_ways_give_raw_lines_back(farm: ScanLines) -> None:
+    """To the last bit; rounding by half a step at most."""
+    for name in ("raw", "pcodec, exact"):
+        if not_here(name) is None:
+            np.testing.assert_array_equal(WAYS[name](farm).restore(), farm.values)
+    unit = 0.5 * farm.noise_dn.astype(np.float32)
+    limit = farm.calibrated(np.zeros_like(farm.values) + unit / 2 + 64) * 1.001
+    assert (np.abs(WAYS["rounded, 0.5"](farm).restore() - farm.values) <= limit + 1e-6).all()
+
+
+def test_a_raster_is_measured_by_its_own_pixels(tmp_path: Path) -> None:
+    """Its raw row has no error, its figures no map without weights, and its noise is estimated."""
+    tradeoff = replace(store_tradeoff(cube_of(tmp_path / "cube.npy"), None), settings=("raw", *STEPS))
+    raw, *condensed = measure_tradeoff(tradeoff, repeats=1).points
+    assert raw.error == raw.beside[BLOCK] == 0
+    assert np.isnan(raw.beside[MIOU])
+    assert all(0.5 < point.error < 1.2 for point in condensed)
+    assert scan_raster(str(tmp_path / "cube.npy"), None).noise_dn == pytest.approx(9, rel=0.3)
+
+
+def test_what_cannot_run_is_told_and_left_out(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A package that is not installed or a driver that GDAL lacks; the caption says which and what to do."""
+    monkeypatch.setattr(store.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(store, "JP2_DRIVER", "JP2None")
+    chosen = ("raw", "pcodec, exact", "PCA, JPEG 2000, 1 B")
+    tradeoff = replace(store_tradeoff(cube_of(tmp_path / "cube.npy"), None), settings=chosen)
+    found = measure_tradeoff(tradeoff, repeats=1)
+    assert [point.setting for point in found.points] == ["raw"]
+    assert "pip install 'spectralzoom[bench]'" in found.missing["pcodec, exact"]
+    assert "no driver JP2None" in found.missing["PCA, JPEG 2000, 1 B"]
+
+
+def test_scenes_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    """Another stage has no scene, weights alone read none, and numbers with parts are no raw ones."""
+    quiet = Console(quiet=True)
+    for stage, scene in (("rectify", "cube.npy"), (None, "cube.npy"), ("store", None)):
+        with pytest.raises(SettingsError, match="for the stage store alone"):
+            run_tradeoff(stage, tmp_path, 1, 0, quiet, scene=scene, weights=Path("w.safetensors"))
+    with pytest.raises(SceneError, match="no whole ones from 0 to 65534"):
+        scan_raster(cube_of(tmp_path / "cube.npy", offset=0.5), None)
+
+
+def test_blocks_are_averaged_whole() -> None:
+    """Means of each, the rest left out; a smaller image is one block."""
+    values = np.arange(4 * 6, dtype=np.float32).reshape(4, 6, 1)
+    np.testing.assert_array_equal(block_means_of(values, 2)[..., 0], [[3.5, 5.5, 7.5], [15.5, 17.5, 19.5]])
+    assert block_means_of(values, 5).shape == (1, 1, 1)
+    assert block_means_of(values[:, :3], 64).item() == values[:, :3].mean()
