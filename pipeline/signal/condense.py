@@ -10,13 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
-from scipy.special import ndtri
+from scipy.special import chdtri
 
 from pipeline.readings import SIGMA_OF_MEDIAN
 from pipeline.signal.components import Components
 
 WHOLE, PARTIAL, UNUSABLE = 0, 1, 2  # all bands seen; some restored from the others; less than half of the bands seen
 JOINT = ((2, 2), (1, 8), (8, 1))  # (line, sample) of neighbours whose residuals are tested together
+ALONE = 1e-3  # what one spectrum of noise exceeds so rarely is the most that it counts beside its neighbours
 LAW_ROUNDS, LAW_CLIP = 4, 4.0
 LEAST_EXPECTED = 0.2  # of the mean residual, whatever the law says of dark or bright spectra ...
 LEAST_RESIDUAL = 0.02  # ... and of the noise's variance: less is rounding
@@ -52,7 +53,7 @@ def score_lines(values: NDArray[np.float32], valid: Bools, components: Component
     if (broken & (quality == WHOLE)).any():
         there = np.isfinite(values[broken]) & lit & (valid[broken] if valid.ndim == 3 else valid[broken][:, None])
         white = np.where(there, components.white(values[broken]), np.float32(0))
-        scores[broken], residual[broken] = _least_squares(white, there, components.axes.T.astype(np.float32))
+        scores[broken], residual[broken] = _least_squares(white, there, components.axes.T.astype(np.float32), bands)
         seen = there.sum(axis=1)
         quality[broken] = np.where(2 * seen < bands, UNUSABLE, np.where(seen < bands, PARTIAL, quality[broken]))
     unusable = quality == UNUSABLE
@@ -80,8 +81,11 @@ def _projected(values: NDArray[np.float32], components: Components) -> tuple[Sco
     return scores.reshape(*values.shape[:-1], len(components)), left.reshape(values.shape[:-1])
 
 
-def _least_squares(white: Scores, there: Bools, axes: Scores) -> tuple[Scores, Scores]:
-    """Scores (n, component) and residuals (n,) of whitened spectra (n, band), by the bands that are there."""
+def _least_squares(white: Scores, there: Bools, axes: Scores, bands: int) -> tuple[Scores, Scores]:
+    """Scores (n, component) and residuals (n,) of whitened spectra (n, band), by those of ``bands`` that are there.
+
+    Missing bands count as noise in the residual: it spreads no more than that of a whole spectrum.
+    """
     count = axes.shape[1]
     products = (axes[:, :, None] * axes[:, None, :]).reshape(len(axes), -1)
     scores, residual = np.empty((len(white), count), np.float32), np.empty(len(white), np.float32)
@@ -92,7 +96,8 @@ def _least_squares(white: Scores, there: Bools, axes: Scores) -> tuple[Scores, S
         found = np.linalg.solve(gram, (white[part] @ axes).astype(np.float64)[..., None])[..., 0]
         scores[part] = found
         rest = np.where(there[part], white[part] - scores[part] @ axes.T, 0)
-        residual[part] = np.einsum("nb,nb->n", rest, rest) / np.maximum(there[part].sum(axis=1) - count, 1)
+        left = np.einsum("nb,nb->n", rest, rest) + np.minimum(bands - there[part].sum(axis=1), bands - count)
+        residual[part] = left / max(bands - count, 1)
     return scores, residual
 
 
@@ -138,21 +143,26 @@ def find_rare(ratio: NDArray[np.float32], law: ResidualLaw, false_alarm: float) 
     whole image that noise alone may mark, over all tests together.
     """
     known = np.isfinite(ratio)
-    count = max(int(known.sum()), 1)
-    limit = float(ndtri(1 - min(false_alarm / (1 + len(JOINT)) / count, 0.5)))
-    rare = known & (_deviations(np.where(known, ratio, 1), law.freedom) > limit)
-    filled = np.where(known, ratio, 1).astype(np.float64)
+    share = false_alarm / (1 + len(JOINT)) / max(int(known.sum()), 1)
+    rare = known & (ratio > _limit(law.freedom, share))
+    filled = np.where(known, np.minimum(ratio, _limit(law.freedom, ALONE)), 1).astype(np.float64)
     for lines, samples in JOINT:
         if lines > ratio.shape[0] or samples > ratio.shape[1]:
             continue
-        mean = uniform_filter(filled, (lines, samples), mode="nearest")
-        high = _deviations(mean, law.freedom * lines * samples) > limit
+        size = lines * samples
+        mean = uniform_filter(filled, (lines, samples))
+        high = np.zeros(ratio.shape, np.float32)
+        within = tuple(slice(side // 2, (side // 2 - side + 1) or None) for side in (lines, samples))
+        high[within] = mean[within] > _limit(law.freedom * size, share / size)
         if high.any():  # all spectra of the window
-            reach = uniform_filter(
-                high.astype(np.float32), (lines, samples), mode="constant", origin=_back(lines, samples)
-            )
-            rare |= known & (reach > 0.5 / (lines * samples))
+            reach = uniform_filter(high, (lines, samples), mode="constant", origin=_back(lines, samples))
+            rare |= known & (reach > 0.5 / size)
     return rare
+
+
+def _limit(freedom: float, false_alarm: float) -> float:
+    """Mean square of noise, over its expectation, that is exceeded with a probability."""
+    return float(chdtri(freedom, min(false_alarm, 0.5)) / freedom)
 
 
 def _back(lines: int, samples: int) -> tuple[int, int]:
@@ -160,18 +170,10 @@ def _back(lines: int, samples: int) -> tuple[int, int]:
     return tuple(-1 if size % 2 == 0 else 0 for size in (lines, samples))  # type: ignore[return-value]
 
 
-def _deviations(ratio: NDArray[np.floating], freedom: float) -> NDArray[np.floating]:
-    """Deviations from normal of a mean square over its expectation (Wilson & Hilferty 1931)."""
-    width = 2 / (9 * freedom)
-    deviations: NDArray[np.floating] = (np.cbrt(ratio) - (1 - width)) / np.sqrt(width)
-    return deviations
-
-
 def residual_steps(
     values: NDArray[np.float32], scores: Scores, components: Components, valid: Bools | None = None
-) -> NDArray[np.int16]:
+) -> NDArray[np.int32]:
     """What (n, component) scores leave of (n, band) spectra, in half deviations of the noise; 0 in missing bands."""
     left = components.white(values) - scores @ components.axes.astype(np.float32)
     there = np.isfinite(left) if valid is None else np.isfinite(left) & valid
-    steps = np.rint(np.where(there, left, 0) / RESIDUAL_STEP)
-    return np.clip(steps, -32767, 32767).astype(np.int16)
+    return np.rint(np.where(there, left, 0) / RESIDUAL_STEP).astype(np.int32)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,8 +43,8 @@ Bools = NDArray[np.bool_]
 class SignalStatistics:
     """Second moments of spectra, of their means over 4 x 4 and of neighbours' differences, and some spectra as such.
 
-    Spectra are centred on a mean of the first ones, so that nothing cancels. Those with less than half of their bands
-    are left out; where single bands are missing they count as the mean.
+    Spectra are centred on a mean of the first ones, so that nothing cancels. Those that miss bands are left out: they
+    would count as the mean there, and make a direction of it. Where most miss some, those with half of them count so.
     """
 
     bands: int
@@ -65,7 +66,8 @@ class SignalStatistics:
         self.total, self.block_total, self.largest = np.zeros((3, self.bands))
         self.single, self.block = np.zeros((2, self.bands, self.bands))
         wanted = max(SPECTRA_A_BAND * self.bands, 4 * KEPT_SPECTRA)
-        self._stride = int(np.clip(np.sqrt(self.expected / wanted), 1, BLOCK))
+        sides = 2 ** round(np.log2(max(self.expected / wanted, 1)) / 2)  # they divide a block's: blocks all begin alike
+        self._stride = min(sides, BLOCK)
         self._thin = max(1, round(self.expected / self._stride**2 / KEPT_SPECTRA))
 
     def add(self, values: Values, valid: Bools) -> None:
@@ -80,15 +82,16 @@ class SignalStatistics:
             shape = (lines, BLOCK, samples, BLOCK)
             every = whole[cut].reshape(shape).all(axis=(1, 3))
             rows = spectra[cut].reshape(lines, BLOCK, samples * BLOCK, -1).sum(axis=1)
-            means = rows.reshape(lines, samples, BLOCK, -1).sum(axis=2)[every] / np.float32(BLOCK * BLOCK)
-            self.block += means.T @ means
-            self.block_total += means.sum(axis=0, dtype=np.float64)
+            means = (rows.reshape(lines, samples, BLOCK, -1).sum(axis=2)[every] / BLOCK**2).astype(np.float64)
+            self.block += means.T @ means  # float32 would round off the noise below a signal of 300 deviations
+            self.block_total += means.sum(axis=0)
             self.means += len(means)
         thin = np.s_[:: self._stride, :: self._stride]
         some = spectra[thin][whole[thin]]
-        self.single += some.T @ some
-        self.total += some.sum(axis=0, dtype=np.float64)
-        self.kept.append(some[:: self._thin].copy())
+        exact = some.astype(np.float64)
+        self.single += exact.T @ exact
+        self.total += exact.sum(axis=0)
+        self.kept.append(some[-self.count % self._thin :: self._thin].copy())
         self.count += len(some)
         if self.bands <= FEW_BANDS:
             self._add_rough(spectra, whole)
@@ -97,18 +100,20 @@ class SignalStatistics:
         """Return spectra from the origin with 0 for what is missing, and which of them count."""
         by_band = valid if valid.ndim == 3 else valid[..., None]
         if self.origin is None or not self.lit.all():
-            there = by_band & np.isfinite(values)
-            counts, seen = there.sum(axis=(0, 1)), there.any(axis=(0, 1))
-            first = np.where(there, values, 0).sum(axis=(0, 1), dtype=np.float64) / np.maximum(counts, 1)
+            known = by_band & np.isfinite(values)
+            seen = known.sum(axis=(0, 1))
+            first = np.where(known, values, 0).sum(axis=(0, 1), dtype=np.float64) / np.maximum(seen, 1)
             before = np.zeros(self.bands, np.float32) if self.origin is None else self.origin
-            self.origin = np.where(self.lit, before, np.where(seen, first, 0)).astype(np.float32)
-            self.lit |= seen
+            self.origin = np.where(self.lit, before, first).astype(np.float32)
+            self.lit |= seen > 0
         spectra = values - self.origin
         if valid.ndim == 2 and valid.all() and self.lit.all() and np.isfinite(spectra).all():
             return spectra, valid
         there = np.isfinite(spectra) & by_band
         spectra = np.where(there, spectra, np.float32(0))
-        return spectra, np.asarray(2 * there.sum(axis=2) >= max(self.lit.sum(), 1))
+        seen, bands = there.sum(axis=2), max(int(self.lit.sum()), 1)
+        whole, usable = seen == bands, 2 * seen >= bands
+        return spectra, np.asarray(whole if 2 * whole.sum() >= usable.sum() else usable)
 
     @property
     def spectra(self) -> Values:
@@ -167,11 +172,12 @@ def find_components(
     model = None if noise is None else noise[lit]
     sigma = _noise(found, covariance, lit, mean[lit], model)
     loadings, deviations = np.zeros((0, found.bands)), np.full(found.bands, np.nan)
-    for _ in range(NOISE_ROUNDS if len(lit) > FEW_BANDS and found.count >= 4 * len(lit) else 1):
-        white = np.outer(sigma, sigma)
-        axes = _axes(found, covariance / white, lit, white, false_alarm, least)
-        if len(lit) > FEW_BANDS and found.count >= 4 * len(lit):
-            sigma = sigma * _left_over(covariance / white, axes)
+    for _ in range(NOISE_ROUNDS if len(lit) > FEW_BANDS and found.count >= 4 * len(lit) else 0):
+        scale = np.outer(sigma, sigma)
+        axes = _axes(found, covariance / scale, lit, scale, false_alarm, least)
+        sigma = sigma * _left_over(covariance / scale, axes)
+    scale = np.outer(sigma, sigma)
+    axes = _axes(found, covariance / scale, lit, scale, false_alarm, least)
     loadings = np.zeros((axes.shape[1], found.bands))
     loadings[:, lit] = axes.T
     deviations[lit] = sigma
@@ -230,9 +236,9 @@ def _axes(
     axes = np.zeros((bands, 0))
     if found.means >= 2 * bands:
         means, _ = _covariance(found.block, found.block_total, found.means)
-        axes = significant_axes(BLOCK**2 * means[np.ix_(lit, lit)] / scale, found.means, false_alarm)
+        axes = significant_axes(BLOCK**2 * means[np.ix_(lit, lit)] / scale, found.means, false_alarm / 2)
     rest = np.eye(bands) - axes @ axes.T
-    more = significant_axes(rest @ white @ rest, found.count, false_alarm, known=axes.shape[1])
+    more = significant_axes(rest @ white @ rest, found.count, false_alarm / 2, known=axes.shape[1])
     axes = np.concatenate([axes, more], axis=1)
     if axes.shape[1] < min(least, bands):
         rest = np.eye(bands) - axes @ axes.T
@@ -282,15 +288,19 @@ def noise_edge(values: Floats, ratio: float, false_alarm: float) -> float:
     middle, low = float(np.median(values)), float(values[count // 10])
     spread = np.sqrt(ratio)
     if middle > 0 and spread < 1:
-        observed = max(middle - low, 0.0) / middle
-        tries = np.geomspace(spread, 1.0, 60)
-        expected = np.array([_law_spread(one) for one in tries])
-        spread = float(np.interp(observed, expected, tries)) if observed > expected[0] else spread
+        tries, expected = _law_spreads()
+        spread = max(spread, float(np.interp(max(middle - low, 0.0) / middle, expected, tries)))
     variance = middle / max(1 - spread**2 / 3, 0.5)
     edge = variance * (1 + spread) ** 2
     width = variance * spread * (1 + spread) ** (4 / 3) * (count ** (-2 / 3))
     quantile = float(np.interp(-np.log(false_alarm), -np.log(TRACY_WIDOM[0]), TRACY_WIDOM[1]))
     return float(edge + quantile * width)
+
+
+@cache
+def _law_spreads() -> tuple[Floats, Floats]:
+    tries = np.geomspace(1e-3, 1.0, 200)
+    return tries, np.array([_law_spread(one) for one in tries])
 
 
 def _law_spread(spread: float) -> float:

@@ -54,12 +54,15 @@ def camera_noise(
 ) -> NDArray[np.float64]:
     """Standard deviation of a sample's noise by the camera's model, (band,) scene value, at the mean of a band.
 
-    Read noise, shot noise of the signal and rounding to DN, for sums of ``binning`` neighbours.
+    NaN in bands without light. Read noise, shot noise of the signal and rounding, for sums of ``binning`` neighbours.
     """
-    gain = np.nanmedian(judge_elements(references).gain, axis=0).astype(np.float64)
+    elements = judge_elements(references)
+    gain = np.full(len(elements.lit), np.nan)
+    gain[elements.lit] = np.nanmedian(elements.gain[:, elements.lit], axis=0)
     signal_dn = np.maximum(np.nan_to_num(components_mean / gain), 0)
     read = binning * (camera.read_noise_e / camera.electrons_per_dn) ** 2
-    return np.abs(gain) * np.sqrt(read + signal_dn / camera.electrons_per_dn + 1 / 12)
+    noise: NDArray[np.float64] = np.abs(gain) * np.sqrt(read + signal_dn / camera.electrons_per_dn + 1 / 12)
+    return noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +70,7 @@ class CondensedSweep:
     """What is known of a sweep once its scores are stored."""
 
     rare: NDArray[np.intp]  # (rare, 2) line and sample, by line
-    residuals: NDArray[np.int16]  # (rare, band) in half deviations of the noise
+    residuals: NDArray[np.int32]  # (rare, band) in half deviations of the noise
     known: int  # spectra of which enough bands were seen
 
 
@@ -93,9 +96,9 @@ class Condenser:
         rare = find_rare(ratio, self.law, self.false_alarm)
         return CondensedSweep(np.argwhere(rare), self._residuals(lines, rare), int(np.isfinite(ratio).sum()))
 
-    def _residuals(self, lines: SweepLines, rare: NDArray[np.bool_]) -> NDArray[np.int16]:
+    def _residuals(self, lines: SweepLines, rare: NDArray[np.bool_]) -> NDArray[np.int32]:
         """Return the (rare, band) residuals of rare spectra from their rounded scores; their lines are read again."""
-        found = [np.zeros((0, self.components.bands), np.int16)]
+        found = [np.zeros((0, self.components.bands), np.int32)]
         blocks = set((np.flatnonzero(rare.any(axis=1)) // BLOCK_LINES).tolist())
         for first, values, valid in calibrated_blocks(lines, self.camera, blocks):
             here = rare[first : first + len(values)]

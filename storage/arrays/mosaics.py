@@ -33,7 +33,14 @@ from storage.arrays.layout import (
     write_image,
 )
 from storage.arrays.quicklooks import Quicklook, write_quicklook
-from storage.arrays.signal_cubes import LARGEST_SHORT, check_condensed, read_components, score_spec, write_components
+from storage.arrays.signal_cubes import (
+    LARGEST_SHORT,
+    check_condensed,
+    read_components,
+    score_spec,
+    whole_steps,
+    write_components,
+)
 from storage.parallel.pool import WorkerPool, run_blocks
 
 HALF = 0.5  # of a pixel's finer ones: of fewer seen it has no value
@@ -116,8 +123,8 @@ class MosaicWriter:
         whole_shards("the mosaic", (rows, columns), shape, self.tile_shape)
         seen = coverage > 0
         if count:
-            steps = np.rint(scores / np.float32(self._step))
-            seen = seen & np.isfinite(steps).all(axis=2)
+            steps = whole_steps(scores, self._step, self._scores.dtype)
+            seen = seen & np.isfinite(scores).all(axis=2)
             steps = np.where(seen[..., None], steps, np.float32(_unseen(self._scores.dtype.str)))
             self._scores[:, rows, columns] = np.ascontiguousarray(steps.transpose(2, 0, 1)).astype(self._scores.dtype)
         self._coverage[rows, columns] = np.where(seen, coverage, 0).astype(np.uint8)

@@ -48,7 +48,11 @@ SHARD_SAMPLES = 640
 FRAMES_OF = "frames_of"  # attribute: the sweep beside it that holds the dark and white frames of both
 REPROCESS = "`spectralzoom reprocess ARCHIVE` makes its run anew"
 MOST_DN = np.iinfo(np.uint16).max
-LARGEST_SHORT = 32_000  # of scores in steps; larger ones are stored in 32 bits
+LARGEST_SHORT = 32_000  # of scores and residuals in steps; larger ones are stored in 32 bits
+
+
+def _kind(largest: float) -> str:
+    return "<i2" if largest <= LARGEST_SHORT else "<i4"
 
 
 @dataclass(frozen=True)
@@ -75,7 +79,14 @@ def score_spec(dims: tuple[str, str, str], shape: tuple[int, int, int], largest:
         -(-min(size, most) // part) * part
         for size, most, part in zip((rows, columns), (SHARD_ROWS, SHARD_SAMPLES), chunk[1:], strict=True)
     )
-    return ArraySpec(dims, shape, "<i2" if largest <= LARGEST_SHORT else "<i4", chunk, (chunk[0], *whole))
+    return ArraySpec(dims, shape, _kind(largest), chunk, (chunk[0], *whole))
+
+
+def whole_steps(scores: NDArray[np.floating], step: float, kind: np.dtype[Any]) -> NDArray[np.floating]:
+    """Scores in steps, at most what a type of integers holds: few bands of a spectrum may tell a component badly."""
+    most = np.iinfo(kind).max & ~127  # a float32
+    steps: NDArray[np.floating] = np.clip(np.rint(scores / np.float32(step)), -most, most)
+    return steps
 
 
 def write_components(group: zarr.Group, components: Components) -> None:
@@ -139,7 +150,7 @@ class SignalCubeWriter:
 
     def write(self, first: int, scores: NDArray[np.floating], quality: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Store (line, sample, component) scores from a line on, a multiple of 64; return them as they are stored."""
-        steps = np.rint(scores / np.float32(self._step))
+        steps = whole_steps(scores, self._step, self._scores.dtype)
         stop = first + len(scores)
         if steps.shape[2]:
             self._scores[:, first:stop] = np.ascontiguousarray(steps.transpose(2, 0, 1)).astype(self._scores.dtype)
@@ -148,7 +159,7 @@ class SignalCubeWriter:
         return kept
 
     def close(
-        self, facts: LineRows, rare: NDArray[np.intp], residuals: NDArray[np.int16], picture: Quicklook | None
+        self, facts: LineRows, rare: NDArray[np.intp], residuals: NDArray[np.int32], picture: Quicklook | None
     ) -> None:
         """Store quality, what is known of lines, and (rare, 2) lines and samples with (rare, band) residual steps."""
         self._quality[...] = self._seen
@@ -156,9 +167,9 @@ class SignalCubeWriter:
         for name, column in (("rare_line", 0), ("rare_sample", 1)):
             write_small(self.group, name, ("rare",), rare[:, column].astype(np.int32), {"units": "1"})
         about = {"long_name": "residual of a rare spectrum", "units": "1", "scale_factor": RESIDUAL_STEP}
-        spec = ArraySpec(
-            ("rare", "band"), residuals.shape, "<i2", (min(1024, max(len(residuals), 1)), residuals.shape[1])
-        )
+        kind = _kind(float(np.abs(residuals).max(initial=0)))
+        chunk = (min(1024, max(len(residuals), 1)), residuals.shape[1])
+        spec = ArraySpec(("rare", "band"), residuals.shape, kind, chunk)
         array = create_array(self.group, "rare_residual", spec, about)
         if residuals.size:
             array[...] = residuals

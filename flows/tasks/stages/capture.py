@@ -33,7 +33,7 @@ from storage.arrays.spool import Spool
 from storage.arrays.statistics import write_statistics
 from storage.parallel.pool import WorkerPool
 
-RAW = Product("capture", version=11)
+RAW = Product("capture", version=12)
 RIG_RECORD = "rig.json"  # beside the cubes: what a rig's captures were like
 
 

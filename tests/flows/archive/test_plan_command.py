@@ -24,7 +24,13 @@ from tests.flows.conftest import be_version, python
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 
-WAITS = {"locate": "capture_coarse", "rectify": "locate", "score": "rectify", "capture_fine": "score"}
+WAITS = {
+    "condense_coarse": "capture_coarse",
+    "locate": "condense_coarse",
+    "rectify": "locate",
+    "score": "rectify",
+    "capture_fine": "score",
+}
 
 
 @pytest.fixture(scope="module")
@@ -189,7 +195,7 @@ def test_plan_as_json_and_as_a_table(settings: Settings, archive: Path, capsys: 
     _show(asked)
     shown = capsys.readouterr().out
     assert all(row["stage"] in shown for row in content["stages"])
-    assert "6 stages to make" in shown
+    assert "7 stages to make" in shown
     _show(replace(settings, out=str(archive)))
     assert "everything is stored" in capsys.readouterr().out
 

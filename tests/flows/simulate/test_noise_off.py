@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import xarray as xr
 from numpy.typing import NDArray
 from scipy.ndimage import convolve1d
 
 from flows.tasks.stages import effects as effect_choice
 from pipeline.geometry.camera import LineCamera, footprint_kernel
+from storage.arrays.mosaics import Mosaic, open_mosaic
+from storage.arrays.signal_cubes import open_signal_cubes
 
 SLIT_PX = LineCamera().slit_px
 SAMPLES = 192  # of a line; a narrow camera is quick to simulate
@@ -70,17 +71,9 @@ def waves(shape: tuple[int, int], shortest_px: float, longest_px: float) -> Wave
 class Stored:
     """What the survey left, opened with plain xarray."""
 
-    mosaic: xr.Dataset
-    patches: xr.Dataset
+    mosaic: Mosaic
+    detail: Mosaic
     along: str
-
-    def fine(self, shape: tuple[int, int]) -> NDArray[np.float64]:
-        """Patches laid out on the scene's pixels, NaN where the camera did not capture again."""
-        values = self.patches["values"].where(self.patches["valid"]).values
-        canvas = np.full((*shape, values.shape[-1]), np.nan)
-        for patch, y, x in zip(values, self.patches["patch_y"].values, self.patches["patch_x"].values, strict=True):
-            canvas[y : y + len(patch), x : x + len(patch)] = patch
-        return canvas
 
 
 @pytest.fixture
@@ -107,12 +100,9 @@ def surveyed(
             policy="random",
             budget="1",
         ).receipt
-        mosaic, patches = (
-            xr.open_zarr(tmp_path / "archive" / found["products"][name], consolidated=False)
-            for name in ("mosaic", "patches")
-        )
-        raw = sorted((tmp_path / "archive" / found["products"]["raw_coarse"]).glob("*.zarr"))[0]
-        return Stored(mosaic, patches, xr.open_zarr(raw, consolidated=False).attrs["sweep"]["along"])
+        mosaic, detail = (open_mosaic(tmp_path / "archive" / found["products"][name]) for name in ("mosaic", "detail"))
+        sweeps = open_signal_cubes(tmp_path / "archive" / found["products"]["signal_coarse"])
+        return Stored(mosaic, detail, sweeps[0].sweep.along)
 
     return survey
 
@@ -147,7 +137,7 @@ def test_survey_is_the_scene_through_the_footprint(
     scene = waves(shape, 4, 40)
     stored = surveyed(scene)
     assert stored.along == along
-    patches, mosaic, pixels = stored.fine(shape), stored.mosaic["values"].values, convolved(scene, along)
+    patches, mosaic, pixels = stored.detail.values(), stored.mosaic.values(), convolved(scene, along)
     assert np.isfinite(patches).mean() > 0.3
     assert error_fraction(patches, pixels) < BOUND
     assert error_fraction(mosaic, coarse_of(pixels)) < BOUND
@@ -163,6 +153,6 @@ def test_survey_of_two_swaths(shortest_px: int, surveyed: Callable[[Waves], Stor
     scene = waves((32, 240), shortest_px, 10 * shortest_px)
     stored = surveyed(scene)
     pixels = convolved(scene, stored.along)
-    assert error_fraction(stored.fine(scene.shape), pixels) < BOUND
+    assert error_fraction(stored.detail.values(), pixels) < BOUND
     if shortest_px >= 4 * FACTOR:
-        assert error_fraction(stored.mosaic["values"].values, coarse_of(pixels)) < BOUND
+        assert error_fraction(stored.mosaic.values(), coarse_of(pixels)) < BOUND

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.usefixtures("no_effects")
 
 
 def _cubes(archive: Path) -> dict[str, xr.Dataset]:
-    return {path.stem: xr.open_zarr(path, consolidated=False) for path in archive.glob("**/capture/**/*.zarr")}
+    return {path.stem: xr.open_zarr(path, consolidated=False) for path in archive.glob("stages/condense*/*/*.zarr")}
 
 
 def test_a_faster_coarse_pass_leaves_its_seconds_to_the_fine_one(survey_png: Any, tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ from storage.arrays.class_maps import (
 )
 from storage.arrays.ground_maps import GroundMap, load_ground_map
 from storage.arrays.layout import AngularGrid
-from storage.arrays.mosaics import MosaicWriter
+from tests.storage.plain_mosaic import write_values
 from tests.storage.small_archive import write_class_map
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
@@ -101,15 +101,10 @@ def stores(tmp_path: Path) -> tuple[StageRef, StageRef]:
     write_class_map(tmp_path / "map" / "class_map.zarr", found)
     believe(tmp_path / "map", np.zeros(SHAPE, np.float32))
     rows, columns = SHAPE[0] // 4, SHAPE[1] // 4
-    writer = MosaicWriter(
-        tmp_path / "mosaic" / "mosaic.zarr",
-        (rows, columns),
-        np.array([460.0, 550.0, 640.0, 800.0]),
-        grid=AngularGrid(1e-4, SHAPE, 4),
-    )
     values = np.linspace(0.1, 0.9, rows)[:, None, None] * np.ones((rows, columns, 4))
     values[:5, :5] = np.nan
-    writer.write_tile(0, 0, values, np.ones((rows, columns)))
+    nm = np.array([460.0, 550.0, 640.0, 800.0])
+    write_values(tmp_path / "mosaic" / "mosaic.zarr", values, nm, AngularGrid(1e-4, SHAPE, 4))
     return StageRef("segment", "m", tmp_path / "map"), StageRef("rectify", "r", tmp_path / "mosaic")
 
 
@@ -158,7 +153,7 @@ def test_map_and_picture_lie_where_the_rays_end(run: Run, stores: tuple[StageRef
     assert sure[wanted == 1] == pytest.approx(0.75)
     ref = draw(run, stores)
     found = load_ground_map(ref.path / STORE)
-    tones = coarse_colours(stores[1])
+    tones = coarse_colours(stores[1], None)
     assert np.nanmin(tones) >= 1
     assert np.isnan(tones[:5, :5]).all()
     seen = found.picture.max(axis=2) > 0

@@ -29,7 +29,7 @@ from tests.flows.conftest import Ended, problems
 pytestmark = pytest.mark.usefixtures("no_effects")
 
 RECORDED_S = 30.0  # in which a server has heard of a task that ended
-NOT_HERE = ("register_coarse", "register_fine", "ground", "average_raster", "take_patches")
+NOT_HERE = ("register_coarse", "register_fine", "ground", "condense_raster")
 OF_THIS = [name for name in STAGES if name not in NOT_HERE]  # a survey in two passes by a mirror that is believed
 CAPTURES = ("capture_coarse", "capture_fine")
 NO_REPLY = "no reply from the camera after 2 s; is it on?"
@@ -223,7 +223,7 @@ def newest_run(flow: str, count: int) -> tuple[Any, dict[str, Any]]:
     return run, {task.name: task for task in tasks}
 
 
-@pytest.mark.parametrize(("stage", "after", "tries"), [("capture_fine", "score", 3), ("segment", "extract_patches", 1)])
+@pytest.mark.parametrize(("stage", "after", "tries"), [("capture_fine", "score", 3), ("segment", "rectify_fine", 1)])
 def test_a_stage_that_fails_by_prefect(
     stage: str, after: str, tries: int, server: str, survey_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -261,7 +261,7 @@ def test_a_served_field_of_which_a_stage_fails(
 
     out, file = tmp_path / "archive", field_file("north")
     with monkeypatch.context() as broken:
-        broken.setitem(STAGES, "extract_patches", failing("extract_patches", refusal("extract_patches")))
+        broken.setitem(STAGES, "rectify", failing("rectify", refusal("rectify")))
         state = survey(SurveySettings(settings_file=str(file), name="north"), return_state=True)
     assert (state.is_failed(), FULL_DISK in str(state.message)) == (True, True)
     assert (Archive.open(out).runs(), problems(out)) == ([], [])

@@ -1,0 +1,120 @@
+"""The law that gives spectra of scores: what is linear stays linear, and bands without a value take no part."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.signal.components import Components
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def law_of(seed: int, bands: int = 12, count: int = 4, dead: tuple[int, ...] = ()) -> Components:
+    """Any law of some bands, of which ``dead`` ones have no value."""
+    rng = np.random.default_rng(seed)
+    mean, noise, axes = rng.uniform(0.1, 2, bands), rng.uniform(0.01, 0.1, bands), np.zeros((count, bands))
+    lit = np.setdiff1d(np.arange(bands), dead)
+    axes[:, lit] = np.linalg.qr(rng.normal(size=(len(lit), count)))[0].T
+    mean[list(dead)] = noise[list(dead)] = np.nan
+    return Components(mean, axes, noise)
+
+
+def spectra_of(seed: int, bands: int = 12) -> np.ndarray:
+    """A few spectra."""
+    return np.random.default_rng([seed, 7]).uniform(0, 3, (2, 3, bands)).astype(np.float32)
+
+
+@given(seed=SEEDS, dead=st.sampled_from([(), (0,), (3, 7)]))
+def test_restoring_a_projection_is_a_projection(seed: int, dead: tuple[int, ...]) -> None:
+    """A spectrum that came of scores gives the same scores, and so the same spectrum, again."""
+    law = law_of(seed, dead=dead)
+    axes = law.axes.T.astype(np.float32)
+    once = law.restore(law.white(spectra_of(seed)) @ axes)
+    twice = law.restore(law.white(np.nan_to_num(once)) @ axes)
+    np.testing.assert_allclose(twice, once, rtol=1e-4, atol=1e-4)
+
+
+@given(seed=SEEDS)
+def test_what_projection_leaves_is_orthogonal_to_the_axes(seed: int) -> None:
+    """Scores of a spectrum less its restored one are 0."""
+    law, spectra = law_of(seed), spectra_of(seed)
+    axes = law.axes.T.astype(np.float32)
+    left = spectra - law.restore(law.white(spectra) @ axes)
+    np.testing.assert_allclose(left / law.noise @ law.axes.T, 0, atol=2e-4)
+
+
+@given(seed=SEEDS, dead=st.sampled_from([(), (2, 11)]))
+def test_a_matrix_acts_on_scores_as_on_spectra(seed: int, dead: tuple[int, ...]) -> None:
+    """Weights and offset of `onto` give of scores what the matrix gives of restored spectra, dead bands being 0."""
+    law, rng = law_of(seed, dead=dead), np.random.default_rng(seed)
+    scores, matrix = rng.normal(0, 20, (2, 3, 4)).astype(np.float32), rng.normal(size=(12, 5))
+    weights, offset = law.onto(matrix)
+    np.testing.assert_allclose(
+        scores @ weights + offset, np.nan_to_num(law.restore(scores)) @ matrix, rtol=1e-3, atol=1e-3
+    )
+
+
+@given(seed=SEEDS, dead=st.sampled_from([(), (5,)]))
+def test_a_gain_acts_on_scores_as_on_spectra(seed: int, dead: tuple[int, ...]) -> None:
+    """Scores of spectra times a gain a band are a matrix times their scores, and a shift."""
+    law, rng = law_of(seed, dead=dead), np.random.default_rng(seed)
+    scores, gain = rng.normal(0, 20, (2, 3, 4)).astype(np.float32), rng.uniform(0.5, 2, 12)
+    matrix, shift = law.scaled(gain)
+    wanted = law.white(np.nan_to_num(law.restore(scores)) * gain) @ law.axes.T
+    np.testing.assert_allclose(scores @ matrix + shift, wanted, rtol=1e-3, atol=1e-2)
+
+
+def test_a_gain_of_one_changes_nothing() -> None:
+    """The matrix is the identity and the shift 0."""
+    matrix, shift = law_of(3).scaled(np.ones(12))
+    np.testing.assert_allclose(matrix, np.eye(4), atol=1e-6)
+    np.testing.assert_array_equal(shift, 0)
+
+
+@given(seed=SEEDS, bands=st.lists(st.integers(0, 11), min_size=1, max_size=12))
+def test_some_bands_are_restored_as_with_all(seed: int, bands: list[int]) -> None:
+    """The law of some bands, in any order, gives those bands of what the whole law gives."""
+    law = law_of(seed, dead=(4,))
+    scores = np.random.default_rng(seed).normal(0, 20, (3, 4)).astype(np.float32)
+    some = law.of_bands(bands)
+    assert some.bands == len(bands)
+    np.testing.assert_allclose(some.restore(scores), law.restore(scores)[:, bands], rtol=1e-5, atol=1e-5)
+
+
+@given(seed=SEEDS)
+def test_no_score_exceeds_the_largest(seed: int) -> None:
+    """Of spectra within some distance of the mean every score is at most what `largest` says."""
+    law, rng = law_of(seed, dead=(1,)), np.random.default_rng(seed)
+    reach = rng.uniform(0, 3, 12)
+    spectra = (np.nan_to_num(law.mean) + reach * rng.choice([-1, 1], (50, 12))).astype(np.float32)
+    assert np.abs(law.white(spectra) @ law.axes.T).max() <= law.largest(reach) * (1 + 1e-4)
+
+
+@pytest.mark.parametrize("value", [np.nan, 0.0, 5.0])
+def test_a_band_without_a_value_says_nothing(value: float) -> None:
+    """Whatever stands in it, it is 0 in whitened spectra, and it comes back as NaN alone."""
+    law, spectra = law_of(1, dead=(6,)), spectra_of(1)
+    spectra[..., 6] = value
+    white = law.white(spectra)
+    assert (white[..., 6] == 0).all()
+    missing = np.isnan(law.restore(white @ law.axes.T.astype(np.float32)))
+    assert np.flatnonzero(missing.all(axis=(0, 1))).tolist() == [6]
+    assert missing.sum() == 6
+
+
+def test_scores_that_are_not_known_restore_nothing() -> None:
+    """A NaN score makes its own spectrum NaN and no other."""
+    scores = np.zeros((2, 4), np.float32)
+    scores[0, 2] = np.nan
+    assert np.isnan(law_of(2).restore(scores)).all(axis=1).tolist() == [True, False]
+
+
+def test_the_law_of_nothing_has_no_component() -> None:
+    """Lines without a value anywhere have 0 scores and restore as NaN."""
+    law = Components.empty(5)
+    assert (len(law), law.bands, law.largest(np.ones(5))) == (0, 5, 0.0)
+    assert np.isnan(law.restore(np.zeros((2, 3, 0), np.float32))).all()
+    assert (law.white(np.full((2, 3, 5), np.nan)) == 0).all()

@@ -1,0 +1,274 @@
+"""Condensing: scores by least squares over the bands that were seen, and the spectra that components do not hold."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import chi2, poisson
+
+from pipeline.signal.components import Components
+from pipeline.signal.condense import (
+    PARTIAL,
+    RESIDUAL_STEP,
+    UNUSABLE,
+    WHOLE,
+    ResidualLaw,
+    find_rare,
+    residual_steps,
+    score_lines,
+)
+from pipeline.signal.subspace import SignalStatistics, find_components
+from tests.pipeline.signal.made_spectra import Field, field_of, marked, restored, scored, statistics_of
+
+SEEDS = st.integers(0, 2**32 - 1)
+SHAPES = {"a pixel": (1, 1), "2 x 2 px": (2, 2), "a line of 8": (1, 8)}
+
+
+@pytest.fixture(scope="module")
+def condensed() -> tuple[Field, SignalStatistics, Components]:
+    """A field of 3 materials in 60 bands, its statistics and its components."""
+    made = field_of(11, bands=60)
+    found = statistics_of(made.values)
+    return made, found, find_components(found)
+
+
+@settings(max_examples=20)
+@given(seed=SEEDS)
+def test_scores_with_missing_bands_are_those_of_least_squares(seed: int) -> None:
+    """Whichever bands are missing, up to half of them, numpy's least squares over the others gives the same scores."""
+    rng = np.random.default_rng(seed)
+    axes = np.linalg.qr(rng.normal(size=(24, 4)))[0].T
+    law = Components(rng.uniform(0, 2, 24), axes, rng.uniform(0.1, 1, 24))
+    values = rng.normal(1, 3, (2, 3, 24)).astype(np.float32)
+    valid = rng.permuted(np.tile(np.arange(24) >= 12, (2, 3, 1)), axis=2)
+    valid[0, 0] = True
+    seen = score_lines(values, valid, law)
+    for place in np.ndindex(2, 3):
+        there = valid[place]
+        white = (values[place] - law.mean)[there] / law.noise[there]
+        wanted = np.linalg.lstsq(axes[:, there].T, white, rcond=None)[0]
+        np.testing.assert_allclose(seen.scores[place], wanted, rtol=2e-3, atol=2e-2)
+
+
+@settings(max_examples=10)
+@given(seed=SEEDS)
+def test_a_spectrum_is_scored_without_its_neighbours(condensed: tuple, seed: int) -> None:
+    """Scores, quality and residual of some spectra, missing bands and all, are those that all together give."""
+    made, _, law = condensed
+    rng = np.random.default_rng(seed)
+    valid = rng.random((*made.values.shape[:2], 60)) > 0.3
+    line, sample = rng.integers(0, 90, 2)
+    part = np.s_[line : line + 3, sample : sample + 2]
+    whole, alone = score_lines(made.values[:, :], valid, law), score_lines(made.values[part], valid[part], law)
+    np.testing.assert_allclose(alone.scores, whole.scores[part], rtol=1e-4, atol=1e-3)
+    np.testing.assert_array_equal(alone.quality, whole.quality[part])
+    np.testing.assert_allclose(alone.residual, whole.residual[part], rtol=1e-3)
+
+
+def test_quality_says_how_much_was_seen(condensed: tuple) -> None:
+    """All bands 0, some restored from the others 1, less than half 2 with scores of 0 and no residual."""
+    made, _, law = condensed
+    valid = np.ones((1, 5, 60), np.bool_)
+    for sample, missing in enumerate((0, 1, 30, 31, 60)):
+        valid[0, sample, :missing] = False
+    seen = score_lines(made.values[:1, :5], valid, law)
+    assert seen.quality[0].tolist() == [WHOLE, PARTIAL, PARTIAL, UNUSABLE, UNUSABLE]
+    assert (seen.scores[0, 3:] == 0).all()
+    assert np.isnan(seen.residual[0]).tolist() == [False, False, False, True, True]
+
+
+def test_spectra_that_are_not_valid_are_unusable(condensed: tuple) -> None:
+    """With one validity a spectrum, and nothing missing, the others keep their scores."""
+    made, _, law = condensed
+    valid = np.ones((4, 4), np.bool_)
+    valid[2, 1] = False
+    seen, plain = scored(made.values[:4, :4], law, valid), scored(made.values[:4, :4], law)
+    assert np.argwhere(seen.quality == UNUSABLE).tolist() == [[2, 1]]
+    np.testing.assert_array_equal(seen.scores[valid], plain.scores[valid])
+
+
+def test_nan_counts_as_missing(condensed: tuple) -> None:
+    """A NaN that validity does not know of is a missing band: it is restored, and the spectrum says so."""
+    made, _, law = condensed
+    values = made.values[:2, :2].copy()
+    values[1, 1, 20:25] = np.nan
+    seen = scored(values, law)
+    assert seen.quality.tolist() == [[WHOLE, WHOLE], [WHOLE, PARTIAL]]
+    off = (restored(seen, law)[1, 1] - made.clean[1, 1]) / made.noise
+    assert np.abs(off).max() < 3
+
+
+def test_saturated_bands_are_restored_from_the_others(condensed: tuple) -> None:
+    """A third of the bands saturated in a patch: their values come back as near as those that were seen, twice."""
+    made, found, law = condensed
+    values, valid = made.values.copy(), np.ones(made.values.shape, np.bool_)
+    values[30:40, 30:50, ::3], valid[30:40, 30:50, ::3] = 9.0, False
+    seen = score_lines(values, valid, law)
+    assert (seen.quality == PARTIAL).sum() == 200
+    off = np.abs(restored(seen, law) - made.clean)[30:40, 30:50] / made.noise
+    assert np.median(off[..., ::3]) < 2 * np.median(off[..., 1::3])
+    assert not marked(values, found, law, valid).any()
+
+
+def test_many_components_and_few_bands_left_mark_nothing() -> None:
+    """Half of the bands saturated and half as many components: few degrees of freedom make nothing rare."""
+    made = field_of(6, bands=30, materials=9)
+    found = statistics_of(made.values)
+    law = find_components(found)
+    valid = np.ones(made.values.shape, np.bool_)
+    valid[40:60, :, 1::2] = False
+    assert not marked(made.values, found, law, valid).any()
+
+
+def test_lines_without_light_are_unusable() -> None:
+    """No band has a value: no scores, all of them unusable."""
+    seen = score_lines(np.full((2, 3, 12), np.nan, np.float32), np.zeros((2, 3), np.bool_), Components.empty(12))
+    assert seen.scores.shape == (2, 3, 0)
+    assert (seen.quality == UNUSABLE).all()
+
+
+def test_one_of_two_bands_is_enough() -> None:
+    """Half of two bands is one: the one that was seen comes back, and the other is the mean."""
+    made = field_of(1, bands=2, materials=1)
+    law = find_components(statistics_of(made.values))
+    valid = np.ones((1, 2, 2), np.bool_)
+    valid[0, 1, 0] = False
+    seen = score_lines(made.values[:1, :2], valid, law)
+    back = law.restore(seen.scores)[0, 1]
+    assert seen.quality.tolist() == [[WHOLE, PARTIAL]]
+    assert back[1] == pytest.approx(made.values[0, 1, 1], rel=1e-3)
+    assert back[0] == pytest.approx(law.mean[0], rel=1e-3)
+
+
+def test_the_law_follows_shot_noise() -> None:
+    """Noise that grows with the signal is expected by the scores: bright spectra are no more often rare than dark."""
+    made = field_of(5, bands=60, materials=1, signal=40)
+    level = 1 + np.clip((made.clean - 1) / np.ptp(made.clean), -0.45, 0.45).mean(axis=2, keepdims=True)
+    values = (made.clean + (made.values - made.clean) * level).astype(np.float32)
+    found = statistics_of(values)
+    components = find_components(found)
+    law, seen = ResidualLaw.learned(found.spectra, components), scored(values, components)
+    ratio = seen.residual / law.expected(seen.scores)
+    bright = level[..., 0] > np.median(level)
+    assert seen.residual[bright].mean() > 1.05 * seen.residual[~bright].mean()
+    assert ratio[bright].mean() == pytest.approx(ratio[~bright].mean(), rel=0.02)
+
+
+def test_few_spectra_teach_no_law() -> None:
+    """Fewer than 8 a component: the noise's own variance is expected of all."""
+    made = field_of(2)
+    components = find_components(statistics_of(made.values))
+    law = ResidualLaw.learned(made.values[:2, :10].reshape(-1, 40), components)
+    assert (law.constant, law.freedom) == (1.0, 36.0)
+    assert not law.slope.any()
+
+
+@pytest.mark.parametrize("alarms", [1.0, 10.0])
+@pytest.mark.parametrize("shape", [(64, 64), (8, 500), (1, 300), (2, 9)])
+def test_noise_alone_marks_no_more_than_stated(shape: tuple[int, int], alarms: float) -> None:
+    """Marks of 60 images of noise, edges and all, are no more than a mean of ``alarms`` each gives.
+
+    Windows mark up to 8 at once, so that single chances are 8 times fewer.
+    """
+    law, total = ResidualLaw(1.0, np.zeros(0), 50.0), 0
+    for seed in range(60):
+        noise = np.random.default_rng(seed).chisquare(50, shape) / 50
+        total += int(find_rare(noise.astype(np.float32), law, alarms).sum())
+    assert total <= 8 * poisson.ppf(0.999, 60 * alarms / 8)
+
+
+def test_noise_of_a_field_marks_no_more_than_stated() -> None:
+    """The same of fields of materials, whose noise, components and law are all learned of them: 8 fields, 10 each."""
+    total = 0
+    for seed in range(8):
+        made = field_of(seed, (64, 64), 24)
+        found = statistics_of(made.values)
+        total += int(marked(made.values, found, find_components(found), alarms=10.0).sum())
+    assert total <= 8 * poisson.ppf(0.999, 80 / 8)
+
+
+@pytest.mark.parametrize("sigma", [1.0, 2.0, 5.0, 20.0])
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+def test_planted_spectra_are_marked(condensed: tuple, shape: tuple[int, int], sigma: float) -> None:
+    """A signature over all bands, of 1 to 20 deviations a band: 30 places of it, in 60 bands.
+
+    At 1 deviation more than half of the single pixels are, and nine in ten of the others.
+    """
+    made, found, law = condensed
+    rng = np.random.default_rng(8)
+    values, there = made.values.copy(), np.zeros(made.values.shape[:2], np.bool_)
+    for number in range(30):
+        line, sample = 3 + 15 * (number // 6), 2 + 15 * (number % 6)
+        place = np.s_[line : line + shape[0], sample : sample + shape[1]]
+        values[place] += (sigma * rng.choice([-1, 1], 60) * made.noise).astype(np.float32)
+        there[place] = True
+    kept = marked(values, found, law)[there].mean()
+    assert kept >= (0.9 if sigma == 1 and shape != (1, 1) else 0.55 if sigma == 1 else 1.0)
+
+
+def test_neighbours_are_found_together_that_none_shows_alone(condensed: tuple) -> None:
+    """.7 deviations a band: a pixel of it is nearly never rare, most of the blocks and lines of 8 are."""
+    made, found, law = condensed
+    rng = np.random.default_rng(9)
+    kept = {}
+    for name, shape in SHAPES.items():
+        values, there = made.values.copy(), np.zeros(made.values.shape[:2], np.bool_)
+        for line, sample in np.ndindex(6, 6):
+            place = np.s_[4 + 15 * line : 4 + 15 * line + shape[0], 4 + 15 * sample : 4 + 15 * sample + shape[1]]
+            values[place] += (0.7 * rng.choice([-1, 1], 60) * made.noise).astype(np.float32)
+            there[place] = True
+        kept[name] = marked(values, found, law)[there].mean()
+    assert kept["a pixel"] < 0.3
+    assert kept["2 x 2 px"] > kept["a pixel"] + 0.3
+    assert kept["a line of 8"] > 0.9
+
+
+def test_one_bright_spectrum_marks_only_itself(condensed: tuple) -> None:
+    """A spectrum far off all components is rare; those beside it are noise, and stay so."""
+    made, found, law = condensed
+    values = made.values.copy()
+    values[50, 40, ::2] += 1.0
+    assert np.argwhere(marked(values, found, law)).tolist() == [[50, 40]]
+
+
+def test_windows_mark_all_of_their_own_spectra() -> None:
+    """2 x 2 spectra, and lines of 8 either way, as far as the corners of the image, are marked and nothing else is."""
+    law = ResidualLaw(1.0, np.zeros(0), 200.0)
+    places = (np.s_[0:2, 0:2], np.s_[18:20, 28:30], np.s_[0, :8], np.s_[19, 22:], np.s_[12:, 29], np.s_[5, 9:17])
+    for place in places:
+        ratio = np.ones((20, 30), np.float32)
+        freedom = 200 * ratio[place].size
+        ratio[place] = 1.001 * chi2.isf(1e-3 / 4 / 600 / ratio[place].size, freedom) / freedom  # a part is not enough
+        wanted = ratio > 1
+        np.testing.assert_array_equal(find_rare(ratio, law, 1e-3), wanted)
+
+
+def test_what_is_unusable_is_never_rare() -> None:
+    """NaN is not rare and does not hide its neighbours."""
+    ratio = np.ones((20, 30), np.float32)
+    ratio[5, 5], ratio[5, 6] = np.nan, 9
+    assert np.argwhere(find_rare(ratio, ResidualLaw(1.0, np.zeros(0), 50.0), 1.0)).tolist() == [[5, 6]]
+
+
+@pytest.mark.parametrize("sigma", [2.0, 20.0, 1e5])
+def test_rare_spectra_lie_within_a_quarter_deviation(condensed: tuple, sigma: float) -> None:
+    """Rounded scores and residual steps together give the raw spectrum back, however far from all others it lies."""
+    made, _, law = condensed
+    values = made.values[7, :20] + (sigma * np.random.default_rng(1).normal(size=(20, 60)) * made.noise).astype("f4")
+    seen = scored(values[None], law)
+    rounded = np.rint(seen.scores[0])
+    steps = residual_steps(values, rounded, law)
+    back = law.restore(rounded) + steps * RESIDUAL_STEP * law.noise
+    assert np.abs((back - values) / law.noise).max() <= RESIDUAL_STEP / 2 + 1e-6 * sigma + 1e-3
+
+
+def test_missing_bands_have_no_residual(condensed: tuple) -> None:
+    """What was not seen adds nothing to what scores restore."""
+    made, _, law = condensed
+    values, valid = made.values[:1, :4].reshape(4, 60) + 1, np.ones((4, 60), np.bool_)
+    valid[1, 5:9] = False
+    values[2, 30] = np.nan
+    steps = residual_steps(values, np.zeros((4, len(law)), np.float32), law, valid)
+    assert np.argwhere(steps == 0).tolist() == [[1, 5], [1, 6], [1, 7], [1, 8], [2, 30]]

@@ -1,0 +1,228 @@
+"""A sweep, block by block: what lines tell as they arrive, what is stored of them, and which stored lines differ."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipeline.signal.calibrate import calibrate
+from pipeline.signal.components import Components
+from pipeline.signal.condense import RESIDUAL_STEP, UNUSABLE, ResidualLaw
+from pipeline.signal.subspace import SignalStatistics, find_components
+from pipeline.signal.sweep_signal import CondensedSweep, Condenser, LineStatistics, camera_noise, differing_lines
+from pipeline.source import Line
+from tests.pipeline.signal.made_spectra import CAMERA, DARK, GAIN, MadeLines, field_of, raw_of
+
+SHAPE, BANDS = (150, 40), 24
+
+
+@dataclass
+class Stored:
+    """Scores as a store would keep them."""
+
+    components: Components
+    step: float
+    scores: NDArray[np.int32]
+    quality: NDArray[np.uint8]
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """Spectra that may be used."""
+        return self.quality != UNUSABLE
+
+    def write(self, first: int, scores: NDArray[np.float32], quality: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Take some lines."""
+        part = slice(first, first + len(scores))
+        self.scores[part], self.quality[part] = np.rint(scores / self.step), quality
+        return (self.scores[part] * self.step).astype(np.float32)
+
+    def read(self, start: int, stop: int) -> NDArray[np.int32]:
+        """Scores of some lines in steps."""
+        return self.scores[start:stop]
+
+    def restored(self, done: CondensedSweep) -> NDArray[np.float32]:
+        """Scene values of all lines."""
+        values = self.components.restore(self.scores.astype(np.float32) * np.float32(self.step))
+        line, sample = done.rare.T
+        values[line, sample] += done.residuals * RESIDUAL_STEP * np.nan_to_num(self.components.noise)
+        return values
+
+
+def statistics_of_lines(lines: MadeLines) -> SignalStatistics:
+    """What the lines tell while they arrive."""
+    found = SignalStatistics(lines.raw.shape[2], lines.raw.shape[0] * lines.raw.shape[1])
+    taker = LineStatistics(found, lines.sweep, lines.references, CAMERA)
+    for number, (data, at) in enumerate(zip(lines.raw, lines.position, strict=True)):
+        taker.add(Line(number, data, *at, 0.1 * number, 100.0, bool(lines.valid_line[number])))
+    taker.flush()
+    return found
+
+
+def condense(lines: MadeLines, step: float = 1.0, alarms: float = 0.01) -> tuple[Stored, CondensedSweep]:
+    """Store all lines of a sweep."""
+    found = statistics_of_lines(lines)
+    components = find_components(found)
+    condenser = Condenser(components, ResidualLaw.learned(found.spectra, components), CAMERA, alarms, step)
+    shape = lines.raw.shape[:2]
+    stored = Stored(components, step, np.zeros((*shape, len(components)), np.int32), np.zeros(shape, np.uint8))
+    return stored, condenser.sweep(lines, stored.write)
+
+
+def made_lines(seed: int = 3, **how: float) -> MadeLines:
+    """Lines of 3 materials, the third block of which is no whole one."""
+    return MadeLines.of(raw_of(field_of(seed, SHAPE, BANDS, **how).values))
+
+
+def values_of(lines: MadeLines) -> NDArray[np.float32]:
+    """Scene values of raw lines."""
+    return calibrate(lines.raw, lines.references, saturated_dn=1e9, position=lines.position)[0]
+
+
+def test_statistics_of_lines_are_those_of_their_values() -> None:
+    """64 lines at a time and what is left, calibrated, count as all values at once do."""
+    lines = made_lines()
+    values = values_of(lines)
+    found, whole = statistics_of_lines(lines), SignalStatistics(BANDS, values[..., 0].size)
+    whole.add(values, np.ones(SHAPE, np.bool_))
+    assert (found.count, found.means) == (whole.count, 10 * (16 + 16 + 5))
+    np.testing.assert_allclose(find_components(found).noise, find_components(whole).noise, rtol=0.01)
+
+
+def test_lines_that_are_not_valid_tell_nothing() -> None:
+    """Whatever stands in a lost line, statistics are those without it, and it is unusable."""
+    lines = made_lines()
+    lines.valid_line[[5, 140]] = False
+    lines.raw[5] = 3000
+    stored, _ = condense(lines)
+    assert statistics_of_lines(lines).count == 148 * 40
+    assert np.flatnonzero((stored.quality == UNUSABLE).all(axis=1)).tolist() == [5, 140]
+    assert (stored.quality == UNUSABLE).sum() == 80
+    assert differing_lines(lines, stored, CAMERA) == []
+
+
+@pytest.mark.parametrize("step", [0.5, 1.0, 3.0])
+def test_scores_are_stored_in_steps(step: float) -> None:
+    """What comes back lies as near to the raw values as the noise, and rounding by a step, allow; nothing is rare."""
+    lines = made_lines()
+    stored, done = condense(lines, step)
+    off = (stored.restored(done) - values_of(lines)) / stored.components.noise
+    count = len(stored.components)
+    assert np.mean(off**2) == pytest.approx((BANDS - count * (1 - step**2 / 12)) / BANDS, rel=0.05)
+    assert (len(done.rare), done.known) == (0, 150 * 40)
+    assert differing_lines(lines, stored, CAMERA) == []
+
+
+def test_rare_spectra_come_back_within_a_quarter_deviation() -> None:
+    """Single spectra in every block, the last one too, are found in order and restored to a quarter of the noise."""
+    lines = made_lines()
+    places = [(3, 7), (63, 39), (64, 0), (149, 20)]
+    for number, (line, sample) in enumerate(places):
+        lines.raw[line, sample, number::2] += 200
+    stored, done = condense(lines)
+    assert [tuple(place) for place in done.rare.tolist()] == places
+    assert done.residuals.shape == (4, BANDS)
+    off = (stored.restored(done) - values_of(lines)) / stored.components.noise
+    assert max(np.abs(off[place]).max() for place in places) <= RESIDUAL_STEP / 2 + 1e-3
+
+
+def test_one_altered_score_is_found() -> None:
+    """One score a step off: its line differs, and no other does."""
+    lines = made_lines()
+    stored, _ = condense(lines)
+    stored.scores[77, 13, 1] += 1
+    assert differing_lines(lines, stored, CAMERA) == [77]
+
+
+def test_lines_that_changed_or_were_lost_are_found() -> None:
+    """A raw line that is another one now, and spectra stored as unusable that are not, are named by their lines."""
+    lines = made_lines()
+    stored, _ = condense(lines)
+    stored.quality[149, 0] = UNUSABLE
+    lines.raw[66] = lines.raw[0]
+    assert differing_lines(lines, stored, CAMERA) == [66, 149]
+
+
+def test_saturated_spectra_are_restored_or_unusable() -> None:
+    """Some bands at full scale: quality 1, values from the others. All bands: quality 2. Neither spoils the field."""
+    lines = made_lines()
+    before = find_components(statistics_of_lines(lines))
+    values = values_of(lines)
+    lines.raw[20, 10:14, ::3] = CAMERA.full_scale_dn
+    lines.raw[80, 5] = CAMERA.full_scale_dn
+    stored, done = condense(lines)
+    assert np.argwhere(stored.quality == 1).tolist() == [[20, sample] for sample in range(10, 14)]
+    assert np.argwhere(stored.quality == UNUSABLE).tolist() == [[80, 5]]
+    assert len(stored.components) == len(before)
+    np.testing.assert_allclose(stored.components.noise, before.noise, rtol=0.02)
+    off = (stored.restored(done) - values)[20, 10:14] / before.noise
+    assert np.abs(off).max() < 5
+    assert len(done.rare) == 0
+
+
+def test_dead_columns_and_elements() -> None:
+    """A column of bad elements is unusable, one bad element is filled from its neighbours, and no line differs."""
+    bad = np.zeros((40, BANDS), np.bool_)
+    bad[8], bad[25, 4] = True, True
+    lines = replace(made_lines(), references=MadeLines.of(made_lines().raw, bad).references)
+    lines.raw[:, 8], lines.raw[:, 25, 4] = 0, 4095
+    stored, done = condense(lines)
+    unusable = stored.quality == UNUSABLE
+    assert np.flatnonzero(unusable.all(axis=0)).tolist() == [8]
+    assert unusable.sum() == 150
+    assert done.known == 150 * 39
+    assert differing_lines(lines, stored, CAMERA) == []
+
+
+def test_all_dark_lines() -> None:
+    """A white frame that is no brighter than the dark one: no component, no usable spectrum, and no line differs."""
+    lines = made_lines()
+    references = replace(lines.references, white=lines.references.dark)
+    lines = replace(lines, references=references)
+    stored, done = condense(lines)
+    assert (len(stored.components), done.known, done.rare.shape) == (0, 0, (0, 2))
+    assert (stored.quality == UNUSABLE).all()
+    assert done.residuals.shape == (0, BANDS)
+    assert differing_lines(lines, stored, CAMERA) == []
+
+
+def test_a_dark_frame_that_drifts_apart_in_every_element_makes_raw_lines_stay() -> None:
+    """Elements that drift each by its own are no low rank and no noise: more spectra than exceptions are, are rare."""
+    made = field_of(3, SHAPE, BANDS)
+    own = np.random.default_rng(2).normal(size=(40, BANDS)) * made.noise
+    drift = 6 * np.linspace(0, 1, 150)[:, None, None] * own
+    lines = MadeLines.of(raw_of((made.values + drift).astype(np.float32)))
+    stored, done = condense(lines)
+    assert len(done.rare) > 0.05 * done.known
+    off = ((stored.restored(done) - values_of(lines)) / stored.components.noise)[tuple(done.rare.T)]
+    assert np.abs(off).max() <= RESIDUAL_STEP / 2 + 1e-3
+
+
+def test_progress_ends_at_one() -> None:
+    """Every block is told, the last one as all of it."""
+    lines, told = made_lines(), []
+    found = statistics_of_lines(lines)
+    components = find_components(found)
+    condenser = Condenser(components, ResidualLaw.learned(found.spectra, components), CAMERA, 1.0)
+    condenser.sweep(lines, lambda first, scores, quality: scores, told.append)
+    assert told == [64 / 150, 128 / 150, 1.0]
+
+
+@pytest.mark.parametrize("binning", [1, 4])
+def test_the_cameras_noise_is_that_of_its_electrons(binning: int) -> None:
+    """Read noise of 4 DN, shot noise of 5 electrons a DN, and rounding, in quadrature."""
+    lines = made_lines()
+    mean = np.linspace(0.1, 2, BANDS)
+    dn = mean / GAIN
+    wanted = GAIN * np.sqrt(binning * (CAMERA.read_noise_e / 5) ** 2 + dn / 5 + 1 / 12)
+    np.testing.assert_allclose(camera_noise(mean, lines.references, CAMERA, binning), wanted, rtol=1e-5)
+
+
+def test_the_cameras_noise_of_a_band_without_light_is_not_known() -> None:
+    """A band without light is NaN, and the others are what they are."""
+    lines = made_lines()
+    lines.references.white[:, 3] = DARK
+    found = camera_noise(np.ones(BANDS), lines.references, CAMERA, 1)
+    assert np.flatnonzero(np.isnan(found)).tolist() == [3]

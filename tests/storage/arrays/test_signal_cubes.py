@@ -1,0 +1,288 @@
+"""A condensed sweep comes back as it was stored, any reader restores its spectra, a flipped bit is never a number."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+import zarr
+from numpy.typing import NDArray
+
+from pipeline.errors import IncompleteStoreError
+from pipeline.geometry.mirror import mirror_throughput
+from pipeline.signal.calibrate import calibrate
+from pipeline.signal.components import Components
+from pipeline.signal.condense import RESIDUAL_STEP, ResidualLaw
+from pipeline.signal.subspace import SignalStatistics, find_components
+from pipeline.signal.sweep_signal import CondensedSweep, Condenser, differing_lines
+from storage.arrays.cubes import SweepHeader
+from storage.arrays.signal_cubes import (
+    LARGEST_SHORT,
+    LineRows,
+    RestoredCube,
+    SignalCube,
+    SignalCubeWriter,
+    open_lines,
+    open_signal_cube,
+    open_signal_cubes,
+)
+from tests.pipeline.signal.made_spectra import CAMERA, DARK, GAIN, MadeLines, field_of, raw_of
+from tests.storage.small_archive import flip
+
+SHAPE, BANDS, RARE = (130, 70), 24, [(2, 3), (64, 69), (129, 0)]
+
+
+def lines_of(bands: int = BANDS, signal: float = 30.0) -> MadeLines:
+    """Lines of 3 materials with some rare spectra."""
+    raw = raw_of(field_of(4, SHAPE, bands, materials=min(3, bands), signal=signal).values)
+    rng = np.random.default_rng(3)
+    for line, sample in RARE:  # each of its own kind
+        raw[line, sample] += rng.choice([0, 60], bands).astype(np.uint16)
+    return MadeLines.of(raw)
+
+
+def store(
+    path: Path, lines: MadeLines, *, step: float = 1.0, largest: float | None = None
+) -> tuple[SignalCube, CondensedSweep]:
+    """Condense lines and store them."""
+    values, valid = calibrate(lines.raw, lines.references, saturated_dn=4095, position=lines.position)
+    found = SignalStatistics(values.shape[2], values[..., 0].size)
+    found.add(values, valid)
+    components = find_components(found)
+    bands = np.linspace(400, 1000, values.shape[2])
+    header = SweepHeader(lines.sweep, lines.references, bands, np.full(len(bands), 5.0), "sim", "2026-05-01T10:00:00")
+    origin = np.zeros(len(bands)) if found.origin is None else found.origin
+    reach = components.largest(found.largest + np.abs(origin - np.nan_to_num(components.mean)))
+    writer = SignalCubeWriter(path, header, components, step=step, largest=reach if largest is None else largest)
+    law = ResidualLaw.learned(found.spectra, components)
+    done = Condenser(components, law, CAMERA, 1e-3, step).sweep(lines, writer.write)
+    x, y = lines.position.T
+    facts = LineRows(lines.time_s, x, y, np.full(len(x), 100.0), lines.valid_line)
+    writer.close(facts, done.rare, done.residuals, None)
+    return open_signal_cube(path), done
+
+
+def common(cube: SignalCube) -> NDArray[np.bool_]:
+    """Spectra that are not rare, (line, sample)."""
+    found = np.ones(cube.shape[:2], np.bool_)
+    found[cube.rare] = False
+    return found
+
+
+def test_what_is_stored_comes_back(tmp_path: Path) -> None:
+    """The sweep, line facts, references, wavelengths, components, rare spectra and the step are as they were."""
+    lines = lines_of()
+    cube, done = store(tmp_path / "fine-0.zarr", lines, step=0.5)
+    assert (cube.sweep, cube.source, cube.started, cube.step) == (lines.sweep, "sim", "2026-05-01T10:00:00", 0.5)
+    assert cube.shape == (*SHAPE, len(cube.components))
+    assert cube.usable.all()
+    np.testing.assert_array_equal(cube.position, lines.position)
+    np.testing.assert_array_equal(cube.time_s, lines.time_s)
+    np.testing.assert_array_equal(cube.references.white, lines.references.white)
+    assert list(zip(*(part.tolist() for part in cube.rare), strict=True)) == RARE == [tuple(p) for p in done.rare]
+    assert (cube.quicklook(), cube.simulation) == (None, None)
+    np.testing.assert_allclose(cube.components.axes @ cube.components.axes.T, np.eye(cube.shape[2]), atol=1e-9)
+    assert [one.sweep.name for one in open_signal_cubes(tmp_path)] == ["fine-0"]
+
+
+@pytest.mark.parametrize("step", [0.5, 1.0])
+def test_plain_zarr_restores_the_spectra(tmp_path: Path, step: float) -> None:
+    """Three lines of numpy give what `spectra` gives, to the last bit, but for the rare ones."""
+    cube, _ = store(tmp_path / "fine-0.zarr", lines_of(), step=step)
+    group = zarr.open_group(tmp_path / "fine-0.zarr", mode="r")
+    scores, axes, mean = (np.asarray(group[name][...], np.float32) for name in ("scores", "axes", "mean"))
+    step = np.float32(group["scores"].attrs["scale_factor"])
+    spectra = scores.transpose(1, 2, 0) * step @ axes + mean
+    found = cube.spectra(0, 130)
+    np.testing.assert_array_equal(spectra[common(cube)], found[common(cube)])
+    assert (spectra != found)[~common(cube)].any(axis=1).all()
+
+
+def test_xarray_restores_the_spectra(tmp_path: Path) -> None:
+    """Opened with names and coordinates, scores in deviations of the noise; one line more adds the rare spectra."""
+    cube, _ = store(tmp_path / "fine-0.zarr", lines_of(), step=0.5)
+    with xr.open_zarr(tmp_path / "fine-0.zarr", consolidated=False) as data:
+        assert data["scores"].dims == ("component", "line", "sample")
+        assert {"wavelength", "band", "time"} <= set(data.variables)
+        spectra = (data["scores"].astype("f8") * data["axes"]).sum("component") + data["mean"]
+        spectra = spectra.transpose("line", "sample", "band").values
+        place = data["rare_line"].values.astype(int), data["rare_sample"].values.astype(int)
+        spectra[place] += data["rare_residual"].values * data["noise"].values
+    np.testing.assert_allclose(spectra, cube.spectra(0, 130), atol=1e-5)
+
+
+def test_rare_spectra_come_back(tmp_path: Path) -> None:
+    """Wherever the lines are read from, rare ones lie within a quarter of the noise of the raw ones."""
+    lines = lines_of()
+    cube, _ = store(tmp_path / "fine-0.zarr", lines)
+    values, _ = calibrate(lines.raw, lines.references, saturated_dn=4095)
+    for line, sample in RARE:
+        for first, last in ((0, 130), (line, line + 1), (line // 64 * 64, 130)):
+            off = cube.spectra(first, last)[line - first, sample] - values[line, sample]
+            assert np.abs(off / cube.components.noise).max() <= RESIDUAL_STEP / 2 + 1e-3
+
+
+def test_windows_are_parts_of_the_whole(tmp_path: Path) -> None:
+    """Scores of some lines and samples are those of all, cut."""
+    cube, _ = store(tmp_path / "fine-0.zarr", lines_of())
+    whole = cube.read()
+    assert whole.dtype == np.int16
+    np.testing.assert_array_equal(cube.read_window(slice(60, 70), slice(5, 66)), whole[60:70, 5:66])
+    np.testing.assert_array_equal(cube.read(127), whole[127:])
+
+
+def test_no_line_of_the_store_differs(tmp_path: Path) -> None:
+    """Raw lines and what is read from the disk agree, and one score altered there is found."""
+    lines = lines_of()
+    cube, _ = store(tmp_path / "fine-0.zarr", lines)
+    assert differing_lines(lines, cube, CAMERA) == []
+    scores = zarr.open_group(tmp_path / "fine-0.zarr", mode="r+")["scores"]
+    scores[2, 99, 41] += 1
+    assert differing_lines(lines, open_signal_cube(tmp_path / "fine-0.zarr"), CAMERA) == [99]
+
+
+READS: dict[str, Callable[[SignalCube], object]] = {
+    "scores": lambda cube: cube.read(),
+    "axes": lambda cube: cube.components,
+    "rare_residual": lambda cube: cube.spectra(0, 130),
+    "quality": lambda cube: cube.usable,
+    "mean": lambda cube: cube.components,
+}
+
+
+@pytest.mark.parametrize("name", READS)
+def test_a_flipped_bit_is_named(tmp_path: Path, name: str) -> None:
+    """A bit that rots in an array is an error that names it, never another number."""
+    lines = lines_of()
+    lines.raw[9, 9] = 4095
+    store(tmp_path / "fine-0.zarr", lines)
+    chunk = next(path for path in (tmp_path / "fine-0.zarr" / name / "c").rglob("*") if path.is_file())
+    flip(chunk, chunk.stat().st_size // 2)
+    with pytest.raises(IncompleteStoreError, match=rf"/{name} cannot be read"):
+        READS[name](open_signal_cube(tmp_path / "fine-0.zarr"))
+
+
+def test_a_store_that_was_not_closed_is_incomplete(tmp_path: Path) -> None:
+    """Without line facts there is no sweep."""
+    lines = lines_of()
+    header = SweepHeader(lines.sweep, lines.references, np.linspace(400, 1000, BANDS))
+    SignalCubeWriter(tmp_path / "a.zarr", header, Components.empty(BANDS), step=1.0, largest=1.0)
+    with pytest.raises(IncompleteStoreError, match="mirror_x"):
+        open_signal_cube(tmp_path / "a.zarr")
+
+
+@pytest.mark.parametrize("by_mirror", [False, True])
+def test_restored_lines_are_raw_numbers(tmp_path: Path, by_mirror: bool) -> None:
+    """They lie within the noise of the raw ones, nearer to what they would be without noise; rare ones within 2 DN."""
+    made = field_of(4, SHAPE, BANDS)
+    lines = MadeLines.of(lines_of().raw, by_mirror=by_mirror)
+    light = mirror_throughput(lines.position)[:, None, None] if by_mirror else 1.0
+    raw = np.rint((lines.raw.astype(float) - DARK) * light + DARK).astype(np.uint16)
+    lines = replace(lines, raw=raw)
+    cube, _ = store(tmp_path / "fine-0.zarr", lines)
+    restored = open_lines(tmp_path / "fine-0.zarr")
+    assert isinstance(restored, RestoredCube)
+    numbers = restored.read()
+    assert (numbers.dtype, numbers.shape, restored.shape) == (np.uint16, raw.shape, raw.shape)
+    off = numbers.astype(float) - raw
+    assert np.abs(off[~common(cube)]).max() <= 0.25 * 10 + 1
+    assert np.abs(off).max() < 6 * 10
+    clean = (made.clean / GAIN) * light + DARK
+    truth = (numbers - clean)[common(cube)]
+    assert np.sqrt(np.mean(truth**2)) < 0.5 * np.sqrt(np.mean((raw - clean)[common(cube)] ** 2))
+    np.testing.assert_array_equal(restored.read_window(slice(60, 70), slice(4, 9)), numbers[60:70, 4:9])
+    np.testing.assert_array_equal(restored.read_lines(np.array([1, 65, 128])), numbers[[1, 65, 128]])
+
+
+def test_restored_lines_count_unusable_spectra_as_saturated(tmp_path: Path) -> None:
+    """A spectrum saturated in all bands is the largest number in all of them, and calibrates as unusable again."""
+    lines = lines_of()
+    lines.raw[7, 9] = 4095
+    store(tmp_path / "fine-0.zarr", lines)
+    numbers = open_lines(tmp_path / "fine-0.zarr").read(0, 10)
+    assert np.argwhere((numbers == 65_535).all(axis=2)).tolist() == [[7, 9]]
+    _, valid = calibrate(numbers, lines.references, saturated_dn=4095)
+    assert np.argwhere(~valid).tolist() == [[7, 9]]
+
+
+@pytest.mark.parametrize("bands", [1, 2, 8])
+def test_few_bands_take_no_more_bytes_than_raw_numbers(tmp_path: Path, bands: int) -> None:
+    """All components of 1 to 8 bands are kept, and stored scores are smaller than the numbers as uint16."""
+    cube, _ = store(tmp_path / "fine-0.zarr", lines_of(bands))
+    assert cube.shape[2] == bands
+    stored = sum(path.stat().st_size for path in (tmp_path / "fine-0.zarr" / "scores").rglob("*") if path.is_file())
+    assert stored < 2 * bands * SHAPE[0] * SHAPE[1]
+
+
+def test_lines_without_light_are_stored(tmp_path: Path) -> None:
+    """No component and no usable spectrum: every spectrum is NaN, and restored lines are saturated."""
+    lines = lines_of()
+    lines = replace(lines, references=replace(lines.references, white=lines.references.dark))
+    cube, _ = store(tmp_path / "fine-0.zarr", lines)
+    assert cube.shape == (*SHAPE, 0)
+    assert not cube.usable.any()
+    assert np.isnan(cube.spectra(0, 130)).all()
+    assert cube.read(0, 5).shape == (5, 70, 0)
+    assert (open_lines(tmp_path / "fine-0.zarr").read() == 65_535).all()
+
+
+@pytest.mark.parametrize(("largest", "kind"), [(LARGEST_SHORT, "int16"), (LARGEST_SHORT + 1, "int32")])
+def test_scores_beyond_16_bits_are_stored_in_32(tmp_path: Path, largest: float, kind: str) -> None:
+    """What the largest score may be says the type, and either gives back what was written."""
+    lines = lines_of()
+    header = SweepHeader(lines.sweep, lines.references, np.linspace(400, 1000, BANDS))
+    axes = np.eye(2, BANDS)
+    components = Components(np.zeros(BANDS), axes, np.ones(BANDS))
+    writer = SignalCubeWriter(tmp_path / "a.zarr", header, components, step=1.0, largest=largest)
+    scores = np.random.default_rng(0).uniform(-largest, largest, (*SHAPE, 2)).astype(np.float32)
+    kept = writer.write(0, scores, np.zeros(SHAPE, np.uint8))
+    steps = np.array([[70_000, -3], [0, 9]]).repeat(BANDS // 2, axis=1).astype(np.int32)
+    x, y = lines.position.T
+    facts = LineRows(lines.time_s, x, y, np.full(len(x), 100.0), lines.valid_line)
+    writer.close(facts, np.array([[0, 1], [5, 6]]), steps, None)
+    cube = open_signal_cube(tmp_path / "a.zarr")
+    assert cube.read().dtype == kind
+    np.testing.assert_array_equal(cube.read(), np.rint(scores))
+    np.testing.assert_array_equal(cube.read(), kept)
+    off = cube.spectra(0, 1)[0, 1] - components.restore(kept[0, 1])
+    np.testing.assert_array_equal(off[2:], steps[0, 2:] * RESIDUAL_STEP)
+
+
+def test_a_score_beyond_its_type_is_cut_off_and_does_not_wrap(tmp_path: Path) -> None:
+    """A score that the bound did not foresee is the largest of its sign, which a comparison with raw lines tells."""
+    lines = lines_of()
+    header = SweepHeader(lines.sweep, lines.references, np.linspace(400, 1000, BANDS))
+    components = Components(np.zeros(BANDS), np.eye(1, BANDS), np.ones(BANDS))
+    writer = SignalCubeWriter(tmp_path / "a.zarr", header, components, step=1.0, largest=100.0)
+    scores = np.zeros((1, 70, 1), np.float32)
+    scores[0, :2, 0] = 40_000, -1e9
+    kept = writer.write(0, scores, np.zeros((1, 70), np.uint8))
+    assert kept[0, 0, 0] > LARGEST_SHORT
+    assert kept[0, 1, 0] < -LARGEST_SHORT
+
+
+def test_full_scale_lines_are_stored_in_32_bits_and_come_back(tmp_path: Path) -> None:
+    """A signal of thousands of deviations in every band: scores are large, and nothing is lost of them."""
+    made = field_of(4, SHAPE, BANDS, signal=8000)
+    values = made.values
+    found = SignalStatistics(BANDS, values[..., 0].size)
+    found.add(values, np.ones(SHAPE, np.bool_))
+    components = find_components(found)
+    lines = lines_of()
+    header = SweepHeader(lines.sweep, lines.references, np.linspace(400, 1000, BANDS))
+    largest = components.largest(found.largest)
+    writer = SignalCubeWriter(tmp_path / "a.zarr", header, components, step=1.0, largest=largest)
+    scores = components.white(values) @ components.axes.T.astype(np.float32)
+    assert largest > LARGEST_SHORT
+    kept = writer.write(0, scores, np.zeros(SHAPE, np.uint8))
+    x, y = lines.position.T
+    facts = LineRows(lines.time_s, x, y, np.full(len(x), 100.0), lines.valid_line)
+    writer.close(facts, np.zeros((0, 2), np.intp), np.zeros((0, BANDS), np.int32), None)
+    cube = open_signal_cube(tmp_path / "a.zarr")
+    np.testing.assert_array_equal(cube.read(), kept)
+    off = (cube.spectra(0, 130) - values) / made.noise
+    assert np.sqrt(np.mean(off**2)) == pytest.approx(1, abs=0.1)
