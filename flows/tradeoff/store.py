@@ -112,7 +112,7 @@ def _new_cube(scan: ScanLines, components: Components, step: float, found: Signa
 
 
 def _closed(
-    scan: ScanLines, cube: SignalCubeInMemory, rare: NDArray[np.intp], residuals: NDArray[np.int16]
+    scan: ScanLines, cube: SignalCubeInMemory, rare: NDArray[np.intp], residuals: NDArray[np.int32]
 ) -> KeptLines:
     lines, (x, y) = scan.lines, scan.lines.position.T
     exposure_ms = np.full(len(lines.data), scan.camera.exposure_ms)
@@ -173,7 +173,7 @@ def keep_principal(scan: ScanLines, step: float) -> KeptLines:
     cube = _new_cube(scan, components, step, found)
     for first, scores in _scores(scan, components, raw=True):
         cube.writer.write(first, scores, np.zeros(scores.shape[:2], np.uint8))
-    nothing = np.zeros((0, components.bands), np.int16)
+    nothing = np.zeros((0, components.bands), np.int32)
     stored = _closed(scan, cube, np.zeros((0, 2), np.intp), nothing)
     return KeptLines(stored.size, lambda: scan.calibrated(stored.restore()))
 
