@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.survey_settings import RECORDED, RIG, SIM, MapChoice, Settings
+from flows.settings.survey_settings import RECORDED, RIG, MapChoice, Settings
 from flows.settings.values import EXTENT_PART, EXTENT_WHOLE
 from flows.tasks.capture_plan import CapturePlan, PassLayout
 from flows.tasks.drawing import UnknownRule
@@ -139,11 +139,6 @@ class CaptureRun:
             **({} if self.settings.visit is None else {"visit": self.settings.visit}),
             **self.source.key(self.name),
         }
-
-    @property
-    def noise_known(self) -> bool:
-        """Whether the camera of the settings took the lines, so that its model tells their noise."""
-        return self.settings.source in (SIM, RIG)
 
     @property
     def recorder(self) -> SweepRecorder:

@@ -105,6 +105,14 @@ def judge_elements(references: References) -> Elements:
     return Elements(references, gain, out, lit, fill)
 
 
+def number_values(references: References) -> NDArray[np.float64]:
+    """Scene value of one number of the camera, (band,): the median over the samples; NaN of bands without light."""
+    gain, known = judge_elements(references).gain.astype(np.float64), np.full(references.dark.shape[1], np.nan)
+    lit = np.isfinite(gain).any(axis=0)
+    known[lit] = np.abs(np.nanmedian(gain[:, lit], axis=0))
+    return known
+
+
 def _fill_of(wanted: Bools, good: Bools) -> Fill:
     """Where each wanted element finds its good neighbours of the same band; without any near enough it is left out."""
     samples, width = good.shape

@@ -24,6 +24,7 @@ class Components:
     mean: Floats  # (band,) scene value
     axes: Floats  # (component, band) orthonormal rows
     noise: Floats  # (band,) standard deviation of one spectrum's noise [scene value]
+    covariance: Floats | None = None  # (band, band) of the spectra, by which few bands stand in for missing ones
 
     @classmethod
     def empty(cls, bands: int) -> Components:
@@ -65,6 +66,22 @@ class Components:
     @property
     def _rows(self) -> Scores:
         return np.asarray(self.axes * np.nan_to_num(self.noise), np.float32)
+
+    def completed(self, values: NDArray[np.floating]) -> Scores:
+        """Return spectra (n, band) with what the bands that are there let expect of those that are NaN.
+
+        Every pattern of missing bands is solved by itself. A spectrum without any band takes the mean.
+        """
+        assert self.covariance is not None
+        lit = np.isfinite(self.mean)
+        spectra = np.asarray(values, np.float64) - self.mean
+        there = np.isfinite(spectra)
+        for pattern in np.unique(there, axis=0):
+            rows, have = (there == pattern).all(axis=1), np.flatnonzero(pattern)
+            lack = np.flatnonzero(lit & ~pattern)
+            law = np.linalg.lstsq(self.covariance[np.ix_(have, have)], self.covariance[np.ix_(have, lack)], rcond=1e-9)
+            spectra[np.ix_(rows, lack)] = spectra[np.ix_(rows, have)] @ law[0]
+        return np.asarray(spectra + self.mean, np.float32)
 
     def onto(self, matrix: NDArray[np.floating]) -> tuple[Scores, Scores]:
         """Weights (component, n) and offset (n,) that give ``spectrum @ matrix`` of scores, for a (band, n) matrix.

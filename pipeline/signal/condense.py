@@ -41,7 +41,8 @@ class ScoredLines:
 def score_lines(values: NDArray[np.float32], valid: Bools, components: Components) -> ScoredLines:
     """Project (line, sample, band) scene values onto components, by the bands that `calibrate` calls valid.
 
-    Where bands of a spectrum are missing the scores are those of least squares over the others. ``valid`` is (line,
+    Where bands of a spectrum are missing the scores are those of least squares over the others; of few bands, which
+    know their covariance, what the others let expect. ``valid`` is (line,
     sample) or (line, sample, band).
     """
     lit, count = np.isfinite(components.mean), len(components)
@@ -52,8 +53,13 @@ def score_lines(values: NDArray[np.float32], valid: Bools, components: Component
     broken = ~np.isfinite(left) if valid.ndim == 2 else ~np.isfinite(left) | ~valid[..., lit].all(axis=2)
     if (broken & (quality == WHOLE)).any():
         there = np.isfinite(values[broken]) & lit & (valid[broken] if valid.ndim == 3 else valid[broken][:, None])
-        white = np.where(there, components.white(values[broken]), np.float32(0))
-        scores[broken], residual[broken] = _least_squares(white, there, components.axes.T.astype(np.float32), bands)
+        axes = components.axes.T.astype(np.float32)
+        if components.covariance is not None:
+            spectra = components.completed(np.where(there, values[broken], np.float32(np.nan)))
+            scores[broken], residual[broken] = components.white(spectra) @ axes, 0
+        else:
+            white = np.where(there, components.white(values[broken]), np.float32(0))
+            scores[broken], residual[broken] = _least_squares(white, there, axes, bands)
         seen = there.sum(axis=1)
         quality[broken] = np.where(2 * seen < bands, UNUSABLE, np.where(seen < bands, PARTIAL, quality[broken]))
     unusable = quality == UNUSABLE

@@ -20,8 +20,10 @@ from pipeline.signal.components import Components
 
 BLOCK = 4  # spectra a side of a mean
 SPECTRA_A_BAND = 200  # single spectra that a covariance is estimated from, for each band; more cost and tell little
-FEW_BANDS = 8  # fewer cannot predict each other: the noise comes from neighbouring pixels, and all bands are kept
+FEW_BANDS = 8  # fewer cannot predict each other: their noise comes from neighbouring pixels, and all are kept
 KEPT_SPECTRA = 8192  # of which the law of residuals is learned
+FINE = 1 / 16  # of the noise: the step in which few bands are kept, where nothing tells a better one
+SMALL_FIELD, MOST_OF_SMALL = 10_000, 32  # spectra up to which so many components are kept; fewer in larger fields
 NOISE_ROUNDS = 6
 MOST_SHARED = 32  # directions of rare spectra that become components
 LEAST_NOISE = 1e-6  # of a band's largest value: values that never change have no noise to divide by
@@ -122,25 +124,6 @@ class SignalStatistics:
             return np.zeros((0, self.bands), np.float32)
         return np.concatenate(self.kept) + self.origin
 
-    def completed(self, values: Values) -> Values:
-        """Return (..., band) spectra with what the bands that are there let expect of those that are not.
-
-        For few bands: every pattern of missing bands is solved by itself. A spectrum without a band stays without.
-        """
-        there = np.isfinite(values)
-        some = there.any(axis=-1) & ~there.all(axis=-1)
-        if self.origin is None or not some.any():
-            return values
-        covariance, mean = _covariance(self.single, self.total, self.count)
-        spectra, known = values[some].astype(np.float64) - self.origin - mean, there[some]
-        for pattern in np.unique(known, axis=0):
-            rows, have, lack = (known == pattern).all(axis=1), np.flatnonzero(pattern), np.flatnonzero(~pattern)
-            weights = np.linalg.lstsq(covariance[np.ix_(have, have)], covariance[np.ix_(have, lack)], rcond=1e-9)[0]
-            spectra[np.ix_(rows, lack)] = spectra[np.ix_(rows, have)] @ weights
-        found = values.copy()
-        found[some] = spectra + self.origin + mean
-        return found
-
     def arrays(self) -> dict[str, NDArray[np.generic]]:
         """All of it by names, to be stored."""
         none = np.zeros((0, self.bands), np.float32)
@@ -172,14 +155,11 @@ class SignalStatistics:
         self.rough.append(both.reshape(-1, self.bands)[:: self._thin * self._stride**2].copy())
 
 
-def find_components(
-    found: SignalStatistics, *, false_alarm: float = 0.01, least: int = 4, noise: Floats | None = None
-) -> Components:
+def find_components(found: SignalStatistics, *, false_alarm: float = 0.01, least: int = 4) -> Components:
     """Return the components of a field: directions whose variance exceeds that of noise, as the whole field shows.
 
-    ``false_alarm`` is the probability that noise alone gives a component, ``least`` how many are kept at any rate,
-    ``noise`` (band,) the standard deviation by the camera's model, which few bands need; many tell it themselves. Bands
-    without a value anywhere are NaN in the mean and have no part in a component.
+    ``false_alarm`` is the probability that noise alone gives a component, ``least`` how many are kept at any rate. Bands without a value anywhere are NaN in
+    the mean and have no part in a component.
     """
     lit = np.flatnonzero(found.lit)
     mean = np.full(found.bands, np.nan)
@@ -188,8 +168,7 @@ def find_components(
     single, own = _covariance(found.single, found.total, found.count)
     mean[lit] = (found.origin + own)[lit]
     covariance = single[np.ix_(lit, lit)]
-    model = None if noise is None else noise[lit]
-    sigma = _noise(found, covariance, lit, mean[lit], model)
+    sigma = _noise(found, covariance, lit, mean[lit])
     loadings, deviations = np.zeros((0, found.bands)), np.full(found.bands, np.nan)
     for _ in range(NOISE_ROUNDS if len(lit) > FEW_BANDS and found.count >= 4 * len(lit) else 0):
         scale = np.outer(sigma, sigma)
@@ -203,22 +182,39 @@ def find_components(
     return Components(mean, loadings, deviations)
 
 
+def least_of_field(spectra: int) -> int:
+    """Components to keep at any rate of a field of so many spectra: few of them prove little, and cost little."""
+    return int(MOST_OF_SMALL * min(1.0, np.sqrt(SMALL_FIELD / max(spectra, 1))))
+
+
+def bands_alone(found: SignalStatistics, unit: Floats | float | None = None) -> Components:
+    """Return components that are the bands themselves, in steps of ``unit`` (band,): few bands are kept as they are.
+
+    A band's own steps, such as one of the camera's numbers, lose nothing; without them steps are far below the noise.
+    """
+    usual = find_components(found)
+    lit = np.isfinite(usual.mean)
+    steps = usual.noise * FINE if unit is None else np.where(lit, unit, np.nan)
+    covariance = np.zeros((found.bands, found.bands))
+    if found.count:
+        covariance, _ = _covariance(found.single, found.total, found.count)
+    axes = np.diag(lit.astype(np.float64))[lit]
+    return Components(np.where(lit, np.rint(usual.mean / steps) * steps, np.nan), axes, steps, covariance)
+
+
 def _covariance(products: Floats, total: Floats, count: int) -> tuple[Floats, Floats]:
     mean = total / count
     covariance: Floats = products / count - np.outer(mean, mean)
     return (covariance + covariance.T) / 2, mean
 
 
-def _noise(
-    found: SignalStatistics, covariance: Floats, lit: NDArray[np.intp], mean: Floats, model: Floats | None
-) -> Floats:
+def _noise(found: SignalStatistics, covariance: Floats, lit: NDArray[np.intp], mean: Floats) -> Floats:
     """First estimate of the noise's standard deviation, (band,): what the other bands, or neighbours, leave open."""
     variance = np.diag(covariance)
     floor = LEAST_NOISE * np.maximum(np.sqrt(variance), np.abs(mean)).max(initial=0.0) or 1.0
     if len(lit) <= FEW_BANDS:
         rough = np.concatenate(found.rough)[:, lit] if found.rough else np.zeros((0, len(lit)))
         sigma = SIGMA_OF_MEDIAN * np.median(np.abs(rough), axis=0) / 6 if len(rough) else np.sqrt(variance)
-        sigma = sigma if model is None else model
     elif found.count >= 4 * len(lit):
         with np.errstate(divide="ignore"):
             sigma = 1 / np.sqrt(np.abs(np.diag(np.linalg.pinv(covariance, hermitian=True))))
@@ -259,10 +255,12 @@ def _axes(
     rest = np.eye(bands) - axes @ axes.T
     more = significant_axes(rest @ white @ rest, found.count, false_alarm / 2, known=axes.shape[1])
     axes = np.concatenate([axes, more], axis=1)
-    if axes.shape[1] < min(least, bands):
+    wanted = min(least, bands)
+    if axes.shape[1] < wanted:
         rest = np.eye(bands) - axes @ axes.T
-        largest = np.linalg.eigh(rest @ white @ rest)[1][:, ::-1]
-        axes = np.concatenate([axes, largest[:, : min(least, bands) - axes.shape[1]]], axis=1)
+        means = BLOCK**2 * _covariance(found.block, found.block_total, max(found.means, 1))[0][np.ix_(lit, lit)] / scale
+        largest = np.linalg.eigh(rest @ (white + means) @ rest)[1][:, ::-1]
+        axes = np.concatenate([axes, largest[:, : wanted - axes.shape[1]]], axis=1)
     turned = np.linalg.eigh(axes.T @ white @ axes)[1][:, ::-1]  # by falling variance
     return np.linalg.qr(axes @ turned)[0]
 

@@ -49,22 +49,6 @@ class LineStatistics:
         self._waiting.clear()
 
 
-def camera_noise(
-    components_mean: NDArray[np.float64], references: References, camera: LineCamera, binning: int
-) -> NDArray[np.float64]:
-    """Standard deviation of a sample's noise by the camera's model, (band,) scene value, at the mean of a band.
-
-    NaN in bands without light. Read noise, shot noise of the signal and rounding, for sums of ``binning`` neighbours.
-    """
-    elements = judge_elements(references)
-    gain = np.full(len(elements.lit), np.nan)
-    gain[elements.lit] = np.nanmedian(elements.gain[:, elements.lit], axis=0)
-    signal_dn = np.maximum(np.nan_to_num(components_mean / gain), 0)
-    read = binning * (camera.read_noise_e / camera.electrons_per_dn) ** 2
-    noise: NDArray[np.float64] = np.abs(gain) * np.sqrt(read + signal_dn / camera.electrons_per_dn + 1 / 12)
-    return noise
-
-
 @dataclass(frozen=True, eq=False)
 class CondensedSweep:
     """What is known of a sweep once its scores are stored."""
@@ -122,15 +106,18 @@ def calibrated_blocks(
         yield first, *signal.values(_reader(lines), numbers, every, camera.full_scale_dn)
 
 
-def differing_lines(lines: SweepLines, stored: CondensedLines, camera: LineCamera) -> list[int]:
+def differing_lines(
+    lines: SweepLines, stored: CondensedLines, camera: LineCamera, components: Components | None = None
+) -> list[int]:
     """Return the lines of which a stored score, read from the disk, is more than rounding off what the raw line gives.
 
-    What scores leave of a spectrum is noise by the tests of condensing, or was kept.
+    What scores leave of a spectrum is noise by the tests of condensing, or was kept. ``components`` are those that the
+    lines were condensed by, where they know more than what is stored.
     """
     wrong = list[int]()
     for first, values, valid in calibrated_blocks(lines, camera):
         last = first + len(values)
-        seen = score_lines(values, valid, stored.components)
+        seen = score_lines(values, valid, components or stored.components)
         off = np.abs(stored.read(first, last) * np.float32(stored.step) - seen.scores)
         usable = seen.quality != UNUSABLE
         same = (off <= (0.5 + SLACK) * stored.step + SLACK * np.abs(seen.scores)).all(axis=2) | ~usable

@@ -93,7 +93,7 @@ def test_sweeps_of_the_rig_give_its_map(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: Path, asked: dict[str, Any]
 ) -> None:
     """Written as ENVI and CSV and surveyed as a recording, or out of the archive itself: the class map by hash."""
-    settings = rig_settings(tmp_path / "rig", weights, **asked)
+    settings = rig_settings(tmp_path / "rig", weights, keep="raw", **asked)
     with emulated(settings, {}, monkeypatch, scene=field()):
         published = run_survey(settings, QUIET)
     expected = digest_of_map(tmp_path / "rig", published.receipt)
@@ -139,7 +139,7 @@ def full_scan(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> t
     """A full scan of the session's picture by the simulated rig: its archive, its run, and its sweeps as files."""
     folder = tmp_path_factory.mktemp("recorded")
     with without_effects():
-        published = survey_png(folder / "sim", budget=None, scan_step="1", **NARROW)
+        published = survey_png(folder / "sim", budget=None, scan_step="1", keep="raw", **NARROW)
     return folder / "sim", published, write_sweeps(folder / "sim", published, folder / "sweeps")
 
 
@@ -156,7 +156,7 @@ def two_passes(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> 
     """A simulated survey in two passes, the first one binned: its archive and its run."""
     out = tmp_path_factory.mktemp("two_passes") / "sim"
     with without_effects():
-        return out, survey_png(out, budget=0.8, policy="entropy", **NARROW)
+        return out, survey_png(out, budget=0.8, policy="entropy", keep="raw", **NARROW)
 
 
 def test_two_simulated_passes_give_their_map(tmp_path: Path, two_passes: tuple[Path, Published]) -> None:
@@ -186,7 +186,7 @@ def test_a_budget_reads_only_the_lines_that_it_asks_for(
     """Of a recorded full scan two passes read their own lines and no other; the receipt says what zooming saves."""
     _, _, sweeps = full_scan
     with counted_lines(monkeypatch) as read:
-        published = survey_sweeps(tmp_path / "a", sweeps, weights=str(weights), budget=0.6)
+        published = survey_sweeps(tmp_path / "a", sweeps, weights=str(weights), budget=0.6, keep="raw")
     told = published.receipt["recording"]
     recorded = sum(open_raw_cube(path).sweep.lines for path in raw_cubes(full_scan))
     assert told["lines_recorded"] == recorded
@@ -416,8 +416,8 @@ def test_a_run_of_the_rig_is_reprocessed_from_its_raw_cubes(
 ) -> None:
     """Once captures have a newer version the rig is not asked: the same map, once, and nothing is left to do."""
     archive = tmp_path / "rig"
-    with emulated(rig_settings(archive, weights), {}, monkeypatch, scene=field()):
-        published = run_survey(rig_settings(archive, weights, scan_step=2), QUIET)
+    with emulated(rig_settings(archive, weights, keep="raw"), {}, monkeypatch, scene=field()):
+        published = run_survey(rig_settings(archive, weights, keep="raw", scan_step=2), QUIET)
     be_version(monkeypatch, "capture", 99)
     assert run_reprocess(archive, QUIET) == 0
     first, second = Archive.open(archive).runs()
@@ -435,7 +435,7 @@ def test_a_recording_whose_files_moved_is_reprocessed(
     """New weights read the raw cubes that the archive has of it."""
     folder, _ = pushbroom
     archive = tmp_path / "a"
-    survey_sweeps(archive, folder / "scan.hdr", weights=str(weights))
+    survey_sweeps(archive, folder / "scan.hdr", weights=str(weights), keep="raw")
     folder.rename(tmp_path / "elsewhere")
     other = make_weights(dim=24)
     assert run_reprocess(archive, QUIET, weights=other) == 0
@@ -469,7 +469,7 @@ def test_swaths_of_ones_own_are_surveyed_in_two_passes(tmp_path: Path, weights: 
             cube.write(source.lines(sweep))
     for path in sorted((tmp_path / "raw").glob("*.zarr")):
         write_recorded_files(open_raw_cube(path), tmp_path / "files")
-    asked = {"weights": str(weights), "size": "120x96", "budget": 0.7, "policy": "entropy"}
+    asked = {"weights": str(weights), "size": "120x96", "budget": 0.7, "policy": "entropy", "keep": "raw"}
     published = survey_sweeps(tmp_path / "a", tmp_path / "files", **asked)
     raw = {
         path.stem: open_raw_cube(path).sweep

@@ -14,10 +14,18 @@ from flows.settings.survey_settings import SignalChoice
 from flows.tasks.stage import Product, Report, Wanted, stage
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.camera import LineCamera
+from pipeline.signal.calibrate import number_values
 from pipeline.signal.components import Components
 from pipeline.signal.condense import RESIDUAL_STEP, ResidualLaw
-from pipeline.signal.subspace import FEW_BANDS, SignalStatistics, find_components, with_shared
-from pipeline.signal.sweep_signal import CondensedSweep, Condenser, camera_noise, differing_lines
+from pipeline.signal.subspace import (
+    FEW_BANDS,
+    SignalStatistics,
+    bands_alone,
+    find_components,
+    least_of_field,
+    with_shared,
+)
+from pipeline.signal.sweep_signal import CondensedSweep, Condenser, differing_lines
 from storage.archive.keys import StageRef
 from storage.archive.manifests import check_files, read_table, write_table
 from storage.arrays.cubes import RawCube, SweepHeader, open_raw_cubes
@@ -33,29 +41,25 @@ MOST_RARE = 0.05  # of spectra: more are no exceptions, and raw lines stay
 
 
 @stage("condense_coarse", "signal of the sweeps", SIGNAL, named="signal_coarse")
-def condense_coarse(
-    raw: StageRef, *, camera: LineCamera, signal: SignalChoice, noise_known: bool, report: Report
-) -> Wanted:
+def condense_coarse(raw: StageRef, *, camera: LineCamera, signal: SignalChoice, report: Report) -> Wanted:
     """Condense the sweeps of the first pass, or of a uniform scan."""
-    return _condensed(raw, camera, signal, noise_known, report)
+    return _condensed(raw, camera, signal, report)
 
 
 @stage("condense_fine", "signal of the fine sweeps", SIGNAL_FINE, named="signal_fine")
-def condense_fine(
-    raw: StageRef, *, camera: LineCamera, signal: SignalChoice, noise_known: bool, report: Report
-) -> Wanted:
+def condense_fine(raw: StageRef, *, camera: LineCamera, signal: SignalChoice, report: Report) -> Wanted:
     """Condense the sweeps of the second pass."""
-    return _condensed(raw, camera, signal, noise_known, report)
+    return _condensed(raw, camera, signal, report)
 
 
-def _condensed(raw: StageRef, camera: LineCamera, choice: SignalChoice, noise_known: bool, report: Report) -> Wanted:
-    """Want the condensed sweeps of a capture. ``noise_known``: the camera's model holds for its lines."""
+def _condensed(raw: StageRef, camera: LineCamera, choice: SignalChoice, report: Report) -> Wanted:
+    """Want the condensed sweeps of a capture."""
 
     def build(path: Path) -> None:
         """Find the components of the pass, and write every sweep's scores; once more where rare spectra share some."""
         cubes = open_raw_cubes(raw.path)
         found = read_statistics(raw.path)
-        components = components_of(found, cubes, camera, choice, noise_known)
+        components = components_of(found, cubes, choice)
         condenser = Condenser(
             components, ResidualLaw.learned(found.spectra, components), camera, choice.rare_spectra, choice.step
         )
@@ -84,8 +88,8 @@ def with_shared_directions(
 
 
 def _camera_key(camera: LineCamera) -> dict[str, Any]:
-    """Return what scores depend on of a camera: where samples saturate, and the noise of few bands."""
-    return {name: getattr(camera, name) for name in ("bits", "electrons_per_dn", "read_noise_e")}
+    """Return what scores depend on of a camera: where samples saturate."""
+    return {"bits": camera.bits}
 
 
 def camera_of(params: Mapping[str, Any]) -> LineCamera:
@@ -93,15 +97,12 @@ def camera_of(params: Mapping[str, Any]) -> LineCamera:
     return LineCamera(**params["camera"])
 
 
-def components_of(
-    found: SignalStatistics, cubes: Sequence[RawCube], camera: LineCamera, choice: SignalChoice, noise_known: bool
-) -> Components:
-    """Find the components of a pass; few bands take their noise from the camera's model, where that is known."""
-    noise = None
-    if noise_known and found.bands <= FEW_BANDS and found.count and found.origin is not None:
-        mean = found.origin + found.total / found.count
-        noise = camera_noise(mean, cubes[0].references, camera, cubes[0].sweep.binning)
-    return find_components(found, false_alarm=choice.false_alarm, least=choice.least, noise=noise)
+def components_of(found: SignalStatistics, cubes: Sequence[RawCube], choice: SignalChoice) -> Components:
+    """Find the components of a pass; few bands are kept as they are, in steps of one number of the camera."""
+    if found.bands > FEW_BANDS or not found.count:
+        least = max(choice.least, least_of_field(found.expected))
+        return find_components(found, false_alarm=choice.false_alarm, least=least)
+    return bands_alone(found, number_values(cubes[0].references))
 
 
 def _write_sweeps(
@@ -167,7 +168,8 @@ def _lines_differ(raw: StageRef, signal: StageRef, camera: LineCamera) -> str | 
     if [cube.sweep for cube in cubes] != [stored.sweep for stored in condensed]:
         return "the sweeps of the signal are not those of the raw lines"
     for cube, stored in zip(cubes, condensed, strict=True):
-        wrong = differing_lines(cube, stored, camera)
+        few = components_of(read_statistics(raw.path), cubes, SignalChoice()) if cube.shape[2] <= FEW_BANDS else None
+        wrong = differing_lines(cube, stored, camera, few)
         if wrong:
             return f"sweep {cube.sweep.name}: {line_values(wrong)} of the signal are not those of the raw lines"
     return None

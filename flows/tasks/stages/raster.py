@@ -13,14 +13,12 @@ from flows.settings.survey_settings import RASTER, SignalChoice
 from flows.tasks.stage import FieldFrame, Report, Wanted, stage
 from flows.tasks.stages.placement import MOSAIC, finish_mosaic
 from pipeline.readings import MOST_VALUE, readings_alone
-from pipeline.signal.components import Components
 from pipeline.signal.condense import UNUSABLE, score_lines
-from pipeline.signal.subspace import FEW_BANDS, SignalStatistics, find_components
+from pipeline.signal.subspace import FEW_BANDS, SignalStatistics, bands_alone, find_components, least_of_field
 from storage.arrays.layout import SHARD_ROWS
 from storage.arrays.mosaics import MosaicWriter
 from storage.readers.raster_fields import RasterPixels
 
-FINE = 1 / 16  # of the noise: the step in which few bands are kept
 Rows = tuple[int, NDArray[np.float32], NDArray[np.bool_]]
 
 
@@ -45,9 +43,11 @@ def condense_raster(
             found.add(values, valid)
             whole = whole and not np.nanmax(np.abs(values - np.rint(values)), initial=0)
             report(0.5 * first / frame.grid.height)
-        components = find_components(found, false_alarm=signal.false_alarm, least=signal.least)
         if raster.bands <= FEW_BANDS and found.count:
-            components = bands_alone(components, whole=whole)
+            components = bands_alone(found, 1.0 if whole else None)
+        else:
+            least = max(signal.least, least_of_field(found.expected))
+            components = find_components(found, false_alarm=signal.false_alarm, least=least)
         origin = np.zeros(raster.bands) if found.origin is None else found.origin
         writer = MosaicWriter(
             path / "mosaic.zarr",
@@ -60,8 +60,6 @@ def condense_raster(
             grid=frame.angular_grid(),
         )
         for first, values, valid in blocks():
-            if raster.bands <= FEW_BANDS and found.count:
-                values = found.completed(values)
             seen = score_lines(values, valid, components)
             writer.write_rows(first, seen.scores, seen.quality != UNUSABLE)
             report(0.5 + 0.5 * (first + len(values)) / frame.grid.height)
@@ -69,13 +67,3 @@ def condense_raster(
 
     params = {"source": RASTER, "scene": scene_key, "grid": asdict(frame.grid), **asdict(signal), **frame.key}
     return Wanted(build, params | {"bands": raster.bands})
-
-
-def bands_alone(components: Components, *, whole: bool) -> Components:
-    """Return components that are the bands themselves, in steps far below their noise, or of 1 for ``whole`` numbers.
-
-    Few bands do not tell their noise from what they show.
-    """
-    lit = np.isfinite(components.mean)
-    unit = np.where(lit, 1.0 if whole else components.noise * FINE, np.nan)
-    return Components(np.where(lit, 0.0, np.nan), np.diag(lit.astype(np.float64))[lit], unit)

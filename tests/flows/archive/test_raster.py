@@ -70,7 +70,7 @@ def whole(published: Any, archive: Path, factor: int = 4) -> tuple[NDArray[np.fl
 
 def rounding(values: NDArray[Any]) -> float:
     """Return what stored values may lie off by: nothing of whole numbers, else a small part of their spread."""
-    return 1e-3 if (values == np.rint(values)).all() else 0.02 * float(np.nanstd(values))
+    return 1e-3 if (values == np.rint(values)).all() else 0.05 * float(np.nanstd(values))
 
 
 def means_of(values: NDArray[Any], factor: int = 4) -> NDArray[np.float64]:
@@ -360,7 +360,7 @@ def test_prefect_runs_the_stages_of_a_raster(
     """The same receipt comes of the Prefect engine."""
     given = {"scene": str(scene_files / "scene.png"), "weights": str(weights), "out": str(tmp_path / "archive")}
     published = run_survey(load_settings(None, given), QUIET)
-    assert [row["state"] for row in published.receipt["stages"]] == ["ran"] * 4
+    assert [row["state"] for row in published.receipt["stages"]] == ["ran"] * 3
 
 
 def test_an_image_and_its_wavelengths(surveyed: Raster, tmp_path: Path) -> None:

@@ -21,12 +21,11 @@ from models.network.spectral import SpectralBasis
 from models.reading.inference import CoarsePrediction
 from models.reading.regions import whole_field
 from pipeline.errors import SettingsError
-from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.grid import SceneGrid, patch_pixels
 from pipeline.geometry.scan import Sweep
 from pipeline.planning.coverage import coarse_sweeps, full_sweeps, reach_px
 from pipeline.simulator.effects.pointing import PointingErrors
-from storage.arrays.layout import open_group, read_array
-from storage.arrays.mosaics import open_mosaic
+from storage.arrays.mosaics import chosen_patches, open_mosaic
 from tests.flows.conftest import FEW_BANDS
 from tests.prior_work import without_effects
 from tests.storage.plain_mosaic import write_values
@@ -75,9 +74,10 @@ def test_sweeps_are_put_right_by_seams_and_on_the_mosaic(surveyed: tuple[dict[st
 def test_what_the_mirror_missed_is_told_and_detail_still_helps(surveyed: tuple[dict[str, Any], Path]) -> None:
     """Patches seen in part are counted, either pass has its row, and with patches the map is better than without."""
     receipt, archive = surveyed
-    values = read_array(open_group(archive / receipt["products"]["patches"]), "values")
-    partly = np.isnan(values).all(axis=3).any(axis=(1, 2))
-    assert receipt["pointing"]["fine"]["partly_seen"] == np.count_nonzero(partly)
+    detail = open_mosaic(archive / receipt["products"]["detail"])
+    grid = SceneGrid(*detail.shape, 16, 4)
+    unseen = patch_pixels(grid, detail.coverage() == 0)[chosen_patches(archive / receipt["products"]["attention"])]
+    assert receipt["pointing"]["fine"]["partly_seen"] == np.count_nonzero(unseen.any(axis=(1, 2)))
     rows = dict(finding_rows(surveyed[0]))
     assert all("put right by up to" in rows[f"pointing, {name}"] for name in ("coarse", "fine"))
     accuracy = surveyed[0]["accuracy"]

@@ -12,9 +12,9 @@ from pipeline.signal.calibrate import calibrate
 from pipeline.signal.components import Components
 from pipeline.signal.condense import RESIDUAL_STEP, UNUSABLE, ResidualLaw
 from pipeline.signal.subspace import SignalStatistics, find_components
-from pipeline.signal.sweep_signal import CondensedSweep, Condenser, LineStatistics, camera_noise, differing_lines
+from pipeline.signal.sweep_signal import CondensedSweep, Condenser, LineStatistics, differing_lines
 from pipeline.source import Line
-from tests.pipeline.signal.made_spectra import CAMERA, DARK, GAIN, MadeLines, field_of, raw_of
+from tests.pipeline.signal.made_spectra import CAMERA, MadeLines, field_of, raw_of
 
 SHAPE, BANDS = (150, 40), 24
 
@@ -208,21 +208,3 @@ def test_progress_ends_at_one() -> None:
     condenser = Condenser(components, ResidualLaw.learned(found.spectra, components), CAMERA, 1.0)
     condenser.sweep(lines, lambda first, scores, quality: scores, told.append)
     assert told == [64 / 150, 128 / 150, 1.0]
-
-
-@pytest.mark.parametrize("binning", [1, 4])
-def test_the_cameras_noise_is_that_of_its_electrons(binning: int) -> None:
-    """Read noise of 4 DN, shot noise of 5 electrons a DN, and rounding, in quadrature."""
-    lines = made_lines()
-    mean = np.linspace(0.1, 2, BANDS)
-    dn = mean / GAIN
-    wanted = GAIN * np.sqrt(binning * (CAMERA.read_noise_e / 5) ** 2 + dn / 5 + 1 / 12)
-    np.testing.assert_allclose(camera_noise(mean, lines.references, CAMERA, binning), wanted, rtol=1e-5)
-
-
-def test_the_cameras_noise_of_a_band_without_light_is_not_known() -> None:
-    """A band without light is NaN, and the others are what they are."""
-    lines = made_lines()
-    lines.references.white[:, 3] = DARK
-    found = camera_noise(np.ones(BANDS), lines.references, CAMERA, 1)
-    assert np.flatnonzero(np.isnan(found)).tolist() == [3]
