@@ -18,7 +18,7 @@ from flows.publish.receipt import is_pending
 from flows.publish.retention import RawClearance, clear_raw_lines
 from flows.settings.load import of_this_version, parse_settings
 from flows.settings.survey_settings import OF_THE_MACHINE, Settings
-from flows.tasks.open_survey import versions, versions_made_again
+from flows.tasks.open_survey import versions
 from flows.tasks.scores import score_of
 from flows.terminal.figures import DASH, counted, format_bytes, format_points, format_seconds, known_number
 from flows.terminal.processes import DONE, FAILED, PARTLY
@@ -82,7 +82,6 @@ def gc(
     *,
     keep_days: float = 1.0,
     raw_too: Switch = False,
-    patches_too: Switch = False,
     dry_run: Switch = False,
     as_json: AsJson = False,
 ) -> int:
@@ -97,9 +96,6 @@ def gc(
         Stores younger than this stay: a survey may be about to name them.
     raw_too
         Also raw lines of a rig, or ingested, that no run names; they cannot be had again.
-    patches_too
-        Also the fine patches that runs name, most of an archive: they are cut again from the raw lines when they are
-        asked for, such as by `reprocess` with other weights.
     dry_run
         Only say what would go, and how many bytes.
     """
@@ -109,7 +105,6 @@ def gc(
             opened,
             keep_days=keep_days,
             raw_too=raw_too,
-            made_again=versions_made_again() if patches_too else {},
             dry_run=dry_run,
             progress=lambda removal, fraction: bars.show("gc", fraction, removal.uri),
         )

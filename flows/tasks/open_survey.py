@@ -50,11 +50,6 @@ def versions() -> dict[str, int]:
     return {one.product.name: one.product.version for one in STAGES.values()}
 
 
-def versions_made_again() -> dict[str, int]:
-    """Return the present version of every product whose files may be cleared away, since they are soon made again."""
-    return {one.product.name: one.product.version for one in STAGES.values() if one.product.made_again}
-
-
 @dataclass(frozen=True)
 class RunRef:
     """Address of a published run."""

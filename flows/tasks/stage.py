@@ -67,7 +67,6 @@ class Product:
     version: int
     files: tuple[str, ...] = ()  # in a store, that receipts name, by their stems
     by_weights: bool = False  # the weights are one of its parameters
-    made_again: bool = False  # large, and soon made of what stays: `gc` may clear its files away
 
 
 @dataclass(frozen=True)

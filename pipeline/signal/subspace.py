@@ -158,8 +158,8 @@ class SignalStatistics:
 def find_components(found: SignalStatistics, *, false_alarm: float = 0.01, least: int = 4) -> Components:
     """Return the components of a field: directions whose variance exceeds that of noise, as the whole field shows.
 
-    ``false_alarm`` is the probability that noise alone gives a component, ``least`` how many are kept at any rate. Bands without a value anywhere are NaN in
-    the mean and have no part in a component.
+    ``false_alarm`` is the probability that noise alone gives a component, ``least`` how many are kept at any rate.
+    Bands without a value anywhere are NaN in the mean and have no part in a component.
     """
     lit = np.flatnonzero(found.lit)
     mean = np.full(found.bands, np.nan)

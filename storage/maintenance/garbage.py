@@ -1,18 +1,15 @@
 """Clearing an archive up: what no run names goes, what a run names or rests on never does.
 
-Of named stores that can be made again the files may go where somebody asks for that; their manifests stay.
-
 Stores go before those that they were made of, each in one step, so that an archive is whole wherever this is killed.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from types import MappingProxyType
 from typing import Literal
 
 from pipeline.errors import SettingsError
@@ -32,9 +29,8 @@ from storage.archive.staging import (
 )
 
 DAY_S = 86400.0
-NOTHING: Mapping[str, int | str] = MappingProxyType({})
 IN_USE = "somebody is using the archive: run gc again when it is free"
-What = Literal["store", "files", "spool", "unfinished", "upload"]  # files: of a store that runs go on naming
+What = Literal["store", "files", "spool", "unfinished", "upload"]  # files: raw lines of a run, by its setting `keep`
 
 
 @dataclass(frozen=True)
@@ -66,7 +62,6 @@ def clear_up(
     *,
     keep_days: float = 1.0,
     raw_too: bool = False,
-    made_again: Mapping[str, int | str] = NOTHING,
     dry_run: bool = False,
     progress: Callable[[Removal, float], None] | None = None,
 ) -> Clearance:
@@ -76,7 +71,7 @@ def clear_up(
     """
 
     def plan_now() -> Clearance:
-        return plan_clearance(archive, keep_days=keep_days, raw_too=raw_too, made_again=made_again)
+        return plan_clearance(archive, keep_days=keep_days, raw_too=raw_too)
 
     if dry_run:
         with refusals(archive.root, "clear up the archive"):
@@ -88,22 +83,19 @@ def clear_up(
         for number, removal in enumerate(plan.removals):
             if progress is not None:
                 progress(removal, number / len(plan.removals))
-            in_archive = removal.what in ("store", "files")
+            in_archive = removal.what == "store"
             held = (in_archive and obstacle is not None) or (removal.what == "upload" and not alone)
             if not held and _remove(archive, removal):
                 gone.append(removal)
     return Clearance(tuple(gone), plan.kept, obstacle)
 
 
-def plan_clearance(
-    archive: Archive, *, keep_days: float = 1.0, raw_too: bool = False, made_again: Mapping[str, int | str] = NOTHING
-) -> Clearance:
+def plan_clearance(archive: Archive, *, keep_days: float = 1.0, raw_too: bool = False) -> Clearance:
     """Find what can go: stores that no run names, spools of published captures, and what a dead process left.
 
     Stores younger than ``keep_days`` stay, and so does what they rest on: a survey may be about to name them.
-    ``raw_too`` also takes raw lines of a rig (or that were ingested) that no run names; they cannot be had again. Of
-    stages ``made_again``, by their present versions, also the files of named stores go: their manifests stay. Raises
-    SettingsError: ``keep_days`` is negative or no number.
+    ``raw_too`` also takes raw lines of a rig (or that were ingested) that no run names; they cannot be had again.
+    Raises SettingsError: ``keep_days`` is negative or no number.
     """
     if not (math.isfinite(keep_days) and keep_days >= 0):
         raise SettingsError(f"--keep-days {keep_days}: expected a number of days, 0 or more")
@@ -117,11 +109,6 @@ def plan_clearance(
     gone = [] if obstacle else [uri for uri in catalogue.stores if uri not in named and uri not in kept]
     removals = [
         Removal(uri, "store", archive.size_of(uri), "no run names it") for uri in reversed(catalogue.inputs_first(gone))
-    ]
-    removals += [
-        Removal(uri, "files", store.size, "they can be made again")
-        for uri, store in catalogue.stores.items()
-        if not obstacle and _age_days(store, moment) >= keep_days and _can_be_made_again(catalogue, store, made_again)
     ]
     uploads = [
         Removal(uri, "upload", size, "it was never published") for uri, size in archive.leftovers(keep_days).items()
@@ -150,15 +137,6 @@ def _spared(catalogue: Catalogue, named: set[str], keep_days: float, raw_too: bo
     for uri in catalogue.dependents(younger) - named:
         kept.setdefault(uri, f"made of what is younger than {keep_days:g} days")
     return kept
-
-
-def _can_be_made_again(catalogue: Catalogue, store: Store, made_again: Mapping[str, int | str]) -> bool:
-    """Whether a survey makes a store again as it is: by this version of its stage, of stores that are there."""
-    if store.problem is not None or store.cleared or store.version != str(made_again.get(store.ref.stage)):
-        return False
-    below = [catalogue.stores.get(uri) for uri in catalogue.ancestors([store.ref.uri])]
-    asked = any(run.settings for run in catalogue.named_by(store.ref.uri))
-    return asked and all(one is not None and one.problem is None for one in below)
 
 
 def _age_days(store: Store, now: datetime) -> float:
@@ -213,8 +191,6 @@ def _remove(archive: Archive, removal: Removal) -> bool:
     path = archive.root / removal.uri
     if removal.what == "store":
         return archive.discard(StageRef(path.parent.name, path.name, path), wait=False, unnamed=True)
-    if removal.what == "files":
-        return archive.clear(StageRef(path.parent.name, path.name, path), wait=False)
     if removal.what == "upload":
         archive.drop_leftover(removal.uri)
         return True

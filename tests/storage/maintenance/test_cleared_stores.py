@@ -12,16 +12,13 @@ from storage.archive import run_folders
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.records import read_store
-from storage.maintenance.garbage import IN_USE, clear_up, plan_clearance
-from tests.storage.small_archive import flip, problems, small_survey
-
-MOSAICS = {"rectify": 1}  # of which the files may go
+from tests.storage.small_archive import problems, small_survey
 
 
-def cleared(archive: Archive, **more: object) -> list[str]:
-    """Addresses of which the files go."""
-    done = clear_up(archive, keep_days=0, made_again=MOSAICS, **more)  # type: ignore[arg-type]
-    return [one.uri for one in done.removals if one.what == "files"]
+def cleared(archive: Archive) -> list[str]:
+    """Addresses of the mosaics of which the files go."""
+    there = [ref for ref in archive.refs("rectify") if archive.is_there(ref.uri)]
+    return [ref.uri for ref in there if archive.clear(ref, wait=False)]
 
 
 def content(ref: StageRef) -> str:
@@ -33,7 +30,7 @@ def test_the_files_go_and_the_manifest_stays(archive: Archive) -> None:
     """What it was made of, what it took and how large it was is told yet; the archive is whole."""
     small = small_survey(archive)
     before, size = archive.manifest(small.mosaic), archive.stored_bytes(small.mosaic)
-    assert cleared(archive, dry_run=True) == cleared(archive) == [small.mosaic.uri]
+    assert cleared(archive) == [small.mosaic.uri]
     assert [path.name for path in small.mosaic.path.iterdir()] == ["manifest.json"]
     after = archive.manifest(small.mosaic)
     assert {name: after[name] for name in ("key", "params", "inputs", "created")} == {
@@ -68,37 +65,6 @@ def test_a_reader_of_what_was_cleared_is_told_what_to_do(archive: Archive) -> No
     cleared(archive)
     with pytest.raises(IncompleteStoreError, match="cleared away by gc; run its survey again"):
         archive.locate(f"{small.mosaic.uri}/mosaic.zarr")
-
-
-def test_what_cannot_be_made_again_stays(archive: Archive) -> None:
-    """Stores of another version of their stage, and those of which the raw lines are damaged or gone."""
-    small = small_survey(archive)
-    assert clear_up(archive, keep_days=0, made_again={"rectify": 2, "capture": 7}).removals == ()
-    flip(small.raw.path / "manifest.json", at=20)
-    assert cleared(archive) == []
-    assert content(small.mosaic)
-
-
-def test_unnamed_and_young_stores_are_not_cleared(archive: Archive) -> None:
-    """What no run names goes as a whole; what a survey may just be reading stays."""
-    gone = small_survey(archive, named=False)
-    removals = plan_clearance(archive, keep_days=0, made_again=MOSAICS).removals
-    assert {(one.uri, one.what) for one in removals} == {
-        (ref.uri, "store") for ref in (gone.raw, gone.mosaic, gone.map)
-    }
-    small_survey(archive)
-    assert plan_clearance(archive, keep_days=1, made_again=MOSAICS).removals == ()
-
-
-def test_nothing_is_cleared_while_somebody_works(archive: Archive) -> None:
-    """Neither in an archive that is in use, nor a store that is being made."""
-    small = small_survey(archive)
-    with archive.in_use():
-        done = clear_up(archive, keep_days=0, made_again=MOSAICS)
-    assert (done.removals, done.obstacle) == ((), IN_USE)
-    with archive._locked(f"rectify-{small.mosaic.key}"):
-        assert cleared(archive) == []
-    assert content(small.mosaic)
 
 
 @pytest.mark.parametrize("exchanges", [True, False])

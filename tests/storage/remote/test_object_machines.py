@@ -253,8 +253,7 @@ def test_what_one_machine_cleared_another_makes_again(machine: Machine) -> None:
     small = small_survey(first)
     assert second.find("rectify", small.mosaic.key) is not None
     kept = second.ref("rectify", small.mosaic.key).path
-    done = clear_up(first, keep_days=0, made_again={"rectify": 1})
-    assert [(one.uri, one.what) for one in done.removals] == [(small.mosaic.uri, "files")]
+    assert first.clear(small.mosaic)
     assert [name.rpartition("/")[2] for name in first.objects.listing(small.mosaic.uri)] == ["manifest.json"]
     assert problems(first) == []
     assert first.find("rectify", small.mosaic.key) is None
@@ -275,7 +274,7 @@ def test_a_run_that_rests_on_what_was_cleared_brings_it_back(machine: Machine) -
     assert (second.ref("rectify", small.mosaic.key).path / "manifest.json").parent == second.root / small.mosaic.uri
     assert second.find("rectify", small.mosaic.key) is not None
     assert (second.ref("rectify", small.mosaic.key).path / "data.bin").is_file()
-    clear_up(first, keep_days=0, made_again={"rectify": 1})
+    assert first.clear(small.mosaic)
     small_survey(second, kernel="bilinear")
     assert any(name.endswith("/data.bin") for name in second.objects.listing(small.mosaic.uri))
     assert problems(second) == []
