@@ -20,7 +20,7 @@ from pipeline.source import Line, References, SweepLines
 Store = Callable[[int, NDArray[np.float32], NDArray[np.uint8]], NDArray[np.float32]]
 Report = Callable[[float], None]
 Bools = NDArray[np.bool_]
-SLACK = 1e-3  # of a step, and of a score, by which sums of float32 may differ
+SLACK, DIGITS = 1e-3, 1e-5  # of a step, and of a score, by which sums of float32 may differ
 
 
 class LineStatistics:
@@ -120,7 +120,7 @@ def differing_lines(
         seen = score_lines(values, valid, components or stored.components)
         off = np.abs(stored.read(first, last) * np.float32(stored.step) - seen.scores)
         usable = seen.quality != UNUSABLE
-        same = (off <= (0.5 + SLACK) * stored.step + SLACK * np.abs(seen.scores)).all(axis=2) | ~usable
+        same = (off <= (0.5 + SLACK) * stored.step + DIGITS * np.abs(seen.scores)).all(axis=2) | ~usable
         wrong += (first + np.flatnonzero(~(same & (usable == stored.usable[first:last])).all(axis=1))).tolist()
     return wrong
 
