@@ -149,8 +149,8 @@ def find_rare(ratio: NDArray[np.float32], law: ResidualLaw, false_alarm: float) 
     whole image that noise alone may mark, over all tests together.
     """
     known = np.isfinite(ratio)
-    share = false_alarm / (1 + len(JOINT)) / max(int(known.sum()), 1)
-    rare = known & (ratio > _limit(law.freedom, share))
+    part = false_alarm / (1 + len(JOINT)) / max(int(known.sum()), 1)
+    rare = known & (ratio > _limit(law.freedom, part))
     filled = np.where(known, np.minimum(ratio, _limit(law.freedom, ALONE)), 1).astype(np.float64)
     for lines, samples in JOINT:
         if lines > ratio.shape[0] or samples > ratio.shape[1]:
@@ -159,7 +159,7 @@ def find_rare(ratio: NDArray[np.float32], law: ResidualLaw, false_alarm: float) 
         mean = uniform_filter(filled, (lines, samples))
         high = np.zeros(ratio.shape, np.float32)
         within = tuple(slice(side // 2, (side // 2 - side + 1) or None) for side in (lines, samples))
-        high[within] = mean[within] > _limit(law.freedom * size, share / size)
+        high[within] = mean[within] > _limit(law.freedom * size, part / size)
         if high.any():  # all spectra of the window
             reach = uniform_filter(high, (lines, samples), mode="constant", origin=_back(lines, samples))
             rare |= known & (reach > 0.5 / size)

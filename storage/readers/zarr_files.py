@@ -84,6 +84,11 @@ def open_zarr_cube(path: Path, variable: str | None = None, *, labels: bool = Fa
                 f"{path} holds raw lines of a survey, whose pixels lie where the mirror looked; survey them as "
                 f"--sweeps {path}"
             )
+        if isinstance(node, zarr.Group) and {"scores", "axes"} <= set(node.array_keys()):
+            raise SceneError(
+                f"{path} holds components of spectra; `spectralzoom export` writes its reflectance as an image, and "
+                "spectralzoom.open(ARCHIVE).latest.cube opens it in Python"
+            )
         arrays: dict[str, Any] = dict(node.arrays()) if isinstance(node, zarr.Group) else {"": node}
         cube = find_cube(arrays, variable, path, labels=labels)
         for used in {cube.name, *names_beside(arrays), *({*FRAMES, *OF_LINES, *dims_of(cube.array)} & set(arrays))}:

@@ -12,6 +12,7 @@ import numpy as np
 
 from flows.settings.survey_settings import SignalChoice
 from flows.tasks.stage import Product, Report, Wanted, stage
+from flows.tasks.stages.capture import RIG_RECORD
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.camera import LineCamera
 from pipeline.signal.calibrate import number_values
@@ -68,6 +69,8 @@ def _condensed(raw: StageRef, camera: LineCamera, choice: SignalChoice, report: 
         if better is not None:
             condenser, done = better, _write_sweeps(path, cubes, better, found, report)
         write_table(path / RECORD, _record(condenser, done))
+        if (raw.path / RIG_RECORD).is_file():  # raw lines may go
+            shutil.copyfile(raw.path / RIG_RECORD, path / RIG_RECORD)
 
     return Wanted(build, {"camera": _camera_key(camera), **asdict(choice)}, [raw])
 

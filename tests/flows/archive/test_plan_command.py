@@ -24,13 +24,7 @@ from tests.flows.conftest import be_version, python
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 
-WAITS = {
-    "condense_coarse": "capture_coarse",
-    "locate": "condense_coarse",
-    "rectify": "locate",
-    "score": "rectify",
-    "capture_fine": "score",
-}
+WAITS = {"locate": "condense_coarse", "rectify": "locate", "score": "rectify", "capture_fine": "score"}
 
 
 @pytest.fixture(scope="module")

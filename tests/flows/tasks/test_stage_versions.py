@@ -116,7 +116,8 @@ def test_every_barrier_stands_in_a_way(barrier: str) -> None:
         "score": ("PatchScorer", "Encoder", "fill_dead", "SceneGrid"),
         "segment": ("Encoder", "fill_dead", "MOST_DEAD", "Segmenter", "write_class_tile"),
         "capture": ("RigSource", "CaptureRunner", "open_mirror", "HeadwallCamera", "lines_by_time", "EFFECTS"),
-        "patches": ("read_patches", "LineCache", "calibrate", "PatchWriter"),
+        "condense": ("find_components", "find_rare", "calibrate", "SignalCubeWriter"),
+        "rectify": ("mosaic_tile", "LineCache", "MosaicWriter"),
     }.items(),
 )
 def test_code_is_watched_however_it_is_reached(stage: str, names: tuple[str, ...]) -> None:
@@ -137,8 +138,8 @@ def test_words_beside_the_code_concern_no_stage() -> None:
     }
 
 
-@pytest.mark.parametrize("absent", [("average_raster", "take_patches"), ("rectify", "extract_patches")])
-def test_every_stage_says_once_what_receipts_call_its_store(absent: tuple[str, str]) -> None:
+@pytest.mark.parametrize("absent", [("condense_raster",), ("rectify", "rectify_fine")])
+def test_every_stage_says_once_what_receipts_call_its_store(absent: tuple[str, ...]) -> None:
     """No two stages of a survey, of a capture or of a raster, share a name in receipts; each has one at least."""
     ran = [one for name, one in STAGES.items() if name not in absent]
     named = [one.addresses(StageRef(one.product.name, "abc", Path())) for one in ran]

@@ -18,9 +18,9 @@ from pipeline.errors import SceneError
 from pipeline.geometry.scan import Sweep
 from pipeline.source import Line, References
 from storage.arrays.cubes import RawCubeWriter, SweepHeader
-from storage.arrays.mosaics import MosaicWriter
 from storage.readers.open_cubes import open_cube
 from storage.readers.scene_files import load_scene_file
+from tests.storage.plain_mosaic import write_values
 
 NM = np.array([450.0, 550.0, 650.0, 800.0, 900.0])
 
@@ -104,15 +104,10 @@ def test_dims_that_are_not_known(
 
 
 def test_own_mosaic(tmp_path: Path) -> None:
-    """A mosaic of this project is the scene that it shows; what no line reached is missing."""
-    values = np.random.default_rng(0).random((8, 9, 5)).astype(np.float32).round(2)
-    values[2, 3] = np.nan
-    writer = MosaicWriter(tmp_path / "mosaic.zarr", (8, 9), NM, fwhm_nm=NM / 100)
-    writer.write_tile(0, 0, values, np.ones((8, 9), np.float32))
-    scene = load_scene_file(tmp_path / "mosaic.zarr")
-    np.testing.assert_allclose(scene.values, values, rtol=3e-4)
-    assert scene.fwhm_nm is not None
-    np.testing.assert_allclose(scene.fwhm_nm, NM / 100)
+    """A mosaic of this project holds scores and no values: one message says how to have them."""
+    write_values(tmp_path / "mosaic.zarr", np.zeros((8, 9, 5)), NM)
+    with pytest.raises(SceneError, match=r"holds components of spectra; `spectralzoom export` writes"):
+        load_scene_file(tmp_path / "mosaic.zarr")
 
 
 def test_own_raw_cube(tmp_path: Path) -> None:
