@@ -218,7 +218,6 @@ class Settings:
         "signal",
         "What stays of captured lines: signal (raw lines are cleared away once each was compared with what was "
         "condensed from it), raw (they stay too), or for how long they stay: raw 7d",
-        example="raw 7d",
     )
     budget: Budget = stated(
         0.5, "Seconds of coarse and fine capture over those of the full scan, above 0 and at most 1"
