@@ -288,7 +288,7 @@ class FullDisk:
         self._patches.close()
 
 
-FULL_WORDS = "--labels labels.png --budget 0.7"
+FULL_WORDS = "--labels labels.png --budget 0.7 --keep raw"
 
 
 @pytest.fixture(scope="module")
@@ -296,7 +296,9 @@ def undisturbed(folder: Path, tmp_path_factory: pytest.TempPathFactory, survey_p
     """Writes of a whole survey, and its class map."""
     out = tmp_path_factory.mktemp("undisturbed")
     with FullDisk(out, np.inf) as disk:
-        survey_png(out, budget="0.7", scene=str(folder / "scene.png"), weights=str(folder / "w.safetensors"))
+        survey_png(
+            out, keep="raw", budget="0.7", scene=str(folder / "scene.png"), weights=str(folder / "w.safetensors")
+        )
     return disk.writes, class_map(Archive.open(out))
 
 
