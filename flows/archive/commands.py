@@ -322,7 +322,7 @@ def show_contents(content: dict[str, Any], console: Console) -> None:
     runs = map(_shown_run, content["runs"])
     console.print(table(columns, runs, title="Runs", left=2, whole=WHOLE) if content["runs"] else "no runs")
     rows = [row for stage, stores in content["stages"].items() for row in _shown_stores(stage, stores)]
-    columns = ("stage", "key", "version", "size", "age", "runs that name it")
+    columns = ("stage", "key", "version", "size", "age", "named by")
     console.print(table(columns, rows, title="Stores", left=3, whole=WHOLE) if rows else "no stores")
     for uri in content["lost"]:
         console.print(f"[bold red]{escape(uri)} has lost its manifest; run verify[/]", soft_wrap=True)

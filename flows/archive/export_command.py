@@ -207,10 +207,12 @@ def name_stores(export: Export) -> None:
     """Name the archive's own stores and the run's files to the catalogue, where they are."""
     run, root = export.run, export.run.archive.root
     nowhere = export.nowhere
-    boxes = {product: load_geobox(run.path(product)) for product in ("mosaic", "class_map")}
+    there = ("mosaic", "class_map", *(("detail",) if run.store("detail") is not None else ()))
+    boxes = {product: load_geobox(run.path(product)) for product in there}
     places = {product: nowhere if box is None else projection(box) for product, box in boxes.items()}
     stores: dict[str, tuple[str, dict[str, Any]]] = {
-        "mosaic": ("Coarse mosaic", places["mosaic"]),
+        "mosaic": ("Mosaic of the first pass or of a uniform scan", places["mosaic"]),
+        "detail": ("Mosaic of the fine sweeps", places.get("detail", nowhere)),
         "class_map": ("Class map and confidence on the camera's grid", places["class_map"]),
         "attention": ("Score and rank of the patches", nowhere),
     }
@@ -221,7 +223,9 @@ def name_stores(export: Export) -> None:
             path = root / run.receipt["products"][product]
             export.add(f"{product}_zarr", path, title, ZARR, ["data"], **fields)
     for sweep in run.sweeps():
-        export.add(f"{sweep.stem}_zarr", sweep, f"Raw sweep {sweep.stem}", ZARR, ["data", "raw"], **nowhere)
+        raw = (sweep / "dn").is_dir()  # else condensed
+        title, roles = ("Raw sweep", ["data", "raw"]) if raw else ("Signal of sweep", ["data"])
+        export.add(f"{sweep.stem}_zarr", sweep, f"{title} {sweep.stem}", ZARR, roles, **nowhere)
     for name, (title, kind, roles) in RUN_FILES.items():
         if (run.folder / name).is_file():
             export.add(Path(name).stem, run.folder / name, title, kind, roles)

@@ -24,6 +24,8 @@ from flows.settings.load import load_settings
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from pipeline.ground.view import RigPose
 from storage.archive.archive import Archive
+from storage.arrays.mosaics import open_mosaic
+from storage.arrays.signal_cubes import open_lines
 from storage.readers.envi_files import open_envi_cube
 from storage.remote.opening import verify_archive
 from tests.prior_work import without_effects
@@ -75,6 +77,7 @@ def surveys(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Publis
         "out": str(archive),
         "controls": False,
         "seed": "1",
+        "keep": "raw",
     }
     settings = load_settings(None, flags)
     with without_effects():
@@ -175,7 +178,8 @@ def test_cubes_are_the_archives_bit_for_bit(exports: list[Exported], number: int
     """Mosaic and sweeps through this project's ENVI reader and through rasterio are the Zarr stores' numbers."""
     done = exports[number]
     mosaic, products = done.store("mosaic"), done.published.receipt["products"]
-    stores = {"mosaic_envi": mosaic["values"].values}
+    values = open_mosaic(done.archive / products["mosaic"]).values()
+    stores = {"mosaic_envi": values}
     for product in ("raw_coarse", "raw_fine"):
         for path in (done.archive / products[product]).glob("*.zarr"):
             stores[f"{path.stem}_envi"] = xr.open_zarr(path, consolidated=False)["dn"].values
@@ -188,7 +192,7 @@ def test_cubes_are_the_archives_bit_for_bit(exports: list[Exported], number: int
         np.testing.assert_array_equal(cube.header.fwhm_nm, mosaic["fwhm"].values)
         assert cube.notes == ()
     with rasterio.open(done.file("mosaic_envi")) as file:
-        np.testing.assert_array_equal(np.moveaxis(file.read(), 0, -1), mosaic["values"].values)
+        np.testing.assert_array_equal(np.moveaxis(file.read(), 0, -1), values)
         assert np.isnan(file.nodata)
 
 
@@ -206,7 +210,22 @@ def test_the_catalogue_is_valid_and_leads_to_every_file(exports: list[Exported])
             target = Path(str(asset.get_absolute_href()))
             assert (target / "zarr.json").is_file() if "zarr" in asset.media_type else target.is_file()
             assert asset.roles
-    assert {"class_map", "mosaic_zarr", "patches_zarr", "receipt", "mosaic_envi_header"} <= set(items[0].assets)
+        assert any(one.title.startswith("Raw sweep ") for one in item.assets.values() if "raw" in one.roles)
+    assert {"class_map", "mosaic_zarr", "detail_zarr", "receipt", "mosaic_envi_header"} <= set(items[0].assets)
+
+
+def test_sweeps_whose_raw_lines_went_are_not_called_raw(surveyed_png: Any, tmp_path: Path) -> None:
+    """Their condensed stores are named as such, and their files hold numbers that these give back."""
+    published = surveyed_png(tmp_path / "archive")
+    answer = run_export(tmp_path / "archive", None, tmp_path / "out", envi=True, console=QUIET)
+    done = Exported(published, tmp_path / "archive", tmp_path / "out", answer)
+    assets = done.item()["assets"]
+    assert not [key for key, asset in assets.items() if "raw" in asset["roles"]]
+    sweeps = sorted((done.archive / published.receipt["products"]["signal_coarse"]).glob("*.zarr"))
+    assert sweeps
+    for path in sweeps:
+        assert assets[f"{path.stem}_zarr"]["title"] == f"Signal of sweep {path.stem}"
+        np.testing.assert_array_equal(open_envi_cube(done.file(f"{path.stem}_envi")).values, open_lines(path).read())
 
 
 def test_items_say_when_where_and_how(plain: Exported, posed: Exported) -> None:

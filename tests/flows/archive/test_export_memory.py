@@ -137,11 +137,9 @@ def test_images_lie_where_the_class_map_lies(visited: Visited) -> None:
 
 
 def test_what_was_not_looked_at_grows_older(visited: Visited) -> None:
-    """Three days where no patch was cut, none where one was; the rest of the memory is kept."""
-    probabilities, patches = visited.store("class_probabilities"), visited.store("patches")
-    observation = np.zeros(SHAPE, np.bool_)
-    for y, x in zip(patches["patch_y"].values, patches["patch_x"].values, strict=True):
-        observation[y : y + PATCH, x : x + PATCH] = True
+    """Three days where no patch was chosen, none where one was; the rest of the memory is kept."""
+    probabilities, rank = visited.store("class_probabilities"), visited.store("attention")["rank"].values
+    observation = np.kron(rank >= 0, np.ones((PATCH, PATCH), np.bool_))[: SHAPE[0], : SHAPE[1]]
     assert 0 < observation.mean() < 1
     np.testing.assert_array_equal(probabilities["age"].values, np.where(observation, 0.0, 3.0))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -158,12 +159,12 @@ def test_what_is_no_budget_is_refused_in_a_sentence(
 
 
 def test_a_part_of_the_scan_is_kept_and_read(survey_png: Survey, tmp_path: Path) -> None:
-    """Patches are those of the best patches, receipt and page tell what they take, and what everything would have."""
+    """The patches read are the best ones; receipt and page tell what they take, and what everything would have."""
     published = survey_png(tmp_path, **SCAN, macs="40%", policy="sobel", controls=True)
-    (patches,) = tmp_path.glob("**/patches.zarr")
-    (attention,) = tmp_path.glob("**/attention.zarr")
-    patch_index = xr.open_zarr(patches, consolidated=False)["patch_index"].values
+    (attention,) = tmp_path.glob("stages/attend/*/attention.zarr")
+    patch_index = json.loads(attention.with_name("plan.json").read_text())["patch_index"]
     seen = xr.open_zarr(attention, consolidated=False)
+    assert np.flatnonzero(seen["rank"].values.ravel() >= 0).tolist() == patch_index  # which the map reads in detail
     best = np.argsort(-seen["score"].values.ravel(), kind="stable")[: len(patch_index)]
     assert sorted(patch_index) == sorted(best)
     kept, costs = published.receipt["kept"], published.receipt["savings"]["multiply_adds"]

@@ -24,6 +24,7 @@ from storage.archive.archive import Archive
 from storage.arrays.cubes import RawCube, open_raw_cube
 from storage.arrays.layout import open_group
 from storage.arrays.quicklooks import quicklook_of
+from storage.arrays.signal_cubes import SignalCube
 from storage.arrays.spool import Spool
 from storage.remote.opening import verify_archive
 from tests.conftest import Survey
@@ -33,7 +34,7 @@ from tests.storage.small_archive import flip
 
 @pytest.fixture(scope="module")
 def surveyed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Published]:
-    """An archive with one survey, which nobody changes, and what it published."""
+    """An archive with one survey that kept its raw lines, which nobody changes, and what it published."""
     root = tmp_path_factory.mktemp("raw") / "archive"
     return root, _survey_farm(root)
 
@@ -47,6 +48,7 @@ def _survey_farm(root: Path) -> Published:
         "engine": "plain",
         "controls": False,
         "budget": "0.95",
+        "keep": "raw",
         "out": str(root),
     }
     with without_effects():
@@ -73,22 +75,37 @@ def _dims(array: zarr.Array[Any]) -> tuple[str, ...]:
 def test_raw_is_stored_once_and_as_uint16(surveyed: tuple[Path, Published]) -> None:
     """Every captured line is in one array, and under no other name; no spool is left; what is derived is smaller."""
     root, published = surveyed
-    by_line = [(path, array) for path, array in _arrays(root) if {"line", "band"} <= set(_dims(array))]
+    arrays = list(_arrays(root))
+    by_line = [(path, array) for path, array in arrays if {"line", "band"} <= set(_dims(array))]
     assert {path.name for path, _ in by_line} == {"dn"}
     assert {array.dtype for _, array in by_line} == {np.dtype(np.uint16)}
     sweeps = [open_raw_cube(path.parent).sweep.name for path, _ in by_line]
     assert len(sweeps) == len(set(sweeps))
     assert sum(array.shape[0] for _, array in by_line) == published.receipt["savings"]["lines"]["done"]
     assert [path for path in (root / "spool").rglob("*") if path.is_file()] == []
-    root, _ = surveyed
-    raw = {path for path, _ in _arrays(root) if path.name == "dn"}
-    assert not [
-        path for path, array in _arrays(root) if array.dtype == np.uint16 and path not in raw and path.name != "age"
-    ]
-    largest = max(array.nbytes for path, array in _arrays(root) if path in raw)
-    mosaics = [array for path, array in _arrays(root) if path.match("rectify/*/mosaic.zarr/values")]
-    assert len(mosaics) == 1
-    assert mosaics[0].size * 2 <= largest
+    raw = {path for path, _ in by_line}
+    assert not [path for path, array in arrays if array.dtype == np.uint16 and path not in raw and path.name != "age"]
+    for kind in ("condense", "condense_fine", "rectify", "rectify_fine"):  # no derived array has every band of a pixel
+        scores = [array for path, array in arrays if path.match(f"stages/{kind}/*/*.zarr/scores")]
+        assert scores, kind
+        assert all(array.shape[0] < by_line[0][1].shape[2] for array in scores), kind
+    lines, signal = (
+        sum(array.nbytes for path, array in arrays if path.match(f"stages/{kind}/*/*.zarr/{name}"))
+        for kind, name in (("capture", "dn"), ("condense*", "scores"))
+    )
+    assert signal < lines
+
+
+def test_raw_lines_are_cleared_and_not_taken_again(tmp_path: Path, survey_png: Survey) -> None:
+    """By default no raw number stays; the same survey again finds every stage, and the lines of it are as before."""
+    first, again = (survey_png(tmp_path) for _ in range(2))
+    assert not [path for path, array in _arrays(tmp_path) if path.name == "dn" or {"line", "band"} <= set(_dims(array))]
+    assert [one["state"] for one in again.receipt["stages"]] == ["cached"] * len(first.receipt["stages"])
+    assert [one["key"] for one in again.receipt["stages"]] == [one["key"] for one in first.receipt["stages"]]
+    assert {one.kind for one in verify_archive(Archive.open(tmp_path))} == {"whole"}
+
+
+PICTURED = ("capture", "condense", "condense_fine", "rectify")
 
 
 def test_the_picture_of_raw_lines_reads_no_raw_line(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -99,8 +116,9 @@ def test_the_picture_of_raw_lines_reads_no_raw_line(copied: Path, monkeypatch: p
 
     monkeypatch.setattr(RawCube, "read", read)
     monkeypatch.setattr(RawCube, "read_window", read)
+    monkeypatch.setattr(SignalCube, "read_window", read)
     assert (_survey_farm(copied).folder / "quicklook.png").stat().st_size > 10_000
-    stores = [ref.path for stage in ("capture", "rectify") for ref in Archive.open(copied).refs(stage)]
+    stores = [ref.path for stage in PICTURED for ref in Archive.open(copied).refs(stage)]
     assert all(quicklook_of(open_group(path)) for store in stores for path in store.glob("*.zarr"))
 
 

@@ -7,6 +7,7 @@ import os
 import signal
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -21,7 +22,7 @@ from flows.tasks import prefect_tasks
 from flows.tasks.local_server import ServerUnavailable
 from flows.tasks.open_survey import STAGES
 from flows.tasks.stages import accuracy as evaluation
-from pipeline.errors import RigError, SettingsError
+from pipeline.errors import IncompleteStoreError, RigError, SettingsError
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from tests.flows.conftest import CommandLine, act_instead, problems
@@ -30,10 +31,21 @@ from tests.prior_work import with_effects
 pytestmark = pytest.mark.usefixtures("no_effects")
 
 
+class UnmadeRef(StageRef):
+    """Address of a store that nobody made: it has no key."""
+
+    def __getattribute__(self, name: str) -> Any:
+        """Refuse the key."""
+        if name == "key":
+            raise IncompleteStoreError("it was not made")
+        return super().__getattribute__(name)
+
+
 class Noted:
-    """An opened survey that notes which stage is asked for with which inputs."""
+    """An opened survey of an empty archive that notes which stage is asked for with which inputs."""
 
     capture_deployment = None
+    run = SimpleNamespace(archive=SimpleNamespace(ref=UnmadeRef))
 
     def __init__(self, **facts: bool) -> None:
         self.uniform = self.registers = self.on_the_ground = self.is_map = False
@@ -43,7 +55,7 @@ class Noted:
     def __call__(self, stage: str, *inputs: StageRef) -> StageRef:
         """Note the names of the stages that left the inputs."""
         self.steps[stage] = [ref.stage for ref in inputs]
-        return StageRef(stage, "key", Path())
+        return UnmadeRef(stage, "", Path())
 
 
 def steps(**facts: bool) -> dict[str, list[str]]:
@@ -54,30 +66,33 @@ def steps(**facts: bool) -> dict[str, list[str]]:
 
 
 def test_a_survey_in_two_passes_captures_again() -> None:
-    """The fine sweeps follow from the plan, and patches are cut from them."""
+    """The fine sweeps follow from the plan, and the map is drawn of both mosaics; each pass is condensed first."""
     found = steps()
     assert list(found) == [
-        *("choose_effects", "capture_coarse", "locate", "rectify", "score", "capture_fine", "extract_patches"),
-        "segment",
+        *("choose_effects", "capture_coarse", "condense_coarse", "locate", "rectify", "score"),
+        *("capture_fine", "condense_fine", "rectify_fine", "segment"),
     ]
     assert found["capture_fine"] == ["score", "choose_effects"]
-    assert found["extract_patches"] == ["score", "capture_fine"]
+    assert found["condense_fine"] == ["capture_fine"]
+    assert found["rectify_fine"] == ["score", "condense_fine"]
+    assert found["segment"] == ["rectify", "score", "rectify_fine"]
 
 
 def test_a_uniform_scan_has_no_second_pass() -> None:
-    """Patches are cut from the one scan."""
+    """The map is drawn of the one scan's mosaic."""
     found = steps(uniform=True)
-    assert "capture_fine" not in found
-    assert found["extract_patches"] == ["score", "capture_coarse"]
+    assert not [name for name in found if name.endswith("_fine")]
+    assert found["segment"] == ["rectify", "score"]
 
 
 @pytest.mark.parametrize(("uniform", "passes"), [(True, ["coarse"]), (False, ["coarse", "fine"])])
-def test_patches_are_placed_by_the_registration_of_their_own_pass(uniform: bool, passes: list[str]) -> None:
-    """What was found of the other pass's pointing has no part in them."""
+def test_a_mosaic_is_placed_by_the_registration_of_its_own_pass(uniform: bool, passes: list[str]) -> None:
+    """What was found of the other pass's pointing has no part in it."""
     found = steps(registers=True, uniform=uniform)
-    assert found["locate"] == ["capture_coarse", "register_coarse"]
     assert [name for name in found if name.startswith("register")] == [f"register_{one}" for one in passes]
-    assert found["extract_patches"] == ["score", f"capture_{passes[-1]}", f"register_{passes[-1]}"]
+    assert found["locate"] == ["condense_coarse", "register_coarse"]
+    assert found["rectify"] == ["condense_coarse", "locate", "register_coarse"]
+    assert found.get("rectify_fine") == (None if uniform else ["score", "condense_fine", "register_fine"])
 
 
 def test_a_posed_survey_is_drawn_on_the_ground() -> None:
@@ -87,7 +102,7 @@ def test_a_posed_survey_is_drawn_on_the_ground() -> None:
 
 def test_a_raster_is_neither_captured_nor_rectified() -> None:
     """Its own pixels take the place of capture, geolocation grid and mosaic."""
-    assert list(steps(is_map=True)) == ["average_raster", "score", "take_patches", "segment"]
+    assert list(steps(is_map=True)) == ["condense_raster", "score", "segment"]
 
 
 SETTINGS = [
@@ -198,8 +213,9 @@ def test_prefect_makes_the_stores_that_plain_makes(
         [*(f"{stage['name']}-scene" for stage in flow["stages"]), *(f"{one}-scene" for one in STEPS)]
     )
     assert {one.state.type.value for one in tasks.values()} == {"COMPLETED"}
-    assert edges(tasks, "rectify") == {"plan_capture", "capture_coarse", "locate"}
-    assert edges(tasks, "extract_patches") == {"plan_capture", "score", "capture_fine"}
+    assert edges(tasks, "condense_fine") == {"plan_capture", "capture_fine"}
+    assert edges(tasks, "rectify") == {"plan_capture", "condense_coarse", "locate"}
+    assert edges(tasks, "rectify_fine") == {"plan_capture", "score", "condense_fine"}
     assert edges(tasks, "add_accuracy") == {"plan_capture", "publish", "evaluate"}
     assert any(words.startswith("mosaic: ") and "stages/rectify/" in words for words in log)
     assert set(artifacts) == {None, "survey-scene", "savings-scene", "report-scene"}
@@ -209,7 +225,7 @@ def test_prefect_makes_the_stores_that_plain_makes(
     assert len(json.loads(artifacts["savings-scene"].data)) > 4
 
 
-STEPS = ("plan_capture", "publish", "add_accuracy")
+STEPS = ("plan_capture", "publish", "add_accuracy", "clear_raw")
 
 
 def edges(tasks: dict[str, Any], name: str) -> set[str]:
