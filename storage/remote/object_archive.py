@@ -92,6 +92,10 @@ class ObjectArchive(Archive):
                 self._send(ref.uri)
         return None if is_cleared(read_manifest(self.root / ref.uri)) else ref
 
+    def is_known(self, ref: StageRef) -> bool:
+        """Whether a store was published, here or in the bucket; what its manifest tells is here then."""
+        return super().is_known(ref) or self._find(ref.uri)
+
     def manifest_hashes(self, refs: Iterable[StageRef]) -> dict[str, str]:
         """`manifest_hash` by address, of stores and of all they rest on, each of which is in the bucket then."""
         given = list(refs)

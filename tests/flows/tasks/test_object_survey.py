@@ -29,7 +29,7 @@ pytestmark = pytest.mark.usefixtures("no_effects")
 
 SMALL = ("--size", "96x64", "--bands", FEW_BANDS, "--no-controls", "--engine", "plain")
 CACHED = {"cached"}
-OF_THIS = set(STAGES) - {"register_coarse", "register_fine", "ground", "average_raster", "take_patches"}
+OF_THIS = set(STAGES) - {"register_coarse", "register_fine", "ground", "condense_raster"}
 
 
 def states(receipt: dict[str, object]) -> set[str]:
@@ -63,6 +63,10 @@ def test_a_rerun_makes_nothing_and_moves_next_to_nothing(
     elsewhere = survey_png(bucket)
     assert states(elsewhere.receipt) <= CACHED
     assert elsewhere.folder != again.folder
+    archive = open_archive(bucket)
+    assert isinstance(archive, ObjectArchive)
+    raw = {name.rpartition("/")[2] for name in archive.objects.listing("stages/capture")}
+    assert raw == {"manifest.json"}  # raw lines were cleared in the bucket, and neither machine took or sent them again
     np.testing.assert_array_equal(map_of(open_archive(bucket), elsewhere), beside)
     monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / "a desk"))
     run = spectralzoom.open(bucket).latest
@@ -104,7 +108,7 @@ def rot_mosaic(address: str) -> None:
     """Let a bit of the mosaic's numbers flip in the bucket."""
     archive = open_archive(address)
     assert isinstance(archive, ObjectArchive)
-    name = next(name for name in archive.objects.listing("stages/rectify") if "/values/c/" in name)
+    name = next(name for name in archive.objects.listing("stages/rectify") if "/scores/c/" in name)
     content = bytearray(archive.objects.read(name) or b"")
     content[100] ^= 1
     archive.objects.write(name, bytes(content))
@@ -117,7 +121,7 @@ def test_a_flipped_bit_is_named_and_written_again(bucket: str, survey_png: Surve
     ended = command_line("verify", bucket, "--json")
     (problem,) = json.loads(ended.out)["problems"]
     assert ended.code == 1
-    assert problem["problem"].endswith("(its SHA-256 differs) (mosaic.zarr/values: all of it)")
+    assert problem["problem"].endswith("(its SHA-256 differs) (mosaic.zarr/scores: all of it)")
     repaired = command_line("verify", bucket, "--repair", "--json")
     assert repaired.code == 0
     assert json.loads(repaired.out)["repair"]["remade"] == [problem["uri"]]

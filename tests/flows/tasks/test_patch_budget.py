@@ -161,7 +161,7 @@ def test_what_is_no_budget_is_refused_in_a_sentence(
 def test_a_part_of_the_scan_is_kept_and_read(survey_png: Survey, tmp_path: Path) -> None:
     """The patches read are the best ones; receipt and page tell what they take, and what everything would have."""
     published = survey_png(tmp_path, **SCAN, macs="40%", policy="sobel", controls=True)
-    (attention,) = tmp_path.glob("stages/attend/*/attention.zarr")
+    (attention,) = tmp_path.glob("stages/score/*/attention.zarr")
     patch_index = json.loads(attention.with_name("plan.json").read_text())["patch_index"]
     seen = xr.open_zarr(attention, consolidated=False)
     assert np.flatnonzero(seen["rank"].values.ravel() >= 0).tolist() == patch_index  # which the map reads in detail

@@ -112,6 +112,7 @@ def rows_of(archive: Path, published: Published) -> dict[str, Any]:
             cube = open_raw_cube(path)
             assert cube.valid_line.all()
             found[f"{name} {path.stem}"] = cube.read(0, cube.sweep.lines)
+    assert found
     return found
 
 
@@ -137,9 +138,9 @@ def test_every_line_is_the_simulated_one(tmp_path: Path, monkeypatch: pytest.Mon
     """By Prefect: coarse sweep, attention, plan and fine sweeps give each line of the simulated survey, and its map."""
     with without_effects(), pytest.MonkeyPatch.context() as patch:  # but for those that it names
         references_of_frames(patch)
-        simulated = run_survey(small_settings(tmp_path / "sim"), QUIET)
+        simulated = run_survey(small_settings(tmp_path / "sim", keep="raw"), QUIET)
     effects = chosen_effects(next(ref for ref in Archive.open(tmp_path / "sim").refs("effects")))
-    settings = small_settings(tmp_path / "rig", source="rig", visit="first", engine="prefect")
+    settings = small_settings(tmp_path / "rig", source="rig", visit="first", engine="prefect", keep="raw")
     with emulated(settings, effects, monkeypatch):
         published = run_survey(settings, QUIET)
     expected = rows_of(tmp_path / "sim", simulated)
@@ -153,7 +154,7 @@ def test_every_line_is_the_simulated_one(tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_a_plain_scan_by_the_rig_is_the_simulated_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every second line, of a quarter of the exposure: each line, with references so exposed, and the map."""
-    scan = {"budget": None, "scan_step": "2", "scan_exposure_ms": "25"}
+    scan = {"budget": None, "scan_step": "2", "scan_exposure_ms": "25", "keep": "raw"}
     with without_effects(), pytest.MonkeyPatch.context() as patch:
         references_of_frames(patch)
         simulated = run_survey(small_settings(tmp_path / "sim", **scan), QUIET)
@@ -169,8 +170,9 @@ def test_a_plain_scan_by_the_rig_is_the_simulated_one(tmp_path: Path, monkeypatc
 
 @pytest.fixture(scope="module")
 def straight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Settings, Published]:
-    """A survey through a rig whose mirror is mounted straight."""
-    settings = small_settings(tmp_path_factory.mktemp("straight"), source="rig", visit="first", budget=0.5)
+    """A survey through a rig whose mirror is mounted straight; its raw lines stay."""
+    told = {"visit": "first", "budget": 0.5, "keep": "raw"}
+    settings = small_settings(tmp_path_factory.mktemp("straight"), source="rig", **told)
     with pytest.MonkeyPatch.context() as patch, emulated(settings, {}, patch):
         return settings, run_survey(settings, QUIET)
 
@@ -216,16 +218,17 @@ def test_a_mounting_that_does_not_reach_the_field_is_refused_first(tmp_path: Pat
 @pytest.mark.usefixtures("no_effects")
 def test_pulses_of_frames_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, simulated_map: np.ndarray):
     """One pulse a frame, as cameras give: fine lines are stepped by it, coarse ones lie where the mirror's log says."""
-    settings = small_settings(tmp_path, source="rig", visit="first", **{"rig.pulses": "frame", "effects": "none"})
+    told = {"rig.pulses": "frame", "effects": "none", "keep": "raw"}
+    settings = small_settings(tmp_path, source="rig", visit="first", **told)
     with emulated(settings, {}, monkeypatch):
         published = run_survey(settings, QUIET)
-    told = {
+    captures = {
         name: json.loads((tmp_path / published.receipt["products"][name] / "rig.json").read_text())["captures"]
         for name in ("raw_coarse", "raw_fine")
     }
-    assert {one["method"] for one in told["raw_coarse"]} == {"log"}
-    assert {one["method"] for one in told["raw_fine"]} == {"trigger"}
-    assert max(one["residual_px"] for one in told["raw_coarse"]) < 16  # a coarse line
+    assert {one["method"] for one in captures["raw_coarse"]} == {"log"}
+    assert {one["method"] for one in captures["raw_fine"]} == {"trigger"}
+    assert max(one["residual_px"] for one in captures["raw_coarse"]) < 16  # a coarse line
     alike = class_map_of(published, tmp_path) == simulated_map
     assert alike.mean() > 0.9
     assert {finding.kind for finding in verify_archive(Archive.open(tmp_path))} == {"whole"}
@@ -235,7 +238,7 @@ def test_pulses_of_frames_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 def test_a_rig_as_the_defaults_have_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, simulated_map: np.ndarray):
     """No pulses and no CRC: every line lies where the mirror's log measured it, and the map is nearly the simulated."""
     usual = SurveyRig()
-    told = {"rig.pulses": usual.pulses, "rig.with_crc": usual.with_crc, "effects": "none"}
+    told = {"rig.pulses": usual.pulses, "rig.with_crc": usual.with_crc, "effects": "none", "keep": "raw"}
     settings = small_settings(tmp_path, source="rig", visit="first", **told)
     with emulated(settings, {}, monkeypatch) as rig:
         published = run_survey(settings, QUIET)
@@ -310,7 +313,8 @@ def test_field_without_a_picture_is_surveyed(tmp_path: Path, monkeypatch: pytest
 
 def test_survey_over_a_pty_and_sockets_gives_the_same_lines(tmp_path: Path):
     """Devices behind a real pty, a control socket and FTP, their clock sped up: every line is the simulated one."""
-    settings = small_settings(tmp_path, source="rig", visit="first", budget=0.5)
+    asked = {"source": "rig", "visit": "first", "budget": 0.5, "keep": "raw"}
+    settings = small_settings(tmp_path, **asked)
     scene, _ = open_scene(settings)
     source = replace(make_source(scene, settings), chosen=effects_on("rotation", "slit", "smear", "shot"))
     with EmulatedRig(source, FastClock(40)).serve() as served:
@@ -321,7 +325,7 @@ def test_survey_over_a_pty_and_sockets_gives_the_same_lines(tmp_path: Path):
             "file_port": served.file_port,
         }
         told = {f"rig.{name}": value for name, value in rig.items()}
-        published = run_survey(small_settings(tmp_path, source="rig", visit="first", budget=0.5, **told), QUIET)
+        published = run_survey(small_settings(tmp_path, **asked, **told), QUIET)
     cube = open_raw_cube(tmp_path / published.receipt["products"]["raw_coarse"] / "coarse-0.zarr")
     np.testing.assert_array_equal(cube.read(0, cube.sweep.lines), source.render(cube.sweep, range(cube.sweep.lines)))
     assert cube.valid_line.all()
