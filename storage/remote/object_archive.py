@@ -92,6 +92,13 @@ class ObjectArchive(Archive):
                 self._send(ref.uri)
         return None if is_cleared(read_manifest(self.root / ref.uri)) else ref
 
+    def is_known(self, ref: StageRef) -> bool:
+        """Whether a store was published, also where its files were cleared away since; its manifest is here then.
+
+        Raises IncompleteStoreError: its manifest in the bucket is damaged.
+        """
+        return super().is_known(ref) or self._find(ref.uri)
+
     def manifest_hashes(self, refs: Iterable[StageRef]) -> dict[str, str]:
         """`manifest_hash` by address, of stores and of all they rest on, each of which is in the bucket then."""
         given = list(refs)
