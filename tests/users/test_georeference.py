@@ -27,6 +27,7 @@ from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from pipeline.ground.georeference import pixel_rows_m2
+from storage.arrays.mosaics import open_mosaic
 from storage.remote.opening import open_archive, verify_archive
 from tests.conftest import RGB_NM, patchy_scene
 from tests.prior_work import without_effects
@@ -35,6 +36,11 @@ SHAPE = (52, 70)
 NORTH_UP = Affine(0.05, 0, 534_257.65, 0, -0.05, 5_772_301.4)
 TURNED = Affine(0.0433, 0.025, 534_257.65, 0.025, -0.0433, 5_772_301.4)  # by 30 degrees
 ENVI_TURNED = (1, 1, 534_257.65, 5_772_301.4, 0.05, 0.05)
+EVERY_STORE = (
+    *("class_map", "class_probabilities", "mosaic", "detail", "attention"),
+    *("raw_coarse", "raw_fine", "signal_coarse", "signal_fine"),
+)
+UNCOUNTED = ("quicklook", "rgb", "rare")  # rare spectra are found by their line and sample
 GAP = np.s_[:20, :24]
 QUIET = Console(quiet=True)
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")
@@ -141,7 +147,7 @@ def test_products_lie_where_the_scene_does(tmp_path: Path, weights: Path, kind: 
     run = survey(scene, weights, tmp_path / "archive")
     factor = 4
     coarse = Affine(*(number * (factor if place % 3 < 2 else 1) for place, number in enumerate(transform[:6])))
-    for product, name, wanted in (("class_map", "classes", transform), ("mosaic", "values", coarse)):
+    for product, name, wanted in (("class_map", "classes", transform), ("mosaic", "scores", coarse)):
         found = opened(run, product)[name]
         shape = (found.sizes["y"], found.sizes["x"])
         assert (found.odc.crs.epsg, found.rio.crs.to_epsg()) == (32632, 32632)
@@ -161,9 +167,10 @@ def test_products_lie_where_the_scene_does(tmp_path: Path, weights: Path, kind: 
 
 
 def test_transparent_pixels_are_no_data_to_the_end(tmp_path: Path, weights: Path) -> None:
-    """They are 255 in the map, NaN in mosaic and patches, outside of areas and scores, and no place to look at."""
+    """They are 255 in the map, NaN in both mosaics, outside of areas and scores, and no place to look at."""
     run = survey(write_geotiff(tmp_path / "a.tif", NORTH_UP, gap=True), weights, tmp_path / "archive", budget=1)
-    with opened(run, "class_map") as drawn, opened(run, "mosaic") as mosaic, opened(run, "patches") as patches:
+    coarse, fine = (open_mosaic(tmp_path / "archive" / run.receipt["products"][one]) for one in ("mosaic", "detail"))
+    with opened(run, "class_map") as drawn:
         classes = drawn["classes"].values
         assert classes.dtype == np.uint8
         assert (classes[GAP] == 255).all()
@@ -171,16 +178,13 @@ def test_transparent_pixels_are_no_data_to_the_end(tmp_path: Path, weights: Path
         gap[GAP] = True
         assert (classes[~gap] != 255).all()
         assert np.isnan(drawn["confidence"].values[GAP]).all()
-        coarse = mosaic["values"].values
-        assert np.isnan(coarse[:5, :6]).all()  # 20 x 24 px
-        assert np.isfinite(coarse[5:]).all()
-        assert (mosaic["coverage"].values[:5, :6] == 0).all()
-        for patch_number in range(patches.sizes["patch"]):
-            y, x = int(patches["patch_y"][patch_number]), int(patches["patch_x"][patch_number])
-            there = gap[y : y + 8, x : x + 8]
-            one = patches["valid"].values[patch_number][: there.shape[0], : there.shape[1]]
-            assert not one[there].any()
-            assert np.isnan(patches["values"].values[patch_number][: there.shape[0], : there.shape[1]][there]).all()
+    values, seen = coarse.values(), fine.coverage() > 0
+    assert np.isnan(values[:5, :6]).all()  # 20 x 24 px
+    assert np.isfinite(values[5:]).all()
+    assert (coarse.coverage()[:5, :6] == 0).all()
+    assert not seen[gap].any()
+    assert seen[~gap].any()
+    np.testing.assert_array_equal(np.isfinite(fine.values()), np.repeat(seen[..., None], 3, axis=2))
     assert run.receipt["pixels"]["map_without_a_class"] == gap.sum()
     geobox = GeoBox(SHAPE, NORTH_UP, "EPSG:32632")
     ground = run.receipt["ground"]
@@ -249,8 +253,8 @@ def test_a_pose_is_the_one_place_of_a_run(tmp_path: Path, weights: Path) -> None
 
 def test_every_store_opens_without_a_word(tmp_path: Path, weights: Path) -> None:
     """Axes have coordinates with units, a band is found by its wavelength, and classes are whole numbers."""
-    run = survey(write_geotiff(tmp_path / "a.tif", NORTH_UP), weights, tmp_path / "archive")
-    for product in ("class_map", "class_probabilities", "mosaic", "patches", "attention", "raw_coarse"):
+    run = survey(write_geotiff(tmp_path / "a.tif", NORTH_UP), weights, tmp_path / "archive", keep="raw", budget=1)
+    for product in EVERY_STORE:
         address = run.receipt["products"][product]
         stores = sorted((tmp_path / "archive" / address).glob("*.zarr")) or [tmp_path / "archive" / address]
         for store in stores:
@@ -258,12 +262,12 @@ def test_every_store_opens_without_a_word(tmp_path: Path, weights: Path) -> None
                 warnings.simplefilter("error")
                 content = xr.open_zarr(store)
             for name, array in content.data_vars.items():
-                axes = [axis for axis in array.dims if not str(axis).startswith(("quicklook", "rgb"))]
+                axes = [axis for axis in array.dims if not str(axis).startswith(UNCOUNTED)]
                 assert set(axes) <= set(content.coords), (product, name)
                 assert all("units" in content[axis].attrs for axis in axes), (product, name)
-    values = opened(run, "mosaic")["values"]
-    assert float(values.sel(band=560, method="nearest")["wavelength"]) == 550
-    swapped = values.swap_dims(band="wavelength").sel(wavelength=[455, 700], method="nearest")
+    axes = opened(run, "mosaic")["axes"]
+    assert float(axes.sel(band=560, method="nearest")["wavelength"]) == 550
+    swapped = axes.swap_dims(band="wavelength").sel(wavelength=[455, 700], method="nearest")
     assert swapped["wavelength"].values.tolist() == [460, 640]
 
 

@@ -28,6 +28,7 @@ from pipeline.errors import SettingsError, WavelengthError
 from pipeline.ground.map_grid import grid_of_map, ground_grid, image_at
 from pipeline.ground.view import GroundView, RigPose
 from pipeline.products.indices import find_index
+from storage.arrays.mosaics import open_mosaic
 from storage.readers.scene_files import load_scene_file
 from tests.prior_work import without_effects
 from tests.storage.export.stac_rules import core_problems, extension_problems, is_cog
@@ -89,9 +90,8 @@ def test_reflectance_lies_on_the_map_with_its_wavelengths(posed: Products) -> No
     fine, factor = ground_grid(GroundView(POSE, about["ifov_rad"]), scene["classes"].shape), 4
     grid = grid_of_map(fine.frame.view, fine.scene_shape, fine.geobox.zoom_out(factor))
     rows, columns = (slice(0, size) for size in grid.shape)
-    wanted = image_at(
-        mosaic["values"].values, grid.scene_pixels(rows, columns), factor=mosaic.attrs["angular_grid"]["factor"]
-    )
+    values = open_mosaic(posed.archive / posed.receipt["products"]["mosaic"]).values()
+    wanted = image_at(values, grid.scene_pixels(rows, columns), factor=mosaic.attrs["angular_grid"]["factor"])
     with rasterio.open(posed.file("reflectance")) as file:
         np.testing.assert_allclose(np.moveaxis(file.read(), 0, -1), wanted, atol=1e-6)
         assert file.crs.to_epsg() == 32632
