@@ -93,14 +93,10 @@ class ObjectArchive(Archive):
         return None if is_cleared(read_manifest(self.root / ref.uri)) else ref
 
     def is_known(self, ref: StageRef) -> bool:
-<<<<<<< HEAD
-        """Whether a store was published, here or in the bucket; what its manifest tells is here then."""
-=======
         """Whether a store was published, also where its files were cleared away since; its manifest is here then.
 
         Raises IncompleteStoreError: its manifest in the bucket is damaged.
         """
->>>>>>> fixq
         return super().is_known(ref) or self._find(ref.uri)
 
     def manifest_hashes(self, refs: Iterable[StageRef]) -> dict[str, str]:
