@@ -309,10 +309,10 @@ def figure_lines(figures: Mapping[str, Any]) -> list[str]:
 
 def format_kept(kept: Mapping[str, Any]) -> str:
     """How much of a uniform scan the budgets pay for at most."""
-    read, stored = (kept[name]["done"] / kept[name]["everything"] for name in ("multiply_adds", "bytes"))
+    read = kept["multiply_adds"]["done"] / kept["multiply_adds"]["everything"]
     return (
         f"detail: at most {kept['patches']} of {kept['of_patches']} patches, for {format_percent(read)} of the "
-        f"multiply-adds of reading everything and {format_percent(stored)} of the bytes of keeping it"
+        "multiply-adds of reading everything"
     )
 
 

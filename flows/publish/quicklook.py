@@ -196,7 +196,7 @@ def _draw_attention(axes: Axes, data: QuicklookData) -> None:
     _heat_key(heat, ("low", "high"))
     words = f"{len(data.patch_index)} patches chosen by {data.policy} (cyan)"
     if data.scan:
-        return _caption(axes, "2  What is kept in detail", words)
+        return _caption(axes, "2  What is read in detail", words)
     return _caption(axes, "2  Where it captured again", f"{words}; captured in detail (dashed)")
 
 

@@ -226,7 +226,7 @@ def _most_px(sweeps: Mapping[str, Sequence[float]]) -> str:
 
 # parts of a receipt whose rows are called otherwise
 _LABELS = {
-    **{"extent": "captured", "kept": "kept in detail", "memory": "prior map", "expected": "expected score"},
+    **{"extent": "captured", "kept": "read in detail", "memory": "prior map", "expected": "expected score"},
     **{"scans": "uniform scans", "ground": "on the ground"},
 }
 # part of a receipt, figure, its words and its form, in the order of rows and of words
@@ -250,7 +250,6 @@ _FIGURES: Sequence[tuple[str, str, str, Callable[[Any], Any]]] = (
     ("extent", "due_left", "{} places that were due had to wait", format_count),
     ("kept", "patches", "{} patches", format_count),
     ("kept", "multiply_adds", "{} of the multiply-adds of reading everything", _fraction),
-    ("kept", "bytes", "{} of the bytes of keeping everything", _fraction),
     ("memory", "run", "{}", str),
     ("memory", "days", "{}", format_days),
     ("memory", "shift_px", "{}", lambda one: f"lay {np.hypot(*one):.0f} px beside it" if any(one) else ""),

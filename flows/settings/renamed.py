@@ -26,6 +26,7 @@ OF_TRAINING = {
 FLAGS = {  # and what to say of each
     **{old.replace("_", "-"): f"it is called --{new.replace('_', '-')} now" for old, new in SETTINGS.items()},
     **{old: f"it is called --{new} now" for old, new in OF_TRAINING.items()},
+    "bytes-kept": "patches are no longer stored; --macs says how much is read in detail",
     "late": "Prefect begins a run late rather than never, and cancels one that is due while the field's last still "
     "runs",
     "notify": "Prefect sends notices of failed runs by an automation: prefect automation create --from-file "

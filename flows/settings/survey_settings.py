@@ -18,7 +18,6 @@ from flows.settings.values import (
     Bands,
     Budget,
     Bytes,
-    BytesKept,
     Compute,
     Effects,
     ExpectedError,
@@ -56,7 +55,7 @@ OF_THE_MACHINE = ("scheduler", "workers", "device")  # what of that day need not
 OF_A_PART = ("max_age", "skip_below_error")  # of what a field that is remembered is looked at by
 OF_RECORDINGS = ("sweeps", "pointing", "dark", "white", "scan")
 UNIFORM = ("seconds", "bytes_raw", "goal", "scan_step", "scan")  # settings of which one asks for a uniform scan
-SPARING = ("macs", "bytes_kept", "least_gain")  # by which a uniform scan is kept and read in detail in part
+SPARING = ("macs", "least_gain")  # by which a uniform scan is read in detail in part
 OF_TWO_PASSES = ("budget", "coarse_exposure_ms", "policy", "mask")  # and of which none may
 OF_CHOOSING = ("policy", "mask")  # but for these where a part of the scan is chosen
 PATHS = (
@@ -71,7 +70,7 @@ OF_A_CAMERA = (
     *("coarse_exposure_ms", "budget", "effects", "tol", "resampling", "pointing_px", "extent", *OF_A_PART),
 )
 OF_A_VIEW = ("camera.pitch_um", "camera.focal_length_mm")  # how large a pixel is seen, which a [pose] asks for
-ALL_OF_IT = "leave it out to keep and read all of the scan"
+ALL_OF_IT = "leave it out to read all of the scan in detail"
 INSTEAD = "leave it out for a survey in two passes"
 WORKERS = "one process or thread each; leave it out for one a core"
 EPSG = "the number after EPSG:, such as 32632"
@@ -253,16 +252,9 @@ class Settings:
         example="25%",
         why=ALL_OF_IT,
     )
-    bytes_kept: BytesKept | None = stated(
-        None,
-        "Of a uniform scan or a raster keep in detail what promises most within so much of the bytes of all its pixels "
-        "and coarse means, 40%, or within so many before compression, 500MB",
-        example="40%",
-        why=ALL_OF_IT,
-    )
     least_gain: float | None = stated(
         None,
-        "Of a uniform scan or a raster keep and read in detail only patches that promise at least so much, for the "
+        "Of a uniform scan or a raster read in detail only patches that promise at least so much, for the "
         "policies gain and entropy",
         "nat per px",
         0,

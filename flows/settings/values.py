@@ -103,17 +103,6 @@ def parse_compute(value: object) -> str:
     return percent or f"{number!r}"
 
 
-def parse_bytes_kept(value: object) -> str:
-    """A fraction of the bytes of keeping everything, such as 40%, or bytes, before compression, such as 500MB."""
-    try:
-        return _parse_percent(value) or str(parse_bytes(value))
-    except ValueError:
-        raise BudgetError(
-            "must be a fraction of the bytes of keeping everything, above 0% and at most 100%, such as 40%, or "
-            f"bytes with a unit such as 500MB; got {value!r}"
-        ) from None
-
-
 def _parse_percent(value: object) -> str | None:
     """Text such as 25% of a fraction above 0 and at most all; None of anything else."""
     percent = _amount(value, {"%": 1.0})
@@ -380,7 +369,6 @@ Budget = Annotated[float, PlainValidator(parse_budget)]
 Unknown = Annotated[str, PlainValidator(parse_unknown)]
 Goal = Annotated[str, PlainValidator(parse_goal)]
 Compute = Annotated[str, PlainValidator(parse_compute)]
-BytesKept = Annotated[str, PlainValidator(parse_bytes_kept)]
 Bytes = Annotated[int, PlainValidator(parse_bytes)]
 Memory = Annotated[int, PlainValidator(parse_memory)]
 Scheduler = Annotated[str, PlainValidator(lambda value: WorkerPool(parse_text(value)).scheduler)]

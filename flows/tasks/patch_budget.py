@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Iterator
 from dataclasses import astuple, dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -20,7 +19,6 @@ from pipeline.errors import BudgetError
 from pipeline.geometry.grid import SceneGrid
 from storage.arrays.layout import SHARD_COLUMNS, SHARD_ROWS
 
-BYTES_A_VALUE = 4  # of patches and means, before compression
 SHARD = (SHARD_ROWS, SHARD_COLUMNS)  # of what is written at once: regions hold whole ones
 DIGITS = 2  # of the least fraction that a refusal names
 
@@ -62,15 +60,14 @@ class ReadingCosts:
 class PatchBudget:
     """What may be spent on patches, and which there are to spend it on.
 
-    Shares are of reading every one of ``patch_index`` and choosing none, and of the bytes of all their pixels with the
-    coarse means of the field. A memory that the map goes on from is weighed whatever is seen, and counts for neither.
+    Fractions are of reading every one of ``patch_index`` and choosing none. A memory that the map goes on from is
+    weighed whatever is seen, and does not count.
     """
 
     costs: ReadingCosts
     patch_index: NDArray[np.intp]  # (patch,) that are worth anything at all
     policy: str
     macs: str | None = None
-    bytes_kept: str | None = None
     least_gain: float | None = None
 
     @staticmethod
@@ -79,22 +76,28 @@ class PatchBudget:
         shown: NDArray[np.bool_] | None,
         policy: str,
         macs: str | None = None,
-        bytes_kept: str | None = None,
         least_gain: float | None = None,
     ) -> PatchBudget | None:
-        """Say what may be spent; None where all of the scan is kept and read.
+        """Say what may be spent; None where all of the scan is read in detail.
 
         ``shown`` (patch,) are the patches that zones leave; None: all. Raises BudgetError: not even the coarse pass
         is paid for; names the least that is.
         """
-        if macs is None and bytes_kept is None and least_gain is None:
+        if macs is None and least_gain is None:
             return None
         patch_index = costs.grid.valid_patches()
         kept = patch_index if shown is None else patch_index[shown[patch_index]]
-        budget = PatchBudget(costs, kept, policy, macs, bytes_kept, least_gain)
-        for wrong in budget._too_little():
-            raise BudgetError(wrong)
-        return None if budget._pays_for_all else budget
+        budget = PatchBudget(costs, kept, policy, macs, least_gain)
+        coarse = budget.operations_of(patch_index[:0])
+        if budget._most < coarse:
+            least = str(coarse)
+            if macs is not None and macs.endswith("%"):
+                least = f"{math.ceil(10**DIGITS * 100 * coarse / budget.everything) / 10**DIGITS:g}%"
+            raise BudgetError(
+                f"--macs {macs} does not pay for the coarse pass and the scores of its patches, {coarse:.4g} of "
+                f"{budget.everything:.4g} multiply-adds; the least is --macs {least}"
+            )
+        return None if not least_gain and budget._most >= budget.everything else budget
 
     @property
     def grid(self) -> SceneGrid:
@@ -106,19 +109,9 @@ class PatchBudget:
         """Multiply-adds of reading every patch."""
         return self.costs.of_map(self.patch_index).total
 
-    @cached_property
-    def every_byte(self) -> int:
-        """Bytes of all patches and the coarse means, before compression."""
-        return self.bytes_of(len(self.patch_index))
-
     def operations_of(self, patch_index: NDArray[np.integer]) -> int:
         """Multiply-adds of scoring all patches and reading these."""
         return self.costs.with_scores(patch_index, self.policy).total
-
-    def bytes_of(self, count: int) -> int:
-        """Bytes of so many patches and the coarse means, before compression."""
-        pixels = math.prod(self.grid.coarse_shape) + count * self.grid.patch**2
-        return pixels * self.costs.bands * BYTES_A_VALUE
 
     def choose(self, scores: NDArray[np.floating]) -> NDArray[np.intp]:
         """Patches that are bought, best first, by the scores (patch,) of the padded grid; equal ones by number.
@@ -130,9 +123,7 @@ class PatchBudget:
         promising = (expected_gain > 0) & (expected_gain >= (self.least_gain or 0.0))
         ranked = self.patch_index[promising][np.argsort(-expected_gain[promising], kind="stable")]
         counts = range(1, len(ranked) + 1)
-        read = bisect_right(counts, self._most_operations, key=lambda count: self.operations_of(ranked[:count]))
-        kept = bisect_right(counts, self._most_bytes, key=self.bytes_of)
-        return ranked[: min(read, kept)]
+        return ranked[: bisect_right(counts, self._most, key=lambda count: self.operations_of(ranked[:count]))]
 
     @property
     def most_patches(self) -> NDArray[np.intp]:
@@ -140,46 +131,14 @@ class PatchBudget:
         return self.choose(np.full(math.prod(self.grid.patch_shape), np.inf))
 
     def figures(self, patch_index: NDArray[np.integer]) -> dict[str, Any]:
-        """What these patches take beside reading and keeping everything, for a receipt."""
-        whole = {"multiply_adds": self.everything, "bytes": self.every_byte}
-        done = {"multiply_adds": self.operations_of(patch_index), "bytes": self.bytes_of(len(patch_index))}
-        asked = {"macs": self.macs, "bytes_kept": self.bytes_kept, "least_gain": self.least_gain}
-        costs = {name: {"done": done[name], "everything": whole[name]} for name in whole}
-        return {"asked": asked, "patches": len(patch_index), "of_patches": len(self.patch_index), **costs}
+        """Return the multiply-adds of these patches beside those of reading everything, for a receipt."""
+        return {
+            "asked": {"macs": self.macs, "least_gain": self.least_gain},
+            "patches": len(patch_index),
+            "of_patches": len(self.patch_index),
+            "multiply_adds": {"done": self.operations_of(patch_index), "everything": self.everything},
+        }
 
     @property
-    def _most_operations(self) -> float:
+    def _most(self) -> float:
         return limit_of(self.macs, self.everything)
-
-    @property
-    def _most_bytes(self) -> float:
-        return limit_of(self.bytes_kept, self.every_byte)
-
-    @property
-    def _pays_for_all(self) -> bool:
-        """Whether nothing is to be chosen: then the scores are spared too."""
-        return not self.least_gain and self._most_operations >= self.everything and self._most_bytes >= self.every_byte
-
-    def _too_little(self) -> Iterator[str]:
-        """Limits that do not pay for the coarse pass, with the least that do."""
-        none = self.patch_index[:0]
-        scan_pass, means = self.operations_of(none), self.bytes_of(0)
-        if self._most_operations < scan_pass:
-            least = _least(self.macs, scan_pass, self.everything)
-            yield (
-                f"--macs {self.macs} does not pay for the coarse pass and the scores of its patches, "
-                f"{scan_pass:.4g} of {self.everything:.4g} multiply-adds; the least is --macs {least}"
-            )
-        if self._most_bytes < means:
-            least = _least(self.bytes_kept, means, self.every_byte)
-            yield (
-                f"--bytes-kept {self.bytes_kept} does not hold the coarse means of the field, {means:.4g} of "
-                f"{self.every_byte:.4g} bytes; the least is --bytes-kept {least}"
-            )
-
-
-def _least(asked: str | None, done: int, whole: int) -> str:
-    """The least limit of the kind that was asked for: a fraction, rounded up, or a number."""
-    if asked is None or not asked.endswith("%"):
-        return str(done)
-    return f"{math.ceil(10**DIGITS * 100 * done / whole) / 10**DIGITS:g}%"

@@ -350,7 +350,7 @@ def _run_by(
         raster = RasterPixels(pixels.read, pixels.missing, bands, grid)
     settings = replace(settings, extent=layout.extent, scan_step=layout.step, scan_exposure_ms=layout.exposure_ms)
     costs = ReadingCosts(described.config, grid, bands)
-    spending = settings.policy, settings.macs, settings.bytes_kept, settings.least_gain
+    spending = settings.policy, settings.macs, settings.least_gain
     budget = PatchBudget.asked(costs, None if zones.fractions is None else zones.fractions > 0, *spending)
     simulated, planned = make_source(scene, settings), (*plan.coarse, *plan.full)
     source = field_source(scene, settings, simulated, planned) if recorded is None else recorded.field

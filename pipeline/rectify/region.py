@@ -117,32 +117,6 @@ def _on_the_scene(first: NDArray[np.integer], patch: int, size: int) -> tuple[ND
     return np.where(pixel < size, pixel, np.where(mirrored >= first, mirrored, size - 1)), pixel < size
 
 
-def read_every_patch(
-    placed: Sequence[Placed], camera: LineCamera, grid: SceneGrid, kernel: Kernel = "catmull-rom", *, most_bytes: int
-) -> Iterator[tuple[Values, NDArray[np.bool_]]]:
-    """Rectify the whole scene into patches, a row of patches at a time, or a column where lines lie along y.
-
-    Yields what :func:`read_patches` gives for these patches, whose numbers ascend, or go down the columns; with tables
-    of the scene's pixels (:func:`place`) within their bound. Raw lines are kept for the next row, up to ``most_bytes``.
-    """
-    pixels, p, shape = PixelGrid.of_scene(grid, 1), grid.patch, (grid.height, grid.width)
-    firsts = [np.arange(0, size, p)[:, None] for size in shape]
-    axes = [_on_the_scene(first, p, size) for first, size in zip(firsts, shape, strict=True)]
-    down = 1 if placed[0].lines.sweep.along == "y" else 0  # the axis that lines follow each other along
-    tiles = plan_tiles(placed, camera, pixels, (shape[0], p) if down else (p, shape[1]))
-    cache = LineCache(min(cache_bytes(placed, tiles, 2), most_bytes))
-    for number, tile in enumerate(tiles):
-        own = [slice(None), slice(None)]
-        own[down] = slice(number, number + 1)
-        (y, y_in), (x, x_in) = ((kept[part], there[part]) for (kept, there), part in zip(axes, own, strict=True))
-        values, coverage = mosaic_tile(
-            placed, camera, pixels, tile.rows, tile.columns, kernel=kernel, cache=cache, reach=tile.reach
-        )
-        at = y[:, None, :, None] - tile.rows.start, x[None, :, None, :] - tile.columns.start
-        seen = (coverage[at] > 0) & y_in[:, None, :, None] & x_in[None, :, None, :]
-        yield values[at].reshape(-1, p, p, values.shape[-1]), seen.reshape(-1, p, p)
-
-
 def read_patches(
     sweeps: Sequence[SweepLines | Placed],
     camera: LineCamera,

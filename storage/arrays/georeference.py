@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import zarr
 from affine import Affine
-from numpy.typing import NDArray
 
 from pipeline.errors import PoseError
 from pipeline.ground.georeference import zoomed_out
@@ -115,22 +114,6 @@ def write_grid_mapping(group: zarr.Group, geobox: GeoBox) -> None:
     """Store CRS and transform of a map as CF's grid mapping."""
     mapping = odc_geo_xr.xr_crs_coord(_crs_of(geobox), transform=geobox.transform)
     write_small(group, GRID_MAPPING, (), np.asarray(mapping.values, np.int32), dict(mapping.attrs))
-
-
-def write_corners(group: zarr.Group, grid: AngularGrid | None, origin_px: NDArray[np.integer]) -> list[str]:
-    """Store where on a map patches begin, (patch, 2) first row and column, and give the coordinates' names.
-
-    Nothing where the scene has no place.
-    """
-    if grid is None or grid.geobox is None:
-        return []
-    a, b, c, d, e, f = grid.geobox.affine[:6]
-    row, column = origin_px.T.astype(np.float64)
-    for name, values in (("map_y", d * column + e * row + f), ("map_x", a * column + b * row + c)):
-        about = _axis(_crs_of(grid.geobox), name[-1]) | {"long_name": "upper left corner of the patch on the map"}
-        write_small(group, name, ("patch",), np.asarray(values, np.float64), about)
-    write_grid_mapping(group, grid.geobox)
-    return ["map_y", "map_x", GRID_MAPPING]
 
 
 def _axis(crs: CRS, name: str) -> dict[str, str]:

@@ -34,8 +34,6 @@ StorePlace = Path | MemoryStore  # where a store lies
 CHUNK_PX = 32
 SHARD_ROWS = 64
 SHARD_COLUMNS = 640
-KEPT_BITS = 11
-BLOCK_VALUES = 1 << 16  # rounded at once
 Packing = tuple[Literal["zstd", "lz4"], int]
 PACKING: Packing = ("zstd", 3)  # by blosc: codec and level
 MAP_PACKING: Packing = ("zstd", 5)  # of maps: a tenth shorter than at level 3; 9 takes forty times as long
@@ -256,27 +254,6 @@ def damage_named(where: str) -> Iterator[None]:
         yield
     except (OSError, ValueError, KeyError, TypeError, RuntimeError, IndexError) as error:
         raise IncompleteStoreError(f"{where} cannot be read: {error}; run verify on the archive") from error
-
-
-def round_bits(values: NDArray[np.floating], *, out: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
-    """Round float32 to KEPT_BITS of the mantissa, half to even: the rest is zero and compresses away.
-
-    Relative error at most 2^-(KEPT_BITS + 1), 2.4e-4; rounding again changes nothing. NaN and infinities stay.
-    ``out`` is contiguous memory of the same shape to write to, None takes fresh memory.
-    """
-    source = np.ascontiguousarray(values, np.float32)
-    found = np.empty(source.shape, np.float32) if out is None else out
-    flat, rounded = source.reshape(-1), found.reshape(-1)
-    drop = np.uint32(23 - KEPT_BITS)
-    half_less_one = (np.uint32(1) << (drop - np.uint32(1))) - np.uint32(1)
-    for first in range(0, len(flat), BLOCK_VALUES):  # stays in cache: in one go it costs more than the codec
-        part = slice(first, first + BLOCK_VALUES)
-        bits = flat[part].view(np.uint32)
-        nearest = bits + half_less_one + ((bits >> drop) & np.uint32(1))
-        nearest &= ~((np.uint32(1) << drop) - np.uint32(1))
-        as_float = nearest.view(np.float32)
-        rounded[part] = np.where(np.isfinite(flat[part]) & np.isfinite(as_float), as_float, flat[part])
-    return found
 
 
 def numbers_in_memory(values: NDArray[Any]) -> tuple[int, zarr.Array[Any]]:

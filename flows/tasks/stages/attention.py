@@ -167,10 +167,10 @@ def all_seen(grid: SceneGrid, sweeps: Sequence[Sweep], camera: LineCamera, *, pa
 
 
 def kept_within(budget: PatchBudget, scores: Scores, seen: FinePlan) -> FinePlan:
-    """Return the plan of a uniform scan with the patches that the budget pays for: all were seen, some are kept."""
+    """Return the plan of a uniform scan with the patches that the budget pays for; all patches were seen."""
     bought, s = budget.choose(scores), budget.grid.factor
     reason = (
-        f"{seen.reason}; {len(bought)} of {len(budget.patch_index)} patches are kept and read in detail, the others "
+        f"{seen.reason}; {len(bought)} of {len(budget.patch_index)} patches are read in detail, the others "
         f"as means of {s} x {s} px"
     )
     finite = np.where(np.isfinite(scores), scores, 0.0)

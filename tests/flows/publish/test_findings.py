@@ -90,7 +90,7 @@ def test_a_plain_scan_is_told_what_its_map_scores_by_itself(survey_png: Survey, 
 
 @pytest.mark.parametrize(
     "flags",
-    [{"budget": None, "scan_step": "2"}, {"budget": None, "scan_step": "1", "bytes_kept": "60%"}],
+    [{"budget": None, "scan_step": "2"}, {"budget": None, "scan_step": "1", "macs": "60%"}],
     ids=["another step", "read in part"],
 )
 def test_nothing_is_told_of_maps_of_which_nobody_knows(

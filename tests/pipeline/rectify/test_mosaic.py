@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,7 +19,7 @@ from pipeline.geometry.scan import Sweep
 from pipeline.planning.coverage import full_sweeps
 from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
 from pipeline.rectify.placed import place
-from pipeline.rectify.region import mosaic_rows, patch_pixels, read_every_patch, read_patches
+from pipeline.rectify.region import mosaic_rows, patch_pixels, read_patches
 from pipeline.signal.lines import LineCache
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
@@ -165,26 +165,6 @@ def test_patches_are_windows_of_the_mosaic() -> None:
         np.testing.assert_array_equal(values, plain[part])
         np.testing.assert_array_equal(seen, valid[part])
     assert cache.reads == sum(-(-lines.sweep.lines // 64) for lines in sweeps)
-
-
-@pytest.mark.parametrize("along", ["x", "y"])
-@pytest.mark.parametrize("shape", [(150, 100), (83, 61)])
-def test_every_patch_at_once_is_each_by_itself(along: str, shape: tuple[int, int]) -> None:
-    """Rows of patches, or columns of them, hold what each patch holds, at the border of the scene too; bit for bit."""
-    grid = SceneGrid(*shape, 10, 2)
-    sweeps = full_sweeps(grid, CAMERA, along)  # type: ignore[arg-type]
-    short = [replace(sweep, lines=sweep.lines * 2 // 3) for sweep in sweeps]  # patches that nothing shows
-    placed = [place(lines, CAMERA) for lines in viewed(smooth_scene(shape), short)]
-    patch_index = grid.valid_patches()
-    row, column = np.divmod(patch_index, grid.patch_shape[1])
-    ordered = patch_index[np.lexsort((column, row) if along == "x" else (row, column))]
-    values, seen = (
-        np.concatenate(parts) for parts in zip(*read_every_patch(placed, CAMERA, grid, most_bytes=1 << 30), strict=True)
-    )
-    one_by_one, valid = read_patches(placed, CAMERA, grid, ordered)
-    np.testing.assert_array_equal(values, one_by_one)
-    np.testing.assert_array_equal(seen, valid)
-    assert not valid.all()
 
 
 def test_a_partial_patch_is_filled_from_inside() -> None:

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
 from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError
 from pipeline.geometry.grid import SceneGrid
-from storage.arrays.layout import AngularGrid, round_bits
+from storage.arrays.layout import AngularGrid
 from storage.arrays.mosaics import MosaicWriter, open_mosaic, patch_scores
 from tests.storage.plain_mosaic import plain_writer, write_values
 
@@ -139,31 +138,3 @@ def test_patches_are_cut_from_the_mosaic(stored: tuple[Path, NDArray[np.float32]
         y, x = grid.patch_origin(np.array(number))
         if y < 150 and x < 90:
             np.testing.assert_array_equal(patch, padded[y : y + 16, x : x + 16])
-
-
-FLOATS = hnp.arrays(np.float32, st.integers(1, 20), elements=st.floats(width=32))
-
-
-@given(FLOATS)
-@settings(max_examples=100, deadline=None)
-def test_rounding_again_changes_nothing(values: NDArray[np.float32]) -> None:
-    """round(round(x)) is round(x), NaN and infinities and signs included."""
-    once = round_bits(values)
-    np.testing.assert_array_equal(round_bits(once), once)
-    np.testing.assert_array_equal(np.isnan(once), np.isnan(values))
-    np.testing.assert_array_equal(np.isinf(once), np.isinf(values))
-
-
-@given(hnp.arrays(np.float32, 16, elements=st.floats(2.0**-100, 2.0**100, width=32)))
-@settings(max_examples=100, deadline=None)
-def test_error_is_below_half_a_step(values: NDArray[np.float32]) -> None:
-    """The relative error is at most 2^-12, and the last 12 bits of the mantissa are zero."""
-    rounded = round_bits(values)
-    assert (np.abs(rounded.astype(float) - values) <= 2.0**-12 * np.abs(values.astype(float))).all()
-    assert not (rounded.view(np.uint32) & 0xFFF).any()
-
-
-def test_halves_are_rounded_to_even() -> None:
-    """1 + 2^-12 lies in the middle between two numbers of 11 bits, as 1 + 3 * 2^-12 does."""
-    halves = np.array([1 + 2.0**-12, 1 + 3 * 2.0**-12, -1 - 2.0**-12], np.float32)
-    assert round_bits(halves).tolist() == [1.0, 1 + 2.0**-10, -1.0]
