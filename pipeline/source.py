@@ -45,7 +45,7 @@ class References:
     by_mirror: bool = False  # white was taken at rest; away from it the mirror passes another fraction of the light
 
     def same_as(self, other: References) -> bool:
-        """Whether all frames of two references are the same, bit for bit."""
+        """Return True if all frames of two references are equal bit for bit."""
         frames = ("dark", "white", "white_reference", "bad", "flat")
         pairs = [(getattr(self, name), getattr(other, name)) for name in frames]
         return self.by_mirror == other.by_mirror and all(

@@ -118,23 +118,20 @@ def _on_the_scene(first: NDArray[np.integer], patch: int, size: int) -> tuple[ND
 
 
 def read_patches(
-    sweeps: Sequence[SweepLines | Placed],
+    sweeps: Sequence[SweepLines],
     camera: LineCamera,
     grid: SceneGrid,
     patch_index: NDArray[np.integer],
     kernel: Kernel = "catmull-rom",
-    *,
-    cache: LineCache | None = None,
 ) -> tuple[Values, NDArray[np.bool_]]:
-    """Rectify whole patches from the sweeps that saw them: placed with :func:`place`, or lines to be placed now.
+    """Rectify whole patches from the sweeps that saw them.
 
-    Best in the order in which the sweeps pass the patches: neighbours share what is read and calibrated. ``cache``
-    holds raw lines that earlier calls read; None reads what is needed, once.
+    Best in the order in which the sweeps pass the patches: neighbours share what is read and calibrated.
 
     (patch, p, p, band) float32, NaN where no line reached, and (patch, p, p) pixels that lie on the scene and were
     seen.
     """
-    placed = [one if isinstance(one, Placed) else place(one, camera) for one in sweeps]
+    placed = [place(one, camera) for one in sweeps]
     points, on_scene = patch_pixels(grid, patch_index)
     located = []
     for one in placed:
@@ -143,7 +140,7 @@ def read_patches(
             if np.isfinite(coordinates[..., 0]).any():
                 whole = slice(0, one.signal.samples)
                 located.append(
-                    LocatedSweep(one, scan_path, coordinates, _reader(one, scan_path, coordinates, cache, whole))
+                    LocatedSweep(one, scan_path, coordinates, _reader(one, scan_path, coordinates, None, whole))
                 )
     bands = placed[0].signal.bands
     values = np.full((*points.shape[:3], bands), np.nan, np.float32)

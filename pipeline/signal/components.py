@@ -23,7 +23,7 @@ class Components:
 
     mean: Floats  # (band,) scene value
     axes: Floats  # (component, band) orthonormal rows
-    noise: Floats  # (band,) standard deviation of one spectrum's noise [scene value]
+    noise: Floats  # (band,) standard deviation of one spectrum's noise [scene value]; of few bands the step they keep
     covariance: Floats | None = None  # (band, band) of the spectra, by which few bands stand in for missing ones
 
     @classmethod

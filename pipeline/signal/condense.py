@@ -41,9 +41,9 @@ class ScoredLines:
 def score_lines(values: NDArray[np.float32], valid: Bools, components: Components) -> ScoredLines:
     """Project (line, sample, band) scene values onto components, by the bands that `calibrate` calls valid.
 
-    Where bands of a spectrum are missing the scores are those of least squares over the others; of few bands, which
-    know their covariance, what the others let expect. ``valid`` is (line,
-    sample) or (line, sample, band).
+    A spectrum with missing bands gets the scores of least squares over its other bands. Few bands know their
+    covariance: there a missing band takes the value that the others let expect. ``valid`` is (line, sample) or (line,
+    sample, band).
     """
     lit, count = np.isfinite(components.mean), len(components)
     bands = int(lit.sum())
@@ -143,7 +143,7 @@ class ResidualLaw:
 
 
 def find_rare(ratio: NDArray[np.float32], law: ResidualLaw, false_alarm: float) -> Bools:
-    """Which (line, sample) spectra have more residual than noise gives, alone or with their neighbours.
+    """Find the (line, sample) spectra that have more residual than noise gives, alone or with their neighbours.
 
     ``ratio`` is the residual over the expected one, NaN where unusable; ``false_alarm`` the number of spectra of the
     whole image that noise alone may mark, over all tests together.
@@ -160,8 +160,9 @@ def find_rare(ratio: NDArray[np.float32], law: ResidualLaw, false_alarm: float) 
         high = np.zeros(ratio.shape, np.float32)
         within = tuple(slice(side // 2, (side // 2 - side + 1) or None) for side in (lines, samples))
         high[within] = mean[within] > _limit(law.freedom * size, part / size)
-        if high.any():  # all spectra of the window
-            reach = uniform_filter(high, (lines, samples), mode="constant", origin=_back(lines, samples))
+        if high.any():  # all spectra of the window that the mark came from
+            back = tuple(-1 if side % 2 == 0 else 0 for side in (lines, samples))
+            reach = uniform_filter(high, (lines, samples), mode="constant", origin=back)
             rare |= known & (reach > 0.5 / size)
     return rare
 
@@ -171,15 +172,10 @@ def _limit(freedom: float, false_alarm: float) -> float:
     return float(chdtri(freedom, min(false_alarm, 0.5)) / freedom)
 
 
-def _back(lines: int, samples: int) -> tuple[int, int]:
-    """Origin of the filter that spreads a mark over the window that it came from."""
-    return tuple(-1 if size % 2 == 0 else 0 for size in (lines, samples))  # type: ignore[return-value]
-
-
 def residual_steps(
     values: NDArray[np.float32], scores: Scores, components: Components, valid: Bools | None = None
 ) -> NDArray[np.int32]:
-    """What (n, component) scores leave of (n, band) spectra, in half deviations of the noise; 0 in missing bands."""
+    """Return what scores (n, component) leave of spectra (n, band), in half deviations; 0 in missing bands."""
     left = components.white(values) - scores @ components.axes.astype(np.float32)
     there = np.isfinite(left) if valid is None else np.isfinite(left) & valid
     return np.rint(np.where(there, left, 0) / RESIDUAL_STEP).astype(np.int32)

@@ -169,7 +169,6 @@ def find_components(found: SignalStatistics, *, false_alarm: float = 0.01, least
     mean[lit] = (found.origin + own)[lit]
     covariance = single[np.ix_(lit, lit)]
     sigma = _noise(found, covariance, lit, mean[lit])
-    loadings, deviations = np.zeros((0, found.bands)), np.full(found.bands, np.nan)
     for _ in range(NOISE_ROUNDS if len(lit) > FEW_BANDS and found.count >= 4 * len(lit) else 0):
         scale = np.outer(sigma, sigma)
         axes = _axes(found, covariance / scale, lit, scale, false_alarm, least)
@@ -178,6 +177,7 @@ def find_components(found: SignalStatistics, *, false_alarm: float = 0.01, least
     axes = _axes(found, covariance / scale, lit, scale, false_alarm, least)
     loadings = np.zeros((axes.shape[1], found.bands))
     loadings[:, lit] = axes.T
+    deviations = np.full(found.bands, np.nan)
     deviations[lit] = sigma
     return Components(mean, loadings, deviations)
 

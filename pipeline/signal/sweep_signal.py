@@ -13,11 +13,11 @@ from pipeline.geometry.scan import Sweep
 from pipeline.signal.calibrate import calibrate, judge_elements
 from pipeline.signal.components import Components
 from pipeline.signal.condense import UNUSABLE, ResidualLaw, find_rare, residual_steps, score_lines
-from pipeline.signal.lines import BLOCK_LINES, CondensedLines, ReadWindow, Signal
+from pipeline.signal.lines import BLOCK_LINES, CondensedLines
 from pipeline.signal.subspace import SignalStatistics
 from pipeline.source import Line, References, SweepLines
 
-Store = Callable[[int, NDArray[np.float32], NDArray[np.uint8]], NDArray[np.float32]]
+Store = Callable[[int, NDArray[np.float32], NDArray[np.uint8]], None]
 Report = Callable[[float], None]
 Bools = NDArray[np.bool_]
 SLACK, DIGITS = 1e-3, 1e-5  # of a step, and of a score, by which sums of float32 may differ
@@ -69,7 +69,7 @@ class Condenser:
     step: float = 1.0  # in which scores are rounded [noise's deviations]
 
     def sweep(self, lines: SweepLines, store: Store, report: Report = lambda done: None) -> CondensedSweep:
-        """Give the scores of all lines to ``store``, which returns them rounded, and find the rare spectra."""
+        """Give the scores of all lines to ``store``, and find the rare spectra."""
         count, samples = len(lines.valid_line), len(lines.references.dark)
         ratio = np.empty((count, samples), np.float32)
         for first, values, valid in calibrated_blocks(lines, self.camera):
@@ -96,14 +96,22 @@ class Condenser:
 def calibrated_blocks(
     lines: SweepLines, camera: LineCamera, chosen: Collection[int] | None = None
 ) -> Iterator[tuple[int, NDArray[np.float32], NDArray[np.bool_]]]:
-    """Yield the first line, scene values and validity of 64 lines at a time; of ``chosen`` blocks alone."""
-    signal = Signal(lines)
+    """Yield the first line, scene values and validity of 64 lines at a time; of ``chosen`` blocks alone.
+
+    A line that is not valid, whose position is unknown, keeps its light. Where it was lost it holds zeros, which
+    are out.
+    """
+    elements, saturated = judge_elements(lines.references), float(camera.full_scale_dn * lines.sweep.binning)
     for first in range(0, len(lines.valid_line), BLOCK_LINES):
         if chosen is not None and first // BLOCK_LINES not in chosen:
             continue
-        numbers = np.arange(first, min(first + BLOCK_LINES, len(lines.valid_line)))
-        every = slice(0, signal.samples)
-        yield first, *signal.values(_reader(lines), numbers, every, camera.full_scale_dn)
+        part = slice(first, min(first + BLOCK_LINES, len(lines.valid_line)))
+        raw = lines.read(part.start, part.stop)
+        values, valid = calibrate(raw, elements, saturated_dn=saturated, position=lines.position[part])
+        lost = ~lines.valid_line[part]
+        if lost.any():
+            valid[lost] &= raw[lost].any(axis=2).reshape(-1, raw.shape[1], *[1] * (valid.ndim - 2))
+        yield first, values, valid
 
 
 def differing_lines(
@@ -123,7 +131,3 @@ def differing_lines(
         same = (off <= (0.5 + SLACK) * stored.step + DIGITS * np.abs(seen.scores)).all(axis=2) | ~usable
         wrong += (first + np.flatnonzero(~(same & (usable == stored.usable[first:last])).all(axis=1))).tolist()
     return wrong
-
-
-def _reader(lines: SweepLines) -> ReadWindow:
-    return lambda wanted, samples: lines.read(wanted.start, wanted.stop)[:, samples]

@@ -178,11 +178,10 @@ def write_line_facts(
 
 
 @dataclass(frozen=True)
-class RawCube:
-    """A stored sweep, opened. What belongs to lines and bands is in memory; numbers are read when asked for."""
+class StoredSweep:
+    """A stored sweep, opened. Values of lines and bands are in memory; spectra are read when asked for."""
 
     sweep: Sweep
-    references: References
     wavelength_nm: NDArray[np.float64]  # (band,)
     fwhm_nm: NDArray[np.float64] | None
     position: NDArray[np.float64]  # (line, 2) mirror X and Y at mid exposure
@@ -198,6 +197,17 @@ class RawCube:
         """What was simulated and what left out, as its attributes tell; None of a rig's lines."""
         found = dict(self.group.attrs).get("simulation")
         return found if isinstance(found, Mapping) else None
+
+    def quicklook(self) -> Quicklook | None:
+        """A small picture of the sweep, its values over the white reference; None where it was stored without one."""
+        return quicklook_of(self.group)
+
+
+@dataclass(frozen=True)
+class RawCube(StoredSweep):
+    """A stored sweep of raw numbers, opened."""
+
+    references: References
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -217,9 +227,31 @@ class RawCube:
         """Raw numbers of some lines and samples, (line, sample, band) uint16; decodes the chunks that hold them."""
         return read_array(self.group, "dn", (lines, samples))
 
-    def quicklook(self) -> Quicklook | None:
-        """A small picture of the sweep, its values over the white reference; None where it was stored without one."""
-        return quicklook_of(self.group)
+
+def read_line_facts(group: zarr.Group, path: object) -> dict[str, Any]:
+    """Return the values of `StoredSweep` by their names (IncompleteStoreError: damaged)."""
+    wavelength, fwhm = read_bands(group)
+    with damage_named(str(path)):
+        sweep = Sweep(**dict(group.attrs)["sweep"])  # type: ignore[arg-type]
+    return {
+        "sweep": sweep,
+        "wavelength_nm": wavelength,
+        "fwhm_nm": fwhm,
+        "position": np.stack([read_array(group, "mirror_x"), read_array(group, "mirror_y")], axis=-1),
+        "time_s": read_array(group, "time"),
+        "exposure_ms": read_array(group, "exposure_ms"),
+        "valid_line": read_array(group, "valid_line"),
+        "source": str(group.attrs.get("source", "")),
+        "started": None if "started" not in group.attrs else str(group.attrs["started"]),
+        "group": group,
+    }
+
+
+def read_references(group: zarr.Group) -> References:
+    """Read the frames that `write_references` stored."""
+    dark, white, white_reference = (read_array(group, name) for name in ("dark", "white", "white_reference"))
+    bad, flat = (read_array(group, name) if name in group else None for name in ("bad", "flat"))
+    return References(dark, white, white_reference, bad, flat, bool(group.attrs.get("by_mirror", False)))
 
 
 def open_raw_cube(path: Path) -> RawCube:
@@ -228,24 +260,7 @@ def open_raw_cube(path: Path) -> RawCube:
     Raises IncompleteStoreError: there is none, it was not closed, or it is damaged.
     """
     group = open_group(path)
-    wavelength, fwhm = read_bands(group)
-    dark, white, white_reference = (read_array(group, name) for name in ("dark", "white", "white_reference"))
-    bad, flat = (read_array(group, name) if name in group else None for name in ("bad", "flat"))
-    with damage_named(str(path)):
-        sweep = Sweep(**dict(group.attrs)["sweep"])  # type: ignore[arg-type]
-    return RawCube(
-        sweep=sweep,
-        references=References(dark, white, white_reference, bad, flat, bool(group.attrs.get("by_mirror", False))),
-        wavelength_nm=wavelength,
-        fwhm_nm=fwhm,
-        position=np.stack([read_array(group, "mirror_x"), read_array(group, "mirror_y")], axis=-1),
-        time_s=read_array(group, "time"),
-        exposure_ms=read_array(group, "exposure_ms"),
-        valid_line=read_array(group, "valid_line"),
-        source=str(group.attrs.get("source", "")),
-        started=None if "started" not in group.attrs else str(group.attrs["started"]),
-        group=group,
-    )
+    return RawCube(**read_line_facts(group, path), references=read_references(group))
 
 
 def open_raw_cubes(folder: Path) -> list[RawCube]:

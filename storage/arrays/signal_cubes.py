@@ -11,7 +11,7 @@ the sweep, so that a later calibration can take their place.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -23,12 +23,20 @@ from zarr.storage import MemoryStore
 
 from pipeline.errors import OldStoreError
 from pipeline.geometry.mirror import mirror_throughput
-from pipeline.geometry.scan import Sweep
 from pipeline.signal.calibrate import judge_elements
 from pipeline.signal.components import Components
 from pipeline.signal.condense import RESIDUAL_STEP, UNUSABLE
 from pipeline.source import References
-from storage.arrays.cubes import RawCube, SweepHeader, open_raw_cube, write_line_facts, write_references
+from storage.arrays.cubes import (
+    RawCube,
+    StoredSweep,
+    SweepHeader,
+    open_raw_cube,
+    read_line_facts,
+    read_references,
+    write_line_facts,
+    write_references,
+)
 from storage.arrays.layout import (
     SHARD_ROWS,
     ArraySpec,
@@ -39,12 +47,11 @@ from storage.arrays.layout import (
     damage_named,
     open_group,
     read_array,
-    read_bands,
     write_bands,
     write_counts,
     write_small,
 )
-from storage.arrays.quicklooks import Quicklook, quicklook_of, write_quicklook
+from storage.arrays.quicklooks import Quicklook, write_quicklook
 
 CHUNK = 64  # lines and samples of a chunk of scores, all components of them: what lies together packs together
 SHARD_SAMPLES = 640
@@ -152,15 +159,13 @@ class SignalCubeWriter:
         self._quality = create_array(self.group, "quality", spec, about)
         self._seen: NDArray[np.uint8] = np.zeros(shape[1:], np.uint8)
 
-    def write(self, first: int, scores: NDArray[np.floating], quality: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Store (line, sample, component) scores from a line on, a multiple of 64; return them as they are stored."""
+    def write(self, first: int, scores: NDArray[np.floating], quality: NDArray[np.uint8]) -> None:
+        """Store (line, sample, component) scores from a line on, a multiple of 64."""
         steps = whole_steps(scores, self._step, self._scores.dtype)
         stop = first + len(scores)
         if steps.shape[2]:
             self._scores[:, first:stop] = np.ascontiguousarray(steps.transpose(2, 0, 1)).astype(self._scores.dtype)
         self._seen[first:stop] = quality
-        kept: NDArray[np.float32] = steps.astype(np.float32) * np.float32(self._step)
-        return kept
 
     def close(
         self, facts: LineRows, rare: NDArray[np.intp], residuals: NDArray[np.int32], picture: Quicklook | None
@@ -182,28 +187,13 @@ class SignalCubeWriter:
 
 
 @dataclass(frozen=True)
-class SignalCube:
+class SignalCube(StoredSweep):
     """A condensed sweep, opened. Scores are read when asked for."""
 
-    sweep: Sweep
     components: Components
     step: float
     largest: float  # size that no score exceeds
-    wavelength_nm: NDArray[np.float64]  # (band,)
-    fwhm_nm: NDArray[np.float64] | None
-    position: NDArray[np.float64]  # (line, 2) mirror X and Y at mid exposure
-    time_s: NDArray[np.float64]  # (line,)
-    exposure_ms: NDArray[np.float64]  # (line,)
-    valid_line: NDArray[np.bool_]  # (line,)
-    source: str
-    started: str | None
-    group: zarr.Group
     path: Path | None  # None: in memory
-
-    @property
-    def simulation(self) -> Any:
-        """What was simulated and what left out; None of a rig's lines."""
-        return self.group.attrs.get("simulation")
 
     @cached_property
     def usable(self) -> NDArray[np.bool_]:
@@ -218,9 +208,7 @@ class SignalCube:
         group = self.group
         if shared is not None and self.path is not None:
             group = open_group(self.path.with_name(f"{shared}.zarr"))
-        dark, white, white_reference = (read_array(group, name) for name in ("dark", "white", "white_reference"))
-        bad, flat = (read_array(group, name) if name in group else None for name in ("bad", "flat"))
-        return References(dark, white, white_reference, bad, flat, bool(self.group.attrs.get("by_mirror", False)))
+        return read_references(group)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -263,10 +251,6 @@ class SignalCube:
         values[~self.usable[start:stop, first:last]] = np.nan
         return values
 
-    def quicklook(self) -> Quicklook | None:
-        """A small picture of the sweep."""
-        return quicklook_of(self.group)
-
 
 def check_condensed(group: zarr.Group, path: StorePlace) -> None:
     """Refuse a store of spectra that an earlier version wrote band by band (OldStoreError)."""
@@ -300,25 +284,14 @@ def open_signal_cube(path: StorePlace) -> SignalCube:
     Raises IncompleteStoreError: there is none, it was not closed, it is damaged, or of an earlier version.
     """
     group = open_group(path)
-    wavelength, fwhm = read_bands(group)
     check_condensed(group, path)
     with damage_named(str(path)):
-        sweep = Sweep(**dict(group.attrs)["sweep"])  # type: ignore[arg-type]
         step, largest = (float(group["scores"].attrs[name]) for name in ("scale_factor", "largest"))  # type: ignore[arg-type]
     return SignalCube(
-        sweep=sweep,
+        **read_line_facts(group, path),
         components=read_components(group),
         step=step,
         largest=largest,
-        wavelength_nm=wavelength,
-        fwhm_nm=fwhm,
-        position=np.stack([read_array(group, "mirror_x"), read_array(group, "mirror_y")], axis=-1),
-        time_s=read_array(group, "time"),
-        exposure_ms=read_array(group, "exposure_ms"),
-        valid_line=read_array(group, "valid_line"),
-        source=str(group.attrs.get("source", "")),
-        started=None if "started" not in group.attrs else str(group.attrs["started"]),
-        group=group,
         path=path if isinstance(path, Path) else None,
     )
 
@@ -361,8 +334,8 @@ def open_lines(path: Path) -> RawCube:
     if "dn" in open_group(path):
         return open_raw_cube(path)
     one = open_signal_cube(path)
-    facts = (one.position, one.time_s, one.exposure_ms, one.valid_line, one.source, one.started, one.group)
-    return RestoredCube(one.sweep, one.references, one.wavelength_nm, one.fwhm_nm, *facts, signal=one)
+    facts = {field.name: getattr(one, field.name) for field in fields(StoredSweep)}
+    return RestoredCube(**facts, references=one.references, signal=one)
 
 
 class SignalCubeInMemory:

@@ -72,7 +72,8 @@ def _condensed(raw: StageRef, camera: LineCamera, choice: SignalChoice, report: 
         if (raw.path / RIG_RECORD).is_file():  # raw lines may go
             shutil.copyfile(raw.path / RIG_RECORD, path / RIG_RECORD)
 
-    return Wanted(build, {"camera": _camera_key(camera), **asdict(choice)}, [raw])
+    key = {"camera": {"bits": camera.bits}, **asdict(choice)}  # of a camera scores depend on where it saturates
+    return Wanted(build, key, [raw])
 
 
 def with_shared_directions(
@@ -88,11 +89,6 @@ def with_shared_directions(
     if len(shared) == len(components):
         return None
     return replace(condenser, components=shared, law=ResidualLaw.learned(found.spectra, shared))
-
-
-def _camera_key(camera: LineCamera) -> dict[str, Any]:
-    """Return what scores depend on of a camera: where samples saturate."""
-    return {"bits": camera.bits}
 
 
 def camera_of(params: Mapping[str, Any]) -> LineCamera:
@@ -170,8 +166,9 @@ def _lines_differ(raw: StageRef, signal: StageRef, camera: LineCamera) -> str | 
     cubes, condensed = open_raw_cubes(raw.path), open_signal_cubes(signal.path)
     if [cube.sweep for cube in cubes] != [stored.sweep for stored in condensed]:
         return "the sweeps of the signal are not those of the raw lines"
+    found = read_statistics(raw.path)
+    few = components_of(found, cubes, SignalChoice()) if found.bands <= FEW_BANDS else None
     for cube, stored in zip(cubes, condensed, strict=True):
-        few = components_of(read_statistics(raw.path), cubes, SignalChoice()) if cube.shape[2] <= FEW_BANDS else None
         wrong = differing_lines(cube, stored, camera, few)
         if wrong:
             return f"sweep {cube.sweep.name}: {line_values(wrong)} of the signal are not those of the raw lines"

@@ -26,14 +26,12 @@ from flows.tasks.run import open_run
 from flows.tasks.stages.accuracy import columns_of_all_patches, columns_of_raster
 from pipeline.errors import PipelineError, SceneError, SettingsError
 from storage.archive.archive import Archive
-from storage.arrays.layout import KEPT_BITS
 from storage.arrays.mosaics import open_mosaic
 from storage.readers.raster_fields import open_raster
 from storage.remote.opening import verify_archive
 from tests.conftest import RGB_NM, Survey, WeightsMaker, patchy_scene
 
 QUIET = Console(quiet=True)
-ROUNDING = 2.0 ** -(KEPT_BITS + 1)  # of stored values, relative
 CORNER = Affine(0.5, 0, 500_000, 0, -0.5, 5_400_000)
 UTM = "EPSG:32632"
 Raster = Callable[..., Any]

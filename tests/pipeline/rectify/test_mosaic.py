@@ -18,7 +18,6 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
 from pipeline.planning.coverage import full_sweeps
 from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
-from pipeline.rectify.placed import place
 from pipeline.rectify.region import mosaic_rows, patch_pixels, read_patches
 from pipeline.signal.lines import LineCache
 from pipeline.simulator.rig_model import Rig
@@ -150,7 +149,7 @@ def test_fine_mosaic_is_the_scene_behind_the_footprint(along: str) -> None:
 
 
 def test_patches_are_windows_of_the_mosaic() -> None:
-    """A patch read by itself holds the mosaic's own pixels; placed once, with lines kept, none is read twice."""
+    """A patch read by itself holds the mosaic's own pixels."""
     grid = SceneGrid(150, 100, 10, 2)
     sweeps = viewed(smooth_scene((150, 100)), full_sweeps(grid, CAMERA, "x"))
     mosaic = np.concatenate([values for _, values, _ in mosaic_rows(sweeps, CAMERA, grid, rows=64)])
@@ -158,13 +157,6 @@ def test_patches_are_windows_of_the_mosaic() -> None:
     plain, valid = read_patches(sweeps, CAMERA, grid, patch_index)
     np.testing.assert_array_equal(plain, mosaic.reshape(15, 10, 10, 10, -1).swapaxes(1, 2).reshape(150, 10, 10, -1))
     assert valid.all()
-    placed, cache = [place(lines, CAMERA) for lines in sweeps], LineCache(2**30)
-    for first in range(0, len(patch_index), 7):
-        part = slice(first, first + 7)
-        values, seen = read_patches(placed, CAMERA, grid, patch_index[part], cache=cache)
-        np.testing.assert_array_equal(values, plain[part])
-        np.testing.assert_array_equal(seen, valid[part])
-    assert cache.reads == sum(-(-lines.sweep.lines // 64) for lines in sweeps)
 
 
 def test_a_partial_patch_is_filled_from_inside() -> None:

@@ -33,11 +33,10 @@ class Stored:
         """Spectra that may be used."""
         return self.quality != UNUSABLE
 
-    def write(self, first: int, scores: NDArray[np.float32], quality: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def write(self, first: int, scores: NDArray[np.float32], quality: NDArray[np.uint8]) -> None:
         """Take some lines."""
         part = slice(first, first + len(scores))
         self.scores[part], self.quality[part] = np.rint(scores / self.step), quality
-        return (self.scores[part] * self.step).astype(np.float32)
 
     def read(self, start: int, stop: int) -> NDArray[np.int32]:
         """Scores of some lines in steps."""
@@ -91,15 +90,26 @@ def test_statistics_of_lines_are_those_of_their_values() -> None:
     np.testing.assert_allclose(find_components(found).noise, find_components(whole).noise, rtol=0.01)
 
 
-def test_lines_that_are_not_valid_tell_nothing() -> None:
-    """Whatever stands in a lost line, statistics are those without it, and it is unusable."""
+def test_lines_that_are_not_valid_stay_out_of_the_statistics() -> None:
+    """Whatever stands in such a line, statistics are those without it."""
     lines = made_lines()
     lines.valid_line[[5, 140]] = False
     lines.raw[5] = 3000
-    stored, _ = condense(lines)
     assert statistics_of_lines(lines).count == 148 * 40
-    assert np.flatnonzero((stored.quality == UNUSABLE).all(axis=1)).tolist() == [5, 140]
-    assert (stored.quality == UNUSABLE).sum() == 80
+
+
+@pytest.mark.parametrize("hot", [False, True])
+def test_a_lost_line_is_unusable_and_a_line_without_position_keeps_its_light(hot: bool) -> None:
+    """Zeros of a line that is not valid are out; light from an unknown place comes back, in either form of validity."""
+    lines = made_lines()
+    lines.valid_line[[5, 140]] = False
+    lines.raw[5] = 0
+    if hot:
+        lines.raw[9, 3, 2] = CAMERA.full_scale_dn
+    stored, done = condense(lines)
+    assert np.argwhere(stored.quality == UNUSABLE).tolist() == [[5, sample] for sample in range(40)]
+    off = (stored.restored(done) - values_of(lines))[140] / stored.components.noise
+    assert np.sqrt(np.mean(off**2)) == pytest.approx(1, abs=0.1)
     assert differing_lines(lines, stored, CAMERA) == []
 
 

@@ -20,6 +20,7 @@ from pipeline.signal.condense import RESIDUAL_STEP, ResidualLaw
 from pipeline.signal.subspace import SignalStatistics, find_components
 from pipeline.signal.sweep_signal import CondensedSweep, Condenser, differing_lines
 from storage.arrays.cubes import SweepHeader
+from storage.arrays.layout import read_array
 from storage.arrays.signal_cubes import (
     LARGEST_SHORT,
     LineRows,
@@ -239,7 +240,7 @@ def test_scores_beyond_16_bits_are_stored_in_32(tmp_path: Path, largest: float, 
     components = Components(np.zeros(BANDS), axes, np.ones(BANDS))
     writer = SignalCubeWriter(tmp_path / "a.zarr", header, components, step=1.0, largest=largest)
     scores = np.random.default_rng(0).uniform(-largest, largest, (*SHAPE, 2)).astype(np.float32)
-    kept = writer.write(0, scores, np.zeros(SHAPE, np.uint8))
+    writer.write(0, scores, np.zeros(SHAPE, np.uint8))
     steps = np.array([[70_000, -3], [0, 9]]).repeat(BANDS // 2, axis=1).astype(np.int32)
     x, y = lines.position.T
     facts = LineRows(lines.time_s, x, y, np.full(len(x), 100.0), lines.valid_line)
@@ -247,8 +248,7 @@ def test_scores_beyond_16_bits_are_stored_in_32(tmp_path: Path, largest: float, 
     cube = open_signal_cube(tmp_path / "a.zarr")
     assert cube.read().dtype == kind
     np.testing.assert_array_equal(cube.read(), np.rint(scores))
-    np.testing.assert_array_equal(cube.read(), kept)
-    off = cube.spectra(0, 1)[0, 1] - components.restore(kept[0, 1])
+    off = cube.spectra(0, 1)[0, 1] - components.restore(cube.read(0, 1)[0, 1])
     np.testing.assert_array_equal(off[2:], steps[0, 2:] * RESIDUAL_STEP)
 
 
@@ -260,9 +260,10 @@ def test_a_score_beyond_its_type_is_cut_off_and_does_not_wrap(tmp_path: Path) ->
     writer = SignalCubeWriter(tmp_path / "a.zarr", header, components, step=1.0, largest=100.0)
     scores = np.zeros((1, 70, 1), np.float32)
     scores[0, :2, 0] = 40_000, -1e9
-    kept = writer.write(0, scores, np.zeros((1, 70), np.uint8))
-    assert kept[0, 0, 0] > LARGEST_SHORT
-    assert kept[0, 1, 0] < -LARGEST_SHORT
+    writer.write(0, scores, np.zeros((1, 70), np.uint8))
+    kept = read_array(writer.group, "scores")[0, 0]
+    assert kept[0] > LARGEST_SHORT
+    assert kept[1] < -LARGEST_SHORT
 
 
 def test_full_scale_lines_are_stored_in_32_bits_and_come_back(tmp_path: Path) -> None:
@@ -278,11 +279,10 @@ def test_full_scale_lines_are_stored_in_32_bits_and_come_back(tmp_path: Path) ->
     writer = SignalCubeWriter(tmp_path / "a.zarr", header, components, step=1.0, largest=largest)
     scores = components.white(values) @ components.axes.T.astype(np.float32)
     assert largest > LARGEST_SHORT
-    kept = writer.write(0, scores, np.zeros(SHAPE, np.uint8))
+    writer.write(0, scores, np.zeros(SHAPE, np.uint8))
     x, y = lines.position.T
     facts = LineRows(lines.time_s, x, y, np.full(len(x), 100.0), lines.valid_line)
     writer.close(facts, np.zeros((0, 2), np.intp), np.zeros((0, BANDS), np.int32), None)
     cube = open_signal_cube(tmp_path / "a.zarr")
-    np.testing.assert_array_equal(cube.read(), kept)
     off = (cube.spectra(0, 130) - values) / made.noise
     assert np.sqrt(np.mean(off**2)) == pytest.approx(1, abs=0.1)
