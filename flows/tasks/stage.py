@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.tasks.prefect_tasks import as_task
+from models.network.machine import give_back_freed_memory
 from pipeline.geometry.grid import SceneGrid
 from pipeline.ground.georeference import georeference_record
 from storage.archive.archive import Archive
@@ -132,6 +133,8 @@ class Stage:
             params=wanted.params,
             inputs=[ref.key for ref in wanted.inputs],
         )
+        if built:
+            give_back_freed_memory()
         wanted.then()
         return ref, built
 

@@ -65,3 +65,11 @@ def keep_freed_memory() -> None:
             libc.mallopt(option, value)
     except (OSError, AttributeError):
         return  # another C library: slower, nothing else
+
+
+def give_back_freed_memory() -> None:
+    """Return the memory that the C library kept, when a stage is done: the next one takes pieces of other sizes."""
+    try:
+        ctypes.CDLL("libc.so.6").malloc_trim(0)
+    except (OSError, AttributeError):
+        return  # another C library

@@ -1,7 +1,9 @@
 """Regions: parts of a field that the segmenter reads as scenes of their own, so that memory has a bound.
 
-Attention is global, so what a token sees has to end somewhere. A field of up to 2560 x 2560 px is one region and is
-read whole. A larger one is cut; each part is read with a halo of coarse cells around it, of which nothing is kept.
+Attention is global, so what a token sees has to end somewhere. A field of up to 640 x 640 px is one region and is read
+whole. A larger one is cut; each part is read with a halo of coarse cells around it, of which nothing is kept. Attention
+takes multiply-adds quadratic in a region: three farms of 1280 x 1024 px, cut, score within .1 points of one region, for
+84 % of its multiply-adds (docs/benchmarks.md).
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from numpy.typing import NDArray
 from models.network.sizes import SegmenterConfig, level_widths
 from pipeline.geometry.grid import SceneGrid
 
-REGION_PX = 2560  # a side, at most
+REGION_PX = 640  # a side, at most
 HALO_CELLS = 1  # coarse patches around a region that are read with it; see bench_regions.py for more and for none
 CELL_COPIES, PATCH_COPIES = 8, 2  # of a coarse cell's features, and of a patch's columns, in memory at once
 MAP_COPIES = 2  # of what is believed of every class: of the look, and of look and memory together
