@@ -1,8 +1,7 @@
 """Judging a map by labels: its own accuracy, and what no detail, all detail and other placements would have given.
 
 A stage like the others, but outside the survey's savings: it looks at the whole scene in full and needs labels. Labels
-come with simulated fields alone, which memory holds as well: columns and maps are of the whole field, and the model
-reads it as one region however large it is.
+come with simulated fields alone, which memory holds as well. Controls read the whole field as one region.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from flows.tasks.capture_plan import CapturePlan
 from flows.tasks.field_work import coarse_region
-from flows.tasks.patch_budget import PatchBudget
+from flows.tasks.patch_budget import SHARD, PatchBudget
 from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
 from flows.tasks.stages.attention import load_plan
 from flows.tasks.stages.effects import source_with
@@ -35,7 +34,7 @@ from models.evaluation.metrics import (
 )
 from models.evaluation.placement import CONTROL_FRACTION, run_controls
 from models.reading.inference import read_coarse_prediction, segment
-from models.reading.regions import whole_field
+from models.reading.regions import plan_regions, whole_field
 from models.weights.files import Weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
@@ -90,12 +89,10 @@ def evaluate(
         weights, grid, drawn = load(), frame.grid, load_class_map(class_map.path / "class_map.zarr")
         names, classes = weights.class_names, drawn.classes
         judged = np.where(classes == UNLABELLED, np.uint8(UNLABELLED), labels)  # what has no class is not
-        seen = read_coarse_prediction(weights, coarse_region(weights, mosaic.path / "mosaic.zarr", whole_field(grid)))
         counts = confusion(judged, classes, len(drawn.names))  # with the class unknown, which no label has
         result: dict[str, Any] = map_figures(names, counts) | {"confusion": counts.tolist()}
-        empty = np.empty((0, grid.patch, grid.patch, weights.basis.columns), np.float32)
-        none = segment(weights, seen, empty, np.empty(0, np.int64))
-        result["none"] = map_figures(names, confusion(judged, none.classes, weights.config.classes))
+        image = mosaic.path / "mosaic.zarr"
+        result["none"] = map_figures(names, _confusion_of_coarse_map(weights, image, grid, judged))
         result |= {"all": {"miou": None, "per_class_iou": {}}, "gap_closed": None, "controls": {}}
         if controls:
             if raster is not None:
@@ -112,7 +109,7 @@ def evaluate(
             rows, among = count(1), None if zones.fractions is None else zones.fractions > 0
             found = run_controls(
                 weights,
-                seen,
+                read_coarse_prediction(weights, coarse_region(weights, image, whole_field(grid))),
                 columns,
                 judged,
                 fraction=fraction,
@@ -131,6 +128,19 @@ def evaluate(
 
     params = {**model_key, "labels": array_digest(labels), "controls": controls, "resampling": resampling, **source_key}
     return Wanted(build, params, [mosaic, attention, class_map, *captures])
+
+
+def _confusion_of_coarse_map(
+    weights: Weights, mosaic: Path, grid: SceneGrid, labels: NDArray[np.uint8]
+) -> NDArray[np.int64]:
+    """Count (class, class) pixels of the map that the coarse pass alone gives, region by region as surveys draw it."""
+    empty = np.empty((0, grid.patch, grid.patch, weights.basis.columns), np.float32)
+    counts = np.zeros((weights.config.classes,) * 2, np.int64)
+    for region in plan_regions(grid, SHARD):
+        drawn = segment(weights, coarse_region(weights, mosaic, region), empty, np.empty(0, np.int64))
+        inside = labels[region.kept.rows, region.kept.columns]
+        counts += confusion(inside, region.crop(drawn.classes), weights.config.classes)
+    return counts
 
 
 def map_offset(simulated: SimulatedSource, pointing: Sequence[StageRef]) -> NDArray[np.float64]:
