@@ -438,6 +438,9 @@ def _extent_errors(settings: Settings, origin: Mapping[str, str]) -> Iterator[st
     if settings.skip_below_error is not None and settings.extent == EXTENT_WHOLE:
         place = place_of("skip_below_error", origin.get("skip_below_error"))
         yield f"{place} says how sure a memory may be so that nothing is looked at: give --extent part too"
+    if settings.kept_bytes is not None and not (settings.plain and settings.source != RASTER):
+        place = place_of("kept_bytes", origin.get("kept_bytes"))
+        yield f"{place} is for the lines of a uniform scan: give --seconds or --scan-step too, or leave it out"
     if settings.max_age is not None and settings.extent == EXTENT_WHOLE:
         place = place_of("max_age", origin.get("max_age"))
         yield f"{place} says how old a place may become of which a visit looks at a part: give --extent part too"

@@ -218,6 +218,13 @@ class Settings:
         "What stays of captured lines: signal (raw lines are cleared away once each was compared with what was "
         "condensed from it), raw (they stay too), or for how long they stay: raw 7d",
     )
+    kept_bytes: Bytes | None = stated(
+        None,
+        "What the scores of a uniform scan's lines and mosaic may take, most of what a run keeps: they are rounded in "
+        "coarser steps than [signal] says where they take more",
+        example="8MB",
+        why="leave it out for steps of the noise",
+    )
     budget: Budget = stated(
         0.5, "Seconds of coarse and fine capture over those of the full scan, above 0 and at most 1"
     )

@@ -12,7 +12,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.signal.calibrate import calibrate, judge_elements
 from pipeline.signal.components import Components
-from pipeline.signal.condense import UNUSABLE, ResidualLaw, find_rare, residual_steps, score_lines
+from pipeline.signal.condense import UNUSABLE, ResidualLaw, find_rare, residual_steps, score_lines, whole_steps
 from pipeline.signal.lines import BLOCK_LINES, CondensedLines
 from pipeline.signal.subspace import SignalStatistics
 from pipeline.source import Line, References, SweepLines
@@ -86,9 +86,9 @@ class Condenser:
         blocks = set((np.flatnonzero(rare.any(axis=1)) // BLOCK_LINES).tolist())
         for first, values, valid in calibrated_blocks(lines, self.camera, blocks):
             here = rare[first : first + len(values)]
-            scores = score_lines(values, valid, self.components).scores[here]
+            scores = score_lines(values, valid, self.components).scores
+            rounded = whole_steps(scores, self.step)[here] * np.float32(self.step)
             there = None if valid.ndim == 2 else valid[here]
-            rounded = np.rint(scores / np.float32(self.step)) * np.float32(self.step)
             found.append(residual_steps(values[here], rounded, self.components, there))
         return np.concatenate(found)
 
@@ -128,6 +128,7 @@ def differing_lines(
         seen = score_lines(values, valid, components or stored.components)
         off = np.abs(stored.read(first, last) * np.float32(stored.step) - seen.scores)
         usable = seen.quality != UNUSABLE
-        same = (off <= (0.5 + SLACK) * stored.step + DIGITS * np.abs(seen.scores)).all(axis=2) | ~usable
+        most = 0.5 if stored.step <= 1 else 1  # see `whole_steps`
+        same = (off <= (most + SLACK) * stored.step + DIGITS * np.abs(seen.scores)).all(axis=2) | ~usable
         wrong += (first + np.flatnonzero(~(same & (usable == stored.usable[first:last])).all(axis=1))).tolist()
     return wrong

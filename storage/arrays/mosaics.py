@@ -38,7 +38,7 @@ from storage.arrays.signal_cubes import (
     check_condensed,
     read_components,
     score_spec,
-    whole_steps,
+    steps_within,
     write_components,
 )
 from storage.parallel.pool import WorkerPool, run_blocks
@@ -123,7 +123,7 @@ class MosaicWriter:
         whole_shards("the mosaic", (rows, columns), shape, self.tile_shape)
         seen = coverage > 0
         if count:
-            steps = whole_steps(scores, self._step, self._scores.dtype)
+            steps = steps_within(scores, self._step, self._scores.dtype)
             seen = seen & np.isfinite(scores).all(axis=2)
             steps = np.where(seen[..., None], steps, np.float32(_unseen(self._scores.dtype.str)))
             self._scores[:, rows, columns] = np.ascontiguousarray(steps.transpose(2, 0, 1)).astype(self._scores.dtype)

@@ -25,7 +25,7 @@ from pipeline.errors import OldStoreError
 from pipeline.geometry.mirror import mirror_throughput
 from pipeline.signal.calibrate import judge_elements
 from pipeline.signal.components import Components
-from pipeline.signal.condense import RESIDUAL_STEP, UNUSABLE
+from pipeline.signal.condense import RESIDUAL_STEP, UNUSABLE, whole_steps
 from pipeline.source import References
 from storage.arrays.cubes import (
     RawCube,
@@ -93,10 +93,10 @@ def score_spec(dims: tuple[str, str, str], shape: tuple[int, int, int], largest:
     return ArraySpec(dims, shape, _kind(largest), chunk, (chunk[0], *whole))
 
 
-def whole_steps(scores: NDArray[np.floating], step: float, kind: np.dtype[Any]) -> NDArray[np.floating]:
-    """Scores in steps, at most what a type of integers holds: few bands of a spectrum may tell a component badly."""
+def steps_within(scores: NDArray[np.floating], step: float, kind: np.dtype[Any]) -> NDArray[np.floating]:
+    """Return scores in whole steps, at most what a type of integers holds: few bands may tell a component badly."""
     most = np.iinfo(kind).max & ~127  # a float32
-    steps: NDArray[np.floating] = np.clip(np.rint(scores / np.float32(step)), -most, most)
+    steps: NDArray[np.floating] = np.clip(whole_steps(scores, step), -most, most)
     return steps
 
 
@@ -161,7 +161,7 @@ class SignalCubeWriter:
 
     def write(self, first: int, scores: NDArray[np.floating], quality: NDArray[np.uint8]) -> None:
         """Store (line, sample, component) scores from a line on, a multiple of 64."""
-        steps = whole_steps(scores, self._step, self._scores.dtype)
+        steps = steps_within(scores, self._step, self._scores.dtype)
         stop = first + len(scores)
         if steps.shape[2]:
             self._scores[:, first:stop] = np.ascontiguousarray(steps.transpose(2, 0, 1)).astype(self._scores.dtype)

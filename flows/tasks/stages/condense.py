@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from flows.settings.survey_settings import SignalChoice
-from flows.tasks.stage import Product, Report, Wanted, stage
+from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
 from flows.tasks.stages.capture import RIG_RECORD
-from pipeline.errors import IncompleteStoreError
+from flows.tasks.stages.placement import MOSAIC_STEP
+from flows.terminal.figures import format_bytes
+from pipeline.errors import BudgetError, IncompleteStoreError
 from pipeline.geometry.camera import LineCamera
 from pipeline.signal.calibrate import number_values
 from pipeline.signal.components import Components
-from pipeline.signal.condense import RESIDUAL_STEP, ResidualLaw
+from pipeline.signal.condense import RESIDUAL_STEP, ResidualLaw, score_lines, whole_steps
+from pipeline.signal.lines import BLOCK_LINES
 from pipeline.signal.subspace import (
     FEW_BANDS,
     SignalStatistics,
@@ -26,10 +29,11 @@ from pipeline.signal.subspace import (
     least_of_field,
     with_shared,
 )
-from pipeline.signal.sweep_signal import CondensedSweep, Condenser, differing_lines
+from pipeline.signal.sweep_signal import CondensedSweep, Condenser, calibrated_blocks, differing_lines
 from storage.archive.keys import StageRef
 from storage.archive.manifests import check_files, read_table, write_table
 from storage.arrays.cubes import RawCube, SweepHeader, open_raw_cubes
+from storage.arrays.layout import numbers_in_memory
 from storage.arrays.signal_cubes import LineRows, SignalCubeWriter, open_signal_cubes
 from storage.arrays.spool import line_values
 from storage.arrays.statistics import read_statistics
@@ -38,13 +42,24 @@ SIGNAL = Product("condense", version=1)
 SIGNAL_FINE = Product("condense_fine", version=1)
 RECORD = "signal.json"
 SHARED_FRACTION = 2e-3  # of all spectra: of more rare ones, a component is cheaper than their residuals
+COARSER = (1.5, 2.0, 3.0, 4.0, 6.0)  # steps that a limit of bytes may ask for [noise's deviations]
+SAMPLED_BLOCKS = 8  # of lines, by which bytes are foretold
 MOST_RARE = 0.05  # of spectra: more are no exceptions, and raw lines stay
 
 
 @stage("condense_coarse", "signal of the sweeps", SIGNAL, named="signal_coarse")
-def condense_coarse(raw: StageRef, *, camera: LineCamera, signal: SignalChoice, report: Report) -> Wanted:
-    """Condense the sweeps of the first pass, or of a uniform scan."""
-    return _condensed(raw, camera, signal, report)
+def condense_coarse(
+    raw: StageRef,
+    *,
+    camera: LineCamera,
+    signal: SignalChoice,
+    kept_bytes: int | None,
+    frame: FieldFrame,
+    report: Report,
+) -> Wanted:
+    """Condense the sweeps of the first pass, or of a uniform scan, with its mosaic in at most ``kept_bytes``."""
+    limit = None if kept_bytes is None else KeptBytes(kept_bytes, frame.grid.height * frame.grid.width)
+    return _condensed(raw, camera, signal, report, limit)
 
 
 @stage("condense_fine", "signal of the fine sweeps", SIGNAL_FINE, named="signal_fine")
@@ -53,7 +68,46 @@ def condense_fine(raw: StageRef, *, camera: LineCamera, signal: SignalChoice, re
     return _condensed(raw, camera, signal, report)
 
 
-def _condensed(raw: StageRef, camera: LineCamera, choice: SignalChoice, report: Report) -> Wanted:
+@dataclass(frozen=True)
+class KeptBytes:
+    """What scores of lines and of the mosaic made of them may take."""
+
+    most: int
+    mosaic_px: int
+
+    def step(self, cubes: Sequence[RawCube], components: Components, camera: LineCamera, finest: float) -> float:
+        """Return the finest step in which they fit, by lines here and there from all sweeps.
+
+        Raises BudgetError: not even the coarsest does; names the least that is enough.
+        """
+        blocks = [(cube, block) for cube in cubes for block in range(-(-cube.shape[0] // BLOCK_LINES))]
+        some = blocks[:: max(1, len(blocks) // SAMPLED_BLOCKS)]
+        scores = [
+            score_lines(values, valid, components).scores
+            for cube, block in some
+            for _, values, valid in calibrated_blocks(cube, camera, [block])
+        ]
+        spectra = sum(cube.shape[0] * cube.shape[1] for cube in cubes)
+
+        def take(step: float, count: int) -> float:
+            whole = (whole_steps(one, step).transpose(2, 0, 1) for one in scores)
+            packed = sum(numbers_in_memory(np.ascontiguousarray(one, np.int32))[0] for one in whole)
+            return count * packed / max(sum(one[..., 0].size for one in scores), 1)
+
+        least = 0.0
+        for step in (finest, *(step for step in COARSER if step > finest)):
+            least = take(step, spectra) + take(MOSAIC_STEP * step, self.mosaic_px)
+            if least <= self.most:
+                return step
+        raise BudgetError(
+            f"--kept-bytes {self.most} does not hold the scores of lines and mosaic: in the coarsest steps they take "
+            f"{format_bytes(least)}; raw lines stay until a larger one is given"
+        )
+
+
+def _condensed(
+    raw: StageRef, camera: LineCamera, choice: SignalChoice, report: Report, limit: KeptBytes | None = None
+) -> Wanted:
     """Want the condensed sweeps of a capture."""
 
     def build(path: Path) -> None:
@@ -61,9 +115,9 @@ def _condensed(raw: StageRef, camera: LineCamera, choice: SignalChoice, report: 
         cubes = open_raw_cubes(raw.path)
         found = read_statistics(raw.path)
         components = components_of(found, cubes, choice)
-        condenser = Condenser(
-            components, ResidualLaw.learned(found.spectra, components), camera, choice.rare_spectra, choice.step
-        )
+        step = choice.step if limit is None else limit.step(cubes, components, camera, choice.step)
+        law = ResidualLaw.learned(found.spectra, components)
+        condenser = Condenser(components, law, camera, choice.rare_spectra, step)
         done = _write_sweeps(path, cubes, condenser, found, report)
         better = with_shared_directions(condenser, done, found, choice.false_alarm)
         if better is not None:
@@ -73,7 +127,7 @@ def _condensed(raw: StageRef, camera: LineCamera, choice: SignalChoice, report: 
             shutil.copyfile(raw.path / RIG_RECORD, path / RIG_RECORD)
 
     key = {"camera": {"bits": camera.bits}, **asdict(choice)}  # of a camera scores depend on where it saturates
-    return Wanted(build, key, [raw])
+    return Wanted(build, key if limit is None else {**key, "kept": asdict(limit)}, [raw])
 
 
 def with_shared_directions(

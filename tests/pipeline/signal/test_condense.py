@@ -18,6 +18,7 @@ from pipeline.signal.condense import (
     find_rare,
     residual_steps,
     score_lines,
+    whole_steps,
 )
 from pipeline.signal.subspace import SignalStatistics, find_components
 from tests.pipeline.signal.made_spectra import Field, field_of, marked, restored, scored, statistics_of
@@ -272,3 +273,43 @@ def test_missing_bands_have_no_residual(condensed: tuple) -> None:
     values[2, 30] = np.nan
     steps = residual_steps(values, np.zeros((4, len(law)), np.float32), law, valid)
     assert np.argwhere(steps == 0).tolist() == [[1, 5], [1, 6], [1, 7], [1, 8], [2, 30]]
+
+
+@given(seed=SEEDS, step=st.sampled_from([1.5, 3.0, 6.0]), shape=st.tuples(*[st.integers(0, 13)] * 2, st.integers(0, 3)))
+@settings(max_examples=40)
+def test_coarse_steps_keep_the_means_of_blocks(seed: int, step: float, shape: tuple[int, int, int]) -> None:
+    """No score is off by more than a step, and the mean of a whole block of 4 x 4 by more than 1/32 of one."""
+    scores = np.random.default_rng(seed).normal(0, 4, shape).astype(np.float32)
+    off = whole_steps(scores, step) - scores / np.float32(step)
+    assert np.abs(off).max(initial=0) <= 1
+    lines, samples = (size // 4 * 4 for size in shape[:2])
+    blocks = off[:lines, :samples].reshape(lines // 4, 4, samples // 4, 4, shape[2])
+    assert np.abs(blocks.mean(axis=(1, 3))).max(initial=0) <= 1 / 32 + 1e-5
+    rest = np.concatenate([off[lines:].ravel(), off[:, samples:].ravel()])
+    assert np.abs(rest).max(initial=0) <= 0.5 + 1e-5
+
+
+def test_a_signal_weaker_than_a_coarse_step_stays_in_the_means() -> None:
+    """Half of a field lies a quarter of a deviation higher: rounded one by one most of that is lost, here none is."""
+    rng = np.random.default_rng(5)
+    scores = rng.normal(0, 0.5, (64, 64, 1)).astype(np.float32)
+    scores[:, 32:] += 0.25
+    seen = [half.mean() for half in np.split(scores, 2, axis=1)]
+    kept = [half.mean() * 4 for half in np.split(whole_steps(scores, 4), 2, axis=1)]
+    alone = [half.mean() * 4 for half in np.split(np.rint(scores / 4), 2, axis=1)]
+    assert kept[1] - kept[0] == pytest.approx(seen[1] - seen[0], abs=0.02)
+    assert alone[1] - alone[0] < 0.05
+
+
+def test_blocks_with_a_score_that_is_not_finite_are_rounded_one_by_one() -> None:
+    """A spectrum that nobody saw says nothing of its neighbours."""
+    scores = np.random.default_rng(2).normal(0, 4, (8, 4, 2)).astype(np.float32)
+    scores[1, 2, 0], scores[2, 2, 0] = np.nan, np.inf
+    np.testing.assert_array_equal(whole_steps(scores, 3)[:4, :, 0], np.rint(scores[:4, :, 0] / 3))
+
+
+@pytest.mark.parametrize("step", [0.5, 1.0])
+def test_fine_steps_are_rounded_one_by_one(step: float) -> None:
+    """Noise is larger than they are, and keeps the means."""
+    scores = np.random.default_rng(2).normal(0, 4, (8, 8, 2)).astype(np.float32)
+    np.testing.assert_array_equal(whole_steps(scores, step), np.rint(scores / np.float32(step)))

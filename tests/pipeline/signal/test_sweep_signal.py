@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.signal.calibrate import calibrate
 from pipeline.signal.components import Components
-from pipeline.signal.condense import RESIDUAL_STEP, UNUSABLE, ResidualLaw
+from pipeline.signal.condense import RESIDUAL_STEP, UNUSABLE, ResidualLaw, whole_steps
 from pipeline.signal.subspace import SignalStatistics, find_components
 from pipeline.signal.sweep_signal import CondensedSweep, Condenser, LineStatistics, differing_lines
 from pipeline.source import Line
@@ -36,7 +36,7 @@ class Stored:
     def write(self, first: int, scores: NDArray[np.float32], quality: NDArray[np.uint8]) -> None:
         """Take some lines."""
         part = slice(first, first + len(scores))
-        self.scores[part], self.quality[part] = np.rint(scores / self.step), quality
+        self.scores[part], self.quality[part] = whole_steps(scores, self.step), quality
 
     def read(self, start: int, stop: int) -> NDArray[np.int32]:
         """Scores of some lines in steps."""
