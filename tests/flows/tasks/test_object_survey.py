@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -72,6 +73,32 @@ def test_a_rerun_makes_nothing_and_moves_next_to_nothing(
     run = spectralzoom.open(bucket).latest
     np.testing.assert_array_equal(run.class_map, beside)
     assert run.report.is_file()
+
+
+def test_another_machine_clears_outlived_raw_lines_in_a_bucket(
+    bucket: str, survey_png: Survey, command_line: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They stay for their days; then gc compares and clears them, counts bytes again; no survey sends them."""
+    kept = survey_png(bucket, keep="raw 7d").receipt["data_bytes"]["kept"]
+
+    def raw() -> set[str]:
+        archive = open_archive(bucket)
+        assert isinstance(archive, ObjectArchive)
+        return {name.rpartition("/")[2] for name in archive.objects.listing("stages/capture")}
+
+    assert command_line("gc", bucket).code == 0
+    assert len(raw()) > 1
+    monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / "elsewhere"))
+    with monkeypatch.context() as later:
+        later.setattr(ObjectArchive, "now", lambda self: datetime.now(UTC) + timedelta(days=8))
+        ended = json.loads(command_line("gc", bucket, "--json").out)
+    assert [removal["uri"].split("/")[1] for removal in ended["removals"]] == ["capture"] * 2  # coarse and fine lines
+    assert raw() == {"manifest.json"}
+    assert spectralzoom.open(bucket).latest.receipt["data_bytes"]["kept"] < kept
+    monkeypatch.delenv("SPECTRALZOOM_WORK")
+    assert states(survey_png(bucket, keep="raw 7d").receipt) <= CACHED
+    assert raw() == {"manifest.json"}
+    assert command_line("verify", bucket).code == 0
 
 
 def test_verbs_read_an_archive_in_a_bucket(

@@ -200,3 +200,42 @@ def test_weights_without_a_record_scan_by_hand_alone(survey_png: Survey, tmp_pat
     assert "instead of" in page
     assert "the weights have no scan performance table, so that seconds stand beside every line" in page
     assert published.receipt["plan"]["reason"] == "the field was scanned once: every 4th line, 100 ms"
+
+
+def _scores_bytes(out: Path) -> int:
+    """Bytes of the scores of lines and mosaic."""
+    return sum(one.stat().st_size for one in out.glob("stages/*/*/*.zarr/scores/c/**/*") if one.is_file())
+
+
+def _step(out: Path) -> float:
+    (record,) = out.glob("stages/condense/*/signal.json")
+    return float(json.loads(record.read_text())["step"])
+
+
+def test_scores_keep_to_a_limit_of_bytes(
+    scanned: tuple[Path, Any], survey_png: Survey, recorded: Path, tmp_path: Path
+) -> None:
+    """Coarser steps are taken, as few as suffice; each raw line is compared with them and cleared."""
+    every = _scores_bytes(scanned[0])
+    flags = {"budget": None, "scan_step": "2", "scan_exposure_ms": "25", "weights": str(recorded)}
+    survey_png(tmp_path / "half", **flags, kept_bytes=str(int(0.6 * every)))
+    assert _scores_bytes(tmp_path / "half") <= 0.65 * every
+    assert _step(tmp_path / "half") > _step(scanned[0]) == 1
+    assert not list(tmp_path.glob("half/stages/capture/*/*.zarr"))
+    survey_png(tmp_path / "enough", **flags, kept_bytes=str(2 * every))
+    assert _step(tmp_path / "enough") == 1
+
+
+def test_a_limit_that_nothing_fits_leaves_the_raw_lines(survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
+    """What was captured stays, and the message says the least."""
+    flags = {"budget": None, "scan_step": "4", "weights": str(recorded), "kept_bytes": "1kB"}
+    with pytest.raises(BudgetError, match=r"--kept-bytes 1000 does not hold .* in the coarsest steps they take \d"):
+        survey_png(tmp_path, **flags)
+    assert list(tmp_path.glob("stages/capture/*/*.zarr"))
+
+
+@pytest.mark.parametrize("given", [{}, {"source": "raster"}])
+def test_a_limit_without_lines_of_a_uniform_scan_is_refused(given: dict[str, str]) -> None:
+    """Two passes and rasters are kept otherwise."""
+    with pytest.raises(SettingsError, match="--kept-bytes is for the lines of a uniform scan: give --seconds"):
+        load_settings(None, {"scene": "field.png", "kept_bytes": "8MB", **given})
