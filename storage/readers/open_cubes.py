@@ -127,17 +127,21 @@ def open_cube(
     return source
 
 
-def load_labels_array(address: str | Path, *, by_number: bool = False) -> NDArray[Any]:
-    """Read a file of labels or a mask as it stands, (y, x, band).
+def open_labels(address: str | Path, *, by_number: bool = False) -> CubeSource:
+    """Open a file of labels or a mask as it stands: no scale is applied.
 
     ``by_number`` keeps the numbers of a picture with a palette. Raises SceneError: as `open_cube`.
     """
     path, _ = split_variable(address)
     if reader_of(address) == "image":
         _check_content(path)
-        source = open_image(path, scaled=False, palette=by_number)
-    else:
-        source = open_cube(address, labels=True)
+        return open_image(path, scaled=False, palette=by_number)
+    return open_cube(address, labels=True)
+
+
+def load_labels_array(address: str | Path) -> NDArray[Any]:
+    """Read a file of labels or a mask as it stands, (y, x, band). Raises SceneError: as `open_cube`."""
+    source = open_labels(address)
     return source.read(0, source.shape[0])
 
 

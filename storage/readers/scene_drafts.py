@@ -138,8 +138,9 @@ def _classes(
     for number, (image, label) in enumerate(found.labels.items()):
         report(number / len(found.labels), label.name)
         try:
-            codes, is_colour = load_codes(label, by_number=False)
-            size = shape if image == found.images[0] else open_cube(image).shape
+            source = open_cube(image)
+            size, read = source.shape, load_codes(label, source.geobox, by_number=False)
+            codes, is_colour = read.values, read.of_colours
         except PipelineError as error:
             unseen.append(str(error))
             continue

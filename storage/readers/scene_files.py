@@ -51,6 +51,7 @@ class SceneFile:
     class_colours: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))  # (class, 3)
     geobox: GeoBox | None = None  # where the pixels lie on the earth
     labels_found: bool = False  # by the file's name: nobody stated them
+    regridded: bool = False  # labels came on another grid and were brought to the scene's
     kept: NDArray[np.float32] | None = field(default=None, repr=False)  # all values, where they were kept
 
     @property
@@ -69,6 +70,7 @@ class SceneFile:
             class_values=found.values,
             class_colours=found.colours,
             labels_found=by_name,
+            regridded=found.regridded,
         )
 
     def without_labels(self, note: str) -> SceneFile:
@@ -277,7 +279,8 @@ def _labels_of(
             settings = settings.model_copy(update={"classes": dict(known)})
             found, notes = load_polygon_labels(address, shape, geobox, settings=settings)
         else:
-            found = load_labels(address, shape, classes=known, unlabelled=settings.unlabelled)
+            found = load_labels(address, shape, geobox, classes=known, unlabelled=settings.unlabelled)
+            notes = found.notes
     except SceneError as error:
         if needed or not by_name:
             raise
