@@ -105,7 +105,7 @@ def open_cube(
             source = open_headwall_cube(path)
             frames = [(kind, frame or find_reference(path, kind)) for kind, frame in frames]
         case "envi":
-            source = open_envi_source(path)
+            source = open_envi_source(path, scaled=not labels and dark is None and white is None)
         case "hdf":
             source = open_hdf_cube(path, variable, labels=labels)
         case "image":

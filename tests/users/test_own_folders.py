@@ -129,7 +129,10 @@ def test_training_and_judging_say_that_labels_lay_elsewhere(tmp_path: Path, comm
     (folder / "scene.toml").write_text("wavelengths_nm = [800]\n")
     classes = np.kron(np.random.default_rng(1).integers(0, 2, (4, 4)), np.ones((8, 8))).astype(np.uint8)
     for number, beside in (("001", 0), ("002", 7), ("003", 7)):
-        for name, values, west in ((number, classes * 50 + np.uint8(number), 0), (f"{number}_labels", classes[:, beside:], beside)):
+        for name, values, west in (
+            (number, classes * 50 + np.uint8(number), 0),
+            (f"{number}_labels", classes[:, beside:], beside),
+        ):
             height, width = values.shape
             kind = {"driver": "GTiff", "count": 1, "dtype": "uint8", "height": height, "width": width}
             with rasterio.open(
