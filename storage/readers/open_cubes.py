@@ -15,7 +15,6 @@ from pipeline.errors import SceneError
 from storage.readers.array_files import (
     ARRAY_ENDINGS,
     HDF_ENDINGS,
-    check_picture,
     load_npy,
     open_array_file,
     open_hdf_cube,
@@ -31,6 +30,7 @@ from storage.readers.envi_files import (
     open_headwall_cube,
 )
 from storage.readers.image_files import IMAGE_ENDINGS, JPEG2000_ENDINGS, open_image
+from storage.readers.pixel_tables import check_picture
 from storage.readers.scene_toml import SceneSettings, find_scene_settings, settle_wavelengths
 from storage.readers.zarr_files import find_zarr_store, open_zarr_cube
 
