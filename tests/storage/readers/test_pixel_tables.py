@@ -33,12 +33,12 @@ def table(cube: NDArray[Any], order: Literal["C", "F"]) -> NDArray[Any]:
 
 
 @pytest.mark.parametrize("order", ["F", "C"])
-@pytest.mark.parametrize("kind", ["mat", "73.mat", "npz", "turned.mat"])
+@pytest.mark.parametrize("kind", [".mat", "73.mat", ".npz", "turned.mat"])
 def test_a_table_with_rows_and_columns_is_its_picture(tmp_path: Path, kind: str, order: Literal["C", "F"]) -> None:
     """Values come out as they were, whatever the order of the pixels and the kind of the file; a note says which."""
     cube = picture(40, 30)
     values, path = table(cube, order), tmp_path / f"a{kind}"
-    if kind == "npz":
+    if kind == ".npz":
         np.savez(path, Y=values, height=40, width=30)
     elif kind == "73.mat":
         with h5py.File(path, "w", userblock_size=512) as file:
