@@ -198,7 +198,8 @@ def spectral_layers(run: ExportedRun, choice: ProductChoice) -> list[Layer]:
         if index.wants_reflectance and white != 1.0:
             raise SettingsError(
                 f"{index.name} wants reflectance (0 to 1), and the values of run {run.id} reach {white:.3g}; choose "
-                "an index of ratios, such as NDVI or PRI"
+                "an index of ratios, such as NDVI or PRI, or write the factor that makes them reflectance into the "
+                "scene.toml beside the scene (scale = 0.0001 where 10000 is white) and survey it again"
             )
     layers = [_reflectance(view, white)] if choice.flags.reflectance else []
     return layers + [_index(view, index, bands, white) for index, bands in zip(choice.indices, picked, strict=True)]

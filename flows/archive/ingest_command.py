@@ -145,6 +145,7 @@ def _key(name: str | None, source: CubeSource, files: Sequence[SourceFile]) -> d
         "wavelength_nm": None if centres is None else centres.tolist(),
         "fwhm_nm": None if widths is None else widths.tolist(),
         **georeference_record(source.geobox),
+        **({"scaling": source.scaling} if source.scaling else {}),
         **({"bad_bands": source.bad_bands} if source.bad_bands else {}),
         **({} if source.void is None else {"gaps": True}),
         **({"numbers_in_names": source.by_names} if source.by_names else {}),

@@ -207,6 +207,7 @@ class Jobs:
     frames: dict[str, tuple[int, ...]] = field(default_factory=dict)
     left_out: list[str] = field(default_factory=list)
     alike: dict[str, str] = field(default_factory=dict)  # frame -> class, where all its labels are one
+    regridded: list[str] = field(default_factory=list)  # frames whose labels came on another grid
 
     def covered(self, number: int) -> list[str]:
         return [name for name, fit in self.frames.items() if number in fit]
@@ -256,6 +257,8 @@ def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[
                     "are left to judge each of them on; evaluate them one by one"
                 )
         jobs.frames[name] = tuple(fit)
+        if scene.regridded:
+            jobs.regridded.append(name)
         labels = judged_labels(scene, first.described)
         labelled = labelled or (labels is not None and bool((labels != UNLABELLED).any()))
     show("looking for frames", 1.0, f"{len(jobs.frames)} of {len(data.train)}")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import base64
 import zlib
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +52,7 @@ class TrainingData:
 
 def scene_of_file(file: SceneFile, camera: LineCamera) -> RasterScene:
     """Light a scene file as the simulator does."""
-    return raster_from_values(
+    scene = raster_from_values(
         file.values,
         camera,
         name=file.name,
@@ -64,6 +64,7 @@ def scene_of_file(file: SceneFile, camera: LineCamera) -> RasterScene:
         key=file.light_hash,
         geobox=file.geobox,
     )
+    return replace(scene, regridded=file.regridded)
 
 
 def farm_test_data(scenes: int, camera: LineCamera) -> TrainingData:
@@ -179,6 +180,17 @@ def alike_notes(alone: Mapping[str, str]) -> tuple[str, ...]:
         f"all labels are {kind} in {', '.join(names[:5])}{f' and {len(names) - 5} more' if len(names) > 5 else ''}; if"
         f" its value in the label files stands for no class, write unlabelled = VALUE into the scene.toml"
         for kind, names in by_class.items()
+    )
+
+
+def regridded_notes(names: Sequence[str]) -> tuple[str, ...]:
+    """Name scenes whose labels came on another grid than theirs."""
+    if not names:
+        return ()
+    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+    return (
+        f"labels of {', '.join(names[:5])}{more} have another place, CRS or pixels than their images: they are brought"
+        " to the images' pixels by nearest neighbour",
     )
 
 

@@ -78,7 +78,7 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
             ],
             _label_lines(draft),
             _wavelength_lines(draft),
-            _nodata_lines(draft),
+            _value_lines(draft),
             _class_lines(draft),
         ]
         write_whole(path, ("\n\n".join("\n".join(lines) for lines in parts if lines) + "\n"))
@@ -125,7 +125,7 @@ def _wavelength_lines(draft: SceneDraft) -> list[str]:
     return [f"# wavelengths_nm = [{listed}]   # assumed of its colours: if you know better, take away the first #"]
 
 
-def _nodata_lines(draft: SceneDraft) -> list[str]:
+def _value_lines(draft: SceneDraft) -> list[str]:
     lines = []
     if draft.missing:
         lines.append(f"# {draft.missing:.1%} of the values looked at are NaN, and count as missing")
@@ -136,7 +136,7 @@ def _nodata_lines(draft: SceneDraft) -> list[str]:
         sure = value <= NO_READING or value > MOST_VALUE
         parts = f"nodata = {value!r}   # {fraction:.0%} of the first image's edge"
         lines.append(parts if sure else f"# {parts}; if it stands for no data there, take away the first #")
-    return lines
+    return lines + (["# scale = 0.0001   # if these numbers are reflectance times 10000"] * (draft.dtype.itemsize == 2))
 
 
 def _class_lines(draft: SceneDraft) -> list[str]:

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from flows.terminal.progress import one_after_the_other
-from flows.training.data import Report, TrainingData, alike_notes, either_mask, open_training_data
+from flows.training.data import Report, TrainingData, alike_notes, either_mask, open_training_data, regridded_notes
 from flows.training.figures import judge_scans, validate
 from flows.training.fit_ood import SeenScenes, measure_and_add, measured_calibration, trained_on
 from flows.training.train_scenes import About, TrainRequest, as_read, network_config, observe_all
@@ -70,6 +70,8 @@ def train_weights(
     split = joined_split(own | {"pixels": dict(about.pixels)}, start)
     weights, summary = _learned(request, lesson, checkpoint, report)
     kept, _ = observe_all(request, data, data.validation, "looking at validation scenes", report, about)
+    for note in regridded_notes([name for name in about.regridded if name in data.validation]):
+        tell(note)
     frames = as_read(kept, lesson.normalisation)
     whole = SeenScenes(lesson.examples, frames, about.wavelength_nm, request.settings.darkest_ms, request.settings.seed)
     trained = trained_on(data, whole, about.names)
@@ -113,7 +115,7 @@ def _lesson(
     notes = alike_notes(about.alike)
     if len(about.alike) == len(about.keys) and len(notes) == 1:
         raise SceneError(f"{request.dataset}: training needs two or more classes, and {notes[0]}")
-    for note in notes:
+    for note in (*notes, *regridded_notes(about.regridded)):
         tell(note)
     darkest_ms = request.settings.darkest_ms
     normalisation = measured_normalisation(seen, math.sqrt(darkest_ms * REFERENCE_MS))

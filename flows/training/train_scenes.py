@@ -58,6 +58,7 @@ class About:
     keys: dict[str, str] = field(default_factory=dict)  # scene -> identity of its light
     pixels: dict[str, str] = field(default_factory=dict)  # identity -> trained pixels, where not all labelled ones
     alike: dict[str, str] = field(default_factory=dict)  # scene -> class, where all its labels are one
+    regridded: list[str] = field(default_factory=list)  # scenes whose labels came on another grid
 
 
 def observe_all(
@@ -86,6 +87,8 @@ def observe_all(
         about = known
         if (alone := only_class(scene)) is not None:
             known.alike[name] = alone
+        if scene.regridded:
+            known.regridded.append(name)
         grid = SceneGrid(*scene.shape, known.patch, request.factor)
         rng = np.random.default_rng([request.settings.seed, 0x0B5, number])
         seen.append(observe_scene(scene, request.camera, grid, known.basis, rng))

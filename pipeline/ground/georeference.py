@@ -25,6 +25,8 @@ WGS84 = 4326  # by EPSG
 APART_DEG = 1e-3  # of places between which a degree is measured
 STEP_M = 100.0  # over which the slopes of a projection are taken
 TIE_POINTS = 9  # along each side of a grid, between which the scale of its map is linear
+OFF_GRID_PX = 0.02  # by which pixels of one grid may lie beside it: places are written with rounded numbers
+SAME_SIZE = 1e-6  # by which pixels of one size may differ
 
 
 def zoomed_out(geobox: GeoBox, factor: int, shape: tuple[int, int]) -> GeoBox:
@@ -37,6 +39,15 @@ def zoomed_out(geobox: GeoBox, factor: int, shape: tuple[int, int]) -> GeoBox:
     a, b, c, d, e, f = geobox.affine[:6]
     coarser = Affine(a * factor, b * factor, c, d * factor, e * factor, f)
     return odc_geobox.GeoBox(shape, coarser, geobox.crs)
+
+
+def shift_px(grid: GeoBox, other: GeoBox) -> tuple[float, float] | None:
+    """Return the pixels (x, y) by which another grid of the same CRS begins beside a grid.
+
+    None where its pixels have another size or direction.
+    """
+    a, b, c, d, e, f = (~grid.affine * other.affine)[:6]
+    return None if max(abs(a - 1), abs(b), abs(d), abs(e - 1)) > SAME_SIZE else (float(c), float(f))
 
 
 def georeference_record(geobox: GeoBox | None) -> dict[str, Any]:

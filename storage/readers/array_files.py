@@ -43,6 +43,7 @@ from storage.readers.cube_sources import (
     reading,
     unpacked,
 )
+from storage.readers.pixel_tables import find_tables
 
 if TYPE_CHECKING:
     import h5py
@@ -66,7 +67,6 @@ ARRAY_ENDINGS = (".npy", ".npz", ".mat")
 _MATLAB = {"double": "f8", "single": "f4", "logical": "?"} | {
     f"{u}int{8 * n}": f"{u or 'i'}{n}" for n in (1, 2, 4, 8) for u in ("", "u")
 }
-MOST_UNEVEN = 16  # times that a picture is longer than wide
 
 
 def open_hdf_cube(path: Path, variable: str | None = None, *, labels: bool = False) -> CubeSource:
@@ -333,10 +333,16 @@ def open_array_file(path: Path, variable: str | None = None, *, labels: bool = F
             arrays = _npz_arrays(path)
         else:
             arrays = _mat73_arrays(path) if _is_hdf(path) else _mat_arrays(path)
-        cube = find_cube(arrays, variable, path, labels=labels)
-        values = cube.array[...]
-        whole = FileArray(values.shape, values.dtype, {}, values.__getitem__)
+        tables = find_tables(arrays)
+        cube = find_cube(
+            arrays | {name: table.shaped(arrays[name]) for name, table in tables.items()}, variable, path, labels=labels
+        )
         notes = tuple(note for note in cube.notes if note != UNNAMED)  # as everyone keeps them
+        values = arrays[cube.name][...]
+        if cube.name in tables:
+            values, note = tables[cube.name].folded(values, "C" if path.suffix.lower() == ".npz" else "F")
+            notes = (*notes, note)
+        whole = FileArray(values.shape, values.dtype, {}, values.__getitem__)
         return cube_source(path, replace(cube, array=whole, notes=notes), arrays, {}, guard)
 
 
@@ -348,15 +354,6 @@ def reading_array(path: Path) -> AbstractContextManager[None]:
 def load_npy(path: Path) -> NDArray[Any]:
     """Return the array of a .npy file as a read-only view of it."""
     return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
-
-
-def check_picture(shape: tuple[int, ...], where: object) -> None:
-    """Question a table of numbers that is given for a scene of one band (SceneError)."""
-    if max(shape) >= MOST_UNEVEN * min(shape) and max(shape) >= 1000:
-        raise SceneError(
-            f"{where} is a table of {shape[0]} x {shape[1]} numbers, expected a picture (y, x) or a cube (y, x, band);"
-            " are its columns or rows spectra? Then store them as a cube: values.reshape(height, width, bands)"
-        )
 
 
 def _lazy(shape: tuple[int, ...], kind: np.dtype[Any], load: Callable[[], NDArray[Any]]) -> FileArray:

@@ -163,7 +163,7 @@ def split_labels(
     """
     if scene.labels is None:
         raise SceneError(f"{scene.path} has no labels, which a training mask needs; give --labels")
-    mask, _ = load_codes(train_mask, by_number=True)
+    mask = load_codes(train_mask, scene.geobox, by_number=True).values
     if mask.shape != scene.labels.shape:
         sizes = [f"{image.shape[0]} x {image.shape[1]} px" for image in (mask, scene.labels)]
         raise SceneError(f"mask {train_mask} is {sizes[0]}, the scene is {sizes[1]} (y x x)")

@@ -37,7 +37,7 @@ from pipeline.rig.camera.camera_texts import (
     wavelengths_nm,
 )
 from storage.readers.cube_sources import MOST_MISSING, Bands, CubeSource, LineFacts
-from storage.readers.image_files import bad_bands, place_of_envi
+from storage.readers.image_files import bad_bands, place_of_envi, rescaled
 
 LARGEST_HEADER = 1 << 22  # bytes; the largest seen holds 33 thousand
 INTERLEAVES = ("bil", "bip", "bsq")
@@ -243,12 +243,19 @@ def is_headwall_folder(folder: Path) -> bool:
     return any(_PART.fullmatch(entry.name) is not None for entry in folder.iterdir())
 
 
-def open_envi_source(path: Path) -> CubeSource:
-    """Open one ENVI cube by its header or data file; the lines that it lost are its last (SceneError as there)."""
+def open_envi_source(path: Path, *, scaled: bool = True) -> CubeSource:
+    """Open one ENVI cube by its header or data file; the lines that it lost are its last (SceneError as there).
+
+    Numbers are divided by the header's reflectance scale factor, unless not ``scaled``.
+    """
     cube = open_envi_cube(path)
     source = _joined(cube.path.name, {0: cube}, list(cube.notes))
     geobox, where = place_of_envi(cube.header.fields, cube.path, source.shape[:2])
-    return replace(source, geobox=geobox, notes=(*source.notes, *where))
+    source = replace(source, geobox=geobox, notes=(*source.notes, *where))
+    factor = finite_number(cube.header.fields.get("reflectance scale factor", "")) or 1.0
+    if not scaled or factor == 1 or factor <= 0:
+        return source
+    return rescaled(source, np.full(source.shape[2], 1 / factor), np.zeros(source.shape[2]), source.nodata)
 
 
 def open_headwall_cube(folder: Path) -> CubeSource:

@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
-from storage.readers.open_cubes import load_labels_array
+from pipeline.ground.georeference import OFF_GRID_PX, crs_name, shift_px
+from pipeline.lazy import deferred
+from storage.readers.open_cubes import open_labels
 from storage.readers.scene_toml import ClassValue, Colour
 
+if TYPE_CHECKING:  # half a second to import, for labels on another grid alone
+    import odc.geo.warp as odc_warp
+    from odc.geo.geobox import GeoBox
+else:
+    odc_warp = deferred("odc.geo.warp")
+
+NO_VALUE = -1  # in codes
 MOST_FOUND_CLASSES = 64
 MIXED = (
     "JPEG, soft edges and scaling mix values; save the labels again as PNG, with hard edges and by nearest neighbour,"
@@ -43,22 +53,37 @@ class Labels:
     names: tuple[str, ...]
     values: tuple[ClassValue, ...]  # number or colour of each class in the file
     colours: NDArray[np.uint8]  # (class, 3)
+    notes: tuple[str, ...] = ()
+    regridded: bool = False  # their file has another grid than the scene
+
+
+@dataclass(frozen=True)
+class LabelCodes:
+    """A label file as one whole number a pixel."""
+
+    values: NDArray[np.int64]  # (y, x), -1 = no value
+    of_colours: bool  # a number is r * 65536 + g * 256 + b
+    notes: tuple[str, ...] = ()
+    regridded: bool = False  # the file has another grid than the one that was asked for
 
 
 def load_labels(
     address: str | Path,
     shape: tuple[int, int],
+    geobox: GeoBox | None = None,
     *,
     classes: Mapping[str, ClassValue],
     unlabelled: ClassValue | None = None,
 ) -> Labels:
     """Read a label file of numbers or exact colours; without ``classes`` every value found becomes one.
 
-    Raises SceneError: the file cannot be read, has another size than the scene, a value that is no class (named with
-    its count), or more than 64 values where no classes are stated.
+    ``geobox`` is the grid of the scene: labels with a place of their own are brought to it. Raises SceneError: the file
+    cannot be read, lies beside the scene, has another size and no place, a value that is no class (named with its
+    count), or more than 64 values where no classes are stated.
     """
     by_colour = any(isinstance(value, tuple) for value in (*classes.values(), unlabelled))
-    codes, is_colour = load_codes(address, by_number=bool(classes) and not by_colour)
+    read = load_codes(address, geobox, by_number=bool(classes) and not by_colour, classes=classes.values())
+    codes, is_colour = read.values, read.of_colours
     if codes.shape != shape:
         raise SceneError(
             f"labels {address} are {codes.shape[0]} x {codes.shape[1]} px, the scene is {shape[0]} x {shape[1]} px "
@@ -74,6 +99,8 @@ def load_labels(
         names=tuple(stated),
         values=tuple(stated.values()),
         colours=np.array(colours, np.uint8).reshape(-1, 3),
+        notes=read.notes,
+        regridded=read.regridded,
     )
 
 
@@ -83,29 +110,46 @@ def found_classes(addresses: Iterable[str | Path], unlabelled: ClassValue | None
     is_colour = isinstance(unlabelled, tuple)
     parts: list[tuple[NDArray[np.int64], bool]] = []
     for address in addresses:
-        values, of_colours = load_codes(address, by_number=False)
-        is_colour = is_colour or of_colours
-        parts.append((np.unique(values), of_colours))
-        found_codes(parts[-1][0], None, of_colours, str(address))  # refuses mixed values by the file's name
+        read = load_codes(address, by_number=False)
+        is_colour = is_colour or read.of_colours
+        parts.append((np.unique(read.values), read.of_colours))
+        found_codes(parts[-1][0], None, read.of_colours, str(address))  # refuses mixed values by the file's name
     for values, of_colours in parts:  # a grey value g is the colour (g, g, g) where others have colours
         codes |= {int(code) * (0x010101 if is_colour and not of_colours else 1) for code in values if code >= 0}
     none = None if unlabelled is None else _code(unlabelled)
     return found_codes(np.array(sorted(codes), np.int64), none, is_colour, f"of {len(parts)} files")
 
 
-def load_codes(address: str | Path, *, by_number: bool) -> tuple[NDArray[np.int64], bool]:
-    """Read a file as one whole number a pixel, (y, x); colours become r * 65536 + g * 256 + b, NaN becomes -1.
+def load_codes(
+    address: str | Path, geobox: GeoBox | None = None, *, by_number: bool, classes: Collection[ClassValue] = ()
+) -> LabelCodes:
+    """Read a file as one whole number a pixel; NaN and the file's no-data value are none, unless it is of ``classes``.
 
-    The second value says whether the numbers are colours. ``by_number`` takes the indices of an image with a palette,
-    and the one value of an image whose channels are alike.
+    On a ``geobox`` a file with a place is brought to its pixels by nearest neighbour. ``by_number`` takes the indices
+    of an image with a palette, and the one value of an image whose channels are alike. Raises SceneError: the file
+    cannot be read, holds fractions, or lies beside the geobox.
     """
-    values = load_labels_array(address, by_number=by_number)
+    source = open_labels(address, by_number=by_number)
+    codes, of_colours = _whole_numbers(source.read(0, source.shape[0]), address, by_number=by_number)
+    notes, regridded, own = list[str](), False, source.geobox
+    if source.nodata is not None and source.nodata.is_integer():
+        void = codes == int(source.nodata) * (0x010101 if of_colours else 1)
+        if void.any() and codes[void][0] not in map(_code, classes):
+            codes[void] = NO_VALUE
+            notes.append(f"{void.sum()} px have the label file's no-data value {source.nodata:g}: unlabelled")
+    if geobox is not None and own is not None and (difference := _grid_difference(own, geobox)):
+        codes, regridded = _on_grid(codes, own, geobox, address), True
+        notes.append(f"labels {address} {difference}: they are brought to its pixels by nearest neighbour")
+    return LabelCodes(codes, of_colours, tuple(notes), regridded)
+
+
+def _whole_numbers(values: NDArray[Any], address: str | Path, *, by_number: bool) -> tuple[NDArray[np.int64], bool]:
+    """Return one number a pixel of (y, x, band) values, -1 for NaN, and whether they are colours."""
     if values.shape[2] == 1:
         values = values[..., 0]
-    if values.ndim == 2:
         if values.dtype.kind != "f":
             return values.astype(np.int64), False
-        rounded = np.where(np.isnan(values), -1, values)
+        rounded = np.where(np.isnan(values), NO_VALUE, values)
         if not np.isfinite(rounded).all() or (rounded != np.rint(rounded)).any():
             raise SceneError(f"labels {address} hold fractions, expected whole numbers; is it a scene?")
         return rounded.astype(np.int64), False
@@ -118,6 +162,36 @@ def load_codes(address: str | Path, *, by_number: bool) -> tuple[NDArray[np.int6
         f"labels {address} have shape {values.shape} and type {values.dtype}; expected whole numbers (y, x) or colours "
         f"(y, x, 3) of 8 bits"
     )
+
+
+def _grid_difference(own: GeoBox, scene: GeoBox) -> str:
+    """Say how the grid of labels differs from a scene's; nothing where the pixels are the same."""
+    if own.crs != scene.crs:
+        return f"are in {crs_name(own)}, the scene in {crs_name(scene)}"
+    shift = shift_px(scene, own)
+    if shift is None:
+        return "have other or turned pixels than the scene"
+    if max(map(abs, shift)) > OFF_GRID_PX:
+        return f"begin {shift[0]:.4g} px right of and {shift[1]:.4g} px below the scene's corner"
+    return "" if own.shape == scene.shape else "have another size than the scene"
+
+
+def _on_grid(codes: NDArray[np.int64], own: GeoBox, grid: GeoBox, address: str | Path) -> NDArray[np.int64]:
+    """Return the nearest code to each pixel of a grid, -1 beside the labels (SceneError: all of it lies there)."""
+    values, index = np.unique(codes, return_inverse=True)
+    found = np.full(tuple(grid.shape), NO_VALUE, np.int32)
+    odc_warp.rio_reproject(index.reshape(codes.shape).astype(np.int32), found, own, grid, "nearest", NO_VALUE, NO_VALUE)
+    if (found == NO_VALUE).all():
+        raise SceneError(
+            f"labels {address} do not lie on the scene: {_extent(own)}, the scene {_extent(grid)}; give the labels of "
+            "this scene, or correct the CRS of one of them (gdal_edit -a_srs)"
+        )
+    return np.where(found == NO_VALUE, NO_VALUE, values[found])
+
+
+def _extent(grid: GeoBox) -> str:
+    west, south, east, north = grid.extent.boundingbox
+    return f"x {west:g} to {east:g}, y {south:g} to {north:g} in {crs_name(grid)}"
 
 
 def _code(value: ClassValue) -> int:
@@ -154,7 +228,7 @@ def _index(
     if none is not None and none in table:
         name = tuple(classes)[table[none]]
         raise SceneError(f"scene.toml says that {_shown(none, classes)} is unlabelled and also class {name}; keep one")
-    unknown = [int(value) for value in values if int(value) not in table and value not in (none, -1)]
+    unknown = [int(value) for value in values if int(value) not in table and value not in (none, NO_VALUE)]
     if unknown:
         count = int((codes == unknown[0]).sum())
         cure = "add it to [classes] or state it as unlabelled in scene.toml"

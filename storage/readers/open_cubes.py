@@ -15,7 +15,6 @@ from pipeline.errors import SceneError
 from storage.readers.array_files import (
     ARRAY_ENDINGS,
     HDF_ENDINGS,
-    check_picture,
     load_npy,
     open_array_file,
     open_hdf_cube,
@@ -31,6 +30,7 @@ from storage.readers.envi_files import (
     open_headwall_cube,
 )
 from storage.readers.image_files import IMAGE_ENDINGS, JPEG2000_ENDINGS, open_image
+from storage.readers.pixel_tables import check_picture
 from storage.readers.scene_toml import SceneSettings, find_scene_settings, settle_wavelengths
 from storage.readers.zarr_files import find_zarr_store, open_zarr_cube
 
@@ -105,7 +105,7 @@ def open_cube(
             source = open_headwall_cube(path)
             frames = [(kind, frame or find_reference(path, kind)) for kind, frame in frames]
         case "envi":
-            source = open_envi_source(path)
+            source = open_envi_source(path, scaled=not labels and dark is None and white is None)
         case "hdf":
             source = open_hdf_cube(path, variable, labels=labels)
         case "image":
@@ -127,17 +127,21 @@ def open_cube(
     return source
 
 
-def load_labels_array(address: str | Path, *, by_number: bool = False) -> NDArray[Any]:
-    """Read a file of labels or a mask as it stands, (y, x, band).
+def open_labels(address: str | Path, *, by_number: bool = False) -> CubeSource:
+    """Open a file of labels or a mask as it stands: no scale is applied.
 
     ``by_number`` keeps the numbers of a picture with a palette. Raises SceneError: as `open_cube`.
     """
     path, _ = split_variable(address)
     if reader_of(address) == "image":
         _check_content(path)
-        source = open_image(path, scaled=False, palette=by_number)
-    else:
-        source = open_cube(address, labels=True)
+        return open_image(path, scaled=False, palette=by_number)
+    return open_cube(address, labels=True)
+
+
+def load_labels_array(address: str | Path) -> NDArray[Any]:
+    """Read a file of labels or a mask as it stands, (y, x, band). Raises SceneError: as `open_cube`."""
+    source = open_labels(address)
     return source.read(0, source.shape[0])
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
+from pipeline.ground.georeference import OFF_GRID_PX, shift_px
 from pipeline.lazy import deferred
 from storage.parallel.pool import RESERVED_BYTES, memory_refusal
 from storage.readers.envi_files import is_headwall_folder
@@ -41,8 +42,6 @@ else:
     odc_geobox = deferred("odc.geo.geobox")
 
 WILD = "*?["
-OFF_GRID_PX = 0.02  # by which tiles of one grid may lie beside it: their places are written with rounded numbers
-SCALE = 1e-6  # by which pixels of one size may differ
 APART_NM = 0.1  # wavelengths of one band
 COPIES = 6  # of a block while it is read: the file's numbers, their float32, and what is made of them
 FRACTION = 4  # of the memory beside what the process takes anyway: more at once is read no faster
@@ -137,7 +136,8 @@ def _side_by_side(address: Path, opened: Sequence[SceneFile], labels: str | Path
         found = _merged_labels(tiles, shape, notes)
     else:  # on the pixels of the whole field
         settings = find_scene_settings(first.path)
-        found = load_labels(labels, shape, classes=settings.classes, unlabelled=settings.unlabelled)
+        found = load_labels(labels, shape, geobox, classes=settings.classes, unlabelled=settings.unlabelled)
+        notes += found.notes
     places = [(tile.scene.light_hash, tile.row, tile.column) for tile in tiles]
     light_hash = hashlib.sha256(json.dumps(places).encode()).hexdigest()
 
@@ -214,17 +214,17 @@ def _placed(opened: Sequence[SceneFile]) -> tuple[list[_Tile], GeoBox]:
 
 def _origin(first: SceneFile, other: SceneFile, grid: GeoBox, own: GeoBox) -> tuple[int, int]:
     """Row and column of a tile on the grid of the first (SceneError: other pixels, or pixels that lie between)."""
-    a, b, c, d, e, f = (~grid.affine * own.affine)[:6]
-    if max(abs(a - 1), abs(b), abs(d), abs(e - 1)) > SCALE:
+    shift = shift_px(grid, own)
+    if shift is None:
         sizes = [f"{abs(one.affine.a):g} x {abs(one.affine.e):g}" for one in (grid, own)]
         raise SceneError(
             f"the tiles {first.path} and {other.path} have pixels of {sizes[0]} and {sizes[1]}, or turned ones: tiles "
             "of one field have the same; warp them onto one grid (gdalwarp -tr -tap), or survey them one by one"
         )
-    row, column = round(f), round(c)
-    if max(abs(f - row), abs(c - column)) > OFF_GRID_PX:
+    (x, y), row, column = shift, round(shift[1]), round(shift[0])
+    if max(abs(y - row), abs(x - column)) > OFF_GRID_PX:
         raise SceneError(
-            f"the pixels of {other.path} lie {c - column:.2f} and {f - row:.2f} px (x, y) beside those of {first.path}:"
+            f"the pixels of {other.path} lie {x - column:.2f} and {y - row:.2f} px (x, y) beside those of {first.path}:"
             " tiles of one field lie on one grid; warp them onto one (gdalwarp -tr -tap), or survey them one by one"
         )
     return row, column

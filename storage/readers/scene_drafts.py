@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +57,7 @@ class SceneDraft:
     wavelength_nm: NDArray[np.float64] | None  # (band,)
     wavelength_origin: str
     nodata: float | None  # as the file itself says
+    dtype: np.dtype[Any]  # of its values, once the file's own scale was applied
     edge: tuple[float, float] | None  # value that fills the edge, and its fraction of it
     missing: float  # fraction of NaN among the values looked at
     classes: tuple[FoundClass, ...] = ()
@@ -104,6 +106,7 @@ def draft_scene(address: str | Path, report: Report = lambda done, name: None) -
         wavelength_nm=source.bands.wavelength_nm,
         wavelength_origin=source.bands.origin,
         nodata=source.nodata,
+        dtype=source.dtype,
         edge=edge,
         missing=missing,
         classes=classes,
@@ -138,8 +141,9 @@ def _classes(
     for number, (image, label) in enumerate(found.labels.items()):
         report(number / len(found.labels), label.name)
         try:
-            codes, is_colour = load_codes(label, by_number=False)
-            size = shape if image == found.images[0] else open_cube(image).shape
+            source = open_cube(image)
+            size, read = source.shape, load_codes(label, source.geobox, by_number=False)
+            codes, is_colour = read.values, read.of_colours
         except PipelineError as error:
             unseen.append(str(error))
             continue

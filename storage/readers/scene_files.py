@@ -17,7 +17,7 @@ from pipeline.geometry.grid import UNLABELLED
 from pipeline.readings import MOST_STEPS, MOST_VALUE, Beyond, beyond_range, find_beyond
 from pipeline.simulator.scenes.scene import BRIGHT_PERCENTILE
 from storage.archive.staging import file_hash
-from storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, check_memory, scene_lines
+from storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, check_memory, scene_lines, unpacked
 from storage.readers.label_files import label_file
 from storage.readers.labels import Labels, load_labels
 from storage.readers.open_cubes import open_cube, split_variable
@@ -51,6 +51,7 @@ class SceneFile:
     class_colours: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))  # (class, 3)
     geobox: GeoBox | None = None  # where the pixels lie on the earth
     labels_found: bool = False  # by the file's name: nobody stated them
+    regridded: bool = False  # labels came on another grid and were brought to the scene's
     kept: NDArray[np.float32] | None = field(default=None, repr=False)  # all values, where they were kept
 
     @property
@@ -69,6 +70,7 @@ class SceneFile:
             class_values=found.values,
             class_colours=found.colours,
             labels_found=by_name,
+            regridded=found.regridded,
         )
 
     def without_labels(self, note: str) -> SceneFile:
@@ -151,6 +153,16 @@ def _open(
         if void.all():
             void, gap_notes = None, ("every pixel is transparent or masked, which is not believed",)
 
+    scaling, scale_note = "", tuple[str, ...]()
+    if (settings.scale, settings.offset) != (1.0, 0.0):
+        scaling = f"scene.toml scale {settings.scale!r} offset {settings.offset!r}"
+        scale_note = (
+            f"values are the file's times {settings.scale:g} plus {settings.offset:g}, as {settings.path} says",
+        )
+
+    def scaled(values: NDArray[np.float32]) -> NDArray[np.float32]:
+        return unpacked(values, settings.scale, settings.offset, None) if scaling else values
+
     def gaps(first: int, last: int) -> NDArray[np.bool_] | None:
         return None if void is None else void[first:last]
 
@@ -158,7 +170,7 @@ def _open(
         """Give rows (y, x, band), NaN where the file has no value."""
         _, values, _ = _converted(scene_lines(source, first, last), chosen, nodata, gaps(first, last))
         values[np.isinf(values)] = np.nan
-        return values
+        return scaled(values)
 
     if keep:
         check_memory(address, 8 * height * width * count)  # as float32, and once more while the scene is made
@@ -168,13 +180,13 @@ def _open(
         last = min(first + BLOCK_LINES, height)
         taken = counted.take(scene_lines(source, first, last), gaps(first, last))
         if values is not None:
-            values[first:last] = taken
+            values[first:last] = scaled(taken)
     missing_notes = counted.notes()
     found, label_note, by_name = _labels_of(
         file, source.shape[:2], source.geobox, labels, settings, classes, labels_needed
     )
     assert light.wavelength_nm is not None
-    light_hash = _light_hash(file, variable, source, chosen, light, settings.nodata, void)
+    light_hash = _light_hash(file, variable, source, chosen, light, settings.nodata, void, scaling)
     some = () if chosen == list(range(count)) else (f"bands {bands_text(chosen)} of {count}, counted from 0",)
     over = ("values are over the white reference",) if calibrated else ()
     scene = SceneFile(
@@ -187,7 +199,17 @@ def _open(
         missing=counted.missing,
         filled_px=counted.filled_px,
         light_hash=light_hash,
-        provenance=(*some, *bad_note, *source.notes, *over, light.origin, *gap_notes, *missing_notes, *label_note),
+        provenance=(
+            *some,
+            *bad_note,
+            *source.notes,
+            *over,
+            *scale_note,
+            light.origin,
+            *gap_notes,
+            *missing_notes,
+            *label_note,
+        ),
         geobox=source.geobox,
         kept=values,
     )
@@ -202,13 +224,14 @@ def _light_hash(
     light: Bands,
     nodata: float | None,
     void: NDArray[np.bool_] | None,
+    scaling: str,
 ) -> str:
     """Return the hash of values and wavelengths: of the files, and of all that says what their numbers mean."""
     assert light.wavelength_nm is not None
     widths = None if light.fwhm_nm is None else light.fwhm_nm.tolist()
     stated: tuple[str, ...] = () if nodata is None else (f"nodata {nodata!r}",)
     stated += () if void is None else (f"void {hashlib.sha256(np.packbits(void).tobytes()).hexdigest()}",)
-    stated += (source.scaling,) if source.scaling else ()
+    stated += tuple(one for one in (source.scaling, scaling) if one)
     content = _content_hash(file, source.files)
     return _digest(content, variable, chosen, light.wavelength_nm.tolist(), widths, *stated)
 
@@ -277,7 +300,8 @@ def _labels_of(
             settings = settings.model_copy(update={"classes": dict(known)})
             found, notes = load_polygon_labels(address, shape, geobox, settings=settings)
         else:
-            found = load_labels(address, shape, classes=known, unlabelled=settings.unlabelled)
+            found = load_labels(address, shape, geobox, classes=known, unlabelled=settings.unlabelled)
+            notes = found.notes
     except SceneError as error:
         if needed or not by_name:
             raise

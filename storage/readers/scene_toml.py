@@ -30,6 +30,8 @@ _EXPECTED = {
     "wavelengths_file": _FILE,
     "dropped_bands": _WHOLE,
     "nodata": "a number such as -9999 or 1e30",
+    "scale": "a number above 0 such as 0.0001",
+    "offset": "a number such as -0.1",
     "labels": _FILE,
     "unlabelled": "a whole number or a colour [r, g, b] in 0..255",
     "class_attribute": "the name of an attribute in quotes",
@@ -48,6 +50,8 @@ class SceneSettings(BaseModel):
     wavelengths_file: StrictStr | None = None  # rows of nm and FWHM, all bands of the file and the dropped ones
     dropped_bands: tuple[StrictInt, ...] = ()  # rows of wavelengths_file that the file leaves out, counted from 1
     nodata: _Number | None = None  # the number that stands for no value
+    scale: Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)] = 1.0  # values = file's * scale + offset
+    offset: Annotated[float, Field(strict=True, allow_inf_nan=False)] = 0.0
     labels: StrictStr | None = None  # beside scene.toml; may hold {number}, {name}; "": there are none
     unlabelled: _Value | None = None
     class_attribute: StrictStr | None = None  # of labels that are polygons: which attribute says the class

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import rasterio
+from affine import Affine
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -26,6 +29,8 @@ from tests.flows.conftest import command_line
 from tests.users.mistaken_files import write_files
 
 __all__ = ["command_line"]
+
+pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")
 
 SMALL = ["--steps", "1", "--dim", "16", "--layers", "1", "--heads", "2", "--batch", "1", "--crop", "16"]
 
@@ -116,6 +121,31 @@ def test_training_leaves_out_and_says_so(made: Path, tmp_path: Path, command_lin
     (made / "tiles" / "scene.toml").unlink(missing_ok=True)
     data = open_training_data(str(made / "tiles"), 0, None, LineCamera())
     assert {scene.class_names for scene in data.scenes(data.train)} == {("class_0", "class_1", "class_2")}
+
+
+def test_training_and_judging_say_that_labels_lay_elsewhere(tmp_path: Path, command_line: Any) -> None:
+    """Labels of some frames begin 7 m beside their images: one note names these, in training and in an evaluation."""
+    (folder := tmp_path / "field").mkdir()
+    (folder / "scene.toml").write_text("wavelengths_nm = [800]\n")
+    classes = np.kron(np.random.default_rng(1).integers(0, 2, (4, 4)), np.ones((8, 8))).astype(np.uint8)
+    for number, beside in (("001", 0), ("002", 7), ("003", 7)):
+        for name, values, west in (
+            (number, classes * 50 + np.uint8(number), 0),
+            (f"{number}_labels", classes[:, beside:], beside),
+        ):
+            height, width = values.shape
+            kind = {"driver": "GTiff", "count": 1, "dtype": "uint8", "height": height, "width": width}
+            with rasterio.open(
+                folder / f"{name}.tif", "w", **kind, crs="EPSG:32632", transform=Affine(1, 0, west, 0, -1, 60)
+            ) as file:
+                file.write(values, 1)
+    out = tmp_path / "w.safetensors"
+    ended = command_line("train", folder, "-o", out, "--validation", "1", "--hold-out", "003", *SMALL)
+    assert ended.code == 0, ended.err
+    assert re.findall(r"note: labels of (.*) have another place", ended.err) == ["002"]
+    judged = command_line("evaluate", folder, "--weights", out, "--policies", "random", "--fractions", "0.5")
+    assert judged.code == 0, judged.err + judged.out
+    assert re.findall(r"note: labels of (.*) have another place", judged.err) == ["003"]
 
 
 def test_labels_that_nobody_stated_are_left_out_where_the_weights_know_others(made: Path) -> None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from storage.readers.open_cubes import open_cube
-from storage.readers.scene_files import load_scene_file
+from storage.readers.scene_files import load_scene_file, open_scene_file
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:Use `@` matmul:PendingDeprecationWarning", "ignore:Dataset has no geotransform"
@@ -96,3 +96,51 @@ def test_unscaled_files_keep_their_hash(tmp_path: Path) -> None:
 
     parts = [hashlib.sha256(path.read_bytes()).hexdigest(), None, [0, 1], [500.0, 600.0], None]
     assert scene.light_hash == hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+
+
+def test_scale_of_scene_toml(tmp_path: Path) -> None:
+    """Values are the file's times scale plus offset, kept or read by rows; no data is found before it."""
+    path = write_tiff(tmp_path / "plain.tif")
+    before = load_scene_file(path, wavelengths=[500, 600])
+    (tmp_path / "scene.toml").write_text("scale = 0.0001\noffset = -0.1\nnodata = 300\n")
+    after, opened = (read(path, wavelengths=[500, 600]) for read in (load_scene_file, open_scene_file))
+    raw = np.moveaxis(np.arange(24).reshape(2, 3, 4) * 100, 0, -1)
+    np.testing.assert_allclose(after.values, np.where(raw == 300, np.nan, raw * 0.0001 - 0.1), rtol=1e-6)
+    np.testing.assert_array_equal(opened.read(1, 3), after.values[1:3])
+    assert before.light_hash != after.light_hash == opened.light_hash
+    assert any(note.startswith("values are the file's times 0.0001 plus -0.1, as ") for note in after.provenance)
+
+
+def test_scale_of_scene_toml_comes_after_that_of_the_file(tmp_path: Path) -> None:
+    """A file that scales its numbers is scaled once more."""
+    path = write_tiff(tmp_path / "scaled.tif", (0.1, 0.1))
+    before = load_scene_file(path, wavelengths=[500, 600])
+    (tmp_path / "scene.toml").write_text("scale = 0.001\n")
+    after = load_scene_file(path, wavelengths=[500, 600])
+    np.testing.assert_allclose(after.values, before.values * 0.001, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "toml", ["scale = 0", "scale = -1.0", "scale = inf", 'scale = "0.0001"', "offset = nan", "offset = true"]
+)
+def test_scales_that_cannot_be(tmp_path: Path, toml: str) -> None:
+    """A scale is a number above 0, an offset any number; the message says so."""
+    path = write_tiff(tmp_path / "plain.tif")
+    (tmp_path / "scene.toml").write_text(toml)
+    with pytest.raises(SceneError, match=r"(scale|offset) must be a number (above 0 )?such as"):
+        load_scene_file(path, wavelengths=[500, 600])
+
+
+def test_reflectance_scale_factor_of_envi(tmp_path: Path) -> None:
+    """Numbers are divided by it, but for labels and where dark and white frames say what is white."""
+    numbers = np.arange(24, dtype=np.uint16).reshape(3, 4, 2) * 400
+    head = "ENVI\nsamples = 4\nlines = 3\nbands = 2\ndata type = 12\ninterleave = bip\nbyte order = 0\n"
+    (tmp_path / "a.hdr").write_text(f"{head}reflectance scale factor = 10000\ndata ignore value = 0\n")
+    (tmp_path / "a.bip").write_bytes(numbers.tobytes())
+    scene = load_scene_file(tmp_path / "a.hdr", wavelengths=[500, 600])
+    np.testing.assert_allclose(scene.values, np.where(numbers == 0, np.nan, numbers / 10_000), rtol=1e-6)
+    np.testing.assert_array_equal(open_cube(tmp_path / "a.hdr", labels=True).read(0, 3), numbers)
+    for name, level in (("dark", 0.0), ("white", 8000.0)):
+        np.save(tmp_path / f"{name}.npy", np.full((1, 4, 2), level, np.float32))
+    raw = open_cube(tmp_path / "a.hdr", dark=tmp_path / "dark.npy", white=tmp_path / "white.npy")
+    np.testing.assert_array_equal(raw.read(0, 3), numbers)

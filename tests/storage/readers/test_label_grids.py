@@ -1,0 +1,187 @@
+"""Labels with a place of their own lie where they say, on the pixels of the scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rasterio
+from affine import Affine
+from numpy.typing import NDArray
+from pyproj import Transformer
+
+from pipeline.errors import SceneError
+from storage.readers.datasets import load_data_set
+from storage.readers.raster_fields import open_raster
+from storage.readers.scene_drafts import draft_scene
+from storage.readers.scene_files import load_scene_file, open_scene_file
+
+pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")
+WEST, NORTH, SIDE = 600_000.0, 5_700_000.0, 60
+CLASSES = np.zeros((SIDE, SIDE), np.uint8)  # three stripes and a corner, nothing of them symmetric
+CLASSES[:, 20:], CLASSES[:, 45:], CLASSES[:10, :15] = 1, 2, 3
+NORTH_UP = Affine(1, 0, WEST, 0, -1, NORTH)
+
+
+def write(path: Path, values: NDArray[Any], transform: Affine, crs: str | None = "EPSG:32632", **about: Any) -> Path:
+    """A GeoTIFF of (y, x) or (y, x, band) values."""
+    planes = np.moveaxis(np.atleast_3d(values), -1, 0)
+    count, height, width = planes.shape
+    kind = {"driver": "GTiff", "count": count, "height": height, "width": width, "dtype": values.dtype}
+    place = {"crs": crs, "transform": transform} if crs else {}
+    with rasterio.open(path, "w", photometric="MINISBLACK", **kind, **place, **about) as file:
+        file.write(planes)
+    return path
+
+
+def image(folder: Path, transform: Affine = NORTH_UP, classes: NDArray[np.uint8] = CLASSES) -> Path:
+    """An image whose only band is ten times the class of its ground, with its wavelength beside it."""
+    (folder / "scene.toml").write_text("wavelengths_nm = [800]\n")
+    return write(folder / "field.tif", classes * np.uint8(10) + np.uint8(5), transform)
+
+
+def agree(scene: Any) -> float:
+    """Fraction of the labelled pixels whose label is the class that the image shows there."""
+    there = scene.labels != 255
+    named = np.array([int(name.removeprefix("class_")) for name in scene.class_names])
+    return float((named[scene.labels[there]] == (scene.values[..., 0][there] - 5) / 10).mean())
+
+
+def test_labels_seven_metres_beside_the_image(tmp_path: Path) -> None:
+    """Labels that begin 7 m to the east lie on their own ground; what they do not reach is unlabelled."""
+    path = image(tmp_path)
+    write(tmp_path / "field_labels.tif", CLASSES[:, 7:], NORTH_UP * Affine.translation(7, 0))
+    write(tmp_path / "pixel_by_pixel.tif", np.pad(CLASSES[:, 7:], ((0, 0), (0, 7)), mode="edge"), NORTH_UP)
+    scene = load_scene_file(path)
+    assert scene.labels is not None
+    assert agree(scene) == 1.0
+    assert (scene.labels[:, :7] == 255).all()
+    assert (scene.labels[:, 7:] != 255).all()
+    assert [note for note in scene.provenance if "begin 7 px right of and 0 px below the scene's corner" in note]
+    assert agree(load_scene_file(path, labels=tmp_path / "pixel_by_pixel.tif")) < 0.8  # so they were laid before
+
+
+def test_labels_in_another_crs(tmp_path: Path) -> None:
+    """Labels in degrees lie on their ground to a pixel at borders of classes."""
+    path = image(tmp_path)
+    to_metres = Transformer.from_crs(4326, 32632, always_xy=True)
+    to_degrees = Transformer.from_crs(32632, 4326, always_xy=True)
+    west, south, east, north = to_degrees.transform_bounds(WEST - 5, NORTH - SIDE - 5, WEST + SIDE + 5, NORTH + 5)
+    grid = Affine((east - west) / 200, 0, west, 0, (south - north) / 200, north)
+    lon, lat = grid * (np.meshgrid(np.arange(200) + 0.5, np.arange(200) + 0.5))
+    x, y = to_metres.transform(lon, lat)
+    row, column = (np.clip(np.floor(at), 0, SIDE - 1).astype(int) for at in (NORTH - y, x - WEST))
+    write(tmp_path / "field_labels.tif", CLASSES[row, column], grid, "EPSG:4326")
+    scene = load_scene_file(path)
+    assert scene.labels is not None
+    assert (scene.labels != 255).all()
+    assert agree(scene) > 0.98
+    assert any("are in EPSG:4326, the scene in EPSG:32632" in note for note in scene.provenance)
+
+
+@pytest.mark.parametrize("turned", ["labels", "image"])
+def test_north_up_beside_south_up(tmp_path: Path, turned: str) -> None:
+    """Rows from the south up and rows from the north down are the same ground."""
+    south_up = Affine(1, 0, WEST, 0, 1, NORTH - SIDE)
+    flipped = np.ascontiguousarray(CLASSES[::-1])
+    path = image(tmp_path, south_up, flipped) if turned == "image" else image(tmp_path)
+    labels = (flipped, south_up) if turned == "labels" else (CLASSES, NORTH_UP)
+    write(tmp_path / "field_labels.tif", *labels)
+    scene = load_scene_file(path)
+    assert agree(scene) == 1.0
+    assert (scene.labels != 255).all()
+    assert any("other or turned pixels" in note for note in scene.provenance)
+
+
+def test_coarse_labels_of_a_larger_area(tmp_path: Path) -> None:
+    """Labels of 5 m around the image give each pixel the class that its centre lies in."""
+    path = image(tmp_path)
+    coarse = np.pad(CLASSES[2::5, 2::5], 4, mode="edge")
+    write(tmp_path / "field_labels.tif", coarse, NORTH_UP * Affine.translation(-20, -20) * Affine.scale(5))
+    scene = load_scene_file(path)
+    assert agree(scene) == 1.0
+    assert (scene.labels != 255).all()
+
+
+def test_labels_of_one_grid_are_as_they_were(tmp_path: Path) -> None:
+    """Labels on the image's own pixels are taken without a word, rounding of their place included."""
+    path = image(tmp_path)
+    write(tmp_path / "field_labels.tif", CLASSES, NORTH_UP * Affine.translation(0.01, -0.01))
+    scene = load_scene_file(path)
+    np.testing.assert_array_equal(scene.labels, CLASSES)
+    assert not any("nearest" in note for note in scene.provenance)
+    assert not scene.regridded
+
+
+def test_labels_of_another_place(tmp_path: Path) -> None:
+    """Labels that lie beside the image are one error where they are needed, and one note where they are not."""
+    path = image(tmp_path)
+    write(tmp_path / "field_labels.tif", CLASSES, NORTH_UP * Affine.translation(500, 0))
+    with pytest.raises(SceneError, match=r"do not lie on the scene: x 600500 to 600560, y .* the scene x 600000"):
+        load_scene_file(path)
+    scene = open_scene_file(path)
+    assert scene.labels is None
+    assert any("left out" in note and "do not lie on the scene" in note for note in scene.provenance)
+
+
+def test_labels_of_tiles_and_a_training_mask(tmp_path: Path) -> None:
+    """Labels of a field of tiles, and a mask of where to train, are brought to the scene's pixels as well."""
+    path = image(tmp_path)
+    south_up = Affine(1, 0, WEST, 0, 1, NORTH - SIDE)
+    labels = write(tmp_path / "truth.tif", np.ascontiguousarray(CLASSES[::-1]), south_up)
+    mask = write(tmp_path / "mask.tif", np.where(CLASSES == 1, 1, 0).astype(np.uint8)[::-1].copy(), south_up)
+    data = load_data_set(path, labels=labels, train_mask=mask)
+    train = data.load("field", "train").labels
+    assert train is not None
+    np.testing.assert_array_equal(train != 255, CLASSES == 1)
+    (tiles := tmp_path / "tiles").mkdir()
+    (tiles / "scene.toml").write_text("wavelengths_nm = [800]\n")
+    for number, left in enumerate((0, 30)):
+        part = np.ascontiguousarray(CLASSES[:, left : left + 30] * np.uint8(10) + np.uint8(5))
+        write(tiles / f"{number}.tif", part, NORTH_UP * Affine.translation(left, 0))
+    field = open_raster(tiles, labels=labels)
+    assert agree(field) == 1.0
+    assert any("other or turned pixels" in note for note in field.provenance)
+
+
+def test_init_takes_labels_of_another_grid(tmp_path: Path) -> None:
+    """Labels of another size with a place are nothing that `init` could not see."""
+    image(tmp_path).rename(tmp_path / "a.tif")
+    write(tmp_path / "a_labels.tif", CLASSES[:, 7:], NORTH_UP * Affine.translation(7, 0))
+    assert draft_scene(tmp_path).unseen == ()
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_no_data_of_a_label_file_is_no_class(tmp_path: Path, turned: bool) -> None:
+    """The file's no-data value is unlabelled, on its own grid and on another; a note counts its pixels."""
+    path = image(tmp_path)
+    codes = np.where(CLASSES == 3, np.uint8(255), CLASSES)
+    grid = (codes[::-1].copy(), Affine(1, 0, WEST, 0, 1, NORTH - SIDE)) if turned else (codes, NORTH_UP)
+    write(tmp_path / "field_labels.tif", *grid, nodata=255)
+    scene = load_scene_file(path)
+    assert scene.class_names == ("class_0", "class_1", "class_2")
+    np.testing.assert_array_equal(scene.labels == 255, CLASSES == 3)
+    assert any("150 px have the label file's no-data value 255" in note for note in scene.provenance)
+    assert [one.value for one in draft_scene(path).classes] == [0, 1, 2]
+
+
+def test_a_stated_class_is_no_missing_label(tmp_path: Path) -> None:
+    """A class that scene.toml states counts, also where programs wrote its value as no data."""
+    path = image(tmp_path)
+    write(tmp_path / "field_labels.tif", CLASSES, NORTH_UP, nodata=0)
+    assert load_scene_file(path).class_names == ("class_1", "class_2", "class_3")
+    names = "\n".join(f"class_{number} = {number}" for number in range(4))
+    (tmp_path / "scene.toml").write_text(f"wavelengths_nm = [800]\n[classes]\n{names}\n")
+    np.testing.assert_array_equal(load_scene_file(path).labels, CLASSES)
+
+
+def test_no_data_of_coloured_labels(tmp_path: Path) -> None:
+    """Colours whose every channel is the no-data value are unlabelled; others that share a channel are not."""
+    path = image(tmp_path)
+    colours = np.array([(0, 0, 0), (0, 200, 0), (200, 0, 0), (9, 9, 9)], np.uint8)[CLASSES]
+    write(tmp_path / "field_labels.tif", colours, NORTH_UP, nodata=0)
+    scene = load_scene_file(path)
+    assert scene.class_names == ("colour_00c800", "colour_090909", "colour_c80000")
+    np.testing.assert_array_equal(scene.labels == 255, CLASSES == 0)
