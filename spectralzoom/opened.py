@@ -50,7 +50,7 @@ class OpenedArchive(Mapping[str, "OpenedRun"]):
 
     @property
     def name(self) -> str:
-        """What was given to open it."""
+        """The address that it was opened by."""
         return self._archive.name
 
     @property
@@ -107,7 +107,7 @@ class OpenedRun:
 
     @property
     def archive_name(self) -> str:
-        """What to give to open its archive."""
+        """The address that opens its archive."""
         return self._archive.name
 
     @cached_property
@@ -133,7 +133,7 @@ class OpenedRun:
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """What the numbers of its class map mean."""
+        """Names of the numbers in its class map."""
         return tuple(self.dataset("class_map").attrs["class_names"])
 
     @property

@@ -146,7 +146,7 @@ class Point:
 
     @property
     def cost(self) -> float:
-        """What settings are compared by beside their error."""
+        """The figure that settings are compared by beside their error."""
         return self.price_s if self.paid is None else self.paid
 
 

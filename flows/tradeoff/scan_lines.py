@@ -65,7 +65,7 @@ class HeldLines:
 
 @dataclass(frozen=True)
 class Fidelity:
-    """How far restored spectra lie from what was there, in deviations of the noise, and what their map scores."""
+    """Distance of restored spectra from what was there, in deviations of the noise, and the score of their map."""
 
     error: float  # root mean square against the truth
     block_mean: float  # largest mean of a band over 64 x 64 spectra against the truth

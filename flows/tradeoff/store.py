@@ -46,7 +46,7 @@ EXTRA = {"pcodec": "pcodec", "ZFP": "zfpy"}  # packages by family
 
 @dataclass(frozen=True, eq=False)
 class KeptLines:
-    """What a way of storing keeps: its bytes, and how they give scene values (line, sample, band) back."""
+    """Stored lines: their bytes, and a function that gives scene values (line, sample, band) back."""
 
     size: int
     restore: Callable[[], Values]
@@ -249,7 +249,7 @@ WAYS: Mapping[Setting, Callable[[ScanLines], KeptLines]] = {
 
 
 def not_here(setting: Setting) -> str | None:
-    """Why a way of storing cannot run on this machine; None where it can."""
+    """Say why a way of storing cannot run on this machine; None where it can."""
     family = str(setting).partition(",")[0]
     package = EXTRA.get(family)
     if package is not None and importlib.util.find_spec(package) is None:

@@ -114,7 +114,7 @@ def number_values(references: References) -> NDArray[np.float64]:
 
 
 def _fill_of(wanted: Bools, good: Bools) -> Fill:
-    """Where each wanted element finds its good neighbours of the same band; without any near enough it is left out."""
+    """Find the good neighbours of each wanted element in its band; an element without any near enough is left out."""
     samples, width = good.shape
     bands = np.flatnonzero(wanted.any(axis=0) & good.any(axis=0))
     number = np.arange(samples)[:, None]

@@ -28,7 +28,7 @@ class Components:
 
     @classmethod
     def empty(cls, bands: int) -> Components:
-        """Of lines without a single value: no component."""
+        """Return no component, for lines without a single value."""
         return cls(np.full(bands, np.nan), np.zeros((0, bands)), np.full(bands, np.nan))
 
     def __len__(self) -> int:

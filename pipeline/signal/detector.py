@@ -1,4 +1,4 @@
-"""What the frames say of the detector: elements that are not to be believed."""
+"""Judgement of the detector by its frames: elements that are not to be believed."""
 
 from __future__ import annotations
 

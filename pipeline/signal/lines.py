@@ -109,7 +109,7 @@ class CondensedLines(Protocol):
 
     @property
     def step(self) -> float:
-        """What one step of a stored score counts."""
+        """Size of one step of a stored score."""
 
     @property
     def usable(self) -> NDArray[np.bool_]:

@@ -321,7 +321,7 @@ def _law_spreads() -> tuple[Floats, Floats]:
 
 
 def _law_spread(spread: float) -> float:
-    """How far the tenth part lies below the median of the Marchenko-Pastur law, over the median."""
+    """Return the distance of the lowest tenth from the median of the Marchenko-Pastur law, over the median."""
     low, high = (1 - spread) ** 2, (1 + spread) ** 2
     angle = (np.arange(2000) + 0.5) / 2000 * np.pi
     at = (low + high) / 2 - (high - low) / 2 * np.cos(angle)

@@ -51,7 +51,7 @@ class LineStatistics:
 
 @dataclass(frozen=True, eq=False)
 class CondensedSweep:
-    """What is known of a sweep once its scores are stored."""
+    """Facts of a sweep once its scores are stored."""
 
     rare: NDArray[np.intp]  # (rare, 2) line and sample, by line
     residuals: NDArray[np.int32]  # (rare, band) in half deviations of the noise

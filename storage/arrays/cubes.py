@@ -36,7 +36,7 @@ _LINE_COORDINATES = "time mirror_x mirror_y exposure_ms valid_line"
 
 @dataclass(frozen=True)
 class SweepHeader:
-    """What is known of a sweep before its first line."""
+    """Facts of a sweep before its first line."""
 
     sweep: Sweep
     references: References
@@ -194,7 +194,7 @@ class StoredSweep:
 
     @property
     def simulation(self) -> Mapping[str, Any] | None:
-        """What was simulated and what left out, as its attributes tell; None of a rig's lines."""
+        """Effects that were simulated and left out, by its attributes; None of a rig's lines."""
         found = dict(self.group.attrs).get("simulation")
         return found if isinstance(found, Mapping) else None
 

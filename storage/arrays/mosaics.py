@@ -143,14 +143,14 @@ class MosaicWriter:
 
 
 def nothing_seen(path: Path) -> dict[str, float]:
-    """What stands in the images of a mosaic for a pixel that shows no scene, by their names."""
+    """Return the value of a pixel that shows no scene, by the names of a mosaic's images."""
     scores = open_group(path)["scores"]
     assert isinstance(scores, zarr.Array)
     return {"scores": _unseen(scores.dtype.str), "coverage": 0}
 
 
 def _unseen(dtype: str) -> int:
-    """What stands for a pixel without a score, by CF's ``_FillValue``."""
+    """Return the value of a pixel without a score, CF's ``_FillValue``."""
     return int(np.iinfo(np.dtype(dtype)).min)
 
 
@@ -229,7 +229,7 @@ class Mosaic:
         return found
 
     def coverage(self, rows: slice = slice(None), columns: slice = slice(None)) -> NDArray[np.uint8]:
-        """How many sweeps saw some pixels, (y, x)."""
+        """Count the sweeps that saw some pixels, (y, x)."""
         return read_array(self.group, "coverage", (rows, columns))
 
     def values(

@@ -68,7 +68,7 @@ def _kind(largest: float) -> str:
 
 @dataclass(frozen=True)
 class LineRows:
-    """What is known of every line beside its light, (line,) each."""
+    """Facts of every line beside its light, (line,) each."""
 
     time_s: NDArray[np.float64]
     mirror_x: NDArray[np.float64]

@@ -70,7 +70,7 @@ def condense_fine(raw: StageRef, *, camera: LineCamera, signal: SignalChoice, re
 
 @dataclass(frozen=True)
 class KeptBytes:
-    """What scores of lines and of the mosaic made of them may take."""
+    """Limit of bytes for the scores of lines and of the mosaic made of them."""
 
     most: int
     mosaic_px: int

@@ -287,7 +287,7 @@ def finish_mosaic(writer: MosaicWriter, frame: FieldFrame, factor: int) -> None:
 
 
 def seen_fractions(frame: FieldFrame, detail: StageRef, patch_index: NDArray[np.integer]) -> NDArray[np.float64]:
-    """How much of each patch was seen, (patch,) 0..1 of its pixels on the scene; 1 where it has none there."""
+    """Return the seen part of each patch, (patch,) 0..1 of its pixels on the scene; 1 where it has none there."""
     grid = frame.grid
     covered = patch_pixels(grid, open_mosaic(detail.path / "mosaic.zarr").coverage() > 0)[patch_index]
     seen: NDArray[np.float64] = covered.mean(axis=(1, 2))
