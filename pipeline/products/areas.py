@@ -23,12 +23,20 @@ class FractionEstimate:
     errors: Floats  # (class,)
 
 
-def stratified_fractions(mapped: ArrayLike, confusion: ArrayLike) -> FractionEstimate:
-    """Estimate shares from a map's and what pixels of each mapped class turned out to be.
+def judged_enough(confusion: ArrayLike) -> NDArray[np.bool_]:
+    """Return which mapped classes (class,) have the two judged pixels that an estimate with its error takes."""
+    return np.asarray(np.asarray(confusion).sum(axis=0) >= 2, np.bool_)
+
+
+def stratified_fractions(
+    mapped: ArrayLike, confusion: ArrayLike, others: FractionEstimate | None = None
+) -> FractionEstimate:
+    """Estimate fractions from a map's and what pixels of each mapped class turned out to be.
 
     ``mapped`` is (class,) fractions of the map, ``confusion`` (label, mapped class) counts, as
     `models.evaluation.metrics.confusion` gives them. The judged pixels are taken for a random sample of each mapped
-    class. NaN where a class that is mapped was judged at fewer than two pixels. Raises ShapeError: the sizes differ.
+    class. ``others`` are the fractions within all pixels mapped as classes that are not `judged_enough`, by other
+    means; NaN without them where there are such pixels. Raises ShapeError: the sizes differ.
 
     References
     ----------
@@ -38,13 +46,17 @@ def stratified_fractions(mapped: ArrayLike, confusion: ArrayLike) -> FractionEst
     weight, counts = np.asarray(mapped, np.float64), np.asarray(confusion, np.float64)
     if counts.shape != (len(weight), len(weight)):
         raise ShapeError(f"{len(weight)} classes and a confusion matrix of {counts.shape} do not fit")
-    judged = counts.sum(axis=0)
-    with np.errstate(all="ignore"):  # a class that was not judged says nothing
-        of_map = np.where(weight > 0, counts / judged, 0.0)
-        spread = np.where(weight > 0, of_map * (1 - of_map) / (judged - 1), 0.0)
-    fractions = (weight * of_map).sum(axis=1)  # [1] Eq. 9
-    errors = np.sqrt((weight**2 * spread).sum(axis=1))  # [1] Eq. 10
-    return FractionEstimate(fractions, np.where(np.isfinite(fractions), errors, np.nan))
+    judged = judged_enough(counts)
+    strata, number = weight[judged], counts[:, judged].sum(axis=0)
+    of_map = counts[:, judged] / number
+    fractions = (strata * of_map).sum(axis=1)  # [1] Eq. 9
+    variance = (strata**2 * of_map * (1 - of_map) / (number - 1)).sum(axis=1)  # [1] Eq. 10, squared
+    rest = float(weight[~judged].sum())
+    if rest > 0:
+        unknown = np.full(len(weight), np.nan)
+        others = FractionEstimate(unknown, unknown) if others is None else others
+        fractions, variance = fractions + rest * others.fractions, variance + (rest * others.errors) ** 2
+    return FractionEstimate(fractions, np.sqrt(variance))
 
 
 def probable_fractions(swaths: Iterable[NDArray[np.floating]], classes: int) -> FractionEstimate:

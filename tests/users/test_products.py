@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ import xarray as xr
 from affine import Affine
 from isoxml.converter.np_grid import to_numpy_array
 from isoxml.util.isoxml_io import isoxml_from_path
+from PIL import Image
 from rich.console import Console
 from scipy import ndimage
 
@@ -32,7 +34,8 @@ from pipeline.ground.view import GroundView, RigPose
 from pipeline.products.indices import find_index
 from storage.arrays.mosaics import open_mosaic
 from storage.readers.scene_files import load_scene_file
-from tests.prior_work import without_effects
+from tests.conftest import Survey
+from tests.prior_work import with_effects, without_effects
 from tests.storage.export.stac_rules import core_problems, extension_problems, is_cog
 from tests.users.test_georeference import SHAPE, TURNED, corners_px, survey, write_geotiff
 
@@ -382,6 +385,29 @@ def grid_hectares(grid: Any) -> float:
     north = south + grid.maximum_row * grid.cell_north_size
     around = shapely.segmentize(shapely.box(west, south, east, north), 1e-3)
     return abs(pyproj.Geod(ellps="WGS84").geometry_area_perimeter(around)[0]) / 1e4
+
+
+def test_a_class_without_judged_pixels_is_estimated_from_probabilities(
+    one_picture: Products, tmp_path: Path, scene_files: Path, survey_png: Survey
+) -> None:
+    """All other classes keep their estimates from labels: of labels with a hole where the map shows that class."""
+    drawn = one_picture.store("class_map")["classes"].values
+    rarest = int(np.argmin(np.where(np.bincount(drawn.ravel()) > 0, np.bincount(drawn.ravel()), drawn.size)))
+    labels = np.where(drawn == rarest, 255, 0).astype(np.uint8)
+    Image.fromarray(labels).save(tmp_path / "labels.png")
+    (tmp_path / "scene.toml").write_text("unlabelled = 255\n[classes]\nclass_0 = 0\n")
+    scene = shutil.copy(scene_files / "scene.png", tmp_path)
+    with with_effects():
+        receipt = survey_png(tmp_path / "archive", scene=scene, labels=str(tmp_path / "labels.png")).receipt
+    assert np.sum(receipt["accuracy"]["confusion"], axis=0)[rarest] == 0
+    answer = run_export(tmp_path / "archive", None, tmp_path / "maps", False, QUIET)
+    with Products(tmp_path / "archive", receipt, answer, tmp_path / "maps").file("areas").open() as text:
+        table = list(csv.DictReader(text))
+    assert all(row["estimated_fraction"] and row["standard_error_fraction"] for row in table)
+    assert sum(float(row["estimated_fraction"]) for row in table) == pytest.approx(1, abs=1e-4)
+    sources = [row["estimated_from"] for row in table]
+    assert [place for place, source in enumerate(sources) if source == "probabilities"] == [rarest]
+    assert set(sources) == {"labels", "probabilities"}
 
 
 @pytest.fixture(scope="module")

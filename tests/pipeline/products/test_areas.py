@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import ShapeError
-from pipeline.products.areas import BLOCK_PX, probable_fractions, stratified_fractions
+from pipeline.products.areas import BLOCK_PX, FractionEstimate, judged_enough, probable_fractions, stratified_fractions
 
 # Olofsson et al. 2014, table 8: rows are mapped classes there, columns what the reference says
 EXAMPLE = np.array([[66, 0, 5, 4], [0, 55, 8, 12], [1, 0, 153, 11], [2, 1, 9, 313]])
@@ -24,13 +24,22 @@ def test_the_stratified_estimate_is_that_of_its_paper() -> None:
     assert hectares.sum() == pytest.approx(900_000)
 
 
-def test_a_mapped_class_that_was_not_judged_says_nothing() -> None:
-    """NaN instead of a number; one that is not mapped either takes nothing from the others. Sizes that differ raise."""
-    counts = np.array([[5, 0, 0], [1, 0, 0], [0, 0, 0]])
-    assert np.isnan(stratified_fractions([0.5, 0.5, 0.0], counts).fractions).all()
-    np.testing.assert_allclose(stratified_fractions([1.0, 0.0, 0.0], counts).fractions, [5 / 6, 1 / 6, 0])
+def test_a_mapped_class_that_was_not_judged_takes_its_own_estimate() -> None:
+    """By hand: .9 of the map by counts, .1 by what is said of it; without that NaN. Sizes that differ raise."""
+    counts = np.array([[8, 0], [2, 0]])
+    others = FractionEstimate(np.array([0.25, 0.75]), np.array([0.2, 0.2]))
+    found = stratified_fractions([0.9, 0.1], counts, others)
+    np.testing.assert_allclose(found.fractions, [0.9 * 0.8 + 0.1 * 0.25, 0.9 * 0.2 + 0.1 * 0.75])
+    np.testing.assert_allclose(found.errors, np.hypot(0.9 * np.sqrt(0.8 * 0.2 / 9), 0.1 * 0.2))
+    assert np.isnan(stratified_fractions([0.9, 0.1], counts).fractions).all()
+    np.testing.assert_allclose(stratified_fractions([1.0, 0.0], counts).fractions, [0.8, 0.2])
     with pytest.raises(ShapeError, match="2 classes and a confusion matrix"):
-        stratified_fractions([0.5, 0.5], counts)
+        stratified_fractions([0.5, 0.5], np.eye(3))
+
+
+def test_classes_with_two_judged_pixels_are_judged() -> None:
+    """One pixel has no spread to tell an error by."""
+    np.testing.assert_array_equal(judged_enough([[1, 0, 1], [1, 1, 0], [0, 0, 0]]), [True, False, False])
 
 
 def test_errors_by_probability_are_those_of_draws() -> None:
