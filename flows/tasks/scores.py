@@ -8,7 +8,17 @@ from typing import Any, NamedTuple
 from flows.terminal.figures import format_count, format_points, known_number
 
 JUDGING = "evaluate"  # the stage that judges the map
+MOST_ERROR = (
+    0.1  # a standard deviation of a predicted mIoU from which on nothing is predicted: 40 points lie within two
+)
 MAPS = {"this survey": None, "none": "none", "all": "all"}  # as they are called; where a receipt's accuracy has them
+
+
+def format_prediction(miou: float | None, error: float | None) -> str:
+    """Return a predicted mIoU with its standard deviation, 0..1; empty where there is none, or where it may be any."""
+    if miou is None or (error is not None and error > MOST_ERROR):
+        return ""
+    return format_points(miou) if error is None else f"{format_points(miou)} ± {format_points(error)}"
 
 
 class WorstClass(NamedTuple):
