@@ -21,7 +21,7 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.map_grid import GroundGrid, grid_of_map, image_at, map_blocks
 from pipeline.ground.view import GroundView, RigPose
-from pipeline.products.areas import FractionEstimate, probable_fractions, stratified_fractions
+from pipeline.products.areas import FractionEstimate, judged_enough, probable_fractions, stratified_fractions
 from pipeline.products.indices import SpectralIndex, index_values, pick_bands, white_level
 from storage.archive.whole_files import write_whole
 from storage.arrays.class_maps import ProbabilityStore
@@ -53,7 +53,7 @@ def write_areas(run: ExportedRun, path: Path) -> None:
         areas = run.receipt["ground"]["areas_ha"]
         hectares = np.array([areas.get(name, 0.0) for name in names], np.float64)
     fraction = pixels / max(pixels.sum(), 1) if hectares is None else hectares / (hectares.sum() or 1.0)
-    estimate, source = _estimate(run, fraction)
+    estimate, sources = _estimate(run, fraction)
     total = np.nan if hectares is None else hectares.sum()
     own = np.full(len(names), np.nan) if hectares is None else hectares
     figures = (own, fraction, confidence, estimate.fractions, estimate.fractions * total, estimate.errors)
@@ -63,7 +63,7 @@ def write_areas(run: ExportedRun, path: Path) -> None:
     for number, (name, count) in enumerate(zip(names, pixels.tolist(), strict=True)):
         own_figures = [figure[number] for figure in (*figures, estimate.errors * total)]
         cells = [f"{value:.{DIGITS}g}" if np.isfinite(value) else "" for value in own_figures]
-        table.writerow([name, count, *cells, source])
+        table.writerow([name, count, *cells, sources[number]])
     write_whole(path, text.getvalue())
 
 
@@ -80,27 +80,33 @@ def _counted(path: Path, count: int) -> tuple[NDArray[np.int64], NDArray[np.floa
     return pixels[:count], np.where(sure_pixels > 0, sums / np.maximum(sure_pixels, 1), np.nan)[:count]
 
 
-def _estimate(run: ExportedRun, fraction: NDArray[np.float64]) -> tuple[FractionEstimate, str]:
-    """Shares with their errors: by the confusion matrix of the receipt where there is one, else by probabilities."""
-    confusion = run.receipt.get("accuracy", {}).get("confusion")
-    if confusion is not None:
-        return stratified_fractions(fraction, confusion), "labels"
-    if run.store("class_probabilities") is None:
-        unknown = np.full(len(fraction), np.nan)
-        return FractionEstimate(unknown, unknown), ""
-    return probable_fractions(_probabilities(run, len(fraction)), len(fraction)), "probabilities"
+def _estimate(run: ExportedRun, fraction: NDArray[np.float64]) -> tuple[FractionEstimate, list[str]]:
+    """Fractions with their errors, and of what they are for each class: empty where of nothing.
+
+    Pixels that are mapped as a class with judged ones count by the receipt's confusion matrix, others by their
+    probabilities.
+    """
+    count, confusion = len(fraction), run.receipt.get("accuracy", {}).get("confusion")
+    judged = np.zeros(count, np.bool_) if confusion is None else judged_enough(confusion)
+    mapped = (fraction > 0) & ~judged
+    there = run.store("class_probabilities") is not None
+    others = probable_fractions(_probabilities(run, count, np.flatnonzero(mapped)), count) if there else None
+    matrix = np.zeros((count, count)) if confusion is None else confusion
+    source = "probabilities" if there else ""
+    of_labels = ~mapped & (confusion is not None)
+    return stratified_fractions(fraction, matrix, others), ["labels" if one else source for one in of_labels]
 
 
-def _probabilities(run: ExportedRun, count: int) -> Iterator[NDArray[np.float32]]:
-    """What is believed of the pixels with a class, (y, x, class); of those called unknown that they are, for sure."""
+def _probabilities(run: ExportedRun, count: int, mapped: NDArray[np.intp]) -> Iterator[NDArray[np.float32]]:
+    """Probabilities of the pixels mapped as some classes, (y, x, class); 1 of the class unknown where they are that."""
     store = ProbabilityStore(run.path("class_probabilities"))
     for first, drawn in open_image(run.path("class_map"), "classes").rows():
         values = np.exp(store.read(slice(first, first + len(drawn)))[0])
         known = values.shape[-1]
         values = np.pad(values, [(0, 0), (0, 0), (0, count - known)])
-        values[drawn == UNLABELLED] = np.nan
         unknown = (drawn >= known) & (drawn != UNLABELLED)
         values[unknown] = np.arange(count) == drawn[unknown, None]
+        values[~np.isin(drawn, mapped)] = np.nan
         yield values
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from affine import Affine
@@ -17,9 +17,11 @@ from flows.archive.export_layers import ExportedRun
 from flows.archive.product_choice import ProductChoice, class_numbers
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.ground.georeference import crs_wkt, degree_m, pixel_side_m, to_degrees, to_plane
-from pipeline.products.areas import CellGrid, Heading, ToAxes, cell_polygons, count_classes, dose_cells, pixel_axes
-from pipeline.products.regions import class_polygons, grow_class, merge_small
+from pipeline.ground.field_places import M2_PER_HECTARE, PlacedPicture, areas_by_number
+from pipeline.ground.georeference import Places, crs_wkt, degree_m, pixel_side_m, plane_pixel_m, to_degrees, to_plane
+from pipeline.lazy import deferred
+from pipeline.products.cells import CellGrid, Heading, ToAxes, cell_polygons, covered_fractions, dose_cells, pixel_sides
+from pipeline.products.regions import Coverage, class_polygons, grow_class, merge_small, outline_regions
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.ground_maps import open_image
 from storage.export.map_files import (
@@ -39,8 +41,16 @@ from storage.export.map_files import (
     write_task_data,
 )
 
+if TYPE_CHECKING:
+    import shapely
+else:
+    shapely = deferred("shapely")
+
+FINER = 0.99  # of a pixel's side: cells below it are finer than pixels
+CELL_M = 3.0  # of a prescription, where no side is given and pixels are smaller
 IN_DEGREES = {"proj:code": "EPSG:4326"}
 NEEDS_PLACE = "the run does not say where on earth it was; survey with a [pose], or a scene with a CRS"
+Floats = NDArray[np.float64]
 Add = Callable[..., None]  # names a file to the catalogue: key, path, title, media type, roles, fields of STAC's
 
 
@@ -91,6 +101,19 @@ def check_zones(run: ExportedRun, choice: ProductChoice) -> None:
         raise SettingsError(f"a prescription is in metres, and {NEEDS_PLACE}")
 
 
+def zone_notes(run: ExportedRun, choice: ProductChoice) -> list[str]:
+    """Return what a prescription's reader has to know of it: cells that are finer than the map's pixels."""
+    if not choice.doses or run.geobox is None or choice.flags.cell is None:
+        return []
+    cell_m, pixel_m = choice.flags.cell, plane_pixel_m(run.geobox)
+    if cell_m > FINER * pixel_m:
+        return []
+    return [
+        f"cells of {cell_m:g} m are finer than the map's pixels of {pixel_m:.3g} m, and show no more than these; "
+        f"--cell {pixel_m:.3g} makes fewer"
+    ]
+
+
 def write_zones(run: ExportedRun, folder: Path, choice: ProductChoice, add: Add) -> None:
     """Write polygons and prescriptions that were asked for into ``folder``, each with its style, and ``add`` them."""
     if choice.flags.polygons or choice.doses:
@@ -126,54 +149,90 @@ def _add_style(path: Path, column: str, entries: Sequence[Entry], add: Add) -> N
     add(f"{path.stem}_polygon_style", style, f"QGIS style of {path.name}", STYLE, ["metadata", "style"])
 
 
+def cell_side_m(run: ExportedRun, choice: ProductChoice) -> float:
+    """Return the side of a prescription's cells [m]: as given, else `CELL_M`, or a pixel where that is larger."""
+    assert run.geobox is not None
+    return choice.flags.cell or max(CELL_M, round(plane_pixel_m(run.geobox), 3))
+
+
 def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, choice: ProductChoice, add: Add) -> None:
     assert raster.geobox is not None
-    assert raster.pixel_m is not None
-    flags, unit, heading = choice.flags, choice.unit, Heading(choice.flags.heading % 360)
-    doses = class_numbers(raster.legend.names, choice.doses, "--prescription")
-    plane, to_own = to_plane(raster.geobox)
+    numbers = class_numbers(raster.legend.names, choice.doses, "--prescription")
+    areas = areas_by_number(PlacedPicture(raster.geobox), raster.classes, len(raster.legend.names))
+    assert areas is not None
+    words = ", ".join(f"{name} {dose:g} {choice.unit.name}" for name, dose in choice.doses.items())
+    field = DosedField(
+        raster, numbers, choice.flags.least_fraction, cell_side_m(run, choice), float(areas.sum()), words
+    )
+    _write_cells(field, folder, choice, add)
+    down, across = (round(field.cell_m / metres, DEGREE_DIGITS) for metres in degree_m(raster.geobox))
+    grid, _, doses = field.dosed((down, across), to_degrees(raster.geobox))
+    survey, version = run.receipt["survey"], str(run.receipt["versions"].get("spectralzoom", "unknown"))
+    task = TaskGrid(*grid.corner, *grid.step, doses, choice.unit)
+    files = write_task_data(folder, task, TaskText(survey, survey, words, version, field.area_m2))
+    title = f"Prescription ({words}) as ISOXML task data, cells along north"
+    kinds = (("task_data", "application/xml"), ("task_grid", "application/octet-stream"))
+    for (key, kind), file in zip(kinds, files, strict=True):
+        add(key, file, title, kind, ["data"], **IN_DEGREES)
 
-    def along_heading(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+
+def _write_cells(field: DosedField, folder: Path, choice: ProductChoice, add: Add) -> None:
+    """Write the shapefile of cells along the heading, each as far as the field reaches, and its style."""
+    assert field.raster.geobox is not None
+    unit, heading, (plane, to_own) = choice.unit, Heading(choice.flags.heading % 360), to_plane(field.raster.geobox)
+
+    def along_heading(x: Floats, y: Floats) -> Floats:
         place = plane(x, y)
         return heading.to_axes(place[..., 0], place[..., 1])
 
-    grid, found = _dosed(raster, doses, flags.least_fraction, (flags.cell, flags.cell), along_heading)
-    seen = np.isfinite(found)
+    grid, covered, doses = field.dosed((field.cell_m, field.cell_m), along_heading)
+    outlines, seen = cell_polygons(grid, heading, covered, field.outlines(plane)), covered > 0
     row, column = np.nonzero(seen)
-    columns: dict[str, Any] = {"dose": found[seen], "unit": [unit.name] * len(row), "row": row, "col": column}
+    hectares = covered[seen] * field.area_m2 / covered.sum() / M2_PER_HECTARE  # of the ellipsoid
+    columns: dict[str, Any] = {"dose": doses[seen], "unit": [unit.name] * len(row), "row": row, "col": column}
     path = folder / "prescription.shp"
-    write_polygons(path, cell_polygons(grid, heading)[seen], columns, to_own)
-    words = ", ".join(f"{name} {dose:g} {unit.name}" for name, dose in choice.doses.items())
-    title = f"Prescription ({words})"
-    cells = f"in cells of {flags.cell:g} m along {heading.degrees:g} degrees; .shx, .dbf, .prj and .cpg beside it"
-    add("prescription", path, f"{title} {cells}", SHAPEFILE, ["data"])
-    most = max(doses.values())
-    levels = sorted({0.0, *found[seen].tolist()})
+    write_polygons(path, outlines, columns | {"hectares": hectares}, to_own)
+    cells = f"in cells of {field.cell_m:g} m along {heading.degrees:g} degrees; .shx, .dbf, .prj and .cpg beside it"
+    add("prescription", path, f"Prescription ({field.words}) {cells}", SHAPEFILE, ["data"])
+    most, levels = max(choice.doses.values()), np.unique([0.0, *doses[seen]]).tolist()
     shown = [(d, f"{d:g} {unit.name}", ramp_colour(d / most, REDS) if d else NONE) for d in levels]
     _add_style(path, "dose", shown, add)
-    down, across = (round(flags.cell / metres, DEGREE_DIGITS) for metres in degree_m(raster.geobox))
-    grid, found = _dosed(raster, doses, flags.least_fraction, (down, across), to_degrees(raster.geobox))
-    known_m2 = int((raster.classes != UNLABELLED).sum()) * raster.pixel_m**2
-    survey, version = run.receipt["survey"], str(run.receipt["versions"].get("spectralzoom", "unknown"))
-    task = TaskGrid(*grid.corner, *grid.step, found, unit)
-    files = write_task_data(folder, task, TaskText(survey, survey, words, version, known_m2))
-    kinds = (("task_data", "application/xml"), ("task_grid", "application/octet-stream"))
-    for (key, kind), file in zip(kinds, files, strict=True):
-        add(key, file, f"{title} as ISOXML task data, cells along north", kind, ["data"], **IN_DEGREES)
 
 
-def _dosed(
-    raster: ClassRaster, doses: dict[int, float], least_fraction: float, step: tuple[float, float], to_axes: ToAxes
-) -> tuple[CellGrid, NDArray[np.float64]]:
-    """Cells around all that has a class, and their doses."""
-    known = raster.classes != UNLABELLED
-    rows, columns = (np.flatnonzero(known.any(axis=axis)) for axis in (1, 0))
-    if not len(rows):
-        raise SettingsError("no pixel of the run's map has a class; there is nothing to prescribe")
-    width = raster.classes.shape[1]
-    edges = [pixel_axes(raster.transform, slice(r, r + 1), width, to_axes)[0] for r in (rows[0], rows[-1])]
-    sides = pixel_axes(raster.transform, slice(rows[0], rows[-1] + 1), width, to_axes)[:, [columns[0], columns[-1]]]
-    around = np.concatenate([*(edge[columns[0] : columns[-1] + 1] for edge in edges), sides.reshape(-1, 2)])
-    grid = CellGrid.around(around, step)
-    counts = count_classes(grid, raster.classes, raster.transform, to_axes, len(raster.legend.names))
-    return grid, dose_cells(counts, doses, least_fraction)
+@dataclass(frozen=True)
+class DosedField:
+    """A map of classes with doses, and the cells that these are given in."""
+
+    raster: ClassRaster
+    doses: dict[int, float]  # by number of the class
+    least_fraction: float
+    cell_m: float
+    area_m2: float  # of all that has a class, on the ellipsoid
+    words: str
+
+    def dosed(self, step: tuple[float, float], to_axes: ToAxes) -> tuple[CellGrid, Floats, Floats]:
+        """Lay cells over all that has a class: the grid, the fraction of each that is covered, and their doses.
+
+        Raises SettingsError: no pixel has a class, or there are too many cells.
+        """
+        classes, transform = self.raster.classes, self.raster.transform
+        known = classes != UNLABELLED
+        sides = [part.reshape(-1, 2) for part in pixel_sides(known, transform, to_axes) if len(part)]
+        if not sides:
+            raise SettingsError("no pixel of the run's map has a class; there is nothing to prescribe")
+        low, high = (np.array([at(part, axis=0) for part in sides]) for at in (np.min, np.max))
+        grid = CellGrid.around(low.min(axis=0), high.max(axis=0), step)
+        covered = covered_fractions(grid, known, transform, to_axes)
+        treated = [
+            (covered_fractions(grid, classes == number, transform, to_axes), dose)
+            for number, dose in self.doses.items()
+        ]
+        return grid, covered, dose_cells(covered, treated, self.least_fraction)
+
+    def outlines(self, plane: Places) -> NDArray[Any]:
+        """Outline all that has a class, in metres of a plane, with a vertex at every pixel's corner."""
+        known = np.where(self.raster.classes == UNLABELLED, UNLABELLED, 0).astype(np.uint8)
+        regions = outline_regions(known).of_classes()
+        stepped = Coverage(regions.classes, shapely.segmentize(regions.polygons, 1.0)).moved(self.raster.transform)
+        found: NDArray[Any] = shapely.transform(stepped.polygons, lambda points: plane(*points.T))
+        return found

@@ -22,10 +22,11 @@ from flows.settings.survey_settings import Settings
 from flows.tasks.open_survey import JUDGED, STAGES, OpenSurvey
 from flows.tasks.run import SurveyRun, open_run
 from flows.tasks.scan_choice import ScanChoice, as_figures
+from flows.tasks.scores import MOST_ERROR, format_prediction
 from flows.tasks.stage import Stage, Wanted
 from flows.tasks.stages.accuracy import evaluate
 from flows.tasks.stages.attention import load_plan
-from flows.terminal.figures import format_bytes, format_count, format_percent, format_points, format_seconds
+from flows.terminal.figures import DASH, format_bytes, format_count, format_percent, format_seconds
 from flows.terminal.processes import DONE
 from flows.terminal.progress import put_out, table
 from pipeline.errors import IncompleteStoreError, PipelineError
@@ -324,8 +325,12 @@ def _show_scans(scans: dict[str, Any], console: Console) -> None:
     cells = []
     for seconds, scan in sorted(rows.items()):
         said = ", ".join(MARKS[name] for name, one in marks.items() if one == scan)
-        spread = "" if scan["expected_spread"] is None else f" ± {format_points(scan['expected_spread'])}"
-        figures = f"{seconds:.1f}", format_bytes(scan["bytes_raw"]), f"{format_points(scan['expected_miou'])}{spread}"
+        predicted = format_prediction(scan["expected_miou"], scan["expected_spread"]) or DASH
+        figures = f"{seconds:.1f}", format_bytes(scan["bytes_raw"]), predicted
         cells.append([format_scan(scan["step"], scan["exposure_ms"]), said, *figures])
     columns = ("scan", "", "seconds", "raw data", "mIoU, about")
     console.print(table(columns, cells, left=2, title=SCANS_TITLE, whole=columns))
+    if any(row[-1] == DASH for row in cells):
+        console.print(
+            f"[dim]{DASH}: scenes differ by more than {100 * MOST_ERROR:.0f} points (one standard deviation)[/]"
+        )

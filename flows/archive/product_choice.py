@@ -34,7 +34,9 @@ class ProductFlags:
         Parameter(help="Doses by class, with commas: weed=2.5,grass=1. Written as shapefile and ISOXML task data."),
     ] = None
     dose_unit: Annotated[str, Parameter(help="Unit of the doses: l/ha or kg/ha.")] = "l/ha"
-    cell: Annotated[float, Parameter(help="Side of the prescription's cells [m].")] = 3.0
+    cell: Annotated[
+        float | None, Parameter(help="Side of the prescription's cells [m]; by default 3 m, or a pixel if larger.")
+    ] = None
     heading: Annotated[float, Parameter(help="Along which its cells lie, clockwise from north [deg].")] = 0.0
     least_fraction: Annotated[
         float, Parameter(help="A cell gets the dose of a class of which it has more than this fraction, 0 to 1.")
@@ -70,7 +72,7 @@ def choose_products(flags: ProductFlags) -> ProductChoice:
     numbers = (
         ("--least-area", flags.least_area, 0 <= flags.least_area < float("inf"), "0 or more"),
         ("--simplify", flags.simplify, 0 <= (flags.simplify or 0.0) < float("inf"), "0 or more"),
-        ("--cell", flags.cell, 0 < flags.cell < float("inf"), "metres above 0"),
+        ("--cell", flags.cell, flags.cell is None or 0 < flags.cell < float("inf"), "metres above 0"),
         ("--heading", flags.heading, abs(flags.heading) <= 360, "degrees from north"),
         ("--least-fraction", flags.least_fraction, 0 <= flags.least_fraction < 1, "a fraction from 0 to below 1"),
     )

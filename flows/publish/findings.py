@@ -15,7 +15,9 @@ from flows.publish.receipt_table import FOREIGN
 from flows.settings.values import EXTENT_WHOLE
 from flows.tasks.prior_maps import prior_map_figures
 from flows.tasks.run import SurveyRun
+from flows.tasks.scores import MOST_ERROR
 from flows.tasks.stages.maps import OUT_OF_RANGE
+from flows.terminal.figures import format_points
 from models.evaluation.expected_scores import expected_counts
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, FieldScale, PlacedPicture, areas_by_number
@@ -76,9 +78,16 @@ def _kept(run: SurveyRun, scale: FieldScale) -> FieldScale:
 
 
 def find_ground(
-    run: SurveyRun, posed: GroundMap | None, found: ClassMap, probabilities: ProbabilityStore
+    run: SurveyRun,
+    posed: GroundMap | None,
+    found: ClassMap,
+    probabilities: ProbabilityStore,
+    memory: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
-    """``ground``: grid, hectares of each class, what changed and what is old. Empty where nobody says where it lies."""
+    """Return ``ground``: grid, hectares of each class, what changed by ``memory``, and what is old.
+
+    Empty for a run without a place.
+    """
     geobox = run.scene.geobox if posed is None else posed.geobox
     if geobox is None:
         return {}
@@ -95,7 +104,9 @@ def find_ground(
     place, drawn = run.zones.place, found.classes != UNLABELLED
     figures |= {"older_ha": older_hectares(place, np.where(drawn, probabilities.age(), np.nan))}
     if (old_class := probabilities.old_class()) is not None:
-        figures |= {"changes_ha": changed_hectares(place, old_class, found)}
+        changes = [] if memory is None else memory["changes"]
+        beyond = {(old, new): changed / differing for changed, differing, old, new in changes}
+        figures |= {"changes_ha": changed_hectares(place, old_class, found, beyond)}
     return {"ground": figures}
 
 
@@ -108,15 +119,22 @@ def older_hectares(place: FieldPlace, age_days: NDArray[np.float32]) -> dict[str
     return {str(days): area for days, area in zip(OLDER_DAYS, above.tolist(), strict=True)}
 
 
-def changed_hectares(place: FieldPlace, old_class: NDArray[np.uint8], found: ClassMap) -> list[list[Any]]:
-    """Hectares, class before and class now of the (y, x) pixels that changed, largest first; 255 did not change."""
-    count = len(found.names)
-    changed = (old_class != UNLABELLED) & (found.classes != UNLABELLED)
-    pairs = np.where(changed, old_class.astype(np.int64) * count + found.classes, -1)
+def changed_hectares(
+    place: FieldPlace, old_class: NDArray[np.uint8], found: ClassMap, beyond: Mapping[tuple[str, str], float]
+) -> list[list[Any]]:
+    """Return hectares, class before and class now of the (y, x) pixels that changed, largest first.
+
+    ``old_class`` is 255 where memory and map do not differ. ``beyond`` is the fraction of the differing pixels that two
+    maps of the same ground would not differ by, by class before and now; pairs without one did not change.
+    """
+    names, count = found.names, len(found.names)
+    differing = (old_class != UNLABELLED) & (found.classes != UNLABELLED)
+    pairs = np.where(differing, old_class.astype(np.int64) * count + found.classes, -1)
     areas = areas_by_number(place, pairs, count**2)
     assert areas is not None
+    for pair in range(count**2):
+        areas[pair] *= beyond.get((names[pair // count], names[pair % count]), 0.0)
     largest = [pair for pair in np.argsort(-areas, kind="stable").tolist() if areas[pair] > 0]
-    names = found.names
     return [[float(areas[pair]) / M2_PER_HECTARE, names[pair // count], names[pair % count]] for pair in largest]
 
 
@@ -182,7 +200,8 @@ def find_map(run: SurveyRun, ref: StageRef, drawn: ClassMap) -> dict[str, Any]:
 def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
     """What the map is likely to score by what it says of itself; None where nobody knows how such comes true.
 
-    That is known of maps of uniform scans that are read whole, without a memory.
+    That is known of maps of uniform scans that are read whole, without a memory. Pixels without a class do not count. A
+    score of which the error leaves open nearly everything is not predicted, and the words say so.
     """
     settings, step = run.settings, run.settings.scan_step
     memory = prior_map_figures(ref.path)
@@ -197,5 +216,8 @@ def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
     score = run.map_scores.expected(counts, step, settings.scan_exposure_ms or run.camera.exposure_ms)
     if score is None or not np.isfinite(score.miou):
         return None
+    if score.error > MOST_ERROR:
+        words = f"it would be off by {format_points(score.error)} points (one standard deviation)"
+        return {"not_predicted": f"{words}; judge the map by labels"}
     of_classes = {name: float(iou) for name, iou in zip(names, score.per_class_iou, strict=True) if np.isfinite(iou)}
     return {"miou": score.miou, "error": score.error, "per_class_iou": of_classes}

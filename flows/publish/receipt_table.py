@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from flows.publish.receipt import Receipt, is_pending
-from flows.tasks.scores import format_worst_class
+from flows.tasks.scores import format_prediction, format_worst_class
 from flows.terminal.figures import (
     counted,
     format_area,
@@ -134,7 +134,14 @@ def headline(receipt: Receipt, captured_again: float | None = None) -> str:
 
 
 def finding_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the findings of a receipt as rows of a table: label, and figures with their names."""
+    """Return the findings of a receipt as rows of a table: label, and figures with their names.
+
+    Of a field that the weights do not know no score is predicted: their record is of others.
+    """
+    foreign = (found.get("unknown") or {}).get("fraction", 0.0) > FOREIGN
+    if foreign and "scans" in found:
+        scans = {name: {**scan, "expected_miou": None} for name, scan in found["scans"].items()}
+        found = {**found, "scans": scans}
     rows = [
         (_LABELS.get(part, part), _figures(part, found.get(part))) for part in dict.fromkeys(f[0] for f in _FIGURES)
     ]
@@ -150,7 +157,7 @@ def finding_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
     if "scans" not in found and found.get("plan", {}).get("kind", "raster") != "raster":
         words = "the weights have no scan performance table, so that seconds stand beside every line at full exposure"
         rows.append(("uniform scans", f"{words}; train --min-exposure-ms 3 makes one, by scenes kept for validation"))
-    if (found.get("unknown") or {}).get("fraction", 0.0) > FOREIGN:
+    if foreign:
         rows.append(("weights", FOREIGN_WORDS))
     return [(label, words) for label, words in rows if words]
 
@@ -216,8 +223,13 @@ def _fraction(cost: Mapping[str, float]) -> str:
 
 
 def _scan(scan: Mapping[str, Any]) -> str:
-    score = f"{format_points(scan['expected_miou'])} ± {format_points(scan.get('expected_spread'))}"
-    return f"{format_scan(scan['step'], scan['exposure_ms'])}, {scan['seconds']:.1f} s, about {score}"
+    words = f"{format_scan(scan['step'], scan['exposure_ms'])}, {scan['seconds']:.1f} s"
+    score, spread = scan["expected_miou"], scan.get("expected_spread")
+    if score is None:  # of a field that the weights do not know
+        return words
+    if not (predicted := format_prediction(score, spread)):
+        return f"{words}, no score predicted: scenes differ by {format_points(spread)} points (one standard deviation)"
+    return f"{words}, about {predicted}"
 
 
 def _most_px(sweeps: Mapping[str, Sequence[float]]) -> str:
@@ -256,11 +268,14 @@ _FIGURES: Sequence[tuple[str, str, str, Callable[[Any], Any]]] = (
     ("memory", "turned_deg", "{}", lambda one: f"turned by {abs(one):.1f} degrees" if abs(one) >= 1 else ""),
     ("memory", "put_aside", "put aside: {}", str),
     ("memory", "agreement", "today's capture agrees with {} of it", format_percent),
-    ("memory", "changed_px", "{} px changed", format_count),
+    ("memory", "differing_px", "{} px differ from it", format_count),
+    ("memory", "expected_differing_px", "two maps of the same ground would differ at about {}", format_count),
+    ("memory", "changed_px", "{} px changed beyond that", format_count),
     ("unknown", "fraction", "{} of the map is unknown, unlike all that the weights were trained on", format_percent),
     ("unknown", "rate", "of what they know it would be about {}", format_percent),
     ("expected", "miou", "about {}, with no label asked", format_points),
     ("expected", "error", "error {}", format_points),
+    ("expected", "not_predicted", "no score predicted: {}", str),
     ("scans", "taken", "this one, read whole: {}", _scan),
     ("scans", "best_in_time", "best in the same seconds: {}", _scan),
     ("scans", "reference", "nearly as good as any: {}", _scan),

@@ -23,7 +23,7 @@ from flows.publish.field_map import FieldMap
 from flows.publish.panels import data_address
 from flows.publish.receipt import Receipt
 from flows.publish.receipt_table import byte_rows, cost_rows, finding_rows, format_reused, headline, plot_rows
-from flows.tasks.scores import format_false_classes
+from flows.tasks.scores import error_matrix, format_false_classes
 from flows.terminal.figures import format_bytes, format_percent, format_points, format_seconds
 from pipeline.errors import visible
 
@@ -163,6 +163,7 @@ def render_report(
         findings=finding_rows(receipt),
         plots=plot_rows(receipt.get("plots", [])),
         accuracy=accuracy,
+        error_matrix=None if accuracy is None else error_matrix(accuracy),
         false_classes="" if accuracy is None else format_false_classes(accuracy),
         format_total="" if total is None else " ".join(format_total(total)),
         details={

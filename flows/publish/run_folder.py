@@ -318,9 +318,8 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     class_map = products["segment"]
     drawn = load_class_map(class_map.path / "class_map.zarr")
     posed = next((load_ground_map(ref.path / STORE) for ref in products.there("ground")), None)
-    found |= find_ground(run, posed, drawn, ProbabilityStore(class_map.path / "class_probabilities.zarr")) | find_zones(
-        run, drawn
-    )
+    probabilities = ProbabilityStore(class_map.path / "class_probabilities.zarr")
+    found |= find_ground(run, posed, drawn, probabilities, memory) | find_zones(run, drawn)
     found |= find_map(run, class_map, drawn)
     lines = {} if run.raster is not None else read_table(products.mosaic.path / "lines.json")
     troubled = {name: facts for name, facts in lines.items() if any(facts.values())}

@@ -8,7 +8,17 @@ from typing import Any, NamedTuple
 from flows.terminal.figures import format_count, format_points, known_number
 
 JUDGING = "evaluate"  # the stage that judges the map
+MOST_ERROR = (
+    0.1  # a standard deviation of a predicted mIoU from which on nothing is predicted: 40 points lie within two
+)
 MAPS = {"this survey": None, "none": "none", "all": "all"}  # as they are called; where a receipt's accuracy has them
+
+
+def format_prediction(miou: float | None, error: float | None) -> str:
+    """Return a predicted mIoU with its standard deviation, 0..1; empty where there is none, or where it may be any."""
+    if miou is None or (error is not None and error > MOST_ERROR):
+        return ""
+    return format_points(miou) if error is None else f"{format_points(miou)} ± {format_points(error)}"
 
 
 class WorstClass(NamedTuple):
@@ -67,3 +77,35 @@ def format_false_classes(accuracy: Mapping[str, Any]) -> str:
             pixels = ", ".join(f"{kind.replace('_', ' ')} {format_count(count)} px" for kind, count in false.items())
             parts.append(f"{name} {pixels}")
     return f"Shown although the truth has none: {'; '.join(parts)}." if parts else ""
+
+
+class ErrorMatrix(NamedTuple):
+    """A confusion matrix in words, over the classes that map or labels have."""
+
+    labels: list[str]  # of the columns
+    rows: list[list[str]]  # mapped class, pixels by label, user's accuracy [%]; last the producer's accuracies [%]
+
+
+def error_matrix(accuracy: Mapping[str, Any]) -> ErrorMatrix | None:
+    """Return the confusion matrix of a receipt's accuracy as a table; None where the receipt has none."""
+    if not (counts := accuracy.get("confusion")):
+        return None
+    size = len(counts)
+    names = [*_by_class(accuracy), "unknown"][:size]
+    label, mapped = [sum(row) for row in counts], [sum(row[one] for row in counts) for one in range(size)]
+    columns = [one for one in range(size) if label[one]]
+    rows = [
+        [_spaced(names[one]), *(format_count(counts[by][one]) for by in columns), _right(counts[one][one], mapped[one])]
+        for one in range(size)
+        if label[one] or mapped[one]
+    ]
+    producers = [_right(counts[one][one], label[one]) for one in columns]
+    return ErrorMatrix([_spaced(names[one]) for one in columns], [*rows, ["producer's accuracy", *producers, ""]])
+
+
+def _right(right: int, pixels: int) -> str:
+    return format_points(right / pixels if pixels else None)
+
+
+def _spaced(name: str) -> str:
+    return name.replace("_", " ")

@@ -14,9 +14,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from models.evaluation.expected_scores import expected_counts
 from models.evaluation.metrics import confusion, kappa, overall_accuracy
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import deferred
+from pipeline.products.areas import BLOCK_PX
 
 if TYPE_CHECKING:
     import torch
@@ -32,6 +34,7 @@ FADES_DAYS = 120.0  # in which a memory that nobody looks after is worth e times
 SETTLED_DAYS = 1.0  # from which on a reader has all the say of what nobody looked at
 SURE = 0.97  # of today's look, without a reader, to speak against a memory
 CERTAIN = 0.8  # of memory and map alike, so that a pixel of another class counts as changed
+ERRORS_BEYOND = 2.0  # standard errors that more pixels differ by than of two maps of the same ground
 ROWS = 128  # read at a time
 SEEN_PX = 3  # that the reader sees beside a pixel, and three coarse pixels
 LEAST_AGREEMENT, LEAST_KAPPA = 0.5, 0.35  # of a memory that is of this field; less of both, and it is put aside
@@ -245,9 +248,36 @@ class TemporalAgreement:
 
     observation: NDArray[np.int64]  # (class before, class of today's look alone) pixels that both know
     changed: NDArray[np.int64]  # (class before, class of the map) pixels that both are sure of
+    before: NDArray[np.float64]  # (likely class, mapped class) of the memory, by its probabilities, of these pixels
+    now: NDArray[np.float64]  # the same of the map
 
     def __add__(self, other: TemporalAgreement) -> TemporalAgreement:
-        return TemporalAgreement(self.observation + other.observation, self.changed + other.changed)
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return TemporalAgreement(*(own + its for own, its in pairs))
+
+    @property
+    def expected(self) -> NDArray[np.float64]:
+        """Pixels (class before, class of the map) of two maps of the same ground, by the maps' own probabilities.
+
+        Both maps tell what a likely class is mapped as, so that a class that is gone keeps its errors. Errors are taken
+        to be independent at pixels of one class.
+        """
+        both = self.before + self.now
+        likely = both.sum(axis=1, keepdims=True)
+        of_class = np.divide(both, likely, out=np.zeros_like(both), where=likely > 0)
+        return np.asarray(self.before.T @ of_class, np.float64)
+
+    @property
+    def beyond(self) -> NDArray[np.int64]:
+        """Pixels (class before, class of the map) that changed, beyond what two maps of the same ground differ by.
+
+        0 where the excess lies within two standard errors, errors within blocks of 16 x 16 px taken to come together.
+        """
+        expected = self.expected
+        excess = self.changed - expected
+        told = excess > ERRORS_BEYOND * BLOCK_PX * np.sqrt(expected)
+        np.fill_diagonal(told, False)
+        return np.where(told, np.rint(excess), 0).astype(np.int64)
 
     @property
     def agreement(self) -> float:
@@ -275,7 +305,10 @@ def compare(
     least = math.log(CERTAIN)
     sure = known & (before.max(axis=-1) > least) & (now.max(axis=-1) > least)
     return TemporalAgreement(
-        *(confusion(old[where], other[where], classes) for where, other in ((known, shown), (sure, new)))
+        confusion(old[known], shown[known], classes),
+        confusion(old[sure], new[sure], classes),
+        expected_counts([before[sure]], classes),
+        expected_counts([now[sure]], classes),
     )
 
 

@@ -151,3 +151,12 @@ def to_plane(geobox: GeoBox) -> tuple[Places, str]:
     zone = pyproj.CRS.from_epsg((32600 if lat >= 0 else 32700) + int((lon + 180) % 360 // 6) + 1)
     transformer = pyproj.Transformer.from_crs(crs, zone, always_xy=True)
     return (lambda x, y: np.stack(transformer.transform(x, y), axis=-1)), zone.to_wkt()
+
+
+def plane_pixel_m(geobox: GeoBox) -> float:
+    """Return the side of the square that is as large as the middle pixel in the plane of `to_plane` [m]."""
+    rows, columns = geobox.shape
+    column, row = columns // 2 + np.array([0.0, 1.0, 0.0]), rows // 2 + np.array([0.0, 0.0, 1.0])
+    a, b, c, d, e, f = geobox.affine[:6]
+    corner, right, below = to_plane(geobox)[0](a * column + b * row + c, d * column + e * row + f)
+    return float(np.sqrt(abs(np.linalg.det(np.stack([right - corner, below - corner])))))

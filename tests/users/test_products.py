@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
+import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,9 @@ import xarray as xr
 from affine import Affine
 from isoxml.converter.np_grid import to_numpy_array
 from isoxml.util.isoxml_io import isoxml_from_path
+from PIL import Image
 from rich.console import Console
+from scipy import ndimage
 
 from flows.archive.export_command import run_export
 from flows.archive.product_choice import ProductFlags, choose_products
@@ -30,7 +34,8 @@ from pipeline.ground.view import GroundView, RigPose
 from pipeline.products.indices import find_index
 from storage.arrays.mosaics import open_mosaic
 from storage.readers.scene_files import load_scene_file
-from tests.prior_work import without_effects
+from tests.conftest import Survey
+from tests.prior_work import with_effects, without_effects
 from tests.storage.export.stac_rules import core_problems, extension_problems, is_cog
 from tests.users.test_georeference import SHAPE, TURNED, corners_px, survey, write_geotiff
 
@@ -163,7 +168,8 @@ def test_prescribed_cells_hold_the_dose_of_their_classes(posed: Products) -> Non
         ".dbf",
     }
     assert set(cells.dose) == {0.0, 1.0, 2.5}
-    np.testing.assert_allclose(cells.area, 9.0)
+    assert (cells.area <= 9.0 + 1e-6).all()
+    assert np.isclose(cells.area, 9.0).mean() > 0.5  # the others lie at the field's edge
     x, y, classes, names = _classes_of_polygons(posed)
     grass = (classes == names.index("grass")).ravel()
     tree = shapely.STRtree(shapely.points(x.ravel(), y.ravel()))
@@ -179,7 +185,8 @@ def test_prescribed_cells_hold_the_dose_of_their_classes(posed: Products) -> Non
 
 def test_cells_lie_along_the_heading(posed: Products) -> None:
     """The first side of each cell is turned by it, clockwise from the map's north."""
-    corners = shapely.get_coordinates(geopandas.read_file(posed.file("prescription")).geometry).reshape(-1, 5, 2)
+    cells = geopandas.read_file(posed.file("prescription")).geometry
+    corners = shapely.get_coordinates(cells[np.isclose(cells.area, 9.0)]).reshape(-1, 5, 2)
     turned = np.rad2deg(np.arctan2(*np.diff(corners, axis=1).transpose(2, 0, 1))) % 90
     np.testing.assert_allclose(turned, 20, atol=1e-3)
 
@@ -205,7 +212,7 @@ def test_task_data_hold_what_the_map_says(posed: Products) -> None:
     mostly = (total > 4) & (grass > 0.5 * total)
     assert mostly.sum() > 10
     assert (doses[mostly] >= 1.0).all()
-    assert (doses[total == 0] == 0).all()
+    assert (doses[ndimage.maximum_filter(total, 3) == 0] == 0).all()  # a cell may have a part of a pixel
 
 
 def test_a_table_of_areas_adds_up(posed: Products) -> None:
@@ -323,12 +330,84 @@ def test_products_of_a_georeferenced_scene_lie_where_it_does(
     assert seen  # nothing in the gap
     cells = geopandas.read_file(done.file("prescription"))
     assert cells.crs.to_epsg() == 32632
-    np.testing.assert_allclose(cells.area, 0.25, rtol=1e-6)
+    assert np.isclose(cells.area, 0.25, rtol=1e-6).mean() > 0.25
+    assert cells.area.max() < 0.25 * (1 + 1e-6)
     assert (cells.dose == 2).any()
     assert {0.0, 2.0} >= set(cells.dose)
     with done.file("areas").open() as text:
         hectares = [float(row["hectares"]) for row in csv.DictReader(text)]
     assert sum(hectares) == pytest.approx(found.area_m2.sum() / 1e4, rel=1e-3)
+
+
+@pytest.fixture(scope="module")
+def coarse(tmp_path_factory: pytest.TempPathFactory, weights: Path) -> tuple[Path, Path]:
+    """An archive with a survey of a GeoTIFF with pixels of 30 m, a corner of it without a value; and where it lies."""
+    folder = tmp_path_factory.mktemp("coarse")
+    scene = write_geotiff(folder / "a.tif", Affine(30, 0, 534_240, 0, -30, 5_772_330), gap=True)
+    survey(scene, weights, folder / "archive")
+    return folder / "archive", folder
+
+
+@pytest.mark.parametrize(
+    ("flags", "count", "notes"),
+    [({}, 3160, 0), ({"cell": 30.0, "heading": 20.0}, None, 0), ({"cell": 10.0}, 9 * 3160, 1)],
+    ids=["default cell", "across the pixels", "finer than pixels"],
+)
+def test_cells_of_coarse_pixels_leave_no_hole(
+    coarse: tuple[Path, Path], flags: dict[str, float], count: int | None, notes: int
+) -> None:
+    """Cells of the size of pixels, turned, or finer cover the field once; a note tells of those that are finer."""
+    archive, folder = coarse
+    out, console = folder / f"out{len(flags)}{notes}", Console(record=True, quiet=False, file=io.StringIO(), width=200)
+    choice = choose_products(ProductFlags(polygons=True, simplify=0.0, prescription="class_1=2,class_2=1", **flags))
+    done = Products(archive, {}, run_export(archive, None, out, False, console, choice), out)
+    cells, field = geopandas.read_file(done.file("prescription")), geopandas.read_file(done.file("polygons"))
+    assert count is None or len(cells) == count
+    assert cells.dose.notna().all()
+    gap = shapely.union_all(field.geometry).difference(shapely.union_all(cells.geometry)).area
+    assert gap < 1e-4 * field.area.sum()
+    assert cells.area.sum() == pytest.approx(field.area.sum(), rel=1e-3)
+    with done.file("areas").open() as text:
+        hectares = sum(float(row["hectares"]) for row in csv.DictReader(text))
+    assert cells.hectares.sum() == pytest.approx(hectares, rel=1e-3)
+    assert console.export_text().count("finer than the map's pixels") == notes
+    task_data, numbers = isoxml_from_path(done.file("task_data"))
+    (grid,) = task_data.tasks[0].grids
+    treated = (to_numpy_array(numbers[grid.filename], grid) > 0).mean()
+    wanted = cells.area[cells.dose > 0].sum() / field.area.sum()
+    assert treated > 0.5 * wanted * hectares / (grid_hectares(grid))
+
+
+def grid_hectares(grid: Any) -> float:
+    """Hectares of all cells of a task's grid, on the ellipsoid."""
+    west, south = float(grid.minimum_east_position), float(grid.minimum_north_position)
+    east = west + grid.maximum_column * grid.cell_east_size
+    north = south + grid.maximum_row * grid.cell_north_size
+    around = shapely.segmentize(shapely.box(west, south, east, north), 1e-3)
+    return abs(pyproj.Geod(ellps="WGS84").geometry_area_perimeter(around)[0]) / 1e4
+
+
+def test_a_class_without_judged_pixels_is_estimated_from_probabilities(
+    one_picture: Products, tmp_path: Path, scene_files: Path, survey_png: Survey
+) -> None:
+    """All other classes keep their estimates from labels: of labels with a hole where the map shows that class."""
+    drawn = one_picture.store("class_map")["classes"].values
+    rarest = int(np.argmin(np.where(np.bincount(drawn.ravel()) > 0, np.bincount(drawn.ravel()), drawn.size)))
+    labels = np.where(drawn == rarest, 255, 0).astype(np.uint8)
+    Image.fromarray(labels).save(tmp_path / "labels.png")
+    (tmp_path / "scene.toml").write_text("unlabelled = 255\n[classes]\nclass_0 = 0\n")
+    scene = shutil.copy(scene_files / "scene.png", tmp_path)
+    with with_effects():
+        receipt = survey_png(tmp_path / "archive", scene=scene, labels=str(tmp_path / "labels.png")).receipt
+    assert np.sum(receipt["accuracy"]["confusion"], axis=0)[rarest] == 0
+    answer = run_export(tmp_path / "archive", None, tmp_path / "maps", False, QUIET)
+    with Products(tmp_path / "archive", receipt, answer, tmp_path / "maps").file("areas").open() as text:
+        table = list(csv.DictReader(text))
+    assert all(row["estimated_fraction"] and row["standard_error_fraction"] for row in table)
+    assert sum(float(row["estimated_fraction"]) for row in table) == pytest.approx(1, abs=1e-4)
+    sources = [row["estimated_from"] for row in table]
+    assert [place for place, source in enumerate(sources) if source == "probabilities"] == [rarest]
+    assert set(sources) == {"labels", "probabilities"}
 
 
 @pytest.fixture(scope="module")

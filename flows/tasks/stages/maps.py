@@ -34,7 +34,7 @@ from storage.arrays.class_maps import (
 )
 from storage.arrays.layout import NO_CLASS, blank_pixels
 
-CLASS_MAP = Product("segment", version=12, files=("class_map.zarr", "class_probabilities.zarr"), by_weights=True)
+CLASS_MAP = Product("segment", version=13, files=("class_map.zarr", "class_probabilities.zarr"), by_weights=True)
 OUT_OF_RANGE = "out_of_range.json"  # beside a map, where values were no readings
 LEFT_OUT = "left_out.npy"  # beside a map while it is drawn: the pixels of which none is
 MOST_TURN_PX = 12.0  # that a field's corners may lie off by, as it is turned, so that its memory is of use
@@ -146,11 +146,23 @@ def _prior_map_figures(
     lies: FieldShift,
     comparison: TemporalAgreement | None,
 ) -> dict[str, Any]:
-    """Return what became of a memory: agreement with today's look, and pixels that changed from class to class."""
-    changed = np.zeros((len(names),) * 2, np.int64) if comparison is None else comparison.changed
+    """Return what became of a memory: agreement with today's look, and pixels that changed from class to class.
+
+    Those changed that are more than two maps of the same ground differ by; all that differ are counted beside them.
+    """
     agreement = None if comparison is None or np.isnan(comparison.agreement) else comparison.agreement
     put_aside = "turned" if comparison is None else "another field" if comparison.is_of_another_field else None
-    pairs = [(int(changed[old, new]), names[old], names[new]) for old, new in np.argwhere(changed) if old != new]
+    compared, differing, expected, pairs = 0, 0, 0.0, list[tuple[int, int, str, str]]()
+    if comparison is not None:
+        compared = int(comparison.changed.sum())
+    if comparison is not None and put_aside is None:
+        beyond = comparison.beyond
+        differing = compared - int(np.trace(comparison.changed))
+        expected = float(comparison.expected.sum() - np.trace(comparison.expected))
+        pairs = [
+            (int(beyond[old, new]), int(comparison.changed[old, new]), names[old], names[new])
+            for old, new in np.argwhere(beyond)
+        ]
     return {
         "run": prior.run,
         "days": prior.days,
@@ -159,7 +171,9 @@ def _prior_map_figures(
         "put_aside": put_aside,
         "shift_px": list(whole_pixels(lies)),
         "turned_deg": lies.turned_deg,
-        "compared_px": int(changed.sum()),
-        "changed_px": 0 if put_aside else sum(count for count, _, _ in pairs),
-        "changes": [] if put_aside else [list(pair) for pair in sorted(pairs, key=lambda pair: -pair[0])],
+        "compared_px": compared,
+        "differing_px": differing,
+        "expected_differing_px": round(expected),
+        "changed_px": sum(beyond for beyond, _, _, _ in pairs),
+        "changes": [list(pair) for pair in sorted(pairs, reverse=True)],
     }

@@ -156,8 +156,14 @@ def test_receipt_and_page_have_the_hectares(visited: Visited) -> None:
     store = visited.store("ground_map" if posed else "class_probabilities")
     pixel_ha, slack = store.attrs["spatial:transform"][0] ** 2 / 1e4, 0.03 if posed else 1e-3  # footprints' borders
     changes, older = later["ground"]["changes_ha"], later["ground"]["older_ha"]
-    changed = (store["changed_from"].values != 255).sum() * pixel_ha
-    assert sum(area for area, _, _ in changes) == pytest.approx(changed, rel=slack)
+    names, drawn = store.attrs["class_names"], visited.store("ground_map" if posed else "class_map")["classes"].values
+    there = store["changed_from"].values.astype(int) * 1000 + drawn
+    wanted = {
+        (old, new): (there == 1000 * names.index(old) + names.index(new)).sum() * pixel_ha * beyond / differing
+        for beyond, differing, old, new in later["memory"]["changes"]
+    }  # beyond what two maps of the same ground differ by
+    assert wanted
+    assert {(old, new): area for area, old, new in changes} == pytest.approx(wanted, rel=slack)
     assert older["1"] == pytest.approx((store["age"].values > 1).sum() * pixel_ha, rel=slack)
     assert older["7"] == 0
     page = (visited.runs[1].folder / "report.html").read_text(encoding="utf-8")

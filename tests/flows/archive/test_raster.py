@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from rich.console import Console
 
+import models.reading.prior_map as prior_map
 from flows.archive.export_command import run_export
 from flows.archive.plan_command import plan_content, show_plan
 from flows.archive.product_choice import ProductFlags, choose_products
@@ -368,3 +369,21 @@ def test_an_image_and_its_wavelengths(surveyed: Raster, tmp_path: Path) -> None:
     image = whole(surveyed(tmp_path / "picture.png"), tmp_path / "archive")[0]
     np.testing.assert_array_equal(image, values)
     assert len(RGB_NM) == image.shape[2]
+
+
+def test_two_dates_of_the_same_ground_tell_no_change(
+    tmp_path: Path, surveyed: Raster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One field with the noise of two days: its maps differ at hundreds of pixels, as their confidences say."""
+    for name in ("CERTAIN", "SURE"):  # untrained weights are sure of nothing: what they say is taken for sure
+        monkeypatch.setattr(prior_map, name, 1e-6)
+    values = patchy_scene((96, 128), 3, seed=4)[0]
+    for seed, date in ((1, "2026-06-01T10:00:00Z"), (2, "2026-06-11T10:00:00Z")):
+        noise = np.random.default_rng(seed).normal(0, 25, values.shape)
+        scene = write_tif(tmp_path / "a.tif", np.clip(values + noise, 0, 255).astype(np.uint8))
+        published = surveyed(scene, name="north", visit=date, prior="latest")
+    memory, page = published.receipt["memory"], (published.folder / "report.html").read_text(encoding="utf-8")
+    assert 300 < memory["differing_px"] < 1.3 * memory["expected_differing_px"]
+    assert (memory["changed_px"], memory["changes"], published.receipt["ground"]["changes_ha"]) == (0, [], [])
+    assert "two maps of the same ground would differ at about" in page
+    assert "px changed" not in page

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -37,17 +38,14 @@ def test_hectares_are_older_than_days_and_not_as_old() -> None:
 
 
 def test_changed_hectares_are_told_from_class_to_class() -> None:
-    """Largest first; a pixel without a class today, as outside of zones, counts nothing."""
+    """Largest first, as far as two maps would not differ anyway; a pixel without a class today counts nothing."""
     now = np.array([[0, 0, 1, 1], [2, UNLABELLED, 2, 2]], np.uint8)
     old = np.array([[1, 255, 0, 0], [0, 0, 255, 255]], np.uint8)
     names = "soil", "crop", "unknown", *(f"class_{number}" for number in range(3, 16))  # a pair is 255, too
     legend = names, np.zeros((16, 3), np.uint8)
-    found = changed_hectares(PLACE, old, ClassMap(now, np.ones(now.shape, np.float32), *legend))
-    assert [(round(area, 6), *pair) for area, *pair in found] == [
-        (0.02, "soil", "crop"),
-        (0.01, "soil", "unknown"),
-        (0.01, "crop", "soil"),
-    ]
+    beyond = {("soil", "crop"): 1.0, ("soil", "unknown"): 0.5}
+    found = changed_hectares(PLACE, old, ClassMap(now, np.ones(now.shape, np.float32), *legend), beyond)
+    assert [(round(area, 6), *pair) for area, *pair in found] == [(0.02, "soil", "crop"), (0.005, "soil", "unknown")]
 
 
 def test_words_tell_what_changed_and_what_is_old() -> None:
@@ -86,6 +84,43 @@ def test_a_plain_scan_is_told_what_its_map_scores_by_itself(survey_png: Survey, 
     assert set(receipt["expected"]["per_class_iou"]) <= set(CLASSES)
     words = f"about {100 * told.miou:.1f}, with no label asked; error {100 * told.error:.1f}"
     assert words in dict(finding_rows(receipt))["expected score"]
+
+
+def test_a_score_that_may_be_any_is_not_predicted(survey_png: Survey, weights: Path, tmp_path: Path) -> None:
+    """Weights whose maps were off by 37 points: the receipt has no score, and says why."""
+    content = SCORES.as_dict() | {"error": [[0.371, 0.371]]}
+    path = _judged(weights, tmp_path, content)
+    receipt: Any = survey_png(tmp_path / "a", weights=str(path), effects="none", budget=None, scan_step="1").receipt
+    assert "miou" not in receipt["expected"]
+    words = dict(finding_rows(receipt))["expected score"]
+    assert re.fullmatch(
+        r"no score predicted: it would be off by 3[78]\.\d points \(one .*\); judge the map by labels", words
+    )
+
+
+@pytest.mark.parametrize(
+    ("spread", "unknown", "words"),
+    [
+        (0.038, 0.0, "every line, 25 ms, 9.0 s, about 92.7 ± 3.8"),
+        (0.371, 0.0, "every line, 25 ms, 9.0 s, no score predicted: scenes differ by 37.1 points"),
+        (0.038, 1.0, "every line, 25 ms, 9.0 s$"),
+    ],
+    ids=["known", "spread too wide", "all of it unknown"],
+)
+def test_scans_promise_what_their_record_can_say(spread: float, unknown: float, words: str) -> None:
+    """A score with its spread; none of scenes that differ too much, nor of a field that the weights do not know."""
+    scan = {"step": 1, "exposure_ms": 25.0, "seconds": 9.0, "expected_miou": 0.927, "expected_spread": spread}
+    found = {"scans": {"taken": scan}, "unknown": {"pixels": 1, "fraction": unknown, "rate": 0.01}}
+    assert re.search(words, dict(finding_rows(found))["uniform scans"])
+
+
+def test_words_of_a_memory_tell_change_beyond_what_maps_differ_by() -> None:
+    """Where about as many pixels differ as of two maps of the same ground none is said to have changed."""
+    memory = {"run": "r", "days": 3.0, "differing_px": 950, "expected_differing_px": 810, "changed_px": 0}
+    words = "r; 3.0 days earlier; 950 px differ from it; two maps of the same ground would differ at about 810"
+    assert dict(finding_rows({"memory": memory}))["prior map"] == words
+    changed = dict(finding_rows({"memory": memory | {"changed_px": 700}}))["prior map"]
+    assert changed == f"{words}; 700 px changed beyond that"
 
 
 @pytest.mark.parametrize(

@@ -284,3 +284,14 @@ def test_findings_are_rows_and_what_is_not_there_is_none():
         ("expected score", "about 80.0, with no label asked; error 2.0"),
         ("zones", "50 px are mapped; 5 ha"),
     ]
+
+
+def test_a_report_has_the_confusion_matrix() -> None:
+    """By hand: user's accuracy beside each mapped class, producer's below each label, kappa; none without counts."""
+    receipt = make_receipt()
+    assert "Confusion matrix" not in render_report(receipt, b"")
+    receipt["accuracy"] |= {"confusion": [[8, 2, 1], [1, 6, 1], [0, 0, 0]], "kappa": 0.4875}
+    page = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", render_report(receipt, b"")))
+    assert "mapped as soil bare weed user's accuracy" in page.replace("&#39;", "'")
+    for row in ("soil 8 1 88.9", "bare weed 2 6 75.0", "wheat 1 1 0.0", "producer's accuracy 72.7 75.0", "is 0.487"):
+        assert row in page.replace("&#39;", "'"), row

@@ -20,6 +20,7 @@ from models.reading.prior_map import (
     ClassProbabilities,
     CurrentVisit,
     PriorMap,
+    TemporalAgreement,
     carried,
     changed_fractions,
     changed_from,
@@ -269,6 +270,45 @@ def test_a_harvest_overnight_is_seen() -> None:
     np.testing.assert_array_equal(
         changed_fractions(changed_from(memory, after), 5)[:4], np.full((4, 4), 0.4, np.float32)
     )
+
+
+def two_maps(seed: int, truth: tuple[NDArray[np.int64], NDArray[np.int64]], noise: float) -> TemporalAgreement:
+    """Maps of two days' ground whose confidences are right: noise added to each class's own signal, and Bayes."""
+    rng, size = np.random.default_rng(seed), 3
+
+    def look(classes: NDArray[np.int64]) -> NDArray[np.float32]:
+        blocks = rng.normal(0, noise, (*(side // 4 for side in classes.shape), size)).repeat(4, 0).repeat(4, 1)
+        signal = (np.eye(size)[classes] + blocks) / noise**2  # errors come in blocks of 4 x 4 px
+        return np.asarray(signal - np.log(np.exp(signal).sum(axis=-1, keepdims=True)), np.float32)
+
+    before, now = (look(classes) for classes in truth)
+    nothing = np.zeros((2, *truth[0].shape), np.float32)
+    today = CurrentVisit(now, np.ones(truth[0].shape, np.bool_), np.zeros((1, 1, 1), np.float32), 1.0, 1)
+    memory = PriorMap(ClassProbabilities(before, *nothing), None, 1.0)
+    return compare(memory, today, ClassProbabilities(now, *nothing), np.s_[:, :])
+
+
+@pytest.mark.parametrize("noise", [0.3, 0.45, 0.6])
+@pytest.mark.parametrize("seed", range(6))
+def test_two_maps_of_the_same_ground_tell_no_change(seed: int, noise: float) -> None:
+    """Though up to one pixel in ten differs; the number that differ is the one expected of the confidences."""
+    ground = np.random.default_rng(seed).integers(0, 3, (8, 8)).repeat(32, 0).repeat(32, 1)
+    found = two_maps(seed, (ground, ground), noise)
+    differing = found.changed.sum() - np.trace(found.changed)
+    assert differing > 0
+    assert differing == pytest.approx(found.expected.sum() - np.trace(found.expected), rel=0.3, abs=100)
+    assert found.expected.sum() == pytest.approx(found.changed.sum(), rel=1e-3)
+    assert not found.beyond.any()
+
+
+def test_change_is_told_beyond_what_maps_differ_by() -> None:
+    """A felled quarter: from forest to grass, most pixels that both maps are sure of, and no other pair."""
+    ground = np.random.default_rng(1).integers(1, 3, (8, 8)).repeat(32, 0).repeat(32, 1)
+    ground[:128, :128] = 0
+    felled = np.where(ground == 0, 1, ground)
+    found = two_maps(2, (ground, felled), 0.45)
+    assert 0.8 * found.changed[0, 1] < found.beyond[0, 1] <= found.changed[0, 1]
+    assert found.beyond.sum() == found.beyond[0, 1]
 
 
 def test_a_field_under_snow_is_no_field_that_is_remembered() -> None:
