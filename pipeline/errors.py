@@ -77,6 +77,18 @@ class WavelengthError(SceneError):
     """Wavelengths do not fit the bands, the unit or the range."""
 
 
+class EmptySceneError(SceneError):
+    """A scene has no value anywhere."""
+
+
+class SeriesError(SceneError):
+    """A file holds several steps of time, and none is named."""
+
+    def __init__(self, message: str, steps: int) -> None:
+        super().__init__(message)
+        self.steps = steps
+
+
 class ShapeError(PipelineError, ValueError):
     """Arrays whose shapes do not fit each other."""
 

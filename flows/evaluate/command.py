@@ -22,13 +22,12 @@ from flows.evaluate.frames import (
     checked_request,
     open_candidates,
     open_frames,
-    scene_of,
     sort_frames,
 )
 from flows.evaluate.judge import Record, Trial, judge_frame, seeds_of, summarise
 from flows.terminal.processes import writing
 from flows.terminal.progress import StageProgress, on_stdout
-from flows.training.data import TrainingData, alike_notes, regridded_notes
+from flows.training.data import TrainingData, alike_notes, scene_notes
 from models.evaluation.metrics import LEVEL
 from models.network.machine import PROCESSOR, choose_device, keep_freed_memory
 from models.weights.files import Weights, load_weights
@@ -96,7 +95,7 @@ def evaluate_weights(request: EvaluateRequest, show: Show = lambda what, done, w
         "settings": {**asked, "camera": asdict(candidates[0].camera), "cost_model": asdict(COST)},
         "seeds": [[candidates[number].path.name for number in one] for one in seeds_of(runs)],
         **summarise(runs, candidates[0].described.class_names, trial, request.draws),
-        "data_notes": [*data.notes, *alike_notes(jobs.alike), *regridded_notes(jobs.regridded)],
+        "data_notes": [*data.notes, *alike_notes(jobs.alike), *scene_notes(jobs.empty, jobs.regridded)],
         "files": [],
     }
     if request.out is not None:
@@ -120,7 +119,7 @@ def _judged(
     kept = KeptResults(None if request.out is None else request.out / "frames")
     runs: list[list[Record]] = [[] for _ in candidates]
     for number, (name, fit) in enumerate(frames.items()):
-        scene = scene_of(data, name)
+        scene = data.scene(name)
         for at, index in enumerate(fit):
             one = candidates[index]
             show("judging frames", (number + at / len(fit)) / len(frames), f"{name}, {one.path.name}")

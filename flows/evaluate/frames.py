@@ -25,7 +25,7 @@ from models.policies.policies import POLICIES
 from models.reading.inference import CoarsePrediction, coarse_prediction_of_columns
 from models.training.examples import normalised
 from models.weights.files import Description, Weights, describe_weights
-from pipeline.errors import PipelineError, SceneError, SettingsError, WeightsError
+from pipeline.errors import EmptySceneError, PipelineError, SceneError, SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.geometry.scan import CostModel
@@ -207,15 +207,11 @@ class Jobs:
     frames: dict[str, tuple[int, ...]] = field(default_factory=dict)
     left_out: list[str] = field(default_factory=list)
     alike: dict[str, str] = field(default_factory=dict)  # frame -> class, where all its labels are one
+    empty: list[str] = field(default_factory=list)  # frames left out, which have no value anywhere
     regridded: list[str] = field(default_factory=list)  # frames whose labels came on another grid
 
     def covered(self, number: int) -> list[str]:
         return [name for name, fit in self.frames.items() if number in fit]
-
-
-def scene_of(data: TrainingData, name: str) -> RasterScene:
-    """Make one scene of the data."""
-    return next(data.scenes((name,)))
 
 
 def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[Candidate], show: Show) -> Jobs:
@@ -229,7 +225,11 @@ def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[
     in_turn = len({one.held_out for one in weights}) > 1
     for number, name in enumerate(data.train):
         show("looking for frames", number / len(data.train), name)
-        scene = scene_of(data, name)
+        try:
+            scene = data.scene(name)
+        except EmptySceneError:
+            jobs.empty.append(name)
+            continue
         if scene.labels is None:
             raise SceneError(
                 f"frame {scene.name} has no labels, and a map is judged by labels: give --labels or a scene.toml"

@@ -32,6 +32,7 @@ from flows.settings.values import (
     Size,
     Tolerance,
     Unknown,
+    VisitName,
     Wavelengths,
     parse_tolerance,
 )
@@ -144,9 +145,10 @@ class Settings:
     """
 
     name: Name | None = stated(None, "What the field is called; as its scene by default", example="north")
-    visit: str | None = stated(
+    visit: VisitName | None = stated(
         None,
-        "Which look at the field, in any words: another one is captured anew, the same one gone on with",
+        "Which look at the field, by its date (2026-06-01) or in any words: another one is captured anew, the same one"
+        " gone on with",
         example="first of June",
     )
     prior: str = stated(

@@ -68,6 +68,24 @@ def parse_name(value: object) -> str:
     return name
 
 
+_DATE = re.compile(r"\d{1,4}([./-])\d{1,2}\1\d{1,4}")
+
+
+def parse_visit(value: object) -> str:
+    """Words, or a date or moment as 2026-06-01; raises ValueError for a date in another form."""
+    text = parse_text(value)
+    first = text.split()[0]
+    if _DATE.fullmatch(first):
+        try:
+            datetime.fromisoformat(first)
+        except ValueError:
+            raise ValueError(
+                f"must be words, or a date as year-month-day (2026-06-01), by which days between visits are counted; "
+                f"got {value!r}"
+            ) from None
+    return text
+
+
 def parse_budget(value: object) -> float:
     """A fraction of the full scan's seconds above 0 and at most 1; raises BudgetError."""
     number = _to_float(value)
@@ -364,6 +382,7 @@ def parse_expected_error(value: object) -> float:
 
 
 Name = Annotated[str, PlainValidator(parse_name)]
+VisitName = Annotated[str, PlainValidator(parse_visit)]
 SceneName = Annotated[str, PlainValidator(parse_scene)]
 Budget = Annotated[float, PlainValidator(parse_budget)]
 Unknown = Annotated[str, PlainValidator(parse_unknown)]

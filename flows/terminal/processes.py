@@ -76,8 +76,10 @@ def writing(out: Path, flag: str = "--out") -> Iterator[None]:
     """Turn a place that cannot be written to into an error that says so (ArchiveError)."""
     try:
         yield
+    except ArchiveError:  # which says so already
+        raise
     except OSError as error:
-        raise ArchiveError(f"cannot write to {out}: {error.strerror}; choose another {flag}") from error
+        raise ArchiveError(f"cannot write to {out}: {error.strerror or error}; choose another {flag}") from error
 
 
 NO_HOME = "/nonexistent"  # as Debian calls the home of users that have none

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import base64
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.terminal.figures import counted
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED
@@ -41,13 +42,12 @@ class TrainingData:
     files: DataSet | None = None
     notes: tuple[str, ...] = ()  # what was left out, for people
 
-    def scenes(self, names: tuple[str, ...]) -> Iterator[RasterScene]:
-        for name in names:
-            if self.files is None:
-                seed, day, hour = read_farm_name(name)
-                yield farm_scene(seed, FARM_SHAPE, camera=self.camera, day=day, hour=hour)
-            else:
-                yield scene_of_file(self.files.load(name, "train"), self.camera)
+    def scene(self, name: str) -> RasterScene:
+        """Make one scene. Raises SceneError: its file; EmptySceneError: it has no value anywhere."""
+        if self.files is None:
+            seed, day, hour = read_farm_name(name)
+            return farm_scene(seed, FARM_SHAPE, camera=self.camera, day=day, hour=hour)
+        return scene_of_file(self.files.load(name, "train"), self.camera)
 
 
 def scene_of_file(file: SceneFile, camera: LineCamera) -> RasterScene:
@@ -177,21 +177,25 @@ def alike_notes(alone: Mapping[str, str]) -> tuple[str, ...]:
     for name, kind in alone.items():
         by_class.setdefault(kind, []).append(name)
     return tuple(
-        f"all labels are {kind} in {', '.join(names[:5])}{f' and {len(names) - 5} more' if len(names) > 5 else ''}; if"
-        f" its value in the label files stands for no class, write unlabelled = VALUE into the scene.toml"
+        f"all labels are {kind} in {listed_scenes(names)}; if its value in the label files stands for no class, write"
+        " unlabelled = VALUE into the scene.toml"
         for kind, names in by_class.items()
     )
 
 
-def regridded_notes(names: Sequence[str]) -> tuple[str, ...]:
-    """Name scenes whose labels came on another grid than theirs."""
-    if not names:
-        return ()
-    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-    return (
-        f"labels of {', '.join(names[:5])}{more} have another place, CRS or pixels than their images: they are brought"
-        " to the images' pixels by nearest neighbour",
+def listed_scenes(names: Sequence[str]) -> str:
+    """Name the first of some scenes, and how many more there are."""
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+
+
+def scene_notes(empty: Sequence[str], regridded: Sequence[str]) -> tuple[str, ...]:
+    """Name scenes that are left out, having no value anywhere, and those whose labels came on another grid."""
+    left_out = f"{counted(len(empty), 'scene')} without any value left out: {listed_scenes(empty)}"
+    moved = (
+        f"labels of {listed_scenes(regridded)} have another place, CRS or pixels than their images: they are brought to"
+        " the images' pixels by nearest neighbour"
     )
+    return (*([left_out] if empty else []), *([moved] if regridded else []))
 
 
 def trained_pixels(scene: RasterScene) -> NDArray[np.bool_]:

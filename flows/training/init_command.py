@@ -188,8 +188,9 @@ def _next(source: str, draft: SceneDraft) -> str:
     place, _ = split_variable(source)
     name = re.sub(r"[^\w.-]+", "-", place.resolve().stem).strip("-") or "mine"
     if len(draft.classes) > 1:
-        return shlex.join(["spectralzoom", "train", source, "-o", f"{name}.safetensors"])
-    scene = source if not place.is_dir() else str(draft.files.images[0])
+        scenes = draft.first if draft.has_steps else source
+        return shlex.join(["spectralzoom", "train", scenes, "-o", f"{name}.safetensors"])
+    scene = draft.first if draft.has_steps or place.is_dir() else source
     return shlex.join(["spectralzoom", "survey", "--scene", scene, "--weights", "WEIGHTS.safetensors"])
 
 

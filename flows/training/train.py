@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from flows.terminal.progress import one_after_the_other
-from flows.training.data import Report, TrainingData, alike_notes, either_mask, open_training_data, regridded_notes
+from flows.training.data import Report, TrainingData, alike_notes, either_mask, open_training_data
 from flows.training.figures import judge_scans, validate
 from flows.training.fit_ood import SeenScenes, measure_and_add, measured_calibration, trained_on
 from flows.training.train_scenes import About, TrainRequest, as_read, network_config, observe_all
@@ -70,7 +70,7 @@ def train_weights(
     split = joined_split(own | {"pixels": dict(about.pixels)}, start)
     weights, summary = _learned(request, lesson, checkpoint, report)
     kept, _ = observe_all(request, data, data.validation, "looking at validation scenes", report, about)
-    for note in regridded_notes([name for name in about.regridded if name in data.validation]):
+    for note in about.notes(data.validation):
         tell(note)
     frames = as_read(kept, lesson.normalisation)
     whole = SeenScenes(lesson.examples, frames, about.wavelength_nm, request.settings.darkest_ms, request.settings.seed)
@@ -115,7 +115,7 @@ def _lesson(
     notes = alike_notes(about.alike)
     if len(about.alike) == len(about.keys) and len(notes) == 1:
         raise SceneError(f"{request.dataset}: training needs two or more classes, and {notes[0]}")
-    for note in (*notes, *regridded_notes(about.regridded)):
+    for note in (*notes, *about.notes(data.train)):
         tell(note)
     darkest_ms = request.settings.darkest_ms
     normalisation = measured_normalisation(seen, math.sqrt(darkest_ms * REFERENCE_MS))
@@ -192,8 +192,8 @@ def refuse_seen(start: StartFile | None, data: TrainingData) -> None:
     seen = set(earlier.get("train", {}).values())  # with a mask too: validation counts every labelled pixel
     if start is None or not seen:
         return
-    for name, scene in zip(data.validation, data.scenes(data.validation), strict=True):
-        if scene.key in seen:
+    for name in data.validation:
+        if data.scene(name).key in seen:
             raise SettingsError(
                 f"--init {start.path} was trained on the scene {name}, which is kept for validation here: figures on it"
                 " would say nothing; pass --validation 0 and judge on others with evaluate"
@@ -272,9 +272,12 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
         console.print(record["familiar"], markup=False, soft_wrap=True)
     figures = record["validation"]
     if figures is None:
+        left = request.dataset in FARM_NAMES or request.hold_out or request.choices.get("train_mask") is not None
+        on = request.dataset if left else "OTHER_SCENES"
         console.print(
             "no scene was kept for validation; to judge the weights on scenes that they were not trained on: "
-            f"spectralzoom evaluate {request.dataset} --weights {out}",
+            f"spectralzoom evaluate {on} --weights {out}"
+            + ("" if left or len(record["split"]["train"]) < 2 else "; or train with some held out: --hold-out NAMES"),
             soft_wrap=True,
         )
         if request.settings.darkest_ms < REFERENCE_MS:

@@ -10,14 +10,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.training.data import Report, TrainingData, alike_notes, only_class, pack_mask, trained_pixels
+from flows.training.data import (
+    Report,
+    TrainingData,
+    alike_notes,
+    listed_scenes,
+    only_class,
+    pack_mask,
+    scene_notes,
+    trained_pixels,
+)
 from flows.training.observed_scenes import observe_scene
 from models.network.machine import PROCESSOR
 from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
 from models.training.examples import Example, normalised
 from models.training.train import TrainingSettings
-from pipeline.errors import SceneError, SettingsError
+from pipeline.errors import EmptySceneError, SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
@@ -58,7 +67,13 @@ class About:
     keys: dict[str, str] = field(default_factory=dict)  # scene -> identity of its light
     pixels: dict[str, str] = field(default_factory=dict)  # identity -> trained pixels, where not all labelled ones
     alike: dict[str, str] = field(default_factory=dict)  # scene -> class, where all its labels are one
+    empty: list[str] = field(default_factory=list)  # scenes left out, which have no value anywhere
     regridded: list[str] = field(default_factory=list)  # scenes whose labels came on another grid
+
+    def notes(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Say which of some scenes are left out, and whose labels came on another grid."""
+        empty, regridded = ([one for one in of if one in names] for of in (self.empty, self.regridded))
+        return scene_notes(empty, regridded)
 
 
 def observe_all(
@@ -70,9 +85,14 @@ def observe_all(
     about: About | None = None,
 ) -> tuple[list[Example], About]:
     """Look at named scenes of the data, and say what they have in common with each other, and with earlier ones."""
-    seen = []
-    for number, (name, scene) in enumerate(zip(names, data.scenes(names), strict=True)):
+    seen, empty = [], list[str]()
+    for number, name in enumerate(names):
         report(what, number / len(names), name)
+        try:
+            scene = data.scene(name)
+        except EmptySceneError:
+            empty.append(name)
+            continue
         known = about or _common(request, scene)
         if scene.class_names != known.names:
             raise SceneError(f"scene {scene.name} has classes {scene.class_names}, the scenes before it {known.names}")
@@ -93,7 +113,9 @@ def observe_all(
         rng = np.random.default_rng([request.settings.seed, 0x0B5, number])
         seen.append(observe_scene(scene, request.camera, grid, known.basis, rng))
     if about is None:
-        raise SceneError(f"{request.dataset} has no scene to train on")
+        why = f": no value anywhere in {listed_scenes(empty)}" if empty else ""
+        raise SceneError(f"{request.dataset} has no scene to train on{why}")
+    about.empty += empty
     return seen, about
 
 

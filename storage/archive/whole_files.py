@@ -9,10 +9,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from pipeline.errors import ArchiveError, visible
+from pipeline.errors import ArchiveError, PipelineError, visible
 from storage.archive.staging import PART_SUFFIX, refusals, remove_tree, sync_path
 
 _PREFIX = ".export-"
+PROBE_BYTES = 1 << 20  # a disk without room for so much is full
 
 
 @contextmanager
@@ -26,7 +27,8 @@ def written_aside(folder: Path, names: Sequence[str]) -> Iterator[Path]:
     with refusals(folder, "export to"):
         make_folder(folder)
         with tempfile.TemporaryDirectory(prefix=_PREFIX, suffix=PART_SUFFIX, dir=folder) as aside:
-            yield Path(aside)
+            with _told_by_the_disk(Path(aside)):
+                yield Path(aside)
             for name in names:
                 sync_path(Path(aside) / name)
             for name in names[1:]:
@@ -34,6 +36,20 @@ def written_aside(folder: Path, names: Sequence[str]) -> Iterator[Path]:
             for name in names:
                 (Path(aside) / name).replace(folder / name)
             sync_path(folder)
+
+
+@contextmanager
+def _told_by_the_disk(folder: Path) -> Iterator[None]:
+    """Raise the disk's refusal (OSError) where an error comes of it: GDAL's and others hide the system's number."""
+    try:
+        yield
+    except PipelineError:
+        raise
+    except Exception as error:
+        if not isinstance(error, OSError) or error.errno is None:
+            with tempfile.TemporaryFile(dir=folder) as file:
+                file.write(bytes(PROBE_BYTES))
+        raise
 
 
 def make_folder(folder: Path) -> None:

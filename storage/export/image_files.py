@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -83,22 +84,20 @@ def write_cog(path: Path, image: CogImage, blocks: Blocks) -> None:
     rasterio = importlib.import_module("rasterio")
     copy = importlib.import_module("rasterio.shutil").copy
     sidecar = f"{path.name}.aux.xml"
-    with written_aside(path.parent, [path.name] if image.legend is None else [path.name, sidecar]) as aside:
+    files = [path.name] if image.legend is None else [path.name, sidecar]
+    with _refusals_of_gdal(path), written_aside(path.parent, files) as aside:
         plain, made = aside / "plain.tif", aside / path.name
-        try:
-            _write_plain(rasterio, plain, image, blocks)
-            options = {
-                "COMPRESS": "DEFLATE",  # every reader has it; not every build of GDAL has zstd
-                "PREDICTOR": "NO" if image.legend is not None else "YES",  # neighbouring class numbers have no slope
-                "OVERVIEW_RESAMPLING": "AVERAGE" if image.legend is None else "MODE",
-                "BLOCKSIZE": str(TILE),
-                "NUM_THREADS": "1",
-            }
-            copy(str(plain), str(made), driver="COG", **options)
-            with rasterio.open(plain) as wanted, rasterio.open(made) as found:
-                same = all(wanted.checksum(band) == found.checksum(band) for band in wanted.indexes)
-        except rasterio.errors.RasterioError as error:
-            raise ArchiveError(f"{path} cannot be written: {error}; is there space on the disk?") from error
+        _write_plain(rasterio, plain, image, blocks)
+        options = {
+            "COMPRESS": "DEFLATE",  # every reader has it; not every build of GDAL has zstd
+            "PREDICTOR": "NO" if image.legend is not None else "YES",  # neighbouring class numbers have no slope
+            "OVERVIEW_RESAMPLING": "AVERAGE" if image.legend is None else "MODE",
+            "BLOCKSIZE": str(TILE),
+            "NUM_THREADS": "1",
+        }
+        copy(str(plain), str(made), driver="COG", **options)
+        with rasterio.open(plain) as wanted, rasterio.open(made) as found:
+            same = all(wanted.checksum(band) == found.checksum(band) for band in wanted.indexes)
         if not same:
             raise ArchiveError(f"{path} does not read back as written; is the disk full? Run again")
         if image.legend is not None:
@@ -107,6 +106,15 @@ def write_cog(path: Path, image: CogImage, blocks: Blocks) -> None:
             for name in image.legend.names:
                 ElementTree.SubElement(names, "Category").text = name
             ElementTree.ElementTree(root).write(aside / sidecar, encoding="utf-8")
+
+
+@contextmanager
+def _refusals_of_gdal(path: Path) -> Iterator[None]:
+    """Turn an error of rasterio's into one that names the file (ArchiveError)."""
+    try:
+        yield
+    except importlib.import_module("rasterio").errors.RasterioError as error:
+        raise ArchiveError(f"{path} cannot be written: {error}; is there space on the disk?") from error
 
 
 def _write_plain(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> None:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import SceneError
+from pipeline.errors import SceneError, SeriesError
 from pipeline.rig.camera.camera_texts import MICROMETRES, NANOMETRES, UNSAID
 from storage.arrays.georeference import find_geobox
 from storage.readers.cube_sources import Bands, CubeSource, unpacked
@@ -244,9 +244,10 @@ def _moment(array: Any, step: int | None, address: str, *, unnamed: bool) -> tup
         return None
     steps = array.shape[axis]
     if step is None and steps > 1:
-        raise SceneError(
+        raise SeriesError(
             f"{address} has the shape {array.shape} and {steps} steps of time; name one, {address}:0 to "
-            f"{address}:{steps - 1}"
+            f"{address}:{steps - 1}",
+            steps,
         )
     if step is not None and step >= steps:
         raise SceneError(f"{address} has {steps} steps of time, counted from 0; got :{step}")

@@ -19,7 +19,9 @@ from storage.readers.open_cubes import CUBE_ENDINGS
 from storage.readers.polygons import POLYGON_ENDINGS, split_layer
 from storage.readers.scene_toml import SETTINGS_NAME, SceneSettings, is_image_folder
 
-LABEL_WORDS = ("mask", "masks", "label", "labels", "annotation", "annotations", "gt", "groundtruth", "truth", "seg")
+_OF_LAND = ("lulc", "landcover", "land_cover")
+_OF_TRUTH = ("gt", "groundtruth", "truth", "seg")
+LABEL_WORDS = ("mask", "masks", "label", "labels", "annotation", "annotations", *_OF_TRUTH, *_OF_LAND)
 LABEL_FOLDERS = {*LABEL_WORDS, "ground_truth", "segmentation", "segmentations", "targets", "labelimages"}
 IMAGE_WORDS = ("image", "img", "rgb", "picture", "photo", "scene", "ortho", "cube")
 SHOWN = 5  # names in a message

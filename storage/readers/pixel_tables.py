@@ -48,7 +48,7 @@ def _reshaping(shape: tuple[int, ...]) -> str:
 
 
 @dataclass(frozen=True)
-class PixelTable:
+class SpectraTable:
     """A table of pixels and their bands, and the picture that it is of as the file says."""
 
     names: tuple[str, str]  # of the variables that say rows and columns
@@ -94,7 +94,7 @@ def _roughness(cube: NDArray[Any]) -> float:
     return float(np.mean(steps) / spread) if steps and spread > 0 else 0.0
 
 
-def find_tables(arrays: Mapping[str, FileArray]) -> dict[str, PixelTable]:
+def find_tables(arrays: Mapping[str, FileArray]) -> dict[str, SpectraTable]:
     """Find the tables of pixels in a file that says rows and columns of its picture, by their names."""
     single = {name: one for name, one in arrays.items() if math.prod(one.shape) == 1 and one.dtype.kind in "uif"}
     known = {re.sub("[^a-z]", "", name.lower()): name for name in reversed(single)}
@@ -106,5 +106,5 @@ def find_tables(arrays: Mapping[str, FileArray]) -> dict[str, PixelTable]:
     for name, one in arrays.items():
         axes = [axis for axis, size in enumerate(one.shape) if size == rows * columns]
         if one.ndim in (1, 2) and len(axes) == 1 and name not in single and one.dtype.kind in "buif":
-            found[name] = PixelTable(names, int(rows), int(columns), axes[0])
+            found[name] = SpectraTable(names, int(rows), int(columns), axes[0])
     return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import PipelineError, SceneError
+from pipeline.errors import PipelineError, SceneError, SeriesError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.readings import edge_fill
 from storage.readers.cube_sources import CubeSource
 from storage.readers.label_files import (
+    LABEL_WORDS,
     MatchedFiles,
     filled,
     find_label,
@@ -29,7 +31,7 @@ from storage.readers.label_files import (
     scene_number,
 )
 from storage.readers.labels import found_codes, load_codes
-from storage.readers.open_cubes import open_cube, split_variable, with_wavelengths
+from storage.readers.open_cubes import open_cube, open_labels, split_variable, with_wavelengths
 from storage.readers.polygons import is_polygon_file, load_polygon_labels, polygon_classes
 from storage.readers.scene_toml import ClassValue, SceneSettings
 
@@ -52,6 +54,7 @@ class SceneDraft:
 
     folder: Path  # of scene.toml
     files: MatchedFiles
+    first: str  # address of the scene that was looked at
     shape: tuple[int, int, int]  # of the first image, (y, x, band)
     pattern: str | None  # of all label files by their images' names, relative to ``folder``
     wavelength_nm: NDArray[np.float64] | None  # (band,)
@@ -63,6 +66,7 @@ class SceneDraft:
     classes: tuple[FoundClass, ...] = ()
     notes: tuple[str, ...] = ()  # what readers made of the first image
     unseen: tuple[str, ...] = field(default=())  # what could not be read or does not fit, one sentence each
+    has_steps: bool = False  # the first is one step of a series
 
 
 def draft_scene(address: str | Path, report: Report = lambda done, name: None) -> SceneDraft:
@@ -85,9 +89,9 @@ def draft_scene(address: str | Path, report: Report = lambda done, name: None) -
         within = folders_within(path)
         raise SceneError(f"{path} holds no image that is read; give a folder of images, or with images/ in it{within}")
     folder = path.parent if alone else path
-    first = address if alone else found.images[0]
+    first, series = _named_step(address if alone else found.images[0])
     source = with_wavelengths(open_cube(first), first, None)
-    unseen: list[str] = []
+    found, unseen = _shared_labels(found, source.shape[:2]), list[str]()
     # files that may hold outlines in words that no reader here knows
     outlines = [one for image in found.bare for one in map(image.with_suffix, (".json", ".xml")) if one.is_file()]
     if outlines:
@@ -110,9 +114,31 @@ def draft_scene(address: str | Path, report: Report = lambda done, name: None) -
         edge=edge,
         missing=missing,
         classes=classes,
-        notes=source.notes,
+        notes=(*series, *source.notes),
+        first=str(first),
+        has_steps=bool(series),
         unseen=tuple(unseen),
     )
+
+
+def _named_step(address: str | Path) -> tuple[str | Path, tuple[str, ...]]:
+    """Return the address of a scene, of a series that of its first step; and a note of the others."""
+    try:
+        open_cube(address)
+    except SeriesError as error:
+        last = f"{address}:{error.steps - 1}"
+        return f"{address}:0", (f"{address} has {error.steps} steps of time; each is a scene, {address}:0 to {last}",)
+    return address, ()
+
+
+def _shared_labels(found: MatchedFiles, shape: tuple[int, ...]) -> MatchedFiles:
+    """Give all images the only label file, where it is called by a word for labels alone and has their size."""
+    if found.labels or len(found.alone) != 1 or found.alone[0].stem.lower() not in LABEL_WORDS:
+        return found
+    with suppress(PipelineError):
+        if open_labels(found.alone[0]).shape[:2] == shape:
+            return MatchedFiles(found.images, dict.fromkeys(found.images, found.alone[0]), ())
+    return found
 
 
 def _pattern(found: MatchedFiles, folder: Path) -> str | None:
@@ -122,7 +148,7 @@ def _pattern(found: MatchedFiles, folder: Path) -> str | None:
         number = scene_number(image)
         tried = [label.name.replace(image.stem, "{name}", 1)] if image.stem in label.name else []
         tried += [label.name.replace(number, "{number}", 1)] if number and number in label.name else []
-        tried += [label.name] if len(found.images) == 1 else []
+        tried += [label.name] if len(found.images) == 1 or len(set(found.labels.values())) == 1 else []
         for name in tried:
             pattern = Path(place, name).as_posix()
             places = {one: (folder / filled(pattern, one)).resolve() for one in found.images}
@@ -141,7 +167,7 @@ def _classes(
     for number, (image, label) in enumerate(found.labels.items()):
         report(number / len(found.labels), label.name)
         try:
-            source = open_cube(image)
+            source = open_cube(_named_step(image)[0])
             size, read = source.shape, load_codes(label, source.geobox, by_number=False)
             codes, is_colour = read.values, read.of_colours
         except PipelineError as error:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import SceneError
+from pipeline.errors import EmptySceneError, SceneError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.readings import MOST_STEPS, MOST_VALUE, Beyond, beyond_range, find_beyond
 from pipeline.simulator.scenes.scene import BRIGHT_PERCENTILE
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from odc.geo.geobox import GeoBox
 
 ReadRows = Callable[[int, int], NDArray[np.float32]]
+USUAL_NODATA = -9999.0  # what programs write for no data, and no sensor reads
 _SAMPLED = 1 << 20  # values, evenly spread, by which the range of a scene is told
 
 
@@ -146,6 +147,8 @@ def _open(
     _refuse_bands_first(file, source.shape, wavelengths or settings.wavelengths_nm)
     light = settle_wavelengths(file, chosen, count, stated=wavelengths, settings=settings, known=source.bands)
     nodata = settings.nodata if settings.nodata is not None or calibrated else source.nodata
+    assumed = nodata is None and not calibrated and source.dtype.kind in "if"
+    nodata = USUAL_NODATA if assumed else nodata
     void = source.void
     gap_notes: tuple[str, ...] = ()
     if void is not None:
@@ -181,12 +184,13 @@ def _open(
         taken = counted.take(scene_lines(source, first, last), gaps(first, last))
         if values is not None:
             values[first:last] = scaled(taken)
-    missing_notes = counted.notes()
+    missing_notes = counted.notes(assumed=assumed)
     found, label_note, by_name = _labels_of(
         file, source.shape[:2], source.geobox, labels, settings, classes, labels_needed
     )
     assert light.wavelength_nm is not None
-    light_hash = _light_hash(file, variable, source, chosen, light, settings.nodata, void, scaling)
+    stated = nodata if assumed and counted.void else settings.nodata
+    light_hash = _light_hash(file, variable, source, chosen, light, stated, void, scaling)
     some = () if chosen == list(range(count)) else (f"bands {bands_text(chosen)} of {count}, counted from 0",)
     over = ("values are over the white reference",) if calibrated else ()
     scene = SceneFile(
@@ -367,11 +371,12 @@ class ValueCount:
 
     def __init__(self, path: Path, chosen: Sequence[int], nodata: float | None, shape: tuple[int, int]) -> None:
         self.missing = np.zeros(shape, np.bool_)  # (y, x) pixels without a value in more than half of their bands
+        self.void = 0  # samples that have the no-data value
         self.filled_px = 0  # pixels without a value in a band
         self._path, self._chosen, self._nodata = path, list(chosen), nodata
         self._every = max(1, shape[0] * shape[1] * len(chosen) // _SAMPLED)
         self._seen = np.zeros(len(chosen), np.bool_)  # bands with a value somewhere
-        self._void = self._infinite = self._absent = self._size = self._row = self._beyond = 0
+        self._infinite = self._absent = self._size = self._row = self._beyond = 0
         self._first_beyond: Beyond | None = None
         self._first_infinite = ""
         self._lit: list[NDArray[np.float32]] = []
@@ -381,7 +386,7 @@ class ValueCount:
         picked, values, empty = _converted(rows, self._chosen, self._nodata, void)
         if (out_of_range := beyond_range(picked)) is not None and empty is not None:
             picked = np.where(empty, picked.dtype.type(0), picked)
-        self._void += 0 if empty is None else int(np.count_nonzero(empty))
+        self.void += 0 if empty is None else int(np.count_nonzero(empty))
         if out_of_range is not None:
             self._note_out_of_range(picked, values)
         values[np.isinf(values)] = np.nan
@@ -410,8 +415,8 @@ class ValueCount:
                 y, x, band = found.place
                 self._first_beyond = Beyond(found.count, (self._row + y, x, band), found.value)
 
-    def notes(self) -> tuple[str, ...]:
-        """Return a sentence for each thing that is missing, once all rows were taken.
+    def notes(self, *, assumed: bool = False) -> tuple[str, ...]:
+        """Return a sentence for each thing that is missing, once all rows were taken; the no-data value is ``assumed``.
 
         Raises SceneError: a value is no reading, a band has no value anywhere, or no value is finite.
         """
@@ -423,12 +428,17 @@ class ValueCount:
                 f"it stands for no data, write nodata = {found.value!s} into a {SETTINGS_NAME} beside the file, else "
                 "leave the band out with --bands, or give the values in a larger unit"
             )
-        if self._nodata is not None:
-            notes.append(f"{self._void} samples have the file's no-data value {self._nodata:g}")
+        if self._nodata is not None and not assumed:
+            notes.append(f"{self.void} samples have the file's no-data value {self._nodata:g}")
+        elif self.void:
+            notes.append(
+                f"{self.void} samples are {self._nodata:g}, which is taken for no data though nothing says so; where it"
+                f" is a reading, state another number as nodata in a {SETTINGS_NAME}"
+            )
         if self._infinite:
             notes.append(f"{self._infinite} infinite samples count as missing, the first at {self._first_infinite}")
         if self._absent == self._size:
-            raise SceneError(f"{path} holds no finite number in the bands used; choose others")
+            raise EmptySceneError(f"{path} holds no finite number in the bands used; choose others")
         empty = [band for band, seen in zip(self._chosen, self._seen, strict=True) if not seen]
         if empty:
             rest = bands_text([band for band in self._chosen if band not in set(empty)])

@@ -50,7 +50,7 @@ def write_weights(path: Path, seed: int = 0, factor: int = 2, **record: Any) -> 
 def scene_at(data: Path, name: str = "001") -> RasterScene:
     """One frame of the field."""
     opened = open_frames(str(data), (name,), None, LineCamera(), {})
-    return next(opened.scenes(opened.train))
+    return opened.scene(opened.train[0])
 
 
 def observed_passes(data: Path, path: Path, factor: int = 2, seed: int = 0) -> tuple[ScenePasses, Weights]:

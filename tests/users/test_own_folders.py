@@ -120,7 +120,7 @@ def test_training_leaves_out_and_says_so(made: Path, tmp_path: Path, command_lin
     assert "note: label files without a scene, 1: 009.png" in ended.err
     (made / "tiles" / "scene.toml").unlink(missing_ok=True)
     data = open_training_data(str(made / "tiles"), 0, None, LineCamera())
-    assert {scene.class_names for scene in data.scenes(data.train)} == {("class_0", "class_1", "class_2")}
+    assert {scene.class_names for scene in map(data.scene, data.train)} == {("class_0", "class_1", "class_2")}
 
 
 def test_training_and_judging_say_that_labels_lay_elsewhere(tmp_path: Path, command_line: Any) -> None:

@@ -1,0 +1,206 @@
+"""Files and disks that people with data of their own met first: one message that says what to do, or it works."""
+
+from __future__ import annotations
+
+import errno
+import os
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rasterio
+from affine import Affine
+from numpy.typing import NDArray
+from PIL import Image
+
+from flows.settings.load import load_settings
+from pipeline.errors import SettingsError
+from storage.archive.whole_files import written_aside
+from storage.readers.scene_files import load_scene_file
+from tests.flows.conftest import command_line
+
+__all__ = ["command_line"]
+
+pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")
+SMALL = ["--steps", "1", "--dim", "16", "--layers", "1", "--heads", "2", "--batch", "1", "--crop", "16"]
+RNG = np.random.default_rng(4)
+CLASSES = np.kron(RNG.integers(0, 2, (4, 4)), np.ones((8, 8))).astype(np.uint8)
+
+
+def write(path: Path, values: NDArray[Any], **about: Any) -> Path:
+    """A GeoTIFF of (y, x) or (y, x, band) values."""
+    planes = np.moveaxis(np.atleast_3d(values), -1, 0)
+    count, height, width = planes.shape
+    kind = {"driver": "GTiff", "count": count, "height": height, "width": width, "dtype": values.dtype}
+    place = {"crs": "EPSG:32632", "transform": Affine(1, 0, 600_000, 0, -1, 5_700_000)}
+    with rasterio.open(path, "w", photometric="MINISBLACK", **kind, **place, **about) as file:
+        file.write(planes)
+    return path
+
+
+def image() -> NDArray[np.int16]:
+    """Three bands of noise on classes, another one each time."""
+    return (CLASSES[..., None] * 60 + RNG.integers(1, 40, (32, 32, 3))).astype(np.int16)
+
+
+# --- values -----------------------------------------------------------------------------------------------------------
+
+
+def test_minus_9999_that_nothing_declares_is_no_data(tmp_path: Path) -> None:
+    """It is missing, and a note says so; a stated no-data value keeps it; scenes without it are as they were."""
+    values = image()
+    values[:6] = -9999
+    path = write(tmp_path / "a.tif", values)
+    scene = load_scene_file(path, wavelengths=[460, 550, 640])
+    assert np.isnan(scene.values[:6]).all()
+    assert np.isfinite(scene.values[6:]).all()
+    assert scene.missing.sum() == 6 * 32
+    assert any("576 samples are -9999, which is taken for no data" in note for note in scene.provenance)
+    (tmp_path / "scene.toml").write_text("nodata = 1e30\n")
+    stated = load_scene_file(path, wavelengths=[460, 550, 640])
+    np.testing.assert_array_equal(stated.values, values)
+    assert stated.light_hash != scene.light_hash
+
+
+# --- training ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def tiles(tmp_path: Path) -> Path:
+    """Four labelled tiles; the second is no data everywhere."""
+    (folder := tmp_path / "tiles").mkdir()
+    (folder / "scene.toml").write_text("wavelengths_nm = [460, 550, 640]\n")
+    for number in range(1, 5):
+        values = np.full((32, 32, 3), -9999, np.int16) if number == 2 else image()
+        write(folder / f"{number:03d}.tif", values, nodata=-9999)
+        write(folder / f"{number:03d}_labels.tif", CLASSES)
+    return folder
+
+
+def test_a_tile_without_any_value_is_left_out(tiles: Path, tmp_path: Path, command_line: Any) -> None:
+    """Training and evaluation go on without it, and a note names it; alone it is refused by its name."""
+    out = tmp_path / "w.safetensors"
+    ended = command_line("train", tiles, "-o", out, "--hold-out", "004", *SMALL)
+    assert ended.code == 0, ended.err
+    assert "note: 1 scene without any value left out: 002" in ended.err
+    judged = command_line("evaluate", tiles, "--weights", out, "--policies", "random", "--fractions", "0.5")
+    assert judged.code == 0, judged.err
+    assert "note: 1 scene without any value left out: 002" in judged.err
+    for number in ("001", "003", "004"):
+        (tiles / f"{number}.tif").unlink()
+    command_line("train", tiles, "-o", out, *SMALL).refused(1, "no scene to train on: no value anywhere in 002")
+
+
+@pytest.mark.parametrize("held_out", [False, True])
+def test_the_evaluation_that_training_advises_is_none_that_refuses(
+    tiles: Path, tmp_path: Path, command_line: Any, held_out: bool
+) -> None:
+    """Where all scenes were trained on it asks for others; where some were held out, its command runs."""
+    out = tmp_path / "w.safetensors"
+    ended = command_line("train", tiles, "-o", out, *(["--hold-out", "004"] if held_out else []), *SMALL)
+    said = " ".join(ended.err.split())
+    if held_out:
+        assert f"spectralzoom evaluate {tiles} --weights {out}" in said
+        assert command_line("evaluate", tiles, "--weights", out, "--policies", "random").code == 0
+    else:
+        assert f"spectralzoom evaluate OTHER_SCENES --weights {out}; or train with some held out" in said
+
+
+# --- init -------------------------------------------------------------------------------------------------------------
+
+
+def test_init_takes_a_land_cover_file_for_the_labels_of_all_dates(tmp_path: Path, command_line: Any) -> None:
+    """Five dates and LULC.npy are five images with one file of labels, and train as init says."""
+    np.save(tmp_path / "LULC.npy", CLASSES)
+    for month in range(5, 10):
+        np.save(tmp_path / f"2024-{month:02d}-01.npy", image().astype(np.float32))
+    ended = command_line("init", tmp_path)
+    assert "5 images, 5 with labels; the first has 32 x 32 px, 3 bands" in ended.out
+    toml = (tmp_path / "scene.toml").read_text()
+    assert 'labels = "LULC.npy"' in toml
+    (tmp_path / "scene.toml").write_text("wavelengths_nm = [460, 550, 640]\n" + toml)
+    assert f"next: spectralzoom train {tmp_path} " in ended.out
+    trained = command_line("train", tmp_path, "-o", tmp_path / "w.safetensors", *SMALL)
+    assert trained.code == 0, trained.err
+
+
+def test_init_sees_the_dates_of_a_series(tmp_path: Path, command_line: Any) -> None:
+    """An array of five dates beside LULC.npy is a series with labels; the next command takes one of its dates."""
+    np.save(tmp_path / "LULC.npy", CLASSES)
+    np.save(tmp_path / "series.npy", np.stack([image() for _ in range(5)]).astype(np.float32))
+    ended = command_line("init", tmp_path)
+    series = tmp_path / "series.npy"
+    assert f"note: {series} has 5 steps of time; each is a scene, {series}:0 to {series}:4" in ended.out
+    assert f"next: spectralzoom train {series}:0 " in ended.out
+    toml = (tmp_path / "scene.toml").read_text()
+    (tmp_path / "scene.toml").write_text("wavelengths_nm = [460, 550, 640]\n" + toml)
+    trained = command_line("train", f"{series}:0", "-o", tmp_path / "w.safetensors", *SMALL)
+    assert trained.code == 0, trained.err
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_init_says_why_it_cannot_write(
+    tmp_path: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch, there: bool
+) -> None:
+    """On a disk that is read-only the message says so, with --force too, and a file that is there stays."""
+    Image.fromarray(image().astype(np.uint8)).save(tmp_path / "a.png")
+    if there:
+        (tmp_path / "scene.toml").write_text("nodata = 1\n")
+
+    def refuse(path: Any, *rest: Any, **named: Any) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+
+    monkeypatch.setattr(os, "mkdir", refuse)
+    command_line("init", tmp_path, "--force").refused(1, f"{tmp_path}.*read-only")
+    assert (tmp_path / "scene.toml").exists() == there
+
+
+# --- words ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("visit", ["01.06.2026", "6/1/2026", "2026.06.01", "2026-6-1", "01-06-26", "01.06.2026 noon"])
+def test_a_date_in_another_form_is_no_word(visit: str) -> None:
+    """Days between visits are counted by dates in one form, which the message shows."""
+    with pytest.raises(SettingsError, match=r"visit must be words, or a date as year-month-day \(2026-06-01\)"):
+        load_settings(None, {"scene": "farm", "visit": visit})
+
+
+@pytest.mark.parametrize("visit", ["first of June", "2026-06-01", "2026-06-01T10:00:00Z", "run 3", "v1.2.3"])
+def test_words_and_dates_call_a_visit(visit: str) -> None:
+    """Other words and dates of that form are taken."""
+    assert load_settings(None, {"scene": "farm", "visit": visit}).visit == visit
+
+
+# --- a disk that refuses ----------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def small_files(most: int) -> Iterator[None]:
+    """No file may grow beyond so many bytes, whoever writes it: what GDAL is refused, it does not tell."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_an_export_that_the_disk_refuses(surveyed_png: Any, tmp_path: Path, command_line: Any) -> None:
+    """One message that says what the disk said, nothing of GDAL's, and nothing left behind; with space it works."""
+    archive, out = tmp_path / "archive", tmp_path / "maps"
+    surveyed_png(archive)
+    with small_files(600):
+        ended = command_line("export", archive, "-o", out)
+    ended.refused(1, r"cannot export to .*a file may not grow so large here.*nothing published was changed")
+    assert not [path for path in out.rglob("*") if path.is_file()]
+    assert command_line("export", archive, "-o", out).code == 0
+
+
+def test_errors_that_the_disk_has_no_part_in_stay_what_they_are(tmp_path: Path) -> None:
+    """With space on the disk an error of a library is itself."""
+    with pytest.raises(RuntimeError, match="of its own"), written_aside(tmp_path, ["a"]):
+        raise RuntimeError("of its own")
