@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import colorsys
+import re
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,6 +45,29 @@ _EIGHT_COLOURS = (
     (90, 90, 90),
 )
 
+# Land cover as maps usually show it; the words of one row mean the same.
+_COLOURS_OF_WORDS: dict[str, Colour] = {
+    word: colour
+    for words, colour in (
+        ("water river lake sea", (33, 102, 172)),
+        ("soil bare ground earth", (140, 94, 60)),
+        ("forest tree trees wood woods woodland", (0, 90, 50)),
+        ("grass grassland meadow pasture lawn", (120, 198, 80)),
+        ("crop crops cropland", (217, 178, 60)),
+        ("wheat barley rye oats grain", (240, 210, 110)),
+        ("maize corn", (255, 165, 0)),
+        ("rapeseed rape canola", (250, 235, 50)),
+        ("weed weeds", (200, 30, 90)),
+        ("road roads asphalt street track tracks", (110, 110, 110)),
+        ("building buildings roof roofs urban town", (180, 60, 50)),
+        ("sand beach", (230, 205, 150)),
+        ("snow ice", (235, 245, 255)),
+        ("shadow shadows", (45, 45, 55)),
+        ("cloud clouds", (205, 215, 225)),
+    )
+    for word in words.split()
+}
+
 
 @dataclass(frozen=True)
 class Labels:
@@ -74,6 +98,7 @@ def load_labels(
     *,
     classes: Mapping[str, ClassValue],
     unlabelled: ClassValue | None = None,
+    colours: Mapping[str, Colour] | None = None,
 ) -> Labels:
     """Read a label file of numbers or exact colours; without ``classes`` every value found becomes one.
 
@@ -93,12 +118,11 @@ def load_labels(
         codes = np.where(codes < 0, codes, codes * 0x010101)  # a grey value g is the colour (g, g, g)
     none = None if unlabelled is None else _code(unlabelled)
     stated = dict(classes) or found_codes(codes, none, is_colour or by_colour, str(address))
-    colours = [v if isinstance(v, tuple) else default_colour(index) for index, v in enumerate(stated.values())]
     return Labels(
         index=_index(codes, stated, none, str(address)),
         names=tuple(stated),
         values=tuple(stated.values()),
-        colours=np.array(colours, np.uint8).reshape(-1, 3),
+        colours=class_colours(stated, colours),
         notes=read.notes,
         regridded=read.regridded,
     )
@@ -243,6 +267,21 @@ def _index(
 def _shown(code: int, classes: Mapping[str, ClassValue]) -> str:
     colours = any(isinstance(value, tuple) for value in classes.values())
     return f"colour {list(colour_of(code))}" if colours else f"value {code}"
+
+
+def class_colours(classes: Mapping[str, ClassValue], stated: Mapping[str, Colour] | None = None) -> NDArray[np.uint8]:
+    """Return a colour (class, 3) for each class: as stated, as in the label file, by a word of its name, or any.
+
+    A word that two classes share, such as `winter_wheat` and `spring_wheat`, gives its colour to the first.
+    """
+    found, taken = list[Colour](), set[Colour]()
+    for index, (name, value) in enumerate(classes.items()):
+        words = re.findall(r"[a-z]+", name.lower())
+        known = [_COLOURS_OF_WORDS[word] for word in words if word in _COLOURS_OF_WORDS]
+        usual = next((colour for colour in known if colour not in taken), default_colour(index))
+        found.append((stated or {}).get(name) or (value if isinstance(value, tuple) else usual))
+        taken.add(found[-1])
+    return np.array(found, np.uint8).reshape(-1, 3)
 
 
 def default_colour(index: int) -> Colour:

@@ -23,7 +23,7 @@ from pipeline.ground.field_places import FieldPlace, NoPlace, PlacedPicture
 from pipeline.ground.georeference import WGS84
 from pipeline.ground.zones import on_field
 from pipeline.lazy import deferred
-from storage.readers.labels import MOST_FOUND_CLASSES, Labels, default_colour
+from storage.readers.labels import MOST_FOUND_CLASSES, Labels, class_colours
 from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings
 
 if TYPE_CHECKING:
@@ -204,8 +204,7 @@ def load_polygon_labels(
             f" pixel, with a value of {attribute}"
         )
     values = tuple(classes.values())
-    colours = [value if isinstance(value, tuple) else default_colour(at) for at, value in enumerate(values)]
-    labels = Labels(index, tuple(classes), values, np.array(colours, np.uint8).reshape(-1, 3))
+    labels = Labels(index, tuple(classes), values, class_colours(classes, settings.colours))
     shared = int(np.count_nonzero(index != _burn(burnt[::-1], shape)))
     lacking = sum(not word for word in said)
     return labels, (

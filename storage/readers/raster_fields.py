@@ -136,7 +136,9 @@ def _side_by_side(address: Path, opened: Sequence[SceneFile], labels: str | Path
         found = _merged_labels(tiles, shape, notes)
     else:  # on the pixels of the whole field
         settings = find_scene_settings(first.path)
-        found = load_labels(labels, shape, geobox, classes=settings.classes, unlabelled=settings.unlabelled)
+        found = load_labels(
+            labels, shape, geobox, classes=settings.classes, unlabelled=settings.unlabelled, colours=settings.colours
+        )
         notes += found.notes
     places = [(tile.scene.light_hash, tile.row, tile.column) for tile in tiles]
     light_hash = hashlib.sha256(json.dumps(places).encode()).hexdigest()

@@ -304,7 +304,9 @@ def _labels_of(
             settings = settings.model_copy(update={"classes": dict(known)})
             found, notes = load_polygon_labels(address, shape, geobox, settings=settings)
         else:
-            found = load_labels(address, shape, geobox, classes=known, unlabelled=settings.unlabelled)
+            found = load_labels(
+                address, shape, geobox, classes=known, unlabelled=settings.unlabelled, colours=settings.colours
+            )
             notes = found.notes
     except SceneError as error:
         if needed or not by_name:

@@ -36,6 +36,7 @@ _EXPECTED = {
     "unlabelled": "a whole number or a colour [r, g, b] in 0..255",
     "class_attribute": "the name of an attribute in quotes",
     "classes": "a table of name = number or name = [r, g, b] in 0..255",
+    "colours": "a table of name = [r, g, b] in 0..255",
 }
 
 
@@ -56,6 +57,7 @@ class SceneSettings(BaseModel):
     unlabelled: _Value | None = None
     class_attribute: StrictStr | None = None  # of labels that are polygons: which attribute says the class
     classes: dict[str, _Value] = {}
+    colours: dict[str, tuple[_Channel, _Channel, _Channel]] = {}  # that maps show classes in
 
     @model_validator(mode="after")
     def _agree(self) -> Self:
@@ -65,6 +67,8 @@ class SceneSettings(BaseModel):
             raise ValueError("has some classes that are numbers and some that are colours; use one kind")
         if len(set(self.classes.values())) < len(self.classes):
             raise ValueError("has two classes of the same number or colour; give each its own")
+        if self.classes and (strange := sorted(set(self.colours) - set(self.classes))):
+            raise ValueError(f"has colours of {', '.join(strange)}, which [classes] lacks; name classes of that table")
         if len(self.classes) > 255:
             raise ValueError(f"has {len(self.classes)} classes, at most 255 fit a class map; merge some")
         return self

@@ -10,7 +10,8 @@ import scipy.io
 from PIL import Image
 
 from pipeline.errors import SceneError
-from storage.readers.labels import default_colour, load_labels
+from storage.readers.labels import class_colours, default_colour, load_labels
+from storage.readers.scene_files import load_scene_file
 
 COLOURS = {"soil": (0, 0, 0), "crop": (0, 255, 0), "weed": (255, 0, 0)}
 
@@ -102,3 +103,27 @@ def test_unlabelled_cannot_be_a_class(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.zeros((3, 4), int))
     with pytest.raises(SceneError, match="value 0 is unlabelled and also class soil"):
         load_labels(tmp_path / "a.npy", (3, 4), classes={"soil": 0}, unlabelled=0)
+
+
+def test_names_that_all_know_have_their_colour() -> None:
+    """By a word of the name, once each; others have those that stay apart, and what is stated wins."""
+    names = {"Deep water": 1, "winter_wheat": 2, "spring_wheat": 3, "class_4": 4, "Bare soil": 5, "watery": 6}
+    water, winter, spring, other, soil, watery = class_colours(names).tolist()
+    assert max(water) == water[2]
+    assert soil[0] > soil[1] > soil[2]
+    assert winter != spring == list(default_colour(2))
+    assert (other, watery) == (list(default_colour(3)), list(default_colour(5)))
+    assert class_colours(names, {"Bare soil": (1, 2, 3)})[4].tolist() == [1, 2, 3]
+    assert class_colours({"water": (9, 9, 9)}).tolist() == [[9, 9, 9]]
+
+
+def test_scene_toml_says_colours_of_numbers(tmp_path: Path) -> None:
+    """They reach the scene; a colour of no class is refused."""
+    np.save(tmp_path / "a.npy", np.zeros((4, 4, 3), np.uint8) + 7)
+    np.save(tmp_path / "a_gt.npy", np.arange(16).reshape(4, 4) % 2)
+    words = 'wavelengths_nm = [650.0, 550.0, 450.0]\nlabels = "{name}_gt.npy"\n[classes]\nsoil = 0\ncane = 1\n[colours]\ncane = [1, 2, 3]\n'
+    (tmp_path / "scene.toml").write_text(words)
+    assert load_scene_file(tmp_path / "a.npy").class_colours.tolist()[1] == [1, 2, 3]
+    (tmp_path / "scene.toml").write_text(words.replace("cane = [1", "can = [1"))
+    with pytest.raises(SceneError, match=r"has colours of can, which \[classes\] lacks"):
+        load_scene_file(tmp_path / "a.npy")
