@@ -101,6 +101,7 @@ def open_map(settings: Settings, known: Sequence[str] | None = None) -> tuple[Sc
         filled_px=file.filled_px,
         missing=missing,
         geobox=file.geobox,
+        content=file.content,
     )
     scene, notes = _placed_once(scene, file.provenance, posed=settings.pose is not None)
     return file, scene, (*notes, *_gap_note(scene, "are as they are in the other bands"))
@@ -219,12 +220,29 @@ def check_labels(scene: RasterScene, weights: Description) -> tuple[str, ...]:
     law, learnt = law_of_key(scene.key), law_of_key(str(weights.record.get("data")))
     if None not in (law, learnt) and law != learnt:
         return (f"the weights were trained on {learnt}, the scene is of {law}: expect a poorer map",)
+    seen = seen_in_training(scene, weights)
+    return () if seen is None else (f"accuracy is counted on {TRAINING_SCENE[seen]}",)
+
+
+TRAINING_SCENE = {  # what a score on a scene of the training is a score of
+    "all": "a scene of the training, which says nothing of other fields",
+    "tiles": "a field some tiles of which are scenes of the training, which says little of other fields",
+    "other pixels": "those pixels of a scene of the training whose labels were left out of it",
+}
+
+
+def seen_in_training(scene: RasterScene, weights: Description) -> str | None:
+    """Return how much of a scene the weights were trained on, a key of `TRAINING_SCENE`; None for nothing.
+
+    Files are told by what they hold, whatever their names and whatever bands are read of them.
+    """
     split = weights.record.get("split", {})
     if scene.key in split.get("pixels", {}):
-        return ("accuracy is counted on the labelled pixels that the weights were not trained on",)
-    if scene.key in split.get("train", {}).values():
-        return ("the weights were trained on this scene: its accuracy says nothing of other fields",)
-    return ()
+        return "other pixels"
+    tiles = [one in split.get("content", ()) for one in scene.content]
+    if scene.key in split.get("train", {}).values() or (tiles and all(tiles)):
+        return "all"
+    return "tiles" if any(tiles) else None
 
 
 def judged_labels(scene: RasterScene, weights: Description) -> NDArray[np.uint8] | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import zlib
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +52,7 @@ class TrainingData:
 
 def scene_of_file(file: SceneFile, camera: LineCamera) -> RasterScene:
     """Light a scene file as the simulator does."""
-    return raster_from_values(
+    scene = raster_from_values(
         file.values,
         camera,
         name=file.name,
@@ -64,6 +64,7 @@ def scene_of_file(file: SceneFile, camera: LineCamera) -> RasterScene:
         key=file.light_hash,
         geobox=file.geobox,
     )
+    return replace(scene, content=file.content)
 
 
 def farm_test_data(scenes: int, camera: LineCamera) -> TrainingData:

@@ -44,6 +44,7 @@ class SceneFile:
     missing: NDArray[np.bool_]  # (y, x) pixels without a value in more than half of their bands
     filled_px: int  # pixels without a value in a band
     light_hash: str  # of values and wavelengths alone: labels do not change what a camera sees
+    content: tuple[str, ...]  # hash of what it was read from, in whatever bands; one for each tile
     provenance: tuple[str, ...]  # one sentence for each thing assumed or left out
     labels: NDArray[np.uint8] | None = None  # (y, x) class index, 255 = unlabelled
     class_names: tuple[str, ...] = ()
@@ -174,7 +175,8 @@ def _open(
         file, source.shape[:2], source.geobox, labels, settings, classes, labels_needed
     )
     assert light.wavelength_nm is not None
-    light_hash = _light_hash(file, variable, source, chosen, light, settings.nodata, void)
+    content = _content_hash(file, source.files)
+    light_hash = _light_hash(content, variable, source, chosen, light, settings.nodata, void)
     some = () if chosen == list(range(count)) else (f"bands {bands_text(chosen)} of {count}, counted from 0",)
     over = ("values are over the white reference",) if calibrated else ()
     scene = SceneFile(
@@ -187,6 +189,7 @@ def _open(
         missing=counted.missing,
         filled_px=counted.filled_px,
         light_hash=light_hash,
+        content=(content if variable is None else _digest(content, variable),),
         provenance=(*some, *bad_note, *source.notes, *over, light.origin, *gap_notes, *missing_notes, *label_note),
         geobox=source.geobox,
         kept=values,
@@ -195,7 +198,7 @@ def _open(
 
 
 def _light_hash(
-    file: Path,
+    content: str,
     variable: str | None,
     source: CubeSource,
     chosen: list[int],
@@ -209,7 +212,6 @@ def _light_hash(
     stated: tuple[str, ...] = () if nodata is None else (f"nodata {nodata!r}",)
     stated += () if void is None else (f"void {hashlib.sha256(np.packbits(void).tobytes()).hexdigest()}",)
     stated += (source.scaling,) if source.scaling else ()
-    content = _content_hash(file, source.files)
     return _digest(content, variable, chosen, light.wavelength_nm.tolist(), widths, *stated)
 
 

@@ -34,7 +34,7 @@ from storage.arrays.class_maps import (
 )
 from storage.arrays.layout import NO_CLASS, blank_pixels
 
-CLASS_MAP = Product("segment", version=12, files=("class_map.zarr", "class_probabilities.zarr"), by_weights=True)
+CLASS_MAP = Product("segment", version=13, files=("class_map.zarr", "class_probabilities.zarr"), by_weights=True)
 OUT_OF_RANGE = "out_of_range.json"  # beside a map, where values were no readings
 LEFT_OUT = "left_out.npy"  # beside a map while it is drawn: the pixels of which none is
 MOST_TURN_PX = 12.0  # that a field's corners may lie off by, as it is turned, so that its memory is of use

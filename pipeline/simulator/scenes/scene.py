@@ -126,7 +126,8 @@ class RasterScene:
     ``white_reference`` is the scene value of the white reference, ``wavelength_nm`` and ``fwhm_nm`` are centres and
     widths of the bands, all (band,); widths are None where not known. Equal keys give equal light. ``geobox`` is where
     the pixels lie on the earth, as the scene's file says (None: it does not); ``pixel_m`` is how large a pixel of a
-    scene without one is on the ground, where the scene's own law says so. Planes, labels and electrons may be made when
+    scene without one is on the ground, where the scene's own law says so. ``content`` are hashes of the files that it
+    was read from, whatever bands of them are taken. Planes, labels and electrons may be made when
     they are first asked for; all else is known at once.
     """
 
@@ -143,6 +144,7 @@ class RasterScene:
     missing: NDArray[np.bool_] | None = None
     geobox: GeoBox | None = None
     pixel_m: float | None = None
+    content: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.light.is_made():
