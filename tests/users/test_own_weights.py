@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 import rasterio
+import rioxarray  # noqa: F401 - registers the accessor that users have
+import xarray as xr
 from rasterio.transform import from_origin
 
 from flows.cli.main import main
@@ -112,3 +114,22 @@ def test_the_bands_of_the_training_are_within_the_training(made: Path, tmp_path:
     assert "spectral columns" not in said
     said, _ = survey(command_line, made, made / "field" / "images" / "t0.tif", tmp_path / "a", "--bands", "0-8")
     assert "the bands reach 5 of the weights' 12 spectral columns" in said
+
+
+def test_what_a_run_left_is_written_as_netcdf_and_zarr(made: Path, tmp_path: Path, command_line: Any) -> None:
+    """Every product of a scene with a place, by plain xarray; rioxarray finds the CRS in what was written."""
+    survey(command_line, made, made / "field" / "images" / "t0.tif", tmp_path / "a")
+    run = open_archive(tmp_path / "a").latest
+    run.class_map.to_netcdf(tmp_path / "map.nc")
+    run.class_map.to_zarr(tmp_path / "map.zarr", consolidated=False)
+    for read in (xr.open_dataset(tmp_path / "map.nc"), xr.open_zarr(tmp_path / "map.zarr", consolidated=False)):
+        assert (read["classes"].rio.crs.to_epsg(), read["classes"].dtype) == (32633, np.uint8)
+        np.testing.assert_array_equal(read["classes"], run.class_map)
+        read.close()
+    for name in run.products:
+        run.dataset(name).to_netcdf(tmp_path / f"{name}.nc")
+        with xr.open_dataset(tmp_path / f"{name}.nc") as read:
+            assert set(read.data_vars) == set(run.dataset(name).data_vars)
+    run.mosaic.to_netcdf(tmp_path / "cube.nc")
+    with xr.open_dataset(tmp_path / "cube.nc") as read:
+        np.testing.assert_array_equal(read["spectra"], run.mosaic)
