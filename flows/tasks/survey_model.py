@@ -98,6 +98,8 @@ def weights_offered(settings: Settings) -> tuple[Path, ...]:
             f" train some for {settings.scene} with: spectralzoom train DATASET -o my.safetensors"
         )
     plain, two_passes = shipped_weights(plain=True), shipped_weights()
+    if settings.undecided:
+        return plain, two_passes
     if not settings.plain:
         return (two_passes,)
     if settings.scan_step is None:
