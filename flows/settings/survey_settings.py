@@ -177,7 +177,8 @@ class Settings:
     scene: SceneName = stated(
         "farm",
         "`farm` (built in; `farm@2`), or a file: PNG, JPEG, BMP, GeoTIFF, .npy, .npz, .mat, ENVI, Zarr; as source "
-        "raster also a folder or a glob of georeferenced tiles",
+        "raster also a folder or a glob of georeferenced tiles; a pattern that each visit fills in, "
+        "{date:%Y-%m-%d}.tif or {new}.tif (the newest that was not surveyed)",
     )
     labels: str | None = stated(
         None, "Class colours or numbers on the scene's pixels; accuracy is reported then", example="labels.png"

@@ -6,6 +6,7 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
+from datetime import datetime
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,6 +35,7 @@ from flows.tasks.scene import (
     judged_labels,
     open_map,
     open_scene,
+    scene_of_visit,
 )
 from flows.tasks.stage import FieldFrame, Report
 from flows.tasks.stages.capture import SweepRecorder
@@ -286,7 +288,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     ``archive`` that of the settings is opened. Raises PipelineError: the first thing that cannot be used; see
     `pipeline.errors` for the kinds; NothingToMend: what is remembered is sure enough.
     """
-    settings = for_rig(settings)
+    settings = scene_of_visit(for_rig(settings), datetime.now().astimezone())
     check_scene_there(settings.scene, is_map=settings.is_map)
     recorded = open_recorded(settings) if settings.source == RECORDED else None
     settings = settings if recorded is None else recorded.settings
