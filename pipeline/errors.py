@@ -73,6 +73,10 @@ class NotRecordedError(SceneError):
     """A line is asked of a recording that was never taken."""
 
 
+class NoSceneYet(SceneError):  # noqa: N818 - said of files
+    """A pattern stands for no file yet; one may come."""
+
+
 class WavelengthError(SceneError):
     """Wavelengths do not fit the bands, the unit or the range."""
 

@@ -232,8 +232,9 @@ def open_labelled(path: Path) -> xarray.Dataset:
 
     ``y`` and ``x`` are in metres where the store lies on a map (its CRS in ``spatial_ref``), else tangents of the angle
     from the undeflected direction [rad], else pixels; ``band`` and ``wavelength`` are in nm, both an index. Numbers are
-    those of the store: no class becomes a float, whatever stands for none. Raises IncompleteStoreError: there is no
-    such store, or its metadata is damaged.
+    those of the store: no class becomes a float, whatever stands for none. Attributes are text, numbers or lists of
+    them, and JSON text of what else a store has, so that ``to_netcdf`` and ``to_zarr`` write them. Raises
+    IncompleteStoreError: there is no such store, or its metadata is damaged.
     """
     with damage_named(str(path)):
         opened = xarray.open_dataset(
@@ -241,7 +242,7 @@ def open_labelled(path: Path) -> xarray.Dataset:
         )
         opened = _in_shards(opened.drop_vars([name for name in PICTURES if name in opened]))
     bare = {name: np.arange(size) for name, size in opened.sizes.items() if name not in opened.variables}  # as rgb
-    return spectra.by_wavelength(opened.assign_coords(bare))
+    return spectra.by_wavelength(spectra.with_plain_attributes(opened.assign_coords(bare)))
 
 
 def _in_shards(opened: xarray.Dataset) -> xarray.Dataset:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,6 +14,7 @@ import xarray
 from numpy.typing import NDArray
 from xarray.backends import BackendArray
 from xarray.core import indexing
+from xarray.core.indexing import IndexSelResult
 
 from storage.arrays.georeference import GRID_MAPPING
 from storage.arrays.layout import open_group
@@ -20,7 +22,8 @@ from storage.arrays.mosaics import Mosaic, open_mosaic
 from storage.arrays.signal_cubes import SignalCube, check_condensed, open_signal_cube, read_coordinates, score_layout
 
 Restore = Callable[[slice, slice, Sequence[int]], NDArray[np.float32]]  # rows, columns, bands: (row, column, band)
-OF_BANDS = ("band", "wavelength", "fwhm")
+OF_WAVELENGTHS = ("band", "wavelength")
+OF_BANDS = (*OF_WAVELENGTHS, "fwhm")
 OF_LINES = ("line", "sample", "time", "mirror_x", "mirror_y", "exposure_ms", "valid_line")
 OF_PLACES = ("y", "x", GRID_MAPPING)
 VALUE = {"long_name": "scene value", "units": "1"}
@@ -105,18 +108,51 @@ def _open(path: Path, dims: tuple[str, str, str], places: Sequence[str], restore
     mapped = {"grid_mapping": GRID_MAPPING} if GRID_MAPPING in coords else {}
     spectra = xarray.Variable(dims, indexing.LazilyIndexedArray(RestoredArray(shape, restore)), VALUE | mapped)
     found = xarray.Dataset({"spectra": spectra.chunk(dict(zip(dims, (*block, -1), strict=True)))}, coords | bare)
-    return by_wavelength(xarray.decode_cf(found, mask_and_scale=False))["spectra"]
+    return by_wavelength(with_plain_attributes(xarray.decode_cf(found, mask_and_scale=False)))["spectra"]
+
+
+class BandIndex(xarray.indexes.PandasIndex):
+    """An index of bands that finds the nearest in whatever order they are: two spectrometers may overlap."""
+
+    def sel(self, labels: dict[Any, Any], method: str | None = None, tolerance: Any = None) -> IndexSelResult:
+        """Find bands as pandas does; with a method among the bands in ascending order, the first of equal ones."""
+        if method is None:
+            return super().sel(labels, method, tolerance)
+        ascending, place = np.unique(self.index.to_numpy(), return_index=True)
+        found = xarray.indexes.PandasIndex(ascending, self.dim).sel(labels, method, tolerance)
+        return IndexSelResult({self.dim: _renumbered(found.dim_indexers[self.dim], place)})
+
+
+def _renumbered(found: Any, place: NDArray[np.intp]) -> Any:
+    """Return the places of what was found, in the form in which it was asked for."""
+    if isinstance(found, xarray.Variable | xarray.DataArray):
+        return found.copy(data=place[found.values])
+    return place[found]
 
 
 def by_wavelength(opened: xarray.Dataset) -> xarray.Dataset:
-    """Make ``wavelength`` an index of its bands, so that ``.sel(wavelength=660, method="nearest")`` finds one.
+    """Have the nearest band found by ``band`` and by ``wavelength``: ``.sel(wavelength=660, method="nearest")``.
 
-    Where wavelengths rise or fall without a break, slices work as well; else (two spectrometers that overlap) only the
-    nearest can be asked for.
+    Slices work where wavelengths rise or fall without a break.
     """
-    if "wavelength" not in opened.coords or opened["wavelength"].ndim != 1:
-        return opened
-    steps = np.diff(opened["wavelength"].values)
-    if (steps > 0).all() or (steps < 0).all():
-        return opened.set_xindex("wavelength")
-    return opened.set_xindex("wavelength", xarray.indexes.NDPointIndex)
+    for name in OF_WAVELENGTHS:
+        if name in opened.coords and opened[name].dims == ("band",):
+            opened = opened.drop_indexes(name, errors="ignore").set_xindex(name, BandIndex)
+    return opened
+
+
+def with_plain_attributes(opened: xarray.Dataset) -> xarray.Dataset:
+    """Return arrays whose attributes NetCDF holds as well: text, numbers and lists of them; all else is JSON text."""
+    found = opened.copy()
+    holders: tuple[Any, ...] = (found, *found.variables.values())
+    for one in holders:
+        one.attrs = {name: value if _is_plain(value) else json.dumps(value) for name, value in one.attrs.items()}
+    return found
+
+
+def _is_plain(value: object) -> bool:
+    """Return whether NetCDF has such an attribute."""
+    parts = value if isinstance(value, list | tuple) and value else [value]
+    return all(isinstance(one, str) for one in parts) or all(
+        isinstance(one, int | float | np.number) and not isinstance(one, bool) for one in parts
+    )

@@ -199,6 +199,7 @@ def _run_row(catalogue: Catalogue, run: Run, kept: int) -> dict[str, Any]:
         "budget": settings.get("budget"),
         **score_of(receipt),
         "accuracy_is": receipt.get("accuracy_is"),
+        "training_scene": receipt.get("training_scene"),
         "bytes": kept,
         "state": _run_state(catalogue, run, below),
     }
@@ -321,6 +322,8 @@ def show_contents(content: dict[str, Any], console: Console) -> None:
     columns: Sequence[str] = ("run", "scene", "seed", "budget", "mIoU", "size", "age", "state")
     runs = map(_shown_run, content["runs"])
     console.print(table(columns, runs, title="Runs", left=2, whole=WHOLE) if content["runs"] else "no runs")
+    if any(run["training_scene"] and known_number(run["miou"]) is not None for run in content["runs"]):
+        console.print("* on a scene that the weights were trained on", highlight=False)
     rows = [row for stage, stores in content["stages"].items() for row in _shown_stores(stage, stores)]
     columns = ("stage", "key", "version", "size", "age", "named by")
     console.print(table(columns, rows, title="Stores", left=3, whole=WHOLE) if rows else "no stores")
@@ -334,7 +337,12 @@ def _shown_run(run: Mapping[str, Any]) -> list[str]:
     scene, miou = PurePath(str(run["scene"] or DASH)).name, known_number(run["miou"])
     asked = [DASH if run[name] is None else str(run[name]) for name in ("seed", "budget")]
     state = run["state"] if run["state"] == "there" else f"[bold red]{escape(run['state'])}[/]"
-    figures = ["not yet" if is_pending(run) else format_points(miou), format_bytes(run["bytes"]), _age(run["age_s"])]
+    learned = "" if run["training_scene"] is None or miou is None else "*"
+    figures = [
+        "not yet" if is_pending(run) else format_points(miou) + learned,
+        format_bytes(run["bytes"]),
+        _age(run["age_s"]),
+    ]
     return [*map(escape, (run["id"], scene, *asked)), *figures, state]
 
 

@@ -158,6 +158,7 @@ def _comparison(runs: tuple[Run, Run], maps: list[ClassMap]) -> dict[str, Any]:
         {
             **{name: run.settings.get(name) for name in ("scene", "seed")},
             "created": run.created,
+            "training_scene": run.receipt.get("training_scene"),
             **score_of(run.receipt),
         }
         for run in runs
@@ -218,6 +219,8 @@ def show_comparison(content: dict[str, Any], console: Console) -> None:
     """Print what `compare` found."""
     figures = (("run", str), ("miou", format_points), ("overall_accuracy", format_points))
     rows = [[name.replace("_", " "), *(escape(show(content[side][name])) for side in "ab")] for name, show in figures]
+    if any(content[side]["training_scene"] for side in "ab"):
+        rows.append(["scene of the training", *(str(content[side]["training_scene"] or "no") for side in "ab")])
     rows += [[label, *map(cost, content["savings"][name])] for name, (label, cost) in COST_LABELS.items()]
     rows += [[label, *map(format_megabytes, content["data_bytes"][name])] for name, label in BYTE_LABELS.items()]
     changed = [*content["settings"], *content["made"]]

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from flows.publish.receipt import Receipt, is_pending
+from flows.tasks.scene import TRAINING_SCENE
 from flows.tasks.scores import format_prediction, format_worst_class
 from flows.terminal.figures import (
     counted,
@@ -125,9 +126,10 @@ def headline(receipt: Receipt, captured_again: float | None = None) -> str:
         )
         beside = [f"{name} {format_points(one['miou'])}" for name, one in others.items() if one["miou"] is not None]
         right = format_points(accuracy.get("overall_accuracy"))
+        seen = f" on {TRAINING_SCENE[receipt['training_scene']]}" if "training_scene" in receipt else ""
         words.append(
-            f"The map scores {format_points(accuracy['miou'])} of 100 against the truth ({right} % of its pixels are "
-            f"right){'; ' if beside else ''}{', '.join(beside)}."
+            f"The map scores {format_points(accuracy['miou'])} of 100 against the truth{seen} ({right} % of its pixels "
+            f"are right){'; ' if beside else ''}{', '.join(beside)}."
         )
         words.append(format_worst_class(accuracy, alone=alone))
     return " ".join(filter(None, words))

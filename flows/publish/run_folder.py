@@ -29,6 +29,7 @@ from flows.tasks.open_survey import STAGES, OpenSurvey, Products
 from flows.tasks.prior_maps import prior_map_figures
 from flows.tasks.run import SurveyRun, now
 from flows.tasks.scan_choice import as_figures
+from flows.tasks.scene import seen_in_training
 from flows.tasks.stages.accuracy import load_accuracy
 from flows.tasks.stages.attention import load_plan
 from flows.tasks.stages.effects import load_manifest
@@ -162,6 +163,7 @@ def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
         accuracy_is=accuracy_is,
         judged=None if accuracy is None else now(),
         accuracy=accuracy,
+        training_scene=seen_in_training(run.scene, run.described),
         effects=effects.get("effects"),
         effects_total=effects.get("total"),
         products={**stores, **{name: f"{folder}/{name}" for name in files}},
@@ -215,7 +217,8 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
     moment = run.settings.moment  # of a farm that grows
     notes = [] if moment is None else [f"day {moment[0]}, {moment[1]:g} h"]
     if accuracy is not None and accuracy["miou"] is not None:
-        notes.append(f"mIoU {100 * accuracy['miou']:.1f} %")
+        where = " on a scene of the training" if "training_scene" in receipt else ""
+        notes.append(f"mIoU {100 * accuracy['miou']:.1f} %{where}")
     sweeps = [
         cube for ref in products.there("condense_coarse") for cube in open_signal_cubes(ref.path)
     ]  # of a raster none

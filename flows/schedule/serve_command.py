@@ -26,8 +26,10 @@ from flows.settings.survey_settings import Settings
 from flows.tasks.local_server import ServerUnavailable, check_answers, local_server, quiet_environment
 from flows.tasks.open_survey import RIG_LIMIT
 from flows.tasks.run import open_run
+from flows.tasks.survey_model import weights_path
 from flows.terminal.processes import DONE, terminable
-from pipeline.errors import ArchiveError, PipelineError, SettingsError
+from models.weights.files import describe_weights
+from pipeline.errors import ArchiveError, NoSceneYet, NothingToMend, PipelineError, SettingsError
 from pipeline.lazy import deferred
 from storage.archive.staging import read_toml, take_lock
 from storage.remote.object_stores import is_remote
@@ -162,6 +164,11 @@ def load_fields(files: Sequence[Path], out: str | None = None) -> list[ServedFie
             )
         try:
             open_run(replace(settings, name=name), planning=True)
+        except NothingToMend as known:
+            _say(f"{name}: {known}")
+        except NoSceneYet as error:
+            describe_weights(weights_path(settings))  # raises where they cannot be used
+            _say(f"{name}: {error}; it is looked for whenever it is due")
         except PipelineError as error:
             raise type(error)(f"{file}: {error}") from error
         fields[name] = ServedField(name, file.absolute(), settings)

@@ -31,6 +31,7 @@ from flows.settings.survey_settings import (
     RIG_FIELD,
     SPARING,
     UNIFORM,
+    USUAL_BUDGET,
     MapChoice,
     Settings,
     source_of,
@@ -217,6 +218,9 @@ def load_settings(
     asked = {**cheap, **(usual or {}), **recorded, **table}
     for wrong in (*_camera_of_a_map(asked, origin), *_contradictions(given, origin)):
         raise SettingsError(wrong)
+    passes = any(name in given and not _is_usual(table[name], SURVEY[name], origin.get(name)) for name in OF_TWO_PASSES)
+    if passes and not _is_map(asked) and not any(asked.get(name) is not None for name in (*UNIFORM, "budget")):
+        asked["budget"] = USUAL_BUDGET
     return parse_settings(asked, origin)
 
 
@@ -225,13 +229,21 @@ def _is_usual(value: object, declared: Declared | None, origin: str | None) -> b
     return declared is not None and origin != "flag" and declared.read(value, "") == declared.item.default
 
 
+def _scene_of(table: Mapping[str, object]) -> str:
+    return str(table.get("scene") or SURVEY["scene"].item.default)
+
+
+def _is_map(table: Mapping[str, object]) -> bool:
+    return (table.get("source") or source_of(_scene_of(table))) == RASTER
+
+
 def _camera_of_a_map(table: Mapping[str, object], origin: Mapping[str, str]) -> Iterator[str]:
     """Settings that only a camera has, beside a scene whose pixels are taken as they are.
 
     Those of a file that say what is the default anyway, as those of the example do, ask for nothing.
     """
-    scene = table.get("scene") or SURVEY["scene"].item.default
-    if (table.get("source") or source_of(str(scene))) != RASTER:
+    scene = _scene_of(table)
+    if not _is_map(table):
         return
     view = OF_A_VIEW if table.get("pose") is not None else ()
     for name in OF_A_CAMERA:

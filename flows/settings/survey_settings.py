@@ -55,6 +55,8 @@ RIG_FIELD = "field"  # the scene of which only the rig, or a recording, knows mo
 OF_THE_MACHINE = ("scheduler", "workers", "device")  # what of that day need not be there today
 OF_A_PART = ("max_age", "skip_below_error")  # of what a field that is remembered is looked at by
 OF_RECORDINGS = ("sweeps", "pointing", "dark", "white", "scan")
+USUAL_BUDGET = 0.5  # of two passes
+MOST_STEP = 8  # pixels from line to line of a uniform scan
 UNIFORM = ("seconds", "bytes_raw", "goal", "scan_step", "scan")  # settings of which one asks for a uniform scan
 SPARING = ("macs", "least_gain")  # by which a uniform scan is read in detail in part
 OF_TWO_PASSES = ("budget", "coarse_exposure_ms", "policy", "mask")  # and of which none may
@@ -177,7 +179,8 @@ class Settings:
     scene: SceneName = stated(
         "farm",
         "`farm` (built in; `farm@2`), or a file: PNG, JPEG, BMP, GeoTIFF, .npy, .npz, .mat, ENVI, Zarr; as source "
-        "raster also a folder or a glob of georeferenced tiles",
+        "raster also a folder or a glob of georeferenced tiles; a pattern that each visit fills in, "
+        "{date:%Y-%m-%d}.tif or {new}.tif (the newest that was not surveyed)",
     )
     labels: str | None = stated(
         None, "Class colours or numbers on the scene's pixels; accuracy is reported then", example="labels.png"
@@ -227,8 +230,12 @@ class Settings:
         example="8MB",
         why="leave it out for steps of the noise",
     )
-    budget: Budget = stated(
-        0.5, "Seconds of coarse and fine capture over those of the full scan, above 0 and at most 1"
+    budget: Budget | None = stated(
+        None,
+        "Two passes: seconds of coarse and fine capture over those of the full scan, above 0 and at most 1. Without it "
+        "and without a uniform scan the weights' record chooses the cheapest scan nearly as good as any; without a "
+        "record there are two passes in half of the seconds, or every line of a field too small for them",
+        example=0.5,
     )
     seconds: float | None = stated(
         None,
@@ -249,7 +256,7 @@ class Settings:
         why=INSTEAD,
     )
     scan_step: int | None = stated(
-        None, "One uniform scan with lines so far apart, chosen by hand", "px", 1, 8, example=2, why=INSTEAD
+        None, "One uniform scan with lines so far apart, chosen by hand", "px", 1, MOST_STEP, example=2, why=INSTEAD
     )
     scan_exposure_ms: float | None = stated(
         None, "Exposure of that scan's lines; by default the camera's", "ms", 0.5, 10_000, example=25.0, why=INSTEAD
@@ -367,6 +374,11 @@ class Settings:
     def plain(self) -> bool:
         """Whether all of the field is there at once, scanned or as a raster, in the place of two passes."""
         return self.is_map or any(getattr(self, name) is not None for name in UNIFORM)
+
+    @property
+    def undecided(self) -> bool:
+        """Whether nothing says how the field is captured, so that the record of the weights does."""
+        return not self.plain and self.budget is None
 
     @property
     def is_map(self) -> bool:

@@ -16,6 +16,7 @@ from flows.tasks.observer import current_observer
 from flows.tasks.open_survey import OpenSurvey, RunRef
 from flows.tasks.prefect_tasks import as_task, inside_flow
 from flows.tasks.run import SurveyRun, open_run
+from flows.tasks.scene import scene_of_visit
 from flows.tasks.stages.capture import capture_coarse, capture_fine
 from flows.tasks.stages.condense import condense_coarse, condense_fine
 from pipeline.errors import ArchiveError, IncompleteStoreError, NothingToMend, RigError, SettingsError
@@ -71,7 +72,9 @@ def _plan_capture(settings: SurveySettings) -> OpenSurvey | RunRef:
     first, run = _opened.get() or (None, None)
     if run is None or first is not asked:
         try:
-            run = open_run(asked if due is None else at_due_time(asked, due))
+            if due is not None:
+                asked = scene_of_visit(at_due_time(asked, due), due.astimezone())
+            run = open_run(asked)
         except NothingToMend as known:
             observer.log(str(known))
             return RunRef(f"runs/{known.run}", open_archive(asked.out).root / "runs" / known.run, unchanged=str(known))

@@ -6,6 +6,7 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
+from datetime import datetime
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,7 +24,7 @@ from flows.tasks.mosaic_work import tile_budget
 from flows.tasks.patch_budget import SHARD, PatchBudget, ReadingCosts
 from flows.tasks.prior_maps import AUTO, NONE, Prior, find_prior
 from flows.tasks.recorded_field import OpenedRecording, open_recorded
-from flows.tasks.scan_choice import ScanChoice, choose_uniform_scan
+from flows.tasks.scan_choice import ScanChoice, choose_uniform_scan, lay_out_passes
 from flows.tasks.scene import (
     FieldSource,
     SimulatedField,
@@ -34,6 +35,7 @@ from flows.tasks.scene import (
     judged_labels,
     open_map,
     open_scene,
+    scene_of_visit,
 )
 from flows.tasks.stage import FieldFrame, Report
 from flows.tasks.stages.capture import SweepRecorder
@@ -54,7 +56,6 @@ from pipeline.geometry.scan import Sweep
 from pipeline.ground.field_places import PosedField
 from pipeline.ground.map_grid import GroundGrid
 from pipeline.lazy import Once, deferred
-from pipeline.planning.uniform_scans import ScanLimits
 from pipeline.rectify.placed import PixelGrid, place
 from pipeline.rectify.region import plan_tiles
 from pipeline.rectify.tiles import MosaicWork
@@ -287,7 +288,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     ``archive`` that of the settings is opened. Raises PipelineError: the first thing that cannot be used; see
     `pipeline.errors` for the kinds; NothingToMend: what is remembered is sure enough.
     """
-    settings = for_rig(settings)
+    settings = scene_of_visit(for_rig(settings), datetime.now().astimezone())
     check_scene_there(settings.scene, is_map=settings.is_map)
     recorded = open_recorded(settings) if settings.source == RECORDED else None
     settings = settings if recorded is None else recorded.settings
@@ -324,7 +325,7 @@ def _run_by(
     if settings.extent == EXTENT_PART and prior is None:  # as it can be asked for again
         settings = replace(settings, extent=EXTENT_WHOLE, max_age=None, skip_below_error=None)
         extent_notes = ("nothing is remembered: the whole field is looked at",)
-    plan, scans, raster = CapturePlan.of_map(), ScanChoice(), None
+    plan, scans, raster, plan_notes = CapturePlan.of_map(), ScanChoice(), None, tuple[str, ...]()
     passes, bands = None if recorded is None else recorded.passes, len(scene.wavelength_nm)
     layout = PassLayout.of(settings, grid, zones.shown, passes)
     if settings.extent == EXTENT_PART and prior is not None:
@@ -340,12 +341,10 @@ def _run_by(
         )
         extent_notes = (words,)
     if pixels is None:
-        limits = ScanLimits(settings.seconds, settings.bytes_raw)
-        plain, goal = settings.plain, settings.goal
-        scans = choose_uniform_scan(layout, described, path.name, bands, plain=plain, goal=goal, limits=limits)
-        if scans.chosen is not None and plain and layout.step is None:
-            layout = replace(layout, step=scans.chosen.step, exposure_ms=scans.chosen.exposure_ms)
-        plan = layout.plan(None if plain else settings.budget)
+        scans = choose_uniform_scan(layout, described, path, bands, settings)
+        if settings.undecided and scans.chosen is None and path != weights_offered(settings)[-1]:
+            raise NoScanPaidFor(f"{path.name} reads uniform scans, and its record tells of none of this camera")
+        layout, plan, settings, plan_notes = lay_out_passes(layout, scans.chosen, settings)
     else:
         raster = RasterPixels(pixels.read, pixels.missing, bands, grid)
     settings = replace(settings, extent=layout.extent, scan_step=layout.step, scan_exposure_ms=layout.exposure_ms)
@@ -362,7 +361,7 @@ def _run_by(
     prior, prior_notes = found or find_prior(archive, settings, name, grid, described.class_names)
     if settings.prior != AUTO:  # what is meant when it is asked for again
         settings = replace(settings, prior=NONE if prior is None else prior.run)
-    said = (*notes, *zones.notes, *prior_notes, *extent_notes, *outside, *label_notes)
+    said = (*notes, *zones.notes, *plan_notes, *prior_notes, *extent_notes, *outside, *label_notes)
     return SurveyRun(
         settings=settings,
         archive=archive,

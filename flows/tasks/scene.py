@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from flows.settings.survey_settings import BUILT_IN_SCENES, RASTER, RECORDED, RIG, RIG_FIELD, SIM, Settings
 from flows.training.data import scene_of_file, unpack_mask
 from models.weights.files import Description
-from pipeline.errors import SceneError, SettingsError
+from pipeline.errors import NoSceneYet, NothingToMend, SceneError, SettingsError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import Once
 from pipeline.simulator.effects.effect import Effect
@@ -25,15 +26,66 @@ from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, farm_scene, la
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Source
+from storage.archive.keys import published_runs
+from storage.archive.records import read_run
 from storage.readers.cube_sources import machine_bytes
-from storage.readers.open_cubes import split_variable
+from storage.readers.label_files import is_label_name
+from storage.readers.open_cubes import reader_of, split_variable
 from storage.readers.raster_fields import is_glob, open_raster
 from storage.readers.scene_files import SceneFile, load_scene_file
+from storage.remote.opening import is_archive, open_archive
 
 # Peak of a survey of the farm without controls: 1.58 GB for 1280 x 1024 px, 4.12 GB for 2560 x 2560 px
 FARM_BYTES, FARM_BYTES_PER_PX = 1_000_000_000, 490
 POSE_WINS = "the scene's own place on the earth is set aside: [pose] says where it lies; leave [pose] out to keep it"
 SAME_HOUR = 0.5  # by which true solar time is at most off mean solar time, and whoever rounds it [h]
+
+
+DATE, NEW = "{date", "{new}"
+
+
+def is_pattern(scene: str) -> bool:
+    """Return whether a scene is named anew at each visit: by ``{date:%Y-%m-%d}``, by ``{new}``, or by both."""
+    return DATE in scene or NEW in scene
+
+
+def scene_of_visit(settings: Settings, moment: datetime) -> Settings:
+    """Return the settings with the file that a pattern stands for at a moment; those of any other scene as they are.
+
+    ``{date:%Y-%m-%d}`` is the date, in any form of strftime. ``{new}`` is any text: of the files so named it is the
+    newest, by the time it was written, that no run of the archive surveyed. Raises SettingsError: braces that say
+    neither; NoSceneYet: there is no such file; NothingToMend: all of them were surveyed.
+    """
+    if not is_pattern(settings.scene):
+        return settings
+    try:
+        named = settings.scene.format(date=moment, new=NEW)
+    except (KeyError, IndexError, ValueError) as error:
+        raise SettingsError(
+            f"--scene {settings.scene}: {error} cannot be filled in; braces are {{date:%Y-%m-%d}} or {NEW}"
+        ) from None
+    found = _newest_unseen(settings, named) if NEW in named else named
+    if not is_glob(found) and not split_variable(found)[0].exists():
+        raise NoSceneYet(f"there is no file {found} yet, which --scene {settings.scene} stands for")
+    return replace(settings, scene=found)
+
+
+def _newest_unseen(settings: Settings, pattern: str) -> str:
+    """Return the newest file of a pattern that no run of the archive surveyed; raises what `scene_of_visit` does."""
+    there = [Path(one) for one in glob.glob("*".join(map(glob.escape, pattern.split(NEW))))]  # noqa: PTH207 - escaped
+    there = [one for one in there if reader_of(one) != "none" and not is_label_name(one)]
+    if not there:
+        raise NoSceneYet(f"there is no file yet that --scene {pattern} stands for")
+    seen = dict[str, str]()
+    if is_archive(settings.out):
+        runs = published_runs(open_archive(settings.out, create=False, write=False).root)
+        seen = {str(read_run(folder, {}).settings.get("scene")): folder.name for folder in runs}
+    left = [one for one in there if str(one.absolute()) not in seen]
+    newest = max(left or there, key=lambda one: (one.stat().st_mtime, one.name))
+    if not left:
+        run = seen[str(newest.absolute())]
+        raise NothingToMend(run, f"nothing new: {run} surveyed {newest}, the newest that --scene {pattern} stands for")
+    return str(newest)
 
 
 def check_scene_there(scene: str, *, is_map: bool) -> None:
@@ -101,6 +153,7 @@ def open_map(settings: Settings, known: Sequence[str] | None = None) -> tuple[Sc
         filled_px=file.filled_px,
         missing=missing,
         geobox=file.geobox,
+        content=file.content,
     )
     scene, notes = _placed_once(scene, file.provenance, posed=settings.pose is not None)
     return file, scene, (*notes, *_gap_note(scene, "are as they are in the other bands"))
@@ -219,12 +272,29 @@ def check_labels(scene: RasterScene, weights: Description) -> tuple[str, ...]:
     law, learnt = law_of_key(scene.key), law_of_key(str(weights.record.get("data")))
     if None not in (law, learnt) and law != learnt:
         return (f"the weights were trained on {learnt}, the scene is of {law}: expect a poorer map",)
+    seen = seen_in_training(scene, weights)
+    return () if seen is None else (f"accuracy is counted on {TRAINING_SCENE[seen]}",)
+
+
+TRAINING_SCENE = {  # what a score on a scene of the training is a score of
+    "all": "a scene of the training, which says nothing of other fields",
+    "tiles": "a field some tiles of which are scenes of the training, which says little of other fields",
+    "other pixels": "those pixels of a scene of the training whose labels were left out of it",
+}
+
+
+def seen_in_training(scene: RasterScene, weights: Description) -> str | None:
+    """Return how much of a scene the weights were trained on, a key of `TRAINING_SCENE`; None for nothing.
+
+    Files are told by what they hold, whatever their names and whatever bands are read of them.
+    """
     split = weights.record.get("split", {})
     if scene.key in split.get("pixels", {}):
-        return ("accuracy is counted on the labelled pixels that the weights were not trained on",)
-    if scene.key in split.get("train", {}).values():
-        return ("the weights were trained on this scene: its accuracy says nothing of other fields",)
-    return ()
+        return "other pixels"
+    tiles = [one in split.get("content", ()) for one in scene.content]
+    if scene.key in split.get("train", {}).values() or (tiles and all(tiles)):
+        return "all"
+    return "tiles" if any(tiles) else None
 
 
 def judged_labels(scene: RasterScene, weights: Description) -> NDArray[np.uint8] | None:

@@ -98,6 +98,8 @@ def weights_offered(settings: Settings) -> tuple[Path, ...]:
             f" train some for {settings.scene} with: spectralzoom train DATASET -o my.safetensors"
         )
     plain, two_passes = shipped_weights(plain=True), shipped_weights()
+    if settings.undecided:
+        return plain, two_passes
     if not settings.plain:
         return (two_passes,)
     if settings.scan_step is None:
@@ -123,9 +125,12 @@ def beyond_training(
 ) -> tuple[str, ...]:
     """One note of all that training did not see, or none; ``trained`` is None where nobody knows what it saw."""
     _, reached = described.basis.matrix(scene.wavelength_nm)
+    known = np.ones_like(reached)  # columns that training reached
+    if trained is not None and trained.bands_nm is not None:
+        _, known = described.basis.matrix(np.array(trained.bands_nm))
     found = []
-    if not reached.all():
-        found.append(f"the bands reach {reached.sum()} of the weights' {len(reached)} spectral columns")
+    if (known & ~reached).any():
+        found.append(f"the bands reach {(known & reached).sum()} of the weights' {known.sum()} spectral columns")
     if trained is not None:
         low, high = trained.wavelength_nm
         beyond = (scene.wavelength_nm < low - BAND_NM) | (scene.wavelength_nm > high + BAND_NM)

@@ -7,7 +7,7 @@ as their record names them, and adds it to their file. The weights and all that 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,20 +49,14 @@ def trained_on(data: TrainingData, seen: SeenScenes, classes: tuple[str, ...]) -
     """Ranges of what training saw; season, sun and scale of the farm alone, which states them."""
     low, high = float(seen.wavelength_nm.min()), float(seen.wavelength_nm.max())
     exposures = (seen.darkest_ms, max(seen.darkest_ms, data.camera.exposure_ms))
-    trained = TrainedOn(len(seen.wavelength_nm), (low, high), exposures, len(data.train), classes)
+    bands_nm = tuple(seen.wavelength_nm.tolist())
+    trained = TrainedOn(len(bands_nm), (low, high), exposures, len(data.train), classes, bands_nm=bands_nm)
     if data.files is not None:
         return trained
     moments = [read_farm_name(name)[1:] for name in data.train]
     days, heights = [day for day, _ in moments], [sun_over_farm(*moment).elevation_deg for moment in moments]
-    return TrainedOn(
-        trained.bands,
-        trained.wavelength_nm,
-        trained.exposure_ms,
-        trained.scenes,
-        classes,
-        (min(days), max(days)),
-        (min(heights), max(heights)),
-        FARM_PIXEL_M,
+    return replace(
+        trained, day=(min(days), max(days)), sun_elevation_deg=(min(heights), max(heights)), ground_pixel_m=FARM_PIXEL_M
     )
 
 

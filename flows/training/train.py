@@ -65,7 +65,12 @@ def train_weights(
         tell(note)
     lesson = _lesson(request, data, start, report, tell)
     about = lesson.about
-    own = {"train": dict(about.keys), "validation": list(data.validation), "held_out": list(data.held_out)}
+    own = {
+        "train": dict(about.keys),
+        "content": list(about.content),
+        "validation": list(data.validation),
+        "held_out": list(data.held_out),
+    }
     # before validation scenes are looked at: what was trained on
     split = joined_split(own | {"pixels": dict(about.pixels)}, start)
     weights, summary = _learned(request, lesson, checkpoint, report)
@@ -211,7 +216,9 @@ def joined_split(split: Split, start: StartFile | None) -> Split:
     whole |= {key for key in own.values() if key not in parts}
     masks = {key: either_mask(parts.get(key), parts_before.get(key)) for key in parts.keys() | parts_before.keys()}
     more = {f"{start.path.name}: {name}": key for name, key in before.items() if key not in own.values()}
-    return split | {"train": own | more, "pixels": {key: mask for key, mask in masks.items() if key not in whole}}
+    pixels = {key: mask for key, mask in masks.items() if key not in whole}
+    content = [*split.get("content", ()), *earlier.get("content", ())]
+    return split | {"train": own | more, "content": content, "pixels": pixels}
 
 
 def usual_crop(dataset: str) -> int:

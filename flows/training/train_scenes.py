@@ -65,6 +65,7 @@ class About:
     patch: int
     wavelength_nm: NDArray[np.float64]
     keys: dict[str, str] = field(default_factory=dict)  # scene -> identity of its light
+    content: list[str] = field(default_factory=list)  # hashes of the scenes' files
     pixels: dict[str, str] = field(default_factory=dict)  # identity -> trained pixels, where not all labelled ones
     alike: dict[str, str] = field(default_factory=dict)  # scene -> class, where all its labels are one
     empty: list[str] = field(default_factory=list)  # scenes left out, which have no value anywhere
@@ -101,6 +102,7 @@ def observe_all(
                 f"scene {scene.name} has other bands than the scenes before it; train on scenes of one camera"
             )
         known.keys[name] = scene.key
+        known.content += scene.content
         mask = trained_pixels(scene)
         if request.choices.get("train_mask") is not None:
             known.pixels[scene.key] = pack_mask(mask)

@@ -18,6 +18,7 @@ Floats = NDArray[np.float32]
 Exact = NDArray[np.float64]
 PIXELS_AT_ONCE = 1 << 14  # so many lie in the processor's cache with their columns
 RATE = 0.001  # of known pixels that may be called unknown, unless the settings ask for another
+VARIANCE_FLOOR = 1e-5  # least variance of a direction, as a fraction of the largest: float32 keeps less only as noise
 
 
 @dataclass(frozen=True)
@@ -53,9 +54,12 @@ class OodDetector:
     bands: int  # of the camera in training; columns of fewer are noisier
 
     def lit(self, light: float, readings: float = 1.0) -> LitDetector:
-        """The components as a look shows them whose pixels are means of so many readings of an exposure ``light``."""
+        """The components as a look shows them whose pixels are means of so many readings of an exposure ``light``.
+
+        Raises ValueError: a covariance has a negative variance.
+        """
         noise = (self.shot / light + self.read / light**2) / readings
-        spread = self.covariance + noise
+        spread = np.stack([_floored(one) for one in self.covariance + noise])
         base = _whitening(spread.mean(axis=0))
         back = np.linalg.inv(base)
         columns = len(self.read)
@@ -75,6 +79,21 @@ class OodDetector:
         distance = self.lit(light, readings).distance(columns)
         with np.errstate(invalid="ignore"):
             return np.asarray(distance > limit, np.bool_)
+
+
+def _floored(covariance: Exact) -> Exact:
+    """Return a covariance without directions of less than `VARIANCE_FLOOR`; one that has none stays bit for bit.
+
+    Columns that no band of the training reached, or that repeat each other, have such directions. Raises ValueError: a
+    variance is more negative than rounding makes it.
+    """
+    power, axes = np.linalg.eigh(covariance)
+    least = VARIANCE_FLOOR * power[-1]
+    if power[0] >= least > 0:
+        return covariance
+    if not (least > 0 and power[0] > -least):
+        raise ValueError(f"a covariance has variances from {power[0]:.2g} to {power[-1]:.2g}")
+    return np.asarray((axes * np.maximum(power, least)) @ axes.T)
 
 
 def _whitening(covariance: Exact) -> Exact:

@@ -29,6 +29,7 @@ class TrainedOn:
     day: tuple[int, int] | None = None  # of the year
     sun_elevation_deg: Range | None = None
     ground_pixel_m: float | None = None
+    bands_nm: tuple[float, ...] | None = None  # centre of each band
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for a record; `read` gives them back."""
@@ -51,6 +52,7 @@ class TrainedOn:
             None if content["day"] is None else (int(content["day"][0]), int(content["day"][1])),
             None if content["sun_elevation_deg"] is None else span("sun_elevation_deg"),
             None if content["ground_pixel_m"] is None else float(content["ground_pixel_m"]),
+            None if content.get("bands_nm") is None else tuple(map(float, content["bands_nm"])),
         )
 
 

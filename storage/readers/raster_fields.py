@@ -153,6 +153,7 @@ def _side_by_side(address: Path, opened: Sequence[SceneFile], labels: str | Path
         wavelength_nm=first.wavelength_nm,
         fwhm_nm=first.fwhm_nm,
         light_hash=light_hash,
+        content=tuple(part for one in opened for part in one.content),
         provenance=tuple(notes),
         geobox=geobox,
         shape=shape,

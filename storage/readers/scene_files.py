@@ -45,6 +45,7 @@ class SceneFile:
     missing: NDArray[np.bool_]  # (y, x) pixels without a value in more than half of their bands
     filled_px: int  # pixels without a value in a band
     light_hash: str  # of values and wavelengths alone: labels do not change what a camera sees
+    content: tuple[str, ...]  # hash of what it was read from, in whatever bands; one for each tile
     provenance: tuple[str, ...]  # one sentence for each thing assumed or left out
     labels: NDArray[np.uint8] | None = None  # (y, x) class index, 255 = unlabelled
     class_names: tuple[str, ...] = ()
@@ -190,7 +191,8 @@ def _open(
     )
     assert light.wavelength_nm is not None
     stated = nodata if assumed and counted.void else settings.nodata
-    light_hash = _light_hash(file, variable, source, chosen, light, stated, void, scaling)
+    content = _content_hash(file, source.files)
+    light_hash = _light_hash(content, variable, source, chosen, light, stated, void, scaling)
     some = () if chosen == list(range(count)) else (f"bands {bands_text(chosen)} of {count}, counted from 0",)
     over = ("values are over the white reference",) if calibrated else ()
     scene = SceneFile(
@@ -203,6 +205,7 @@ def _open(
         missing=counted.missing,
         filled_px=counted.filled_px,
         light_hash=light_hash,
+        content=(content if variable is None else _digest(content, variable),),
         provenance=(
             *some,
             *bad_note,
@@ -221,7 +224,7 @@ def _open(
 
 
 def _light_hash(
-    file: Path,
+    content: str,
     variable: str | None,
     source: CubeSource,
     chosen: list[int],
@@ -236,7 +239,6 @@ def _light_hash(
     stated: tuple[str, ...] = () if nodata is None else (f"nodata {nodata!r}",)
     stated += () if void is None else (f"void {hashlib.sha256(np.packbits(void).tobytes()).hexdigest()}",)
     stated += tuple(one for one in (source.scaling, scaling) if one)
-    content = _content_hash(file, source.files)
     return _digest(content, variable, chosen, light.wavelength_nm.tolist(), widths, *stated)
 
 

@@ -153,7 +153,7 @@ def flip_archive(root: Path, flips: int, seed: int = 0) -> list[str]:
 
 def archive_rows(quick: bool) -> Sequence[Row]:
     clock, count = Clock(), 20 if quick else 200
-    survey = "survey --scene farm --size 256x256 --no-controls --engine plain --out"
+    survey = "survey --scene farm --size 256x256 --budget 0.5 --no-controls --engine plain --out"
     with tempfile.TemporaryDirectory(prefix="flips-") as place:
         command = [sys.executable, "-m", "flows.cli.main", *survey.split(), place]
         subprocess.run(command, cwd=ROOT, check=True, capture_output=True)

@@ -128,14 +128,20 @@ def test_a_band_is_found_by_its_wavelength(run: OpenedRun) -> None:
         xr.testing.assert_identical(red, one.isel(band=0))
 
 
-@given(st.lists(st.integers(300, 2500), min_size=1, max_size=8, unique=True), st.integers(300, 2500))
+@given(st.lists(st.integers(300, 2500), min_size=1, max_size=8), st.integers(300, 2500))
 def test_the_nearest_band_is_found_in_any_order(wavelengths: list[int], wanted: int) -> None:
-    """Also of two spectrometers that overlap, whose wavelengths rise and fall."""
-    names = {"wavelength": ("band", np.array(wavelengths, float))}
+    """Also of two spectrometers that overlap, whose wavelengths rise and fall, or that share one."""
+    values = np.array(wavelengths, float)
+    names = {"wavelength": ("band", values), "band": values}
     found = by_wavelength(xr.Dataset({"values": ("band", np.arange(len(wavelengths)))}, names))
-    chosen = found["values"].sel(wavelength=float(wanted), method="nearest")
-    assert abs(float(chosen.wavelength) - wanted) == min(abs(one - wanted) for one in wavelengths)
-    assert float(chosen.wavelength) == wavelengths[int(chosen)]
+    for name in names:
+        chosen = found["values"].sel({name: float(wanted)}, method="nearest")
+        assert abs(float(chosen.wavelength) - wanted) == min(abs(one - wanted) for one in wavelengths)
+        assert float(chosen.wavelength) == wavelengths[int(chosen)]
+        several = found["values"].sel({name: [float(wanted), values[0]]}, method="nearest")
+        assert several.wavelength.values.tolist() == [float(chosen.wavelength), values[0]]
+    assert set(found.indexes) == {"band", "wavelength"}
+    assert int(found.isel(band=slice(1))["values"].sel(band=wanted, method="nearest")) == 0
 
 
 def test_the_map_on_the_ground_has_its_crs(run: OpenedRun) -> None:

@@ -127,7 +127,8 @@ class RasterScene:
     widths of the bands, all (band,); widths are None where not known. Equal keys give equal light. ``geobox`` is where
     the pixels lie on the earth, as the scene's file says (None: it does not); ``pixel_m`` is how large a pixel of a
     scene without one is on the ground, where the scene's own law says so. ``regridded`` says that the labels came on
-    another grid and were brought to the scene's. Planes, labels and electrons may be made when
+    another grid and were brought to the scene's. ``content`` are hashes of the files that it was read from, whatever
+    bands of them are taken. Planes, labels and electrons may be made when
     they are first asked for; all else is known at once.
     """
 
@@ -145,6 +146,7 @@ class RasterScene:
     geobox: GeoBox | None = None
     pixel_m: float | None = None
     regridded: bool = False
+    content: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.light.is_made():

@@ -80,7 +80,11 @@ REFUSED = {
     ),
     "budget -1": (2, "--budget -1", "above 0 and at most 1, got '-1'"),
     "budget below the coarse pass": (2, "--budget 0.1", "the coarse pass alone takes.* least possible is 0.39"),
-    "scene smaller than a patch": (2, "--scene tiny.png", "the coarse pass alone takes.* least possible is 0.92"),
+    "scene smaller than a patch": (
+        2,
+        "--scene tiny.png --budget 0.5",
+        "the coarse pass alone takes.* least possible is 0.92",
+    ),
     "weights corrupt": (1, "--weights corrupt.safetensors", "corrupt.safetensors is not a readable safetensors file"),
     "weights missing": (1, "--weights none.safetensors", "no weights at none.safetensors; train some"),
     "weights of other wavelengths": (1, "--weights infrared.safetensors", "for 1500-2000 nm; .* at 460-640 nm"),

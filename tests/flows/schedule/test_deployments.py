@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -106,6 +107,22 @@ def test_a_wrong_parameter_ends_a_run_with_the_message_of_the_command_line(north
     state = run_here(planned(deployment, DUE, {"settings": {**settings, "budget": 2.0}}))
     assert state.is_failed()
     assert "--budget must be a fraction of the full scan's seconds, above 0 and at most 1, got 2.0" in state.message
+
+
+def test_each_visit_takes_the_scene_of_its_due_date(
+    field_file: Callable[..., Path], scene_files: Path, tmp_path: Path
+) -> None:
+    """A pattern of the date; a date without a file fails with its name, and the schedule goes on."""
+    for day in (1, 3):
+        shutil.copy(scene_files / "scene.png", tmp_path / f"2026-06-0{day}.png")
+    pattern = {"scene": str(tmp_path / "{date:%Y-%m-%d}.png"), "source": "raster", "budget": None}
+    deployment = deployed(load_fields([field_file("dated", **pattern)])[0])
+    states = [run_here(planned(deployment, DUE.replace(day=day, hour=12))) for day in (1, 2, 3)]
+    assert [state.name for state in states] == ["Completed", "Failed", "Completed"]
+    assert "there is no file" in states[1].message
+    assert "2026-06-02.png yet" in states[1].message
+    scenes = [Path(str(one["scene"])).name for one in settings_of(tmp_path / "archive")]
+    assert scenes == ["2026-06-01.png", "2026-06-03.png"]
 
 
 def test_a_run_is_a_visit_of_its_due_time_and_goes_on_from_the_newest(north: Any) -> None:

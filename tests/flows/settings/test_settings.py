@@ -45,7 +45,7 @@ def test_defaults_and_parts_are_read_back():
     """No file and no flag gives the design's defaults; every part is read back; effects are those that exist."""
     found = load_settings()
     assert found == Settings()
-    assert (found.scene, found.budget, found.policy, found.memory) == ("farm", 0.5, "gain", 4 * 2**30)
+    assert (found.scene, found.budget, found.policy, found.memory) == ("farm", None, "gain", 4 * 2**30)
     for name in ("camera", "cost", "optics", "mirror", "detector", "air", "sky"):
         assert parse_settings({name: asdict(getattr(Settings(), name))}) == Settings()
     every = ",".join(effect.name for effect in EFFECTS)

@@ -6,12 +6,15 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import xarray as xr
+from PIL import Image
 from rich.console import Console
 
 from flows.archive.plan_command import plan_content
 from flows.archive.reprocess_command import run_reprocess
+from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from pipeline.errors import BudgetError, SettingsError, WeightsError
 from tests.conftest import Survey, WeightsMaker
@@ -239,3 +242,58 @@ def test_a_limit_without_lines_of_a_uniform_scan_is_refused(given: dict[str, str
     """Two passes and rasters are kept otherwise."""
     with pytest.raises(SettingsError, match="--kept-bytes is for the lines of a uniform scan: give --seconds"):
         load_settings(None, {"scene": "field.png", "kept_bytes": "8MB", **given})
+
+
+def test_without_a_flag_the_cheapest_scan_nearly_as_good_as_any_is_taken(
+    survey_png: Survey, recorded: Path, tmp_path: Path
+) -> None:
+    """It is the reference that seconds are told beside, and the settings of the receipt say which it was."""
+    receipt = survey_png(tmp_path, weights=str(recorded), budget=None).receipt
+    taken, capture = receipt["scans"]["taken"], receipt["savings"]["capture_s"]
+    assert taken == receipt["scans"]["reference"]
+    assert (receipt["settings"]["scan_step"], receipt["settings"]["budget"]) == (taken["step"], None)
+    assert capture["done"] == pytest.approx(capture["full"])
+    assert taken["expected_miou"] >= 0.94 - 0.005
+
+
+def test_without_a_flag_and_a_record_there_are_two_passes(survey_png: Survey, tmp_path: Path) -> None:
+    """In half of the seconds of every line, as the receipt's settings say."""
+    receipt = survey_png(tmp_path, budget=None).receipt
+    assert (receipt["settings"]["budget"], receipt["settings"]["scan_step"]) == (0.5, None)
+    assert receipt["savings"]["capture_s"]["ratio"] <= 0.5
+
+
+@pytest.mark.parametrize(("name", "value"), [("policy", "gain"), ("coarse_exposure_ms", "20")])
+def test_what_only_two_passes_have_asks_for_them(recorded: Path, name: str, value: str) -> None:
+    """A flag that a uniform scan would not use is not passed over in silence."""
+    flags = {"scene": "farm", "weights": str(recorded)}
+    assert load_settings(None, {**flags, name: value}).budget == 0.5
+    assert load_settings(None, flags).undecided
+
+
+@pytest.mark.parametrize("shape", [(32, 32, 3), (8, 8, 3), (1, 40, 3), (1, 1, 3), (32, 32)])
+@pytest.mark.parametrize("source", ["raster", "sim"])
+def test_any_scene_is_surveyed_without_a_flag(
+    weights: Path, tmp_path: Path, shape: tuple[int, ...], source: str
+) -> None:
+    """However small, of one band too: a map of its size; for a camera every line is a scan that always pays."""
+    values = np.random.default_rng(0).integers(0, 255, shape, dtype=np.uint8)
+    Image.fromarray(values).save(tmp_path / "scene.png")
+    flags = {"scene": str(tmp_path / "scene.png"), "weights": str(weights), "source": source, "engine": "plain"}
+    published = run_survey(load_settings(None, flags | {"out": str(tmp_path / "out"), "effects": None}), QUIET)
+    assert _store(tmp_path / "out", "class_map")["classes"].shape == shape[:2]
+    if source == "sim":
+        assert published.receipt["plan"]["kind"] == "scan"
+        assert any("every line is captured" in note for note in published.receipt["settings"]["notes"])
+
+
+def test_candidates_are_those_of_the_weights_that_would_read_them(tmp_path: Path) -> None:
+    """The farm has two files of weights: plan names one reference, whatever was asked for."""
+    farm = {"scene": "farm", "size": "160x128", "out": str(tmp_path)}
+    asked = ({}, {"budget": "0.8"}, {"seconds": "8"}, {"scan_step": "4"}, {"scan_step": "2"})
+    told = [plan_content(load_settings(None, farm | more))["scans"] for more in asked]
+    assert [one["reference"] for one in told] == [told[0]["reference"]] * len(asked)
+    assert told[0]["taken"] == told[0]["reference"]
+    for figure in (min, max):
+        ends = [figure(scan["expected_miou"] for scan in one["frontier"]) for one in told]
+        assert ends == [ends[0]] * len(asked)

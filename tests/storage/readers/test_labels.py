@@ -121,7 +121,8 @@ def test_scene_toml_says_colours_of_numbers(tmp_path: Path) -> None:
     """They reach the scene; a colour of no class is refused."""
     np.save(tmp_path / "a.npy", np.zeros((4, 4, 3), np.uint8) + 7)
     np.save(tmp_path / "a_gt.npy", np.arange(16).reshape(4, 4) % 2)
-    words = 'wavelengths_nm = [650.0, 550.0, 450.0]\nlabels = "{name}_gt.npy"\n[classes]\nsoil = 0\ncane = 1\n[colours]\ncane = [1, 2, 3]\n'
+    facts = 'wavelengths_nm = [650.0, 550.0, 450.0]\nlabels = "{name}_gt.npy"\n'
+    words = f"{facts}[classes]\nsoil = 0\ncane = 1\n[colours]\ncane = [1, 2, 3]\n"
     (tmp_path / "scene.toml").write_text(words)
     assert load_scene_file(tmp_path / "a.npy").class_colours.tolist()[1] == [1, 2, 3]
     (tmp_path / "scene.toml").write_text(words.replace("cane = [1", "can = [1"))

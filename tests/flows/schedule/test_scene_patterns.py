@@ -1,0 +1,88 @@
+"""Scenes that each visit names anew: by its date, or the newest that was not surveyed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+
+from flows.publish.survey_command import run_survey
+from flows.schedule.serve_command import load_fields
+from flows.settings.load import load_settings
+from flows.settings.survey_settings import Settings
+from flows.tasks.scene import scene_of_visit
+from pipeline.errors import NoSceneYet, NothingToMend, SettingsError, WeightsError
+
+JUNE = datetime(2026, 6, 1, 12, tzinfo=UTC)
+
+
+def write_scene(folder: Path, name: str, written_s: float = 0.0) -> Path:
+    """Write a small picture, as if so many seconds after the others."""
+    folder.mkdir(exist_ok=True)
+    values = np.random.default_rng(len(name)).integers(0, 255, (32, 40, 3), dtype=np.uint8)
+    Image.fromarray(values).save(folder / name)
+    os.utime(folder / name, (1e9 + written_s, 1e9 + written_s))
+    return folder / name
+
+
+def asked(tmp_path: Path, pattern: str, **more: Any) -> Settings:
+    """Return the settings of a survey of a pattern in the folder ``scenes``."""
+    return load_settings(
+        None, {"scene": str(tmp_path / "scenes" / pattern), "out": str(tmp_path / "a"), "engine": "plain", **more}
+    )
+
+
+def test_the_date_of_the_visit_names_the_file(tmp_path: Path) -> None:
+    """In any form of strftime; whatever its name says beside it."""
+    names = {"{date:%Y-%m-%d}.png": "2026-06-01.png", "T32_{date:%Y%m%d}_{new}.png": "T32_20260601_b.png"}
+    for pattern, name in names.items():
+        wanted = write_scene(tmp_path / "scenes", name)
+        assert scene_of_visit(asked(tmp_path, pattern), JUNE).scene == str(wanted)
+    with pytest.raises(NoSceneYet, match=r"no file .*2026-06-02.png yet, which --scene .*date"):
+        scene_of_visit(asked(tmp_path, "{date:%Y-%m-%d}.png"), JUNE.replace(day=2))
+
+
+def test_a_scene_that_is_no_pattern_stays(tmp_path: Path) -> None:
+    """Braces are letters of a file's name as well."""
+    settings = asked(tmp_path, "field{1}.png")
+    assert scene_of_visit(settings, JUNE) is settings
+    with pytest.raises(SettingsError, match=r"braces are \{date:%Y-%m-%d\} or \{new\}"):
+        scene_of_visit(asked(tmp_path, "{date:%Y}/{field}.png"), JUNE)
+
+
+def test_the_newest_that_was_not_surveyed_is_taken_until_there_is_none(tmp_path: Path, weights: Path) -> None:
+    """By the time it was written; label files are none. Then the latest run stands, until another file comes."""
+    folder, quiet = tmp_path / "scenes", Console(quiet=True)
+    with pytest.raises(NoSceneYet, match="no file yet that --scene"):
+        scene_of_visit(asked(tmp_path, "{new}.png"), JUNE)
+    write_scene(folder, "z.png", 1)
+    newest = write_scene(folder, "a.png", 2)
+    write_scene(folder, "a_mask.png", 3)
+    more = {"weights": str(weights), "name": "north"}
+    for wanted in (newest, folder / "z.png"):
+        published = run_survey(asked(tmp_path, "{new}.png", **more), quiet)
+        assert published.receipt["settings"]["scene"] == str(wanted)
+    with pytest.raises(NothingToMend, match=r"nothing new: .*-north surveyed .*a.png") as told:
+        run_survey(asked(tmp_path, "{new}.png", **more), quiet)
+    assert (tmp_path / "a" / "runs" / told.value.run).is_dir()
+    later = write_scene(folder, "b.png", 4)
+    assert scene_of_visit(asked(tmp_path, "{new}.png", **more), JUNE).scene == str(later)
+
+
+def test_a_schedule_begins_before_there_is_a_scene(
+    field_file: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It says so; weights that cannot be used are refused at once."""
+    pattern = {"scene": str(tmp_path / "scenes" / "{new}.png"), "source": None, "budget": None}
+    (field,) = load_fields([field_file("north", **pattern)])
+    assert field.settings.scene == pattern["scene"]
+    assert "it is looked for whenever it is due" in capsys.readouterr().err
+    with pytest.raises(WeightsError):
+        load_fields([field_file("south", **pattern, weights=str(tmp_path / "none.safetensors"))])

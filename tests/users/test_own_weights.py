@@ -1,0 +1,135 @@
+"""Weights trained on tiles of one's own, and what a survey by them says: of scenes they learned from, of bands."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rasterio
+import rioxarray  # noqa: F401 - registers the accessor that users have
+import xarray as xr
+from rasterio.transform import from_origin
+
+from flows.cli.main import main
+from models.weights.files import describe_weights, load_ood
+from spectralzoom import open as open_archive
+from tests.flows.conftest import command_line
+
+__all__ = ["command_line"]
+
+SENTINEL_NM = (443, 490, 560, 665, 705, 740, 783, 842, 865, 945, 1375, 1610, 2190)  # none between 1610 and 2190
+SIDE = 32
+SMALL = ["--steps", "2", "--dim", "16", "--layers", "1", "--heads", "2", "--batch", "1", "--crop", "16"]
+PLAIN = ["--engine", "plain", "--no-controls"]
+
+
+def write_tile(folder: Path, number: int) -> None:
+    """Write a tile of three classes in 13 bands, and its labels, side by side with those before it."""
+    rng = np.random.default_rng(number)
+    labels = (np.add.outer(np.arange(SIDE) + 3 * number, np.arange(SIDE)) // 8 % 3).astype(np.uint8)
+    spectra = np.stack([np.linspace(300, 3000, 13), np.linspace(2500, 500, 13), 1500 + 500 * np.sin(np.arange(13))])
+    values = (spectra[labels] + rng.normal(0, 30, (SIDE, SIDE, 13))).astype(np.uint16)
+    place = {"crs": "EPSG:32633", "transform": from_origin(5e5 + 10 * SIDE * number, 5e6, 10, 10)}
+    size = {"driver": "GTiff", "width": SIDE, "height": SIDE, **place}
+    with rasterio.open(folder / "images" / f"t{number}.tif", "w", count=13, dtype="uint16", **size) as file:
+        file.write(np.moveaxis(values, 2, 0))
+        for band, centre in enumerate(SENTINEL_NM, 1):
+            file.update_tags(band, wavelength=str(centre), wavelength_units="nm")
+    with rasterio.open(folder / "labels" / f"t{number}.tif", "w", count=1, dtype="uint8", **size) as file:
+        file.write(labels, 1)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with four tiles and weights that learned from t1 to t3; t0 was kept for validation."""
+    here = tmp_path_factory.mktemp("tiles")
+    for name in ("images", "labels"):
+        (here / "field" / name).mkdir(parents=True)
+    for number in range(4):
+        write_tile(here / "field", number)
+    words = ["train", here / "field", "-o", here / "w.safetensors", "--validation", "1", "--min-exposure-ms", "3"]
+    with pytest.raises(SystemExit) as ended:
+        main([*map(str, words), *SMALL])
+    assert not ended.value.code
+    assert list(describe_weights(here / "w.safetensors").record["split"]["validation"]) == ["0"]
+    return here
+
+
+def survey(command_line: Any, made: Path, scene: object, out: Path, *words: str) -> tuple[str, dict[str, Any]]:
+    """Survey a scene; what the terminal says in one line, and the receipt."""
+    ended = command_line("survey", "--scene", scene, "--weights", made / "w.safetensors", "--out", out, *PLAIN, *words)
+    assert ended.code == 0, ended.err
+    folder = open_archive(out).latest.folder
+    return " ".join((ended.out + ended.err).split()), json.loads((folder / "receipt.json").read_text())
+
+
+def test_a_score_on_a_scene_of_the_training_says_so_in_its_sentence(
+    made: Path, tmp_path: Path, command_line: Any
+) -> None:
+    """Terminal, report and receipt say it, and ls marks the score; of a scene that was kept from training they do not.
+
+    The file is known by what it holds: under another name, and in other bands.
+    """
+    scene = tmp_path / "other name.tif"
+    shutil.copy(made / "field" / "images" / "t1.tif", scene)
+    labels = ["--labels", str(made / "field" / "labels" / "t1.tif")]
+    for words in ([], ["--bands", "0-8"]):
+        said, receipt = survey(command_line, made, scene, tmp_path / "a", *labels, *words)
+        sentence = "of 100 against the truth on a scene of the training, which says nothing of other fields ("
+        assert sentence in said
+        assert receipt["training_scene"] == "all"
+        page = (open_archive(tmp_path / "a").latest.folder / "report.html").read_text()
+        assert sentence in page
+    assert "* on a scene that the weights were trained on" in command_line("ls", tmp_path / "a").out
+    said, receipt = survey(command_line, made, made / "field" / "images" / "t0.tif", tmp_path / "b")
+    assert "of 100 against the truth (" in said
+    assert "training_scene" not in receipt
+    assert "*" not in command_line("ls", tmp_path / "b").out
+
+
+def test_a_field_of_tiles_tells_that_some_are_scenes_of_the_training(
+    made: Path, tmp_path: Path, command_line: Any
+) -> None:
+    """Three of the four tiles taught the weights."""
+    said, receipt = survey(command_line, made, made / "field" / "images", tmp_path / "a")
+    assert "against the truth on a field some tiles of which are scenes of the training" in said
+    assert receipt["training_scene"] == "tiles"
+
+
+def test_what_training_writes_of_13_bands_opens(made: Path) -> None:
+    """No band reaches a column between 1610 and 2190 nm, so that its variance is 0; it is familiar all the same."""
+    familiar = load_ood(made / "w.safetensors")
+    assert np.linalg.eigvalsh(familiar.covariance).min() < 1e-5 * np.linalg.eigvalsh(familiar.covariance).max()
+    for light in familiar.limits.light:
+        assert np.isfinite(familiar.lit(float(light)).distance(familiar.centres)).all()
+
+
+def test_the_bands_of_the_training_are_within_the_training(made: Path, tmp_path: Path, command_line: Any) -> None:
+    """No note of columns that training itself did not reach; other bands still bring one, of those that it did."""
+    said, _ = survey(command_line, made, made / "field" / "images" / "t0.tif", tmp_path / "a")
+    assert "spectral columns" not in said
+    said, _ = survey(command_line, made, made / "field" / "images" / "t0.tif", tmp_path / "a", "--bands", "0-8")
+    assert "the bands reach 5 of the weights' 12 spectral columns" in said
+
+
+def test_what_a_run_left_is_written_as_netcdf_and_zarr(made: Path, tmp_path: Path, command_line: Any) -> None:
+    """Every product of a scene with a place, by plain xarray; rioxarray finds the CRS in what was written."""
+    survey(command_line, made, made / "field" / "images" / "t0.tif", tmp_path / "a")
+    run = open_archive(tmp_path / "a").latest
+    run.class_map.to_netcdf(tmp_path / "map.nc")
+    run.class_map.to_zarr(tmp_path / "map.zarr", consolidated=False)
+    for read in (xr.open_dataset(tmp_path / "map.nc"), xr.open_zarr(tmp_path / "map.zarr", consolidated=False)):
+        assert (read["classes"].rio.crs.to_epsg(), read["classes"].dtype) == (32633, np.uint8)
+        np.testing.assert_array_equal(read["classes"], run.class_map)
+        read.close()
+    for name in run.products:
+        run.dataset(name).to_netcdf(tmp_path / f"{name}.nc")
+        with xr.open_dataset(tmp_path / f"{name}.nc") as read:
+            assert set(read.data_vars) == set(run.dataset(name).data_vars)
+    run.mosaic.to_netcdf(tmp_path / "cube.nc")
+    with xr.open_dataset(tmp_path / "cube.nc") as read:
+        np.testing.assert_array_equal(read["spectra"], run.mosaic)
