@@ -9,7 +9,7 @@ they fluctuate by the Tracy-Widom law (Johnstone 2001): that is the test.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import numpy as np
@@ -23,7 +23,9 @@ SPECTRA_A_BAND = 200  # single spectra that a covariance is estimated from, for 
 FEW_BANDS = 8  # fewer cannot predict each other: their noise comes from neighbouring pixels, and all are kept
 KEPT_SPECTRA = 8192  # of which the law of residuals is learned
 FINE = 1 / 16  # of the noise: the step in which few bands are kept, where nothing tells a better one
-SMALL_FIELD, MOST_OF_SMALL = 10_000, 32  # spectra up to which so many components are kept; fewer in larger fields
+SMALL_FIELD = 500_000  # spectra: of fewer all smooth directions are kept, for some megabytes
+SMOOTH = 24  # bumps over the wavelengths; as many columns as networks read
+LACKING = 0.3  # of the length of a bump: a direction with less of it is in the components already
 NOISE_ROUNDS = 6
 MOST_SHARED = 32  # directions of rare spectra that become components
 LEAST_NOISE = 1e-6  # of a band's largest value: values that never change have no noise to divide by
@@ -182,9 +184,29 @@ def find_components(found: SignalStatistics, *, false_alarm: float = 0.01, least
     return Components(mean, loadings, deviations)
 
 
-def least_of_field(spectra: int) -> int:
-    """Components to keep at any rate of a field of so many spectra: few of them prove little, and cost little."""
-    return int(MOST_OF_SMALL * min(1.0, np.sqrt(SMALL_FIELD / max(spectra, 1))))
+def components_of_field(
+    found: SignalStatistics, wavelength_nm: Floats, *, false_alarm: float, least: int
+) -> Components:
+    """Find the components of a field; of a small one with all smooth directions.
+
+    Materials differ smoothly, and a difference far below the noise of a spectrum tells two crops apart where it is
+    averaged over many spectra. No test of the whole field finds it where one of the two covers a small part: a
+    thirtieth of a million spectra, more of fewer. So small fields keep `SMOOTH` bumps, evenly spread over the
+    wavelengths, which is what networks read of a spectrum. ``wavelength_nm`` is (band,).
+    """
+    components = find_components(found, false_alarm=false_alarm, least=least)
+    lit = np.isfinite(components.mean)
+    nm = np.asarray(wavelength_nm, np.float64)[lit]
+    if found.expected >= SMALL_FIELD or len(nm) <= FEW_BANDS or np.ptp(nm) == 0:
+        return components
+    centres, spacing = np.linspace(nm.min(), nm.max(), SMOOTH, retstep=True)
+    bumps = np.exp(-0.5 * ((nm - centres[:, None]) / (spacing / 2)) ** 2) * components.noise[lit]
+    bumps /= np.linalg.norm(bumps, axis=1, keepdims=True)
+    known = components.axes[:, lit]
+    length, rows = np.linalg.svd(bumps - (bumps @ known.T) @ known, full_matrices=False)[1:]
+    axes = np.zeros((np.count_nonzero(length > LACKING), components.bands))
+    axes[:, lit] = rows[length > LACKING]
+    return replace(components, axes=np.concatenate([components.axes, axes]))
 
 
 def bands_alone(found: SignalStatistics, unit: Floats | float | None = None) -> Components:

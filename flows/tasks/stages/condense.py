@@ -21,14 +21,7 @@ from pipeline.signal.calibrate import number_values
 from pipeline.signal.components import Components
 from pipeline.signal.condense import RESIDUAL_STEP, ResidualLaw, score_lines, whole_steps
 from pipeline.signal.lines import BLOCK_LINES
-from pipeline.signal.subspace import (
-    FEW_BANDS,
-    SignalStatistics,
-    bands_alone,
-    find_components,
-    least_of_field,
-    with_shared,
-)
+from pipeline.signal.subspace import FEW_BANDS, SignalStatistics, bands_alone, components_of_field, with_shared
 from pipeline.signal.sweep_signal import CondensedSweep, Condenser, calibrated_blocks, differing_lines
 from storage.archive.keys import StageRef
 from storage.archive.manifests import check_files, read_table, write_table
@@ -153,8 +146,8 @@ def camera_of(params: Mapping[str, Any]) -> LineCamera:
 def components_of(found: SignalStatistics, cubes: Sequence[RawCube], choice: SignalChoice) -> Components:
     """Find the components of a pass; few bands are kept as they are, in steps of one number of the camera."""
     if found.bands > FEW_BANDS or not found.count:
-        least = max(choice.least, least_of_field(found.expected))
-        return find_components(found, false_alarm=choice.false_alarm, least=least)
+        bands = cubes[0].wavelength_nm
+        return components_of_field(found, bands, false_alarm=choice.false_alarm, least=choice.least)
     return bands_alone(found, number_values(cubes[0].references))
 
 

@@ -14,7 +14,7 @@ from flows.tasks.stage import FieldFrame, Report, Wanted, stage
 from flows.tasks.stages.placement import MOSAIC, finish_mosaic
 from pipeline.readings import MOST_VALUE, readings_alone
 from pipeline.signal.condense import UNUSABLE, score_lines
-from pipeline.signal.subspace import FEW_BANDS, SignalStatistics, bands_alone, find_components, least_of_field
+from pipeline.signal.subspace import FEW_BANDS, SignalStatistics, bands_alone, components_of_field
 from storage.arrays.layout import SHARD_ROWS
 from storage.arrays.mosaics import MosaicWriter
 from storage.readers.raster_fields import RasterPixels
@@ -46,8 +46,9 @@ def condense_raster(
         if raster.bands <= FEW_BANDS and found.count:
             components = bands_alone(found, 1.0 if whole else None)
         else:
-            least = max(signal.least, least_of_field(found.expected))
-            components = find_components(found, false_alarm=signal.false_alarm, least=least)
+            components = components_of_field(
+                found, frame.wavelength_nm, false_alarm=signal.false_alarm, least=signal.least
+            )
         origin = np.zeros(raster.bands) if found.origin is None else found.origin
         writer = MosaicWriter(
             path / "mosaic.zarr",
