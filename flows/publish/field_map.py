@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.colors import to_rgba
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -31,6 +32,7 @@ MOST_PX = 2048  # of a map's longer side; of larger ones every n-th pixel is sho
 QUALITY = 80  # of a photograph as WebP
 LEVELS = 50  # of a ramp of colours; the next number is see-through
 CHANGED_RGB, PATCH_RGB = (196, 38, 46), (0, 190, 200)
+ERROR_COLOURS = {"right": "#c9d3c4", "wrong": "#c4262e"}  # of labelled pixels
 Bytes = NDArray[np.uint8]
 
 
@@ -51,6 +53,7 @@ class FieldMap:
     size: tuple[int, int]
     layers: Sequence[MapLayer]
     classes: Sequence[dict[str, str]]
+    errors: str | None = None  # as an address of data: where map and labels differ, None without labels
 
     @property
     def data(self) -> dict[str, Any]:
@@ -103,8 +106,11 @@ def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: Prio
     layers.append(MapLayer("Class map", classes(shown.class_map), shown=True))
     if shown.confidence is not None:
         layers.append(MapLayer("Confidence, dark 0 to bright 1", _ramp_address(shown.confidence[thin, thin], 1.0)))
+    errors = None
     if shown.truth is not None:
         layers.append(MapLayer("Truth", classes(shown.truth)))
+        errors = error_address(shown.class_map[thin, thin], shown.truth[thin, thin])
+        layers.append(MapLayer("Errors: map and truth differ", errors, opacity=0.8))
     if before is not None:
         layers.append(MapLayer(f"Before: {format_days(before.days)}", classes(before.classes)))
         oldest = float(np.nanmax(before.age_days)) if np.isfinite(before.age_days).any() else 0.0
@@ -133,7 +139,17 @@ def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: Prio
         for name, fraction, colour in zip((*shown.class_names, "no class"), covered, palette, strict=False)
         if fraction
     ]
-    return FieldMap((width, height), layers, rows)
+    return FieldMap((width, height), layers, rows, errors)
+
+
+def error_address(class_map: NDArray[np.integer], labels: NDArray[np.integer]) -> str:
+    """Return the data address of a picture of where (y, x) classes differ from labels, by `ERROR_COLOURS`.
+
+    Pixels that either lacks are see-through.
+    """
+    judged = (class_map != UNLABELLED) & (labels != UNLABELLED)
+    colours = [(0, 0, 0, 0), *(np.rint(255 * np.array(to_rgba(one))) for one in ERROR_COLOURS.values())]
+    return layer_address(np.where(judged, 1 + (class_map != labels), 0).astype(np.uint8), np.array(colours, np.uint8))
 
 
 def palette_bytes(names: Sequence[str], colours: NDArray[np.integer] | None) -> Bytes:

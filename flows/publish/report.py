@@ -8,24 +8,29 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import posixpath
+import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib.resources import files
 from typing import Any
+from urllib.parse import quote
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from jinja2.utils import htmlsafe_json_dumps
 from markupsafe import Markup
 
 from flows.publish.effects_table import format_change, format_total
-from flows.publish.field_map import FieldMap
+from flows.publish.field_map import ERROR_COLOURS, FieldMap
 from flows.publish.panels import data_address
 from flows.publish.receipt import Receipt
 from flows.publish.receipt_table import byte_rows, cost_rows, finding_rows, format_reused, headline, plot_rows
 from flows.tasks.scores import error_matrix, format_false_classes
 from flows.terminal.figures import format_bytes, format_percent, format_points, format_seconds
 from pipeline.errors import visible
+from storage.readers.open_cubes import split_variable
+from storage.readers.recordings import LINE_PRODUCTS
 
 LEAFLET = "vendor/leaflet-1.9.4"  # leafletjs.com, BSD-2-Clause: unchanged from npm's registry
 SHA256 = {
@@ -151,10 +156,13 @@ def render_report(
         kicker="SpectralZoom survey",
         title=receipt["survey"],
         lead=headline(receipt, captured_again),
-        about=f"{receipt['scene']} seen by {receipt['source']}, seed {receipt['seed']}, finished {receipt['finished']}",
+        about=_format_about(receipt),
         receipt=receipt,
+        links=product_links(receipt),
+        export=shlex.join(["spectralzoom", "export", receipt["settings"]["out"], *_run_folder(receipt).split("/")[1:]]),
         field=field,
         leaflet=LEAFLET,
+        error_colours=ERROR_COLOURS,
         pictures=[{"address": data_address(one.content), "caption": one.caption} for one in shown],
         costs=cost_rows(receipt["savings"]),
         byte_rows=byte_rows(receipt),
@@ -173,9 +181,31 @@ def render_report(
                 for key, item in (value.items() if isinstance(value, Mapping) else [("", value)])
             },
             "Versions": receipt["versions"],
-            "Files of this survey": receipt["products"],
         },
     )
+
+
+def _format_about(receipt: Receipt) -> str:
+    """Return the scene by the name of its file, who saw it, and when."""
+    scene = split_variable(receipt["settings"]["scene"])[0].name
+    return f"{scene} seen by {receipt['source']}, seed {receipt['seed']}, finished {receipt['finished']}"
+
+
+def product_links(receipt: Receipt) -> dict[str, str]:
+    """Return the products of a run by name, each as an address seen from its report.
+
+    Raw lines are left out: they may be cleared away later. So is the report itself.
+    """
+    return {
+        name.replace("_", " "): quote(posixpath.relpath(address, _run_folder(receipt)))
+        for name, address in receipt["products"].items()
+        if name not in (*LINE_PRODUCTS, "report.html")
+    }
+
+
+def _run_folder(receipt: Receipt) -> str:
+    products: Mapping[str, str] = receipt["products"]
+    return next(posixpath.dirname(one) for one in products.values() if one.startswith("runs/"))
 
 
 def replace_bytes(page: str, receipt: Receipt) -> str:

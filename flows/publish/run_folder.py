@@ -23,6 +23,7 @@ from flows.publish.panels import draw_ground, webp
 from flows.publish.quicklook import QuicklookData, draw_quicklook
 from flows.publish.receipt import AccuracyIs, Receipt, build_receipt, check_receipt, with_accuracy
 from flows.publish.report import Picture, render_report
+from flows.publish.spectra import draw_spectra
 from flows.settings.load import anchor_paths
 from flows.settings.values import EXTENT_WHOLE
 from flows.tasks.open_survey import STAGES, OpenSurvey, Products
@@ -52,6 +53,7 @@ from storage.arrays.mosaics import load_attention, open_mosaic
 from storage.arrays.quicklooks import choose_bands
 from storage.arrays.signal_cubes import SignalCube, open_signal_cubes
 
+SPECTRA_CAPTION = "Mean spectra of the classes as mapped. Curves stop where bands were removed."
 LIBRARIES = ("spectralzoom", "numpy", "numba", "torch", "zarr", "xarray", "prefect")
 
 
@@ -115,6 +117,10 @@ def _publish(survey: OpenSurvey, draft: RunDraft, plan: FinePlan, receipt: Recei
         picture = webp(opened.convert("RGB"), lossless=True)
     maps = (load_ground_map(ref.path / STORE) for ref in products.there("ground"))
     pictures = [Picture(draw_ground(drawn), "The map on the ground, north up.") for drawn in maps]
+    mosaic = open_mosaic(products.mosaic.path / "mosaic.zarr")
+    drawn = load_class_map(products["segment"].path / "class_map.zarr")
+    if (spectra := draw_spectra(mosaic, drawn)) is not None:
+        pictures.append(Picture(spectra, SPECTRA_CAPTION))
     field = field_map(run, plan, shown, prior_map(run.prior, products["segment"], receipt))
     receipt = publish_counted(
         run.archive,

@@ -11,8 +11,10 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
+from PIL import Image
 from rich.console import Console
 
+from flows.publish.field_map import ERROR_COLOURS, FieldMap, error_address
 from flows.publish.receipt import COSTS, Receipt, build_receipt, check_receipt
 from flows.publish.receipt_table import finding_rows, headline, print_table
 from flows.publish.report import Picture, render_report
@@ -239,7 +241,7 @@ def test_words_are_escaped():
     """A survey, a class, a policy and a setting with markup in their names stay words."""
     receipt = copy.deepcopy(make_receipt())
     bad = '<script>alert("1")</script>&'
-    receipt["survey"] = receipt["scene"] = receipt["settings"]["out"] = receipt["stages"][0]["name"] = bad
+    receipt["survey"] = receipt["settings"]["scene"] = receipt["settings"]["out"] = receipt["stages"][0]["name"] = bad
     receipt["versions"] = {bad: bad}
     receipt["accuracy"]["per_class_iou"] = {bad: 0.5}
     receipt["accuracy"]["false_classes"] = {bad: 1}
@@ -295,3 +297,50 @@ def test_a_report_has_the_confusion_matrix() -> None:
     assert "mapped as soil bare weed user's accuracy" in page.replace("&#39;", "'")
     for row in ("soil 8 1 88.9", "bare weed 2 6 75.0", "wheat 1 1 0.0", "producer's accuracy 72.7 75.0", "is 0.487"):
         assert row in page.replace("&#39;", "'"), row
+
+
+def test_a_report_names_the_file_of_the_scene() -> None:
+    """By its name, not by the hash of what it holds; a variable of it and its folders are left out."""
+    receipt = make_receipt()
+    receipt["scene"] = "9f86d081884c7d65"
+    receipt["settings"]["scene"] = "/data/fields/north.mat:cube"
+    page = render_report(receipt, PNG)
+    assert "north.mat seen by sim, seed 7" in page
+    assert "9f86d081884c7d65" not in page
+
+
+def test_a_report_links_the_products() -> None:
+    """Seen from its own folder, in letters that a browser takes; neither raw lines, which may go, nor the report."""
+    receipt = make_receipt()
+    receipt["products"] = {
+        **{"raw_coarse": "stages/capture/ab/lines", "class_map": "stages/segment/cd/class_map.zarr"},
+        **{"receipt.json": "runs/north #1/receipt.json", "report.html": "runs/north #1/report.html"},
+    }
+    page = render_report(receipt, PNG)
+    assert Page(page).links == ["../../stages/segment/cd/class_map.zarr", "receipt.json"]
+    assert "spectralzoom export archive &#39;north #1&#39; -o maps" in page
+
+
+def test_the_effects_of_the_simulator_are_folded() -> None:
+    """Their table opens on a click; nothing of it where nothing was simulated."""
+    page = render_report(make_receipt(), PNG)
+    folded = page.partition('<details id="effects"><summary>What the simulator took into account</summary>')[2]
+    assert "asked for" in folded.partition("</details>")[0]
+    receipt = make_receipt()
+    del receipt["effects"], receipt["effects_total"]
+    assert "simulator" not in render_report(receipt, PNG)
+
+
+def test_an_error_map_stands_beside_the_scores() -> None:
+    """By hand: right, wrong, without a label and without a class; none in a report without labels."""
+    classes, labels = np.array([[0, 1], [2, 255]], np.uint8), np.array([[0, 0], [255, 1]], np.uint8)
+    address = error_address(classes, labels)
+    with Image.open(io.BytesIO(base64.b64decode(address.partition(",")[2]))) as opened:
+        shown = np.asarray(opened.convert("RGBA"))
+    right, wrong = ((*bytes.fromhex(one[1:]), 255) for one in ERROR_COLOURS.values())
+    assert tuple(shown[0, 0]) == right
+    assert tuple(shown[0, 1]) == wrong
+    assert shown[1, :, 3].tolist() == [0, 0]
+    page = render_report(make_receipt(), PNG, field=FieldMap((2, 2), [], [], address))
+    assert address in page.partition("Where map and labels differ")[2]
+    assert "labels differ" not in render_report(make_receipt(), PNG, field=FieldMap((2, 2), [], []))

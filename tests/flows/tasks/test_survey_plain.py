@@ -242,6 +242,11 @@ def test_products_are_where_the_receipt_says_and_open_from_disk(farm: Done) -> N
     assert all(one.startswith("data:image/") for one in page.loaded)
     assert not re.search(r"@import|url\(", html.partition("<script>")[0])
     assert "data:image/webp;base64," in html
+    assert len(page.links) > 5
+    for link in page.links:
+        assert (folder.parent / link).exists(), link
+    assert "Errors: map and truth differ" in html
+    assert "Mean spectra of the classes" in html
     with Image.open(farm.archive / farm.receipt["products"]["quicklook.png"]) as image:
         assert image.format == "PNG"
         assert min(image.size) >= 600
