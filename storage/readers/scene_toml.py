@@ -68,7 +68,7 @@ class SceneSettings(BaseModel):
         if len(set(self.classes.values())) < len(self.classes):
             raise ValueError("has two classes of the same number or colour; give each its own")
         if self.classes and (unknown := sorted(set(self.colours) - set(self.classes))):
-            raise ValueError(f"has colours of {", ".join(unknown)}, which [classes] lacks; name classes of that table")
+            raise ValueError(f"has colours of {', '.join(unknown)}, which [classes] lacks; name classes of that table")
         if len(self.classes) > 255:
             raise ValueError(f"has {len(self.classes)} classes, at most 255 fit a class map; merge some")
         return self
