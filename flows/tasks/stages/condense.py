@@ -146,7 +146,7 @@ def camera_of(params: Mapping[str, Any]) -> LineCamera:
 def components_of(found: SignalStatistics, cubes: Sequence[RawCube], choice: SignalChoice) -> Components:
     """Find the components of a pass; few bands are kept as they are, in steps of one number of the camera."""
     if found.bands > FEW_BANDS or not found.count:
-        bands = cubes[0].wavelength_nm
+        bands = cubes[0].wavelength_nm if cubes else np.zeros(found.bands)  # a pass may have no sweep
         return components_of_field(found, bands, false_alarm=choice.false_alarm, least=choice.least)
     return bands_alone(found, number_values(cubes[0].references))
 
