@@ -103,10 +103,11 @@ def find_run(catalogue: Catalogue, text: str) -> Run:
 
 
 def _is_same_field(old: Run, new: Run) -> bool:
-    """By the scene's key without its bands, or by the scene's file, which may show the field as it is now."""
-    files = [run.settings.get("scene") for run in (old, new)]
+    """By the scene's key without its bands, or by its file or the survey's name: either may show the field as now."""
+    files, names = ([run.settings.get(what) for run in (old, new)] for what in ("scene", "name"))
     same_file = files[0] == files[1] and files[0] not in NO_FILES
-    return _field_key(old) == _field_key(new) or same_file
+    same_name = names[0] == names[1] is not None and not set(files) & set(NO_FILES)
+    return _field_key(old) == _field_key(new) or same_file or same_name
 
 
 def _field_key(run: Run) -> str:

@@ -251,7 +251,12 @@ def _draw_legend(figure: Figure, data: QuicklookData, columns: int) -> None:
     if any((image == UNLABELLED).any() for image in others):
         marks.append(Patch(facecolor=UNLABELLED_COLOUR, edgecolor="#555555", linewidth=0.6))
         names.append("unlabelled")
-    figure.legend(marks, names, loc="outside lower center", ncol=min(columns, len(names)), frameon=False, fontsize=13)
+    for count in range(min(columns, len(names)), 0, -1):  # long names leave room for fewer beside each other
+        legend = figure.legend(marks, names, loc="outside lower center", ncol=count, frameon=False, fontsize=13)
+        if legend.get_window_extent().width <= figure.bbox.width:
+            return
+        if count > 1:
+            legend.remove()
 
 
 def _palette(data: QuicklookData) -> NDArray[np.float32]:

@@ -106,11 +106,13 @@ TIME = 7
 
 
 class _WordsOrLeft(TimeRemainingColumn):
-    """Words where there are some, else how long it will take still: they never share a narrow line."""
+    """How long it will take still, behind the words where there are some: a narrow line cuts it off."""
 
     def render(self, task: Task) -> Text:
         words = task.fields["words"]
-        return Text(words) if words else Text("left ") + super().render(task)
+        if words and (task.fields["ended"] or task.time_remaining is None):
+            return Text(words)
+        return Text(f"{words}  left " if words else "left ") + super().render(task)
 
 
 class StageProgress:
@@ -151,9 +153,9 @@ class StageProgress:
             self._listener(stage, done, 1.0)
         title = self.titles.get(stage, stage)
         if stage not in self._tasks:
-            self._tasks[stage] = self._bars.add_task(title, total=1.0, words="")
+            self._tasks[stage] = self._bars.add_task(title, total=1.0, words="", ended=False)
             self._said[stage] = time.monotonic()
-        self._bars.update(self._tasks[stage], completed=done, words=words)
+        self._bars.update(self._tasks[stage], completed=done, words=words, ended=ended)
         due = time.monotonic() - self._said[stage] > LINE_EVERY_S
         if not self.console.is_terminal and (ended or due):
             self._said[stage] = time.monotonic()

@@ -115,6 +115,19 @@ def test_runs_of_different_fields_are_refused(survey_png: Survey, scene_files: P
         compare(tmp_path / "archive", "nothing", "latest")
 
 
+def test_dates_of_one_name_are_one_field(tmp_path: Path) -> None:
+    """A series has a file for each date; other names are other fields."""
+    archive = Archive.open(tmp_path)
+    made = []
+    for date, name in (("2026-05-01", "north"), ("2026-06-01", "south"), ("2026-07-01", "north")):
+        settings = {"scene": f"{date}.tif", "name": name}
+        receipt = {"scene": date, "settings": settings, "products": {"class_map": "stages/segment/aaaa/m"}}
+        with archive.new_run(name) as draft:
+            draft.write_file("receipt.json", json.dumps(receipt))
+            made.append(draft.id)
+    assert find_run(Catalogue.read(tmp_path), "previous").folder.name == made[0]
+
+
 def test_a_map_that_cannot_be_believed_is_not_compared(two_budgets: Path, tmp_path: Path) -> None:
     """Though its numbers can still be read."""
     archive = Path(shutil.copytree(two_budgets, tmp_path / "archive"))

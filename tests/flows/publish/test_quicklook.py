@@ -174,3 +174,11 @@ def test_a_plain_scan_shows_how_sure_its_map_is(monkeypatch: pytest.MonkeyPatch,
     assert told["1  Raw lines"] == "2 sweeps, 2098 lines as they came"
     assert told["2  Confidence"] == ("of the model in its own map" if confident else "the map has none")
     assert "2  Where it captured again" not in told
+
+
+def test_a_legend_of_long_names_lies_within_the_picture():
+    figure = Figure(figsize=(15, 6), layout="constrained")
+    names = tuple(f"buildings_grass_trees_and_drives_{number}" for number in range(16))
+    quicklook._draw_legend(figure, replace(make_data(32, 32), class_names=names), 5)
+    assert figure.legends[0].get_window_extent().width <= figure.bbox.width
+    assert len(figure.legends[0].get_texts()) >= 16

@@ -183,6 +183,16 @@ def test_words_go_beside_the_stage_that_runs() -> None:
     ]
 
 
+def test_time_left_stands_behind_the_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a stage that runs, as a training does for long, and no longer of one that has ended."""
+    monkeypatch.setattr("rich.progress.Task.time_remaining", 75.0)
+    told = progress_of(lambda one: one.show("training", 0.5, "step 28"), **{**TERMINAL, "width": 120})
+    assert "step 28  left 0:01:15" in told
+    told = progress_of(lambda one: one.show("training", 0.5, "failed", ended=True), **{**TERMINAL, "width": 120})
+    assert "failed" in told
+    assert "failed  left" not in told
+
+
 def test_a_narrow_terminal_keeps_bars_and_times() -> None:
     """In 80 columns words stand where the time left would, cut off at the end of the line; nothing else gives way."""
 
