@@ -5,7 +5,7 @@ VENV ?= .venv
 ARCHIVE ?= archive
 SCENE ?= farm
 SECONDS ?= 25
-PYTEST_ARGS ?= -n 2 --dist worksteal
+PYTEST_ARGS ?= -n 3 --dist worksteal
 BENCH ?=
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install -q --no-compile --disable-pip-version-check -c constraints.txt
@@ -37,7 +37,7 @@ survey: $(BIN)/.ok
 survey-rig: $(BIN)/.ok-dev
 	OMP_NUM_THREADS=1 $(BIN)/python tests/soak survey-rig
 
-# Laws draw the same cases each time; PYTEST_ARGS="-n 2 --hypothesis-profile=anew" draws others.
+# Laws draw the same cases each time; PYTEST_ARGS="-n 3 --hypothesis-profile=anew" draws others.
 # Tests start hundreds of processes: bytecode is kept between them, also where the environment says otherwise.
 test: $(BIN)/.ok-dev
 	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q $(PYTEST_ARGS)
