@@ -103,7 +103,7 @@ def find_run(catalogue: Catalogue, text: str) -> Run:
 
 
 def _is_same_field(old: Run, new: Run) -> bool:
-    """By the scene's key without its bands, or by its file or the survey's name: either may show the field as now."""
+    """Compare scenes by key without bands, by file, or by the survey's name: a later file may show the same field."""
     files, names = ([run.settings.get(what) for run in (old, new)] for what in ("scene", "name"))
     same_file = files[0] == files[1] and files[0] not in NO_FILES
     same_name = names[0] == names[1] is not None and not set(files) & set(NO_FILES)

@@ -53,7 +53,7 @@ from storage.arrays.mosaics import load_attention, open_mosaic
 from storage.arrays.quicklooks import choose_bands
 from storage.arrays.signal_cubes import SignalCube, open_signal_cubes
 
-SPECTRA_CAPTION = "Mean spectra of the classes as mapped. Curves stop where bands were removed."
+SPECTRA_CAPTION = "Mean spectra of the classes as mapped."
 LIBRARIES = ("spectralzoom", "numpy", "numba", "torch", "zarr", "xarray", "prefect")
 
 

@@ -377,7 +377,7 @@ class Settings:
 
     @property
     def undecided(self) -> bool:
-        """Whether nothing says how the field is captured, so that the record of the weights does."""
+        """True where no setting says how the field is captured: the record of the weights decides."""
         return not self.plain and self.budget is None
 
     @property

@@ -106,7 +106,7 @@ TIME = 7
 
 
 class _WordsOrLeft(TimeRemainingColumn):
-    """How long it will take still, behind the words where there are some: a narrow line cuts it off."""
+    """The time that is left, behind the words where there are some: a narrow line cuts it off."""
 
     def render(self, task: Task) -> Text:
         words = task.fields["words"]

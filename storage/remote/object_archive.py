@@ -93,7 +93,7 @@ class ObjectArchive(Archive):
         return None if is_cleared(read_manifest(self.root / ref.uri)) else ref
 
     def is_known(self, ref: StageRef) -> bool:
-        """Whether a store was published, also where its files were cleared away since; its manifest is here then.
+        """Tell whether a store was published, also where its files were cleared away since; its manifest is here then.
 
         Raises IncompleteStoreError: its manifest in the bucket is damaged.
         """

@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.stats import binom
 
 from pipeline.signal.subspace import (
+    SMALL_FIELD,
     SUMS,
     SignalStatistics,
     bands_alone,
@@ -165,6 +166,16 @@ def test_small_fields_keep_a_weak_difference_of_a_small_part() -> None:
     assert along[1] == pytest.approx(1, abs=0.1)
     assert len(few) == 4 < len(all_smooth) <= 28
     np.testing.assert_allclose(all_smooth.axes @ all_smooth.axes.T, np.eye(len(all_smooth)), atol=1e-9)
+
+
+def test_large_fields_keep_what_is_proved() -> None:
+    """Half a million spectra are enough for the test alone."""
+    found, wavelength = statistics_of(field_of(2, bands=60).values), np.linspace(400, 900, 60)
+    proved = len(find_components(found, least=4))
+    counts = []
+    for found.expected in (SMALL_FIELD - 1, SMALL_FIELD):
+        counts.append(len(components_of_field(found, wavelength, false_alarm=0.01, least=4)))
+    assert counts[0] > counts[1] == proved
 
 
 @pytest.mark.parametrize("wavelength", [np.full(60, 550.0), np.linspace(400, 900, 60)[::-1]])
