@@ -272,16 +272,16 @@ def _shown(code: int, classes: Mapping[str, ClassValue]) -> str:
 def class_colours(classes: Mapping[str, ClassValue], stated: Mapping[str, Colour] | None = None) -> NDArray[np.uint8]:
     """Return a colour (class, 3) for each class: as stated, as in the label file, by a word of its name, or any.
 
-    A word that two classes share, such as `winter_wheat` and `spring_wheat`, gives its colour to the first.
+    A word that several classes share gives its colour to the shortest name, `woods` before `grass_trees`, then to the
+    first, `winter_wheat` before `spring_wheat`.
     """
-    found, taken = list[Colour](), set[Colour]()
-    for index, (name, value) in enumerate(classes.items()):
-        words = re.findall(r"[a-z]+", name.lower())
-        known = [_COLOURS_OF_WORDS[word] for word in words if word in _COLOURS_OF_WORDS]
-        usual = next((colour for colour in known if colour not in taken), default_colour(index))
-        found.append((stated or {}).get(name) or (value if isinstance(value, tuple) else usual))
-        taken.add(found[-1])
-    return np.array(found, np.uint8).reshape(-1, 3)
+    words = {name: re.findall(r"[a-z]+", name.lower()) for name in classes}
+    found = {name: value for name, value in classes.items() if isinstance(value, tuple)} | dict(stated or {})
+    for name in sorted(set(classes) - set(found), key=lambda name: (len(words[name]), list(classes).index(name))):
+        known = (_COLOURS_OF_WORDS[word] for word in words[name] if word in _COLOURS_OF_WORDS)
+        usual = next((colour for colour in known if colour not in found.values()), None)
+        found[name] = usual or default_colour(list(classes).index(name))
+    return np.array([found[name] for name in classes], np.uint8).reshape(-1, 3)
 
 
 def default_colour(index: int) -> Colour:

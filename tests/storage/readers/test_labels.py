@@ -115,6 +115,7 @@ def test_names_that_all_know_have_their_colour() -> None:
     assert (other, watery) == (list(default_colour(3)), list(default_colour(5)))
     assert class_colours(names, {"Bare soil": (1, 2, 3)})[4].tolist() == [1, 2, 3]
     assert class_colours({"water": (9, 9, 9)}).tolist() == [[9, 9, 9]]
+    assert class_colours({"grass_trees": 1, "woods": 2})[1].tolist() == class_colours({"forest": 1})[0].tolist()
 
 
 def test_scene_toml_says_colours_of_numbers(tmp_path: Path) -> None:
