@@ -185,15 +185,15 @@ def open_frames(
 def capture_passes(scene: RasterScene, name: str, weights: Weights, camera: LineCamera, seed: int) -> ScenePasses:
     """Look at a frame with the camera of the training; the noise follows from the seed and the frame's name."""
     config = weights.config
-    grid = SceneGrid(*scene.shape, config.patch, config.factor)
+    grid = SceneGrid(*scene.shape, config.patch, 1)
     rng = np.random.default_rng([seed, 0xE7A1, zlib.crc32(name.encode())])
     observed = observe_scene(scene, camera, grid, weights.basis, rng)
     _, reached = weights.basis.matrix(scene.wavelength_nm)
     example = normalised(observed, weights.normalisation, reached)
     labels = judged_labels(scene, Description(config, weights.basis, weights.class_names, weights.record))
     assert labels is not None  # sort_frames
-    seen = coarse_prediction_of_columns(weights, np.ascontiguousarray(example.coarse, np.float32), grid)
-    fine = patches_of(example.fine, config.patch).astype(np.float32)
+    seen = coarse_prediction_of_columns(weights, example.columns, grid)
+    fine = patches_of(example.columns, config.patch).astype(np.float32)
     return ScenePasses(name, seen, fine, labels, len(scene.wavelength_nm))
 
 

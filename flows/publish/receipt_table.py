@@ -31,7 +31,7 @@ COST_LABELS = {
     "capture_s": ("time at the camera", format_seconds),
     "lines": ("lines", format_count),
     "samples": ("samples on the field", format_count),
-    "tokens": ("model's tokens", format_count),
+    "patches": ("patches read in full", format_count),
     "multiply_adds": ("model's multiply-adds", format_count),
 }
 BYTE_LABELS = {

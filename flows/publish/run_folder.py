@@ -200,12 +200,10 @@ def _savings(run: SurveyRun, plan: FinePlan) -> dict[str, Any]:
 
 
 def _model_savings(run: SurveyRun, plan: FinePlan) -> dict[str, Any]:
-    """Tokens and multiply-adds of the map beside those of reading every patch."""
+    """Patches that are read in full, and multiply-adds, beside those of reading every patch."""
     did, scan = run.work_done(plan.patch_index), run.costs.of_map(run.grid.valid_patches())
-    config, valid = run.weights.config, len(run.grid.valid_patches())
-    cells, each = int(np.prod(run.grid.padded_shape)) // (config.patch * config.factor) ** 2, config.token_side**2
     return {
-        "tokens": SavingEntry(each * (cells + len(plan.patch_index)), each * (cells + valid), "predicted").as_dict(),
+        "patches": SavingEntry(len(plan.patch_index), len(run.grid.valid_patches()), "predicted").as_dict(),
         "multiply_adds": {**SavingEntry(did.total, scan.total, "predicted").as_dict(), **asdict(did)},
     }
 

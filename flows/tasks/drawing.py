@@ -16,9 +16,18 @@ from numpy.typing import NDArray
 
 from flows.tasks.field_prior_map import FieldPriorMap
 from flows.tasks.field_work import FieldWork, WeightsFile, coarse_region, patch_features
+from models.network.spectral import Capture
 from models.reading.inference import CoarsePass, segment
 from models.reading.ood import OodDetector
-from models.reading.prior_map import CurrentVisit, TemporalAgreement, changed_from, compare, first_probabilities, fuse
+from models.reading.prior_map import (
+    CurrentVisit,
+    TemporalAgreement,
+    changed_from,
+    compare,
+    first_probabilities,
+    fuse,
+    pooled,
+)
 from models.reading.regions import Region
 from pipeline.geometry.grid import UNLABELLED, patch_pixels
 from pipeline.rectify.tiles import let_tiles_go
@@ -39,8 +48,7 @@ class Drawing:
     attention: Path  # whose ranks say which patches are read in detail
     out: Path  # of the class map
     probabilities: Path
-    light: float  # exposure of a line that is read in detail, as a fraction of the reference
-    step: int  # pixels from such a line to the next
+    captures: tuple[Capture, Capture]  # of the overview's pixels, and of those read in full
     memory: FieldPriorMap | None = None  # what is remembered of the field
     left_out: Path | None = None  # (y, x) pixels of which zones have no map drawn
     unknown: UnknownRule | None = None  # which pixels are called unknown
@@ -50,15 +58,16 @@ class Drawing:
         """Read what was seen of the region coarsely and finely, and store the part of the map that is kept."""
         let_tiles_go()
         weights, detail = self.weights.load(), open_mosaic(self.detail)
-        seen, chosen = coarse_region(weights, self.mosaic, region), chosen_patches(self.attention)
+        overview, full = self.captures
+        seen, chosen = coarse_region(weights, self.mosaic, region, overview), chosen_patches(self.attention)
         patch_index, columns = patch_features(weights, detail, chosen, seen, region)
-        drawn = segment(weights, seen, columns, patch_index, every_class=True)
+        drawn = segment(weights, seen, columns, patch_index, capture=full, every_class=True)
         shown = self._shown(region, detail, patch_index)
         assert drawn.log_probability is not None
         unknown = None
         if self.unknown is not None:
             ood_detector, bands = self.weights.load_ood(), len(detail.wavelength_nm)
-            unknown = self.unknown.pixels(ood_detector, seen, columns, patch_index, bands) & (
+            unknown = self.unknown.pixels(ood_detector, seen, columns, patch_index, bands, full) & (
                 drawn.classes != UNLABELLED
             )
             unknown &= shown | (not self.part)
@@ -86,7 +95,7 @@ class Drawing:
         write_probabilities_tile(
             self.probabilities, origin, *map(region.crop, (after.log_probability, after.age_days, after.light))
         )
-        unread = 0 if seen.out_of_range is None else int(np.count_nonzero(region.crop_coarse(seen.out_of_range)))
+        unread = 0 if seen.out_of_range is None else int(np.count_nonzero(region.crop(seen.out_of_range)))
         return Drawn(unread, comparison)
 
     def _within_zones(self, region: Region, log_probability: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -101,7 +110,8 @@ class Drawing:
     ) -> CurrentVisit:
         if self.part:
             log_probability = np.where(shown[..., None], log_probability, np.float32(np.nan))
-        return CurrentVisit(log_probability, shown, seen.seen_columns, self.light, self.step)
+        light, step, _ = self.captures[1]
+        return CurrentVisit(log_probability, shown, pooled(seen.seen_columns), light, int(step))
 
     def _shown(self, region: Region, detail: Mosaic, patch_index: NDArray[np.int64]) -> NDArray[np.bool_]:
         """(y, x) pixels of a region that were looked at in detail.
@@ -122,13 +132,10 @@ class Drawing:
 
 @dataclass(frozen=True)
 class UnknownRule:
-    """Which pixels are called unknown: at which rate, in which light, and by which number."""
+    """Which pixels are called unknown: at which rate, and by which number."""
 
     number: int  # of the class, after those of the weights
     rate: float  # of known pixels that may be
-    light: float  # of a line that is read in detail, as a fraction of the reference
-    coarse_light: float  # of a coarse line
-    step: int
 
     def pixels(
         self,
@@ -137,16 +144,14 @@ class UnknownRule:
         patches: NDArray[np.float32],
         patch_index: NDArray[np.int64],
         bands: int,
+        full: Capture,
     ) -> NDArray[np.bool_]:
-        """Unknown pixels of a region's scene, (y, x): by its patches, and by the coarse pass beside them."""
+        """Unknown pixels of a region's scene, (y, x): by its patches, captured as ``full``, and by the rest."""
         grid, p = seen.grid, seen.grid.patch
         found = np.zeros(grid.padded_shape, np.bool_)
         if len(patch_index) < len(grid.valid_patches()):
-            coarse = ood_detector.unknown(
-                seen.columns, rate=self.rate, light=self.coarse_light, step=None, bands=bands, factor=grid.factor
-            )
-            found[...] = np.repeat(np.repeat(coarse, grid.factor, axis=0), grid.factor, axis=1)
-        fine = ood_detector.unknown(patches, rate=self.rate, light=self.light, step=self.step, bands=bands)
+            found[...] = ood_detector.unknown(seen.columns, rate=self.rate, capture=seen.capture, bands=bands)
+        fine = ood_detector.unknown(patches, rate=self.rate, capture=full, bands=bands)
         for patch, (y, x) in zip(fine, grid.patch_origin(patch_index), strict=True):
             found[y : y + p, x : x + p] = patch
         return found[: grid.height, : grid.width]
@@ -156,7 +161,7 @@ class UnknownRule:
 class Drawn:
     """What was found while a region, or a field, was drawn."""
 
-    unread_px: int  # coarse pixels that were seen, with values that the weights take for no reading
+    unread_px: int  # pixels that were seen, with values that the weights take for no reading
     comparison: TemporalAgreement | None  # with what was remembered; None of a field's first visit
 
 

@@ -47,13 +47,13 @@ class ReadingCosts:
     def with_scores(self, patch_index: NDArray[np.integer], policy: str) -> MultiplyAdds:
         """Count the same and what the policy takes to score all patches.
 
-        Stages keep nothing of the model for each other, so that each reads the coarse pass anew: ``coarse_prediction``
-        holds what map and scores took for it.
+        Stages keep nothing of the model for each other, so that each reads the overview anew: ``overview`` holds what
+        map and scores took for it.
         """
         drawn = self.of_map(patch_index)
         readings = 2 if policy in GLANCING_POLICIES else 1
         score = sum(score_multiply_adds(policy, self.config, region.grid) for region in self._regions)
-        return replace(drawn, coarse_prediction=readings * drawn.coarse_prediction, score=score)
+        return replace(drawn, overview=readings * drawn.overview, score=score)
 
 
 @dataclass(frozen=True)
@@ -80,8 +80,8 @@ class PatchBudget:
     ) -> PatchBudget | None:
         """Say what may be spent; None where all of the scan is read in detail.
 
-        ``shown`` (patch,) are the patches that zones leave; None: all. Raises BudgetError: not even the coarse pass
-        is paid for; names the least that is.
+        ``shown`` (patch,) are the patches that zones leave; None: all. Raises BudgetError: not even the overview is
+        paid for; names the least that is.
         """
         if macs is None and least_gain is None:
             return None
@@ -94,7 +94,7 @@ class PatchBudget:
             if macs is not None and macs.endswith("%"):
                 least = f"{math.ceil(10**DIGITS * 100 * coarse / budget.everything) / 10**DIGITS:g}%"
             raise BudgetError(
-                f"--macs {macs} does not pay for the coarse pass and the scores of its patches, {coarse:.4g} of "
+                f"--macs {macs} does not pay for the overview and the scores of its patches, {coarse:.4g} of "
                 f"{budget.everything:.4g} multiply-adds; the least is --macs {least}"
             )
         return None if not least_gain and budget._most >= budget.everything else budget

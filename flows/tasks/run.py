@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from functools import cached_property
@@ -39,17 +38,18 @@ from flows.tasks.scene import (
 )
 from flows.tasks.stage import FieldFrame, Report
 from flows.tasks.stages.capture import SweepRecorder
-from flows.tasks.survey_model import SurveyModel, beyond_training, weights_offered, weights_path
+from flows.tasks.survey_model import SurveyModel, beyond_training, weights_path
 from flows.tasks.zones import SurveyZones, open_zones, place_of_field
 from models.evaluation.expected_scores import MapScores
 from models.network.machine import PROCESSOR, choose_device
 from models.network.sizes import MultiplyAdds
+from models.network.spectral import Capture
 from models.reading.regions import plan_regions
 from models.weights.checksummed_files import SEAL
 from models.weights.files import Description, Weights
 from models.weights.parts import OodPart, ReaderPart
 from pipeline.capture.recorded_passes import RecordedPasses
-from pipeline.errors import NoScanPaidFor, SceneError, SettingsError
+from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
@@ -77,6 +77,7 @@ else:
     rig_field = deferred("flows.tasks.rig_field")
 
 
+COARSE_FACTOR = 4  # pixels a side that the coarse one of two passes stands for
 USUAL_COMPONENTS = 32  # of condensed lines, before they are known
 
 
@@ -245,21 +246,27 @@ class SurveyRun(CaptureRun):
         return self.settings.extent != EXTENT_WHOLE
 
     @property
-    def light(self) -> tuple[float, int]:
-        """Exposure of a line that is read in detail as a fraction of the reference, and pixels to the next."""
-        exposure_ms = self.settings.scan_exposure_ms if self.plan.plain else None
-        return (exposure_ms or self.camera.exposure_ms) / DEFAULT_EXPOSURE_MS, self.settings.scan_step or 1
+    def captures(self) -> tuple[Capture, Capture]:
+        """How the pixels of the overview were captured, and those that are read in full."""
+        settings, usual = self.settings, self.camera.exposure_ms
+        if self.plan.plain:
+            scan = Capture((settings.scan_exposure_ms or usual) / DEFAULT_EXPOSURE_MS, settings.scan_step or 1)
+            return scan, scan
+        coarse = Capture((settings.coarse_exposure_ms or usual) / DEFAULT_EXPOSURE_MS, self.factor, self.factor)
+        return coarse, Capture(usual / DEFAULT_EXPOSURE_MS)
+
+    @property
+    def capture(self) -> Capture:
+        """How the pixels of the overview were captured."""
+        return self.captures[0]
 
     @property
     def unknown(self) -> UnknownRule | None:
         """Which pixels are called unknown; None where the weights do not know what is familiar, or nobody asks."""
-        settings, rate = self.settings, self.settings.unknown_rate
+        rate = self.settings.unknown_rate
         if self.ood_detector is None or rate is None:
             return None
-        coarse_ms = settings.scan_exposure_ms if self.plan.plain else settings.coarse_exposure_ms
-        coarse_light = (coarse_ms or self.camera.exposure_ms) / DEFAULT_EXPOSURE_MS
-        light, step = self.light
-        return UnknownRule(self.described.config.classes, rate, light, coarse_light, step)
+        return UnknownRule(self.described.config.classes, rate)
 
     @property
     def ground_grid(self) -> GroundGrid:
@@ -278,7 +285,7 @@ class SurveyRun(CaptureRun):
         done = costs.with_scores(patch_index, self.settings.policy) if self.chooses else costs.of_map(patch_index)
         if self.prior is None or self.reader is None:
             return done
-        return replace(done, decode=done.decode + self.reader.sizes.multiply_adds(self.grid.height * self.grid.width))
+        return replace(done, full=done.full + self.reader.sizes.multiply_adds(self.grid.height * self.grid.width))
 
 
 def open_run(settings: Settings, *, planning: bool = False, archive: Archive | None = None) -> SurveyRun:
@@ -293,24 +300,14 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     recorded = open_recorded(settings) if settings.source == RECORDED else None
     settings = settings if recorded is None else recorded.settings
     settings = replace(settings, device=choose_device(settings.device))
-    offered = weights_offered(settings)
-    for better in offered[:-1]:
-        with suppress(NoScanPaidFor):
-            return _run_by(better, settings, recorded, planning=planning, archive=archive)
-    return _run_by(offered[-1], settings, recorded, planning=planning, archive=archive)
-
-
-def _run_by(
-    path: Path, settings: Settings, recorded: OpenedRecording | None, *, planning: bool, archive: Archive | None
-) -> SurveyRun:
-    """Open what a survey needs that is read with the weights of a file, as `open_run`."""
+    path = weights_path(settings)
     model = SurveyModel.open(path, settings.device, settings.unknown, planning=planning)
     described = model.described
     refused = farm_refusal(settings)
     if refused is not None and not planning:
         raise SettingsError(refused)
     pixels, scene, notes, label_notes = _scene_for(model, settings, recorded, planning=planning)
-    grid = SceneGrid(*scene.shape, described.config.patch, described.config.factor)
+    grid = SceneGrid(*scene.shape, described.config.patch, 1 if settings.budget is None else COARSE_FACTOR)
     zones = open_zones(settings.zones, place_of_field(settings, scene), grid)
     outside = beyond_training(settings, scene, described, model.trained_on, path)
     ood_detector = model.asked_ood(settings.unknown)
@@ -342,8 +339,6 @@ def _run_by(
         extent_notes = (words,)
     if pixels is None:
         scans = choose_uniform_scan(layout, described, path, bands, settings)
-        if settings.undecided and scans.chosen is None and path != weights_offered(settings)[-1]:
-            raise NoScanPaidFor(f"{path.name} reads uniform scans, and its record tells of none of this camera")
         layout, plan, settings, plan_notes = lay_out_passes(layout, scans.chosen, settings)
     else:
         raster = RasterPixels(pixels.read, pixels.missing, bands, grid)

@@ -14,13 +14,15 @@ from numpy.typing import NDArray
 
 from flows.settings.load import CHEAP_POLICY
 from flows.tasks.patch_budget import PatchBudget, ReadingCosts
+from flows.tasks.run import COARSE_FACTOR
 from flows.tasks.stages.accuracy import columns_of_all_patches
-from flows.tasks.survey_model import UNIFORM_STEPS, shipped_weights
+from flows.tasks.survey_model import shipped_weights
 from flows.tradeoff.entries import Setting, Tradeoff
 from flows.tradeoff.store import STORE
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.machine import keep_freed_memory
 from models.network.sizes import multiply_adds
+from models.network.spectral import Capture
 from models.policies.policies import score_patches
 from models.reading.inference import (
     CoarsePrediction,
@@ -48,7 +50,7 @@ from pipeline.simulator.readout import dark_frame, read_out
 from pipeline.simulator.render import EFFECTS, expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
-from pipeline.simulator.scenes.scene import RasterScene
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.simulator.selection.choice import Decision, decide
 from pipeline.simulator.selection.survey_probe import probe_scene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_block
@@ -222,6 +224,7 @@ class PlannedPass:
     weights: Weights  # that read it
     seconds: float = 0.0
     bytes_raw: int = 0
+    capture: Capture | None = None  # of the patches, where they were captured otherwise than what the overview reads
 
 
 @dataclass(frozen=True)
@@ -235,7 +238,9 @@ class PlannedField:
     def read(self, plan: Setting) -> DrawnMap:
         """Return the class map of a plan."""
         scan_pass = self.scan_passes[plan]
-        return segment(scan_pass.weights, scan_pass.seen, scan_pass.columns, scan_pass.patch_index)
+        return segment(
+            scan_pass.weights, scan_pass.seen, scan_pass.columns, scan_pass.patch_index, capture=scan_pass.capture
+        )
 
     def miss(self, plan: Setting, drawn: DrawnMap) -> float:
         """Return 1 - mIoU of a map."""
@@ -251,13 +256,13 @@ class PlannedField:
 
 
 def uniform_pass(
-    weights: Weights, source: SimulatedSource, sweeps: list[Sweep], grid: SceneGrid, cost: CostModel
+    weights: Weights, source: SimulatedSource, sweeps: list[Sweep], grid: SceneGrid, cost: CostModel, capture: Capture
 ) -> PlannedPass:
-    """Read a uniform scan whole; its coarse pass are the means of its own pixels, on a field of whole cells."""
+    """Read a uniform scan whole."""
     columns = columns_of_all_patches(source, sweeps, grid, weights, memory=MEMORY, resampling="catmull-rom")
     patch_index, size = grid.valid_patches(), raw_bytes(sweeps, source.camera, len(source.wavelength_nm))
     seconds = cost.seconds(sweeps, source.camera)
-    seen = coarse_prediction_of_patches(weights, columns, grid)
+    seen = coarse_prediction_of_patches(weights, columns, grid, capture)
     return PlannedPass(seen, patch_index, columns[patch_index], weights, seconds, size)
 
 
@@ -279,27 +284,35 @@ def plan_every_way(seed: int) -> PlannedField:
     """Take a farm by every uniform scan, by parts of one, and in two passes of every budget."""
     camera, cost = LineCamera(), CostModel()
     scene = farm_scene(seed, SURVEY_SHAPE, camera=camera)
-    weights, of_scans = load_weights(shipped_weights()), load_weights(shipped_weights(plain=True))
-    grid, finer = (SceneGrid(*SURVEY_SHAPE, read.config.patch, read.config.factor) for read in (weights, of_scans))
+    weights = load_weights(shipped_weights())
+    grid = SceneGrid(*SURVEY_SHAPE, weights.config.patch, COARSE_FACTOR)
     source, bands = SimulatedSource(scene, Rig(camera), seed), len(scene.wavelength_nm)
     along, full, full_s = cheapest_full(grid, camera, cost)
     scan_passes: dict[Setting, PlannedPass] = {}
     for words, (step, exposure_ms) in SCANS.items():
-        read_with, on = (of_scans, finer) if step in UNIFORM_STEPS else (weights, grid)
-        sweeps = uniform_sweeps(on, camera, along, step=step, exposure_ms=exposure_ms)
-        scan_passes[words] = uniform_pass(read_with, source, sweeps, on, cost)
+        sweeps = uniform_sweeps(grid, camera, along, step=step, exposure_ms=exposure_ms)
+        scan = Capture(exposure_ms / DEFAULT_EXPOSURE_MS, step)
+        scan_passes[words] = uniform_pass(weights, source, sweeps, grid, cost, scan)
     whole = scan_passes[format_scan(*PART_OF)]
     scan_passes |= {words: part_of(whole, bands, fraction) for words, fraction in PARTS.items()}
     coarse = coarse_sweeps(grid, camera, along)
     sweeps = uniform_sweeps(grid, camera, along, step=1, exposure_ms=camera.exposure_ms)
-    every = uniform_pass(weights, source, sweeps, grid, cost)
-    seen = coarse_prediction(weights, coarse_mosaic(source, coarse, grid), scene.wavelength_nm, grid)
+    every = uniform_pass(weights, source, sweeps, grid, cost, Capture())
+    seen = coarse_prediction(
+        weights,
+        coarse_mosaic(source, coarse, grid),
+        scene.wavelength_nm,
+        grid,
+        capture=Capture(1.0, COARSE_FACTOR, COARSE_FACTOR),
+        factor=COARSE_FACTOR,
+    )
     coarse_s, scores = cost.seconds(coarse, camera), score_patches("gain", seen)
     for words, budget in BUDGETS.items():
         plan = plan_fine(grid, camera, cost, along, scores, budget_s=budget * full_s - coarse_s, full=full)
         columns = every.columns[np.searchsorted(every.patch_index, plan.patch_index)]
         size = raw_bytes([*coarse, *plan.sweeps], camera, bands)
-        scan_passes[words] = PlannedPass(seen, plan.patch_index, columns, weights, coarse_s + plan.seconds, size)
+        seconds = coarse_s + plan.seconds
+        scan_passes[words] = PlannedPass(seen, plan.patch_index, columns, weights, seconds, size, Capture())
     return PlannedField(np.asarray(scene.labels, np.uint8), bands, scan_passes)
 
 
@@ -322,7 +335,7 @@ SURVEY = Tradeoff(
 )
 
 
-# segment: a farm seen coarsely and finely
+# segment: a farm of which a part is read in full
 
 FARM_SHAPE = (384, 480)
 FRACTIONS = (1.0, 0.35, 0.2, 0.15, 0.1, 0.05, 0.0)
@@ -332,18 +345,17 @@ POLICY = "gain"
 def sources_of_farm(seed: int) -> tuple[Weights, SceneGrid, SimulatedSource, Axis, list[Sweep]]:
     """Draw a farm and plan its full scan; gives weights, grid, source, direction of the lines and sweeps."""
     weights, camera = load_weights(shipped_weights()), LineCamera()
-    grid = SceneGrid(*FARM_SHAPE, weights.config.patch, weights.config.factor)
+    grid = SceneGrid(*FARM_SHAPE, weights.config.patch, 1)
     along, full, _ = cheapest_full(grid, camera, CostModel())
     return weights, grid, SimulatedSource(farm_scene(seed, FARM_SHAPE), Rig(camera), seed), along, list(full)
 
 
 def plan_every_fraction(seed: int) -> PlannedField:
-    """Take a farm coarsely and finely everywhere, and choose every fraction of its patches by their scores."""
+    """Scan a farm by every line, and choose every fraction of its patches by their scores."""
     keep_freed_memory()  # as surveys do
-    weights, grid, source, along, full = sources_of_farm(seed)
-    mosaic = coarse_mosaic(source, coarse_sweeps(grid, source.camera, along), grid)
-    seen = coarse_prediction(weights, mosaic, source.wavelength_nm, grid)
+    weights, grid, source, _, full = sources_of_farm(seed)
     columns = columns_of_all_patches(source, full, grid, weights, memory=MEMORY, resampling="catmull-rom")
+    seen = coarse_prediction_of_patches(weights, columns, grid)
     scores, valid = score_patches(POLICY, seen), grid.valid_fraction().ravel() > 0
     scan_passes: dict[Setting, PlannedPass] = {}
     for fraction in FRACTIONS:

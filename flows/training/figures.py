@@ -21,9 +21,10 @@ from models.evaluation.metrics import (
     mean_iou,
 )
 from models.evaluation.placement import CONTROL_FRACTION, Controls, Counts, run_controls
-from models.network.spectral import patches_of
+from models.network.sizes import PLANES
+from models.network.spectral import Capture, patches_of
 from models.reading.inference import coarse_prediction_of_columns, map_of_columns
-from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
+from models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation
 from models.training.examples import Example
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
@@ -37,7 +38,7 @@ def validate(weights: Weights, examples: Iterable[Example], seed: int, show: Sho
     rows = []
     for example in examples:
         grid, cells, labels = _parts(weights, example)
-        seen = coarse_prediction_of_columns(weights, example.coarse, grid)
+        seen = coarse_prediction_of_columns(weights, example.columns.astype(np.float32), grid)
         rows.append(run_controls(weights, seen, cells, labels, fraction=CONTROL_FRACTION, seed=seed, report=show))
     if not rows:
         return None
@@ -95,8 +96,7 @@ def judge_scans(
     known = [example for example in examples if example.noise is not None]
     if not known or augmentation is None:
         return None
-    factor = weights.config.factor
-    steps = [step for step in augmentation.steps if factor % step == 0]
+    steps = list(STEPS)
     lighter = [
         fraction * REFERENCE_MS for fraction in SCAN_EXPOSURES if fraction * REFERENCE_MS > augmentation.darkest_ms
     ]
@@ -144,9 +144,9 @@ def _scanned(
     """Draw the map of a scene's uniform scan, read whole, and set it beside the labels."""
     assert example.noise is not None
     grid, _, labels = _parts(weights, example)
-    plain, classes = example.fine.astype(np.float32), weights.config.classes
-    fine, means = augmentation.scan(plain, example.noise, grid.factor, light=light, step=step, rng=rng)
-    drawn, every_class = map_of_columns(weights, means, fine, grid)
+    plain, classes = example.columns.astype(np.float32), weights.config.classes
+    scan = augmentation.scan(plain, example.noise, light=light, step=step, rng=rng)[..., :-PLANES]
+    drawn, every_class = map_of_columns(weights, scan, grid, Capture(light, step))
     valid = (labels != UNLABELLED) & np.isfinite(drawn.confidence)
     sure = confidence_counts(drawn.confidence[valid], drawn.classes[valid] == labels[valid])
     expected = expected_counts([every_class[valid]], classes)
@@ -154,8 +154,8 @@ def _scanned(
 
 
 def _parts(weights: Weights, example: Example) -> tuple[SceneGrid, Patches, NDArray[np.uint8]]:
-    grid = SceneGrid(*example.shape, weights.config.patch, weights.config.factor)
-    return grid, patches_of(example.fine, grid.patch).astype(np.float32), example.labels[: grid.height, : grid.width]
+    grid = SceneGrid(*example.shape, weights.config.patch, 1)
+    return grid, patches_of(example.columns, grid.patch).astype(np.float32), example.labels[: grid.height, : grid.width]
 
 
 def _added(parts: list[Counts]) -> Counts:

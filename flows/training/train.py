@@ -249,7 +249,8 @@ def _check_counts(request: TrainRequest) -> None:
         "--crop": settings.crop,
         "--scenes": request.scenes,
         "--patch": request.patch,
-        "--factor": request.factor,
+        "--width": request.width,
+        "--overview-width": request.overview_width,
         "--columns": request.columns,
         **{"--" + name.replace("_", "-"): size for name, size in request.tokens.items()},
     }

@@ -39,7 +39,7 @@ else:
     segmenter = deferred("models.network.segmenter")
 
 NORMALISATION = ("centre", "spread", "whitening")
-FORMAT = "spectralzoom-weights/3"
+FORMAT = "spectralzoom-weights/4"
 OF_COMPONENTS = ("centres", "covariance", "shot", "read")
 OF_LIMITS = ("rates", "light", "fine", "coarse")
 SPREAD = "normalisation.spread"

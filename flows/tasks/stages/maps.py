@@ -15,6 +15,7 @@ from flows.tasks.field_work import FieldWork, region_params
 from flows.tasks.prior_maps import MEMORY, Prior
 from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
 from flows.tasks.zones import SurveyZones
+from models.network.spectral import Capture
 from models.reading.prior_map import TemporalAgreement, changed_fractions
 from models.weights.parts import OodPart, ReaderPart
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
@@ -34,7 +35,7 @@ from storage.arrays.class_maps import (
 )
 from storage.arrays.layout import NO_CLASS, blank_pixels
 
-CLASS_MAP = Product("segment", version=13, files=("class_map.zarr", "class_probabilities.zarr"), by_weights=True)
+CLASS_MAP = Product("segment", version=14, files=("class_map.zarr", "class_probabilities.zarr"), by_weights=True)
 OUT_OF_RANGE = "out_of_range.json"  # beside a map, where values were no readings
 LEFT_OUT = "left_out.npy"  # beside a map while it is drawn: the pixels of which none is
 MOST_TURN_PX = 12.0  # that a field's corners may lie off by, as it is turned, so that its memory is of use
@@ -53,7 +54,7 @@ def segment(
     reader: ReaderPart | None,
     ood_detector: OodPart | None,
     unknown: UnknownRule | None,
-    light: tuple[float, int],
+    captures: tuple[Capture, Capture],
     part: bool,
     model_key: dict[str, Any],
     report: Report,
@@ -61,19 +62,14 @@ def segment(
     """Draw the class map region by region, in detail where patches were chosen; no class where the scene has no value.
 
     ``fine`` is the mosaic of the second pass, where there is one: else the first shows the field's own pixels.
-    ``light`` is the exposure of a line that is read in detail as a fraction of the reference, and the pixels to the
-    next.
+    ``captures`` say how the pixels of the overview were captured, and those that are read in full.
     """
     grid, left_out, inputs = frame.grid, zones.left_out, [mosaic, attention, *([] if fine is None else [fine])]
 
     def build(path: Path) -> None:
         """Draw the map and what is believed; once more without the memory, where that is put aside."""
         out, probabilities = path / "class_map.zarr", path / "class_probabilities.zarr"
-        lies = (
-            FieldShift()
-            if prior is None
-            else prior_map_lies(prior.scan_passes, mosaic.path / "mosaic.zarr", grid.factor)
-        )
+        lies = FieldShift() if prior is None else prior_map_lies(prior.scan_passes, mosaic.path / "mosaic.zarr")
         memory = None if prior is None else memory_of(prior, lies, grid)
         if left_out is not None:
             np.save(path / LEFT_OUT, left_out)
@@ -91,7 +87,7 @@ def segment(
             chosen,
             out.resolve(),
             probabilities.resolve(),
-            *light,
+            captures,
             memory,
             away,
             unknown,
@@ -105,7 +101,7 @@ def segment(
                 drop_changes(probabilities)
                 drawn = draw_field(work, replace(drawing, memory=None), report)
         if drawn.unread_px:
-            write_table(path / OUT_OF_RANGE, {"coarse_px": drawn.unread_px})
+            write_table(path / OUT_OF_RANGE, {"px": drawn.unread_px})
         if frame.missing is not None:
             blank_pixels(out, frame.missing, NO_CLASS)
             changes = {} if drawn.comparison is None else {OLD_CLASS: UNLABELLED}
@@ -117,6 +113,7 @@ def segment(
         (path / LEFT_OUT).unlink(missing_ok=True)
 
     params = {**model_key, "grid": asdict(grid), **region_params(grid), **frame.key, **zones.key}
+    params["captures"] = [list(one) for one in captures]
     if ood_detector is not None and unknown is not None:
         params["unknown"] = {"familiar": ood_detector.key, **asdict(unknown)}
     if part:
@@ -124,7 +121,7 @@ def segment(
     if prior is None:
         return Wanted(build, params, inputs)
     key = None if reader is None else reader.key
-    params |= {"days": prior.days, "classes": list(prior.classes), "reader": key, "light": light}
+    params |= {"days": prior.days, "classes": list(prior.classes), "reader": key}
     if len(prior.scan_passes) > 1:
         params["shifts"] = [list(scan_pass.shift_px) for scan_pass in prior.scan_passes]
     return Wanted(build, params, [*inputs, prior.probabilities, *(one.mosaic for one in prior.scan_passes)])
@@ -135,7 +132,7 @@ def memory_of(prior: Prior, lies: FieldShift, grid: SceneGrid) -> FieldPriorMap 
     if lies.edge_px((grid.height, grid.width)) > MOST_TURN_PX:
         return None
     last, probabilities = prior.scan_passes[0], (prior.probabilities.path / "class_probabilities.zarr").resolve()
-    coarse = (last.mosaic.path / "mosaic.zarr").resolve() if grid.factor % last.factor == 0 else None
+    coarse = (last.mosaic.path / "mosaic.zarr").resolve()
     return FieldPriorMap(probabilities, coarse, prior.days, prior.classes, whole_pixels(lies))
 
 
