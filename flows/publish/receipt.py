@@ -42,7 +42,7 @@ class MultiplyAddsSaving(Saving):
 
     overview: float
     score: float
-    full: float
+    detail: float
 
 
 class CaptureSaving(Saving):

@@ -146,9 +146,7 @@ def render_report(
     """
     shown = [Picture(quicklook, "The survey at a glance."), *pictures]
     split: Mapping[str, Any] = receipt["savings"]["multiply_adds"]
-    parts = [
-        name for name in ("overview", "score", "full") if split["done"] and split[name] is not None
-    ]
+    parts = [name for name in ("overview", "score", "detail") if split["done"] and split[name] is not None]
     total, accuracy = receipt.get("effects_total"), receipt.get("accuracy")
     return render_page(
         "report.html",

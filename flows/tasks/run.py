@@ -285,7 +285,7 @@ class SurveyRun(CaptureRun):
         done = costs.with_scores(patch_index, self.settings.policy) if self.chooses else costs.of_map(patch_index)
         if self.prior is None or self.reader is None:
             return done
-        return replace(done, full=done.full + self.reader.sizes.multiply_adds(self.grid.height * self.grid.width))
+        return replace(done, detail=done.detail + self.reader.sizes.multiply_adds(self.grid.height * self.grid.width))
 
 
 def open_run(settings: Settings, *, planning: bool = False, archive: Archive | None = None) -> SurveyRun:

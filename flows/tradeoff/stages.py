@@ -12,7 +12,6 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.load import CHEAP_POLICY
 from flows.tasks.patch_budget import PatchBudget, ReadingCosts
 from flows.tasks.run import COARSE_FACTOR
 from flows.tasks.stages.accuracy import columns_of_all_patches
@@ -267,10 +266,10 @@ def uniform_pass(
 
 
 def part_of(scan_pass: PlannedPass, bands: int, compute: str) -> PlannedPass:
-    """Return the same scan with the patches alone that edges promise most of, for a fraction of the multiply-adds."""
+    """Return the same scan with the patches alone of the highest expected gain, for a fraction of the multiply-adds."""
     costs = ReadingCosts(scan_pass.weights.config, scan_pass.seen.grid, bands)
-    budget = PatchBudget(costs, scan_pass.patch_index, CHEAP_POLICY, compute)
-    kept = np.sort(budget.choose(score_patches(CHEAP_POLICY, scan_pass.seen)))
+    budget = PatchBudget(costs, scan_pass.patch_index, POLICY, compute)
+    kept = np.sort(budget.choose(score_patches(POLICY, scan_pass.seen)))
     return replace(scan_pass, patch_index=kept, columns=scan_pass.columns[np.searchsorted(scan_pass.patch_index, kept)])
 
 
@@ -321,7 +320,7 @@ SURVEY = Tradeoff(
     knob="plan",
     error="1 - mIoU",
     unit="scene px",
-    reference=f"labels of a farm of {SURVEY_SHAPE[1]} x {SURVEY_SHAPE[0]} px; two passes by gain, parts by edges",
+    reference=f"labels of a farm of {SURVEY_SHAPE[1]} x {SURVEY_SHAPE[0]} px; two passes and parts by expected gain",
     settings=(*SCANS, *PARTS, *BUDGETS),
     prepare=plan_every_way,
     run=PlannedField.read,

@@ -96,7 +96,7 @@ def judge_scans(
     known = [example for example in examples if example.noise is not None]
     if not known or augmentation is None:
         return None
-    steps = list(STEPS)
+    steps = [step for step in STEPS if all(len(one.labels) % step == 0 for one in known)]
     lighter = [
         fraction * REFERENCE_MS for fraction in SCAN_EXPOSURES if fraction * REFERENCE_MS > augmentation.darkest_ms
     ]

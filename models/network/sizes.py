@@ -100,12 +100,12 @@ class MultiplyAdds:
 
     overview: int  # of every pixel
     score: int  # the policy (`models.policies.policies.score_multiply_adds`)
-    full: int  # the full network on chosen patches
+    detail: int  # the full network on chosen patches
 
     @property
     def total(self) -> int:
         """Everything together."""
-        return self.overview + self.score + self.full
+        return self.overview + self.score + self.detail
 
 
 def multiply_adds(

@@ -80,7 +80,8 @@ class CaptureAugmentation:
         where the overview reads binned pixels and the full network a scan. Exposures are even in their logarithm.
         """
         kind = rng.choice(3, p=KINDS_OF_CAPTURE)
-        step = int(rng.choice(list(STEPS), p=list(STEPS.values())))
+        odds = {step: often for step, often in STEPS.items() if len(columns) % step == 0}
+        step = int(rng.choice(list(odds), p=np.array(list(odds.values())) / sum(odds.values())))
         image = self.scan(columns, noise, light=self._light(rng), step=step, rng=rng)
         if kind == TWO_PASSES:
             light = max(self._light(rng), DARKEST_COARSE_MS / REFERENCE_MS)

@@ -134,7 +134,8 @@ def measured_limits(
     """Distances that fractions of labelled pixels of scenes lie beyond, for each step and light of the looks."""
     noisy = all(example.noise is not None for example in examples)
     light = [one for one in LIGHT if one * REFERENCE_MS >= augmentation.darkest_ms] if noisy else [1.0]
-    steps = tuple(STEPS) if noisy and augmentation.darkest_ms < REFERENCE_MS else (1,)
+    varied = noisy and augmentation.darkest_ms < REFERENCE_MS
+    steps = tuple(step for step in STEPS if all(len(one.labels) % step == 0 for one in examples)) if varied else (1,)
     fine, coarse = np.empty((len(steps), len(light), len(RATES))), np.empty((len(light), len(RATES)))
     for j, fraction in enumerate(light):
         for i, step in enumerate(steps):

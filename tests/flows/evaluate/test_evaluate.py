@@ -116,7 +116,7 @@ def test_frames_trained_on_are_left_out(data: Path, tmp_path: Path):
     """Weights that a training made are judged on what it held out or kept for validation."""
     settings = TrainingSettings(steps=1, batch=1, crop=16)
     out = tmp_path / "w.safetensors"
-    train_weights(TrainRequest(str(data), out, ("003",), 1, patch=8, factor=2, width=4, settings=settings))
+    train_weights(TrainRequest(str(data), out, ("003",), 1, patch=8, width=4, settings=settings))
     split = load_weights(out).record["split"]
     content = evaluate_weights(EvaluateRequest(str(data), (out,), **QUICK))
     assert content["weights"][0]["left_out"] == sorted(split["train"])
