@@ -7,13 +7,17 @@ import shlex
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
+from torch import Tensor
 
 from flows.terminal.progress import one_after_the_other
+from flows.training.baselines import better_reading, judge_baselines
 from flows.training.data import Report, TrainingData, alike_notes, either_mask, open_training_data
 from flows.training.figures import judge_scans, validate
 from flows.training.fit_ood import SeenScenes, measure_and_add, measured_calibration, trained_on
@@ -24,6 +28,7 @@ from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation
 from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from models.training.examples import Example, measured_normalisation
+from models.training.spectral_start import LabelledPixels, linear_discriminants
 from models.training.start_weights import Start, StartFile
 from models.training.train import Progress, train
 from models.weights.checksummed_files import read_checkpoint
@@ -80,6 +85,12 @@ def train_weights(
     frames = as_read(kept, lesson.normalisation)
     whole = SeenScenes(lesson.examples, frames, about.wavelength_nm, request.settings.darkest_ms, request.settings.seed)
     trained = trained_on(data, whole, about.names)
+    beside: dict[str, Any] = {}
+    if frames:
+        if lesson.begun is None:
+            weights, beside["readings"] = better_reading(weights, lesson.start, frames)
+        counts = lesson.examples, frames, len(about.names), request.settings.seed
+        beside["baselines"] = judge_baselines(*counts, report)
     figures, scores = _figures(weights, frames, lesson.augmentation, request.settings.seed, report)
     record = {
         "command": request.command,
@@ -91,6 +102,7 @@ def train_weights(
         "training": summary,
         "device": device,
         **figures,
+        **beside,
         **({} if lesson.begun is None else {"begun_from": lesson.begun.record}),
     }
     save_weights(with_record(weights, **record), request.out)
@@ -110,6 +122,14 @@ class Lesson:
     examples: list[Example]
     augmentation: CaptureAugmentation | None  # None where all light is that of the reference
     begun: Start | None
+
+    @cached_property
+    def start(self) -> Mapping[str, Tensor]:
+        """What the network begins with: earlier weights, or the linear discriminants of its scenes."""
+        if self.begun is not None:
+            return self.begun.state
+        rng = np.random.default_rng([0x1DA])
+        return linear_discriminants(LabelledPixels.drawn(self.examples, rng), self.config.classes)
 
 
 def _lesson(
@@ -145,7 +165,7 @@ def _learned(
         lesson.normalisation.gain_shift,
         request.settings,
         progress,
-        start=None if lesson.begun is None else lesson.begun.state,
+        start=lesson.start,
         augmentation=lesson.augmentation,
         checkpoint=checkpoint,
         device=choose_device(request.device),
@@ -294,11 +314,16 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
             )
         return
     title = f"{figures['scenes']} scene{'s' if figures['scenes'] > 1 else ''} kept for validation"
-    caption = f"none: the coarse pass alone; all: fine everywhere; else fine at {figures['share_of_seats']:.0%}"
+    caption = f"none: the overview alone; all: everything read in full; else {figures['share_of_seats']:.0%}"
     table = Table("placement", "mIoU", "overall", title=title, caption=caption)
     for name in ("none", "random", "sobel", "entropy", "gain", "all"):
         table.add_row(name, *(f"{figures[name][figure]:.1%}" for figure in ("miou", "overall_accuracy")))
     console.print(table)
+    if "readings" in record:
+        readings = record["readings"]
+        scores = readings["miou"] | (record["baselines"] or {})
+        beside = ", ".join(f"{name} {100 * miou:.1f}" for name, miou in scores.items())
+        console.print(f"mIoU of the whole scenes by each reading: {beside}; kept: {readings['kept']}", soft_wrap=True)
 
 
 def print_start(begun: Mapping[str, Any], console: Console) -> None:

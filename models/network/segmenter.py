@@ -1,6 +1,7 @@
 """The segmenter: an overview of every pixel, and a full reading of the patches where it is likely to change the map.
 
-The overview is a small U-Net whose lowest level a transformer reads: each token stands for ``TOKEN_PX`` pixels a side.
+The overview is a linear classifier of mean spectra, which a small U-Net corrects. A transformer reads that one's lowest
+level: each token stands for ``TOKEN_PX`` pixels a side.
 The full network is a wider U-Net that reads a patch beside what the overview found there, and corrects its logits.
 
 Shapes: B scenes of H x W px, J spectral features, K patches a scene of p x p px. An input image has J + ``PLANES``
@@ -16,7 +17,7 @@ import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
 
 from models.network.layers import ChannelNorm, Encoder, Head, Stem, code_2d, cut, joined
-from models.network.sizes import BOTTOM, PLANES, SCORER_WIDTH, TOKEN_PX, level_widths, scorer_inputs
+from models.network.sizes import AROUND_PX, BOTTOM, PLANES, SCORER_WIDTH, TOKEN_PX, level_widths, scorer_inputs
 from models.network.sizes import SegmenterConfig as SegmenterConfig
 
 
@@ -42,14 +43,18 @@ class Segmenter(nn.Module):
         self.from_token = nn.Conv2d(dim, widths[-1] * BOTTOM**2, 1)
         self.overview_head = Head(widths)
         self.overview_classes = nn.Conv2d(config.overview_width, config.classes, 1)
+        self.spectral = nn.Conv2d(config.columns, config.classes, 1)  # a linear classifier that the rest corrects
         widths = level_widths(config.width, config.patch)
         self.full_stem = Stem(inputs + config.overview_width, widths)
         self.full_head = Head(widths)
         self.full_classes = nn.Conv2d(config.width, config.classes, 1)
         self.scorer = PatchScorer(config)
-        with torch.no_grad():  # training without other exposures leaves them so: then they say nothing
-            for stem in (self.overview_stem, self.full_stem):
+        with torch.no_grad():
+            for stem in (self.overview_stem, self.full_stem):  # without other exposures training leaves planes so
                 stem.enter.weight[:, config.columns : inputs] = 0
+            for last in (self.spectral, self.overview_classes, self.full_classes):
+                last.weight.zero_()
+                last.bias.zero_()  # type: ignore[union-attr]
 
     @property
     def device(self) -> torch.device:
@@ -88,7 +93,9 @@ class Segmenter(nn.Module):
         context = self.from_token(read.transpose(1, 2).reshape(grid.shape))
         features[-1] = features[-1] + F.pixel_shuffle(context, BOTTOM)
         drawn = self.overview_head(features)[:, :, :height, :width]
-        return Overview(drawn, self.overview_classes(F.gelu(drawn)))
+        around = F.avg_pool2d(image[:, : self.config.columns], AROUND_PX, 1, AROUND_PX // 2, count_include_pad=False)
+        logits = self.overview_classes(F.gelu(drawn)) + self.spectral(around)[:, :, :height, :width]
+        return Overview(drawn, logits)
 
     def _coded(self, grid: Tensor, origin: Tensor | None) -> Tensor:
         """Tokens (B, d, rows, columns) with the codes of their places, (B, rows * columns, d)."""

@@ -27,6 +27,7 @@ MOST = {
 BOTTOM = 4  # pixels a side at the lowest level of a patch
 PATCHES_AT_ONCE = 64  # their features fit the caches; larger chunks go to memory and back at every layer
 CELL_PX = 2  # pixels a side of the spectral features that a reader of prior maps sees
+AROUND_PX = 5  # pixels a side whose mean spectrum the spectral classifier reads
 TOKEN_PX = 32  # pixels a side that a token stands for
 PLANES = 3  # beside the spectral features of a pixel: exposure, line spacing, binned samples
 SCORER_WIDTH = 16  # channels of the network that scores patches
@@ -118,7 +119,7 @@ def multiply_adds(
     basis = bands * config.columns
     rows, columns = (-(-size // TOKEN_PX) for size in grid.padded_shape)
     tokens, cell, p = rows * columns, TOKEN_PX**2, config.patch
-    inputs, drawn = config.columns + PLANES, config.overview_width * config.classes
+    inputs, drawn = config.columns + PLANES, (config.overview_width + config.columns) * config.classes
     bottom = 2 * level_widths(config.overview_width, TOKEN_PX)[-1] * BOTTOM**2 * config.dim  # to a token and back
     overview = cell * (basis + drawn) + _pyramid(inputs, config.overview_width, TOKEN_PX) + bottom
     patch = p * p * (basis + config.width * config.classes) + _pyramid(inputs + config.overview_width, config.width, p)
