@@ -31,7 +31,7 @@ PROBES: dict[str, dict[str, Any]] = {
     "two passes, budget 0.5": {"budget": 0.5},
     "every line, 5 ms": {"scan_step": 1, "scan_exposure_ms": 5},
 }
-WEIGHTS = shipped_weights(plain=True)
+WEIGHTS = shipped_weights()
 BANDS_NM = np.linspace(405.0, 995.0, 60)
 PINES = data_folder("indian_pines")
 BRIGHTNESS = 0.22  # mean reflectance of farms
