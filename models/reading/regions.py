@@ -1,9 +1,8 @@
 """Regions: parts of a field that the segmenter reads as scenes of their own, so that memory has a bound.
 
 Attention is global, so what a token sees has to end somewhere. A field of up to 640 x 640 px is one region and is read
-whole. A larger one is cut; each part is read with a halo of coarse cells around it, of which nothing is kept. Attention
-takes multiply-adds quadratic in a region: three farms of 1280 x 1024 px, cut, score within .1 points of one region, for
-84 % of its multiply-adds (docs/benchmarks.md).
+whole. A larger one is cut; each part is read with a halo around it, of which nothing is kept. Attention takes
+multiply-adds quadratic in a region.
 """
 
 from __future__ import annotations
