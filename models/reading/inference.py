@@ -55,11 +55,17 @@ class CoarsePass:
 
 @dataclass(frozen=True)
 class Read:
-    """An overview of a coarse pass, by whom and of what: the full network corrects it."""
+    """An overview, by whom and of what: the full network corrects it."""
 
     by: Segmenter
-    columns: NDArray[np.float32]
+    of: CoarsePass
     overview: Overview
+
+    def counts_for(self, weights: Weights, coarse_pass: CoarsePass) -> bool:
+        """Whether these weights would read the same of this coarse pass."""
+        alike = self.of.columns is coarse_pass.columns and self.of.living is coarse_pass.living
+        told = self.of.origin == coarse_pass.origin and self.of.capture == coarse_pass.capture
+        return self.by is weights.segmenter and alike and told
 
 
 @dataclass(frozen=True)
@@ -196,7 +202,7 @@ def read_coarse_prediction(weights: Weights, coarse_pass: CoarsePass) -> CoarseP
             origin=coarse_pass.origin,
             living=coarse_pass.living,
             gain=weights.segmenter.score(overview)[0].cpu().numpy(),
-            read=Read(weights.segmenter, coarse_pass.columns, overview),
+            read=Read(weights.segmenter, coarse_pass, overview),
         )
 
 
@@ -218,7 +224,7 @@ def segment(
 
     Raises ShapeError for a patch given twice or outside the grid.
     """
-    numbers = np.asarray(patch_index, np.int64)
+    numbers = np.ascontiguousarray(patch_index, np.int64)
     check_patch_index(numbers, seen.grid)
     own, numbers = captured(patches, numbers)
     with torch.inference_mode():
@@ -301,7 +307,7 @@ def check_patch_index(patch_index: NDArray[np.int64], grid: SceneGrid) -> None:
 def overview_of(weights: Weights, coarse_pass: CoarsePass) -> Overview:
     """Read the overview of a coarse pass; one that a coarse prediction kept is not made twice."""
     kept = coarse_pass.read if isinstance(coarse_pass, CoarsePrediction) else None
-    if kept is not None and kept.by is weights.segmenter and kept.columns is coarse_pass.columns:
+    if kept is not None and kept.counts_for(weights, coarse_pass):
         return kept.overview
     network = weights.segmenter.eval()
     image = torch.from_numpy(with_planes(coarse_pass.columns, coarse_pass.capture)).permute(2, 0, 1)[None]

@@ -33,7 +33,7 @@ class Limits:
     fine: Exact  # (step, light, rate)
     coarse: Exact  # (light, rate) of a coarse pass
 
-    def at(self, rate: float, light: float, step: int | None) -> float:
+    def at(self, rate: float, light: float, step: float | None) -> float:
         """The distance for a rate, even in the logarithms of rate and light; ``step`` None is the coarse pass.
 
         Light and rates beyond those that were measured count as the nearest that was, other steps as the next wider.
@@ -73,7 +73,7 @@ class OodDetector:
 
         ``bands``: Of the camera. A binned pixel is the mean of as many readings. One without columns is not unknown.
         """
-        limit = self.limits.at(rate, capture.light, None if capture.binned > 1 else int(capture.step))
+        limit = self.limits.at(rate, capture.light, None if capture.binned > 1 else capture.step)
         readings = capture.binned * min(1.0, bands / self.bands)  # fewer bands are as fewer readings
         distance = self.lit(capture.light, readings).distance(columns)
         with np.errstate(invalid="ignore"):

@@ -119,7 +119,7 @@ class CropSampler:
     ) -> None:
         """``noise`` is the most that is added, in spreads of the normalised columns, unless ``augmentation`` add it."""
         smallest = min(min(example.labels.shape) for example in examples)
-        cell = TOKEN_PX if smallest >= TOKEN_PX else patch
+        cell = max(TOKEN_PX, patch) if smallest >= TOKEN_PX else patch
         self.size = max(cell, min(crop, smallest) // cell * cell)
         self.examples, self.patch, self.noise, self.augmentation = examples, patch, noise, augmentation
         areas = np.array([np.count_nonzero(example.labels != UNLABELLED) for example in examples], np.float64)

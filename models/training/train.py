@@ -1,4 +1,4 @@
-"""Training of the two-scale segmenter on crops: steps, averages, checkpoints."""
+"""Training of the segmenter on crops: steps, averages, checkpoints."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ class Description:
 
 @dataclass(frozen=True)
 class Weights:
-    """A two-scale segmenter with all it needs: basis, normalisation, classes, and the record of its training."""
+    """A segmenter with all it needs: basis, normalisation, classes, and the record of its training."""
 
     segmenter: Segmenter
     basis: SpectralBasis
