@@ -126,10 +126,11 @@ class Lesson:
     @cached_property
     def start(self) -> Mapping[str, Tensor]:
         """What the network begins with: earlier weights, or the linear discriminants of its scenes."""
-        if self.begun is not None:
-            return self.begun.state
-        rng = np.random.default_rng([0x1DA])
-        return linear_discriminants(LabelledPixels.drawn(self.examples, rng), self.config.classes)
+        begun = {} if self.begun is None else self.begun.state
+        if "spectral.weight" in begun:
+            return begun
+        pixels = LabelledPixels.drawn(self.examples, np.random.default_rng([0x1DA]))
+        return {**begun, **linear_discriminants(pixels, self.config.classes)}
 
 
 def _lesson(

@@ -19,9 +19,9 @@ from models.network.spectral import REACH, Normalisation, SpectralBasis
 from models.weights.files import NORMALISATION, describe_weights, read_tensors
 from pipeline.errors import SettingsError
 
-FIRST_KERNELS = ("overview_stem.enter.weight", "full_stem.enter.weight")
+FIRST_KERNELS = ("overview_stem.enter.weight", "full_stem.enter.weight", "spectral.weight")
 SAME_SPREAD = 0.1  # columns of the same data differ by no more, as a fraction
-CLASS_HEADS = ("overview_classes", "full_classes", "scorer")  # the scorer reads probabilities of classes
+CLASS_HEADS = ("overview_classes", "full_classes", "spectral", "scorer")  # the scorer reads probabilities of classes
 BESIDE = ("class_colours", *(f"normalisation.{name}" for name in NORMALISATION))  # no part of the network
 
 

@@ -52,8 +52,8 @@ def test_each_patch_costs_the_same_and_the_overview_none_of_it() -> None:
     grid = SceneGrid(250, 256, 16, 4)
     one, many, bare = (multiply_adds(config, grid, *given, score=9) for given in ((1, 270), (20, 270), (20, 0)))
     assert one.overview == many.overview == bare.overview + 256**2 * 270 * config.columns
-    assert 20 * one.full == many.full == bare.full + 20 * 16**2 * 270 * config.columns
-    assert many.total == many.overview + many.full + 9
+    assert 20 * one.detail == many.detail == bare.detail + 20 * 16**2 * 270 * config.columns
+    assert many.total == many.overview + many.detail + 9
 
 
 def test_edges_go_through_all_columns_once() -> None:

@@ -76,7 +76,7 @@ def test_other_classes_leave_their_heads_fresh(tmp_path: Path, tiny: Maker):
         config = replace(weights.config, classes=len(names))
         start = file.begin(config, weights.basis, weights.normalisation, names)
         fresh = {name.split(".")[0] for name in weights.segmenter.state_dict() if name not in start.state}
-        assert fresh == {"overview_classes", "full_classes", "scorer"}
+        assert fresh == {"overview_classes", "full_classes", "spectral", "scorer"}
         assert set(start.record["skipped"]) == {"other classes"}
         assert not any(name.split(".")[0] in fresh for name in start.state)
 
@@ -88,9 +88,8 @@ def test_other_columns_are_reached_by_wavelength(tmp_path: Path, tiny: Maker):
     new = Normalisation(np.full(7, 0.3, np.float32), np.full(7, 0.1, np.float32), 3 * np.eye(7, dtype=np.float32))
     config = replace(weights.config, columns=7)
     start = file.begin(config, SpectralBasis(450.0, 900.0, 7), new, weights.class_names)
-    assert start.record["resized"] == {
-        f"{stem}_stem.enter.weight": "4 to 7 spectral columns by wavelength" for stem in ("overview", "full")
-    }
+    kernels = ("overview_stem.enter.weight", "full_stem.enter.weight", "spectral.weight")
+    assert start.record["resized"] == dict.fromkeys(kernels, "4 to 7 spectral columns by wavelength")
     assert start.state.keys() == weights.segmenter.state_dict().keys()
     for stem in ("overview", "full"):
         (before, beside), (after, kept) = (
