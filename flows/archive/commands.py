@@ -25,7 +25,7 @@ from flows.terminal.processes import DONE, FAILED, PARTLY
 from flows.terminal.progress import StageProgress, put_out, table
 from pipeline.lazy import deferred
 from storage.archive.archive import Archive
-from storage.archive.kept_bytes import all_sizes, kept_by_runs, kept_bytes
+from storage.archive.kept_bytes import all_sizes, kept_by_runs, kept_bytes, own_by_runs
 from storage.archive.keys import in_text
 from storage.archive.lineage import Catalogue, changes_between, find_product, version_before
 from storage.archive.records import Run
@@ -41,7 +41,7 @@ else:
 
 DEEPEST = 60  # levels of a lineage that are shown
 SHORT_KEY = 12
-WHOLE = ("when", "key", "seed", "budget", "mIoU", "size", "state", "age", "stage", "what")  # columns never folded
+WHOLE = ("when", "key", "seed", "budget", "mIoU", "size", "own", "state", "age", "stage", "what")  # never folded
 MOST_ROWS = 20  # stores of a stage, changes, removals
 DAY_S = 86400.0
 
@@ -162,7 +162,7 @@ def contents(archive: Archive, now: datetime | None = None) -> dict[str, Any]:
     """Runs, newest last, and stores by stage, oldest first, of an archive."""
     catalogue, moment = Catalogue.read(archive.root), now or datetime.now(UTC)
     sizes = all_sizes(archive, catalogue)
-    kept = kept_by_runs(catalogue, sizes)
+    kept, own = kept_by_runs(catalogue, sizes), own_by_runs(catalogue, sizes)
     stages: dict[str, list[dict[str, Any]]] = {}
     for store in sorted(catalogue.stores.values(), key=lambda store: (store.ref.stage, store.created, store.ref.key)):
         row = {
@@ -179,10 +179,12 @@ def contents(archive: Archive, now: datetime | None = None) -> dict[str, Any]:
     return {
         "archive": archive.name,
         "runs": [
-            {**_run_row(catalogue, run, kept[run.uri]), "age_s": _age_s(run.created, moment)} for run in catalogue.runs
+            _run_row(catalogue, run, kept[run.uri]) | {"own_bytes": own[run.uri], "age_s": _age_s(run.created, moment)}
+            for run in catalogue.runs
         ],
         "stages": stages,
         "bytes": sum(sizes.values()),
+        "shared_bytes": sum(size for uri, size in sizes.items() if len(catalogue.named_by(uri)) > 1),
         "lost": list(catalogue.lost),
     }
 
@@ -319,7 +321,7 @@ def command(settings: Mapping[str, Any], out: str) -> str:
 
 def show_contents(content: dict[str, Any], console: Console) -> None:
     """Print what `ls` found."""
-    columns: Sequence[str] = ("run", "scene", "seed", "budget", "mIoU", "size", "age", "state")
+    columns: Sequence[str] = ("run", "scene", "seed", "budget", "mIoU", "own", "age", "state")
     runs = map(_shown_run, content["runs"])
     console.print(table(columns, runs, title="Runs", left=2, whole=WHOLE) if content["runs"] else "no runs")
     if any(run["training_scene"] and known_number(run["miou"]) is not None for run in content["runs"]):
@@ -330,7 +332,8 @@ def show_contents(content: dict[str, Any], console: Console) -> None:
     for uri in content["lost"]:
         console.print(f"[bold red]{escape(uri)} has lost its manifest; run verify[/]", soft_wrap=True)
     count = counted(sum(map(len, content["stages"].values())), "store")
-    _say(console, f"{counted(len(content['runs']), 'run')}, {count}, {format_bytes(content['bytes'])}")
+    shared = f", {format_bytes(content['shared_bytes'])} of it in several runs" if content["shared_bytes"] else ""
+    _say(console, f"{counted(len(content['runs']), 'run')}, {count}, {format_bytes(content['bytes'])}{shared}")
 
 
 def _shown_run(run: Mapping[str, Any]) -> list[str]:
@@ -340,7 +343,7 @@ def _shown_run(run: Mapping[str, Any]) -> list[str]:
     learned = "" if run["training_scene"] is None or miou is None else "*"
     figures = [
         "not yet" if is_pending(run) else format_points(miou) + learned,
-        format_bytes(run["bytes"]),
+        format_bytes(run["own_bytes"]),
         _age(run["age_s"]),
     ]
     return [*map(escape, (run["id"], scene, *asked)), *figures, state]

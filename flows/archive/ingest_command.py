@@ -22,6 +22,7 @@ from storage.archive.staging import check_name, file_hash
 from storage.readers.cube_sources import CubeSource
 from storage.readers.open_cubes import open_cube, with_wavelengths
 from storage.readers.pointing_tables import find_pointing
+from storage.readers.scene_files import with_stated_values
 from storage.readers.zarr_files import Report, SourceFile, write_ingested_cube
 from storage.remote.opening import open_archive
 
@@ -83,7 +84,8 @@ def run_ingest(
     if name is not None:
         check_name(name)
     with console.status("opening the source"):
-        cube = with_wavelengths(open_cube(source, dark=dark, white=white), source, wavelengths)
+        found = with_wavelengths(open_cube(source, dark=dark, white=white), source, wavelengths)
+        cube = with_stated_values(found, source)
         opened = open_archive(archive)
         opened.reclaim()  # what a killed ingest left half made
     with opened.in_use(), StageProgress(console, TITLES) as progress:

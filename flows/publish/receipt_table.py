@@ -15,6 +15,7 @@ from flows.tasks.scores import format_prediction, format_worst_class
 from flows.terminal.figures import (
     counted,
     format_area,
+    format_bytes,
     format_count,
     format_megabytes,
     format_metres,
@@ -42,6 +43,7 @@ BYTE_LABELS = {
     "moved_workers": "bytes moved, workers",
 }
 MOST_CHANGES = 4  # in words
+LEAST_REFERENCE = 100_000  # bytes from which on all are told in MB
 LEADING = 3  # classes of a plot in words
 FOREIGN = 0.2  # fraction of a map that is unknown from which on its weights are the wrong ones
 FOREIGN_WORDS = (
@@ -60,15 +62,19 @@ def cost_rows(savings: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def byte_rows(receipt: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the bytes of a run against the reference, a row each; dashes where an earlier version did not count."""
+    """Return the bytes of a run against the reference, a row each; dashes where an earlier version did not count.
+
+    They are in MB, so that rows compare, but where the reference is smaller than a tenth of one.
+    """
     told = receipt.get("data_bytes")
     full = None if told is None else told["reference"]
+    show = format_bytes if full is not None and full < LEAST_REFERENCE else format_megabytes
     rows = []
     for name, label in BYTE_LABELS.items():
         done = None if told is None else told[name]
-        words = "not counted" if told is not None and done is None else format_megabytes(done)
+        words = "not counted" if told is not None and done is None else show(done)
         ratio = None if done is None or not full else done / full
-        rows.append({"label": label, "done": words, "full": format_megabytes(full), "ratio": ratio})
+        rows.append({"label": label, "done": words, "full": show(full), "ratio": ratio})
     return rows
 
 

@@ -18,6 +18,7 @@ from rich.segment import Segment
 from rich.table import Column, Table
 from rich.text import Text
 
+from flows.terminal.figures import format_seconds
 from pipeline.errors import visible
 from storage.archive.whole_files import to_json
 
@@ -159,7 +160,9 @@ class StageProgress:
         due = time.monotonic() - self._said[stage] > LINE_EVERY_S
         if not self.console.is_terminal and (ended or due):
             self._said[stage] = time.monotonic()
-            self.console.print(f"{title}: {done:.0%} {escape(words)}".rstrip(), soft_wrap=True)
+            left = None if ended else self._bars.tasks[self._tasks[stage]].time_remaining
+            time_left = "" if left is None else f", {format_seconds(left)} left"
+            self.console.print(f"{title}: {done:.0%} {escape(words)}".rstrip() + time_left, soft_wrap=True)
 
     def watch(self, stage: str, state: str, done: float) -> None:
         """Show how far a stage of a survey is that runs, or how it ended: ran, cached, skipped, failed."""

@@ -94,6 +94,7 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
         "classes": [{"name": one.name, "value": one.value, "fraction": one.fraction} for one in draft.classes],
         "notes": list(draft.notes),
         "unseen": _unseen(draft),
+        "first": _first(path, draft),
         "next": _next(source, draft),
     }
 
@@ -115,8 +116,10 @@ def _wavelength_lines(draft: SceneDraft) -> list[str]:
     bands = draft.shape[2]
     if draft.wavelength_nm is None:
         return [
-            f"# {bands} bands, and nothing says their wavelengths: write them, and take away the #",
-            f"# wavelengths_nm = [450.0, ...]   # {bands} numbers [nm]",
+            f"# {bands} bands, and nothing says their wavelengths. Fill in one of these two lines, and take the # in",
+            "# front of it away:",
+            f"# wavelengths_nm = []   # {bands} numbers [nm] between the brackets, with commas",
+            f'# wavelengths_file = "bands.txt"   # a text file beside this one of {bands} rows, which begin with nm',
         ]
     if "assumed" not in draft.wavelength_origin:
         low, high = draft.wavelength_nm.min(), draft.wavelength_nm.max()
@@ -178,10 +181,17 @@ def _unseen(draft: SceneDraft) -> list[str]:
     if found.alone:
         parts.append(f"the image of {counted(len(found.alone), 'label file')}: {listed_names(found.alone)}")
     if draft.wavelength_nm is None:
-        parts.append(f"the wavelengths of {draft.shape[2]} bands: write wavelengths_nm into {SETTINGS_NAME}")
+        parts.append(f"the wavelengths of {draft.shape[2]} bands")
     if len(draft.classes) == 1:
         parts.append(f"a second class: all labels are {draft.classes[0].name}")
     return [*parts, *draft.unseen]
+
+
+def _first(path: Path, draft: SceneDraft) -> str | None:
+    """What has to be written before the next command runs; None where it runs at once."""
+    if draft.wavelength_nm is not None:
+        return None
+    return f"write the {draft.shape[2]} wavelengths into {path}: wavelengths_nm or wavelengths_file, as its lines say"
 
 
 def _next(source: str, draft: SceneDraft) -> str:

@@ -28,3 +28,14 @@ def all_sizes(archive: Archive, catalogue: Catalogue) -> dict[str, int]:
 def kept_by_runs(catalogue: Catalogue, sizes: Mapping[str, int]) -> dict[str, int]:
     """`kept_bytes` of all runs of a catalogue, by address; ``sizes`` are of `all_sizes`."""
     return {run: sum(sizes[uri] for uri in (run, *uris)) for run, uris in catalogue.named_and_below.items()}
+
+
+def own_by_runs(catalogue: Catalogue, sizes: Mapping[str, int]) -> dict[str, int]:
+    """Bytes of each run's folder and of the stores that no other run names or rests on, by its address.
+
+    So much goes with it. ``sizes`` are of `all_sizes`.
+    """
+    return {
+        run: sizes[run] + sum(sizes[uri] for uri in uris if len(catalogue.named_by(uri)) == 1)
+        for run, uris in catalogue.named_and_below.items()
+    }

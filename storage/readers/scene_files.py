@@ -157,12 +157,7 @@ def _open(
         if void.all():
             void, gap_notes = None, ("every pixel is transparent or masked, which is not believed",)
 
-    scaling, scale_note = "", tuple[str, ...]()
-    if (settings.scale, settings.offset) != (1.0, 0.0):
-        scaling = f"scene.toml scale {settings.scale!r} offset {settings.offset!r}"
-        scale_note = (
-            f"values are the file's times {settings.scale:g} plus {settings.offset:g}, as {settings.path} says",
-        )
+    scaling, scale_note = _stated_scaling(settings)
 
     def scaled(values: NDArray[np.float32]) -> NDArray[np.float32]:
         return unpacked(values, settings.scale, settings.offset, None) if scaling else values
@@ -221,6 +216,41 @@ def _open(
         kept=values,
     )
     return scene.labelled(found, by_name=by_name)
+
+
+def _stated_scaling(settings: SceneSettings) -> tuple[str, tuple[str, ...]]:
+    """Return scale and offset of a ``scene.toml`` in words for hashes, and as a note; empty where it has neither."""
+    if (settings.scale, settings.offset) == (1.0, 0.0):
+        return "", ()
+    note = f"values are the file's times {settings.scale:g} plus {settings.offset:g}, as {SETTINGS_NAME} says"
+    return f"{SETTINGS_NAME} scale {settings.scale!r} offset {settings.offset!r}", (note,)
+
+
+def with_stated_values(source: CubeSource, address: str | Path) -> CubeSource:
+    """Return a cube whose numbers are what the ``scene.toml`` beside it says: no data, scale and offset.
+
+    Scaled numbers are float32, NaN where there is no data, as a survey of the file has them. Raises SceneError: a scale
+    is stated for numbers that have dark or white frames.
+    """
+    settings = find_scene_settings(split_variable(address)[0])
+    scaling, note = _stated_scaling(settings)
+    stated = () if settings.nodata is None else (f"{SETTINGS_NAME} nodata {settings.nodata!r}",)
+    nodata = source.nodata if settings.nodata is None else settings.nodata
+    source = replace(source, nodata=nodata, scaling=" ".join(filter(None, (source.scaling, *stated, scaling))))
+    if not scaling:
+        return source
+    if source.dark is not None or source.white is not None:
+        raise SceneError(
+            f"{settings.path} has a scale or offset, and {address} dark or white frames: a camera's own numbers are "
+            "stored as they are; take scale and offset out of it, and state them where values are made of the numbers"
+        )
+    nodata, plain = USUAL_NODATA if nodata is None and source.dtype.kind in "if" else nodata, source.read
+
+    def read(start: int, stop: int) -> NDArray[np.float32]:
+        """Give some lines (line, sample, band), NaN where the file has no value."""
+        return unpacked(plain(start, stop), settings.scale, settings.offset, nodata)
+
+    return replace(source, read=read, dtype=np.dtype(np.float32), nodata=None, notes=(*source.notes, *note))
 
 
 def _light_hash(

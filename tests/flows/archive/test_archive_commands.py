@@ -16,6 +16,7 @@ from rich.console import Console
 
 from flows.archive.commands import command, contents, explain, gc, ls, run_verify
 from flows.settings.load import load_settings
+from flows.terminal.figures import format_bytes
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from pipeline.errors import ArchiveError
 from storage.archive.archive import Archive
@@ -50,13 +51,17 @@ def test_ls_shows_runs_and_stores(two_budgets: Path, capsys: pytest.CaptureFixtu
     assert first["state"] == second["state"] == "there"
     assert 0 < first["miou"] < 1
     assert first["bytes"] > second["bytes"] > 10_000
+    shared = content["shared_bytes"]
+    assert first["bytes"] - first["own_bytes"] == second["bytes"] - second["own_bytes"] == shared > 10_000
+    assert content["bytes"] == first["own_bytes"] + second["own_bytes"] + shared
     assert [len(content["stages"][stage]) for stage in ("capture", "rectify", "segment")] == [3, 1, 2]
     assert content["stages"]["rectify"][0]["runs"] == 2
     ls(two_budgets)
     out = capsys.readouterr().out
     assert first["id"] in out
     assert content["stages"]["rectify"][0]["key"] in out
-    assert "2 runs, 17 stores" in out
+    assert format_bytes(first["own_bytes"]) in out
+    assert f"2 runs, 17 stores, {format_bytes(content['bytes'])}, {format_bytes(shared)} of it in several runs" in out
     ls(two_budgets)
     out = capsys.readouterr().out
     assert max(map(len, out.splitlines())) <= 80

@@ -237,6 +237,19 @@ def test_terminal_and_page_show_megabytes_against_one_reference() -> None:
             assert figure in text, figure
 
 
+def test_a_tiny_field_has_no_absurd_percentage() -> None:
+    """Where the camera gave 384 bytes, rows are in bytes and kB, and what is kept is so many times as much."""
+    told = {"captured": 384, "written": 655_553, "kept": 655_553, "moved_bucket": 0, "reference": 384}
+    receipt = make_receipt()
+    receipt["data_bytes"] |= told
+    rows = {row["label"]: (row["done"], row["full"]) for row in byte_rows(receipt)}
+    assert rows["bytes captured"] == ("384 B", "384 B")
+    assert rows["bytes kept"] == ("656 kB", "384 B")
+    for text in (_printed(receipt), render_report(receipt, PNG).replace("\u202f", " ")):
+        assert "1 710 times" in text
+        assert "170717" not in text
+
+
 def test_a_receipt_of_an_earlier_version_shows_dashes(published: Published, tmp_path: Path) -> None:
     """Table, page and history take one without the account; a recount leaves its run as it is."""
     receipt = {name: value for name, value in make_receipt().items() if name != "data_bytes"}
