@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from flows.cli.app import ArchiveName, AsJson, OutFolder, check_outside
-from flows.publish.receipt import areas_on_ground
+from flows.publish.receipt import hectares_of_classes
 from flows.publish.receipt_table import BYTE_LABELS, COST_LABELS
 from flows.settings.survey_settings import BUILT_IN_SCENES
 from flows.tasks.scores import score_of
@@ -186,7 +186,7 @@ def _comparison(runs: tuple[Run, Run], maps: list[ClassMap]) -> dict[str, Any]:
 
 def _classes(runs: tuple[Run, Run], joint: NDArray[np.int64], names: list[str]) -> list[dict[str, Any]]:
     """Area in each map and the agreement of both, for each class that is in one of them; hectares where both know."""
-    areas = [known for run in runs if (known := areas_on_ground(run.receipt)) is not None]
+    areas = [known for run in runs if (known := hectares_of_classes(run.receipt)) is not None]
     hectares = [{str(name).replace("_", " "): area for name, area in one.items()} for one in areas]
     found = []
     for number, name in enumerate(names):

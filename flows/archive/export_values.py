@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from flows.archive.export_layers import ExportedRun, Layer, Rows, layer_tags, place_of
 from flows.archive.product_choice import ProductChoice
+from flows.publish.receipt import hectares_of_classes
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.map_grid import GroundGrid, grid_of_map, image_at, map_blocks
@@ -44,14 +45,12 @@ Floats = NDArray[np.float32]
 
 
 def write_areas(run: ExportedRun, path: Path) -> None:
-    """Write the table, a row a class; empty where something is not known, as hectares where there is no CRS."""
+    """Write the table, a row a class; empty where something is not known, as hectares of pixels of any size."""
     path_of_map = run.path(run.map_product)
     names = tuple(open_image(path_of_map, "classes").about["class_names"])
     pixels, confidence = _counted(path_of_map, len(names))
-    hectares = None  # where nothing says where the field lies
-    if "ground" in run.receipt:
-        areas = run.receipt["ground"]["areas_ha"]
-        hectares = np.array([areas.get(name, 0.0) for name in names], np.float64)
+    areas = hectares_of_classes(run.receipt)
+    hectares = None if areas is None else np.array([areas.get(name, 0.0) for name in names], np.float64)
     fraction = pixels / max(pixels.sum(), 1) if hectares is None else hectares / (hectares.sum() or 1.0)
     estimate, sources = _estimate(run, fraction)
     total = np.nan if hectares is None else hectares.sum()

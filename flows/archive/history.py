@@ -19,7 +19,7 @@ from rich.markup import escape
 
 from flows.archive.stale_runs import called
 from flows.cli.app import ArchiveName, AsJson, OutFile, check_outside, stderr
-from flows.publish.receipt import areas_on_ground
+from flows.publish.receipt import hectares_of_classes
 from flows.publish.receipt_table import format_days
 from flows.settings.survey_settings import BUILT_IN_SCENES
 from flows.tasks.scene import TRAINING_SCENE
@@ -149,7 +149,7 @@ def _row(run: Run, shown: ClassMap | None, kept: int) -> Row:
     told = found if isinstance(found := run.receipt.get("data_bytes"), Mapping) else {}
     if reference := known_number(told.get("reference")):
         entries["bytes_kept"] = {"ratio": kept / reference}
-    hectares, areas = areas_on_ground(run.receipt), dict[str, float]()
+    hectares, areas = hectares_of_classes(run.receipt), dict[str, float]()
     if hectares is not None:
         areas = {str(name): float(area) for name, area in hectares.items() if known_number(area) is not None}
     elif shown is not None:

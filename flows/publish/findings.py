@@ -20,7 +20,7 @@ from flows.tasks.stages.maps import OUT_OF_RANGE
 from flows.terminal.figures import format_points
 from models.evaluation.expected_scores import expected_counts
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, FieldScale, PlacedPicture, areas_by_number
+from pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, FieldScale, areas_by_number
 from pipeline.ground.georeference import crs_name, pixel_side_m
 from pipeline.ground.zones import figures_of_plots
 from pipeline.planning.fine_pass import FinePlan
@@ -77,6 +77,20 @@ def _kept(run: SurveyRun, scale: FieldScale) -> FieldScale:
     return replace(scale, area_m2=_ground_m2(run, run.zones.kept.kept))
 
 
+def find_areas(run: SurveyRun, posed: GroundMap | None, drawn: ClassMap) -> dict[str, Any]:
+    """Return ``areas``: pixels of each class, and hectares where something says how large a pixel is.
+
+    Those of a run with a pose are of its map on the ground.
+    """
+    names = drawn.names
+    pixels = np.bincount(drawn.classes.ravel(), minlength=len(names)).tolist()
+    m2 = None if posed is not None else areas_by_number(run.zones.place, drawn.classes, len(names))
+    hectares = {} if m2 is None else dict(zip(names, (m2 / M2_PER_HECTARE).tolist(), strict=True))
+    if posed is not None:
+        hectares = {name: area["ha"] for name, area in posed.areas.items()}
+    return {"areas": {"px": dict(zip(names, pixels, strict=False)), **({"ha": hectares} if hectares else {})}}
+
+
 def find_ground(
     run: SurveyRun,
     posed: GroundMap | None,
@@ -84,23 +98,13 @@ def find_ground(
     probabilities: ProbabilityStore,
     memory: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
-    """Return ``ground``: grid, hectares of each class, what changed by ``memory``, and what is old.
-
-    Empty for a run without a place.
-    """
+    """Return ``ground``: grid, what changed by ``memory``, and what is old. Empty for a run without a place."""
     geobox = run.scene.geobox if posed is None else posed.geobox
     if geobox is None:
         return {}
-    if posed is None:  # the class map itself, in hectares of the ellipsoid
-        areas = areas_by_number(PlacedPicture(geobox), found.classes, len(found.names))
-        assert areas is not None
-        hectares = dict(zip(found.names, (areas / M2_PER_HECTARE).tolist(), strict=True))
-        side = pixel_side_m(geobox)
-    else:
-        hectares = {name: area["ha"] for name, area in posed.areas.items()}
-        side = abs(float(geobox.resolution.x))
-    figures: dict[str, Any] = {"crs": crs_name(geobox), "resolution_m": side}
-    figures |= {"shape": [int(size) for size in geobox.shape], "areas_ha": hectares}
+    side = pixel_side_m(geobox) if posed is None else abs(float(geobox.resolution.x))
+    shape = [int(size) for size in geobox.shape]
+    figures: dict[str, Any] = {"crs": crs_name(geobox), "resolution_m": side, "shape": shape}
     place, drawn = run.zones.place, found.classes != UNLABELLED
     figures |= {"older_ha": older_hectares(place, np.where(drawn, probabilities.age(), np.nan))}
     if (old_class := probabilities.old_class()) is not None:

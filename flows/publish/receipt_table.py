@@ -9,7 +9,7 @@ import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
-from flows.publish.receipt import Receipt, is_pending
+from flows.publish.receipt import Receipt, hectares_of_classes, is_pending
 from flows.tasks.scene import TRAINING_SCENE
 from flows.tasks.scores import format_prediction, format_worst_class
 from flows.terminal.figures import (
@@ -205,12 +205,37 @@ def plot_rows(plots: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     ]
 
 
+def area_rows(receipt: Mapping[str, Any]) -> list[dict[str, str]]:
+    """Return the classes of a map as a table in words: name, pixels, share of the pixels that have a class, hectares.
+
+    Hectares are left out where nothing says how large a pixel is.
+    """
+    pixels: Mapping[str, int] = (receipt.get("areas") or {}).get("px", {})
+    hectares, every = hectares_of_classes(receipt), sum(pixels.values())
+    return [
+        {"class": _spaced(name), "pixels": format_count(count), "share": format_percent(count / every)}
+        | ({} if hectares is None else {"area": format_area(hectares.get(name, 0.0))})
+        for name, count in pixels.items()
+        if count
+    ]
+
+
 def _spaced(name: str) -> str:
     return name.replace("_", " ")
 
 
 def _areas(areas: Mapping[str, float]) -> str:
     return ", ".join(f"{_spaced(name)} {format_area(area)}" for name, area in areas.items() if area)
+
+
+def _pixels(pixels: Mapping[str, int]) -> str:
+    every = sum(pixels.values())
+    shown = (
+        f"{_spaced(name)} {format_count(count)} px ({format_percent(count / every)})"
+        for name, count in pixels.items()
+        if count
+    )
+    return ", ".join(shown) or "no pixel has a class"
 
 
 def _changes(changes: Sequence[Sequence[Any]]) -> str:
@@ -247,7 +272,7 @@ def _most_px(sweeps: Mapping[str, Sequence[float]]) -> str:
 # parts of a receipt whose rows are called otherwise
 _LABELS = {
     **{"extent": "captured", "kept": "read in detail", "memory": "prior map", "expected": "expected score"},
-    **{"scans": "uniform scans", "ground": "on the ground"},
+    **{"scans": "uniform scans", "ground": "on the ground", "areas": "classes"},
 }
 # part of a receipt, figure, its words and its form, in the order of rows and of words
 _FIGURES: Sequence[tuple[str, str, str, Callable[[Any], Any]]] = (
@@ -287,12 +312,13 @@ _FIGURES: Sequence[tuple[str, str, str, Callable[[Any], Any]]] = (
     ("scans", "taken", "this one, read whole: {}", _scan),
     ("scans", "best_in_time", "best in the same seconds: {}", _scan),
     ("scans", "reference", "nearly as good as any: {}", _scan),
+    ("areas", "ha", "{}", _areas),
+    ("areas", "px", "{}", _pixels),
     ("zones", "kept_px", "{} px are mapped", format_count),
     ("zones", "kept_m2", "{}", lambda one: format_area(one / M2_PER_HECTARE)),
     ("zones", "no_go_px", "no-go zones touch {} px", format_count),
     ("ground", "crs", "{}", str),
     ("ground", "resolution_m", "{:.4g} m a pixel", float),
-    ("ground", "areas_ha", "{}", _areas),
     ("ground", "changes_ha", "{}", _changes),
     ("ground", "older_ha", "{}", _older),
     ("pass", "sweeps", "put right by up to {} px", _most_px),

@@ -25,7 +25,15 @@ from flows.publish.effects_table import format_change, format_total
 from flows.publish.field_map import ERROR_COLOURS, FieldMap
 from flows.publish.panels import data_address
 from flows.publish.receipt import Receipt
-from flows.publish.receipt_table import byte_rows, cost_rows, finding_rows, format_reused, headline, plot_rows
+from flows.publish.receipt_table import (
+    area_rows,
+    byte_rows,
+    cost_rows,
+    finding_rows,
+    format_reused,
+    headline,
+    plot_rows,
+)
 from flows.tasks.scores import error_matrix, format_false_classes
 from flows.terminal.figures import format_bytes, format_percent, format_points, format_seconds
 from pipeline.errors import visible
@@ -168,7 +176,8 @@ def render_report(
         byte_rows=byte_rows(receipt),
         reused=format_reused(receipt),
         fractions={name: split[name] / split["done"] for name in parts},
-        findings=finding_rows(receipt),
+        areas=area_rows(receipt),
+        findings=finding_rows({name: one for name, one in receipt.items() if name != "areas"}),
         plots=plot_rows(receipt.get("plots", [])),
         accuracy=accuracy,
         error_matrix=None if accuracy is None else error_matrix(accuracy),

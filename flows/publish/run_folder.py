@@ -18,7 +18,7 @@ from PIL import Image
 
 from flows.publish.byte_account import open_account, publish_counted
 from flows.publish.field_map import block_of, field_map, prior_map
-from flows.publish.findings import PLOTS_FILE, field_figures, find_ground, find_map, find_zones, plots_csv
+from flows.publish.findings import PLOTS_FILE, field_figures, find_areas, find_ground, find_map, find_zones, plots_csv
 from flows.publish.panels import draw_ground, webp
 from flows.publish.quicklook import QuicklookData, draw_quicklook
 from flows.publish.receipt import AccuracyIs, Receipt, build_receipt, check_receipt, with_accuracy
@@ -328,6 +328,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     drawn = load_class_map(class_map.path / "class_map.zarr")
     posed = next((load_ground_map(ref.path / STORE) for ref in products.there("ground")), None)
     probabilities = ProbabilityStore(class_map.path / "class_probabilities.zarr")
+    found |= find_areas(run, posed, drawn)
     found |= find_ground(run, posed, drawn, probabilities, memory) | find_zones(run, drawn)
     found |= find_map(run, class_map, drawn)
     lines = {} if run.raster is not None else read_table(products.mosaic.path / "lines.json")

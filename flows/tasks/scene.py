@@ -153,6 +153,7 @@ def open_map(settings: Settings, known: Sequence[str] | None = None) -> tuple[Sc
         filled_px=file.filled_px,
         missing=missing,
         geobox=file.geobox,
+        pixel_m=file.pixel_m,
         content=file.content,
     )
     scene, notes = _placed_once(scene, file.provenance, posed=settings.pose is not None)

@@ -64,7 +64,7 @@ def scene_of_file(file: SceneFile, camera: LineCamera) -> RasterScene:
         key=file.light_hash,
         geobox=file.geobox,
     )
-    return replace(scene, regridded=file.regridded, content=file.content)
+    return replace(scene, regridded=file.regridded, content=file.content, pixel_m=file.pixel_m)
 
 
 def farm_test_data(scenes: int, camera: LineCamera) -> TrainingData:

@@ -139,7 +139,11 @@ def _value_lines(draft: SceneDraft) -> list[str]:
         sure = value <= NO_READING or value > MOST_VALUE
         parts = f"nodata = {value!r}   # {fraction:.0%} of the first image's edge"
         lines.append(parts if sure else f"# {parts}; if it stands for no data there, take away the first #")
-    return lines + (["# scale = 0.0001   # if these numbers are reflectance times 10000"] * (draft.dtype.itemsize == 2))
+    if draft.dtype.itemsize == 2:
+        lines.append("# scale = 0.0001   # if these numbers are reflectance times 10000")
+    if not draft.placed:
+        lines.append("# pixel_m = 0.05   # side of a pixel on the ground [m], where it is known: gives hectares")
+    return lines
 
 
 def _class_lines(draft: SceneDraft) -> list[str]:

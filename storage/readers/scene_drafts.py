@@ -62,6 +62,7 @@ class SceneDraft:
     nodata: float | None  # as the file itself says
     dtype: np.dtype[Any]  # of its values, once the file's own scale was applied
     edge: tuple[float, float] | None  # value that fills the edge, and its fraction of it
+    placed: bool  # whether the file says where its pixels lie on the earth
     missing: float  # fraction of NaN among the values looked at
     classes: tuple[FoundClass, ...] = ()
     notes: tuple[str, ...] = ()  # what readers made of the first image
@@ -112,6 +113,7 @@ def draft_scene(address: str | Path, report: Report = lambda done, name: None) -
         nodata=source.nodata,
         dtype=source.dtype,
         edge=edge,
+        placed=source.geobox is not None,
         missing=missing,
         classes=classes,
         notes=(*series, *source.notes),

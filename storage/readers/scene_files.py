@@ -52,6 +52,7 @@ class SceneFile:
     class_values: tuple[ClassValue, ...] = ()  # what each class is in the label file: a number or a colour
     class_colours: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))  # (class, 3)
     geobox: GeoBox | None = None  # where the pixels lie on the earth
+    pixel_m: float | None = None  # side of a pixel on the ground, as scene.toml says, of a scene without a place
     labels_found: bool = False  # by the file's name: nobody stated them
     regridded: bool = False  # labels came on another grid and were brought to the scene's
     kept: NDArray[np.float32] | None = field(default=None, repr=False)  # all values, where they were kept
@@ -213,6 +214,7 @@ def _open(
             *label_note,
         ),
         geobox=source.geobox,
+        pixel_m=None if source.geobox is not None else settings.pixel_m,
         kept=values,
     )
     return scene.labelled(found, by_name=by_name)
