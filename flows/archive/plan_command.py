@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from rich.console import Console
 from rich.markup import escape
 
+from flows.archive.plan_estimate import Estimate, estimate_survey, estimate_table
 from flows.cli.app import AsJson
 from flows.cli.survey_verbs import NO_FLAGS, SurveyFlags, by_setting
 from flows.publish.findings import field_figures
@@ -54,8 +55,9 @@ State = Literal["cached", "to run", "blocked"]
 def plan(
     settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, preview: Path | None = None, as_json: AsJson = False
 ) -> int:
-    """Tell what a survey would run: what is stored, what is to be made and why, and how long the camera takes.
+    """Tell what a survey would run: what is stored, what is to be made and why, and estimates of what it takes.
 
+    Those are seconds of the camera, bytes, multiply-adds, score and processor time, each with what it comes from.
     Nothing is captured, started or written, but for the preview. Give the settings that you would give to `survey`.
 
     Parameters
@@ -105,6 +107,7 @@ class Forecast:
     refused: str | None = None
     scans: ScanChoice = field(default_factory=ScanChoice)
     figures: Mapping[str, Any] = field(default_factory=dict)  # see `flows.publish.findings`
+    estimates: Mapping[str, Estimate] = field(default_factory=dict)
     kept: Mapping[str, Any] | None = (
         None  # of a uniform scan that is kept and read in part: at most, as receipts tell it
     )
@@ -135,7 +138,8 @@ def forecast(settings: Settings, preview: Path | None = None) -> Forecast:
             with refusals(preview.parent, "write the preview"):
                 plan_preview.draw_preview(preview, run, fine, _last_map(run, catalogue), figure_lines(figures))
     kept = None if run.budget is None else run.budget.figures(run.budget.most_patches)
-    return Forecast(planner.rows, run.refused, run.scans, figures, kept)
+    estimates = estimate_survey(run, fine, catalogue)
+    return Forecast(planner.rows, run.refused, run.scans, figures, estimates, kept)
 
 
 def _last_map(run: SurveyRun, catalogue: Catalogue) -> ClassMap | None:
@@ -247,6 +251,7 @@ def plan_content(settings: Settings, preview: Path | None = None) -> dict[str, A
         "refused": found.refused,
         "scans": scans_content(found.scans),
         "field": found.figures,
+        "estimate": {name: asdict(one) for name, one in found.estimates.items()},
         **({} if found.kept is None else {"kept": found.kept}),
         **({} if preview is None else {"preview": str(preview)}),
     }
@@ -279,6 +284,8 @@ def show_plan(content: dict[str, Any], console: Console) -> None:
         f"{content['to_make']} stages to make" if content["to_make"] else "everything is stored: it would be published"
     )
     console.print(made)
+    if content["to_make"]:
+        console.print(estimate_table(content["estimate"]))
     if content["scans"]["frontier"]:
         _show_scans(content["scans"], console)
     if "preview" in content:
