@@ -28,7 +28,7 @@ from flows.terminal.progress import put_out, table
 from pipeline.errors import ArchiveError, SceneError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import deferred
-from pipeline.simulator.scenes.farm.farm_scene import REMOVED_LAW, law_of_key
+from pipeline.simulator.scenes.farm.farm_scene import is_farm_key
 from storage.archive.archive import Archive
 from storage.archive.keys import in_text
 from storage.archive.lineage import ABSENT, Catalogue, find_product, flatten
@@ -44,7 +44,7 @@ else:
 
 MOST_CHANGES = 10
 NOT_ASKED = ("notes", "out")  # of a receipt's settings
-NO_FILES = (None, *BUILT_IN_SCENES, REMOVED_LAW)  # scenes of runs that are no file's
+NO_FILES = (None, *BUILT_IN_SCENES)  # scenes of runs that are no file's
 
 
 def compare(archive: ArchiveName, old: str, new: str, *, out: OutFolder = None, as_json: AsJson = False) -> int:
@@ -113,7 +113,7 @@ def _is_same_field(old: Run, new: Run) -> bool:
 def _field_key(run: Run) -> str:
     """What names the land: not the bands, nor the day and hour at which a farm was looked at."""
     key = str(run.receipt.get("scene", run.uri)).split("/bands=")[0].split("/only=")[0]
-    if law_of_key(key) is None:
+    if not is_farm_key(key):
         return key
     return "/".join(part for part in key.split("/") if not part.startswith(("day=", "hour=")))
 

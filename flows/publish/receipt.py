@@ -122,7 +122,7 @@ class ReceiptFields(_Part):
     settings: Facts
     stages: list[StageRecord]
     savings: Savings
-    data_bytes: DataBytes | None = None  # earlier versions did not count them
+    data_bytes: DataBytes
     accuracy_is: AccuracyIs | None = None
     judged: str | None = None  # when accuracy was added
     accuracy: Accuracy | None = None

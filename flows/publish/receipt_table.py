@@ -60,13 +60,12 @@ def cost_rows(savings: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def byte_rows(receipt: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the bytes of a run against the reference, a row each; dashes where an earlier version did not count."""
-    told = receipt.get("data_bytes")
-    full = None if told is None else told["reference"]
-    rows = []
+    """Return the bytes of a run against the reference, a row each."""
+    told, rows = receipt["data_bytes"], []
+    full = told["reference"]
     for name, label in BYTE_LABELS.items():
-        done = None if told is None else told[name]
-        words = "not counted" if told is not None and done is None else format_megabytes(done)
+        done = told[name]
+        words = "not counted" if done is None else format_megabytes(done)
         ratio = None if done is None or not full else done / full
         rows.append({"label": label, "done": words, "full": format_megabytes(full), "ratio": ratio})
     return rows
@@ -74,7 +73,7 @@ def byte_rows(receipt: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def format_reused(receipt: Mapping[str, Any]) -> str:
     """Return what of the bytes kept was found in the archive and not built; empty where all was built."""
-    reused = receipt.get("data_bytes", {}).get("reused", {})
+    reused = receipt["data_bytes"]["reused"]
     if not reused:
         return ""
     size = format_megabytes(sum(reused.values()))

@@ -20,7 +20,6 @@ from pipeline.planning.uniform_scans import MIOU
 from pipeline.setting_fields import format_number, numbers_of
 from pipeline.simulator.effects.probe import Unit
 from pipeline.simulator.render import BY_NAME
-from pipeline.simulator.scenes.farm.farm_scene import refuse_removed
 from pipeline.simulator.selection.choice import named_effects
 from storage.archive.staging import is_name
 from storage.parallel.pool import WorkerPool
@@ -283,10 +282,9 @@ def unit_guess(value: object, low: float, high: float, unit: str) -> str:
 
 
 def parse_scene(value: object) -> str:
-    """The name of a scene or of its file; that of a farm which is drawn no more is refused."""
+    """Return the name of a scene or of its file."""
     if not isinstance(value, str) or not value:
         raise ValueError("must be the name of a scene or of its file")
-    refuse_removed(value)
     return value
 
 

@@ -113,7 +113,7 @@ def _usable(
         return run.problem
     places = [run.products.get(name, "").split("/") for name in (PROBABILITIES, "mosaic")]
     if any(len(parts) < 3 for parts in places):
-        return "it left no class probabilities, as runs of earlier versions"
+        return "it left no class probabilities"
     try:
         probabilities, mosaic = (archive.find(parts[1], parts[2]) for parts in places)
         if probabilities is None or mosaic is None:

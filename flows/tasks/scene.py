@@ -22,7 +22,7 @@ from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import Once
 from pipeline.simulator.effects.effect import Effect
 from pipeline.simulator.rig_model import Sky
-from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, farm_scene, law_of_key
+from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, farm_scene
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Source
@@ -269,9 +269,6 @@ def check_labels(scene: RasterScene, weights: Description) -> tuple[str, ...]:
                 f"the scene's file: {weights.class_names[0]} = {value}"
             )
         raise SceneError(f"the labels have the class {missing[0]!r}, the weights know {known}; {hint}")
-    law, learnt = law_of_key(scene.key), law_of_key(str(weights.record.get("data")))
-    if None not in (law, learnt) and law != learnt:
-        return (f"the weights were trained on {learnt}, the scene is of {law}: expect a poorer map",)
     seen = seen_in_training(scene, weights)
     return () if seen is None else (f"accuracy is counted on {TRAINING_SCENE[seen]}",)
 

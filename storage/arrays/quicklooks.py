@@ -186,7 +186,7 @@ def write_quicklook(group: zarr.Group, found: Quicklook) -> None:
 
 
 def quicklook_of(group: zarr.Group) -> Quicklook | None:
-    """The picture of an opened cube or mosaic, None where it has none (stores of before). The cube is not read.
+    """The picture of an opened cube or mosaic, None where it has none. The cube is not read.
 
     Raises IncompleteStoreError: the picture is damaged.
     """

@@ -16,11 +16,11 @@ from flows.archive.compare_command import compare
 from flows.archive.history import read_history
 from flows.publish import byte_account, publishing
 from flows.publish.byte_account import publish_counted, recount_bytes
-from flows.publish.receipt import Receipt, check_receipt
+from flows.publish.receipt import Receipt
 from flows.publish.receipt_table import byte_rows, print_table
 from flows.publish.report import render_report, replace_bytes
 from flows.publish.run_folder import Published
-from flows.terminal.figures import DASH, format_megabytes
+from flows.terminal.figures import format_megabytes
 from storage.archive.archive import Archive
 from storage.archive.kept_bytes import kept_bytes
 from storage.archive.keys import StageRef
@@ -235,25 +235,6 @@ def test_terminal_and_page_show_megabytes_against_one_reference() -> None:
         assert words in text
         for figure in ("bytes kept", "1.5 MB", "38 %", "4 MB"):
             assert figure in text, figure
-
-
-def test_a_receipt_of_an_earlier_version_shows_dashes(published: Published, tmp_path: Path) -> None:
-    """Table, page and history take one without the account; a recount leaves its run as it is."""
-    receipt = {name: value for name, value in make_receipt().items() if name != "data_bytes"}
-    assert check_receipt(receipt) == receipt
-    assert {row["done"] for row in byte_rows(receipt)} == {DASH}
-    assert f"bytes kept {DASH} {DASH} {DASH}" in _printed(receipt)
-    assert "bytes kept" in render_report(receipt, PNG)
-    archive = Archive.open(tmp_path / "archive")
-    earlier = {name: value for name, value in published.receipt.items() if name != "data_bytes"}
-    with archive.new_run("earlier") as draft:
-        publish_counted(archive, draft, earlier, lambda told: render_report(told, PNG), rests_on={})
-    folder = archive.runs()[-1]
-    known = (folder / "manifest.json").read_bytes()
-    assert recount_bytes(archive, folder.name, replace_bytes) == earlier
-    assert (folder / "manifest.json").read_bytes() == known
-    ratios = [row["savings"]["bytes_kept"] for row in read_history(archive).runs]
-    assert sorted(ratio is None for ratio in ratios) == [False, True]
 
 
 def test_compare_has_the_bytes_of_both(published: Published, survey_png: Survey, capsys: Any, tmp_path: Path) -> None:
