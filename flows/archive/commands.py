@@ -25,7 +25,6 @@ from flows.terminal.processes import DONE, FAILED, PARTLY
 from flows.terminal.progress import StageProgress, put_out, table
 from pipeline.lazy import deferred
 from storage.archive.archive import Archive
-from storage.archive.kept_bytes import all_sizes, kept_by_runs, kept_bytes
 from storage.archive.keys import in_text
 from storage.archive.lineage import Catalogue, changes_between, find_product, version_before
 from storage.archive.records import Run
@@ -161,8 +160,8 @@ def run_verify(
 def contents(archive: Archive, now: datetime | None = None) -> dict[str, Any]:
     """Runs, newest last, and stores by stage, oldest first, of an archive."""
     catalogue, moment = Catalogue.read(archive.root), now or datetime.now(UTC)
-    sizes = all_sizes(archive, catalogue)
-    kept = kept_by_runs(catalogue, sizes)
+    sizes = archive.all_sizes(catalogue)
+    kept = catalogue.kept_by_runs(sizes)
     stages: dict[str, list[dict[str, Any]]] = {}
     for store in sorted(catalogue.stores.values(), key=lambda store: (store.ref.stage, store.created, store.ref.key)):
         row = {
@@ -230,7 +229,7 @@ def explanation(archive: Archive, product: str) -> dict[str, Any]:
         below = set[str]().union(*(catalogue.ancestors([uri]) for uri in found.names))
         shown: set[str] = set()
         trees = [_tree(catalogue, uri, shown, ()) for uri in sorted(found.names - below)]
-        kept = kept_bytes(archive, found, catalogue)
+        kept = archive.kept_bytes(found, catalogue)
         row = {
             **_run_row(catalogue, found, kept),
             "problem": found.problem,

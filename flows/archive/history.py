@@ -30,7 +30,6 @@ from pipeline.errors import ArchiveError, SettingsError, visible
 from pipeline.lazy import deferred
 from pipeline.simulator.scenes.farm.farm_scene import USUAL_HOUR
 from storage.archive.archive import Archive
-from storage.archive.kept_bytes import all_sizes, kept_by_runs
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run
 from storage.archive.whole_files import write_whole
@@ -110,7 +109,7 @@ def read_history(archive: Archive, field: str | None = None) -> FieldHistory:
         raise ArchiveError(f"{which}; give --field with one of: {', '.join(names) or 'none'}")
     own = sorted((run for run in catalogue.runs if called(run) == name), key=lambda run: str(time_of_visit(run) or ""))
     maps = {run.uri: shown for run in own if (shown := _map_of(archive, catalogue, run)) is not None}
-    kept = kept_by_runs(catalogue, all_sizes(archive, catalogue))
+    kept = catalogue.kept_by_runs(archive.all_sizes(catalogue))
     rows = [_row(run, maps.get(run.uri), kept[run.uri]) for run in own]
     mapped = [(run, row) for run, row in zip(own, rows, strict=True) if run.uri in maps][-MOST_VISITS:]
     visits = [_visit(archive, run, row, maps[run.uri]) for run, row in mapped]

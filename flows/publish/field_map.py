@@ -102,7 +102,8 @@ def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: Prio
 
     title = choose_bands(shown.wavelength_nm)[1].capitalize()
     colours = np.rint(255 * colours_of(shown, shown.rectified)).astype(np.uint8)
-    layers = [MapLayer(title, photo_address(colours[thin, thin]), shown=True)]
+    photo = webp(Image.fromarray(np.ascontiguousarray(colours[thin, thin])), quality=QUALITY)
+    layers = [MapLayer(title, data_address(photo), shown=True)]
     layers.append(MapLayer("Class map", classes(shown.class_map), shown=True))
     if shown.confidence is not None:
         layers.append(MapLayer("Confidence, dark 0 to bright 1", _ramp_address(shown.confidence[thin, thin], 1.0)))
@@ -177,11 +178,6 @@ def _table(colours: Bytes) -> Bytes:
     table[:, 3] = 255
     table[: len(colours), : colours.shape[1]] = colours
     return table
-
-
-def photo_address(picture: Bytes) -> str:
-    """Return the data address of a (y, x, 3) photograph."""
-    return data_address(webp(Image.fromarray(np.ascontiguousarray(picture)), quality=QUALITY))
 
 
 def _ramp_address(values: NDArray[np.floating], most: float) -> str:

@@ -22,7 +22,7 @@ from models.evaluation.expected_scores import expected_counts
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, FieldScale, PlacedPicture, areas_by_number
 from pipeline.ground.georeference import crs_name, pixel_side_m
-from pipeline.ground.zones import figures_of_plots
+from pipeline.ground.zones import figures_of_plot
 from pipeline.planning.fine_pass import FinePlan
 from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table
@@ -150,8 +150,10 @@ def find_zones(run: SurveyRun, drawn: ClassMap) -> dict[str, Any]:
             "kept_m2": _ground_m2(run, kept),
         }
     if zones.plots is not None:
-        rows = figures_of_plots(zones.plots, zones.place, drawn.classes, drawn.confidence, drawn.names)
-        found["plots"] = [asdict(row) for row in rows]
+        found["plots"] = [
+            asdict(figures_of_plot(name, shape, zones.place, drawn.classes, drawn.confidence, drawn.names))
+            for name, shape in zones.plots.items()
+        ]
     return found
 
 

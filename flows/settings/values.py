@@ -109,21 +109,17 @@ def parse_bytes(value: object) -> int:
 
 def parse_compute(value: object) -> str:
     """A fraction of what reading everything takes, such as 25%, or a number of multiply-adds such as 4e9."""
-    percent = _parse_percent(value)
+    percent = _amount(value, {"%": 1.0})
+    if percent is not None and 0 < percent <= 100:
+        return f"{percent!r}%".replace(".0%", "%")
     number = None if isinstance(value, str) and value.strip().endswith("%") else _to_float(value)
-    if percent is None and (number is None or not number >= 1):
+    if number is None or not number >= 1:
         hint = f"; for {100 * number:g} % write {100 * number:g}%" if number is not None and 0 < number < 1 else ""
         raise BudgetError(
             "must be a fraction of the multiply-adds of reading everything, above 0% and at most 100%, such as 25%, "
             f"or a number of them such as 4e9; got {value!r}{hint}"
         )
-    return percent or f"{number!r}"
-
-
-def _parse_percent(value: object) -> str | None:
-    """Text such as 25% of a fraction above 0 and at most all; None of anything else."""
-    percent = _amount(value, {"%": 1.0})
-    return f"{percent!r}%".replace(".0%", "%") if percent is not None and 0 < percent <= 100 else None
+    return f"{number!r}"
 
 
 def limit_of(text: str | None, whole: float) -> float:

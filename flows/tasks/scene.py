@@ -44,11 +44,6 @@ SAME_HOUR = 0.5  # by which true solar time is at most off mean solar time, and 
 DATE, NEW = "{date", "{new}"
 
 
-def is_pattern(scene: str) -> bool:
-    """Return whether a scene is named anew at each visit: by ``{date:%Y-%m-%d}``, by ``{new}``, or by both."""
-    return DATE in scene or NEW in scene
-
-
 def scene_of_visit(settings: Settings, moment: datetime) -> Settings:
     """Return the settings with the file that a pattern stands for at a moment; those of any other scene as they are.
 
@@ -56,7 +51,7 @@ def scene_of_visit(settings: Settings, moment: datetime) -> Settings:
     newest, by the time it was written, that no run of the archive surveyed. Raises SettingsError: braces that say
     neither; NoSceneYet: there is no such file; NothingToMend: all of them were surveyed.
     """
-    if not is_pattern(settings.scene):
+    if DATE not in settings.scene and NEW not in settings.scene:
         return settings
     try:
         named = settings.scene.format(date=moment, new=NEW)
@@ -165,7 +160,9 @@ def _judged_by_known(file: SceneFile, known: Sequence[str] | None) -> SceneFile:
     if not (file.labels_found and out_of_range):
         return file
     hint = f"of the class {out_of_range[0]!r}, which the weights do not know: name its classes in a scene.toml to judge"
-    return file.without_labels(f"the labels beside the scene are left out: they are {hint} by them")
+    note = f"the labels beside the scene are left out: they are {hint} by them"
+    nothing: dict[str, Any] = {"labels": None, "class_names": (), "class_values": ()}
+    return replace(file, **nothing, class_colours=file.class_colours[:0], provenance=(*file.provenance, note))
 
 
 def _placed_once(scene: RasterScene, notes: tuple[str, ...], *, posed: bool) -> tuple[RasterScene, tuple[str, ...]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -158,18 +158,7 @@ class PlotFigures:
     fractions: dict[str, float | None]  # of the mapped ground, by class; of the pixels where that is not known
 
 
-def figures_of_plots(
-    plots: Mapping[str, BaseGeometry],
-    place: FieldPlace,
-    classes: NDArray[np.uint8],
-    confidence: NDArray[np.float32],
-    names: tuple[str, ...],
-) -> list[PlotFigures]:
-    """Work out the figures of every plot, in pixels of a (y, x) class map and by name. Plots may overlap."""
-    return [_figures(name, shape, place, classes, confidence, names) for name, shape in plots.items()]
-
-
-def _figures(
+def figures_of_plot(
     plot: str,
     shape: BaseGeometry,
     place: FieldPlace,
@@ -177,6 +166,7 @@ def _figures(
     confidence: NDArray[np.float32],
     names: tuple[str, ...],
 ) -> PlotFigures:
+    """Work out the figures of a plot of this name, in pixels of a (y, x) class map and by name. Plots may overlap."""
     rows, columns = _window(shape, classes.shape)
     size = rows.stop - rows.start, columns.stop - columns.start
     inside = pixels_inside([shape], size, origin=(rows.start, columns.start))

@@ -215,11 +215,6 @@ def _cuts(size: int, step: int) -> Iterator[slice]:
     return (slice(first, min(first + step, size)) for first in range(0, size, step))
 
 
-def tile_bytes(tile_shape: tuple[int, int], bands: int) -> int:
-    """Memory that one tile takes while it is made and written, raw lines not counted [bytes]."""
-    return COPIES * tile_shape[0] * tile_shape[1] * bands * 4
-
-
 def cache_bytes(placed: Sequence[Placed], tiles: Sequence[Tile], at_once: int) -> int:
     """Memory for the raw lines that any ``at_once`` tiles in a row need together [bytes]."""
     needed = [_blocks_of(placed, tile) for tile in tiles]

@@ -34,7 +34,7 @@ from storage.archive.keys import (
     store_at,
     without_manifest,
 )
-from storage.archive.lineage import rests_on
+from storage.archive.lineage import Catalogue, rests_on
 from storage.archive.manifests import (
     check_files,
     cleared_facts,
@@ -44,6 +44,7 @@ from storage.archive.manifests import (
     read_manifest,
     write_manifest,
 )
+from storage.archive.records import Run
 from storage.archive.run_folders import RunDraft, date_of_store, finish_extensions, take_its_place
 from storage.archive.staging import (
     PART_SUFFIX,
@@ -294,6 +295,18 @@ class Archive:
     def sizes(self, uris: Iterable[str]) -> dict[str, int]:
         """`size_of` stores and runs, by address."""
         return {uri: self.size_of(uri) for uri in uris}
+
+    def kept_bytes(self, run: Run, catalogue: Catalogue) -> int:
+        """Return the bytes kept for a run: of its folder, of the stores that it names and of those they rest on.
+
+        Manifests count, and a store whose files were cleared away has its manifest alone.
+        """
+        return sum(self.sizes([run.uri, *catalogue.named_and_below[run.uri]]).values())
+
+    def all_sizes(self, catalogue: Catalogue) -> dict[str, int]:
+        """Return the bytes of all files of every store and run, by address, also of stores that are only named."""
+        below = catalogue.named_and_below
+        return self.sizes(sorted({*catalogue.stores, *below, *(uri for uris in below.values() for uri in uris)}))
 
     def take_moved(self) -> int:
         """Bytes that went to and from a bucket since this was asked last, or the archive was opened."""

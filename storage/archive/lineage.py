@@ -116,6 +116,10 @@ class Catalogue:
         """For each run the stores that it names, and what these rest on."""
         return {run.uri: set(run.names) | self.ancestors(run.names) for run in self.runs}
 
+    def kept_by_runs(self, sizes: Mapping[str, int]) -> dict[str, int]:
+        """Return `Archive.kept_bytes` of all runs, by address; ``sizes`` are of `Archive.all_sizes`."""
+        return {run: sum(sizes[uri] for uri in (run, *uris)) for run, uris in self.named_and_below.items()}
+
     def roles(self, uri: str) -> set[str]:
         """What runs call the stage that made a store, such as capture_fine."""
         return self._roles.get(uri.rpartition("/")[2], set())

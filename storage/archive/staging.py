@@ -190,6 +190,13 @@ def format_disk_error(error: OSError) -> str:
     return disk_advice(error) or f"{error.strerror or error}; free space or rights and run again"
 
 
+def write_all(descriptor: int, content: bytes) -> None:
+    """Write every byte; a full disk may take only some of them before it refuses."""
+    view = memoryview(content)
+    while view:
+        view = view[os.write(descriptor, view) :]
+
+
 def remove_tree(path: Path) -> None:
     """Remove a folder if it is there; one that cannot be removed is left for the next run to reclaim."""
     if path.is_symlink():  # what it points at is not the archive's

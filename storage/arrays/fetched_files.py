@@ -25,7 +25,15 @@ from pathlib import Path
 from urllib.parse import quote
 
 from pipeline.rig.transports import NotKept
-from storage.archive.staging import format_disk_error, open_plain, plain_reader, plain_size, read_plain, sync_path
+from storage.archive.staging import (
+    format_disk_error,
+    open_plain,
+    plain_reader,
+    plain_size,
+    read_plain,
+    sync_path,
+    write_all,
+)
 
 SYNC_BYTES = 1 << 24
 SUMS = "%sums"  # which no quoted name ends with
@@ -91,7 +99,7 @@ class FetchedFiles:
             if not before:
                 self.folder.mkdir(parents=True, exist_ok=True)
             with os.fdopen(open_plain(path, _APPEND), "ab", buffering=0) as file:
-                _write_all(file.fileno(), data)
+                write_all(file.fileno(), data)
                 waiting = self._unsynced.get(name, 0) + len(data)
                 if _is_note(name) or waiting >= SYNC_BYTES:
                     os.fdatasync(file.fileno())
@@ -128,7 +136,7 @@ class FetchedFiles:
         text, sums = _record(reached, crc32), _sums_of(path)
         try:
             with os.fdopen(open_plain(sums, _APPEND), "ab", buffering=0) as file:
-                _write_all(file.fileno(), text)
+                write_all(file.fileno(), text)
         except OSError:
             _cut(sums, known.records * _RECORD.size)
             raise
@@ -209,12 +217,6 @@ def _unread(path: Path, error: OSError) -> NotKept:
     return NotKept(
         f"cannot read {path}: {error.strerror or error}; mend the disk and run again: the camera still has it"
     )
-
-
-def _write_all(file: int, data: bytes) -> None:
-    view = memoryview(data)
-    while view:
-        view = view[os.write(file, view) :]
 
 
 def _cut(path: Path, size: int) -> None:

@@ -29,7 +29,7 @@ from pipeline.errors import RigError
 from pipeline.json_lines import read_checked, with_check
 from pipeline.source import Line
 from storage.archive.keys import plain
-from storage.archive.staging import format_disk_error, open_plain, plain_reader, sync_path
+from storage.archive.staging import format_disk_error, open_plain, plain_reader, sync_path, write_all
 
 ENDING = ".lines"
 SYNC_LINES = 64
@@ -101,7 +101,7 @@ class Spool:
             if self._file is None:
                 self._file = self._writer(os.O_APPEND)
             try:
-                _write_all(self._file, record)
+                write_all(self._file.fileno(), record)
             except OSError:
                 self._cut_back()
                 raise
@@ -119,7 +119,7 @@ class Spool:
             record = self._record(line, number)
             with _refusals(self.path, number), self._writer() as file:
                 file.seek(self._place(number))
-                _write_all(file, record)
+                write_all(file.fileno(), record)
                 os.fdatasync(file.fileno())
             self.lost = [one for one in self.lost if one != number]
 
@@ -146,7 +146,7 @@ class Spool:
                 )
             LOG.warning("%s: its header has changed; lines that belong to this sweep are kept", self.path)
             with self._writer() as file:
-                _write_all(file, self._head)
+                write_all(file.fileno(), self._head)
         self.count = max(good, default=-1) + 1
         self.lost = sorted(set(range(self.count)) - set(good))
         if self.lost:
@@ -274,10 +274,3 @@ def _refusals(path: Path, lines: int) -> Iterator[None]:
         raise RigError(
             f"cannot write line {lines} to {path}: {format_disk_error(error)}; the {lines} lines before it are kept"
         ) from error
-
-
-def _write_all(file: BinaryIO, content: bytes) -> None:
-    """Write every byte; a full disk may take only some of them before it refuses."""
-    view = memoryview(content)
-    while view:
-        view = view[os.write(file.fileno(), view) :]

@@ -75,17 +75,6 @@ class SceneFile:
             regridded=found.regridded,
         )
 
-    def without_labels(self, note: str) -> SceneFile:
-        """The same scene as if it had no labels; the note says why."""
-        return replace(
-            self,
-            labels=None,
-            class_names=(),
-            class_colours=self.class_colours[:0],
-            class_values=(),
-            provenance=(*self.provenance, note),
-        )
-
     def with_labels(self, labels: NDArray[np.uint8], note: str) -> SceneFile:
         """The same scene with other labels; its provenance says so."""
         return replace(self, labels=labels, provenance=(*self.provenance, note))

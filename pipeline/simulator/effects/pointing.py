@@ -423,17 +423,13 @@ def responses(time: Floats, damping: float) -> tuple[Floats, Floats]:
             impulse = decay * time * np.sinc(turn / np.pi)
             rest = decay * np.cos(turn) + damping * impulse
         else:
-            slow = _slow_rate(damping)
-            apart, decay = 2 * math.sqrt((damping - 1) * (damping + 1)) * time, np.exp(-slow * time)
+            root = math.sqrt((damping - 1) * (damping + 1))
+            slow = 1 / (damping + root)  # zeta - sqrt(zeta^2 - 1) without its cancellation
+            apart, decay = 2 * root * time, np.exp(-slow * time)
             impulse = decay * time * np.where(apart > 0, -np.expm1(-apart) / np.where(apart > 0, apart, 1.0), 1.0)
             rest = decay + slow * impulse
     early = time * (1 + 2 * damping) < _SERIES_BELOW
     return impulse, np.where(early, _early_rise(np.where(early, time, 0.0), damping), 1 - rest)
-
-
-def _slow_rate(damping: float) -> float:
-    """The smaller of the two rates of an overdamped system, zeta - sqrt(zeta^2 - 1) without its cancellation."""
-    return 1 / (damping + math.sqrt((damping - 1) * (damping + 1)))
 
 
 def _early_rise(time: Floats, damping: float) -> Floats:

@@ -14,7 +14,7 @@ from rich.console import Console
 from flows.archive.commands import contents
 from flows.archive.compare_command import compare
 from flows.archive.history import read_history
-from flows.publish import byte_account, publishing
+from flows.publish import publishing
 from flows.publish.byte_account import publish_counted, recount_bytes
 from flows.publish.receipt import Receipt
 from flows.publish.receipt_table import byte_rows, print_table
@@ -22,8 +22,8 @@ from flows.publish.report import render_report, replace_bytes
 from flows.publish.run_folder import Published
 from flows.terminal.figures import format_megabytes
 from storage.archive.archive import Archive
-from storage.archive.kept_bytes import kept_bytes
 from storage.archive.keys import StageRef
+from storage.archive.lineage import Catalogue
 from storage.archive.records import read_run
 from tests.conftest import Survey
 from tests.flows.conftest import Page, problems
@@ -108,7 +108,7 @@ def test_the_account_of_a_survey_is_what_lies_in_its_folders(
     assert 0 < account["captured"] < sum(spooled)  # a spool has numbers, times and checksums beside the lines
     assert account["captured"] > 0.9 * sum(spooled)
     run = read_run(published.folder, {})
-    assert kept_bytes(Archive.open(root), run) == account["kept"]
+    assert Archive.open(root).kept_bytes(run, Catalogue.read(root)) == account["kept"]
     (listed,) = contents(Archive.open(root))["runs"]
     assert listed["bytes"] == account["kept"]
     (row,) = read_history(Archive.open(root)).runs
@@ -202,8 +202,7 @@ def test_the_figure_of_a_folder_that_holds_the_figure(
 ) -> None:
     """Where a digit more of it makes the folder larger, or shorter words make the page smaller, it holds as well."""
     archive = Archive.open(tmp_path / "archive")
-    monkeypatch.setattr(byte_account, "_reused", lambda receipt, stores: {})
-    monkeypatch.setattr(archive, "sizes", lambda uris: {"stages/a/b": stores})
+    monkeypatch.setattr(archive, "sizes", lambda uris: {"stages/capture/ab12": stores})  # which the run built
     widths = iter(range(100_000, 0, -1))  # a page that gets shorter whenever it is asked for
     with archive.new_run("north") as draft:
         publish_counted(archive, draft, make_receipt(), lambda receipt: "x" * next(widths), rests_on={})
