@@ -310,7 +310,7 @@ def _run_by(
     if refused is not None and not planning:
         raise SettingsError(refused)
     pixels, scene, notes, label_notes = _scene_for(model, settings, recorded, planning=planning)
-    grid = SceneGrid(*scene.shape, described.config.patch, described.config.factor)
+    grid, bands = SceneGrid(*scene.shape, described.config.patch, described.config.factor), len(scene.wavelength_nm)
     zones = open_zones(settings.zones, place_of_field(settings, scene), grid)
     outside = beyond_training(settings, scene, described, model.trained_on, path)
     ood_detector = model.asked_ood(settings.unknown)
@@ -320,39 +320,18 @@ def _run_by(
     if settings.extent == EXTENT_PART:  # what is remembered says where to look: nothing else is asked for so early
         archive = open_archive(settings.out) if archive is None and is_archive(settings.out) else archive
         found = (None, ()) if archive is None else find_prior(archive, settings, name, grid, described.class_names)
-    prior = None if found is None else found[0]
-    extent, extent_notes = None, tuple[str, ...]()
-    if settings.extent == EXTENT_PART and prior is None:  # as it can be asked for again
-        settings = replace(settings, extent=EXTENT_WHOLE, max_age=None, skip_below_error=None)
-        extent_notes = ("nothing is remembered: the whole field is looked at",)
-    plan, scans, raster, plan_notes = CapturePlan.of_map(), ScanChoice(), None, tuple[str, ...]()
-    passes, bands = None if recorded is None else recorded.passes, len(scene.wavelength_nm)
-    layout = PassLayout.of(settings, grid, zones.shown, passes)
-    if settings.extent == EXTENT_PART and prior is not None:
-        assert settings.seconds is not None  # checked with the settings
-        layout, extent, words = choose_extent(
-            layout,
-            prior,
-            described,
-            path,
-            seconds=settings.seconds,
-            max_age=settings.max_age,
-            skip_below_error=settings.skip_below_error,
-        )
-        extent_notes = (words,)
+    passes = None if recorded is None else recorded.passes
+    planned = _PlannedCapture(settings)
     if pixels is None:
-        scans = choose_uniform_scan(layout, described, path, bands, settings)
-        if settings.undecided and scans.chosen is None and path != weights_offered(settings)[-1]:
-            raise NoScanPaidFor(f"{path.name} reads uniform scans, and its record tells of none of this camera")
-        layout, plan, settings, plan_notes = lay_out_passes(layout, scans.chosen, settings)
-    else:
-        raster = RasterPixels(pixels.read, pixels.missing, bands, grid)
-    settings = replace(settings, extent=layout.extent, scan_step=layout.step, scan_exposure_ms=layout.exposure_ms)
+        prior = None if found is None else found[0]
+        planned = _plan_capture(settings, grid, bands, path, described, prior, shown=zones.shown, passes=passes)
+    settings, plan = planned.settings, planned.plan
     costs = ReadingCosts(described.config, grid, bands)
     spending = settings.policy, settings.macs, settings.least_gain
     budget = PatchBudget.asked(costs, None if zones.fractions is None else zones.fractions > 0, *spending)
-    simulated, planned = make_source(scene, settings), (*plan.coarse, *plan.full)
-    source = field_source(scene, settings, simulated, planned) if recorded is None else recorded.field
+    simulated, sweeps = make_source(scene, settings), (*plan.coarse, *plan.full)
+    source = field_source(scene, settings, simulated, sweeps) if recorded is None else recorded.field
+    raster = None if pixels is None else RasterPixels(pixels.read, pixels.missing, bands, grid)
     if raster is None:
         check_memory(simulated, grid, plan, settings.memory, settings.pool)
     else:
@@ -361,30 +340,74 @@ def _run_by(
     prior, prior_notes = found or find_prior(archive, settings, name, grid, described.class_names)
     if settings.prior != AUTO:  # what is meant when it is asked for again
         settings = replace(settings, prior=NONE if prior is None else prior.run)
-    said = (*notes, *zones.notes, *plan_notes, *prior_notes, *extent_notes, *outside, *label_notes)
     return SurveyRun(
         settings=settings,
         archive=archive,
         source=source,
         simulated=simulated,
         scene=scene,
-        planned=planned,
+        planned=sweeps,
         described=described,
         load=model.load,
         grid=grid,
         costs=costs,
         plan=plan,
         recorded=passes,
-        scans=scans,
+        scans=planned.scans,
         zones=zones,
         raster=raster,
         budget=budget,
-        extent=extent,
+        extent=planned.extent,
         prior=prior,
         ood_detector=ood_detector,
-        notes=said,
+        notes=(*notes, *zones.notes, *planned.notes, *prior_notes, *outside, *label_notes),
         refused=refused,
     )
+
+
+@dataclass(frozen=True)
+class _PlannedCapture:
+    """The lines of a survey, the choices that led to them, and the settings that ask for just these."""
+
+    settings: Settings
+    plan: CapturePlan = field(default_factory=CapturePlan.of_map)
+    scans: ScanChoice = field(default_factory=ScanChoice)
+    extent: ExtentChoice | None = None
+    notes: tuple[str, ...] = ()
+
+
+def _plan_capture(
+    settings: Settings,
+    grid: SceneGrid,
+    bands: int,
+    path: Path,
+    described: Description,
+    prior: Prior | None,
+    *,
+    shown: NDArray[np.bool_] | None,
+    passes: RecordedPasses | None,
+) -> _PlannedCapture:
+    """Choose the part of the field, then the uniform scan or two passes, for the weights of the file ``path``.
+
+    Raises what `choose_extent`, `choose_uniform_scan` and `lay_out_passes` raise; NoScanPaidFor: other weights read
+    uniform scans of this camera.
+    """
+    extent, extent_notes, is_part = None, tuple[str, ...](), settings.extent == EXTENT_PART
+    if is_part and prior is None:  # as it can be asked for again
+        settings = replace(settings, extent=EXTENT_WHOLE, max_age=None, skip_below_error=None)
+        extent_notes = ("nothing is remembered: the whole field is looked at",)
+    layout = PassLayout.of(settings, grid, shown, passes)
+    if is_part and prior is not None:
+        assert settings.seconds is not None  # checked with the settings
+        limits = {"max_age": settings.max_age, "skip_below_error": settings.skip_below_error}
+        layout, extent, words = choose_extent(layout, prior, described, path, seconds=settings.seconds, **limits)
+        extent_notes = (words,)
+    scans = choose_uniform_scan(layout, described, path, bands, settings)
+    if settings.undecided and scans.chosen is None and path != weights_offered(settings)[-1]:
+        raise NoScanPaidFor(f"{path.name} reads uniform scans, and its record tells of none of this camera")
+    layout, plan, settings, plan_notes = lay_out_passes(layout, scans.chosen, settings)
+    settings = replace(settings, extent=layout.extent, scan_step=layout.step, scan_exposure_ms=layout.exposure_ms)
+    return _PlannedCapture(settings, plan, scans, extent, (*plan_notes, *extent_notes))
 
 
 def _scene_for(
