@@ -28,7 +28,7 @@ def visible(text: str, escaped: Callable[[str], str] = _escaped) -> str:
 
 
 def is_visible(character: str) -> bool:
-    """Whether a character is one that `visible` leaves as it is."""
+    """Return whether a character is one that `visible` leaves as it is."""
     if character in _LAYOUT:
         return True
     if character in _UNSEEN or unicodedata.bidirectional(character) in _DIRECTION:

@@ -78,7 +78,7 @@ def _whole(text: bytes, seed: int) -> dict[str, Any] | None:
 
 
 def _had_check(text: bytes) -> bool:
-    """Whether a line ends as one with a checksum does, but for one byte at most."""
+    """Return whether a line ends as one with a checksum does, but for one byte at most."""
     tail = text[-_LENGTH:]
     fixed = tail[: len(_OPENS)] + tail[-len(_CLOSES) :]
     return len(tail) == _LENGTH and sum(a != b for a, b in zip(fixed, _OPENS + _CLOSES, strict=True)) <= 1

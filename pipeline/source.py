@@ -58,7 +58,7 @@ class Source(Protocol):
 
     @property
     def name(self) -> str:
-        """What the receipt calls it: ``sim``, ``rig``, or an archive's address."""
+        """Return what the receipt calls it: ``sim``, ``rig``, or an archive's address."""
 
     @property
     def camera(self) -> LineCamera:
@@ -83,7 +83,7 @@ class Source(Protocol):
 
     @property
     def record(self) -> Mapping[str, Any] | None:
-        """What its captures were like, for their store; None where its effects tell all of it."""
+        """Return what its captures were like, for their store; None where its effects tell all of it."""
 
 
 class SweepLines(Protocol):

@@ -275,7 +275,7 @@ def _tree(catalogue: Catalogue, uri: str, shown: set[str], path: tuple[str, ...]
 
 
 def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
-    """What verification found, and for what is broken what a repair would do."""
+    """Return what verification found, and for what is broken what a repair would do."""
     bad = [finding for finding in findings if finding.problem is not None]
     places = {finding.uri for finding in findings if finding.kind in ("whole", "broken")}
     broken = {finding.uri for finding in bad if finding.kind == "broken"}

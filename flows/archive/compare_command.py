@@ -1,4 +1,4 @@
-"""What `spectralzoom compare` does: two runs of one field side by side, and a picture of where they differ."""
+"""The verb `compare`: two runs of one field side by side, and a picture of where they differ."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def _is_same_field(old: Run, new: Run) -> bool:
 
 
 def _field_key(run: Run) -> str:
-    """What names the land: not the bands, nor the day and hour at which a farm was looked at."""
+    """Return what names the land: not the bands, nor the day and hour at which a farm was looked at."""
     key = str(run.receipt.get("scene", run.uri)).split("/bands=")[0].split("/only=")[0]
     if not is_farm_key(key):
         return key

@@ -1,4 +1,4 @@
-"""What `spectralzoom export` does: a run's maps and products, its cubes as ENVI, and a STAC catalogue of them."""
+"""The verb `export`: a run's maps and products, its cubes as ENVI, and a STAC catalogue of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an export takes from a run: its images for map programs, its cubes for ENVI, its stores for the catalogue."""
+"""Sources of an export: a run's images for map programs, its cubes for ENVI, its stores for the catalogue."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class ExportedRun:
         return ref
 
     def path(self, product: str) -> Path:
-        """Where a product lies that every finished run has (IncompleteStoreError: this one has not)."""
+        """Return where a product lies that every finished run has (IncompleteStoreError: this one has not)."""
         if self.store(product) is None:
             raise IncompleteStoreError(f"the run {self.id} has no {product}: it did not finish; export another run")
         return self.archive.locate(self.receipt["products"][product])
@@ -78,7 +78,7 @@ class ExportedRun:
 
     @cached_property
     def geobox(self) -> GeoBox | None:
-        """Where the run's map lies on the earth, by its pose or its scene's file; None where neither says it."""
+        """Return where the run's map lies on the earth, by its pose or its scene's file; None where neither says it."""
         return load_geobox(self.path(self.map_product))
 
     @property
@@ -138,7 +138,7 @@ def map_layers(run: ExportedRun) -> list[Layer]:
 
 
 def layer_tags(run: ExportedRun, product: str, place: Place) -> dict[str, str]:
-    """What every image says of its run."""
+    """Return what every image says of its run."""
     return {
         "TIFFTAG_SOFTWARE": f"spectralzoom {run.receipt['versions'].get('spectralzoom', 'of unknown version')}",
         "run": run.id,
@@ -149,7 +149,7 @@ def layer_tags(run: ExportedRun, product: str, place: Place) -> dict[str, str]:
 
 
 def place_of(run: ExportedRun, stored: StoredImage) -> Place:
-    """Where a store's images lie, as the store itself says."""
+    """Return where a store's images lie, as the store itself says."""
     if stored.geobox is not None:
         return Place.on_map(stored.geobox)
     transform = stored.about.get("spatial:transform")
@@ -208,7 +208,7 @@ def _picture(run: ExportedRun) -> tuple[CogImage, Callable[[], Rows]]:
 
 
 def seen_rows(run: ExportedRun) -> Iterator[tuple[int, NDArray[np.bool_]]]:
-    """Where a run's map shows anything, some rows at a time."""
+    """Yield where a run's map shows anything, some rows at a time."""
     if run.map_product == "class_map":
         yield from (
             (first, found != UNLABELLED) for first, found in open_image(run.path("class_map"), "classes").rows()

@@ -1,4 +1,4 @@
-"""What is exported of a run's values: the table of its classes' areas, and layers of the mosaic's bands and indices.
+"""Exported values of a run: the table of its classes' areas, and layers of the mosaic's bands and indices.
 
 Areas say how surely they are known. Layers lie on the map where the run has one.
 """
@@ -123,12 +123,12 @@ class MosaicView:
 
     @property
     def words(self) -> str:
-        """How large its pixels are."""
+        """Return how large its pixels are."""
         return "Pixels of the field" if self.factor == 1 else f"Pixels of {self.factor} x {self.factor} px"
 
     @cached_property
     def place(self) -> Place:
-        """Where the image lies."""
+        """Return where the image lies."""
         if self.ground is not None:
             return Place.on_map(self.ground.geobox)
         return place_of(self.run, open_image(self.run.path("mosaic"), "coverage"))

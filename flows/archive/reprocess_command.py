@@ -1,4 +1,4 @@
-"""What `spectralzoom reprocess` and `evaluate ARCHIVE RUN` do: surveys of an archive again, and maps judged later.
+"""The verbs `reprocess` and `evaluate ARCHIVE RUN`: surveys of an archive again, and maps judged later.
 
 What the archive holds is found by its key, raw light above all; only what new weights or newer stages change is made.
 """

@@ -95,7 +95,7 @@ def from_raw_cubes(catalogue: Catalogue, run: Run, settings: Settings) -> Settin
 
 
 def _is_there(settings: Settings) -> bool:
-    """Whether what a recording or a scene comes from still lies where it lay; a rig is taken to be there."""
+    """Return whether what a recording or a scene comes from still lies where it lay; a rig is taken to be there."""
     if settings.source == RECORDED:
         try:
             find_raw_cubes(str(settings.sweeps))
@@ -117,7 +117,7 @@ def _light_of(run: Run) -> dict[str, Any]:
 
 
 def is_called(generation: Generation, pattern: str) -> bool:
-    """Whether a field's survey, scene or run is called so; ``*`` stands for any letters."""
+    """Return whether a field's survey, scene or run is called so; ``*`` stands for any letters."""
     scene = str(generation.run.settings.get("scene", ""))
     names = (generation.field, scene, PurePath(scene).name, generation.run.folder.name)
     return any(fnmatchcase(name, pattern.replace("[", "[[]").replace("?", "[?]")) for name in names)
@@ -147,20 +147,20 @@ def stale_stores(catalogue: Catalogue, uris: set[str], weights: str | None) -> s
 
 
 def is_whole(catalogue: Catalogue, run: Run) -> bool:
-    """Whether run and stores are there, told from manifests alone, and none of its stages failed."""
+    """Return whether run and stores are there, told from manifests alone, and none of its stages failed."""
     stores = [catalogue.stores.get(uri) for uri in catalogue.named_and_below[run.uri]]
     failed = any(row.get("state") == "failed" for row in run.stages)
     return run.problem is None and not failed and all(one is not None and one.problem is None for one in stores)
 
 
 def is_current(catalogue: Catalogue, run: Run, settings: Settings) -> bool:
-    """Whether its survey would find all that this run rests on, by versions and weights, not by a scene's file."""
+    """Return whether its survey would find all that this run rests on, by versions and weights alone."""
     stale = stale_stores(catalogue, catalogue.named_and_below[run.uri], weights_key(settings))
     return not stale and is_whole(catalogue, run) and not is_pending(run.receipt)
 
 
 def weights_key(settings: Settings) -> str | None:
-    """What the weights are called by what they hold, as stages know it; None where they cannot be read."""
+    """Return what the weights are called by what they hold, as stages know it; None where they cannot be read."""
     try:
         path = weights_path(settings)
         return _file_key(path, path.stat().st_mtime_ns, path.stat().st_size)

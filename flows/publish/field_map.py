@@ -48,7 +48,7 @@ class MapLayer:
 
 @dataclass(frozen=True)
 class FieldMap:
-    """What the page shows: size (width, height) [px], layers from the lowest up, classes with colour and share."""
+    """Content of the page: size (width, height) [px], layers from the lowest up, classes with colour and share."""
 
     size: tuple[int, int]
     layers: Sequence[MapLayer]
@@ -57,13 +57,13 @@ class FieldMap:
 
     @property
     def data(self) -> dict[str, Any]:
-        """What the page's script is given."""
+        """Return what the page's script is given."""
         return {"size": list(self.size), "layers": [asdict(layer) for layer in self.layers]}
 
 
 @dataclass(frozen=True)
 class PriorMapField:
-    """What a map that goes on from an earlier run has of it."""
+    """Images that a map has of the earlier run it goes on from."""
 
     run: str
     days: float  # between that capture and this one

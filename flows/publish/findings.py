@@ -1,4 +1,4 @@
-"""What a run finds: hectares of each class, what changed, what is old; its zones and plots; what its map says."""
+"""Findings of a run: hectares of each class, changes, ages; its zones and plots; the map's own figures."""
 
 from __future__ import annotations
 
@@ -200,7 +200,7 @@ def find_map(run: SurveyRun, ref: StageRef, drawn: ClassMap) -> dict[str, Any]:
 
 
 def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
-    """What the map is likely to score by what it says of itself; None where nobody knows how such comes true.
+    """Return what the map is likely to score by what it says of itself; None where nobody knows how such comes true.
 
     That is known of maps of uniform scans that are read whole, without a memory. Pixels without a class do not count. A
     score of which the error leaves open nearly everything is not predicted, and the words say so.

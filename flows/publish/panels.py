@@ -1,4 +1,4 @@
-"""What pictures of a map are made of: palettes, outlines of patches, scale bars; and the map on the ground."""
+"""Parts of pictures of a map: palettes, outlines of patches, scale bars; and the map on the ground."""
 
 from __future__ import annotations
 

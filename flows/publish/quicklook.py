@@ -44,7 +44,7 @@ FIXED = (PAPER, INK, MUTED, UNLABELLED_COLOUR, "white", "black")
 
 @dataclass(frozen=True)
 class QuicklookData:
-    """What the four panels show, as plain arrays. Pixels are scene pixels; patches are numbered row by row."""
+    """Content of the four panels, as plain arrays. Pixels are scene pixels; patches are numbered row by row."""
 
     survey: str
     seed: int

@@ -66,7 +66,7 @@ class Declared:
 
     @property
     def expected(self) -> str:
-        """What it may be, as the end of "must be"; '' where only its own parser knows."""
+        """Return what it may be, as the end of "must be"; '' where only its own parser knows."""
         if self.choices:
             return f"one of {self.listed}"
         low, high = span_of(self.item)
@@ -408,7 +408,7 @@ def _rig_wrongs(settings: Settings) -> Iterator[str]:
 
 
 def _recorded_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
-    """What a recording needs, and what nothing else has."""
+    """Yield what a recording needs, and what nothing else has."""
     if settings.source != RECORDED:
         for name in OF_RECORDINGS:
             if getattr(settings, name) is not None:
@@ -475,7 +475,7 @@ def _sparing_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[s
 
 
 def place_of(key: str, origin: str | None) -> str:
-    """How a message names a setting: as a flag (without the table that holds it), or in its file."""
+    """Return how a message names a setting: as a flag (without the table that holds it), or in its file."""
     if origin == "flag":
         return "--" + key.rpartition(".")[2].replace("_", "-")
     return f"'{key}'" + (f" in {origin}" if origin else "")

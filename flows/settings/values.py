@@ -43,7 +43,7 @@ _OTHER_UNITS: dict[str, tuple[tuple[str, float], ...]] = {
 
 @dataclass(frozen=True)
 class Tolerance:
-    """What a simulation may leave out: the greatest change of any number, in noise sigmas or in DN."""
+    """Greatest change of any number by effects that a simulation leaves out, in noise sigmas or in DN."""
 
     value: float = 0.1
     unit: Unit = "sigma"

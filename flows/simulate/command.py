@@ -1,4 +1,4 @@
-"""What `spectralzoom simulate` does and shows: one scan of a scene as raw cubes, and the manifest of its effects."""
+"""The verb `simulate`: one scan of a scene as raw cubes, and the manifest of its effects."""
 
 from __future__ import annotations
 

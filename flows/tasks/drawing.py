@@ -122,7 +122,7 @@ class Drawing:
 
 @dataclass(frozen=True)
 class UnknownRule:
-    """Which pixels are called unknown: at which rate, in which light, and by which number."""
+    """Rule for pixels that are called unknown: at which rate, in which light, and by which number."""
 
     number: int  # of the class, after those of the weights
     rate: float  # of known pixels that may be
@@ -154,7 +154,7 @@ class UnknownRule:
 
 @dataclass(frozen=True)
 class Drawn:
-    """What was found while a region, or a field, was drawn."""
+    """Findings while a region, or a field, was drawn."""
 
     unread_px: int  # coarse pixels that were seen, with values that the weights take for no reading
     comparison: TemporalAgreement | None  # with what was remembered; None of a field's first visit

@@ -33,7 +33,7 @@ def open_sweeps(signal: Path, registration: Path | None, camera: LineCamera) -> 
 
 @dataclass(frozen=True)
 class MosaicRecipe:
-    """What a mosaic is made of, by absolute paths: small, hashable, and good in every process that sees them."""
+    """Recipe of a mosaic, by absolute paths: small, hashable, and good in every process that sees them."""
 
     signal: Path  # folder of condensed sweeps
     camera: LineCamera
@@ -44,7 +44,7 @@ class MosaicRecipe:
 
     @property
     def folders(self) -> list[Path]:
-        """What has to be seen by whoever makes tiles."""
+        """Return what has to be seen by whoever makes tiles."""
         given = (self.signal, self.geolocation, None if self.registration is None else self.registration.parent)
         return [path for path in given if path is not None]
 
@@ -67,7 +67,7 @@ class MosaicRecipe:
 
 @dataclass(frozen=True)
 class TileBudget:
-    """How many tiles are made at a time, and the memory that this takes [bytes]."""
+    """Number of tiles made at a time, and the memory that this takes [bytes]."""
 
     workers: int
     cache: int  # lines kept; by each process where there are several

@@ -1,4 +1,4 @@
-"""What reading a field takes, and which patches of a uniform scan are read: those that promise most within budgets."""
+"""Costs of reading a field, and the patches of a uniform scan that are read: the best within budgets."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DIGITS = 2  # of the least fraction that a refusal names
 
 @dataclass(frozen=True)
 class ReadingCosts:
-    """What it takes to read one field by one network, region by region as surveys do."""
+    """Multiply-adds of reading one field by one network, region by region as surveys do."""
 
     config: SegmenterConfig
     grid: SceneGrid
@@ -58,7 +58,7 @@ class ReadingCosts:
 
 @dataclass(frozen=True)
 class PatchBudget:
-    """What may be spent on patches, and which there are to spend it on.
+    """Budget of patches, and the patches there are to spend it on.
 
     Fractions are of reading every one of ``patch_index`` and choosing none. A memory that the map goes on from is
     weighed whatever is seen, and does not count.

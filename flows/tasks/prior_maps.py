@@ -34,7 +34,7 @@ OF_THE_LIGHT = (  # settings that the same light has alike
 
 @dataclass(frozen=True)
 class EarlierRun:
-    """What a run saw of a field coarsely."""
+    """Coarse view of a field by an earlier run."""
 
     mosaic: StageRef
     factor: int  # fine px to a pixel of it, along either axis
@@ -86,7 +86,7 @@ def _before(archive: Archive, settings: Settings, name: str) -> Iterator[Run]:
     """Return the newest runs of a field with class probabilities, the last captured before this visit first."""
     found: list[tuple[float, int, Run]] = []
     part, asked = run_stem(name), anchor_paths(settings.to_dict(), Path.cwd())
-    # Of a survey that leaves it to the memory where to look, that choice says nothing of its light.
+    # A survey may leave it to the prior map where to look: that choice says nothing of its light.
     chosen = ("extent", "scan_step", "scan_exposure_ms") if settings.extent == EXTENT_PART else ()
     light = [key for key in OF_THE_LIGHT if key not in chosen]
     for number, folder in enumerate(reversed(published_runs(archive.root))):
@@ -142,7 +142,7 @@ def _usable(
 
 
 def _factor(seen: Mosaic, grid: SceneGrid) -> int | None:
-    """How many fine px a pixel of an earlier mosaic is wide; None where the field has no such grid."""
+    """Return how many fine px a pixel of an earlier mosaic is wide; None where the field has no such grid."""
     fits = grid.patch % seen.factor == 0
     rows, columns = (-(-size // seen.factor) for size in (grid.height, grid.width))
     return (
@@ -153,7 +153,7 @@ def _factor(seen: Mosaic, grid: SceneGrid) -> int | None:
 
 
 def _earlier_runs(archive: Archive, run: Run, grid: SceneGrid) -> Iterator[EarlierRun]:
-    """What earlier runs saw of the rest of a field, where a run looked at a part of it and went on from them."""
+    """Yield what earlier runs saw of the rest of a field, where a run looked at a part of it and went on from them."""
     down, across = 0, 0
     for _ in range(MOST_EARLIER - 1):
         memory = run.receipt.get("memory")
@@ -198,7 +198,7 @@ def _days_since(run: Run, visit: str | None, moment: tuple[int, float] | None) -
 
 
 def prior_map_figures(store: Path) -> dict[str, Any] | None:
-    """What became of the memory that the map of a store goes on from; None of a field's first look."""
+    """Return what became of the memory that the map of a store goes on from; None of a field's first look."""
     record = store / MEMORY
     return dict(read_table(record)) if record.is_file() else None
 

@@ -103,7 +103,7 @@ class _PlannedSweep(SimulatedSweep):
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureRun:
-    """What deciding on effects and capturing need to know."""
+    """Needs of deciding on effects and of capturing."""
 
     settings: Settings
     archive: Archive
@@ -125,12 +125,12 @@ class CaptureRun:
 
     @property
     def name(self) -> str:
-        """What the survey is called: its field, or its scene."""
+        """Return what the survey is called: its field, or its scene."""
         return self.settings.name or Path(self.scene.name).stem
 
     @property
     def source_key(self) -> dict[str, Any]:
-        """What the captured light depends on, beside the sweeps and the effects."""
+        """Return what the captured light depends on, beside the sweeps and the effects."""
         return {
             "source": self.source.name,
             "scene": self.scene.key,
@@ -143,7 +143,7 @@ class CaptureRun:
 
     @property
     def recorder(self) -> SweepRecorder:
-        """What takes the sweeps into the archive."""
+        """Return what takes the sweeps into the archive."""
         scene, settings = self.scene, self.settings
         bands = scene.wavelength_nm, scene.fwhm_nm
         return SweepRecorder(
@@ -188,12 +188,12 @@ class SurveyRun(CaptureRun):
 
     @property
     def map_scores(self) -> MapScores | None:
-        """How what maps expect of themselves came true, where that was measured."""
+        """Return how what maps expect of themselves came true, where that was measured."""
         return None if self.described.ood_detector is None else self.described.ood_detector.map_scores
 
     @property
     def device(self) -> str:
-        """Where the network computes."""
+        """Return where the network computes."""
         return self.settings.device
 
     @property
@@ -203,17 +203,17 @@ class SurveyRun(CaptureRun):
 
     @property
     def chooses(self) -> bool:
-        """Whether patches are chosen by their scores; where all are seen and read there is nothing to choose."""
+        """Return whether patches are chosen by their scores; where all are seen and read there is nothing to choose."""
         return not self.plan.plain or self.budget is not None
 
     @property
     def controls(self) -> bool:
-        """Whether other placements of patches are judged too; a uniform scan that is read whole places none."""
+        """Return whether other placements of patches are judged too; a uniform scan that is read whole places none."""
         return self.settings.controls and (self.chooses or self.raster is not None)
 
     @cached_property
     def labels(self) -> NDArray[np.uint8] | None:
-        """What to judge by, (y, x) in the weights' classes: trained pixels taken out. Draws the scene."""
+        """Return what to judge by, (y, x) in the weights' classes: trained pixels taken out. Draws the scene."""
         return judged_labels(self.scene, self.described)
 
     @cached_property
@@ -241,7 +241,7 @@ class SurveyRun(CaptureRun):
 
     @property
     def part(self) -> bool:
-        """Whether a part of the field alone is looked at."""
+        """Return whether a part of the field alone is looked at."""
         return self.settings.extent != EXTENT_WHOLE
 
     @property
@@ -252,7 +252,7 @@ class SurveyRun(CaptureRun):
 
     @property
     def unknown(self) -> UnknownRule | None:
-        """Which pixels are called unknown; None where the weights do not know what is familiar, or nobody asks."""
+        """Return which pixels are called unknown; None where the weights cannot tell, or the settings ask for none."""
         settings, rate = self.settings, self.settings.unknown_rate
         if self.ood_detector is None or rate is None:
             return None
@@ -269,7 +269,7 @@ class SurveyRun(CaptureRun):
 
     @property
     def map_choice(self) -> MapChoice:
-        """What map to draw on the ground."""
+        """Return what map to draw on the ground."""
         return self.settings.map
 
     def work_done(self, patch_index: NDArray[np.integer]) -> MultiplyAdds:

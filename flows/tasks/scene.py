@@ -1,4 +1,4 @@
-"""What a survey looks at, with the labels and the mask on its pixels, and who looks: the simulator or a rig."""
+"""Scene of a survey, with labels and mask on its pixels, and its source: the simulator or a rig."""
 
 from __future__ import annotations
 
@@ -305,7 +305,7 @@ def judged_labels(scene: RasterScene, weights: Description) -> NDArray[np.uint8]
 
 
 class FieldSource:
-    """Who looks at the field for a survey: the one seam between what is simulated and what is there.
+    """Source of a survey's lines: the one seam between what is simulated and what is there.
 
     As it stands a raster, which no camera looks at: its pixels are read from the file.
     """
@@ -314,7 +314,7 @@ class FieldSource:
     simulates = False  # whether effects are chosen for it, which then stand in what is stored of its lines
 
     def key(self, field: str) -> dict[str, Any]:
-        """What its light depends on, beside scene, camera, seed, sweeps and effects."""
+        """Return what its light depends on, beside scene, camera, seed, sweeps and effects."""
         return {}
 
     def saying(self, say: Callable[[str], None]) -> FieldSource:
@@ -326,7 +326,7 @@ class FieldSource:
         return self
 
     def opened(self, spool: Path) -> AbstractContextManager[Source]:
-        """What lines come from, held on to; what it keeps on the way goes beside the lines in ``spool``.
+        """Return what lines come from, held on to; what it keeps on the way goes beside the lines in ``spool``.
 
         Raises SettingsError: it has no lines.
         """

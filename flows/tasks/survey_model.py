@@ -64,13 +64,13 @@ class SurveyModel:
 
     @property
     def trained_on(self) -> TrainedOn | None:
-        """What the weights were trained on, by their record or what is familiar to them; None where neither tells."""
+        """Return the training data of the weights, by their record or their out-of-distribution part, else None."""
         if TRAINED_ON in self.described.record:
             return TrainedOn.read(self.described.record[TRAINED_ON])
         return None if self.described.ood_detector is None else self.described.ood_detector.trained_on
 
     def asked_ood(self, unknown: str) -> OodPart | None:
-        """What is familiar, where pixels may be called unknown; WeightsError where it is asked and nobody knows it."""
+        """Return the out-of-distribution detector if unknown pixels are asked for (WeightsError: it is missing)."""
         if unknown not in (UNKNOWN_AUTO, UNKNOWN_OFF) and self.described.ood_detector is None:
             raise WeightsError(
                 f"--unknown {unknown}: nobody measured what is familiar to {self.path.name}; do so with: "
@@ -80,7 +80,7 @@ class SurveyModel:
 
 
 def weights_path(settings: Settings) -> Path:
-    """Where the weights lie that a survey is read with, as soon as its scan is chosen."""
+    """Return where the weights lie that a survey is read with, as soon as its scan is chosen."""
     return weights_offered(settings)[0]
 
 

@@ -48,13 +48,13 @@ def _terminate(number: int, frame: FrameType | None) -> None:
     raise Terminated
 
 
-# Of exceptions that are no MemoryError: of torch and of threads; and, where memory is limited, of the loader.
+# Texts of exceptions that are no MemoryError: of torch and of threads; and, where memory is limited, of the loader.
 _OF_MEMORY = ("can't allocate memory", "not enough memory", "can't start new thread", "cannot allocate memory")
 _OF_LIMITED_MEMORY = ("failed to map segment", "could not find/load shared object")
 
 
 def format_refusal(error: BaseException) -> str | None:
-    """What was refused and what to do; None where the error is something else."""
+    """Return what was refused and what to do; None where the error is something else."""
     text, limit = str(error), resource.getrlimit(resource.RLIMIT_AS)[0]
     limited = limit != resource.RLIM_INFINITY
     known = (*_OF_MEMORY, *(_OF_LIMITED_MEMORY if limited else ()))
@@ -129,7 +129,7 @@ def place_pages(environment: Mapping[str, str] | None = None) -> dict[str, str]:
 
 
 def _usual_folder(environment: Mapping[str, str]) -> Path | None:
-    """Where caches belong; None where there is no home to hold them."""
+    """Return where caches belong; None where there is no home to hold them."""
     named = Path(environment.get("XDG_CACHE_HOME", ""))
     if named.is_absolute():
         return named

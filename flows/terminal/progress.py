@@ -37,12 +37,12 @@ class Terminal(Console):
 
 
 def on_stderr() -> Terminal:
-    """Where progress and messages go."""
+    """Return where progress and messages go."""
     return Terminal(stderr=True, highlight=False)
 
 
 def on_stdout() -> Terminal:
-    """Where results go."""
+    """Return where results go."""
     return Terminal(file=sys.stdout, highlight=False, width=None if sys.stdout.isatty() else PIPED_WIDTH)
 
 

@@ -1,4 +1,4 @@
-"""What `spectralzoom train` learns from: the built-in farm, a folder of labelled scenes, or one scene with a mask."""
+"""Data of `spectralzoom train`: the built-in farm, a folder of labelled scenes, or one scene with a mask."""
 
 from __future__ import annotations
 

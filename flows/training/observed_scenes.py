@@ -1,4 +1,4 @@
-"""How scenes look in training and where weights are judged: coarsely and finely everywhere, on spectral columns.
+"""Looks at scenes in training and where weights are judged: coarse and fine everywhere, as spectral features.
 
 Built-in farms are seen through the rig as a survey captures them: effects are chosen for each scene as surveys choose
 them by default, then the coarse pass and the scan of everything are rendered, calibrated and rectified. A camera has

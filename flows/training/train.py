@@ -102,7 +102,7 @@ def train_weights(
 
 @dataclass(frozen=True)
 class Lesson:
-    """What there is to learn from: scenes as the network reads them, and the tensors that it begins with."""
+    """A lesson: scenes as the network reads them, and the tensors that it begins with."""
 
     about: About
     config: SegmenterConfig
@@ -157,7 +157,7 @@ def _learned(
 def _figures(
     weights: Weights, frames: list[Example], augmentation: CaptureAugmentation | None, seed: int, report: Report
 ) -> tuple[dict[str, Any], MapScores | None]:
-    """What the record says of scenes kept for validation; of uniform scans too, where training saw such looks."""
+    """Return the record's figures of scenes kept for validation; of uniform scans too, where training saw such."""
     figures = {"validation": validate(weights, frames, seed, lambda row: report("validating", 0.0, row))}
     if (calibration := measured_calibration(weights, frames, seed)) is not None:
         figures[CALIBRATION] = calibration

@@ -162,7 +162,7 @@ class RecordedSource:
 
     @property
     def record(self) -> Mapping[str, Any]:
-        """What the recording consists of and what was assumed of it."""
+        """Return what the recording consists of and what was assumed of it."""
         sweeps = [{"name": one.sweep.name, "lines": one.sweep.lines} for one in self.sweeps]
         return {"recording": {"sweeps": sweeps, "notes": list(self.notes)}}
 
@@ -283,7 +283,7 @@ class RecordedSource:
         return place, line, best
 
     def _can_serve(self, sweep: Sweep, one: RecordedSweep) -> bool:
-        """Whether a recorded sweep lies on the strip of a planned one, with samples and lines that are fine enough."""
+        """Return whether a recorded sweep lies on a planned one's strip, with fine enough samples and lines."""
         recorded = one.sweep
         return (
             recorded.along == sweep.along
@@ -391,7 +391,7 @@ def sum_references(references: References, samples: int) -> References:
 
 
 def _same_lines(one: Sweep, other: Sweep) -> bool:
-    """Whether two sweeps have the same lines and samples; places are compared as derived sweeps state them."""
+    """Return whether two sweeps have the same lines and samples; places are compared as derived sweeps state them."""
     apart = max(abs(one.swath_px - other.swath_px), abs(one.start_px - other.start_px))
     return apart <= SAME_PX and (one.along, one.lines, one.step, one.binning) == (
         other.along,

@@ -21,7 +21,7 @@ from pipeline.errors import PoseError, SettingsError, ShapeError
 Floats = NDArray[Any]  # float64, or float32 where that came in
 
 REST_TANGENT = float(np.tan(np.deg2rad(50.0)))
-# How far beyond the rim, and off length 1, a vector may lie by rounding, by the precision that it came in.
+# Rounding that may put a vector beyond the rim, or off length 1, by the precision that it came in.
 RIM_SLACK = {"float64": 1e-12, "float32": 1e-6}
 LENGTH_SLACK = {"float64": 1e-6, "float32": 1e-5}
 _HALF = float(np.sqrt(0.5))

@@ -107,7 +107,7 @@ def pixels_inside(
 
 @dataclass(frozen=True)
 class FieldZones:
-    """Which pixels a survey keeps to: those inside the area, where one is given, and in no zone that is left out."""
+    """Pixels that a survey keeps: those inside the area, where one is given, and in no zone that is left out."""
 
     kept: Mask  # (y, x)
     no_go: Mask | None = None  # (y, x), every pixel touched

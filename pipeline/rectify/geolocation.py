@@ -40,7 +40,7 @@ class KnotCurve:
 
     @cached_property
     def even(self) -> bool:
-        """Whether the knot coordinate is a closed form."""
+        """Return whether the knot coordinate is a closed form."""
         return self.scan_path.straight and self.scan_path.uniform
 
     @cached_property
@@ -160,7 +160,7 @@ def _find_knots(curve: KnotCurve, a: Floats, b: Floats, tolerance: float) -> Flo
 
 
 def _miss(curve: KnotCurve, a: Floats, b: Floats, knot: Floats) -> tuple[Floats, Floats]:
-    """How far the curve lies beyond the centre that the point needs, and the slope of this over the knots."""
+    """Return how far the curve lies beyond the centre that the point needs, and the slope of this over the knots."""
     scan, scan_slope, across, across_slope = curve.at(knot)
     need, need_slope = _centre_and_slope(a, b, across)
     return scan - need, scan_slope - need_slope * across_slope

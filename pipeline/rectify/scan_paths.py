@@ -50,12 +50,12 @@ class ScanPath:
 
     @property
     def straight(self) -> bool:
-        """Whether all line centres lie on one parallel to the scan axis."""
+        """Return whether all line centres lie on one parallel to the scan axis."""
         return bool(np.ptp(self.across) < EVEN_STEPS * self.width)
 
     @property
     def uniform(self) -> bool:
-        """Whether all knots are ``width`` apart."""
+        """Return whether all knots are ``width`` apart."""
         even = self.scan[0] + self.width * np.arange(len(self.scan))
         return bool(np.abs(self.scan - even).max() < EVEN_STEPS * self.width)
 
@@ -197,7 +197,7 @@ def _with_stand_ins(
 
 @dataclass(frozen=True)
 class LineNumbers:
-    """What the time stamps of a sweep's frames say of its lines."""
+    """Numbers of the lines of a sweep, by the time stamps of its frames."""
 
     number: NDArray[np.intp]  # (frame,) line of the plan, counted from the first believed frame; of that line's
     # first frame where a frame came again; of the line before where the stamp is not believed

@@ -22,7 +22,7 @@ class StoredLines(SweepLines, Protocol):
 
     @property
     def source(self) -> str:
-        """What their source calls itself."""
+        """Return what their source calls itself."""
 
 
 @dataclass(frozen=True)

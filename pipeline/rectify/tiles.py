@@ -21,7 +21,7 @@ from pipeline.signal.lines import LineCache
 
 @dataclass(frozen=True)
 class MosaicWork:
-    """What a mosaic is made of, and with what."""
+    """Placed sweeps, camera and grid of a mosaic."""
 
     placed: Sequence[Placed]
     camera: LineCamera
@@ -29,7 +29,7 @@ class MosaicWork:
     kernel: Kernel = "catmull-rom"
 
     def reach(self, columns: slice) -> Reaches:
-        """What sweeps show of some columns of the grid, the same for all rows."""
+        """Return what sweeps show of some columns of the grid, the same for all rows."""
         return column_reach(self.placed, self.camera, self.grid, columns)
 
     def tile_memory(self, tiles: Sequence[Tile], tile_shape: tuple[int, int], at_once: int) -> tuple[int, int]:
@@ -59,7 +59,7 @@ class TileMaker:
 
 @dataclass(frozen=True)
 class OpenedTiles:
-    """What makes tiles in one process."""
+    """Opened work that makes tiles in one process."""
 
     work: MosaicWork
     lines: LineCache

@@ -19,7 +19,7 @@ MOST_PAIRS = 8191  # cells of the vector memory are addressed by a byte offset o
 
 @dataclass(frozen=True)
 class CameraAddress:
-    """Where the camera is; as its maker sets it, unless changed there."""
+    """Address of the camera, as its maker sets it, unless changed there."""
 
     host: str = "10.0.65.50"
     port: int = 8100
@@ -28,7 +28,7 @@ class CameraAddress:
 
 @dataclass(frozen=True)
 class ControlPatience:
-    """How long a command may take from its first byte to the prompt, and how often reads are asked again."""
+    """Time that a command may take from its first byte to the prompt, and how often reads are asked again."""
 
     deadline_s: float = 5.0
     retries: int = 2
@@ -63,7 +63,7 @@ class FileServer:
 
 @dataclass(frozen=True)
 class CameraLimits:
-    """What is refused before the wire. Assumed, from a data sheet: set them for the camera at hand."""
+    """Limits that are checked before the wire. Assumed, from a data sheet: set them for the camera at hand."""
 
     least_exposure_ms: float = 0.5
     most_rate_hz: float = 350.0
@@ -107,7 +107,7 @@ def check_capture(frames: int, cubes: int, prefix: str) -> None:
 
 @dataclass(frozen=True)
 class Patience:
-    """How long a transaction may take, how often a read is asked again within that, and how long silence lasts. [s]"""
+    """Time that a transaction may take, how often a read is asked again within that, and how long silence lasts. [s]"""
 
     deadline_s: float = 1.0
     retries: int = 2
@@ -116,7 +116,7 @@ class Patience:
 
 @dataclass(frozen=True)
 class MirrorLink:
-    """What settings say of the mirror controller."""
+    """Settings of the link to the mirror controller."""
 
     port: str = stated("/dev/ttyACM0", "Port of the mirror controller; or socket://host:port")
     # public software opens 115200
@@ -143,7 +143,7 @@ class MirrorLink:
 
 @dataclass(frozen=True)
 class MirrorSettings(MirrorLink):
-    """How to reach the mirror controller, and what to believe of it; ``provenance`` says who confirmed what."""
+    """Settings of the mirror controller: its port and assumptions on it; ``provenance`` says who confirmed what."""
 
     vector_pairs: int = stated(CostModel.vector_pairs, "Positions that its memory holds", "", 1, MOST_PAIRS)
     provenance: str = "assumed"
@@ -157,7 +157,7 @@ class MirrorSettings(MirrorLink):
 
     @property
     def patience(self) -> Patience:
-        """How long transactions may take."""
+        """Return how long transactions may take."""
         return Patience(self.deadline_s, self.retries, self.quiet_s)
 
 
@@ -226,16 +226,16 @@ class SurveyRig(MirrorLink):
 
     @property
     def mounting(self) -> Mounting:
-        """How the mirror is mounted."""
+        """Return how the mirror is mounted."""
         return Mounting(self.mirror_axes, self.mirror_clocking_deg, self.mirror_offset_x, self.mirror_offset_y)
 
     @property
     def camera(self) -> CameraAddress:
-        """Where the camera's control socket is."""
+        """Return where the camera's control socket is."""
         return CameraAddress(self.host, self.control_port, self.connect_s)
 
     @property
     def files(self) -> FileServer:
-        """Where the camera's files are."""
+        """Return where the camera's files are."""
         own = {name: getattr(self, name) for name in ("user", "password", "stall_s", "least_kb_s", "read_twice")}
         return FileServer(self.host, self.file_port, **own)

@@ -89,7 +89,7 @@ class StateUnknown(RigError):  # noqa: N818 - the name says what is the case
 
 
 class NotKept(RigError):  # noqa: N818 - the name says what is the case
-    """What a device sent could not be kept here: the disk refuses. The device still has it."""
+    """The disk refuses to keep what a device sent. The device still has it."""
 
 
 USB_ID = (0x0483, 0xA31E)  # vendor and product of the mirror controller

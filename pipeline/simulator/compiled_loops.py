@@ -307,7 +307,7 @@ class PartedKernels(NamedTuple):
 
 
 class PixelTable(NamedTuple):
-    """How pixels lie in a table: how many along its inner and its outer axis, and whether lines lie along the outer."""
+    """Order of pixels in a table: counts along its inner and outer axis, and whether lines lie along the outer."""
 
     inner: int
     outer: int

@@ -94,7 +94,7 @@ class Archive:
 
     @property
     def name(self) -> str:
-        """What a person gives to open it again."""
+        """Return what a person gives to open it again."""
         return str(self.root)
 
     @property
@@ -109,7 +109,7 @@ class Archive:
         return store_at(self.root, stage, key)
 
     def locate(self, address: str) -> Path:
-        """Where on this machine a product lies by its address relative to the archive, as a receipt gives it.
+        """Return where on this machine a product lies by its address relative to the archive, as a receipt gives it.
 
         Raises IncompleteStoreError: its store is not there, its files were cleared away, or one of them is missing, cut
         short, a link or no file at all.
@@ -137,12 +137,12 @@ class Archive:
         return None if is_cleared(read_manifest(ref.path)) else ref
 
     def is_there(self, uri: str) -> bool:
-        """Whether a store's files are there, not only what tells of them."""
+        """Return whether a store's files are there, not only what tells of them."""
         path = self.root / uri
         return path.is_dir() and not is_cleared(read_manifest(path))
 
     def is_known(self, ref: StageRef) -> bool:
-        """Whether a store was published here, also where its files were cleared away since."""
+        """Return whether a store was published here, also where its files were cleared away since."""
         return (self.root / ref.uri).is_dir()
 
     @contextmanager
@@ -205,7 +205,7 @@ class Archive:
         return staged.ref, not staged.done
 
     def manifest(self, ref: StageRef) -> dict[str, Any]:
-        """What is known of a store: stage, key, version, params, inputs, created, libraries, files."""
+        """Return what is known of a store: stage, key, version, params, inputs, created, libraries, files."""
         return read_manifest(self.root / ref.uri)
 
     def stored_bytes(self, ref: StageRef) -> int:
@@ -319,14 +319,14 @@ class Archive:
         ]
 
     def leftovers(self, keep_days: float) -> dict[str, int]:
-        """What broken-off uploads left in a bucket for ``keep_days``: address and bytes; nothing in a folder."""
+        """Return what broken-off uploads left in a bucket for ``keep_days``: address and bytes; nothing in a folder."""
         return {}
 
     def drop_leftover(self, uri: str) -> None:
         """Remove one of `leftovers`."""
 
     def restore(self, uri: str) -> bool:
-        """Whether a broken store or run of a bucket could be written again as it is on this machine."""
+        """Return whether a broken store or run of a bucket could be written again as it is on this machine."""
         return False
 
     def drop_run(self, uri: str) -> None:
@@ -420,5 +420,5 @@ class Archive:
 
 
 def run_stem(name: str) -> str:
-    """What the folder of a run is called by its survey's name, after its time."""
+    """Return what the folder of a run is called by its survey's name, after its time."""
     return re.sub(r"[^A-Za-z0-9_-]+", "-", name).strip("-")[:60] or "run"

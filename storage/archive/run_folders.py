@@ -80,7 +80,7 @@ class RunDraft:
 
     @property
     def published(self) -> Path:
-        """Where the run lies once it is published."""
+        """Return where the run lies once it is published."""
         return self.folder.with_name(self.id)
 
     def __enter__(self) -> RunDraft:

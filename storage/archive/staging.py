@@ -1,4 +1,4 @@
-"""How files and folders come into an archive and leave it: names, refusals of the disk, syncing, renaming, locks.
+"""Files and folders on their way into an archive and out of it: names, refusals of the disk, syncing, locks.
 
 Files are opened as what they should be: no link is followed, and nothing else that can be opened waits. A pipe without
 a writer would hold a reader for ever, a device may give bytes without end, a link leads elsewhere. TOML that people
@@ -38,11 +38,11 @@ _APART = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 
 class NotPlainError(OSError):
-    """What should be a file, or a folder, is something else; ``strerror`` says what."""
+    """A link, a pipe or the like lies where a file or a folder is expected; ``strerror`` says which."""
 
 
 def kind_of(path: Path) -> str | None:
-    """What lies at a path, in words, the path's last name not followed; None where nothing does."""
+    """Return what lies at a path, in words, the path's last name not followed; None where nothing does."""
     try:
         return _kind(path.lstat().st_mode)
     except (FileNotFoundError, NotADirectoryError):
@@ -152,7 +152,7 @@ log = logging.getLogger(__name__)
 
 
 def is_name(name: str) -> bool:
-    """Whether this can be one folder's or file's name in an archive."""
+    """Return whether this can be one folder's or file's name in an archive."""
     return _NAME.fullmatch(name) is not None and not name.endswith(PART_SUFFIX)
 
 
@@ -181,7 +181,7 @@ def refusals(path: Path, doing: str) -> Iterator[None]:
 
 
 def disk_advice(error: OSError) -> str | None:
-    """What a refusal of the disk means and what to do about it; None where the error is another."""
+    """Return what a refusal of the disk means and what to do about it; None where the error is another."""
     return _ADVICE.get(error.errno or 0)
 
 
@@ -314,7 +314,7 @@ def _drop_name(path: Path) -> None:
 
 
 def _is_still(descriptor: int, path: Path) -> bool:
-    """Whether an open file has its name yet: whoever held the lock before may have taken it away."""
+    """Return whether an open file has its name yet: whoever held the lock before may have taken it away."""
     try:
         return os.path.samestat(path.lstat(), os.fstat(descriptor))
     except FileNotFoundError:

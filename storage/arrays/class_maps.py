@@ -61,7 +61,7 @@ class ClassMap:
 
 @dataclass(frozen=True)
 class ClassNames:
-    """What the classes of a map are called, and how they are drawn."""
+    """Names and colours of the classes of a map."""
 
     names: tuple[str, ...]
     colours: NDArray[np.uint8]  # (class, 3)

@@ -46,7 +46,7 @@ _LONGEST = 240  # of a file's name, in most file systems 255
 
 @dataclass
 class _Sums:
-    """How far a file is known to be as it was fetched, and how many records say so."""
+    """The part of a file that agrees with its sums, and how many records say so."""
 
     reached: int = 0
     crc32: int = 0
@@ -185,7 +185,7 @@ def _sums_of(path: Path) -> Path:
 
 
 def _agreeing(path: Path) -> tuple[_Sums, bool]:
-    """How far bytes and sums of a file agree, and whether anything of either has changed since.
+    """Return how far bytes and sums of a file agree, and whether anything of either has changed since.
 
     Each sum is of all bytes before it, so one that is lost is passed over.
     """

@@ -223,7 +223,7 @@ class Spool:
 
 
 def spool_problems(path: Path) -> Iterator[str]:
-    """What is not as it was captured of the lines at a path; a record that is not all there is no damage."""
+    """Yield what is not as it was captured of the lines at a path; a record that is not all there is no damage."""
     spool = Spool.known(path)
     if spool is None:
         with plain_reader(path) as file:
@@ -245,7 +245,7 @@ def line_values(numbers: Sequence[int]) -> str:
 
 
 def _header(head: bytes) -> dict[str, Any] | None:
-    """What a file's first line says its lines belong to; None where it cannot be believed."""
+    """Return what a file's first line says its lines belong to; None where it cannot be believed."""
     found = next(read_checked(head), None)
     if found is None or found.state != "whole" or found.content is None or found.text + b"\n" != head:
         return None

@@ -39,20 +39,20 @@ Blocks = Iterable[tuple[int, NDArray[Any]]]  # first row, (row, x) or (row, x, b
 
 @dataclass(frozen=True)
 class Place:
-    """Where an image's pixels lie. Without a CRS the transform gives tangents of angles [rad]."""
+    """Transform and CRS of an image. Without a CRS the transform gives tangents of angles [rad]."""
 
     transform: tuple[float, ...]  # a, b, c, d, e, f: pixel corners to x = a column + b row + c, y = d ... + f
     crs_wkt: str | None = None
 
     @classmethod
     def on_map(cls, geobox: GeoBox) -> Place:
-        """Of an image on a map, as its Zarr store says it (PoseError: the grid has no CRS)."""
+        """Return the place of an image on a map, as its Zarr store says it (PoseError: the grid has no CRS)."""
         place = map_attributes(geobox)
         return cls(tuple(place["spatial:transform"]), place["proj:wkt2"])
 
     @classmethod
     def on_angles(cls, grid: AngularGrid, shape: tuple[int, int]) -> Place:
-        """Of an image of (y, x) px on the camera's angular grid."""
+        """Return the place of an image of (y, x) px on the camera's angular grid."""
         return cls(tuple(grid.attributes(shape)["spatial:transform"]))
 
     def geobox(self, shape: tuple[int, int]) -> GeoBox | None:
@@ -62,7 +62,7 @@ class Place:
 
 @dataclass(frozen=True)
 class CogImage:
-    """What one file is to hold."""
+    """Shape, place, bands and legend of one file."""
 
     shape: tuple[int, int]  # (y, x) [px]
     dtype: str
@@ -253,14 +253,14 @@ def _listed(words: list[str]) -> str:
 
 
 def has_map_info(geobox: GeoBox) -> bool:
-    """Whether ENVI's header can say where an image lies: north is up, and the CRS counts metres."""
+    """Return whether ENVI's header can say where an image lies: north is up, and the CRS counts metres."""
     a, b, _, d, e, _ = (float(number) for number in geobox.affine[:6])
     metres = geobox.crs is not None and geobox.crs.projected and "metre" in geobox.crs.units
     return metres and not b and not d and a > 0 > e
 
 
 def _map_fields(geobox: GeoBox) -> Iterator[tuple[str, str]]:
-    """Where the upper left pixel's corner lies, the pixels' sides, and the CRS as the WKT that ENVI reads."""
+    """Yield where the upper left pixel's corner lies, the pixels' sides, and the CRS as the WKT that ENVI reads."""
     a, _, c, _, e, f = (float(number) for number in geobox.affine[:6])
     if not has_map_info(geobox) or geobox.crs is None:
         raise PoseError(f"ENVI's map info takes a grid with north up and a CRS, got {geobox!r}")

@@ -120,7 +120,7 @@ class TaskGrid:
 
 @dataclass(frozen=True)
 class TaskText:
-    """What the task is called, and what it is for."""
+    """Names of a task, its field and its product."""
 
     task: str
     field: str

@@ -22,7 +22,7 @@ Rerun = Callable[[dict[str, Any]], None]  # settings of a survey: runs and publi
 
 @dataclass(frozen=True)
 class RepairPlan:
-    """What a repair does. Addresses are relative to the archive, of stores with those that they were made of last."""
+    """Steps of a repair. Addresses are relative to the archive, of stores with those that they were made of last."""
 
     remade: tuple[str, ...]  # broken or missing stores
     hopeless: dict[str, str]  # broken and left as they are, with the reason
@@ -32,7 +32,7 @@ class RepairPlan:
 
 @dataclass
 class Repaired:
-    """What a repair did."""
+    """Outcome of a repair."""
 
     plan: RepairPlan
     remade: list[str] = field(default_factory=list)
@@ -41,7 +41,7 @@ class Repaired:
 
     @property
     def complete(self) -> bool:
-        """Whether nothing broken is left."""
+        """Return whether nothing broken is left."""
         return not (self.plan.hopeless or self.failed)
 
 

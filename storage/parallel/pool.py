@@ -79,7 +79,7 @@ def memory_refusal(least: int, memory: int, why: str) -> SettingsError:
 
 @dataclass(frozen=True)
 class WorkerPool:
-    """Who makes blocks: ``threads``, ``processes``, or the workers of a dask scheduler at ``tcp://host:port``."""
+    """Workers that make blocks: ``threads``, ``processes``, or those of a dask scheduler at ``tcp://host:port``."""
 
     scheduler: str = "threads"
     workers: int | None = None  # at a time; None is one a core. A scheduler elsewhere has workers of its own
@@ -95,12 +95,12 @@ class WorkerPool:
 
     @property
     def elsewhere(self) -> bool:
-        """Whether the workers belong to a scheduler that somebody else started."""
+        """Return whether the workers belong to a scheduler that somebody else started."""
         return "://" in self.scheduler
 
     @property
     def shares_memory(self) -> bool:
-        """Whether work may hold open files and arrays; otherwise it holds paths and is pickled."""
+        """Return whether work may hold open files and arrays; otherwise it holds paths and is pickled."""
         return self.scheduler == "threads"
 
     @property
@@ -399,14 +399,14 @@ class Cluster(Executor):
 
 
 def about_here(folders: Sequence[str]) -> dict[str, str]:
-    """What this process runs, on how many threads, and what it sees in some folders, by name."""
+    """Return what this process runs, on how many threads, and what it sees in some folders, by name."""
     threads = {THREADS_OF: os.environ.get(THREADS_OF, "not set")}
     return versions_here() | threads | {folder: _seen(folder) for folder in folders}
 
 
 @cache
 def versions_here() -> dict[str, str]:
-    """What this process runs, by name, as it was when first asked: so it runs whatever changes on the disk."""
+    """Return what this process runs, by name, as it was when first asked: so it runs whatever changes on the disk."""
     root, found = Path(__file__).parents[2], hashlib.sha256()
     for path in sorted(path for room in ROOMS for path in (root / room).rglob("*.py")):
         found.update(path.relative_to(root).as_posix().encode() + path.read_bytes())

@@ -289,7 +289,7 @@ def _read(path: Path, name: str, part: Any) -> NDArray[Any]:
 
 
 def _words(about: Mapping[str, Any], item: Any) -> dict[str, Any]:
-    """What an array says in other words than CF's: names of its axes, NEON's scale, no-data value and units."""
+    """Return what an array says in other words than CF's: names of its axes, NEON's scale, no-data value and units."""
     dims = [dim[0].name.removeprefix("/") if len(dim) else dim.label for dim in item.dims]
     words: dict[str, Any] = {"_ARRAY_DIMENSIONS": dims} if any(dims) else {}
     scale = about.get("Scale_Factor") or about.get("Scale Factor")  # divides values, where CF's scale_factor multiplies

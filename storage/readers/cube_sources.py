@@ -87,7 +87,7 @@ ReadLines = Callable[[int, int], NDArray[Any]]
 
 @dataclass(frozen=True)
 class LineFacts:
-    """What is known of each line; None where nothing is known of any."""
+    """Known facts of each line; None where nothing is known of any."""
 
     valid: NDArray[np.bool_] | None = None  # (line,) the file holds it whole; None where it holds all
     time_s: NDArray[np.float64] | None = None  # (line,) since the first stamp; NaN where not known
@@ -98,7 +98,7 @@ class LineFacts:
 
 @dataclass(frozen=True)
 class Bands:
-    """What is known of the bands; None where nothing is."""
+    """Known facts of the bands; None where nothing is."""
 
     wavelength_nm: NDArray[np.float64] | None = None  # (band,)
     fwhm_nm: NDArray[np.float64] | None = None  # (band,)

@@ -197,7 +197,7 @@ def _refuse_bands_first(path: Path, shape: tuple[int, ...], wavelengths: Sequenc
 
 
 def _content_hash(file: Path, files: tuple[Path, ...]) -> str:
-    """Of all files that the numbers came from; within a folder their names count, too."""
+    """Return the hash of all files that the numbers came from; within a folder their names count, too."""
     if files == (file,):
         return file_hash(file)
     within = [file.is_dir() and entry.is_relative_to(file) for entry in files]

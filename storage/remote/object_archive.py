@@ -106,7 +106,7 @@ class ObjectArchive(Archive):
         return super().manifest_hashes(given)
 
     def locate(self, address: str) -> Path:
-        """Where on this machine a product lies by its address relative to the archive; fetched if need be."""
+        """Return where on this machine a product lies by its address relative to the archive; fetched if need be."""
         self._fetch(in_text(address) or "/".join(address.split("/")[:2]))
         return super().locate(address)
 
@@ -300,7 +300,7 @@ class ObjectArchive(Archive):
         self._send(uri)
 
     def _is_whole(self, uri: str) -> bool:
-        """Whether all of a store is here, by its manifest and the sizes of its files; no, where those were cleared."""
+        """Return whether all of a store is here, by its manifest and the sizes of its files; not if it was cleared."""
         manifest, problem = try_manifest(self.root / uri)
         return problem is None and not is_cleared(manifest) and not self._lacks(uri, manifest)
 
@@ -308,12 +308,12 @@ class ObjectArchive(Archive):
         return [name for name, one in manifest["files"].items() if _size(self.root / uri / name) != one["size"]]
 
     def _is_dated(self, uri: str, listed: Listed) -> bool:
-        """Whether the manifest here has size and date of an object, as one has that was brought from the bucket."""
+        """Return whether the manifest here has size and date of an object, as one brought from the bucket has."""
         path = self.root / uri / MANIFEST_NAME
         return _size(path) == listed.size and int(path.stat().st_mtime) == int(listed.changed.timestamp())
 
     def _find(self, uri: str, *, keep: bool = False) -> bool:
-        """Whether a manifest stands in the bucket, which is here then; of one that was cleared no, to ``keep`` ours.
+        """Return whether a manifest stands in the bucket, and bring it; a cleared one does not count, to ``keep`` ours.
 
         Raises IncompleteStoreError: it is damaged.
         """
@@ -439,7 +439,7 @@ class ObjectArchive(Archive):
 
 
 def _is_address(uri: str) -> bool:
-    """Whether an object's name can be an address in an archive: what a bucket lists is not trusted."""
+    """Return whether an object's name can be an address in an archive: what a bucket lists is not trusted."""
     return all(is_name(part) for part in uri.split("/"))
 
 
@@ -449,7 +449,7 @@ def _files_at(uri: str, manifest: bytes) -> str:
 
 
 def _manifests(there: Mapping[str, Listed]) -> dict[str, Listed]:
-    """What is published, by address."""
+    """Return what is published, by address."""
     depths = {"stages": 4, "runs": 3}
     named = {
         path.removesuffix(f"/{MANIFEST_NAME}"): one
@@ -479,7 +479,7 @@ def _lay_out(objects: Objects, root: Path, uri: str) -> None:
 
 
 def _problems(objects: Objects, there: Mapping[str, Listed], folder: Path, place: str) -> Iterator[str]:
-    """What is wrong with one published folder, whose files lie at ``place``, object by object."""
+    """Yield what is wrong with one published folder, whose files lie at ``place``, object by object."""
     manifest, problem = try_manifest(folder)
     if problem is not None:
         yield f"{MANIFEST_NAME} cannot be believed: {problem}"

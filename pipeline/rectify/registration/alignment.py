@@ -48,7 +48,7 @@ TRIALS = 200
 
 @dataclass(frozen=True)
 class SweepShift:
-    """Where a sweep's line centres lie beside the reported ones, in scene px along the line and the scan."""
+    """Shift of a sweep's line centres against the reported ones, in scene px along the line and the scan."""
 
     name: str
     offset: Floats  # (2,) at the middle of the sweep [px]
@@ -65,7 +65,7 @@ class SweepShift:
 
 @dataclass(frozen=True)
 class WindowShift:
-    """How far the moving sweep of a pair looks beside the reference sweep, seen in one window of their overlap.
+    """Shift of the moving sweep of a pair against the reference sweep, seen in one window of their overlap.
 
     A shift of the line centre by d moves the place that the window's sample sees by ``turn @ d``: nearly the same, but
     the line turns with its centre, which at its end is 1.7 px for 50.
@@ -174,13 +174,13 @@ def _robust(system: Floats, measured: Floats, error: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class FieldShift:
-    """What brings an earlier image onto a later one: ``shift`` rows and columns [px], then ``turned_deg`` about it."""
+    """Motion of an earlier image onto a later one: ``shift`` rows and columns [px], then ``turned_deg`` about it."""
 
     shift: tuple[float, float] = (0.0, 0.0)
     turned_deg: float = 0.0
 
     def edge_px(self, shape: tuple[int, ...]) -> float:
-        """How far the corners of a field of (y, x) ``shape`` move by the turn alone."""
+        """Return how far the corners of a field of (y, x) ``shape`` move by the turn alone."""
         return math.radians(abs(self.turned_deg)) * math.hypot(*shape[:2]) / 2
 
 
@@ -214,7 +214,7 @@ Pairs = list[tuple[NDArray[np.float64], NDArray[np.float64]]]  # middle of a win
 
 
 def _of_windows(now: NDArray[np.floating], before: NDArray[np.floating]) -> Pairs:
-    """What windows say that say anything."""
+    """Return what windows say that say anything."""
     edges = [np.linspace(0, size, WINDOWS + 1).astype(int).tolist() for size in now.shape]
     pairs: Pairs = []
     for (top, bottom), (left, right) in product(pairwise(edges[0]), pairwise(edges[1])):
@@ -228,7 +228,7 @@ def _of_windows(now: NDArray[np.floating], before: NDArray[np.floating]) -> Pair
 def _agreed(
     pairs: Pairs, start: NDArray[np.float64], shape: tuple[int, ...], within_px: float
 ) -> tuple[int, FieldShift]:
-    """How many windows agree, and on what; 0 and nothing where too few do."""
+    """Return how many windows agree, and on what; 0 and nothing where too few do."""
     if len(pairs) < LEAST_WINDOWS:
         return 0, FieldShift()
     middle = np.array(shape[:2]) / 2

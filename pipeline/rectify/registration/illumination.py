@@ -26,7 +26,7 @@ LEAST_GROUPS = 5
 
 @dataclass(frozen=True)
 class LightRatio:
-    """How much brighter one sweep was than another where both saw the same ground."""
+    """Brightness of one sweep over that of another where both saw the same ground."""
 
     reference: int  # number of the sweep
     moving: int

@@ -116,7 +116,7 @@ class PlacedImage:
 
     @cached_property
     def turn_at_middle(self) -> Floats:
-        """How the place that the middle sample of the middle usable line sees moves with the line's centre, (2, 2)."""
+        """Return how the place seen by the middle sample of the middle line moves with the line's centre, (2, 2)."""
         usable = np.flatnonzero(self.broad.usable)
         return self._turn(int(usable[len(usable) // 2]), (self.broad.image.shape[1] - 1) / 2)
 

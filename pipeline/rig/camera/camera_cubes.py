@@ -38,7 +38,7 @@ _SAMPLES = 16  # looked at together
 
 @dataclass(frozen=True)
 class CubeHeader:
-    """What a header says of 16-bit lines, band after band within each."""
+    """Sizes and layout of 16-bit lines, band after band within each, by a header."""
 
     samples: int
     lines: int
@@ -201,7 +201,7 @@ def _placed(parts: list[tuple[int, CubeLines]], notes: list[str]) -> list[tuple[
 
 
 def _times(by_name: Mapping[str, str], first: int, cube: CubeLines, read: Read, notes: list[str]) -> LineTimes | None:
-    """What the part's index says of its lines; None where there is none that can be read."""
+    """Return what the part's index says of its lines; None where there is none that can be read."""
     name = next((name for name in by_name if (match := FRAME_INDEX.fullmatch(name)) and int(match[1]) == first), None)
     if name is None:
         notes.append(f"there is no frame index for raw_{first}")

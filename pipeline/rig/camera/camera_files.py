@@ -26,7 +26,7 @@ _SIZE = re.compile(r"213 +(\d{1,18})\s*")
 
 
 class DamagedTransfer(RigError):  # noqa: N818 - the name says what is the case
-    """What came is no FTP or not the file, as it is where bytes are lost, doubled or put in between: asked again."""
+    """A transfer is no FTP or not the file, as it is where bytes are lost, doubled or put in between: asked again."""
 
 
 class FileSession(ftplib.FTP):
@@ -126,7 +126,7 @@ class FileSession(ftplib.FTP):
 
     @property
     def heard(self) -> str:
-        """What came of the reply that was waited for last."""
+        """Return what came of the reply that was waited for last."""
         return f"{MOST_REPLY - self._most} bytes of a reply came" if self._most < MOST_REPLY else "nothing came"
 
     def _too_slow(self, name: str, gained: int) -> str:
@@ -208,7 +208,7 @@ def check_remote_name(name: str) -> None:
 
 
 class Kept(Protocol):
-    """Where fetched bytes go: files named as on the camera, of which a part may be there already."""
+    """Store of fetched bytes: files named as on the camera, of which a part may be there already."""
 
     def size(self, name: str) -> int:
         """Bytes held of a file; 0 of one that is not there."""

@@ -170,7 +170,7 @@ class FrameIndex:
 
 @dataclass(frozen=True)
 class LineTimes:
-    """What an index says of the lines of one file; -1 or NaN where it says nothing."""
+    """Times of the lines of one file by its index; -1 or NaN where it says nothing."""
 
     frame: NDArray[np.int64]  # (line,)
     stamp_us: NDArray[np.int64]  # (line,)
@@ -260,7 +260,7 @@ def _rows(lines: Iterable[str]) -> _Rows:
 
 
 def _exposure_column(heading: str) -> tuple[int | None, float]:
-    """Which column holds exposures, and what one of its units is in ms; they are ms where nothing is said."""
+    """Return which column holds exposures, and what one of its units is in ms; they are ms where nothing is said."""
     titles = [word for word in _BETWEEN_COLUMNS.split(heading) if word]
     if len(titles) < 2:
         titles = heading.split()

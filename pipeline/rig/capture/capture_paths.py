@@ -38,7 +38,7 @@ _WINDOW = 7  # neighbours that say whether a stamp strayed: up to three strays i
 
 @dataclass(frozen=True)
 class FrameTimes:
-    """What the camera says of its lines; -1 where it says nothing. Lines are in the order in which they were taken."""
+    """Frame times by the camera; -1 where it says nothing. Lines are in the order in which they were taken."""
 
     number: Ints  # (line,) frame numbers, the capture's first frame 0
     stamp_us: Ints  # (line,) by the camera's clock, taken for the exposure's start: its papers do not say which moment
@@ -105,7 +105,7 @@ def _strayed(late: Floats, period_us: float) -> Bools:
 
 @dataclass(frozen=True)
 class MirrorScanPath:
-    """Where the mirror was, by its clock: positions that its log measured, or those of a path that it played."""
+    """Path of the mirror, by its clock: positions that its log measured, or those of a path that it played."""
 
     time_s: Floats  # (sample,) in order
     position: Floats  # (sample, 2) device X and Y
@@ -305,7 +305,7 @@ def path_of(sweep: Sweep, lines: tuple[int, int], camera: LineCamera, *, trigger
 
 
 def can_trigger(pulses: Pulses, sweep: Sweep) -> bool:
-    """Whether the pulses at the mirror's input step through this sweep: one a position is needed."""
+    """Return whether the pulses at the mirror's input step through this sweep: one a position is needed."""
     return pulses == "position" or (pulses == "frame" and sweep.step == 1)
 
 
@@ -349,7 +349,7 @@ class PlacedLines:
     stamp_us: NDArray[np.int64]  # (row,) by the camera's clock; -1 where it says nothing
 
     def is_valid(self, line: int) -> bool:
-        """Whether a line, counted from the capture's first, is there with its position."""
+        """Return whether a line, counted from the capture's first, is there with its position."""
         row = int(self.row[line])
         return row >= 0 and bool(self.tied.valid[row])
 

@@ -95,7 +95,7 @@ class RigSource:
 
     @property
     def record(self) -> dict[str, Any]:
-        """What captures with this ``kept`` were like: how lines were tied to the mirror, by which settings."""
+        """Return what captures with this ``kept`` were like: how lines were tied to the mirror, by which settings."""
         told: dict[str, Any] = {
             name: getattr(self.rig, name) for name in ("pulses", "ends", "read_back", "strict_crc", "provenance")
         }
@@ -284,7 +284,7 @@ class RigSource:
             )
 
     def _time_s(self, sweep: Sweep, number: int, stamp_us: int) -> float:
-        """Of mid exposure since the sweep's first line began, by the camera's stamps; by its rate without them."""
+        """Return the mid exposure since the sweep's first line began, by the camera's stamps, else by its rate."""
         known, exposed = stamp_us >= 0, exposing(self.camera, sweep)
         origin = self._journal.origin_us(sweep, stamp_us if known and number == 0 else None)
         if known and origin is not None:

@@ -214,7 +214,7 @@ class SceneCamera(CameraDevice):
         return np.concatenate(found)
 
     def is_capturing(self) -> bool:
-        """Whether a capture runs, or its frames are still being written."""
+        """Return whether a capture runs, or its frames are still being written."""
         if super().is_capturing():
             return True
         return self.aside and any(len(capture.pending(self.clock.now(), 1)) for capture in self.captures[-1:])
@@ -265,7 +265,7 @@ class SceneCamera(CameraDevice):
 
 
 def _prefix(capture: EmulatedCapture) -> str:
-    """What a capture's folder is called, without its number."""
+    """Return what a capture's folder is called, without its number."""
     return capture.folder.rsplit("/", 1)[-1].rpartition("_")[0]
 
 
@@ -442,7 +442,7 @@ class EmulatedRig:
 
     @property
     def state(self) -> str:
-        """What both devices do now, in words."""
+        """Return what both devices do now, in words."""
         x, y = self.mirror.positions(self.clock.now())
         last = f", last: {self.mirror.acts[-1].request.words}" if self.mirror.acts else ""
         camera = "capturing" if self.camera.is_capturing() else "idle"

@@ -205,14 +205,14 @@ class MirrorController(Closing):
         return found
 
     def identity(self) -> Identity:
-        """What the controller said it is when it was connected; RigError where it is not connected."""
+        """Return what the controller said it is when it was connected; RigError where it is not connected."""
         self._check_connected()
         assert self._identity is not None
         return self._identity
 
     @property
     def found_in_pro(self) -> bool:
-        """Whether it was in pro mode as it was connected: an earlier session, or another program, had been there."""
+        """Return whether it was in pro mode when it was connected: an earlier session or another program left it so."""
         return self._modes.found_in_pro
 
     def status(self) -> Status:
@@ -307,7 +307,7 @@ class MirrorController(Closing):
         self._link.tell(set_values({channel.vector(VectorRegister.RUN): 0 for channel in (X, Y)}), "halting the path")
 
     def is_playing(self) -> bool:
-        """Whether a unit plays a path."""
+        """Return whether a unit plays a path."""
         self._check_connected()
         registers = [channel.vector(VectorRegister.RUN) for channel in (X, Y)]
         return any(map(cell_int, self._link.ask(get_values(registers), "whether a path plays", read_values)))

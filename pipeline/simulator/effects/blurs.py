@@ -1,4 +1,4 @@
-"""What blurs the image or shifts it band by band: diffraction, the lens itself, defocus, keystone."""
+"""Effects that blur the image or shift it band by band: diffraction, the lens itself, defocus, keystone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What effects are decided from: a summary of scene and rig, units of stored numbers, ranges of gains over wavelength.
+"""Basis of decisions on effects: a summary of scene and rig, units of stored numbers, gains over wavelength.
 
 A number of a raw line sums neighbouring samples, and has the noise of that sum. All is counted per sample: light as the
 mean over the samples of a sum, noise as that of the mean. A change of the one over the other is the change of the

@@ -190,7 +190,7 @@ class RasterScene:
 
     @property
     def labelled(self) -> bool:
-        """Whether there are labels; draws nothing."""
+        """Return whether there are labels; draws nothing."""
         return self.raster.labelled
 
     @property
