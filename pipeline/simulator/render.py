@@ -217,6 +217,6 @@ LIGHT: tuple[Effect, ...] = (
 READOUT: tuple[Effect, ...] = (DARK_CURRENT, DEFECTS, SHOT, READ_NOISE, SATURATION, QUANTISATION)
 EFFECTS: tuple[Effect, ...] = (*AIMS, *RAYS, *FOOTPRINT, *LIGHT, *READOUT)
 BY_NAME = MappingProxyType({effect.name: effect for effect in EFFECTS})
-# effects of any camera behind a mirror, without noise and with; cheap: beside exact ones a farm changes by .015 sigma at most.
+# effects of any camera behind a mirror, without noise and with: a farm changes by .015 sigma at most beside exact ones
 QUIET = Choice.of({ROTATION: "rays", SLIT: "3x1", SMEAR: FOLDED, VIGNETTING: "held"})
 USUAL = Choice((*QUIET.effects, (SHOT, GAUSSIAN), (READ_NOISE, "exact")))
