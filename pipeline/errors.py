@@ -134,7 +134,7 @@ class BoundError(PipelineError, ArithmeticError):
 
 
 class NothingToMend(Exception):  # noqa: N818 - no error: a survey that ends well without a look
-    """A field is remembered so surely that nobody has to look; ``run`` is the one whose map stands."""
+    """The prior map of a field is sure enough, and no capture is needed; ``run`` is the one whose map stands."""
 
     def __init__(self, run: str, why: str) -> None:
         super().__init__(why)

@@ -37,7 +37,7 @@ def stated(
     return field(default=default, metadata={**known, "json_schema_extra": told})
 
 
-assumed = partial(stated, source="assumed")  # nobody has confirmed the default on a unit
+assumed = partial(stated, source="assumed")  # the default is not confirmed on a unit
 
 
 def format_number(low: float, high: float, unit: str = "", *, endless: bool = False) -> str:

@@ -34,7 +34,7 @@ class References:
 
     A sample's scene value is ``(raw - dark) / (white - dark) * white_reference``, over ``flat`` where there is one,
     over the mirror's throughput where ``by_mirror`` says that the light falls off with its tilt. ``bad`` elements of
-    the detector are not to be believed.
+    the detector are not trusted.
     """
 
     dark: NDArray[np.float32]
@@ -76,7 +76,7 @@ class Source(Protocol):
         """Give the sweep's lines one by one, from line ``first`` on."""
 
     def lines_again(self, sweep: Sweep, numbers: Sequence[int]) -> Iterator[Line]:
-        """Give single lines that it gave before, in order; not valid where it has them no more."""
+        """Give single lines that it gave before, in order; not valid where it no longer has them."""
 
     def references(self, sweep: Sweep) -> References:
         """Dark and white frames with the sweep's binning."""

@@ -29,7 +29,7 @@ from storage.archive.keys import in_text
 from storage.archive.lineage import Catalogue, changes_between, find_product, version_before
 from storage.archive.records import Run
 from storage.maintenance.garbage import clear_up
-from storage.maintenance.repair import Rerun, plan_repair, repair
+from storage.maintenance.repair import plan_repair, repair
 from storage.maintenance.verification import Finding
 from storage.remote.opening import open_archive, verify_archive
 
@@ -124,10 +124,8 @@ def gc(
     return DONE if raw.obstacle is None and not raw.kept else PARTLY
 
 
-def run_verify(
-    archive: str | Path, console: Console, *, remake: bool = False, rerun: Rerun | None = None, as_json: bool = False
-) -> int:
-    """Read an archive again; with ``remake`` have what is broken made anew by ``rerun`` (settings in, a run out)."""
+def run_verify(archive: str | Path, console: Console, *, remake: bool = False, as_json: bool = False) -> int:
+    """Read an archive again; with ``remake`` survey again what is broken."""
     opened = open_archive(archive, create=False, write=remake)
     with StageProgress(console, {"verify": "reading again"}) as bars:
         findings = verify_archive(opened, lambda uri, fraction: bars.show("verify", fraction, uri))
@@ -144,7 +142,7 @@ def run_verify(
         here = {**of_this_version(settings), "out": opened.name, **dict.fromkeys(OF_THE_MACHINE)}
         survey_command.run_survey(parse_settings(here), console)
 
-    done = repair(opened, bad, rerun or survey_again, versions=versions())
+    done = repair(opened, bad, survey_again, versions=versions())
     content["repair"] = {
         "remade": done.remade,
         "dropped": done.dropped,

@@ -179,8 +179,8 @@ def _comparison(runs: tuple[Run, Run], maps: list[ClassMap]) -> dict[str, Any]:
         ],
         "settings": _changes(*asked),
         "made": _changes(*made),
-        "savings": {name: [_spent(run.receipt, name) for run in runs] for name in COST_LABELS},
-        "data_bytes": {name: [_bytes(run.receipt, name) for run in runs] for name in BYTE_LABELS},
+        "savings": {name: [_known(run.receipt, "savings", name, "done") for run in runs] for name in COST_LABELS},
+        "data_bytes": {name: [_known(run.receipt, "data_bytes", name) for run in runs] for name in BYTE_LABELS},
     }
 
 
@@ -205,15 +205,12 @@ def _changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[dict[str, A
     return [{"name": name, "old": before, "new": after} for name, before, after in both if before != after]
 
 
-def _spent(receipt: Mapping[str, Any], name: str) -> float | None:
-    savings = receipt.get("savings")
-    entry = savings.get(name) if isinstance(savings, Mapping) else None
-    return known_number(entry.get("done")) if isinstance(entry, Mapping) else None
-
-
-def _bytes(receipt: Mapping[str, Any], name: str) -> float | None:
-    told = receipt.get("data_bytes")
-    return known_number(told.get(name)) if isinstance(told, Mapping) else None
+def _known(receipt: Mapping[str, Any], *path: str) -> float | None:
+    """Return the number at a path of tables in a receipt; None where there is none."""
+    found: Any = receipt
+    for name in path:
+        found = found.get(name) if isinstance(found, Mapping) else None
+    return known_number(found)
 
 
 def show_comparison(content: dict[str, Any], console: Console) -> None:

@@ -51,7 +51,7 @@ else:
 MOST_ROWS = 1000  # of the table; older ones are counted
 MOST_VISITS = 24  # that a page shows: the newest
 MOST_PX = 400  # of a visit's picture
-MOST_CLASSES = 128  # that are told apart, the last of them standing for none
+MOST_CLASSES = 128  # that have numbers of their own, the last of them standing for none
 CHANGED_FRACTION = 0.25  # of a patch's pixels, from which it is said to have changed
 PALE = 0.8  # of what did not change
 SAVINGS = {"capture_s": "time at the camera", "lines": "lines", "bytes_kept": "bytes kept", "multiply_adds": "model"}
@@ -187,7 +187,7 @@ def time_of_visit(run: Run) -> datetime | None:
 def _visit(archive: Archive, run: Run, row: Row, shown: ClassMap) -> dict[str, str]:
     """Return when a visit was, its map, what changed of it among pale colours (empty of a first one), and words."""
     thin = slice(None, None, -(-max(shown.classes.shape) // MOST_PX))
-    palette = pictures.palette_bytes(shown.names[: MOST_CLASSES - 1], shown.colours[: MOST_CLASSES - 1])[:MOST_CLASSES]
+    palette = pictures.palette_bytes(shown.colours[: MOST_CLASSES - 1])[:MOST_CLASSES]
     numbers, changes = np.minimum(shown.classes[thin, thin], MOST_CLASSES - 1), ""
     address = run.products.get("class_probabilities")
     with suppress(OSError, LookupError, ValueError):

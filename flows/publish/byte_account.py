@@ -79,7 +79,7 @@ def publish_counted(
             break
         folder = size
     draft.publish(**facts)
-    archive.take_moved()  # by the upload of the folder, which is told
+    archive.take_moved()  # by the upload of the folder, which is counted
     return receipt
 
 

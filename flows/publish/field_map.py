@@ -13,7 +13,7 @@ from matplotlib.colors import to_rgba
 from numpy.typing import NDArray
 from PIL import Image
 
-from flows.publish.panels import UNLABELLED_COLOUR, class_palette, data_address, webp
+from flows.publish.panels import UNLABELLED_COLOUR, data_address, webp
 from flows.publish.quicklook import QuicklookData, colours_of
 from flows.publish.receipt import Receipt
 from flows.publish.receipt_table import format_days
@@ -63,7 +63,7 @@ class FieldMap:
 
 @dataclass(frozen=True)
 class PriorMapField:
-    """Images that a map has of the earlier run it goes on from."""
+    """Images of the earlier run whose map is the prior map."""
 
     run: str
     days: float  # between that capture and this one
@@ -73,7 +73,7 @@ class PriorMapField:
 
 
 def prior_map(prior: Prior | None, drawn: StageRef, receipt: Receipt) -> PriorMapField | None:
-    """Return what the prior map shows; None where a map goes on from no other run, or put it aside.
+    """Return what the prior map shows; None where there is none, or it was put aside.
 
     ``drawn`` is the store of the class map and of the class probabilities.
     """
@@ -95,7 +95,7 @@ def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: Prio
     """Gather the layers of a run; ``shown`` is what its quicklook shows."""
     height, width = shown.class_map.shape
     thin = slice(None, None, -(-max(height, width) // MOST_PX))
-    palette = palette_bytes(shown.class_names, shown.class_colours)
+    palette = palette_bytes(shown.class_colours)
 
     def classes(image: NDArray[np.integer]) -> str:
         return layer_address(image[thin, thin].astype(np.uint8), palette)
@@ -153,10 +153,10 @@ def error_address(class_map: NDArray[np.integer], labels: NDArray[np.integer]) -
     return layer_address(np.where(judged, 1 + (class_map != labels), 0).astype(np.uint8), np.array(colours, np.uint8))
 
 
-def palette_bytes(names: Sequence[str], colours: NDArray[np.integer] | None) -> Bytes:
+def palette_bytes(colours: NDArray[np.integer]) -> Bytes:
     """Return the (256, 3) colours of class numbers; all beyond the classes are grey."""
     palette = np.tile(np.rint(255 * np.array(UNLABELLED_COLOUR)).astype(np.uint8), (256, 1))
-    palette[: len(names)] = np.rint(255 * class_palette(len(names), colours)).astype(np.uint8)
+    palette[: len(colours)] = colours
     return palette
 
 

@@ -29,13 +29,13 @@ from storage.archive.manifests import read_table
 from storage.arrays.class_maps import ClassMap, ProbabilityStore
 from storage.arrays.ground_maps import GroundMap
 
-OLDER_DAYS = (1, 7, 30)  # since a look, of which the hectares are told
+OLDER_DAYS = (1, 7, 30)  # since a capture, for which hectares are given
 PLOTS_FILE = "plots.csv"
 STRIP_ROWS = 256  # of class probabilities that are read at a time
 
 
 def field_figures(run: SurveyRun, fine: FinePlan | None) -> dict[str, Any]:
-    """Figures of the field and of the captures as JSON tells them; None for what nobody knows.
+    """Return figures of the field and of the captures, for JSON; None for what is unknown.
 
     ``fine`` is the fine pass where it is planned already, else it takes what the budget leaves at most. Hectares are
     those that the survey keeps to, and those an hour are of all of the camera's seconds. A raster has no camera: no
@@ -200,7 +200,7 @@ def find_map(run: SurveyRun, ref: StageRef, drawn: ClassMap) -> dict[str, Any]:
 
 
 def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
-    """Return what the map is likely to score by what it says of itself; None where nobody knows how such comes true.
+    """Return the expected score by the map's own probabilities; None where these were never compared with labels.
 
     That is known of maps of uniform scans that are read whole, without a memory. Pixels without a class do not count. A
     score of which the error leaves open nearly everything is not predicted, and the words say so.

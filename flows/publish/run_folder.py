@@ -352,7 +352,7 @@ def _recording(run: SurveyRun, recorded: RecordedPasses, plan: FinePlan) -> dict
 
 
 def _pointing(ref: StageRef) -> dict[str, Any]:
-    """Corrections of one pass; what they leave is told only where windows are more than offsets and drifts."""
+    """Corrections of one pass; what they leave is given only where windows are more than offsets and drifts."""
     record = load_registration(ref)
     left = np.array([window["residual_px"] for window in record["windows"] if window.get("residual_px")])
     tells = len(left) > 2 * (len(record["sweeps"]) - len(record["untied"]) - 1)

@@ -150,7 +150,7 @@ BUILT_IN_WEIGHTS = "farm"
 
 
 def usual_of_recording(table: Mapping[str, object]) -> dict[str, Any]:
-    """Return what the settings beside ``sweeps`` are by default: those of the run that took them, where one is told.
+    """Return what the settings beside ``sweeps`` are by default: those of the run that took them, where one is named.
 
     So `survey --sweeps ARCHIVE/runs/NAME` alone plans as that run did. Cubes of files know nothing of a survey: without
     a budget or a scan every recorded line is read as it is.

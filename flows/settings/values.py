@@ -1,6 +1,6 @@
 """Settings that are more than a number or a word: from text or TOML to the value, or what is wrong, without its place.
 
-A ValueError goes on from the setting's name ("must be ..."); a SettingsError is a sentence of its own.
+A ValueError continues the setting's name ("must be ..."); a SettingsError is a sentence of its own.
 """
 
 from __future__ import annotations

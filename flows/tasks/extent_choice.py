@@ -159,7 +159,7 @@ def _best_extent(layout: PassLayout, wanted: ExtentGains, seconds: float) -> tup
 def _swaths(
     prior: Prior, grid: SceneGrid, weights: Description, path: Path
 ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-    """Yield what is believed of a field today if nobody looks, and how old that is, some rows of patches at a time."""
+    """Yield class probabilities of a field without a capture today, and their ages, some rows of patches at a time."""
     store, high = ProbabilityStore(prior.probabilities.path / "class_probabilities.zarr"), SWATH_PATCHES * grid.patch
     read = None if weights.reader is None else load_reader(path)
     for top in range(0, grid.height, high):

@@ -44,7 +44,7 @@ class MosaicRecipe:
 
     @property
     def folders(self) -> list[Path]:
-        """Return what has to be seen by whoever makes tiles."""
+        """Return the paths that workers must see."""
         given = (self.signal, self.geolocation, None if self.registration is None else self.registration.parent)
         return [path for path in given if path is not None]
 
@@ -91,7 +91,7 @@ def write_mosaic(
     wanted: NDArray[np.bool_] | None = None,
     report: Callable[[float], None] = lambda done: None,
 ) -> TileBudget:
-    """Rectify and blend sweeps into a stored mosaic; return how. Whoever makes the tiles, the same bytes come out.
+    """Rectify and blend sweeps into a stored mosaic; return how. Any worker's tiles give the same bytes.
 
     ``wanted`` are (y, x) pixels without which a tile is left out. Fewer tiles are made at a time where ``memory``
     [bytes] of this process and those that it starts, not of workers elsewhere, holds fewer. Raises SettingsError: not

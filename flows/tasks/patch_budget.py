@@ -60,7 +60,7 @@ class ReadingCosts:
 class PatchBudget:
     """Budget of patches, and the patches there are to spend it on.
 
-    Fractions are of reading every one of ``patch_index`` and choosing none. A memory that the map goes on from is
+    Fractions are of reading every one of ``patch_index`` and choosing none. A prior map of the survey is
     weighed whatever is seen, and does not count.
     """
 
@@ -116,7 +116,7 @@ class PatchBudget:
     def choose(self, scores: NDArray[np.floating]) -> NDArray[np.intp]:
         """Patches that are bought, best first, by the scores (patch,) of the padded grid; equal ones by number.
 
-        A smaller budget buys the first of what a larger one does. What promises nothing, or less than the least gain,
+        A smaller budget buys the first of what a larger one does. What gains nothing, or less than the least gain,
         is not bought; neither is what has no score (NaN).
         """
         expected_gain = np.asarray(scores, np.float64)[self.patch_index]

@@ -1,4 +1,4 @@
-"""The memory of a field that a survey goes on from: which earlier run, and how many days ago that was."""
+"""The prior map of a survey: which earlier run it is of, and how many days ago that was."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NONE, LATEST, AUTO = "none", "latest", "auto"
 NEWEST_RUNS = 60  # newest runs of a field among which the visit before is looked for
 MOST_EARLIER = 12  # by which a field is known that is looked at in parts
 PROBABILITIES = "class_probabilities"  # a product of runs
-MEMORY = "prior_map.json"  # beside a map that goes on from an earlier one: what became of the memory
+MEMORY = "prior_map.json"  # beside a map with a prior map: what became of that
 OF_THE_LIGHT = (  # settings that the same light has alike
     *("scene", "source", "seed", "size", "visit", "day", "hour", "effects", "pointing_px"),
     *("extent", "scan_step", "scan_exposure_ms", "coarse_exposure_ms", "budget", "policy"),
@@ -57,7 +57,7 @@ class Prior:
 def find_prior(
     archive: Archive, settings: Settings, name: str, grid: SceneGrid, class_names: tuple[str, ...]
 ) -> tuple[Prior | None, tuple[str, ...]]:
-    """The run that a survey of ``name`` goes on from, and what to say of it; None where there is none.
+    """Return the run of the prior map of a survey of ``name``, and notes; None where there is none.
 
     Of the newest runs of the field it is the one looked at last before this visit: one that was taken later, and
     published earlier, is no memory of it. Raises SettingsError: a run that is named cannot be gone on from.
@@ -198,7 +198,7 @@ def _days_since(run: Run, visit: str | None, moment: tuple[int, float] | None) -
 
 
 def prior_map_figures(store: Path) -> dict[str, Any] | None:
-    """Return what became of the memory that the map of a store goes on from; None of a field's first look."""
+    """Return what became of the prior map of a stored map; None of a field's first visit."""
     record = store / MEMORY
     return dict(read_table(record)) if record.is_file() else None
 

@@ -38,7 +38,7 @@ from storage.remote.opening import is_archive, open_archive
 # Peak of a survey of the farm without controls: 1.69 GB for 1280 x 1024 px, 3.10 GB for 2560 x 2560 px
 FARM_BYTES, FARM_BYTES_PER_PX = 1_350_000_000, 270
 POSE_WINS = "the scene's own place on the earth is set aside: [pose] says where it lies; leave [pose] out to keep it"
-SAME_HOUR = 0.5  # by which true solar time is at most off mean solar time, and whoever rounds it [h]
+SAME_HOUR = 0.5  # by which true solar time is at most off mean solar time, and rounding of both [h]
 
 
 DATE, NEW = "{date", "{new}"
@@ -99,7 +99,7 @@ def check_scene_there(scene: str, *, is_map: bool) -> None:
 def open_scene(settings: Settings, known: Sequence[str] | None = None) -> tuple[RasterScene, tuple[str, ...]]:
     """Open the scene, say what was assumed; SceneError, WavelengthError: its file, SettingsError: not for a farm.
 
-    Labels that nobody named, but that lie beside the scene, count where their classes are among the ``known`` ones.
+    Labels that no setting names, but that lie beside the scene, count where their classes are among the ``known`` ones.
     """
     if settings.scene == RIG_FIELD:
         return _field_before_rig(settings), ()
@@ -259,7 +259,7 @@ def check_labels(scene: RasterScene, weights: Description) -> tuple[str, ...]:
     if missing:
         known = ", ".join(weights.class_names)
         hint = "use weights for these"
-        if (found := re.fullmatch(r"class_(\d+)|colour_([0-9a-f]{6})", missing[0])) is not None:  # nobody named it
+        if (found := re.fullmatch(r"class_(\d+)|colour_([0-9a-f]{6})", missing[0])) is not None:  # it has no name
             value = found[1] or list(bytes.fromhex(found[2]))
             hint += (
                 ", or say which class each value of the label file is, in a table [classes] of the scene.toml beside "
@@ -280,7 +280,7 @@ TRAINING_SCENE = {  # what a score on a scene of the training is a score of
 def seen_in_training(scene: RasterScene, weights: Description) -> str | None:
     """Return how much of a scene the weights were trained on, a key of `TRAINING_SCENE`; None for nothing.
 
-    Files are told by what they hold, whatever their names and whatever bands are read of them.
+    Files are identified by what they hold, whatever their names and whatever bands are read of them.
     """
     split = weights.record.get("split", {})
     if scene.key in split.get("pixels", {}):
@@ -318,7 +318,7 @@ class FieldSource:
         return {}
 
     def saying(self, say: Callable[[str], None]) -> FieldSource:
-        """The same, telling somebody what it is at while no line comes."""
+        """The same, reporting what it is at while no line comes."""
         return self
 
     def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> FieldSource:

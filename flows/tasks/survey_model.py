@@ -123,7 +123,7 @@ DAYS, SUN_DEG, DARKER, SCALE, BAND_NM = 10, 3.0, 0.9, 1.5, 25.0  # as much besid
 def beyond_training(
     settings: Settings, scene: RasterScene, described: Description, trained: TrainedOn | None, path: Path
 ) -> tuple[str, ...]:
-    """One note of all that training did not see, or none; ``trained`` is None where nobody knows what it saw."""
+    """One note of all that training did not see, or none; ``trained`` is None where what it saw is unknown."""
     _, reached = described.basis.matrix(scene.wavelength_nm)
     known = np.ones_like(reached)  # columns that training reached
     if trained is not None and trained.bands_nm is not None:

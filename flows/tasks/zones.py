@@ -159,7 +159,7 @@ def _bounds(of_each: Sequence[tuple[float, float, float, float]]) -> tuple[float
 
 
 def _format_pixels(place: FieldPlace) -> str:
-    """Return how large a pixel is, where somebody knows."""
+    """Return how large a pixel is, where that is known."""
     rows, columns = place.shape
     middle = place.pixel_areas_m2(slice(rows // 2, rows // 2 + 1), slice(columns // 2, columns // 2 + 1))
     return "" if middle is None else f" ({float(np.sqrt(middle[0, 0])):.3g} m)"

@@ -6,7 +6,7 @@ import math
 from typing import TypeGuard
 
 DASH = "–"  # noqa: RUF001
-LEAST_HECTARES = 0.1  # smaller areas are told in square metres
+LEAST_HECTARES = 0.1  # smaller areas are given in square metres
 
 
 def format_seconds(seconds: float | None) -> str:

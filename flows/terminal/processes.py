@@ -94,7 +94,7 @@ def place_caches(environment: MutableMapping[str, str] | None = None) -> Path | 
     """Name a private folder in the environment, for this process and those that it starts, where it is needed.
 
     It is `spectralzoom-UID` in the temporary folder, so that the next process finds what this one compiled: where it
-    is not ours alone, a new one that goes with this process. What is in it is run as code, so nobody else may write it.
+    is not ours alone, a new one that goes with this process. Its content is run as code: no other user may write it.
     ``environment`` is this process's own unless given. None where the usual one (XDG_CACHE_HOME, or ~/.cache) can be
     written. Raises SettingsError: nothing can be written, the temporary folder included.
     """
@@ -104,7 +104,7 @@ def place_caches(environment: MutableMapping[str, str] | None = None) -> Path | 
     except KeyError:
         home = None
     if not home:
-        environment["HOME"] = NO_HOME  # Prefect asks for one before anybody tells it where to keep its files
+        environment["HOME"] = NO_HOME  # Prefect asks for one before it is set where to keep its files
     usual = _usual_folder(environment)
     with suppress(OSError):
         if usual is not None:

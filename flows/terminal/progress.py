@@ -91,7 +91,7 @@ _listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
 
 @contextmanager
 def heard_by(listener: Listener | None) -> Iterator[None]:
-    """Have ``listener`` told, besides the terminal, how far each stage is that the block runs; None: nobody."""
+    """Report to ``listener``, too, how far each stage is that the block runs; None: to the terminal alone."""
     before = _listener.set(listener)
     try:
         yield
@@ -176,7 +176,7 @@ class StageProgress:
 def one_after_the_other(console: Console) -> Iterator[Callable[[str, float, str], None]]:
     """Bars of parts that follow each other: a part has ended where the next begins, and the last with the block.
 
-    Gives what a part is told by: its title, how far it is (0..1), and a figure in words.
+    Gives what identifies a part: its title, how far it is (0..1), and a figure in words.
     """
     last = ""
     with StageProgress(console) as progress:

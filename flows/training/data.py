@@ -171,7 +171,7 @@ def only_class(scene: RasterScene) -> str | None:
 
 
 def alike_notes(alone: Mapping[str, str]) -> tuple[str, ...]:
-    """Question scenes whose labels are all one class, given by their names: it may stand for what nobody labelled."""
+    """Question scenes whose labels are all one class, given by their names: it may mean unlabelled."""
     by_class: dict[str, list[str]] = {}
     for name, kind in alone.items():
         by_class.setdefault(kind, []).append(name)

@@ -168,7 +168,7 @@ def _quoted(text: str) -> str:
 
 
 def _unseen(draft: SceneDraft) -> list[str]:
-    """Return what somebody has to look at: what could not be told from the files, or does not fit."""
+    """Return what needs a look: what the files do not say, or does not fit."""
     found, parts = draft.files, []
     if found.labels and found.bare:
         images = counted(len(found.bare), "image")

@@ -115,7 +115,7 @@ def footprint_of(view: GroundView, shape: tuple[int, int]) -> GroundFootprint:
 
 
 def areas_by_number(place: FieldPlace, numbers: NDArray[np.integer], count: int) -> Floats | None:
-    """Sum the ground under a field's pixels by their (y, x) numbers, (count,) [m2]; None where nobody knows it.
+    """Sum the ground under a field's pixels by their (y, x) numbers, (count,) [m2]; None where it is unknown.
 
     Pixels with a number below 0 or from ``count`` on are left out, and those that show no ground.
     """
@@ -132,7 +132,7 @@ def areas_by_number(place: FieldPlace, numbers: NDArray[np.integer], count: int)
 
 @dataclass(frozen=True)
 class NoPlace:
-    """A field of which nobody said where it lies: polygons are in pixels. It may be known how large one is."""
+    """A field without a place: polygons are in pixels. The size of a pixel may be known."""
 
     shape: tuple[int, int]
     pixel_m: float | None = None
@@ -148,7 +148,7 @@ class NoPlace:
         return shape
 
     def pixel_areas_m2(self, rows: slice, columns: slice) -> Floats | None:
-        """The ground under some pixels (row, column) [m2], NaN where they show none; None where nobody knows."""
+        """The ground under some pixels (row, column) [m2], NaN where they show none; None where it is unknown."""
         size = rows.stop - rows.start, columns.stop - columns.start
         return None if self.pixel_m is None else np.full(size, self.pixel_m**2)
 

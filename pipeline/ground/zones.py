@@ -29,7 +29,7 @@ Mask = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 ROUND_THE_FIELD = 1.0  # times its size, on every side, up to which polygons are followed
 EDGE_PARTS = 256  # of that: a straight edge of one map is bent on another
-FAR_EAST_DEG = 90.0  # beyond this longitude of the field, those of polygons are told from it and not from Greenwich
+FAR_EAST_DEG = 90.0  # beyond this longitude of the field, those of polygons count from it and not from Greenwich
 
 
 def on_field(shape: BaseGeometry, crs: pyproj.CRS | None, place: FieldPlace) -> BaseGeometry:
@@ -153,7 +153,7 @@ class PlotFigures:
     plot: str
     pixels: int  # whose centres lie in it
     mapped_pixels: int  # of them, those with a class
-    area_m2: float | None  # of the mapped pixels; None where nobody knows how large they are
+    area_m2: float | None  # of the mapped pixels; None where their size is unknown
     confidence: float | None  # mean over the mapped pixels that have one
     fractions: dict[str, float | None]  # of the mapped ground, by class; of the pixels where that is not known
 

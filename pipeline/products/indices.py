@@ -114,7 +114,7 @@ NARROW = (
 def find_index(name: str) -> SpectralIndex:
     """Give an index by its name, in capitals or not.
 
-    Raises SettingsError: there is none of that name, or it wants what no camera gives; names like it are told.
+    Raises SettingsError: there is none of that name, or it needs what no camera gives; the message lists similar names.
     """
     own = {index.name.lower(): index for index in NARROW}
     if name.lower() in own:

@@ -33,7 +33,7 @@ class KnotCurve:
     """The line's centre as a smooth function of the knot coordinate: what Catmull-Rom makes of a track's knots.
 
     Values resampled by the Catmull-Rom kernel at the coordinate found here are then those of the point asked for,
-    where the scene is linear, however uneven the lines lie. Beyond the ends the curve goes on straight.
+    where the scene is linear, however uneven the lines lie. Beyond the ends the curve is straight.
     """
 
     scan_path: ScanPath

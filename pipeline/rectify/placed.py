@@ -249,7 +249,7 @@ def place(
     """Find where the lines of a sweep lie.
 
     ``grid`` are pixels to make tie tables for, which a large mosaic is made with; None looks every point up directly.
-    ``usable`` (line,) are lines whose position may be believed, None takes ``lines.valid_line``; ``shift_px`` (line, 2)
+    ``usable`` (line,) are lines with a trusted position, None takes ``lines.valid_line``; ``shift_px`` (line, 2)
     pointing corrections along the line and along the scan [px]; ``gain`` (band,) the illumination correction of the
     sweep.
 

@@ -199,8 +199,8 @@ def _with_stand_ins(
 class LineNumbers:
     """Numbers of the lines of a sweep, by the time stamps of its frames."""
 
-    number: NDArray[np.intp]  # (frame,) line of the plan, counted from the first believed frame; of that line's
-    # first frame where a frame came again; of the line before where the stamp is not believed
+    number: NDArray[np.intp]  # (frame,) line of the plan, counted from the first trusted frame; of that line's
+    # first frame where a frame came again; of the line before where the stamp is not trusted
     usable: NDArray[np.bool_]  # (frame,)
     lost: int  # lines between the first and the last for which no frame came
     repeated: int  # frames that came again under the same stamp
@@ -212,7 +212,7 @@ def number_lines(time_s: Floats, frame_s: float) -> LineNumbers:
     """Tell from time stamps (frame,), of mid exposure in the order of arrival [s], which line each frame is.
 
     A gap of more than 1.5 periods leaves numbers out. Of frames with equal stamps the first is kept. A stamp that goes
-    back is not believed: the longest ascending row of stamps is, and of equally long ones that with the earlier frames,
+    back is not trusted: the longest ascending row of stamps is, and of equally long ones that with the earlier frames,
     so that one wild stamp costs one line; so does a wild one that comes first or last. A late frame is used: its
     position is that of its own time. ``frame_s`` is the planned frame period; its true value is taken from the stamps,
     so that a slow clock makes no frame late.

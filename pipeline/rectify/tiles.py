@@ -82,6 +82,6 @@ def opened_tiles(maker: TileMaker) -> OpenedTiles:
 
 
 def let_tiles_go() -> None:
-    """Give back the memory of the last mosaic's raw lines in this process, whose work goes on with something else."""
+    """Give back the memory of the last mosaic's raw lines in this process, before its next work."""
     opened_tiles.cache_clear()
     opened_work.cache_clear()

@@ -133,8 +133,6 @@ class MirrorLink:
     strict_crc: bool = stated(False, "Refuse replies whose CRC does not fit, which is warned of otherwise")
     ends: Ends = assumed("exclusive", "What the mirror takes the end of a range for")  # erratum E14
     read_back: ReadBack = stated("sampled", "How much of a path is read back and compared")
-    check_status: bool = stated(True, "Ask for the mirror's status before each motion")
-    park_at_close: bool = stated(False, "Send the mirror to 0; 0 at the end")
     log_rate_hz: float = stated(
         10000.0, "Rate of measured positions, at most; without pulses they place the lines", "Hz", 0.1, 10_000
     )
@@ -166,7 +164,7 @@ class SurveyRig(MirrorLink):
     """The table [rig] of a survey: both devices, the cable between them, and the white reference.
 
     Written for the documented protocols and tested against emulators; never run on hardware. ``provenance`` says which
-    of the assumed values somebody has confirmed.
+    of the assumed values are confirmed.
     """
 
     mirror_driver: str = stated(

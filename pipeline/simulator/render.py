@@ -57,7 +57,7 @@ PROBES = 17  # lines of a sweep and samples of a line that tell how far a footpr
 class Choice:
     """Effects that are on, each with its variant, in the order of the chain; those of the readout may be among them.
 
-    ``slit``, ``smear`` and ``rotation`` are told by their names, the others by what they do.
+    ``slit``, ``smear`` and ``rotation`` are given by their names, the others by what they do.
     """
 
     effects: tuple[tuple[Effect, str], ...] = ()

@@ -7,8 +7,8 @@
     spool/<key>/              lines of a capture under way
     .locks/                   held while something is made
 
-A folder whose name ends in ``.part`` is not finished: whoever makes the same thing next removes it. An archive in a
-bucket (`storage.remote.object_archive`) has the same addresses.
+A folder whose name ends in ``.part`` is not finished: the next process that makes the same thing removes it. An archive
+in a bucket (`storage.remote.object_archive`) has the same addresses.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ class Archive:
         """Give a folder to write into, and publish it when the block ends well.
 
         One process at a time makes a key; the others wait and then find ``done``. When the block fails, the folder is
-        removed and the archive is as before. Raises ArchiveError: the disk refuses; the message names the path and what
+        removed and the archive is unchanged. Raises ArchiveError: the disk refuses; the message names the path and what
         to do.
         """
         ref = self.ref(stage, key)
@@ -229,7 +229,7 @@ class Archive:
         """Take one store away, for good; a key that is asked for again is made again.
 
         False where another process works on it and ``wait`` is false. ``unnamed`` says that no run may name it, which
-        in a bucket is looked after once more: here whoever clears up is alone.
+        in a bucket is looked after once more: here the process that clears up is alone.
         """
         with refusals(self.root, "remove from the archive"), self._locked(f"{ref.stage}-{ref.key}", wait=wait) as held:
             if held:
@@ -259,7 +259,7 @@ class Archive:
     def in_use(self, *, alone: bool = False) -> Iterator[bool]:
         """Keep others from clearing stores away while the block runs; many may do so at a time.
 
-        With ``alone`` ask to be the only one: gives False, at once, where somebody uses the archive.
+        With ``alone`` ask to be the only one: gives False, at once, where another process uses the archive.
         """
         with refusals(self.root, "write to the archive"):
             release = take_lock(self._lock_path("use"), wait=not alone, shared=not alone)

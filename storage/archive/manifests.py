@@ -137,7 +137,7 @@ def cleared_facts(before: Mapping[str, Any], sha256: str) -> dict[str, Any]:
 
 
 def is_cleared(manifest: Mapping[str, Any]) -> bool:
-    """Return whether a store's files were cleared away: whoever asks for it has it made again."""
+    """Return whether a store's files were cleared away: it is made again when it is needed."""
     return CLEARED in manifest
 
 

@@ -254,13 +254,12 @@ def file_hash(path: Path) -> str:
     return digest.hexdigest()
 
 
-def take_lock(path: Path, *, wait: bool = True, shared: bool = False, words: str = "") -> Callable[[], None] | None:
+def take_lock(path: Path, *, wait: bool = True, shared: bool = False) -> Callable[[], None] | None:
     """Hold ``path`` against other processes and threads until the function returned is called, or the process dies.
 
     None where another holds it and ``wait`` is false. Holders of a ``shared`` lock keep out only those that want it for
-    themselves. The file goes away with a lock that is not shared; letting go twice is harmless. ``words`` are written
-    into it for others to read, as far as the disk takes them. Raises ArchiveError: a link, or something else than a
-    file, is in its place: what it leads to is not touched.
+    themselves. The file goes away with a lock that is not shared; letting go twice is harmless. Raises ArchiveError: a
+    link, or something else than a file, is in its place: what it leads to is not touched.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     while True:
@@ -278,10 +277,6 @@ def take_lock(path: Path, *, wait: bool = True, shared: bool = False, words: str
             if _is_still(descriptor, path):
                 if not shared:  # else another may hold it yet
                     held.callback(_drop_name, path)  # called before the lock is let go
-                if words and os.fstat(descriptor).st_nlink == 1:  # with another name it may be somebody's file
-                    with suppress(OSError):  # a full disk keeps nobody from holding a lock
-                        os.ftruncate(descriptor, 0)
-                        os.pwrite(descriptor, words.encode(), 0)
                 return held.pop_all().close
 
 
@@ -308,13 +303,13 @@ def _misplaced(path: Path, expected: str) -> ArchiveError:
 
 
 def _drop_name(path: Path) -> None:
-    """Take a lock's file away; where the disk refuses it stays, and holds nobody up."""
+    """Take a lock's file away; where the disk refuses it stays, and blocks no process."""
     with suppress(OSError):
         path.unlink()
 
 
 def _is_still(descriptor: int, path: Path) -> bool:
-    """Return whether an open file has its name yet: whoever held the lock before may have taken it away."""
+    """Return whether an open file has its name yet: the last holder of the lock may have removed it."""
     try:
         return os.path.samestat(path.lstat(), os.fstat(descriptor))
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""Camera files on their way here, in a folder: what has come stays, whatever ends the transfer, and goes on there.
+"""Camera files on their way here, in a folder: what has come stays, and the next transfer continues there.
 
 A file of the camera is named by its whole path there, notes about the files by a name alone. Bytes are written at the
 end and nowhere else; a file that came damaged goes as a whole. Notes are on the disk when ``append`` returns; of files
@@ -223,4 +223,4 @@ def _cut(path: Path, size: int) -> None:
     try:
         os.truncate(path, size)
     except OSError:
-        return  # what is held is compared when the transfer goes on
+        return  # what is held is compared when the transfer continues

@@ -71,7 +71,7 @@ class MosaicWriter:
 
     @classmethod
     def reopen(cls, path: Path) -> MosaicWriter:
-        """Go on writing tiles of a mosaic that another writer has begun, in this process or another.
+        """Continue a mosaic that another writer has begun, in this process or another.
 
         Raises IncompleteStoreError: no mosaic has been begun there.
         """
@@ -161,12 +161,12 @@ def write_tiles(
 ) -> None:
     """Store what ``make`` gives for the rows and columns of ``places``, each in a task of its own.
 
-    Whoever makes the tiles, the same bytes come out. See `run_blocks` for what is raised.
+    Any worker's tiles give the same bytes. See `run_blocks` for what is raised.
     """
     task = _TileTask(make, writer.path.absolute())
     if pool.shares_memory:
         _reopened(task.out)  # before several threads ask for it
-    run_blocks(task, places, pool, keep=False, report=report, paths=[*paths, task.out])
+    run_blocks(task, places, pool, report=report, paths=[*paths, task.out])
     _reopened.cache_clear()
 
 

@@ -1,4 +1,4 @@
-"""Quicklooks: a small picture stored beside every cube, so that nobody has to read a cube to show it.
+"""Quicklooks: a small picture stored beside every cube, which need not be read to show it.
 
 ::
 

@@ -2,10 +2,10 @@
 
 ``<name>.lines`` begins with one JSON object on a line: what the lines belong to, with a checksum of its own. Records
 of one size follow, one a line: number, mirror X and Y, time, exposure, valid, a CRC-32, and the raw numbers (sample,
-band) uint16. The CRC goes on from that of the header, so that a record belongs to one sweep alone.
+band) uint16. The CRC continues that of the header, so that a record belongs to one sweep alone.
 
 A line counts when its record has its CRC. Records that do not count lie either behind the last that does, and are cut
-off: the capture goes on there; or before it: these lines are lost, and are put back in their places when the source
+off: the capture continues there; or before it: these lines are lost, and are put back in their places when the source
 gives them again.
 """
 
@@ -73,7 +73,7 @@ class Spool:
 
     @classmethod
     def known(cls, path: Path) -> Spool | None:
-        """Open a spool by its own header, to be read; None where that cannot be believed."""
+        """Open a spool by its own header, to be read; None where that is damaged."""
         with plain_reader(path) as file:
             head = file.readline(_LONGEST_HEADER)
         facts = _header(head)
@@ -132,7 +132,7 @@ class Spool:
     def recover(self) -> int:
         """Find the good lines and those that are lost, cut off what a crash left torn behind the last good one.
 
-        Gives the number of the line to go on with. Raises RigError: the lines are of another sweep.
+        Gives the number of the next line. Raises RigError: the lines are of another sweep.
         """
         with plain_reader(self.path) as file:
             head = file.readline(_LONGEST_HEADER)

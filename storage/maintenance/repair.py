@@ -71,7 +71,7 @@ def repair(
 
     ``findings`` are those of `verify_archive`. ``rerun`` runs a survey by its settings, as the receipt has them, into
     this archive, and finds there what is whole. ``versions`` are the stages' as they are made now: stores of others are
-    not made again, and stay. Raises ArchiveError: somebody else uses the archive, or the disk or bucket refuses.
+    not made again, and stay. Raises ArchiveError: another process uses the archive, or the disk or bucket refuses.
     """
     with archive.in_use(alone=True) as alone:
         if not alone:

@@ -1,7 +1,7 @@
 """Reading a whole archive again: every byte against its manifest, every manifest against its seal and its runs.
 
-What is no file where one should be, such as a link or a pipe, is told and never opened. Of a broken file of an array it
-is told which part it holds.
+A link or a pipe in the place of a file is reported and never opened. Of a broken file of an array it
+says which part it holds.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Finding:
     """Finding of ``verify`` on one store or run; ``problem`` is None where every byte is as published.
 
     ``missing``: something names or rests on a store that is not there. ``stray``: what is no part of the archive.
-    ``growing``: something of a spool that cannot be believed; the rest of it is used.
+    ``growing``: something of a spool that is damaged; the rest of it is used.
     """
 
     uri: str
@@ -140,7 +140,7 @@ def _spool_problems(folder: Path) -> Iterator[str]:
                 where = f"{name.removesuffix(SUMS)} is not as it was fetched from byte {at} on"
                 yield f"{where}; it is asked for again when the capture goes on"
         except (FileNotFoundError, NotPlainError):
-            continue  # its lines are published; or it is a link and the like, which is told of every such thing
+            continue  # its lines are published; or it is a link and the like, which is reported for all of them
         except OSError as error:
             yield f"{name} cannot be read: {error.strerror}"
 
@@ -171,7 +171,7 @@ def _identity_problems(catalogue: Catalogue, uri: str) -> Iterator[str]:
     """Yield whether a store is the one that its place and the runs say."""
     store = catalogue.stores.get(uri)
     if store is None or store.problem is not None or kind_of(store.ref.path / MANIFEST_NAME) != "a file":
-        return  # which is told of already
+        return  # which is reported already
     stated = f"stages/{store.facts.get('stage')}/{store.facts.get('key')}"
     if stated != uri:
         yield f"its {MANIFEST_NAME} is that of {stated}; move it back, or take it out of the archive"

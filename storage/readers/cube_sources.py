@@ -73,7 +73,7 @@ def reading(path: Path, kind: str, cure: str = "copy it again") -> Iterator[None
     except KeyError as error:
         raise SceneError(f"{path} lacks what files of its kind have: {error}; copy it again") from error
     except Exception as error:
-        why = error.__cause__ or error  # rasterio's own says no more than that it failed
+        why = error.__cause__ or error  # rasterio's own says only that it failed
         raise SceneError(
             f"{path} cannot be read as {kind}: {type(why).__name__}: {why}; is it damaged? {cure}"
         ) from error

@@ -50,7 +50,7 @@ class MatchedFiles:
 
 
 def scene_entries(folder: Path) -> list[Path]:
-    """Files and Zarr stores that may be scenes or labels, by name; hidden ones are nobody's."""
+    """Files and Zarr stores that may be scenes or labels, by name; hidden ones are left out."""
     return sorted(
         entry
         for entry in folder.iterdir()
@@ -112,7 +112,7 @@ def is_label_name(path: Path) -> bool:
 
 
 def folders_within(folder: Path) -> str:
-    """Words for the folders of a folder in which images lie, for whoever looks for some; nothing where none does."""
+    """Return words for the folders of a folder in which images lie; empty where none does."""
     inner = [entry for entry in sorted(folder.iterdir()) if entry.is_dir() and not is_store(entry)]
     found = [entry for entry in inner if not entry.name.startswith(".") and scene_entries(image_folder(entry))]
     return f"; there are some in its folders {listed_names(found)}: name one" if found else ""

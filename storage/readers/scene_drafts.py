@@ -161,7 +161,7 @@ def _pattern(found: MatchedFiles, folder: Path) -> str | None:
 def _classes(
     found: MatchedFiles, shape: tuple[int, int, int], unseen: list[str], report: Report
 ) -> tuple[FoundClass, ...]:
-    """All values of the label files, as classes; what cannot be read or has another size than its image is told."""
+    """All values of the label files, as classes; notes name what cannot be read or has another size than its image."""
     counts: Counter[int] = Counter()
     greys: Counter[int] = Counter()  # of files without colours, while others have some
     for number, (image, label) in enumerate(found.labels.items()):

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 ReadRows = Callable[[int, int], NDArray[np.float32]]
 USUAL_NODATA = -9999.0  # what programs write for no data, and no sensor reads
-_SAMPLED = 1 << 20  # values, evenly spread, by which the range of a scene is told
+_SAMPLED = 1 << 20  # values, evenly spread, from which the range of a scene is estimated
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +52,7 @@ class SceneFile:
     class_values: tuple[ClassValue, ...] = ()  # what each class is in the label file: a number or a colour
     class_colours: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))  # (class, 3)
     geobox: GeoBox | None = None  # where the pixels lie on the earth
-    labels_found: bool = False  # by the file's name: nobody stated them
+    labels_found: bool = False  # by the file's name: no setting names them
     regridded: bool = False  # labels came on another grid and were brought to the scene's
     kept: NDArray[np.float32] | None = field(default=None, repr=False)  # all values, where they were kept
 
@@ -275,7 +275,7 @@ def load_field_labels(address: str | Path, shape: tuple[int, int]) -> tuple[Labe
 
 
 def _one_class_note(found: Labels) -> tuple[str, ...]:
-    """Question labels that are all alike: the one value may stand for what nobody has labelled."""
+    """Question labels that are all alike: the one value may mean unlabelled."""
     there = np.unique(found.index[found.index != UNLABELLED])
     if len(there) != 1:
         return ()

@@ -3,10 +3,10 @@
 A store's or run's manifest has the same address in the bucket; its files lie below ``<address>/<attempt>/``, the
 attempt being the beginning of the SHA-256 of the manifest that lists them: two writers never mix theirs. A store is
 published in the working copy first, then uploaded; a conditional put of its manifest, last, publishes it for everybody:
-whoever comes first wins, for ever, and others take what stands. Files are fetched when somebody asks where they lie.
+the first one wins, for ever, and others take what stands. Files are fetched when their path is asked for.
 
 What was made is kept in the working copy where the bucket stops answering, and the same command uploads it. All of the
-working copy that is in the bucket may be deleted at any time while nobody works on it.
+working copy that is in the bucket may be deleted at any time while no process works on it.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ class ObjectArchive(Archive):
         """Take one store away for good, here and in the bucket; see `Archive.discard`.
 
         Its manifest goes first. With ``unnamed`` it comes back where a run that names it has been published since this
-        archive was opened; whoever publishes a run looks for its stores after that.
+        archive was opened; publishing a run looks for its stores after that.
         """
         manifest = f"{ref.uri}/{MANIFEST_NAME}"
         standing = self.objects.read(manifest)
@@ -217,7 +217,7 @@ class ObjectArchive(Archive):
         self._later_runs |= {self.root / uri for uri in changed}
 
     def _bring(self, uri: str) -> None:
-        with suppress(IncompleteStoreError):  # whoever reads it says so
+        with suppress(IncompleteStoreError):  # its reader says so
             if _is_address(uri) and self._find(uri) and uri.startswith("runs/"):
                 self._fetch_files(uri, [RECEIPT])
 
@@ -412,7 +412,7 @@ class ObjectArchive(Archive):
             objects.write(f"{uri}/{MANIFEST_NAME}", text)
             objects.remove([path for path in there if ATTEMPT.fullmatch(path) and not path.startswith(f"{place}/")])
         elif not objects.create(f"{uri}/{MANIFEST_NAME}", text):
-            self._find(uri)  # whoever came first; or it was this upload, of which the answer was lost
+            self._find(uri)  # another was first; or it was this upload, of which the answer was lost
             return
         self._standing[uri] = text
         if uri.startswith("runs/") and (dated := objects.read_dated(f"{uri}/{MANIFEST_NAME}")) is not None:
@@ -531,7 +531,7 @@ def open_object_archive(text: str | Path, *, create: bool = True, write: bool = 
 def _find_mark(objects: Objects, *, create: bool) -> None:
     """See that a prefix has the mark that makes it an archive; where ``create``, write it if need be.
 
-    A store that lets anybody overwrite it is refused.
+    A store that anyone may overwrite is refused.
     """
     name = objects.place.url
     if create and objects.create(MARK, MARK_TEXT):
@@ -550,7 +550,7 @@ def _find_mark(objects: Objects, *, create: bool) -> None:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RemoteRef(StageRef):
-    """A store that may not be on this machine yet: whoever asks for its path has it fetched, and waits."""
+    """A store that may not be on this machine yet: asking for its path fetches it, and waits."""
 
     fetch: Callable[[str], None]
 

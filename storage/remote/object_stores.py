@@ -234,7 +234,7 @@ class Objects:
         return True
 
     def write(self, name: str, source: Path | bytes) -> None:
-        """Write an object from a file, whatever was there; nobody sees a part of it."""
+        """Write an object from a file, whatever was there; readers never see a part of it."""
         with answers_of(self.place):
             self.store.put(name, source, chunk_size=PART_BYTES, max_concurrency=2)
         self._count(len(source) if isinstance(source, bytes) else source.stat().st_size)

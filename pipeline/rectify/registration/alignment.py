@@ -31,7 +31,7 @@ else:
 
 Floats = NDArray[np.float64]
 
-ERROR_FLOOR_PX = 0.05  # no window is believed better: lines jitter
+ERROR_FLOOR_PX = 0.05  # no window counts as better: lines jitter
 OUTLIER_ERRORS = 2.0  # beyond it a window pulls no harder
 WRONG_ERRORS = 10.0  # beyond it a window is left out
 DRIFT_PRIOR_PX = 10.0  # over half a sweep; decides where one window alone would have to tell drift from offset
@@ -40,7 +40,7 @@ WINDOWS = 3  # along either side of a field
 LEAST_WINDOW_PX = 24  # on a side; a smaller field is compared as one
 WINDOW_REACH_PX = 8.0  # what the shift of one window may differ by from that of the field
 AGREE_PX, LOOSELY_PX = 0.5, 1.5  # within which windows say the same, and do so loosely
-LOOSE_SHIFT_PX, LOOSE_EDGE_PX = 2.0, 3.0  # that what they say loosely is believed from: growth looks like less
+LOOSE_SHIFT_PX, LOOSE_EDGE_PX = 2.0, 3.0  # from which on their loose estimates count: growth looks like less
 TRIED_DEG = (-8.0, 8.0, -16.0, 16.0)  # by which a field may be turned of which windows say nothing as it lies
 LEAST_WINDOWS, LEAST_FRACTION = 4, 0.6  # that have to agree, and of those that say something
 TRIALS = 200
@@ -187,7 +187,7 @@ class FieldShift:
 def field_shift(now: NDArray[np.floating], before: NDArray[np.floating], *, reach_px: float) -> FieldShift:
     """Find how ``before`` lies beside ``now``, two (y, x) broad-band images of one field with NaN where nothing is.
 
-    No more than ``reach_px`` is looked for. Nothing is said where no two looks agree on it: fields that changed all
+    Offsets up to ``reach_px`` are looked for. Nothing is said where no two looks agree on it: fields that changed all
     over, or that show nothing.
     """
     whole = pair_shift(now, before, prior_px=reach_px)

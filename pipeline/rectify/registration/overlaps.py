@@ -44,7 +44,7 @@ class BroadSweep:
     ) -> BroadSweep:
         """Read and calibrate a sweep's lines, 64 at a time, keeping the mean of ``bands`` bands spread over all.
 
-        ``usable`` (line,) are lines whose position may be believed; None takes ``lines.valid_line``.
+        ``usable`` (line,) are lines with a trusted position; None takes ``lines.valid_line``.
         """
         position = np.asarray(lines.position, np.float64)
         usable = (lines.valid_line if usable is None else usable) & np.isfinite(position).all(axis=1)

@@ -54,7 +54,7 @@ class CubeHeader:
 
 @dataclass(frozen=True)
 class CubeLines:
-    """Lines of one file. ``lost`` are those that its header promises and it does not hold whole."""
+    """Lines of one file. ``lost`` are those that its header states and it does not hold whole."""
 
     values: NDArray[np.uint16]  # (line, sample, band), a view of the bytes
     lost: int
@@ -110,7 +110,7 @@ def cube_lines(header: CubeHeader, data: bytes) -> CubeLines:
 def read_capture(names: Iterable[str], read: Read) -> CapturedLines:
     """Put a capture's files together, by their names in the folder, which may stand before them.
 
-    RigError where there is no line, a header is missing, wrong or promises less, or the files do not belong together.
+    RigError where there is no line, a header is missing, wrong or states less, or the files do not belong together.
     """
     by_name = {name.rsplit("/", 1)[-1]: name for name in names}
     raw = sorted((int(match[1]), name) for name in by_name if (match := _PART.fullmatch(name)))

@@ -1,7 +1,7 @@
 """Texts that cameras write beside their numbers: ENVI headers taken apart into fields, and frame indices.
 
 A header is ``key = value`` lines after the word ENVI; values in braces may run over lines and be nested. Headwall adds
-lines that begin with ``;``, some of which hold settings of their own. What a header must say is for whoever reads it:
+lines that begin with ``;``, some of which hold settings of their own. Each reader checks what its header must say:
 files from anywhere (``storage.readers.envi_files``), or a camera's own (``camera_cubes``).
 
 ``frameIndex_<n>.txt`` lies beside ``raw_<n>``: a heading, then a line a frame with its number and its time in

@@ -51,7 +51,7 @@ def mend_times(frames: FrameTimes) -> tuple[Ints, Ints, list[str]]:
 
     Frames come at a steady rate or later, never sooner: a stamp off its neighbours' by half a period strayed, and
     where all after one are early the clock was set back. Both follow their neighbours then; so do lines without a
-    stamp. A later stamp is believed, since a frame may have been dropped.
+    stamp. A later stamp counts, since a frame may have been dropped.
     """
     number, notes = whole_numbers(frames.number)
     if (number < 0).all():
@@ -167,7 +167,7 @@ def lines_by_time(
     """Take the track's position at mid exposure of each line, counted from the commands' times.
 
     ``began_s`` is when the log or the path began, ``capture_s`` when the capture did, by one clock. What passes between
-    a command and the first frame is not known, so a constant offset of the lines stays, for whoever registers sweeps
+    a command and the first frame is not known, so a constant offset of the lines stays, for registration
     that go both ways. A stamp that goes back or is missing is made up from its neighbours.
     """
     stamp, number, notes = mend_times(frames)
@@ -366,7 +366,7 @@ def place_lines(
     UntiedError where nothing, or what contradicts itself, ties frames to the mirror.
     """
     held = int(np.flatnonzero(captured.valid)[-1]) + 1
-    number = captured.times.frame[:held]  # from the capture's start; rows in order if none is told or can be missing
+    number = captured.times.frame[:held]  # from the capture's start; rows in order if none is given or can be missing
     if (number >= 0).any():
         number = np.where(number >= 0, number - captured.first_frame, -1)
     elif len(captured.values) == path.lines:

@@ -146,7 +146,7 @@ class CameraUnit:
 
 
 class CameraDevice:
-    """One camera. Frames are looked at when somebody asks, so ``positions`` must answer for times gone by.
+    """One camera. Frames are made when they are asked for, so ``positions`` must answer for times gone by.
 
     ``lines`` gives lines (line, sample, band) uint16 of mirror positions (line, 2) and times (line,) by ``clock``;
     ``positions`` gives mirror positions of times, at rest where none is given.
@@ -312,7 +312,7 @@ class CameraConnection:
         self._held = b""
 
     def feed(self, data: bytes) -> tuple[list[Chunk], bool]:
-        """Take bytes; give replies, and whether the connection goes on."""
+        """Take bytes; give replies, and whether the connection stays open."""
         self._held += data
         chunks: list[Chunk] = []
         while (end := self._held.find(b"\r")) >= 0:

@@ -65,7 +65,7 @@ from pipeline.simulator.simulated import SimulatedSource, render_lines
 from pipeline.source import AT_REST
 
 REFERENCE_FRAMES = 32
-_AT_ONCE = 8  # frames looked at while nobody else may speak to the camera
+_AT_ONCE = 8  # frames looked at while the camera takes no other request
 
 
 @dataclass(frozen=True)
@@ -414,7 +414,7 @@ class EmulatedRig:
     kept
         So many finished captures keep their files; 0 is all.
     mounting
-        How the mirror is mounted, whatever drivers believe.
+        How the mirror is mounted, whatever drivers assume.
 
     A subclass may have devices and servers of other kinds, such as ones that fail.
     """
@@ -477,7 +477,7 @@ class ServedRig(Closing):
         self._thread.start()
 
     def close(self) -> None:
-        """Let go of the pty and the sockets; whoever is connected sees the devices go."""
+        """Let go of the pty and the sockets; clients see the devices go."""
         self._ended.set()
         self._thread.join()
         self._server.close()

@@ -332,7 +332,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Act:
-    """A request that was carried out, for whoever checks what happened, and when. [s]"""
+    """A request that was carried out, and when, for tests. [s]"""
 
     time_s: float
     request: Request

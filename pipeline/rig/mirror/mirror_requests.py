@@ -326,7 +326,7 @@ class Modes:
     def _greet(self) -> None:
         try:
             self._lines.do(START, "greeting")
-        except DeviceRefused as error:  # the greeting ended a line that somebody had begun
+        except DeviceRefused as error:  # the greeting ended a line that was begun before
             LOG.info("%s; greeting it once more", error)
             self._lines.do(START, "greeting")
 

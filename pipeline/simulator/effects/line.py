@@ -84,7 +84,7 @@ class SlitBox(Effect):
     """The footprint of slit and pixel, a box in closed form. Off, a sample sees what its middle ray meets.
 
     Variants tell into how many boxes that do not lie turned, across and along, it is parted; from two across on they
-    have its covariance. Those of a stated error take, for each sweep, as few as misplace no more of the light than
+    have its covariance. Those of a stated error take, for each sweep, as few as misplace at most as much light as
     that.
     """
 

@@ -426,7 +426,7 @@ def blurred_weight(width: float, variance: Floats, held: int = 1) -> tuple[Float
 class TapTable(NamedTuple):
     """Weights (row, tap) of the taps around a position, row after row, for every kernel and in it for every scale.
 
-    A position is told by its distance ``place`` from the first tap, which lies ``left`` px before the centre's pixel.
+    A position is given by its distance ``place`` from the first tap, which lies ``left`` px before the centre's pixel.
     """
 
     weight: Weights

@@ -1,7 +1,7 @@
 """Extrema of a scene: where it is steepest, most curved, brightest and darkest, in and beside the sweeps.
 
 Works on the scene's own pixels, strip by strip, with the slit's box along the scan; it is fast and right to a pixel,
-and leaves the exact numbers to whoever looks closer. Of components a few bands stand for all; where bands have planes
+and leaves the exact numbers to closer looks. Of components a few bands stand for all; where bands have planes
 of their own, each is looked at, tile by tile: see `BandTiles`.
 """
 

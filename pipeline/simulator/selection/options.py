@@ -47,7 +47,7 @@ LIGHT_EFFECTS = frozenset({"slit", "smear", "rotation"})  # that the renderer it
 Floats = NDArray[np.float64]
 # Half of the integrals of |s dG/ds| and |s^2 d^2G/ds^2| for either axis, and, for both, of 2 |s^2 d^2G/ds dx|.
 _PER_LOG, _PER_LOG_TWICE, _PER_LOG_AND_PX = 0.5, 1.1, 2.3
-FINEST_PER_PX = 8.0  # derivatives along the image grow by no more per order: they are differences a quarter px apart
+FINEST_PER_PX = 8.0  # derivatives along the image grow by at most this per order: differences a quarter px apart
 
 
 @dataclass(frozen=True)

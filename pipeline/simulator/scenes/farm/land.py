@@ -381,7 +381,7 @@ def lodged_fraction(day: float) -> float:
 
 
 def days_since_turned(use: str, day: float, late: float) -> float:
-    """Days since weeds were last killed on a field by tillage, sowing included; a whole year where nobody tills."""
+    """Days since weeds were last killed on a field by tillage, sowing included; a whole year without tillage."""
     if use in CROPS:
         crop = CROPS[use]
         return min(since(day, crop.tillage + late), since(day, crop.emergence + late - 9))
