@@ -258,7 +258,7 @@ _FIGURES: Sequence[tuple[str, str, str, Callable[[Any], Any]]] = (
     ("recording", "full_scan_s", "{} for a scan of every line", format_seconds),
     ("extent", "lines", "lines {}", str),
     ("extent", "fraction", "{} of the field", format_percent),
-    ("extent", "remembers", "the rest is as before", bool),
+    ("extent", "remembers", "the rest is unchanged", bool),
     ("extent", "expected_wrong", "about {} of the prior map was expected to be wrong there", format_percent),
     ("extent", "due_left", "{} places that were due had to wait", format_count),
     ("kept", "patches", "{} patches", format_count),

@@ -119,7 +119,7 @@ class ZoneChoice:
         None, "Zones that are left out: no detail is asked for there, and no map drawn", example="no_go.geojson"
     )
     plots: str | None = stated(
-        None, "Plots with names: area, classes and confidence of each are told", example="plots.gpkg:plots"
+        None, "Plots with names: the receipt has area, classes and confidence of each", example="plots.gpkg:plots"
     )
     plots_name: str | None = stated(
         None, "Attribute that names the plots; name, plot, plot_id, id or label by default", example="name"

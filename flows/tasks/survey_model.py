@@ -73,7 +73,7 @@ class SurveyModel:
         """Return the out-of-distribution detector if unknown pixels are asked for (WeightsError: it is missing)."""
         if unknown not in (UNKNOWN_AUTO, UNKNOWN_OFF) and self.described.ood_detector is None:
             raise WeightsError(
-                f"--unknown {unknown}: nobody measured what is familiar to {self.path.name}; do so with: "
+                f"--unknown {unknown}: {self.path.name} has no record of familiar spectra; add one with: "
                 f"spectralzoom train DATASET --fit-ood {self.path} -o {self.path}, or leave --unknown out"
             )
         return None if unknown == UNKNOWN_OFF else self.described.ood_detector

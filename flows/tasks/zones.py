@@ -119,7 +119,7 @@ def _read(source: str, place: FieldPlace, notes: list[str], named_by: str | None
     notes += found.notes
     if place.crs is None and found.crs is not None:
         raise ZoneError(
-            f"{source} is in {found.crs.name}, and nobody said where this field lies: give the rig's [pose], a "
+            f"{source} is in {found.crs.name}, and this field has no place: give the rig's [pose], a "
             "georeferenced scene, or polygons in pixels of the scene as GeoJSON without a CRS"
         )
     if place.crs is None:

@@ -181,7 +181,7 @@ def _observed(weights: Weights, data: TrainingData, request: OodRequest, report:
         if not names:
             raise SettingsError(
                 f"--fit-ood {request.weights}: no scene was kept for validation when these weights were trained, so"
-                " that nobody can say how often a known pixel would be unknown; train them with --validation 1 or more"
+                " that their false-alarm rate is unknown; train them with --validation 1 or more"
             )
         found, about = observe_all(how, data, names, what, report, about)
         examples.append(as_read(found, weights.normalisation))

@@ -1,6 +1,6 @@
 """Keys of stages, a hash of what went in, so that the same work has the same address; and addresses in an archive.
 
-Stores and runs are told apart from what merely lies there, and the folder of an archive from what cannot be one.
+Tell stores and runs from other files, and the folder of an archive from other folders.
 """
 
 from __future__ import annotations

@@ -139,13 +139,13 @@ class Run:
 def read_store(ref: StageRef) -> Store:
     """One store by its manifest, damaged or not."""
     facts, problem = try_manifest(ref.path)
-    return Store(ref, facts, problem and f"{MANIFEST_NAME} cannot be believed: {problem}")
+    return Store(ref, facts, problem and f"{MANIFEST_NAME} is damaged: {problem}")
 
 
 def read_run(folder: Path, by_key: Mapping[str, list[str]]) -> Run:
     """One run by its manifest and receipt, damaged or not; ``by_key`` says which stores there are."""
     facts, broken = try_manifest(folder)
-    problem = broken and f"{MANIFEST_NAME} cannot be believed: {broken}"
+    problem = broken and f"{MANIFEST_NAME} is damaged: {broken}"
     receipt: dict[str, Any] = {}
     if broken is None:
         receipt, problem = _receipt(folder, facts)

@@ -29,7 +29,7 @@ from storage.archive.staging import (
 )
 
 DAY_S = 86400.0
-IN_USE = "somebody is using the archive: run gc again when it is free"
+IN_USE = "the archive is in use: run gc again when it is free"
 What = Literal["store", "files", "spool", "unfinished", "upload"]  # files: raw lines of a run, by its setting `keep`
 
 
@@ -176,7 +176,7 @@ def _unfinished(root: Path) -> list[Removal]:
             if free := release is not None:
                 release()
         if free:
-            found.append(Removal(uri, "unfinished", bytes_below(path), "whoever made it is gone"))
+            found.append(Removal(uri, "unfinished", bytes_below(path), "its process has ended"))
     return found
 
 

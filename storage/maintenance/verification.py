@@ -161,7 +161,7 @@ def _problems(folder: Path) -> Iterator[str]:
     """Yield what is wrong with one published folder, file by file."""
     manifest, problem = try_manifest(folder)
     if problem is not None:
-        yield f"{MANIFEST_NAME} cannot be believed: {problem}"
+        yield f"{MANIFEST_NAME} is damaged: {problem}"
         return
     for name, problem in broken_files(folder, manifest, hashes=True):
         yield f"{name} {problem}{name_damage(folder, name) if name in manifest['files'] else ''}"

@@ -325,7 +325,7 @@ class Cluster(Executor):
 
     def __init__(self, scheduler: str) -> None:
         self.name = f"--scheduler {scheduler}"
-        for name in ("distributed", "distributed.client"):  # lost connections are told once, by an error
+        for name in ("distributed", "distributed.client"):  # lost connections are reported once, by an error
             logging.getLogger(name).setLevel(logging.CRITICAL)
         try:
             self.client: Any = dask_distributed.Client(scheduler, timeout=ANSWER_S, set_as_default=False)  # type: ignore[no-untyped-call]
@@ -342,7 +342,7 @@ class Cluster(Executor):
         return sent
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Let the workers go, which go on living."""
+        """Let go of the workers, which keep running."""
         self.client.close()
 
     def count(self) -> int:

@@ -143,7 +143,7 @@ def _other_place(
             " orthorectified by its geolocation grids (glt_x, glt_y) first",
         )
     if {"lat", "latitude"} & names:
-        return None, ("its place is told by a latitude and longitude of each pixel, which are not read",)
+        return None, ("its place is given by a latitude and longitude of each pixel, which are not read",)
     return None, ()
 
 

@@ -219,7 +219,7 @@ def _match_by_settings(folder: Path, settings: SceneSettings) -> MatchedFiles:
     told: dict[Path, Path] = {}
     for entry in entries:
         if "{number}" in str(settings.labels) and scene_number(entry) is None:
-            continue  # whoever reads the scene is told
+            continue  # reading the scene reports it
         address = label_file(entry, settings)[0]
         if address is not None:
             told[entry] = address

@@ -20,7 +20,7 @@ from storage.readers.array_cubes import FileArray
 MOST_UNEVEN = 16  # times that a picture is longer than wide
 SIZES = (("nrow", "ncol"), ("nrows", "ncols"), ("rows", "cols"), ("height", "width"), ("lines", "samples"), ("h", "w"))
 CLEARLY = 0.8  # times as rough: an order of pixels that gives a picture so much smoother is the right one
-SMOOTHED_BANDS = 8  # by which the order of pixels is told
+SMOOTHED_BANDS = 8  # from which the order of pixels is found
 ORDERS: Mapping[Literal["C", "F"], str] = {
     "F": "down its columns as MATLAB counts pixels",
     "C": "along its rows as numpy counts pixels",

@@ -331,7 +331,7 @@ class FileValues:
         if void is None:
             return tuple(how), ()
         if self.void is None:
-            return tuple(how), ("every pixel is transparent or masked, which is not believed",)
+            return tuple(how), ("every pixel is transparent or masked: the mask is left out",)
         return tuple(how), (f"{int(void.sum())} transparent or masked pixels have no value, and no class in a map",)
 
     def converted(self, first: int, stop: int) -> tuple[NDArray[Any], NDArray[np.float32], NDArray[np.bool_] | None]:

@@ -482,7 +482,7 @@ def _problems(objects: Objects, there: Mapping[str, Listed], folder: Path, place
     """Yield what is wrong with one published folder, whose files lie at ``place``, object by object."""
     manifest, problem = try_manifest(folder)
     if problem is not None:
-        yield f"{MANIFEST_NAME} cannot be believed: {problem}"
+        yield f"{MANIFEST_NAME} is damaged: {problem}"
         return
     broken: dict[str, str] = {}
     for name, entry in manifest["files"].items():

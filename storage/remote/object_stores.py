@@ -123,7 +123,7 @@ def _endpoint() -> str | None:
     allowed = os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true", "yes")
     if parts.scheme == "http" and parts.hostname not in LOOPBACK and not allowed:
         raise SettingsError(
-            f"AWS_ENDPOINT_URL={text}: over plain http anybody on the way can read and change the data; use https, or "
+            f"AWS_ENDPOINT_URL={text}: over plain http others on the way can read and change the data; use https, or "
             "set AWS_ALLOW_HTTP=true"
         )
     return text

@@ -1,8 +1,8 @@
 """From shifts of windows to corrections: of sweeps, by least squares over all of their overlaps, and of a whole field.
 
 How a whole field lies beside an earlier look at it, moved and turned, windows of two coarse images say. Crops grow
-between two looks, shadows go round and leaves fall: a window may say what is not so. What most windows say together is
-believed.
+between two looks, shadows go round and leaves fall: a window may say what is not so. What most windows say together
+counts.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 The journal says what the rig has acknowledged of a stage's captures, one JSON object a line beside the files fetched
 from the camera. A process that is killed leaves it behind; the next one reads which folder on the camera holds which
 lines, so that nothing the rig acknowledged is captured twice. Each line has a checksum. A torn line counts as not
-written, and so does one that has changed since; but then a capture of which no end is told is not gone on with: what
-the mirror stands at now need not be what it stood at after that.
+written, and so does one that has changed since; but then a capture whose end is missing is not continued: the mirror
+may stand elsewhere now.
 """
 
 from __future__ import annotations
@@ -254,7 +254,7 @@ class CaptureRunner:
                         f"the camera still captures {taken.folder}, {WRITING_S:g} s after it was told to stop; see "
                         "what it does, then run again: what it has is fetched then"
                     )
-                LOG.warning("the capture %s goes on for too long and is stopped", taken.folder)
+                LOG.warning("the capture %s takes too long and is stopped", taken.folder)
                 camera.stop()
                 until, stopped = clock.now() + WRITING_S, True
             clock.sleep(min(max(began + wanted - clock.now(), POLL_S), 1.0))

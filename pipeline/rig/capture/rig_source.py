@@ -62,7 +62,7 @@ class RigSource:
     open_devices
         Connects both; they are closed when a session, or a call outside of one, ends.
     kept
-        Where the camera's files and the journal go. With that of an earlier process its captures are gone on with.
+        Where the camera's files and the journal go. With that of an earlier process its captures are continued.
     vector_pairs
         Positions that the mirror's memory holds.
     say

@@ -140,10 +140,7 @@ def test_explain_bears_damage_and_circles(tmp_path: Path, capsys: pytest.Capture
         with archive.publish("segment", key, inputs=[given]):
             pass
     (top,) = _json(capsys, lambda: explain(tmp_path, small.map.uri, as_json=True))["lineage"]
-    assert [one["problem"].split(":")[0] for one in top["inputs"]] == [
-        "is not there",
-        "manifest.json cannot be believed",
-    ]
+    assert [one["problem"].split(":")[0] for one in top["inputs"]] == ["is not there", "manifest.json is damaged"]
     (top,) = _json(capsys, lambda: explain(tmp_path, "aaaa", as_json=True))["lineage"]
     assert top["inputs"][0]["inputs"][0]["see"] == "in a circle"
     for product in (small.map.uri, small.raw.uri, "aaaa"):
