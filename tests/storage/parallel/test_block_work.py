@@ -247,7 +247,7 @@ if __name__ == "__main__":
     with WorkerPool(sys.argv[1]).open() as pool:
         started = begin(pool)
         try:
-            run_blocks(nap, range(9), pool, each=lambda number, result: started[0].kill())
+            run_blocks(nap, range(9), pool, report=lambda done: started[0].kill())
         except WorkerError as error:
             print(error)
         end(started)
