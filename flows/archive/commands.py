@@ -25,12 +25,11 @@ from flows.terminal.processes import DONE, FAILED, PARTLY
 from flows.terminal.progress import StageProgress, put_out, table
 from pipeline.lazy import deferred
 from storage.archive.archive import Archive
-from storage.archive.kept_bytes import all_sizes, kept_by_runs, kept_bytes, own_by_runs
 from storage.archive.keys import in_text
 from storage.archive.lineage import Catalogue, changes_between, find_product, version_before
 from storage.archive.records import Run
 from storage.maintenance.garbage import clear_up
-from storage.maintenance.repair import Rerun, plan_repair, repair
+from storage.maintenance.repair import plan_repair, repair
 from storage.maintenance.verification import Finding
 from storage.remote.opening import open_archive, verify_archive
 
@@ -125,10 +124,8 @@ def gc(
     return DONE if raw.obstacle is None and not raw.kept else PARTLY
 
 
-def run_verify(
-    archive: str | Path, console: Console, *, remake: bool = False, rerun: Rerun | None = None, as_json: bool = False
-) -> int:
-    """Read an archive again; with ``remake`` have what is broken made anew by ``rerun`` (settings in, a run out)."""
+def run_verify(archive: str | Path, console: Console, *, remake: bool = False, as_json: bool = False) -> int:
+    """Read an archive again; with ``remake`` survey again what is broken."""
     opened = open_archive(archive, create=False, write=remake)
     with StageProgress(console, {"verify": "reading again"}) as bars:
         findings = verify_archive(opened, lambda uri, fraction: bars.show("verify", fraction, uri))
@@ -145,7 +142,7 @@ def run_verify(
         here = {**of_this_version(settings), "out": opened.name, **dict.fromkeys(OF_THE_MACHINE)}
         survey_command.run_survey(parse_settings(here), console)
 
-    done = repair(opened, bad, rerun or survey_again, versions=versions())
+    done = repair(opened, bad, survey_again, versions=versions())
     content["repair"] = {
         "remade": done.remade,
         "dropped": done.dropped,
@@ -161,8 +158,8 @@ def run_verify(
 def contents(archive: Archive, now: datetime | None = None) -> dict[str, Any]:
     """Runs, newest last, and stores by stage, oldest first, of an archive."""
     catalogue, moment = Catalogue.read(archive.root), now or datetime.now(UTC)
-    sizes = all_sizes(archive, catalogue)
-    kept, own = kept_by_runs(catalogue, sizes), own_by_runs(catalogue, sizes)
+    sizes = archive.all_sizes(catalogue)
+    kept, own = catalogue.kept_by_runs(sizes), catalogue.own_by_runs(sizes)
     stages: dict[str, list[dict[str, Any]]] = {}
     for store in sorted(catalogue.stores.values(), key=lambda store: (store.ref.stage, store.created, store.ref.key)):
         row = {
@@ -232,7 +229,7 @@ def explanation(archive: Archive, product: str) -> dict[str, Any]:
         below = set[str]().union(*(catalogue.ancestors([uri]) for uri in found.names))
         shown: set[str] = set()
         trees = [_tree(catalogue, uri, shown, ()) for uri in sorted(found.names - below)]
-        kept = kept_bytes(archive, found, catalogue)
+        kept = archive.kept_bytes(found, catalogue)
         row = {
             **_run_row(catalogue, found, kept),
             "problem": found.problem,
@@ -278,7 +275,7 @@ def _tree(catalogue: Catalogue, uri: str, shown: set[str], path: tuple[str, ...]
 
 
 def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
-    """What verification found, and for what is broken what a repair would do."""
+    """Return what verification found, and for what is broken what a repair would do."""
     bad = [finding for finding in findings if finding.problem is not None]
     places = {finding.uri for finding in findings if finding.kind in ("whole", "broken")}
     broken = {finding.uri for finding in bad if finding.kind == "broken"}

@@ -40,7 +40,6 @@ from pipeline.errors import ArchiveError, SettingsError, visible
 from pipeline.lazy import deferred
 from pipeline.simulator.scenes.farm.farm_scene import USUAL_HOUR
 from storage.archive.archive import Archive
-from storage.archive.kept_bytes import all_sizes, kept_by_runs
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run
 from storage.archive.whole_files import write_whole
@@ -62,7 +61,7 @@ else:
 MOST_ROWS = 1000  # of the table; older ones are counted
 MOST_VISITS = 24  # that a page shows: the newest
 MOST_PX = 400  # of a visit's picture
-MOST_CLASSES = 128  # that are told apart, the last of them standing for none
+MOST_CLASSES = 128  # that have numbers of their own, the last of them standing for none
 CHANGED_FRACTION = 0.25  # of a patch's pixels, from which it is said to have changed
 PALE = 0.8  # of what did not change
 SAVINGS = {"capture_s": "time at the camera", "lines": "lines", "bytes_kept": "bytes kept", "multiply_adds": "model"}
@@ -121,7 +120,7 @@ def read_history(archive: Archive, field: str | None = None) -> FieldHistory:
         raise ArchiveError(f"{which}; give --field with one of: {', '.join(names) or 'none'}")
     own = sorted((run for run in catalogue.runs if called(run) == name), key=lambda run: str(time_of_visit(run) or ""))
     maps = {run.uri: shown for run in own if (shown := _map_of(archive, catalogue, run)) is not None}
-    kept = kept_by_runs(catalogue, all_sizes(archive, catalogue))
+    kept = catalogue.kept_by_runs(archive.all_sizes(catalogue))
     rows = [_row(run, maps.get(run.uri), kept[run.uri]) for run in own]
     mapped = [(run, row) for run, row in zip(own, rows, strict=True) if run.uri in maps][-MOST_VISITS:]
     visits = [_visit(archive, run, row, maps[run.uri]) for run, row in mapped]
@@ -200,7 +199,7 @@ def time_of_visit(run: Run) -> datetime | None:
 def _visit(archive: Archive, run: Run, row: Row, shown: ClassMap) -> dict[str, str]:
     """Return when a visit was, its map, what changed of it among pale colours (empty of a first one), and words."""
     thin = slice(None, None, -(-max(shown.classes.shape) // MOST_PX))
-    palette = pictures.palette_bytes(shown.names[: MOST_CLASSES - 1], shown.colours[: MOST_CLASSES - 1])[:MOST_CLASSES]
+    palette = pictures.palette_bytes(shown.colours[: MOST_CLASSES - 1])[:MOST_CLASSES]
     numbers, changes = np.minimum(shown.classes[thin, thin], MOST_CLASSES - 1), ""
     address = run.products.get("class_probabilities")
     with suppress(OSError, LookupError, ValueError):

@@ -1,4 +1,4 @@
-"""What `spectralzoom ingest` does and shows: one file or folder becomes one immutable store of an archive."""
+"""The verb `ingest`: one file or folder becomes one immutable store of an archive."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def _stamps(source: CubeSource) -> list[tuple[int, int]]:
 
 
 def _key(name: str | None, source: CubeSource, files: Sequence[SourceFile]) -> dict[str, Any]:
-    """What the store depends on: content, the flags, and wavelengths that come from elsewhere than the files."""
+    """Return what the store depends on: content, the flags, and wavelengths that come from elsewhere than the files."""
     named = source.root is not None  # in a Zarr store names say where a chunk lies
     centres, widths = source.bands.wavelength_nm, source.bands.fwhm_nm
     return {

@@ -1,4 +1,4 @@
-"""What `spectralzoom plan` does: a survey's stages are asked which store they want; nothing is built or written."""
+"""The verb `plan`: a survey's stages are asked which store they want; nothing is built or written."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def plan(
 
 @dataclass(frozen=True)
 class StageForecast:
-    """What would become of one stage."""
+    """Forecast of one stage."""
 
     stage: str
     state: State
@@ -88,7 +88,7 @@ class _WaitsError(IncompleteStoreError):
 
 @dataclass(frozen=True)
 class _Awaited(StageRef):
-    """Where a store would be: whoever asks for its path, or for a key that is not known, waits for ``made_by``."""
+    """Address of a store that is still to be made: asking for its path, or for an unknown key, raises ``made_by``."""
 
     made_by: str
 
@@ -101,7 +101,7 @@ class _Awaited(StageRef):
 
 @dataclass(frozen=True)
 class Forecast:
-    """What a survey would do, stage by stage in order, and why this machine would refuse to (None: it would not)."""
+    """Forecast of a survey, stage by stage in order, and why this machine would refuse it (None: it would not)."""
 
     stages: list[StageForecast]
     refused: str | None = None
@@ -114,7 +114,7 @@ class Forecast:
 
 
 def forecast(settings: Settings, preview: Path | None = None) -> Forecast:
-    """What a survey would do, stage by stage; writes nothing but the ``preview``, where one is asked for.
+    """Return what a survey would do, stage by stage; writes nothing but the ``preview``, where one is asked for.
 
     Raises PipelineError: what a survey would refuse, but size; ArchiveError: the preview cannot be written.
     """
@@ -195,7 +195,7 @@ class Planner(OpenSurvey):
         return row, _Awaited(ref.stage, key, ref.path, stage.name)
 
     def _reason(self, stage: Stage, store: Store) -> tuple[str, tuple[Change, ...]]:
-        """What differs from the newest store of the same stage of the same scene, in words and in full."""
+        """Return what differs from the newest store of the same stage of the same scene, in words and in full."""
         there = self.catalogue.stores.get(store.ref.uri)
         if there is not None and there.cleared:
             return "its files were cleared away by gc", ()
@@ -316,7 +316,7 @@ def figure_lines(figures: Mapping[str, Any]) -> list[str]:
 
 
 def format_kept(kept: Mapping[str, Any]) -> str:
-    """How much of a uniform scan the budgets pay for at most."""
+    """Return how much of a uniform scan the budgets pay for at most."""
     read = kept["multiply_adds"]["done"] / kept["multiply_adds"]["everything"]
     return (
         f"detail: at most {kept['patches']} of {kept['of_patches']} patches, for {format_percent(read)} of the "

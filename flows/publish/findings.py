@@ -1,4 +1,4 @@
-"""What a run finds: hectares of each class, what changed, what is old; its zones and plots; what its map says."""
+"""Findings of a run: hectares of each class, changes, ages; its zones and plots; the map's own figures."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from models.evaluation.expected_scores import expected_counts
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, FieldScale, areas_by_number
 from pipeline.ground.georeference import crs_name, pixel_side_m
-from pipeline.ground.zones import figures_of_plots
+from pipeline.ground.zones import figures_of_plot
 from pipeline.planning.fine_pass import FinePlan
 from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table
 from storage.arrays.class_maps import ClassMap, ProbabilityStore
 from storage.arrays.ground_maps import GroundMap
 
-OLDER_DAYS = (1, 7, 30)  # since a look, of which the hectares are told
+OLDER_DAYS = (1, 7, 30)  # since a capture, for which hectares are given
 PLOTS_FILE = "plots.csv"
 STRIP_ROWS = 256  # of class probabilities that are read at a time
 
 
 def field_figures(run: SurveyRun, fine: FinePlan | None) -> dict[str, Any]:
-    """Figures of the field and of the captures as JSON tells them; None for what nobody knows.
+    """Return figures of the field and of the captures, for JSON; None for what is unknown.
 
     ``fine`` is the fine pass where it is planned already, else it takes what the budget leaves at most. Hectares are
     those that the survey keeps to, and those an hour are of all of the camera's seconds. A raster has no camera: no
@@ -154,8 +154,10 @@ def find_zones(run: SurveyRun, drawn: ClassMap) -> dict[str, Any]:
             "kept_m2": _ground_m2(run, kept),
         }
     if zones.plots is not None:
-        rows = figures_of_plots(zones.plots, zones.place, drawn.classes, drawn.confidence, drawn.names)
-        found["plots"] = [asdict(row) for row in rows]
+        found["plots"] = [
+            asdict(figures_of_plot(name, shape, zones.place, drawn.classes, drawn.confidence, drawn.names))
+            for name, shape in zones.plots.items()
+        ]
     return found
 
 
@@ -202,7 +204,7 @@ def find_map(run: SurveyRun, ref: StageRef, drawn: ClassMap) -> dict[str, Any]:
 
 
 def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
-    """What the map is likely to score by what it says of itself; None where nobody knows how such comes true.
+    """Return the expected score by the map's own probabilities; None where these were never compared with labels.
 
     That is known of maps of uniform scans that are read whole, without a memory. Pixels without a class do not count. A
     score of which the error leaves open nearly everything is not predicted, and the words say so.

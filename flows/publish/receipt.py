@@ -56,7 +56,7 @@ class CaptureSaving(Saving):
 
 
 class Savings(_Part):
-    """What the run spent against every line, sample and patch; of a raster, of which nothing is captured, less."""
+    """Costs of the run against every line, sample and patch; of a raster, of which nothing is captured, less."""
 
     lines: Saving | None = None
     samples: Saving | None = None
@@ -82,7 +82,7 @@ class DataBytes(_Part):
 
 
 class Score(_Part):
-    """What one map scores, 0..1, over the classes of the truth; IoU is null for a class that the truth lacks.
+    """Score of one map, 0..1, over the classes of the truth; IoU is null for a class that the truth lacks.
 
     ``false_classes`` are those that the map shows and the truth lacks, with pixels.
     """
@@ -122,7 +122,7 @@ class ReceiptFields(_Part):
     settings: Facts
     stages: list[StageRecord]
     savings: Savings
-    data_bytes: DataBytes | None = None  # earlier versions did not count them
+    data_bytes: DataBytes
     accuracy_is: AccuracyIs | None = None
     judged: str | None = None  # when accuracy was added
     accuracy: Accuracy | None = None

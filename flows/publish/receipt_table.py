@@ -62,17 +62,16 @@ def cost_rows(savings: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def byte_rows(receipt: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the bytes of a run against the reference, a row each; dashes where an earlier version did not count.
+    """Return the bytes of a run against the reference, a row each.
 
     They are in MB, so that rows compare, but where the reference is smaller than a tenth of one.
     """
-    told = receipt.get("data_bytes")
-    full = None if told is None else told["reference"]
+    told, rows = receipt["data_bytes"], []
+    full = told["reference"]
     show = format_bytes if full is not None and full < LEAST_REFERENCE else format_megabytes
-    rows = []
     for name, label in BYTE_LABELS.items():
-        done = None if told is None else told[name]
-        words = "not counted" if told is not None and done is None else show(done)
+        done = told[name]
+        words = "not counted" if done is None else show(done)
         ratio = None if done is None or not full else done / full
         rows.append({"label": label, "done": words, "full": show(full), "ratio": ratio})
     return rows
@@ -80,7 +79,7 @@ def byte_rows(receipt: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def format_reused(receipt: Mapping[str, Any]) -> str:
     """Return what of the bytes kept was found in the archive and not built; empty where all was built."""
-    reused = receipt.get("data_bytes", {}).get("reused", {})
+    reused = receipt["data_bytes"]["reused"]
     if not reused:
         return ""
     size = format_megabytes(sum(reused.values()))
@@ -290,7 +289,7 @@ _FIGURES: Sequence[tuple[str, str, str, Callable[[Any], Any]]] = (
     ("recording", "full_scan_s", "{} for a scan of every line", format_seconds),
     ("extent", "lines", "lines {}", str),
     ("extent", "fraction", "{} of the field", format_percent),
-    ("extent", "remembers", "the rest is as before", bool),
+    ("extent", "remembers", "the rest is unchanged", bool),
     ("extent", "expected_wrong", "about {} of the prior map was expected to be wrong there", format_percent),
     ("extent", "due_left", "{} places that were due had to wait", format_count),
     ("kept", "patches", "{} patches", format_count),

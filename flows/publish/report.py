@@ -79,11 +79,6 @@ def render_page(template: str, carries: tuple[str, ...] = (), **facts: Any) -> s
     return visible(_environment(markdown=False).get_template(template).render(facts | own))
 
 
-def render_markup(template: str, **facts: Any) -> str:
-    """Fill in an HTML template that is a part of a page, as `render_page`."""
-    return visible(_environment(markdown=False).get_template(template).render(facts))
-
-
 def render_markdown(template: str, **facts: Any) -> str:
     """Fill in a Markdown template; in words that are no `Markup` nothing has a meaning of its own."""
     return visible(_environment(markdown=True).get_template(template).render(facts))
@@ -153,6 +148,7 @@ def render_report(
     out. ``field`` is the map to move in, above all pictures; None leaves it out, with all scripts.
     """
     shown = [Picture(quicklook, "The survey at a glance."), *pictures]
+    scene = split_variable(receipt["settings"]["scene"])[0].name
     split: Mapping[str, Any] = receipt["savings"]["multiply_adds"]
     parts = [
         name for name in ("coarse_prediction", "score", "encode", "decode") if split["done"] and split[name] is not None
@@ -164,7 +160,7 @@ def render_report(
         kicker="SpectralZoom survey",
         title=receipt["survey"],
         lead=headline(receipt, captured_again),
-        about=_format_about(receipt),
+        about=f"{scene} seen by {receipt['source']}, seed {receipt['seed']}, finished {receipt['finished']}",
         receipt=receipt,
         links=product_links(receipt),
         export=shlex.join(["spectralzoom", "export", receipt["settings"]["out"], *_run_folder(receipt).split("/")[1:]]),
@@ -194,12 +190,6 @@ def render_report(
     )
 
 
-def _format_about(receipt: Receipt) -> str:
-    """Return the scene by the name of its file, who saw it, and when."""
-    scene = split_variable(receipt["settings"]["scene"])[0].name
-    return f"{scene} seen by {receipt['source']}, seed {receipt['seed']}, finished {receipt['finished']}"
-
-
 def product_links(receipt: Receipt) -> dict[str, str]:
     """Return the products of a run by name, each as an address seen from its report.
 
@@ -221,5 +211,6 @@ def replace_bytes(page: str, receipt: Receipt) -> str:
     """Return a report with the bytes of a receipt in the place of those that it tells."""
     begin, end = BYTES_SECTION, "</section>"
     head, there, rest = page.partition(begin)
-    rows = render_markup("bytes.html", byte_rows=byte_rows(receipt), reused=format_reused(receipt))
+    template = _environment(markdown=False).get_template("bytes.html")
+    rows = visible(template.render(byte_rows=byte_rows(receipt), reused=format_reused(receipt)))
     return f"{head}{rows.rstrip()}{rest.partition(end)[2]}" if there else page

@@ -59,7 +59,7 @@ LIBRARIES = ("spectralzoom", "numpy", "numba", "torch", "zarr", "xarray", "prefe
 
 @dataclass(frozen=True)
 class Published:
-    """What a survey leaves for people: the receipt and where its folder lies."""
+    """A published run: the receipt and where its folder lies."""
 
     receipt: Receipt
     folder: Path
@@ -255,7 +255,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
 
 
 def _format_asked(run: SurveyRun) -> str:
-    """How the field was looked at, in a few words."""
+    """Return how the field was looked at, in a few words."""
     if run.raster is not None:
         return "raster, taken as it is"
     if run.plan.plain:
@@ -339,7 +339,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
 
 
 def _recording(run: SurveyRun, recorded: RecordedPasses, plan: FinePlan) -> dict[str, Any]:
-    """What was read of a recording, and what its passes would have taken of a camera beside the scan of every line."""
+    """Return what was read of a recording, and what its passes would have taken of a camera beside every line."""
     done, full, cost = [*run.plan.coarse, *plan.sweeps], run.plan.full, run.settings.cost
     whole = recorded.served(full) is not None
     return {
@@ -353,7 +353,7 @@ def _recording(run: SurveyRun, recorded: RecordedPasses, plan: FinePlan) -> dict
 
 
 def _pointing(ref: StageRef) -> dict[str, Any]:
-    """Corrections of one pass; what they leave is told only where windows are more than offsets and drifts."""
+    """Corrections of one pass; what they leave is given only where windows are more than offsets and drifts."""
     record = load_registration(ref)
     left = np.array([window["residual_px"] for window in record["windows"] if window.get("residual_px")])
     tells = len(left) > 2 * (len(record["sweeps"]) - len(record["untied"]) - 1)

@@ -7,7 +7,7 @@ from typing import TypeGuard
 
 DASH = "–"  # noqa: RUF001
 MOST_PERCENT = 1000  # more is told as a factor
-LEAST_HECTARES = 0.1  # smaller areas are told in square metres
+LEAST_HECTARES = 0.1  # smaller areas are given in square metres
 
 
 def format_seconds(seconds: float | None) -> str:

@@ -38,12 +38,12 @@ class Terminal(Console):
 
 
 def on_stderr() -> Terminal:
-    """Where progress and messages go."""
+    """Return where progress and messages go."""
     return Terminal(stderr=True, highlight=False)
 
 
 def on_stdout() -> Terminal:
-    """Where results go."""
+    """Return where results go."""
     return Terminal(file=sys.stdout, highlight=False, width=None if sys.stdout.isatty() else PIPED_WIDTH)
 
 
@@ -92,7 +92,7 @@ _listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
 
 @contextmanager
 def heard_by(listener: Listener | None) -> Iterator[None]:
-    """Have ``listener`` told, besides the terminal, how far each stage is that the block runs; None: nobody."""
+    """Report to ``listener``, too, how far each stage is that the block runs; None: to the terminal alone."""
     before = _listener.set(listener)
     try:
         yield
@@ -179,7 +179,7 @@ class StageProgress:
 def one_after_the_other(console: Console) -> Iterator[Callable[[str, float, str], None]]:
     """Bars of parts that follow each other: a part has ended where the next begins, and the last with the block.
 
-    Gives what a part is told by: its title, how far it is (0..1), and a figure in words.
+    Gives what identifies a part: its title, how far it is (0..1), and a figure in words.
     """
     last = ""
     with StageProgress(console) as progress:

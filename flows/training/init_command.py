@@ -1,4 +1,4 @@
-"""What `spectralzoom init` does: it looks at images and labels, and writes a scene.toml of what they do not say.
+"""The verb `init`: it looks at images and labels, and writes a scene.toml of what they do not say.
 
 Of a folder of recorded sweeps it writes a survey.toml.
 """
@@ -175,7 +175,7 @@ def _quoted(text: str) -> str:
 
 
 def _unseen(draft: SceneDraft) -> list[str]:
-    """What somebody has to look at: what could not be told from the files, or does not fit."""
+    """Return what needs a look: what the files do not say, or does not fit."""
     found, parts = draft.files, []
     if found.labels and found.bare:
         images = counted(len(found.bare), "image")

@@ -142,7 +142,7 @@ CAMERA_NUMBERS = ("uint8", "uint16", "int16")
 
 @dataclass(frozen=True)
 class SweepsDraft:
-    """What was seen of the sweeps of a folder."""
+    """Findings on the sweeps of a folder."""
 
     folder: Path
     cubes: tuple[Path, ...]

@@ -156,7 +156,7 @@ class _Land:
         exposure_ms: float,
         rng: np.random.Generator,
     ) -> CurrentVisit:
-        """What a uniform scan would have shown, read by the weights."""
+        """Return what a uniform scan would have shown, read by the weights."""
         grid, light = self.grid, exposure_ms / REFERENCE_MS
         fine, means = augmentation.scan(self.columns, self.noise, grid.factor, light=light, step=step, rng=rng)
         _, every_class = map_of_columns(weights, means, fine, grid)
@@ -170,7 +170,7 @@ def judge_temporal(
     request: TemporalRequest,
     report: Report,
 ) -> list[dict[str, float]] | None:
-    """What maps score some days after a first visit, mIoU in the mean of lands that training did not see.
+    """Return what maps score some days after a first visit, mIoU in the mean of lands that training did not see.
 
     ``kept``: the map of before; ``observe``: today's look alone; ``prior_map``: both by the reader; ``surer``: without
     it; ``anew``: the field scanned again as it was at first. None without a land to judge on.

@@ -16,6 +16,7 @@ from rich.console import Console
 
 from flows.archive.commands import command, contents, explain, gc, ls, run_verify
 from flows.settings.load import load_settings
+from flows.settings.survey_settings import Settings
 from flows.terminal.figures import format_bytes
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from pipeline.errors import ArchiveError
@@ -144,10 +145,7 @@ def test_explain_bears_damage_and_circles(tmp_path: Path, capsys: pytest.Capture
         with archive.publish("segment", key, inputs=[given]):
             pass
     (top,) = _json(capsys, lambda: explain(tmp_path, small.map.uri, as_json=True))["lineage"]
-    assert [one["problem"].split(":")[0] for one in top["inputs"]] == [
-        "is not there",
-        "manifest.json cannot be believed",
-    ]
+    assert [one["problem"].split(":")[0] for one in top["inputs"]] == ["is not there", "manifest.json is damaged"]
     (top,) = _json(capsys, lambda: explain(tmp_path, "aaaa", as_json=True))["lineage"]
     assert top["inputs"][0]["inputs"][0]["see"] == "in a circle"
     for product in (small.map.uri, small.raw.uri, "aaaa"):
@@ -187,17 +185,20 @@ def test_verify_repairs_by_surveying_again(archive: Path, capsys: pytest.Capture
     assert "21 of 21 stores and runs are as published" in capsys.readouterr().out
 
 
-def test_verify_says_what_it_could_not_repair(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_verify_says_what_it_could_not_repair(
+    archive: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The scene's file has gone: the store is missing then, and the exit code tells."""
     opened = Archive.open(archive)
     (mosaic,) = opened.refs("rectify")
     flip(mosaic.path / "lines.json")
 
-    def fail(settings: dict[str, Any]) -> None:
-        assert settings["scene"].endswith("scene.png")
+    def fail(settings: Settings, console: Console) -> None:
+        assert str(settings.scene).endswith("scene.png")
         raise ArchiveError("no such scene")
 
-    assert run_verify(archive, QUIET, remake=True, rerun=fail) == FAILED
+    monkeypatch.setattr("flows.publish.survey_command.run_survey", fail)
+    assert run_verify(archive, QUIET, remake=True) == FAILED
     out = capsys.readouterr().out
     assert "no such scene" in out
     assert "some could not be made anew" in out

@@ -201,7 +201,7 @@ def test_what_is_beyond_another_fields_part_has_no_class(
     scene = {"scene": str(tmp_path / "other.png"), "labels": str(tmp_path / "labels.png")}
     other = survey_png(visited, **PART, **scene, visit=LAST, weights=str(recorded))
     assert other.receipt["memory"]["put_aside"] == "another field"
-    assert "the rest is as before" not in (other.folder / "report.html").read_text(encoding="utf-8")
+    assert "the rest is unchanged" not in (other.folder / "report.html").read_text(encoding="utf-8")
     classes = product(visited, other, "class_map").classes.values
     assert 1 - other.receipt["extent"]["fraction"] <= (classes == 255).mean() < 1
 
