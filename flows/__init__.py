@@ -1,1 +1,1 @@
-"""What is done with a rig and an archive: verbs of the command line, surveys, what they publish, schedules."""
+"""Work with a rig and an archive: verbs of the command line, surveys, what they publish, schedules."""

@@ -10,7 +10,7 @@ from numba import types
 
 Loop = TypeVar("Loop", bound=Callable[..., Any])
 FLOATS, DOUBLES, OFFSETS = types.float32, types.float64, types.int64
-# What is not reassociated is the same wherever it stands in a vector: a * b + c is rounded once, in all lanes alike.
+# Sums that are not reassociated are the same anywhere in a vector: a * b + c is rounded once, in all lanes alike.
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
 
 

@@ -28,7 +28,7 @@ def visible(text: str, escaped: Callable[[str], str] = _escaped) -> str:
 
 
 def is_visible(character: str) -> bool:
-    """Whether a character is one that `visible` leaves as it is."""
+    """Return whether a character is one that `visible` leaves as it is."""
     if character in _LAYOUT:
         return True
     if character in _UNSEEN or unicodedata.bidirectional(character) in _DIRECTION:
@@ -125,10 +125,6 @@ class IncompleteStoreError(PipelineError, LookupError):
     """A store has no valid manifest, or its content does not match it."""
 
 
-class OldStoreError(IncompleteStoreError):
-    """A store is whole, but of an earlier version that this one does not read."""
-
-
 class WorkerError(PipelineError, RuntimeError):
     """Processes that work for this one died, or their scheduler went away."""
 
@@ -138,7 +134,7 @@ class BoundError(PipelineError, ArithmeticError):
 
 
 class NothingToMend(Exception):  # noqa: N818 - no error: a survey that ends well without a look
-    """A field is remembered so surely that nobody has to look; ``run`` is the one whose map stands."""
+    """The prior map of a field is sure enough, and no capture is needed; ``run`` is the one whose map stands."""
 
     def __init__(self, run: str, why: str) -> None:
         super().__init__(why)

@@ -1,7 +1,6 @@
 """Lines of JSON that vouch for themselves, for files that only grow and of which any byte may change.
 
-The last member of each object, ``check``, is the CRC-32 of the text before it, so that every bit of a line counts. It
-may go on from a seed, another text's CRC, without which the line is none: so lines are bound to what they belong to.
+The last member of each object, ``check``, is the CRC-32 of the text before it, so that every bit of a line counts.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ State = Literal["whole", "torn", "changed"]
 
 @dataclass(frozen=True)
 class CheckedLine:
-    """One line as it was found; ``content`` is None where it cannot be believed.
+    """One line as it was found; ``content`` is None where the line is damaged.
 
     ``torn``: what a power cut leaves of a line, or of others' bytes. ``changed``: it was whole once.
     """
@@ -33,31 +32,31 @@ class CheckedLine:
     state: State
 
 
-def with_check(text: bytes, seed: int = 0) -> bytes:
+def with_check(text: bytes) -> bytes:
     """Make the line of an object, given as JSON on one line and not empty."""
     body = text[: -len(b"}")]
-    return body + b"%s%08x%s\n" % (_OPENS, zlib.crc32(body, seed), _CLOSES)
+    return body + b"%s%08x%s\n" % (_OPENS, zlib.crc32(body), _CLOSES)
 
 
-def read_checked(content: bytes, seed: int = 0) -> Iterator[CheckedLine]:
+def read_checked(content: bytes) -> Iterator[CheckedLine]:
     """Give every line of a file. Two that only lost the end between them are both whole, and one more is ``changed``.
 
     No single bit that flips makes a line ``torn``, or gives it another content.
     """
     for number, text in enumerate(content.split(b"\n"), 1):
         if text:
-            yield from _line(number, text, seed)
+            yield from _line(number, text)
 
 
-def _line(number: int, text: bytes, seed: int) -> Iterator[CheckedLine]:
-    found = _whole(text, seed)
+def _line(number: int, text: bytes) -> Iterator[CheckedLine]:
+    found = _whole(text)
     if found is not None:
         yield CheckedLine(number, text, found, "whole")
         return
     ends = [match.end() for match in _CHECK.finditer(text)]
     for start, end in zip([0, *ends], ends, strict=False):
         for part in (text[start:end], text[start + 1 : end]):  # or behind what the end of a line became
-            found = _whole(part, seed)
+            found = _whole(part)
             if found is not None:
                 yield CheckedLine(number, part, found, "whole")
                 break
@@ -65,10 +64,10 @@ def _line(number: int, text: bytes, seed: int) -> Iterator[CheckedLine]:
     yield CheckedLine(number, text, None, "changed" if changed else "torn")
 
 
-def _whole(text: bytes, seed: int) -> dict[str, Any] | None:
+def _whole(text: bytes) -> dict[str, Any] | None:
     """The object of a line whose checksum is that of its text."""
     body, check = text[:-_LENGTH], _CHECK.fullmatch(text[-_LENGTH:])
-    if check is None or int(check[1], 16) != zlib.crc32(body, seed):
+    if check is None or int(check[1], 16) != zlib.crc32(body):
         return None
     try:
         found = json.loads(body + b"}")
@@ -78,7 +77,7 @@ def _whole(text: bytes, seed: int) -> dict[str, Any] | None:
 
 
 def _had_check(text: bytes) -> bool:
-    """Whether a line ends as one with a checksum does, but for one byte at most."""
+    """Return whether a line ends as one with a checksum does, but for one byte at most."""
     tail = text[-_LENGTH:]
     fixed = tail[: len(_OPENS)] + tail[-len(_CLOSES) :]
     return len(tail) == _LENGTH and sum(a != b for a, b in zip(fixed, _OPENS + _CLOSES, strict=True)) <= 1

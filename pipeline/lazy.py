@@ -1,4 +1,4 @@
-"""What is there only once it is asked for: a value that is made, a module that is imported."""
+"""Lazy values and modules: a value is made, and a module imported, once it is asked for."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Once(Generic[Value]):
         return once
 
     def is_made(self) -> bool:
-        """Whether the value is there."""
+        """Return whether the value is there."""
         return bool(self._made)
 
     def __call__(self) -> Value:

@@ -1,4 +1,4 @@
-"""What counts as a reading: the range of numbers that a sensor, or a product made of its lines, can give.
+"""Readings: the range of numbers that a sensor, or a product made of its lines, can give.
 
 Fill values of common formats lie outside: 1e20, 9.97e36, 1e30, 3.4e38. So do the ends of 32-bit whole numbers.
 """
@@ -33,7 +33,7 @@ class Beyond:
 
 
 def beyond_range(values: NDArray[Any], most: float = MOST_VALUE) -> NDArray[np.bool_] | None:
-    """Which values are larger than ``most`` by size, infinite ones too; None where none is. NaN is no value at all."""
+    """Mark values larger than ``most`` by size, infinite ones too; None where none is. NaN is no value at all."""
     kind = values.dtype
     if not values.size or kind.kind not in "fiu" or (kind.kind in "iu" and np.iinfo(kind).max <= most):
         return None

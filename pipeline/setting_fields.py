@@ -37,11 +37,11 @@ def stated(
     return field(default=default, metadata={**known, "json_schema_extra": told})
 
 
-assumed = partial(stated, source="assumed")  # nobody has confirmed the default on a unit
+assumed = partial(stated, source="assumed")  # the default is not confirmed on a unit
 
 
 def format_number(low: float, high: float, unit: str = "", *, endless: bool = False) -> str:
-    """What a number may be, for a message."""
+    """Return what a number may be, for a message."""
     words = f"a number from {low:g} to {high:g}" if math.isfinite(high) else f"a number of at least {low:g}"
     return words + (f" {unit}" if unit else "") + (" or inf" if endless else "")
 

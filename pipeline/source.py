@@ -34,7 +34,7 @@ class References:
 
     A sample's scene value is ``(raw - dark) / (white - dark) * white_reference``, over ``flat`` where there is one,
     over the mirror's throughput where ``by_mirror`` says that the light falls off with its tilt. ``bad`` elements of
-    the detector are not to be believed.
+    the detector are not trusted.
     """
 
     dark: NDArray[np.float32]
@@ -58,7 +58,7 @@ class Source(Protocol):
 
     @property
     def name(self) -> str:
-        """What the receipt calls it: ``sim``, ``rig``, or an archive's address."""
+        """Return what the receipt calls it: ``sim``, ``rig``, or an archive's address."""
 
     @property
     def camera(self) -> LineCamera:
@@ -76,14 +76,14 @@ class Source(Protocol):
         """Give the sweep's lines one by one, from line ``first`` on."""
 
     def lines_again(self, sweep: Sweep, numbers: Sequence[int]) -> Iterator[Line]:
-        """Give single lines that it gave before, in order; not valid where it has them no more."""
+        """Give single lines that it gave before, in order; not valid where it no longer has them."""
 
     def references(self, sweep: Sweep) -> References:
         """Dark and white frames with the sweep's binning."""
 
     @property
     def record(self) -> Mapping[str, Any] | None:
-        """What its captures were like, for their store; None where its effects tell all of it."""
+        """Return what its captures were like, for their store; None where its effects tell all of it."""
 
 
 class SweepLines(Protocol):

@@ -28,6 +28,7 @@ from models.weights.files import Weights, save_weights, with_record
 from storage.readers.labels import default_colour
 from tests.object_server import bucket, machine, s3_server  # noqa: F401 - fixtures
 from tests.prior_work import WORKED_OUT, remember, with_effects, without_effects
+from tests.zarr_at_once import close_loops, work_at_once
 
 RGB_NM = (640.0, 550.0, 460.0)
 CLASSES = ("class_0", "class_1", "class_2")  # as a label file of the numbers 0..2 names them
@@ -104,6 +105,15 @@ def no_waiting_for_the_disk() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda descriptor: None)
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def zarr_in_this_thread() -> Iterator[None]:
+    """No call of Zarr is handed to another thread: see `tests.zarr_at_once`."""
+    with pytest.MonkeyPatch.context() as patch:
+        work_at_once(patch)
+        yield
+    close_loops()
 
 
 @pytest.fixture

@@ -1,9 +1,9 @@
 """What takes most of a small survey's time and is the same for the same question, remembered.
 
 Only what is pure is kept: the look at the scene that a choice of effects rests on, the choice, which each process
-remembers by itself, and the changes that were measured. Of pictures one of each kind is drawn, and stands for all of
-that kind. Stores, receipt and run are made each time. Tests that surveys repeat themselves put `WORKED_OUT` back; those
-that ask nothing of effects have no scene looked at: `without_effects`.
+remembers by itself, and the changes that were measured. Of pictures one of each kind is drawn and packed, and stands
+for all of that kind. Stores, receipt and run are made each time. Tests that surveys repeat themselves put `WORKED_OUT`
+back; those that ask nothing of effects have no scene looked at: `without_effects`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from pipeline.planning.coverage import coarse_sweeps
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import raster_from_values
 
-PURE = {effect_choice: ("probe_survey", "decide", "_verified"), run_folder: ("draw_quicklook",)}
+PURE = {effect_choice: ("probe_survey", "decide", "_verified"), run_folder: ("draw_quicklook", "webp")}
 WORKED_OUT: dict[str, tuple[ModuleType, Any]] = {
     name: (module, getattr(module, name)) for module, names in PURE.items() for name in names
 }
@@ -80,7 +80,11 @@ def remember(folder: Path, put: Callable[[object, str, Any], None] = setattr) ->
         if not fresh:  # as often as a picture that is drawn: tests count what is written
             path.write_bytes(picture)
 
-    each = {"probe_survey": probed, "decide": decided, "_verified": verified, "draw_quicklook": drawn}
+    def packed(picture: Any, **choices: Any) -> bytes:
+        question = "packed", picture.size, hashlib.blake2b(picture.tobytes()).hexdigest(), choices
+        return known(question, lambda: WORKED_OUT["webp"][1](picture, **choices))
+
+    each = {"probe_survey": probed, "decide": decided, "_verified": verified, "draw_quicklook": drawn, "webp": packed}
     for name, remembering in each.items():
         REMEMBERING[name] = (WORKED_OUT[name][0], remembering)
         put(WORKED_OUT[name][0], name, remembering)

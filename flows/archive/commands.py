@@ -25,12 +25,11 @@ from flows.terminal.processes import DONE, FAILED, PARTLY
 from flows.terminal.progress import StageProgress, put_out, table
 from pipeline.lazy import deferred
 from storage.archive.archive import Archive
-from storage.archive.kept_bytes import all_sizes, kept_by_runs, kept_bytes
 from storage.archive.keys import in_text
 from storage.archive.lineage import Catalogue, changes_between, find_product, version_before
 from storage.archive.records import Run
 from storage.maintenance.garbage import clear_up
-from storage.maintenance.repair import Rerun, plan_repair, repair
+from storage.maintenance.repair import plan_repair, repair
 from storage.maintenance.verification import Finding
 from storage.remote.opening import open_archive, verify_archive
 
@@ -41,7 +40,7 @@ else:
 
 DEEPEST = 60  # levels of a lineage that are shown
 SHORT_KEY = 12
-WHOLE = ("when", "key", "seed", "budget", "mIoU", "size", "state", "age", "stage", "what")  # columns never folded
+WHOLE = ("when", "key", "seed", "budget", "mIoU", "size", "own", "state", "age", "stage", "what")  # never folded
 MOST_ROWS = 20  # stores of a stage, changes, removals
 DAY_S = 86400.0
 
@@ -125,10 +124,8 @@ def gc(
     return DONE if raw.obstacle is None and not raw.kept else PARTLY
 
 
-def run_verify(
-    archive: str | Path, console: Console, *, remake: bool = False, rerun: Rerun | None = None, as_json: bool = False
-) -> int:
-    """Read an archive again; with ``remake`` have what is broken made anew by ``rerun`` (settings in, a run out)."""
+def run_verify(archive: str | Path, console: Console, *, remake: bool = False, as_json: bool = False) -> int:
+    """Read an archive again; with ``remake`` survey again what is broken."""
     opened = open_archive(archive, create=False, write=remake)
     with StageProgress(console, {"verify": "reading again"}) as bars:
         findings = verify_archive(opened, lambda uri, fraction: bars.show("verify", fraction, uri))
@@ -145,7 +142,7 @@ def run_verify(
         here = {**of_this_version(settings), "out": opened.name, **dict.fromkeys(OF_THE_MACHINE)}
         survey_command.run_survey(parse_settings(here), console)
 
-    done = repair(opened, bad, rerun or survey_again, versions=versions())
+    done = repair(opened, bad, survey_again, versions=versions())
     content["repair"] = {
         "remade": done.remade,
         "dropped": done.dropped,
@@ -161,8 +158,8 @@ def run_verify(
 def contents(archive: Archive, now: datetime | None = None) -> dict[str, Any]:
     """Runs, newest last, and stores by stage, oldest first, of an archive."""
     catalogue, moment = Catalogue.read(archive.root), now or datetime.now(UTC)
-    sizes = all_sizes(archive, catalogue)
-    kept = kept_by_runs(catalogue, sizes)
+    sizes = archive.all_sizes(catalogue)
+    kept, own = catalogue.kept_by_runs(sizes), catalogue.own_by_runs(sizes)
     stages: dict[str, list[dict[str, Any]]] = {}
     for store in sorted(catalogue.stores.values(), key=lambda store: (store.ref.stage, store.created, store.ref.key)):
         row = {
@@ -179,10 +176,12 @@ def contents(archive: Archive, now: datetime | None = None) -> dict[str, Any]:
     return {
         "archive": archive.name,
         "runs": [
-            {**_run_row(catalogue, run, kept[run.uri]), "age_s": _age_s(run.created, moment)} for run in catalogue.runs
+            _run_row(catalogue, run, kept[run.uri]) | {"own_bytes": own[run.uri], "age_s": _age_s(run.created, moment)}
+            for run in catalogue.runs
         ],
         "stages": stages,
         "bytes": sum(sizes.values()),
+        "shared_bytes": sum(size for uri, size in sizes.items() if len(catalogue.named_by(uri)) > 1),
         "lost": list(catalogue.lost),
     }
 
@@ -230,7 +229,7 @@ def explanation(archive: Archive, product: str) -> dict[str, Any]:
         below = set[str]().union(*(catalogue.ancestors([uri]) for uri in found.names))
         shown: set[str] = set()
         trees = [_tree(catalogue, uri, shown, ()) for uri in sorted(found.names - below)]
-        kept = kept_bytes(archive, found, catalogue)
+        kept = archive.kept_bytes(found, catalogue)
         row = {
             **_run_row(catalogue, found, kept),
             "problem": found.problem,
@@ -276,7 +275,7 @@ def _tree(catalogue: Catalogue, uri: str, shown: set[str], path: tuple[str, ...]
 
 
 def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
-    """What verification found, and for what is broken what a repair would do."""
+    """Return what verification found, and for what is broken what a repair would do."""
     bad = [finding for finding in findings if finding.problem is not None]
     places = {finding.uri for finding in findings if finding.kind in ("whole", "broken")}
     broken = {finding.uri for finding in bad if finding.kind == "broken"}
@@ -319,7 +318,7 @@ def command(settings: Mapping[str, Any], out: str) -> str:
 
 def show_contents(content: dict[str, Any], console: Console) -> None:
     """Print what `ls` found."""
-    columns: Sequence[str] = ("run", "scene", "seed", "budget", "mIoU", "size", "age", "state")
+    columns: Sequence[str] = ("run", "scene", "seed", "budget", "mIoU", "own", "age", "state")
     runs = map(_shown_run, content["runs"])
     console.print(table(columns, runs, title="Runs", left=2, whole=WHOLE) if content["runs"] else "no runs")
     if any(run["training_scene"] and known_number(run["miou"]) is not None for run in content["runs"]):
@@ -330,7 +329,8 @@ def show_contents(content: dict[str, Any], console: Console) -> None:
     for uri in content["lost"]:
         console.print(f"[bold red]{escape(uri)} has lost its manifest; run verify[/]", soft_wrap=True)
     count = counted(sum(map(len, content["stages"].values())), "store")
-    _say(console, f"{counted(len(content['runs']), 'run')}, {count}, {format_bytes(content['bytes'])}")
+    shared = f", {format_bytes(content['shared_bytes'])} of it in several runs" if content["shared_bytes"] else ""
+    _say(console, f"{counted(len(content['runs']), 'run')}, {count}, {format_bytes(content['bytes'])}{shared}")
 
 
 def _shown_run(run: Mapping[str, Any]) -> list[str]:
@@ -340,7 +340,7 @@ def _shown_run(run: Mapping[str, Any]) -> list[str]:
     learned = "" if run["training_scene"] is None or miou is None else "*"
     figures = [
         "not yet" if is_pending(run) else format_points(miou) + learned,
-        format_bytes(run["bytes"]),
+        format_bytes(run["own_bytes"]),
         _age(run["age_s"]),
     ]
     return [*map(escape, (run["id"], scene, *asked)), *figures, state]

@@ -1,4 +1,4 @@
-"""What `spectralzoom compare` does: two runs of one field side by side, and a picture of where they differ."""
+"""The verb `compare`: two runs of one field side by side, and a picture of where they differ."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from flows.cli.app import ArchiveName, AsJson, OutFolder, check_outside
-from flows.publish.receipt import areas_on_ground
+from flows.publish.receipt import hectares_of_classes
 from flows.publish.receipt_table import BYTE_LABELS, COST_LABELS
 from flows.settings.survey_settings import BUILT_IN_SCENES
 from flows.tasks.scores import score_of
@@ -28,7 +28,7 @@ from flows.terminal.progress import put_out, table
 from pipeline.errors import ArchiveError, SceneError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import deferred
-from pipeline.simulator.scenes.farm.farm_scene import REMOVED_LAW, law_of_key
+from pipeline.simulator.scenes.farm.farm_scene import is_farm_key
 from storage.archive.archive import Archive
 from storage.archive.keys import in_text
 from storage.archive.lineage import ABSENT, Catalogue, find_product, flatten
@@ -44,7 +44,7 @@ else:
 
 MOST_CHANGES = 10
 NOT_ASKED = ("notes", "out")  # of a receipt's settings
-NO_FILES = (None, *BUILT_IN_SCENES, REMOVED_LAW)  # scenes of runs that are no file's
+NO_FILES = (None, *BUILT_IN_SCENES)  # scenes of runs that are no file's
 
 
 def compare(archive: ArchiveName, old: str, new: str, *, out: OutFolder = None, as_json: AsJson = False) -> int:
@@ -111,9 +111,9 @@ def _is_same_field(old: Run, new: Run) -> bool:
 
 
 def _field_key(run: Run) -> str:
-    """What names the land: not the bands, nor the day and hour at which a farm was looked at."""
+    """Return what names the land: not the bands, nor the day and hour at which a farm was looked at."""
     key = str(run.receipt.get("scene", run.uri)).split("/bands=")[0].split("/only=")[0]
-    if law_of_key(key) is None:
+    if not is_farm_key(key):
         return key
     return "/".join(part for part in key.split("/") if not part.startswith(("day=", "hour=")))
 
@@ -179,14 +179,14 @@ def _comparison(runs: tuple[Run, Run], maps: list[ClassMap]) -> dict[str, Any]:
         ],
         "settings": _changes(*asked),
         "made": _changes(*made),
-        "savings": {name: [_spent(run.receipt, name) for run in runs] for name in COST_LABELS},
-        "data_bytes": {name: [_bytes(run.receipt, name) for run in runs] for name in BYTE_LABELS},
+        "savings": {name: [_known(run.receipt, "savings", name, "done") for run in runs] for name in COST_LABELS},
+        "data_bytes": {name: [_known(run.receipt, "data_bytes", name) for run in runs] for name in BYTE_LABELS},
     }
 
 
 def _classes(runs: tuple[Run, Run], joint: NDArray[np.int64], names: list[str]) -> list[dict[str, Any]]:
     """Area in each map and the agreement of both, for each class that is in one of them; hectares where both know."""
-    areas = [known for run in runs if (known := areas_on_ground(run.receipt)) is not None]
+    areas = [known for run in runs if (known := hectares_of_classes(run.receipt)) is not None]
     hectares = [{str(name).replace("_", " "): area for name, area in one.items()} for one in areas]
     found = []
     for number, name in enumerate(names):
@@ -205,15 +205,12 @@ def _changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[dict[str, A
     return [{"name": name, "old": before, "new": after} for name, before, after in both if before != after]
 
 
-def _spent(receipt: Mapping[str, Any], name: str) -> float | None:
-    savings = receipt.get("savings")
-    entry = savings.get(name) if isinstance(savings, Mapping) else None
-    return known_number(entry.get("done")) if isinstance(entry, Mapping) else None
-
-
-def _bytes(receipt: Mapping[str, Any], name: str) -> float | None:
-    told = receipt.get("data_bytes")
-    return known_number(told.get(name)) if isinstance(told, Mapping) else None
+def _known(receipt: Mapping[str, Any], *path: str) -> float | None:
+    """Return the number at a path of tables in a receipt; None where there is none."""
+    found: Any = receipt
+    for name in path:
+        found = found.get(name) if isinstance(found, Mapping) else None
+    return known_number(found)
 
 
 def show_comparison(content: dict[str, Any], console: Console) -> None:

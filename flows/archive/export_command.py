@@ -1,4 +1,4 @@
-"""What `spectralzoom export` does: a run's maps and products, its cubes as ENVI, and a STAC catalogue of them."""
+"""The verb `export`: a run's maps and products, its cubes as ENVI, and a STAC catalogue of them."""
 
 from __future__ import annotations
 
@@ -152,8 +152,7 @@ def _export_images(export: Export, layers: Sequence[Layer], console: Console) ->
         about |= {} if layer.unit is None else {"unit": layer.unit}
         fields: dict[str, Any] = {"bands": [{"name": name, **about} for name in layer.image.bands]}
         if export.run.geobox is not None:
-            geobox = layer.image.place.geobox(layer.image.shape)
-            fields |= {"proj:code": None} if geobox is None else projection(geobox)
+            fields |= {"proj:code": None} if layer.image.geobox.crs is None else projection(layer.image.geobox)
         export.add(layer.name, path, layer.title, COG, list(layer.roles), **fields)
         style = write_layer_style(layer, path)
         export.add(f"{layer.name}_style", style, f"QGIS style of {path.name}", STYLE, ["metadata", "style"])

@@ -1,4 +1,4 @@
-"""What an export takes from a run: its images for map programs, its cubes for ENVI, its stores for the catalogue."""
+"""Sources of an export: a run's images for map programs, its cubes for ENVI, its stores for the catalogue."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from affine import Affine
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
@@ -25,7 +26,7 @@ from storage.arrays.georeference import load_geobox
 from storage.arrays.ground_maps import StoredImage, open_image
 from storage.arrays.layout import grid_of, open_group
 from storage.arrays.quicklooks import choose_bands
-from storage.export.image_files import ANGULAR, CogImage, Place, value_span
+from storage.export.image_files import ANGULAR, CogImage, angular_geobox, value_span
 from storage.export.map_files import GREENS, GREYS, write_class_style, write_colour_style, write_ramp_style
 from storage.readers.recordings import stores_of_lines
 
@@ -67,7 +68,7 @@ class ExportedRun:
         return ref
 
     def path(self, product: str) -> Path:
-        """Where a product lies that every finished run has (IncompleteStoreError: this one has not)."""
+        """Return where a product lies that every finished run has (IncompleteStoreError: this one has not)."""
         if self.store(product) is None:
             raise IncompleteStoreError(f"the run {self.id} has no {product}: it did not finish; export another run")
         return self.archive.locate(self.receipt["products"][product])
@@ -78,7 +79,7 @@ class ExportedRun:
 
     @cached_property
     def geobox(self) -> GeoBox | None:
-        """Where the run's map lies on the earth, by its pose or its scene's file; None where neither says it."""
+        """Return where the run's map lies on the earth, by its pose or its scene's file; None where neither says it."""
         return load_geobox(self.path(self.map_product))
 
     @property
@@ -137,25 +138,25 @@ def map_layers(run: ExportedRun) -> list[Layer]:
     ]
 
 
-def layer_tags(run: ExportedRun, product: str, place: Place) -> dict[str, str]:
-    """What every image says of its run."""
+def layer_tags(run: ExportedRun, product: str, geobox: GeoBox) -> dict[str, str]:
+    """Return what every image says of its run."""
     return {
         "TIFFTAG_SOFTWARE": f"spectralzoom {run.receipt['versions'].get('spectralzoom', 'of unknown version')}",
         "run": run.id,
         "product": run.receipt["products"][product],
         "surveyed": run.receipt["started"],
-        "place": ANGULAR if place.crs_wkt is None else "map",
+        "place": ANGULAR if geobox.crs is None else "map",
     }
 
 
-def place_of(run: ExportedRun, stored: StoredImage) -> Place:
-    """Where a store's images lie, as the store itself says."""
+def geobox_of(run: ExportedRun, stored: StoredImage) -> GeoBox:
+    """Return the grid of a store's images, as the store itself says; in angles without a CRS."""
     if stored.geobox is not None:
-        return Place.on_map(stored.geobox)
+        return stored.geobox
     transform = stored.about.get("spatial:transform")
     if transform is None:
         raise IncompleteStoreError(f"the {stored.name} of run {run.id} do not say where they lie; verify the archive")
-    return Place(tuple(float(number) for number in transform))
+    return GeoBox((stored.shape[0], stored.shape[1]), Affine(*map(float, transform)), None)
 
 
 def image_layer(
@@ -169,9 +170,8 @@ def image_layer(
 ) -> tuple[CogImage, Callable[[], Rows]]:
     """An image of a store as it stands there, on the store's own grid."""
     stored = open_image(run.path(product), array)
-    place = place_of(run, stored)
-    shape = (stored.shape[0], stored.shape[1])
-    image = CogImage(shape, stored.dtype.name, place, bands, nodata, legend, layer_tags(run, product, place))
+    geobox = geobox_of(run, stored)
+    image = CogImage(geobox, stored.dtype.name, bands, nodata, legend, layer_tags(run, product, geobox))
     return image, stored.rows
 
 
@@ -186,20 +186,19 @@ def patch_layer(
     if scene is None:
         raise IncompleteStoreError(f"the class map of run {run.id} does not say its grid; run its survey again")
     shape = (stored.shape[0], stored.shape[1])
-    geobox = load_geobox(run.path("class_map"))
-    on_angles = Place.on_angles(replace(scene, factor=patch), shape)
-    place = on_angles if geobox is None else Place.on_map(zoomed_out(geobox, patch, shape))
+    fine = load_geobox(run.path("class_map"))
+    geobox = angular_geobox(replace(scene, factor=patch), shape) if fine is None else zoomed_out(fine, patch, shape)
     policy = {"policy": str(stored.about.get("policy", ""))} if product == "attention" else {}
-    tags = {**layer_tags(run, product, place), **policy, "patch_px": str(patch)}
-    return CogImage(shape, stored.dtype.name, place, bands, np.nan, tags=tags), stored.rows
+    tags = {**layer_tags(run, product, geobox), **policy, "patch_px": str(patch)}
+    return CogImage(geobox, stored.dtype.name, bands, np.nan, tags=tags), stored.rows
 
 
 def _picture(run: ExportedRun) -> tuple[CogImage, Callable[[], Rows]]:
     """The coarse mosaic in a photograph's tones, 1 to 255, and 0 where nothing was captured."""
     stored, ref = open_image(run.path("mosaic"), "coverage"), run.store("mosaic")
     assert ref is not None
-    place = place_of(run, stored)
-    image = CogImage((stored.shape[0], stored.shape[1]), "uint8", place, RGB, 0, tags=layer_tags(run, "mosaic", place))
+    geobox = geobox_of(run, stored)
+    image = CogImage(geobox, "uint8", RGB, 0, tags=layer_tags(run, "mosaic", geobox))
 
     def rows() -> Rows:
         yield 0, np.nan_to_num(np.rint(coarse_colours(ref, None))).astype(np.uint8)
@@ -208,7 +207,7 @@ def _picture(run: ExportedRun) -> tuple[CogImage, Callable[[], Rows]]:
 
 
 def seen_rows(run: ExportedRun) -> Iterator[tuple[int, NDArray[np.bool_]]]:
-    """Where a run's map shows anything, some rows at a time."""
+    """Yield where a run's map shows anything, some rows at a time."""
     if run.map_product == "class_map":
         yield from (
             (first, found != UNLABELLED) for first, found in open_image(run.path("class_map"), "classes").rows()
@@ -220,7 +219,7 @@ def seen_rows(run: ExportedRun) -> Iterator[tuple[int, NDArray[np.bool_]]]:
 
 
 def prior_map_layers(run: ExportedRun) -> list[Layer]:
-    """Days since each pixel was looked at; of a run that goes on from another what changed, and from which class.
+    """Days since each pixel was looked at; of a run with a prior map what changed, and from which class.
 
     On the map where there is a pose.
     """
@@ -244,7 +243,7 @@ def prior_map_layers(run: ExportedRun) -> list[Layer]:
 
 
 def _product_with(run: ExportedRun, array: str) -> str | None:
-    """The store of which an image is taken: the map on the ground, else what is believed; None where neither has it."""
+    """Return the product that holds an image: the map on the ground, else class probabilities, else None."""
     products = (name for name in (GROUND, PROBABILITIES) if run.store(name) is not None)
     return next((name for name in products if array in open_group(run.path(name))), None)
 

@@ -1,4 +1,4 @@
-"""What is exported of a run's values: the table of its classes' areas, and layers of the mosaic's bands and indices.
+"""Exported values of a run: the table of its classes' areas, and layers of the mosaic's bands and indices.
 
 Areas say how surely they are known. Layers lie on the map where the run has one.
 """
@@ -14,9 +14,11 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
 
-from flows.archive.export_layers import ExportedRun, Layer, Rows, layer_tags, place_of
+from flows.archive.export_layers import ExportedRun, Layer, Rows, geobox_of, layer_tags
 from flows.archive.product_choice import ProductChoice
+from flows.publish.receipt import hectares_of_classes
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.map_grid import GroundGrid, grid_of_map, image_at, map_blocks
@@ -29,7 +31,7 @@ from storage.arrays.georeference import load_geobox
 from storage.arrays.ground_maps import load_bands, open_image
 from storage.arrays.layout import grid_of
 from storage.arrays.mosaics import Mosaic, open_mosaic
-from storage.export.image_files import CogImage, Place
+from storage.export.image_files import CogImage
 
 CSV = "text/csv"
 COLUMNS = (
@@ -44,14 +46,12 @@ Floats = NDArray[np.float32]
 
 
 def write_areas(run: ExportedRun, path: Path) -> None:
-    """Write the table, a row a class; empty where something is not known, as hectares where there is no CRS."""
+    """Write the table, a row a class; empty where something is not known, as hectares of pixels of any size."""
     path_of_map = run.path(run.map_product)
     names = tuple(open_image(path_of_map, "classes").about["class_names"])
     pixels, confidence = _counted(path_of_map, len(names))
-    hectares = None  # where nothing says where the field lies
-    if "ground" in run.receipt:
-        areas = run.receipt["ground"]["areas_ha"]
-        hectares = np.array([areas.get(name, 0.0) for name in names], np.float64)
+    areas = hectares_of_classes(run.receipt)
+    hectares = None if areas is None else np.array([areas.get(name, 0.0) for name in names], np.float64)
     fraction = pixels / max(pixels.sum(), 1) if hectares is None else hectares / (hectares.sum() or 1.0)
     estimate, sources = _estimate(run, fraction)
     total = np.nan if hectares is None else hectares.sum()
@@ -123,22 +123,15 @@ class MosaicView:
 
     @property
     def words(self) -> str:
-        """How large its pixels are."""
+        """Return how large its pixels are."""
         return "Pixels of the field" if self.factor == 1 else f"Pixels of {self.factor} x {self.factor} px"
 
     @cached_property
-    def place(self) -> Place:
-        """Where the image lies."""
+    def geobox(self) -> GeoBox:
+        """Return the image's grid; in angles without a CRS."""
         if self.ground is not None:
-            return Place.on_map(self.ground.geobox)
-        return place_of(self.run, open_image(self.run.path("mosaic"), "coverage"))
-
-    @cached_property
-    def shape(self) -> tuple[int, int]:
-        """(y, x) of the image [px]."""
-        if self.ground is not None:
-            return self.ground.shape
-        return self.mosaic.shape
+            return self.ground.geobox
+        return geobox_of(self.run, open_image(self.run.path("mosaic"), "coverage"))
 
     @cached_property
     def ground(self) -> GroundGrid | None:
@@ -166,12 +159,12 @@ class MosaicView:
                 yield first, self.mosaic.spectra(block, bands)
                 first += len(block)
             return
-        factor = self.factor
-        at_once = int(np.clip(BYTES_AT_ONCE // (4 * len(bands) * self.shape[1]), 1, 256))
-        for first in range(0, self.shape[0], at_once):
-            last = min(first + at_once, self.shape[0])
-            out = np.full((last - first, self.shape[1], len(bands)), np.nan, np.float32)
-            for _, columns in map_blocks((last - first, self.shape[1]), (last - first, COLUMNS_AT_ONCE)):
+        factor, (height, width) = self.factor, self.ground.shape
+        at_once = int(np.clip(BYTES_AT_ONCE // (4 * len(bands) * width), 1, 256))
+        for first in range(0, height, at_once):
+            last = min(first + at_once, height)
+            out = np.full((last - first, width, len(bands)), np.nan, np.float32)
+            for _, columns in map_blocks((last - first, width), (last - first, COLUMNS_AT_ONCE)):
                 pixels = self.ground.scene_pixels(slice(first, last), columns)
                 out[:, columns] = _window_at(self.mosaic, pixels, factor, bands)
             yield first, out
@@ -214,12 +207,11 @@ def spectral_layers(run: ExportedRun, choice: ProductChoice) -> list[Layer]:
 def _reflectance(view: MosaicView, white: float) -> Layer:
     wave, width = load_bands(view.run.path("mosaic"))
     image = CogImage(
-        view.shape,
+        view.geobox,
         "float32",
-        view.place,
         tuple(f"{centre:.1f} nm" for centre in wave.tolist()),
         np.nan,
-        tags={**layer_tags(view.run, "mosaic", view.place), "values": _format_value(white), "pixels": view.words},
+        tags={**layer_tags(view.run, "mosaic", view.geobox), "values": _format_value(white), "pixels": view.words},
         wavelength_nm=wave.tolist(),
         fwhm_nm=None if width is None else width.tolist(),
     )
@@ -235,8 +227,8 @@ def _index(view: MosaicView, index: SpectralIndex, bands: Sequence[int], white: 
     wave = load_bands(view.run.path("mosaic"))[0][list(bands)].tolist()
     taken = ", ".join(f"{band.symbol} {nm:.1f} nm" for band, nm in zip(index.bands, wave, strict=True))
     tags = {"index": index.name, "bands": taken, "reference": index.reference, "pixels": view.words}
-    about = layer_tags(view.run, "mosaic", view.place) | tags
-    image = CogImage(view.shape, "float32", view.place, (index.name,), np.nan, tags=about)
+    about = layer_tags(view.run, "mosaic", view.geobox) | tags
+    image = CogImage(view.geobox, "float32", (index.name,), np.nan, tags=about)
 
     def rows() -> Rows:
         for first, values in view.rows(bands):

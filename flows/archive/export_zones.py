@@ -149,21 +149,15 @@ def _add_style(path: Path, column: str, entries: Sequence[Entry], add: Add) -> N
     add(f"{path.stem}_polygon_style", style, f"QGIS style of {path.name}", STYLE, ["metadata", "style"])
 
 
-def cell_side_m(run: ExportedRun, choice: ProductChoice) -> float:
-    """Return the side of a prescription's cells [m]: as given, else `CELL_M`, or a pixel where that is larger."""
-    assert run.geobox is not None
-    return choice.flags.cell or max(CELL_M, round(plane_pixel_m(run.geobox), 3))
-
-
 def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, choice: ProductChoice, add: Add) -> None:
     assert raster.geobox is not None
     numbers = class_numbers(raster.legend.names, choice.doses, "--prescription")
     areas = areas_by_number(PlacedPicture(raster.geobox), raster.classes, len(raster.legend.names))
     assert areas is not None
     words = ", ".join(f"{name} {dose:g} {choice.unit.name}" for name, dose in choice.doses.items())
-    field = DosedField(
-        raster, numbers, choice.flags.least_fraction, cell_side_m(run, choice), float(areas.sum()), words
-    )
+    assert run.geobox is not None
+    side_m = choice.flags.cell or max(CELL_M, round(plane_pixel_m(run.geobox), 3))  # no smaller than a pixel
+    field = DosedField(raster, numbers, choice.flags.least_fraction, side_m, float(areas.sum()), words)
     _write_cells(field, folder, choice, add)
     down, across = (round(field.cell_m / metres, DEGREE_DIGITS) for metres in degree_m(raster.geobox))
     grid, _, doses = field.dosed((down, across), to_degrees(raster.geobox))

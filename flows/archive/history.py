@@ -19,18 +19,27 @@ from rich.markup import escape
 
 from flows.archive.stale_runs import called
 from flows.cli.app import ArchiveName, AsJson, OutFile, check_outside, stderr
-from flows.publish.receipt import areas_on_ground
+from flows.publish.receipt import hectares_of_classes
 from flows.publish.receipt_table import format_days
 from flows.settings.survey_settings import BUILT_IN_SCENES
+from flows.tasks.scene import TRAINING_SCENE
 from flows.tasks.scores import score_of
-from flows.terminal.figures import DASH, counted, format_area, format_percent, format_seconds, known_number
+from flows.terminal.figures import (
+    DASH,
+    MOST_PERCENT,
+    counted,
+    format_area,
+    format_percent,
+    format_points,
+    format_seconds,
+    known_number,
+)
 from flows.terminal.processes import DONE
 from flows.terminal.progress import print_json
 from pipeline.errors import ArchiveError, SettingsError, visible
 from pipeline.lazy import deferred
 from pipeline.simulator.scenes.farm.farm_scene import USUAL_HOUR
 from storage.archive.archive import Archive
-from storage.archive.kept_bytes import all_sizes, kept_by_runs
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run
 from storage.archive.whole_files import write_whole
@@ -52,11 +61,12 @@ else:
 MOST_ROWS = 1000  # of the table; older ones are counted
 MOST_VISITS = 24  # that a page shows: the newest
 MOST_PX = 400  # of a visit's picture
-MOST_CLASSES = 128  # that are told apart, the last of them standing for none
+MOST_CLASSES = 128  # that have numbers of their own, the last of them standing for none
 CHANGED_FRACTION = 0.25  # of a patch's pixels, from which it is said to have changed
 PALE = 0.8  # of what did not change
 SAVINGS = {"capture_s": "time at the camera", "lines": "lines", "bytes_kept": "bytes kept", "multiply_adds": "model"}
 SCORES = {"miou": "mIoU", "overall_accuracy": "overall"}
+TRAINING_MARKS = {"all": "*", "tiles": "**", "other pixels": "***"}  # behind scores, by `TRAINING_SCENE`
 DRAWN_YEARS = range(1900, 2200)
 _MOST_VALUE = 1e100  # that can be drawn; receipts may claim anything
 Row = Mapping[str, Any]
@@ -110,7 +120,7 @@ def read_history(archive: Archive, field: str | None = None) -> FieldHistory:
         raise ArchiveError(f"{which}; give --field with one of: {', '.join(names) or 'none'}")
     own = sorted((run for run in catalogue.runs if called(run) == name), key=lambda run: str(time_of_visit(run) or ""))
     maps = {run.uri: shown for run in own if (shown := _map_of(archive, catalogue, run)) is not None}
-    kept = kept_by_runs(catalogue, all_sizes(archive, catalogue))
+    kept = catalogue.kept_by_runs(archive.all_sizes(catalogue))
     rows = [_row(run, maps.get(run.uri), kept[run.uri]) for run in own]
     mapped = [(run, row) for run, row in zip(own, rows, strict=True) if run.uri in maps][-MOST_VISITS:]
     visits = [_visit(archive, run, row, maps[run.uri]) for run, row in mapped]
@@ -138,7 +148,7 @@ def _row(run: Run, shown: ClassMap | None, kept: int) -> Row:
     told = found if isinstance(found := run.receipt.get("data_bytes"), Mapping) else {}
     if reference := known_number(told.get("reference")):
         entries["bytes_kept"] = {"ratio": kept / reference}
-    hectares, areas = areas_on_ground(run.receipt), dict[str, float]()
+    hectares, areas = hectares_of_classes(run.receipt), dict[str, float]()
     if hectares is not None:
         areas = {str(name): float(area) for name, area in hectares.items() if known_number(area) is not None}
     elif shown is not None:
@@ -151,6 +161,7 @@ def _row(run: Run, shown: ClassMap | None, kept: int) -> Row:
         "visited": None if (at := time_of_visit(run)) is None else at.isoformat().replace("+00:00", "Z"),
         "capture_seconds": {name: known_number(entries["capture_s"].get(name)) for name in ("done", "full")},
         **score_of(run.receipt),
+        "training_scene": next((kind for kind in TRAINING_SCENE if kind == run.receipt.get("training_scene")), None),
         "savings": {name: known_number(entry.get("ratio")) for name, entry in entries.items()},
         "areas": areas,
         "unit": "fraction" if hectares is None else "ha",
@@ -188,7 +199,7 @@ def time_of_visit(run: Run) -> datetime | None:
 def _visit(archive: Archive, run: Run, row: Row, shown: ClassMap) -> dict[str, str]:
     """Return when a visit was, its map, what changed of it among pale colours (empty of a first one), and words."""
     thin = slice(None, None, -(-max(shown.classes.shape) // MOST_PX))
-    palette = pictures.palette_bytes(shown.names[: MOST_CLASSES - 1], shown.colours[: MOST_CLASSES - 1])[:MOST_CLASSES]
+    palette = pictures.palette_bytes(shown.colours[: MOST_CLASSES - 1])[:MOST_CLASSES]
     numbers, changes = np.minimum(shown.classes[thin, thin], MOST_CLASSES - 1), ""
     address = run.products.get("class_probabilities")
     with suppress(OSError, LookupError, ValueError):
@@ -229,9 +240,12 @@ def render_history(history: FieldHistory, runs_at: str) -> str:
     moments = ((read_moment(row.get("visited") or row["created"]), row) for row in history.runs)
     dated = [(moment, row) for moment, row in moments if moment is not None and moment.year in DRAWN_YEARS]
 
-    def series(labels: Mapping[str, str], of: str | None = None) -> Points:
-        parts = {name: [(at, row[of].get(name) if of else row[name]) for at, row in dated] for name in labels}
-        return {labels[name]: [(at, one) for at, one in points if one is not None] for name, points in parts.items()}
+    def savings_of(name: str) -> Sequence[tuple[datetime, float]]:
+        return [(at, one) for at, row in dated if (one := row["savings"].get(name)) is not None]
+
+    def scores_of(name: str, *, trained: bool) -> Sequence[tuple[datetime, float]]:
+        fitting = [(at, row[name]) for at, row in dated if (row["training_scene"] is not None) is trained]
+        return [(at, one) for at, one in fitting if one is not None]
 
     colours = {name.replace("_", " "): colour for name, colour in history.colours.items()}
     charts: list[tuple[str, Points, bool]] = []
@@ -240,8 +254,15 @@ def render_history(history: FieldHistory, runs_at: str) -> str:
         names = dict.fromkeys(name for _, areas in own for name, area in areas.items() if area)
         areas = {name.replace("_", " "): [(at, one[name]) for at, one in own if name in one] for name in names}
         charts.append((title, areas, unit == "fraction"))
-    charts.append(("Fraction of everything", series(SAVINGS, "savings"), True))
-    charts.append(("Score against the truth", series(SCORES), True))
+    charts.append(("Fraction of everything", {label: savings_of(name) for name, label in SAVINGS.items()}, True))
+    scores = {
+        f"{label}{', trained on it' * trained}": scores_of(name, trained=trained)
+        for trained in (False, True)
+        for name, label in SCORES.items()
+    }
+    charts.append(("Score against the truth", scores, True))
+    shown = history.runs[-MOST_ROWS:]
+    kinds = [kind for kind in TRAINING_SCENE if any(row["training_scene"] == kind for row in shown)]
     return pages.render_page(
         "history.html",
         kicker="SpectralZoom field",
@@ -250,7 +271,8 @@ def render_history(history: FieldHistory, runs_at: str) -> str:
         about=f"{history.archive}; times in UTC",
         charts=[{"title": title, "picture": picture} for title, picture in _drawn(charts, colours)],
         visits=history.visits,
-        runs=[_shown(row, runs_at) for row in reversed(history.runs[-MOST_ROWS:])],
+        runs=[_shown(row, runs_at) for row in reversed(shown)],
+        trained={TRAINING_MARKS[kind]: TRAINING_SCENE[kind] for kind in kinds},
         older_runs=len(history.runs) - MOST_ROWS,
     )
 
@@ -272,7 +294,9 @@ def _drawn(charts: Sequence[tuple[str, Points, bool]], colours: Mapping[str, str
                 axes.plot(*zip(*points, strict=True), marker="o", markersize=4, label=label, color=colours.get(name))
         axes.set_ylim(bottom=0)
         if is_fraction:
-            axes.yaxis.set_major_formatter(lambda value, _: f"{100 * value:.3g} %")
+            axes.yaxis.set_major_formatter(
+                lambda value, _: format_percent(value) if value >= MOST_PERCENT / 100 else f"{100 * value:.3g} %"
+            )
         axes.grid(color=panels.GRID)
         axes.tick_params(axis="x", labelrotation=20)
         figure.legend(loc="outside right upper", frameon=False, fontsize=8)
@@ -285,12 +309,13 @@ def _shown(row: Row, runs_at: str) -> dict[str, Any]:
     largest = sorted(row["areas"].items(), key=lambda item: -item[1])[:3]
     show = format_area if row["unit"] == "ha" else format_percent
     name = quote(str(row["run"]).removeprefix("runs/"), errors="surrogateescape")
+    mark = TRAINING_MARKS.get(row["training_scene"], "")
     return {
         "visited": _short(str(row.get("visited") or "")) or DASH,
         "published": _short(str(row["created"])),
         "report": f"{runs_at}/runs/{name}/report.html" if runs_at else "",
         "capture_s": row["savings"]["capture_s"],
-        **{score: row[score] for score in SCORES},
+        **{score: format_points(row[score]) + mark * (row[score] is not None) for score in SCORES},
         "areas": ", ".join(f"{name.replace('_', ' ')} {show(area)}" for name, area in largest if area),
     }
 

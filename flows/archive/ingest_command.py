@@ -1,4 +1,4 @@
-"""What `spectralzoom ingest` does and shows: one file or folder becomes one immutable store of an archive."""
+"""The verb `ingest`: one file or folder becomes one immutable store of an archive."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from storage.archive.staging import check_name, file_hash
 from storage.readers.cube_sources import CubeSource
 from storage.readers.open_cubes import open_cube, with_wavelengths
 from storage.readers.pointing_tables import find_pointing
+from storage.readers.scene_files import with_stated_values
 from storage.readers.zarr_files import Report, SourceFile, write_ingested_cube
 from storage.remote.opening import open_archive
 
@@ -83,7 +84,8 @@ def run_ingest(
     if name is not None:
         check_name(name)
     with console.status("opening the source"):
-        cube = with_wavelengths(open_cube(source, dark=dark, white=white), source, wavelengths)
+        found = with_wavelengths(open_cube(source, dark=dark, white=white), source, wavelengths)
+        cube = with_stated_values(found, source)
         opened = open_archive(archive)
         opened.reclaim()  # what a killed ingest left half made
     with opened.in_use(), StageProgress(console, TITLES) as progress:
@@ -134,7 +136,7 @@ def _stamps(source: CubeSource) -> list[tuple[int, int]]:
 
 
 def _key(name: str | None, source: CubeSource, files: Sequence[SourceFile]) -> dict[str, Any]:
-    """What the store depends on: content, the flags, and wavelengths that come from elsewhere than the files."""
+    """Return what the store depends on: content, the flags, and wavelengths that come from elsewhere than the files."""
     named = source.root is not None  # in a Zarr store names say where a chunk lies
     centres, widths = source.bands.wavelength_nm, source.bands.fwhm_nm
     return {

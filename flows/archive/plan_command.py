@@ -1,4 +1,4 @@
-"""What `spectralzoom plan` does: a survey's stages are asked which store they want; nothing is built or written."""
+"""The verb `plan`: a survey's stages are asked which store they want; nothing is built or written."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from rich.console import Console
 from rich.markup import escape
 
+from flows.archive.plan_estimate import Estimate, estimate_survey, estimate_table
 from flows.cli.app import AsJson
 from flows.cli.survey_verbs import NO_FLAGS, SurveyFlags, by_setting
 from flows.publish.findings import field_figures
@@ -54,8 +55,9 @@ State = Literal["cached", "to run", "blocked"]
 def plan(
     settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, preview: Path | None = None, as_json: AsJson = False
 ) -> int:
-    """Tell what a survey would run: what is stored, what is to be made and why, and how long the camera takes.
+    """Tell what a survey would run: what is stored, what is to be made and why, and estimates of what it takes.
 
+    Those are seconds of the camera, bytes, multiply-adds, score and processor time, each with what it comes from.
     Nothing is captured, started or written, but for the preview. Give the settings that you would give to `survey`.
 
     Parameters
@@ -71,7 +73,7 @@ def plan(
 
 @dataclass(frozen=True)
 class StageForecast:
-    """What would become of one stage."""
+    """Forecast of one stage."""
 
     stage: str
     state: State
@@ -86,7 +88,7 @@ class _WaitsError(IncompleteStoreError):
 
 @dataclass(frozen=True)
 class _Awaited(StageRef):
-    """Where a store would be: whoever asks for its path, or for a key that is not known, waits for ``made_by``."""
+    """Address of a store that is still to be made: asking for its path, or for an unknown key, raises ``made_by``."""
 
     made_by: str
 
@@ -99,19 +101,20 @@ class _Awaited(StageRef):
 
 @dataclass(frozen=True)
 class Forecast:
-    """What a survey would do, stage by stage in order, and why this machine would refuse to (None: it would not)."""
+    """Forecast of a survey, stage by stage in order, and why this machine would refuse it (None: it would not)."""
 
     stages: list[StageForecast]
     refused: str | None = None
     scans: ScanChoice = field(default_factory=ScanChoice)
     figures: Mapping[str, Any] = field(default_factory=dict)  # see `flows.publish.findings`
+    estimates: Mapping[str, Estimate] = field(default_factory=dict)
     kept: Mapping[str, Any] | None = (
         None  # of a uniform scan that is kept and read in part: at most, as receipts tell it
     )
 
 
 def forecast(settings: Settings, preview: Path | None = None) -> Forecast:
-    """What a survey would do, stage by stage; writes nothing but the ``preview``, where one is asked for.
+    """Return what a survey would do, stage by stage; writes nothing but the ``preview``, where one is asked for.
 
     Raises PipelineError: what a survey would refuse, but size; ArchiveError: the preview cannot be written.
     """
@@ -135,7 +138,8 @@ def forecast(settings: Settings, preview: Path | None = None) -> Forecast:
             with refusals(preview.parent, "write the preview"):
                 plan_preview.draw_preview(preview, run, fine, _last_map(run, catalogue), figure_lines(figures))
     kept = None if run.budget is None else run.budget.figures(run.budget.most_patches)
-    return Forecast(planner.rows, run.refused, run.scans, figures, kept)
+    estimates = estimate_survey(run, fine, catalogue)
+    return Forecast(planner.rows, run.refused, run.scans, figures, estimates, kept)
 
 
 def _last_map(run: SurveyRun, catalogue: Catalogue) -> ClassMap | None:
@@ -191,7 +195,7 @@ class Planner(OpenSurvey):
         return row, _Awaited(ref.stage, key, ref.path, stage.name)
 
     def _reason(self, stage: Stage, store: Store) -> tuple[str, tuple[Change, ...]]:
-        """What differs from the newest store of the same stage of the same scene, in words and in full."""
+        """Return what differs from the newest store of the same stage of the same scene, in words and in full."""
         there = self.catalogue.stores.get(store.ref.uri)
         if there is not None and there.cleared:
             return "its files were cleared away by gc", ()
@@ -247,6 +251,7 @@ def plan_content(settings: Settings, preview: Path | None = None) -> dict[str, A
         "refused": found.refused,
         "scans": scans_content(found.scans),
         "field": found.figures,
+        "estimate": {name: asdict(one) for name, one in found.estimates.items()},
         **({} if found.kept is None else {"kept": found.kept}),
         **({} if preview is None else {"preview": str(preview)}),
     }
@@ -279,6 +284,8 @@ def show_plan(content: dict[str, Any], console: Console) -> None:
         f"{content['to_make']} stages to make" if content["to_make"] else "everything is stored: it would be published"
     )
     console.print(made)
+    if content["to_make"]:
+        console.print(estimate_table(content["estimate"]))
     if content["scans"]["frontier"]:
         _show_scans(content["scans"], console)
     if "preview" in content:
@@ -309,7 +316,7 @@ def figure_lines(figures: Mapping[str, Any]) -> list[str]:
 
 
 def format_kept(kept: Mapping[str, Any]) -> str:
-    """How much of a uniform scan the budgets pay for at most."""
+    """Return how much of a uniform scan the budgets pay for at most."""
     read = kept["multiply_adds"]["done"] / kept["multiply_adds"]["everything"]
     return (
         f"detail: at most {kept['patches']} of {kept['of_patches']} patches, for {format_percent(read)} of the "

@@ -70,7 +70,7 @@ def _draw_map(axes: Axes, shape: tuple[int, int], last: ClassMap | None) -> list
         outline = {"facecolor": "#e9ebe2", "edgecolor": "#8a8d84"}
         axes.add_patch(PathPatch(_path(shapely.box(0, 0, columns, rows)), **outline))
         return []
-    palette, present = class_palette(len(last.names), last.colours), set(np.unique(last.classes).tolist())
+    palette, present = class_palette(last.colours), set(np.unique(last.classes).tolist())
     thin = slice(None, None, -(-max(rows, columns) // MOST_PX))
     pale = 0.45 + 0.55 * class_rgb(last.classes[thin, thin], palette)
     axes.imshow(pale, extent=(0, columns, rows, 0), interpolation="nearest")

@@ -18,7 +18,7 @@ from storage.export.map_files import UNITS, DoseUnit
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class ProductFlags:
-    """What was given of the products to make of a run."""
+    """Flags of the products to make of a run."""
 
     reflectance: Annotated[
         Switch, Parameter(help="Also all bands as GeoTIFF: the coarse mosaic, of a raster its own pixels.")

@@ -1,4 +1,4 @@
-"""What `spectralzoom reprocess` and `evaluate ARCHIVE RUN` do: surveys of an archive again, and maps judged later.
+"""The verbs `reprocess` and `evaluate ARCHIVE RUN`: surveys of an archive again, and maps judged later.
 
 What the archive holds is found by its key, raw light above all; only what new weights or newer stages change is made.
 """
@@ -86,9 +86,9 @@ def reprocess_fields(
     pool: WorkerPool = THREADS,
     survey: Survey | None = None,
 ) -> dict[str, Any]:
-    """Survey again what was asked for, and return a row a field; ``pool`` makes blocks, whoever made the old ones.
+    """Survey again what was asked for, and return a row a field; ``pool`` makes the blocks.
 
-    Fields whose newest run is already as it would become are skipped: the same command goes on after an interruption.
+    Fields whose newest run is already as it would become are skipped: the same command continues after an interruption.
     Raises SettingsError: no field is called so; ArchiveError: the archive cannot be read or written.
     """
     opened = open_archive(archive, create=False, write=not dry_run)
@@ -133,7 +133,7 @@ def _asked(
 ) -> Settings | None:
     """Return what to survey a field by again; None where its newest run is already as it would become.
 
-    ``renewed`` names the newest run of each visit that another may go on from.
+    ``renewed`` names the newest run of each visit that may be another's prior map.
     """
     here: dict[str, Any] = {"scheduler": pool.scheduler, "workers": pool.workers}
     settings = replace(asked_again(run, archive, weights), **here)

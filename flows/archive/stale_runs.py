@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import cache
@@ -16,7 +15,7 @@ from flows.tasks.open_survey import STAGES, versions
 from flows.tasks.survey_model import weights_path
 from models.weights.files import describe_weights
 from pipeline.errors import PipelineError, SettingsError, WeightsError
-from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, USUAL_DAY, USUAL_HOUR, law_of_key
+from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, USUAL_DAY, USUAL_HOUR
 from storage.archive.keys import canonical_json
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run, Store
@@ -96,7 +95,7 @@ def from_raw_cubes(catalogue: Catalogue, run: Run, settings: Settings) -> Settin
 
 
 def _is_there(settings: Settings) -> bool:
-    """Whether what a recording or a scene comes from still lies where it lay; a rig is taken to be there."""
+    """Return whether what a recording or a scene comes from still lies where it lay; a rig is taken to be there."""
     if settings.source == RECORDED:
         try:
             find_raw_cubes(str(settings.sweeps))
@@ -109,25 +108,16 @@ def _is_there(settings: Settings) -> bool:
 
 
 def _light_of(run: Run) -> dict[str, Any]:
-    """What the light of a run depends on, with the farm by its law: ``farm`` has not always meant the present one."""
-    settings = {**run.settings, **_scene_of(run)}
-    light = {key: settings.get(key) for key in OF_THE_LIGHT}
-    if settings.get("scene") == FARM_LAW:
+    """Return the settings that the light of a run depends on, with the farm by one name and its usual moment."""
+    light = {key: run.settings.get(key) for key in OF_THE_LIGHT}
+    if light["scene"] in BUILT_IN_SCENES:
         usual = {"day": USUAL_DAY, "hour": USUAL_HOUR}
-        light |= {key: value if light[key] is None else light[key] for key, value in usual.items()}
+        light |= {"scene": FARM_LAW} | {key: value for key, value in usual.items() if light[key] is None}
     return light
 
 
-def _scene_of(run: Run) -> Mapping[str, str]:
-    """The scene of a run's settings, where it is a built-in farm: the law that the run was drawn by."""
-    scene = run.settings.get("scene")
-    if scene not in BUILT_IN_SCENES:
-        return {}
-    return {"scene": law_of_key(str(run.receipt.get("scene"))) or FARM_LAW}
-
-
 def is_called(generation: Generation, pattern: str) -> bool:
-    """Whether a field's survey, scene or run is called so; ``*`` stands for any letters."""
+    """Return whether a field's survey, scene or run is called so; ``*`` stands for any letters."""
     scene = str(generation.run.settings.get("scene", ""))
     names = (generation.field, scene, PurePath(scene).name, generation.run.folder.name)
     return any(fnmatchcase(name, pattern.replace("[", "[[]").replace("?", "[?]")) for name in names)
@@ -136,12 +126,11 @@ def is_called(generation: Generation, pattern: str) -> bool:
 def asked_again(run: Run, out: str | Path, weights: Path | None) -> Settings:
     """The settings of a run for another survey into the archive ``out``, with other weights if they are given.
 
-    A farm is asked for by the law that the run was drawn by: it is the same land, or none where the law was removed.
     Raises SettingsError, BudgetError: the run's settings cannot be read, or are not of this version.
     """
     if not run.settings:
         raise SettingsError(f"the settings of {run.uri} cannot be read ({run.problem}); survey this field by hand")
-    known = of_this_version(run.settings) | dict.fromkeys(OF_THE_MACHINE) | {**_scene_of(run)}
+    known = of_this_version(run.settings) | dict.fromkeys(OF_THE_MACHINE)
     return parse_settings({**known, "out": str(out), **({} if weights is None else {"weights": str(weights)})})
 
 
@@ -158,22 +147,20 @@ def stale_stores(catalogue: Catalogue, uris: set[str], weights: str | None) -> s
 
 
 def is_whole(catalogue: Catalogue, run: Run) -> bool:
-    """Whether run and stores are there, told from manifests alone, and none of its stages failed."""
+    """Return whether run and stores are there, told from manifests alone, and none of its stages failed."""
     stores = [catalogue.stores.get(uri) for uri in catalogue.named_and_below[run.uri]]
     failed = any(row.get("state") == "failed" for row in run.stages)
     return run.problem is None and not failed and all(one is not None and one.problem is None for one in stores)
 
 
 def is_current(catalogue: Catalogue, run: Run, settings: Settings) -> bool:
-    """Whether its survey would find all that this run rests on, by versions and weights, not by a scene's file."""
-    drawn_by = law_of_key(str(run.receipt.get("scene")))
-    of_this_law = settings.scene not in BUILT_IN_SCENES or drawn_by == FARM_LAW
+    """Return whether its survey would find all that this run rests on, by versions and weights alone."""
     stale = stale_stores(catalogue, catalogue.named_and_below[run.uri], weights_key(settings))
-    return of_this_law and not stale and is_whole(catalogue, run) and not is_pending(run.receipt)
+    return not stale and is_whole(catalogue, run) and not is_pending(run.receipt)
 
 
 def weights_key(settings: Settings) -> str | None:
-    """What the weights are called by what they hold, as stages know it; None where they cannot be read."""
+    """Return what the weights are called by what they hold, as stages know it; None where they cannot be read."""
     try:
         path = weights_path(settings)
         return _file_key(path, path.stat().st_mtime_ns, path.stat().st_size)

@@ -43,9 +43,10 @@ def tradeoff(
     stage
         rectify, segment, simulate, store or survey; all without one.
     scene
-        For store: a cube of raw numbers, whose pixels are taken in place of a farm's lines.
+        A labelled scene in place of a farm: for segment, whose pixels are taken as they are, for survey, at which the
+        simulated rig looks, and for store, a cube of raw numbers. Without a stage segment and survey.
     weights
-        For store: weights that read the scene; without them no map of it is drawn.
+        Weights that know its classes; for store they may be missing, and no map is drawn.
     out
         Folder for tradeoff.json and tradeoff.png.
     repeats

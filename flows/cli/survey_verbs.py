@@ -51,12 +51,12 @@ _OfSimulation: Any = _flags((*_RENDERING, "tol", "size", "exposure_ms", "workers
 
 @Parameter(name="*")
 class SurveyFlags(_Every):  # type: ignore[misc]
-    """What was given of a survey's settings; None where nothing was."""
+    """Flags of a survey's settings; None where none was given."""
 
 
 @Parameter(name="*")
 class RenderingFlags(_OfRendering):  # type: ignore[misc]
-    """What was given of how a simulated rig sees its scene."""
+    """Flags of how a simulated rig sees its scene."""
 
 
 @Parameter(name="*")

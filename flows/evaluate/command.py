@@ -146,7 +146,7 @@ def _judged(
 
 @dataclass(frozen=True)
 class KeptResults:
-    """A folder of results by what they follow from: a run that was killed goes on. Without a folder nothing is kept."""
+    """A folder of results by their inputs: a run that was killed continues. Without a folder nothing is kept."""
 
     folder: Path | None
 

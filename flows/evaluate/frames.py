@@ -1,4 +1,4 @@
-"""What `spectralzoom evaluate` is asked, on which frames it judges which weights, and what these see of them.
+"""Frames and weights of `spectralzoom evaluate`: which weights are judged on which frames.
 
 Each frame is judged by those that never saw its labels. Of frames left out in turn each file is judged on its own: what
 it kept for validation is held out by another of them.
@@ -40,7 +40,7 @@ COST = CostModel()
 
 @dataclass(frozen=True)
 class EvaluateRequest:
-    """What to judge and how."""
+    """Request to judge weights."""
 
     dataset: str
     weights: tuple[Path, ...]
@@ -99,7 +99,7 @@ class Candidate:
             raise WeightsError(f"{self.path}: its camera is damaged ({error}); copy or train the file again") from error
 
     def trained_on(self, scene: RasterScene, name: str, law: str, *, bands_chosen: bool = False) -> bool:
-        """Whether labels of the scene taught these weights; not so where a mask kept some of its pixels out.
+        """Return whether labels of the scene taught these weights; not so where a mask kept some of its pixels out.
 
         Seen in other bands a scene has another identity: where bands or wavelengths were given, here or to the
         training, a frame of the data set ``law`` is also told by its name.
@@ -122,7 +122,7 @@ class Candidate:
 
     @property
     def split(self) -> dict[str, Any]:
-        """What training saw, validated on and left out."""
+        """Return what training saw, validated on and left out."""
         split: dict[str, Any] = self.described.record.get("split", {})
         return split
 

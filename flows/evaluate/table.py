@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from matplotlib.figure import Figure
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -21,6 +20,7 @@ from flows.terminal.figures import (
     format_points,
     format_seconds,
 )
+from flows.terminal.progress import table
 
 SHOWN_FRACTION = 0.10  # of the patches, or the nearest one tried: what is shown where one share has to do
 CAPTION = (
@@ -53,10 +53,10 @@ def print_evaluation(content: dict[str, Any], console: Console) -> None:
 
 
 def _accuracy(content: dict[str, Any]) -> Table:
-    names = ("K", "mIoU", "overall", "average", "kappa", "to all", "to random", "gap", "captured")
-    table = _table("placement", *names)
+    columns = ("placement", "K", "mIoU", "overall", "average", "kappa", "to all", "to random", "gap", "captured")
+    rows = []
     for row in content["rows"]:
-        table.add_row(
+        cells = (
             f"{row['policy']}{'*' if row['uses_labels'] else ''}",
             format_percent(row["fraction"]),
             _miou(row),
@@ -67,25 +67,26 @@ def _accuracy(content: dict[str, Any]) -> Table:
             format_difference(row["against_random"]),
             format_percent(row["gap_closed"]),
             format_percent(row["captured_gain"]),
-            style="dim" if row["uses_labels"] else "",
         )
-    return table
+        rows.append([f"[dim]{cell}" if row["uses_labels"] else cell for cell in cells])
+    return table(columns, rows, whole=columns)
 
 
 def _costs(content: dict[str, Any]) -> Table:
-    table = _table("placement", "K", "data", "of all", "multiply-adds", "of all", "seconds", "of full scan")
-    for row in content["rows"]:
-        cost = row["cost"]
-        table.add_row(
+    columns = ("placement", "K", "data", "of all", "multiply-adds", "of all", "seconds", "of full scan")
+    rows = [
+        [
             row["policy"],
             format_percent(row["fraction"]),
-            format_bytes(cost["bytes"]["done"]),
-            format_percent(cost["bytes"]["ratio"]),
-            format_count(cost["multiply_adds"]["done"]),
-            format_percent(cost["multiply_adds"]["ratio"]),
-            *_seconds(cost),
-        )
-    return table
+            format_bytes(row["cost"]["bytes"]["done"]),
+            format_percent(row["cost"]["bytes"]["ratio"]),
+            format_count(row["cost"]["multiply_adds"]["done"]),
+            format_percent(row["cost"]["multiply_adds"]["ratio"]),
+            *_seconds(row["cost"]),
+        ]
+        for row in content["rows"]
+    ]
+    return table(columns, rows, whole=columns)
 
 
 def _miou(row: dict[str, Any]) -> str:
@@ -106,15 +107,15 @@ def _classes(content: dict[str, Any]) -> Table:
     first = [row for row in content["rows"] if row["policy"] == content["rows"][1]["policy"]]
     nearest = min(first, key=lambda row: abs(row["fraction"] - SHOWN_FRACTION))
     shown = [shown[0], *([] if nearest in shown else [nearest]), *shown[1:]]
-    heads = (f"{row['policy']} {format_percent(row['fraction'])}" for row in shown)
-    table = _table("class", "labelled px", *heads, title="IoU by class")
+    columns = ("class", "labelled px", *(f"{row['policy']} {format_percent(row['fraction'])}" for row in shown))
+    rows = []
     for name, support in content["support"].items():
         cells = []
         for row in shown:
             false = row["false_classes"].get(name)  # how often the map shows a class that the labels lack
             cells += [format_points(row["per_class_iou"][name]) if false is None else f"{format_count(false)} px false"]
-        table.add_row(escape(name), format_count(support), *cells)
-    return table
+        rows.append([escape(name), format_count(support), *cells])
+    return table(columns, rows, title="IoU by class", whole=columns)
 
 
 def format_difference(interval: dict[str, float | None] | None) -> str:
@@ -124,16 +125,6 @@ def format_difference(interval: dict[str, float | None] | None) -> str:
     text = f"{100 * interval['difference']:+.1f}"
     low, high = interval["low"], interval["high"]
     return text if low is None or high is None else f"{text} [{100 * low:+.1f}, {100 * high:+.1f}]"
-
-
-def _table(first: str, *columns: str, title: str | None = None) -> Table:
-    table = Table(
-        title=title, title_justify="left", title_style="", header_style="dim", box=SIMPLE_HEAD, collapse_padding=True
-    )
-    table.add_column(first, no_wrap=True)
-    for name in columns:
-        table.add_column(name, justify="right", no_wrap=True)
-    return table
 
 
 def evaluation_figure(content: dict[str, Any]) -> Figure:

@@ -1,1 +1,1 @@
-"""What a survey leaves for people: receipt, report, pictures, judged once the run is published."""
+"""Publication of a survey: receipt, report, pictures, judged once the run is published."""

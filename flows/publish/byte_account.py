@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -55,46 +54,40 @@ def publish_counted(
     """Publish a run with receipt and page, and return the receipt: its bytes are those of the published run.
 
     All other files are in the draft's folder. ``rests_on`` is of `Archive.manifest_hashes`, ``written`` are bytes of
-    stores that are not told yet. Of a receipt of an earlier version, which has no account, nothing is counted.
+    stores that are not told yet.
     """
     facts: dict[str, Any] = {"survey": receipt["survey"], "settings": receipt["settings"], "rests_on": rests_on}
     stores, moved = archive.sizes(rests_on), archive.take_moved()
-    before, longest, folder = receipt.get("data_bytes"), {RECEIPT: 0, REPORT: 0}, 0
+    before, longest, folder = receipt["data_bytes"], {RECEIPT: 0, REPORT: 0}, 0
+    built = {row["key"] for row in receipt["stages"] if row["state"] == "ran"}
+    reused = {uri: size for uri, size in stores.items() if uri.rpartition("/")[2] not in built}
     while True:
-        if before is not None:
-            sent = moved + folder if archive.in_bucket else 0
-            told = {
-                "written": before["written"] + written + folder,
-                "kept": sum(stores.values()) + folder,
-                "moved_bucket": before["moved_bucket"] + sent,
-                "reused": _reused(receipt, stores),
-            }
-            receipt = check_receipt(receipt | {"data_bytes": before | told})
+        sent = moved + folder if archive.in_bucket else 0
+        told = {
+            "written": before["written"] + written + folder,
+            "kept": sum(stores.values()) + folder,
+            "moved_bucket": before["moved_bucket"] + sent,
+            "reused": reused,
+        }
+        receipt = check_receipt(receipt | {"data_bytes": before | told})
         for name, text in ((RECEIPT, to_json(receipt)), (REPORT, page_of(receipt))):
             content = text.encode()
             longest[name] = max(longest[name], len(content))
             draft.write_file(name, content.ljust(longest[name], b"\n"))  # none shrinks again: the figures come to rest
         size = draft.bytes_published(**facts)
-        if before is None or size == folder:
+        if size == folder:
             break
         folder = size
     draft.publish(**facts)
-    archive.take_moved()  # by the upload of the folder, which is told
+    archive.take_moved()  # by the upload of the folder, which is counted
     return receipt
-
-
-def _reused(receipt: Receipt, stores: Mapping[str, int]) -> dict[str, int]:
-    """Bytes of the stores that no stage of the run built, by address."""
-    built = {row["key"] for row in receipt["stages"] if row["state"] == "ran"}
-    return {uri: size for uri, size in stores.items() if uri.rpartition("/")[2] not in built}
 
 
 def recount_bytes(archive: Archive, run: str, replace_rows: Callable[[str, Receipt], str]) -> Receipt:
     """Publish a run again with its bytes as they are now, such as after stores were cleared away; return its receipt.
 
     ``run`` is the name of its folder; ``replace_rows`` gives a page with the bytes of a receipt in it. Nothing else of
-    the run changes; one of an earlier version, without an account, stays as it is. Raises ArchiveError: there is no
-    such run; IncompleteStoreError: it is damaged.
+    the run changes. Raises ArchiveError: there is no such run; IncompleteStoreError: it is damaged.
     """
     draft = archive.extend_run(run)
     assert draft is not None
@@ -103,19 +96,12 @@ def recount_bytes(archive: Archive, run: str, replace_rows: Callable[[str, Recei
         found = read_run(place, {})
         if found.problem is not None:
             raise IncompleteStoreError(f"{found.uri}: {found.problem}; run verify --repair on the archive")
-        if "data_bytes" not in found.receipt:
-            return dict(found.receipt)
-        _copy_files(place, draft.folder)
+        for path in place.iterdir():
+            if path.name not in (RECEIPT, REPORT, MANIFEST_NAME):  # those are written anew
+                shutil.copyfile(path, draft.folder / path.name)
         page = (place / REPORT).read_text(encoding="utf-8")
         there = [uri.split("/")[1:] for uri in found.recorded if (archive.root / uri / MANIFEST_NAME).is_file()]
         rests_on = archive.manifest_hashes(store_at(archive.root, stage, key) for stage, key in there)
         return publish_counted(
             archive, draft, dict(found.receipt), lambda receipt: replace_rows(page, receipt), rests_on=rests_on
         )
-
-
-def _copy_files(place: Path, to: Path) -> None:
-    """Copy the files of a published run but those that are written anew."""
-    for path in place.iterdir():
-        if path.name not in (RECEIPT, REPORT, MANIFEST_NAME):
-            shutil.copyfile(path, to / path.name)

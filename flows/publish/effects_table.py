@@ -52,7 +52,7 @@ def _figures(row: Row, total: Row) -> list[str]:
 
 
 def _format_row(row: Row) -> str:
-    """How large an effect is, and why it is nevertheless there or left out where its figures do not tell."""
+    """Return how large an effect is, and why it is nevertheless there or left out where its figures do not tell."""
     said = {
         "exact": "",
         "needed": "",
@@ -75,7 +75,7 @@ def format_change(value: float | None, *, endless: bool = False) -> str:
 
 
 def format_total(total: Mapping[str, Any]) -> Sequence[str]:
-    """What was asked for and what is left out, against the tolerance, and the seconds that this saves."""
+    """Return what was asked for and what is left out, against the tolerance, and the seconds that this saves."""
     unit, count = UNIT_NAMES[total["unit"]], total["on"] + total["off"]
     tolerance = "any number of" if total["tolerance"] is None else f"{total['tolerance']:g}"
     words = [f"{total['on']} of {count} effects are computed (asked: {total['asked']}, tolerance {tolerance} {unit})."]

@@ -13,7 +13,7 @@ from matplotlib.colors import to_rgba
 from numpy.typing import NDArray
 from PIL import Image
 
-from flows.publish.panels import UNLABELLED_COLOUR, class_palette, data_address, webp
+from flows.publish.panels import UNLABELLED_COLOUR, data_address, webp
 from flows.publish.quicklook import QuicklookData, colours_of
 from flows.publish.receipt import Receipt
 from flows.publish.receipt_table import format_days
@@ -48,7 +48,7 @@ class MapLayer:
 
 @dataclass(frozen=True)
 class FieldMap:
-    """What the page shows: size (width, height) [px], layers from the lowest up, classes with colour and share."""
+    """Content of the page: size (width, height) [px], layers from the lowest up, classes with colour and share."""
 
     size: tuple[int, int]
     layers: Sequence[MapLayer]
@@ -57,13 +57,13 @@ class FieldMap:
 
     @property
     def data(self) -> dict[str, Any]:
-        """What the page's script is given."""
+        """Return what the page's script is given."""
         return {"size": list(self.size), "layers": [asdict(layer) for layer in self.layers]}
 
 
 @dataclass(frozen=True)
 class PriorMapField:
-    """What a map that goes on from an earlier run has of it."""
+    """Images of the earlier run whose map is the prior map."""
 
     run: str
     days: float  # between that capture and this one
@@ -73,7 +73,7 @@ class PriorMapField:
 
 
 def prior_map(prior: Prior | None, drawn: StageRef, receipt: Receipt) -> PriorMapField | None:
-    """Return what the prior map shows; None where a map goes on from no other run, or put it aside.
+    """Return what the prior map shows; None where there is none, or it was put aside.
 
     ``drawn`` is the store of the class map and of the class probabilities.
     """
@@ -95,14 +95,15 @@ def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: Prio
     """Gather the layers of a run; ``shown`` is what its quicklook shows."""
     height, width = shown.class_map.shape
     thin = slice(None, None, -(-max(height, width) // MOST_PX))
-    palette = palette_bytes(shown.class_names, shown.class_colours)
+    palette = palette_bytes(shown.class_colours)
 
     def classes(image: NDArray[np.integer]) -> str:
         return layer_address(image[thin, thin].astype(np.uint8), palette)
 
     title = choose_bands(shown.wavelength_nm)[1].capitalize()
     colours = np.rint(255 * colours_of(shown, shown.rectified)).astype(np.uint8)
-    layers = [MapLayer(title, photo_address(colours[thin, thin]), shown=True)]
+    photo = webp(Image.fromarray(np.ascontiguousarray(colours[thin, thin])), quality=QUALITY)
+    layers = [MapLayer(title, data_address(photo), shown=True)]
     layers.append(MapLayer("Class map", classes(shown.class_map), shown=True))
     if shown.confidence is not None:
         layers.append(MapLayer("Confidence, dark 0 to bright 1", _ramp_address(shown.confidence[thin, thin], 1.0)))
@@ -152,10 +153,10 @@ def error_address(class_map: NDArray[np.integer], labels: NDArray[np.integer]) -
     return layer_address(np.where(judged, 1 + (class_map != labels), 0).astype(np.uint8), np.array(colours, np.uint8))
 
 
-def palette_bytes(names: Sequence[str], colours: NDArray[np.integer] | None) -> Bytes:
+def palette_bytes(colours: NDArray[np.integer]) -> Bytes:
     """Return the (256, 3) colours of class numbers; all beyond the classes are grey."""
     palette = np.tile(np.rint(255 * np.array(UNLABELLED_COLOUR)).astype(np.uint8), (256, 1))
-    palette[: len(names)] = np.rint(255 * class_palette(len(names), colours)).astype(np.uint8)
+    palette[: len(colours)] = colours
     return palette
 
 
@@ -177,11 +178,6 @@ def _table(colours: Bytes) -> Bytes:
     table[:, 3] = 255
     table[: len(colours), : colours.shape[1]] = colours
     return table
-
-
-def photo_address(picture: Bytes) -> str:
-    """Return the data address of a (y, x, 3) photograph."""
-    return data_address(webp(Image.fromarray(np.ascontiguousarray(picture)), quality=QUALITY))
 
 
 def _ramp_address(values: NDArray[np.floating], most: float) -> str:

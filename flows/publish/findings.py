@@ -1,4 +1,4 @@
-"""What a run finds: hectares of each class, what changed, what is old; its zones and plots; what its map says."""
+"""Findings of a run: hectares of each class, changes, ages; its zones and plots; the map's own figures."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from flows.tasks.stages.maps import OUT_OF_RANGE
 from flows.terminal.figures import format_points
 from models.evaluation.expected_scores import expected_counts
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, FieldScale, PlacedPicture, areas_by_number
+from pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, FieldScale, areas_by_number
 from pipeline.ground.georeference import crs_name, pixel_side_m
-from pipeline.ground.zones import figures_of_plots
+from pipeline.ground.zones import figures_of_plot
 from pipeline.planning.fine_pass import FinePlan
 from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table
 from storage.arrays.class_maps import ClassMap, ProbabilityStore
 from storage.arrays.ground_maps import GroundMap
 
-OLDER_DAYS = (1, 7, 30)  # since a look, of which the hectares are told
+OLDER_DAYS = (1, 7, 30)  # since a capture, for which hectares are given
 PLOTS_FILE = "plots.csv"
 STRIP_ROWS = 256  # of class probabilities that are read at a time
 
 
 def field_figures(run: SurveyRun, fine: FinePlan | None) -> dict[str, Any]:
-    """Figures of the field and of the captures as JSON tells them; None for what nobody knows.
+    """Return figures of the field and of the captures, for JSON; None for what is unknown.
 
     ``fine`` is the fine pass where it is planned already, else it takes what the budget leaves at most. Hectares are
     those that the survey keeps to, and those an hour are of all of the camera's seconds. A raster has no camera: no
@@ -77,6 +77,20 @@ def _kept(run: SurveyRun, scale: FieldScale) -> FieldScale:
     return replace(scale, area_m2=_ground_m2(run, run.zones.kept.kept))
 
 
+def find_areas(run: SurveyRun, posed: GroundMap | None, drawn: ClassMap) -> dict[str, Any]:
+    """Return ``areas``: pixels of each class, and hectares where something says how large a pixel is.
+
+    Those of a run with a pose are of its map on the ground.
+    """
+    names = drawn.names
+    pixels = np.bincount(drawn.classes.ravel(), minlength=len(names)).tolist()
+    m2 = None if posed is not None else areas_by_number(run.zones.place, drawn.classes, len(names))
+    hectares = {} if m2 is None else dict(zip(names, (m2 / M2_PER_HECTARE).tolist(), strict=True))
+    if posed is not None:
+        hectares = {name: area["ha"] for name, area in posed.areas.items()}
+    return {"areas": {"px": dict(zip(names, pixels, strict=False)), **({"ha": hectares} if hectares else {})}}
+
+
 def find_ground(
     run: SurveyRun,
     posed: GroundMap | None,
@@ -84,23 +98,13 @@ def find_ground(
     probabilities: ProbabilityStore,
     memory: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
-    """Return ``ground``: grid, hectares of each class, what changed by ``memory``, and what is old.
-
-    Empty for a run without a place.
-    """
+    """Return ``ground``: grid, what changed by ``memory``, and what is old. Empty for a run without a place."""
     geobox = run.scene.geobox if posed is None else posed.geobox
     if geobox is None:
         return {}
-    if posed is None:  # the class map itself, in hectares of the ellipsoid
-        areas = areas_by_number(PlacedPicture(geobox), found.classes, len(found.names))
-        assert areas is not None
-        hectares = dict(zip(found.names, (areas / M2_PER_HECTARE).tolist(), strict=True))
-        side = pixel_side_m(geobox)
-    else:
-        hectares = {name: area["ha"] for name, area in posed.areas.items()}
-        side = abs(float(geobox.resolution.x))
-    figures: dict[str, Any] = {"crs": crs_name(geobox), "resolution_m": side}
-    figures |= {"shape": [int(size) for size in geobox.shape], "areas_ha": hectares}
+    side = pixel_side_m(geobox) if posed is None else abs(float(geobox.resolution.x))
+    shape = [int(size) for size in geobox.shape]
+    figures: dict[str, Any] = {"crs": crs_name(geobox), "resolution_m": side, "shape": shape}
     place, drawn = run.zones.place, found.classes != UNLABELLED
     figures |= {"older_ha": older_hectares(place, np.where(drawn, probabilities.age(), np.nan))}
     if (old_class := probabilities.old_class()) is not None:
@@ -150,8 +154,10 @@ def find_zones(run: SurveyRun, drawn: ClassMap) -> dict[str, Any]:
             "kept_m2": _ground_m2(run, kept),
         }
     if zones.plots is not None:
-        rows = figures_of_plots(zones.plots, zones.place, drawn.classes, drawn.confidence, drawn.names)
-        found["plots"] = [asdict(row) for row in rows]
+        found["plots"] = [
+            asdict(figures_of_plot(name, shape, zones.place, drawn.classes, drawn.confidence, drawn.names))
+            for name, shape in zones.plots.items()
+        ]
     return found
 
 
@@ -198,7 +204,7 @@ def find_map(run: SurveyRun, ref: StageRef, drawn: ClassMap) -> dict[str, Any]:
 
 
 def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
-    """What the map is likely to score by what it says of itself; None where nobody knows how such comes true.
+    """Return the expected score by the map's own probabilities; None where these were never compared with labels.
 
     That is known of maps of uniform scans that are read whole, without a memory. Pixels without a class do not count. A
     score of which the error leaves open nearly everything is not predicted, and the words say so.

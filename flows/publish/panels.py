@@ -1,4 +1,4 @@
-"""What pictures of a map are made of: palettes, outlines of patches, scale bars; and the map on the ground."""
+"""Parts of pictures of a map: palettes, outlines of patches, scale bars; and the map on the ground."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from typing import IO, Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import hsv_to_rgb, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
@@ -39,11 +38,6 @@ STYLE: Any = {
     "savefig.facecolor": "#fbfaf7",
 }
 UNLABELLED_COLOUR = (0.86, 0.86, 0.84)
-# Okabe and Ito (2008), then Paul Tol's muted scheme (2021) without near twins: told apart by colour-blind readers
-_SAFE = (
-    *("#E69F00", "#009E73", "#56B4E9", "#D55E00", "#F0E442", "#0072B2", "#CC79A7", "#882255"),
-    *("#44AA99", "#332288", "#999933", "#DDCC77", "#AA4499", "#117733", "#88CCEE", "#CC6677"),
-)
 
 
 def save_png(figure: Figure, file: str | Path | IO[bytes], **choices: Any) -> None:
@@ -74,15 +68,9 @@ def grey_of(image: NDArray[np.floating]) -> NDArray[np.float32]:
     return stretch(mean[..., None])[..., 0]
 
 
-def class_palette(count: int, colours: NDArray[np.integer] | None = None) -> NDArray[np.float32]:
-    """(class, 3) colours 0..1: those given (0..255), else colour-blind safe ones, evenly spaced hues above 16."""
-    if colours is not None:
-        return np.asarray(colours, np.float32) / np.float32(255)
-    number = np.arange(count)
-    if count <= len(_SAFE):
-        return np.array([to_rgb(name) for name in _SAFE[:count]], np.float32)
-    lightness = np.where(number % 3 == 2, 0.55, 0.9)
-    return hsv_to_rgb(np.stack([number / count, 0.55 + 0.4 * (number % 2), lightness], axis=-1)).astype(np.float32)
+def class_palette(colours: NDArray[np.integer]) -> NDArray[np.float32]:
+    """Return (class, 3) colours 0..255 as 0..1."""
+    return np.asarray(colours, np.float32) / np.float32(255)
 
 
 def class_rgb(classes: NDArray[np.integer], palette: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -115,7 +103,7 @@ def draw_difference(path: Path, maps: Sequence[ClassMap], titles: Sequence[str])
     step = -(-max(old.shape) // GROUND_MOST_PX)
     beyond = tuple((0, -size % step) for size in old.shape)
     blocks = np.pad(differs, beyond).reshape(-(-old.shape[0] // step), step, -1, step)
-    palette = class_palette(len(maps[0].names), maps[0].colours)
+    palette = class_palette(maps[0].colours)
     changed = np.where(np.asarray(blocks.any(axis=(1, 3)))[..., None], (0.77, 0.15, 0.18), (0.96, 0.96, 0.95))
     with mpl.rc_context({"text.parse_math": False}):  # names may hold dollar signs
         figure = Figure(figsize=(14, 4.6 * tall + 1.2), dpi=GROUND_DPI, layout="constrained")

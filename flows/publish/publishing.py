@@ -13,7 +13,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from flows.publish.byte_account import recount_bytes
-from flows.publish.receipt import Receipt, is_pending
+from flows.publish.receipt import is_pending
 from flows.publish.receipt_table import byte_rows, cost_rows, finding_rows, headline
 from flows.publish.report import render_markdown, replace_bytes
 from flows.publish.retention import is_outlived
@@ -162,7 +162,16 @@ def _show_artifacts(plan: OpenSurvey, published: Published) -> None:
     report = (published.folder / "report.html").absolute().as_uri()
     receipt = published.receipt
     with suppress(Exception):  # a server that is gone: the archive has it all
-        rows = savings_rows(receipt)
+        costs = [*cost_rows(receipt["savings"]), *byte_rows(receipt)]
+        rows = [
+            {
+                "cost": row["label"],
+                "this survey": row["done"],
+                "everything": row["full"],
+                "fraction": format_percent(row["ratio"]),
+            }
+            for row in costs
+        ]
         text = render_markdown(
             "survey.md",
             survey=receipt["survey"],
@@ -176,19 +185,6 @@ def _show_artifacts(plan: OpenSurvey, published: Published) -> None:
         prefect_artifacts.create_table_artifact(rows, key=f"savings-{key}", description=where)
         prefect_artifacts.create_link_artifact(report, link_text="report.html", key=f"report-{key}", description=where)
         plan.observer.progress("published", 1.0)
-
-
-def savings_rows(receipt: Receipt) -> list[dict[str, str]]:
-    """Return the receipt's savings and bytes, a row each, in words."""
-    return [
-        {
-            "cost": row["label"],
-            "this survey": row["done"],
-            "everything": row["full"],
-            "fraction": format_percent(row["ratio"]),
-        }
-        for row in [*cost_rows(receipt["savings"]), *byte_rows(receipt)]
-    ]
 
 
 def small_jpeg(png: bytes) -> bytes:

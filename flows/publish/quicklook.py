@@ -44,7 +44,7 @@ FIXED = (PAPER, INK, MUTED, UNLABELLED_COLOUR, "white", "black")
 
 @dataclass(frozen=True)
 class QuicklookData:
-    """What the four panels show, as plain arrays. Pixels are scene pixels; patches are numbered row by row."""
+    """Content of the four panels, as plain arrays. Pixels are scene pixels; patches are numbered row by row."""
 
     survey: str
     seed: int
@@ -60,7 +60,7 @@ class QuicklookData:
     blocks: tuple[Box, ...]  # captured in detail: (y0, y1, x0, x1), half open [px]
     class_map: NDArray[np.integer]  # (y, x), 255 unlabelled
     class_names: tuple[str, ...]
-    class_colours: NDArray[np.integer] | None = None  # (class, 3) 0..255; None for a colour-blind safe palette
+    class_colours: NDArray[np.integer]  # (class, 3) 0..255
     truth: NDArray[np.integer] | None = None  # (y, x), 255 unlabelled
     confidence: NDArray[np.floating] | None = None  # (y, x) 0..1, shown where there is no truth
     along: Axis = "x"  # of the scene along which the raw lines lie
@@ -80,7 +80,7 @@ def draw_quicklook(path: str | Path, panels: QuicklookData) -> None:
     name, alpha = ("viridis", 1.0) if panels.policy is None else ("inferno", HEAT_ALPHA)
     key = alpha * mpl.colormaps[name](np.linspace(0, 1, RAMP))[:, :3] + 1 - alpha  # over white
     fixed = np.array([to_rgb(colour) for colour in FIXED])
-    kept = np.rint(255 * np.vstack([_palette(panels)[: COLOURS // 4], fixed, key])).astype(np.uint8)
+    kept = np.rint(255 * np.vstack([class_palette(panels.class_colours)[: COLOURS // 4], fixed, key])).astype(np.uint8)
     with Image.open(drawn) as opened:
         picture = opened.convert("RGB")
     _in_colours(picture, kept).save(path, "PNG", optimize=True)
@@ -209,7 +209,7 @@ def _score_range(score: NDArray[np.floating]) -> tuple[NDArray[np.float64], floa
 
 
 def _draw_classes(axes: Axes, data: QuicklookData) -> None:
-    _show(axes, class_rgb(data.class_map, _palette(data)), interpolation="nearest")
+    _show(axes, class_rgb(data.class_map, class_palette(data.class_colours)), interpolation="nearest")
     most = max(data.class_map.shape[1] / 4, 1)  # of a bar of a round number of pixels
     length = max(step * 10 ** int(np.log10(most)) for step in (1, 2, 5) if step * 10 ** int(np.log10(most)) <= most)
     axes.add_artist(AnchoredSizeBar(axes.transData, length, f"{length} px", "lower left", borderpad=0.5))
@@ -219,7 +219,7 @@ def _draw_classes(axes: Axes, data: QuicklookData) -> None:
 def _draw_truth(axes: Axes, data: QuicklookData) -> None:
     """Panel 4: the truth, without it the confidence, without both a word that there is neither."""
     if data.truth is not None:
-        _show(axes, class_rgb(data.truth, _palette(data)), interpolation="nearest")
+        _show(axes, class_rgb(data.truth, class_palette(data.class_colours)), interpolation="nearest")
         labelled = (data.truth != UNLABELLED) & (data.class_map != UNLABELLED)
         right = float(np.mean(data.truth[labelled] == data.class_map[labelled])) if labelled.any() else float("nan")
         words = f"{100 * right:.1f} % of the labelled pixels agree" if labelled.any() else "no pixel is labelled"
@@ -241,7 +241,7 @@ def _draw_confidence(axes: Axes, confidence: NDArray[np.floating] | None, title:
 
 
 def _draw_legend(figure: Figure, data: QuicklookData, columns: int) -> None:
-    palette = _palette(data)
+    palette = class_palette(data.class_colours)
     counts = np.bincount(data.class_map.ravel(), minlength=256)[: len(data.class_names)]
     fractions = counts / max(int(counts.sum()), 1)
     marks = [Patch(facecolor=tuple(colour), edgecolor="#555555", linewidth=0.6) for colour in palette]
@@ -257,10 +257,6 @@ def _draw_legend(figure: Figure, data: QuicklookData, columns: int) -> None:
             return
         if count > 1:
             legend.remove()
-
-
-def _palette(data: QuicklookData) -> NDArray[np.float32]:
-    return class_palette(len(data.class_names), data.class_colours)
 
 
 def _show(axes: Axes, image: NDArray[np.float32], *, interpolation: str = "antialiased") -> None:

@@ -55,7 +55,7 @@ class CaptureSaving(Saving):
 
 
 class Savings(_Part):
-    """What the run spent against every line, sample and patch; of a raster, of which nothing is captured, less."""
+    """Costs of the run against every line, sample and patch; of a raster, of which nothing is captured, less."""
 
     lines: Saving | None = None
     samples: Saving | None = None
@@ -81,7 +81,7 @@ class DataBytes(_Part):
 
 
 class Score(_Part):
-    """What one map scores, 0..1, over the classes of the truth; IoU is null for a class that the truth lacks.
+    """Score of one map, 0..1, over the classes of the truth; IoU is null for a class that the truth lacks.
 
     ``false_classes`` are those that the map shows and the truth lacks, with pixels.
     """
@@ -121,7 +121,7 @@ class ReceiptFields(_Part):
     settings: Facts
     stages: list[StageRecord]
     savings: Savings
-    data_bytes: DataBytes | None = None  # earlier versions did not count them
+    data_bytes: DataBytes
     accuracy_is: AccuracyIs | None = None
     judged: str | None = None  # when accuracy was added
     accuracy: Accuracy | None = None
@@ -137,7 +137,8 @@ class ReceiptFields(_Part):
     memory: Facts | None = None  # what became of the prior map
     pointing: Facts | None = None  # where the mirror may look beside the plan
     lines: Facts | None = None  # sweeps with lines lost, repeated, out of order, late or invalid
-    ground: Facts | None = None  # with a pose or a placed scene: grid, hectares
+    areas: Facts | None = None  # px of each class; ha where something says how large a pixel is
+    ground: Facts | None = None  # with a pose or a placed scene: grid, what changed, what is old
     zones: Facts | None = None  # where zones leave something out: what is kept
     plots: list[Facts] | None = None  # where plots are given: ground, classes, confidence of each
     unknown: Facts | None = None  # pixels unlike what the weights were trained on
@@ -203,8 +204,8 @@ def is_pending(receipt: Mapping[str, Any]) -> bool:
     return receipt.get("accuracy_is") == "pending"
 
 
-def areas_on_ground(receipt: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """Return the hectares of each class, where the survey was put on the ground."""
-    ground = receipt.get("ground")
-    areas = ground.get("areas_ha") if isinstance(ground, Mapping) else None
-    return areas if isinstance(areas, Mapping) else None
+def hectares_of_classes(receipt: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """Return the hectares of each class, where something says how large a pixel is."""
+    areas = receipt.get("areas")
+    hectares = areas.get("ha") if isinstance(areas, Mapping) else None
+    return hectares if isinstance(hectares, Mapping) else None

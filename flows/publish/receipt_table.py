@@ -9,12 +9,13 @@ import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
-from flows.publish.receipt import Receipt, is_pending
+from flows.publish.receipt import Receipt, hectares_of_classes, is_pending
 from flows.tasks.scene import TRAINING_SCENE
 from flows.tasks.scores import format_prediction, format_worst_class
 from flows.terminal.figures import (
     counted,
     format_area,
+    format_bytes,
     format_count,
     format_megabytes,
     format_metres,
@@ -42,6 +43,7 @@ BYTE_LABELS = {
     "moved_workers": "bytes moved, workers",
 }
 MOST_CHANGES = 4  # in words
+LEAST_REFERENCE = 100_000  # bytes from which on all are told in MB
 LEADING = 3  # classes of a plot in words
 FOREIGN = 0.2  # fraction of a map that is unknown from which on its weights are the wrong ones
 FOREIGN_WORDS = (
@@ -60,21 +62,24 @@ def cost_rows(savings: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def byte_rows(receipt: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the bytes of a run against the reference, a row each; dashes where an earlier version did not count."""
-    told = receipt.get("data_bytes")
-    full = None if told is None else told["reference"]
-    rows = []
+    """Return the bytes of a run against the reference, a row each.
+
+    They are in MB, so that rows compare, but where the reference is smaller than a tenth of one.
+    """
+    told, rows = receipt["data_bytes"], []
+    full = told["reference"]
+    show = format_bytes if full is not None and full < LEAST_REFERENCE else format_megabytes
     for name, label in BYTE_LABELS.items():
-        done = None if told is None else told[name]
-        words = "not counted" if told is not None and done is None else format_megabytes(done)
+        done = told[name]
+        words = "not counted" if done is None else show(done)
         ratio = None if done is None or not full else done / full
-        rows.append({"label": label, "done": words, "full": format_megabytes(full), "ratio": ratio})
+        rows.append({"label": label, "done": words, "full": show(full), "ratio": ratio})
     return rows
 
 
 def format_reused(receipt: Mapping[str, Any]) -> str:
     """Return what of the bytes kept was found in the archive and not built; empty where all was built."""
-    reused = receipt.get("data_bytes", {}).get("reused", {})
+    reused = receipt["data_bytes"]["reused"]
     if not reused:
         return ""
     size = format_megabytes(sum(reused.values()))
@@ -199,12 +204,37 @@ def plot_rows(plots: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     ]
 
 
+def area_rows(receipt: Mapping[str, Any]) -> list[dict[str, str]]:
+    """Return the classes of a map as a table in words: name, pixels, share of the pixels that have a class, hectares.
+
+    Hectares are left out where nothing says how large a pixel is.
+    """
+    pixels: Mapping[str, int] = (receipt.get("areas") or {}).get("px", {})
+    hectares, every = hectares_of_classes(receipt), sum(pixels.values())
+    return [
+        {"class": _spaced(name), "pixels": format_count(count), "share": format_percent(count / every)}
+        | ({} if hectares is None else {"area": format_area(hectares.get(name, 0.0))})
+        for name, count in pixels.items()
+        if count
+    ]
+
+
 def _spaced(name: str) -> str:
     return name.replace("_", " ")
 
 
 def _areas(areas: Mapping[str, float]) -> str:
     return ", ".join(f"{_spaced(name)} {format_area(area)}" for name, area in areas.items() if area)
+
+
+def _pixels(pixels: Mapping[str, int]) -> str:
+    every = sum(pixels.values())
+    shown = (
+        f"{_spaced(name)} {format_count(count)} px ({format_percent(count / every)})"
+        for name, count in pixels.items()
+        if count
+    )
+    return ", ".join(shown) or "no pixel has a class"
 
 
 def _changes(changes: Sequence[Sequence[Any]]) -> str:
@@ -241,7 +271,7 @@ def _most_px(sweeps: Mapping[str, Sequence[float]]) -> str:
 # parts of a receipt whose rows are called otherwise
 _LABELS = {
     **{"extent": "captured", "kept": "read in detail", "memory": "prior map", "expected": "expected score"},
-    **{"scans": "uniform scans", "ground": "on the ground"},
+    **{"scans": "uniform scans", "ground": "on the ground", "areas": "classes"},
 }
 # part of a receipt, figure, its words and its form, in the order of rows and of words
 _FIGURES: Sequence[tuple[str, str, str, Callable[[Any], Any]]] = (
@@ -259,7 +289,7 @@ _FIGURES: Sequence[tuple[str, str, str, Callable[[Any], Any]]] = (
     ("recording", "full_scan_s", "{} for a scan of every line", format_seconds),
     ("extent", "lines", "lines {}", str),
     ("extent", "fraction", "{} of the field", format_percent),
-    ("extent", "remembers", "the rest is as before", bool),
+    ("extent", "remembers", "the rest is unchanged", bool),
     ("extent", "expected_wrong", "about {} of the prior map was expected to be wrong there", format_percent),
     ("extent", "due_left", "{} places that were due had to wait", format_count),
     ("kept", "patches", "{} patches", format_count),
@@ -281,12 +311,13 @@ _FIGURES: Sequence[tuple[str, str, str, Callable[[Any], Any]]] = (
     ("scans", "taken", "this one, read whole: {}", _scan),
     ("scans", "best_in_time", "best in the same seconds: {}", _scan),
     ("scans", "reference", "nearly as good as any: {}", _scan),
+    ("areas", "ha", "{}", _areas),
+    ("areas", "px", "{}", _pixels),
     ("zones", "kept_px", "{} px are mapped", format_count),
     ("zones", "kept_m2", "{}", lambda one: format_area(one / M2_PER_HECTARE)),
     ("zones", "no_go_px", "no-go zones touch {} px", format_count),
     ("ground", "crs", "{}", str),
     ("ground", "resolution_m", "{:.4g} m a pixel", float),
-    ("ground", "areas_ha", "{}", _areas),
     ("ground", "changes_ha", "{}", _changes),
     ("ground", "older_ha", "{}", _older),
     ("pass", "sweeps", "put right by up to {} px", _most_px),

@@ -25,7 +25,15 @@ from flows.publish.effects_table import format_change, format_total
 from flows.publish.field_map import ERROR_COLOURS, FieldMap
 from flows.publish.panels import data_address
 from flows.publish.receipt import Receipt
-from flows.publish.receipt_table import byte_rows, cost_rows, finding_rows, format_reused, headline, plot_rows
+from flows.publish.receipt_table import (
+    area_rows,
+    byte_rows,
+    cost_rows,
+    finding_rows,
+    format_reused,
+    headline,
+    plot_rows,
+)
 from flows.tasks.scores import error_matrix, format_false_classes
 from flows.terminal.figures import format_bytes, format_percent, format_points, format_seconds
 from pipeline.errors import visible
@@ -69,11 +77,6 @@ def render_page(template: str, carries: tuple[str, ...] = (), **facts: Any) -> s
     scripts = Markup("\n").join(Markup("<script>{}</script>").format(Markup(part(name))) for name in carries)
     own = {"policy": policy(carries), "scripts": scripts}
     return visible(_environment(markdown=False).get_template(template).render(facts | own))
-
-
-def render_markup(template: str, **facts: Any) -> str:
-    """Fill in an HTML template that is a part of a page, as `render_page`."""
-    return visible(_environment(markdown=False).get_template(template).render(facts))
 
 
 def render_markdown(template: str, **facts: Any) -> str:
@@ -145,6 +148,7 @@ def render_report(
     out. ``field`` is the map to move in, above all pictures; None leaves it out, with all scripts.
     """
     shown = [Picture(quicklook, "The survey at a glance."), *pictures]
+    scene = split_variable(receipt["settings"]["scene"])[0].name
     split: Mapping[str, Any] = receipt["savings"]["multiply_adds"]
     parts = [name for name in ("overview", "score", "detail") if split["done"] and split[name] is not None]
     total, accuracy = receipt.get("effects_total"), receipt.get("accuracy")
@@ -154,7 +158,7 @@ def render_report(
         kicker="SpectralZoom survey",
         title=receipt["survey"],
         lead=headline(receipt, captured_again),
-        about=_format_about(receipt),
+        about=f"{scene} seen by {receipt['source']}, seed {receipt['seed']}, finished {receipt['finished']}",
         receipt=receipt,
         links=product_links(receipt),
         export=shlex.join(["spectralzoom", "export", receipt["settings"]["out"], *_run_folder(receipt).split("/")[1:]]),
@@ -166,7 +170,8 @@ def render_report(
         byte_rows=byte_rows(receipt),
         reused=format_reused(receipt),
         fractions={name: split[name] / split["done"] for name in parts},
-        findings=finding_rows(receipt),
+        areas=area_rows(receipt),
+        findings=finding_rows({name: one for name, one in receipt.items() if name != "areas"}),
         plots=plot_rows(receipt.get("plots", [])),
         accuracy=accuracy,
         error_matrix=None if accuracy is None else error_matrix(accuracy),
@@ -181,12 +186,6 @@ def render_report(
             "Versions": receipt["versions"],
         },
     )
-
-
-def _format_about(receipt: Receipt) -> str:
-    """Return the scene by the name of its file, who saw it, and when."""
-    scene = split_variable(receipt["settings"]["scene"])[0].name
-    return f"{scene} seen by {receipt['source']}, seed {receipt['seed']}, finished {receipt['finished']}"
 
 
 def product_links(receipt: Receipt) -> dict[str, str]:
@@ -210,5 +209,6 @@ def replace_bytes(page: str, receipt: Receipt) -> str:
     """Return a report with the bytes of a receipt in the place of those that it tells."""
     begin, end = BYTES_SECTION, "</section>"
     head, there, rest = page.partition(begin)
-    rows = render_markup("bytes.html", byte_rows=byte_rows(receipt), reused=format_reused(receipt))
+    template = _environment(markdown=False).get_template("bytes.html")
+    rows = visible(template.render(byte_rows=byte_rows(receipt), reused=format_reused(receipt)))
     return f"{head}{rows.rstrip()}{rest.partition(end)[2]}" if there else page

@@ -15,7 +15,6 @@ from flows.publish.report import replace_bytes
 from flows.settings.values import parse_keep, raw_days
 from flows.tasks.stages.condense import SIGNAL, SIGNAL_FINE, camera_of, raw_differs
 from storage.archive.archive import Archive
-from storage.archive.kept_bytes import kept_bytes
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run, Store
 from storage.maintenance.garbage import IN_USE, Removal
@@ -117,5 +116,5 @@ def _recount(archive: Archive) -> None:
     for run in catalogue.runs:
         account = run.receipt.get("data_bytes")
         named = any(run.products.get(name) in cleared for name in LINE_PRODUCTS)
-        if named and isinstance(account, dict) and account.get("kept") != kept_bytes(archive, run, catalogue):
+        if named and isinstance(account, dict) and account.get("kept") != archive.kept_bytes(run, catalogue):
             recount_bytes(archive, run.folder.name, replace_bytes)

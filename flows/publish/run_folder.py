@@ -18,7 +18,7 @@ from PIL import Image
 
 from flows.publish.byte_account import open_account, publish_counted
 from flows.publish.field_map import block_of, field_map, prior_map
-from flows.publish.findings import PLOTS_FILE, field_figures, find_ground, find_map, find_zones, plots_csv
+from flows.publish.findings import PLOTS_FILE, field_figures, find_areas, find_ground, find_map, find_zones, plots_csv
 from flows.publish.panels import draw_ground, webp
 from flows.publish.quicklook import QuicklookData, draw_quicklook
 from flows.publish.receipt import AccuracyIs, Receipt, build_receipt, check_receipt, with_accuracy
@@ -59,7 +59,7 @@ LIBRARIES = ("spectralzoom", "numpy", "numba", "torch", "zarr", "xarray", "prefe
 
 @dataclass(frozen=True)
 class Published:
-    """What a survey leaves for people: the receipt and where its folder lies."""
+    """A published run: the receipt and where its folder lies."""
 
     receipt: Receipt
     folder: Path
@@ -253,7 +253,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
 
 
 def _format_asked(run: SurveyRun) -> str:
-    """How the field was looked at, in a few words."""
+    """Return how the field was looked at, in a few words."""
     if run.raster is not None:
         return "raster, taken as it is"
     if run.plan.plain:
@@ -326,6 +326,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     drawn = load_class_map(class_map.path / "class_map.zarr")
     posed = next((load_ground_map(ref.path / STORE) for ref in products.there("ground")), None)
     probabilities = ProbabilityStore(class_map.path / "class_probabilities.zarr")
+    found |= find_areas(run, posed, drawn)
     found |= find_ground(run, posed, drawn, probabilities, memory) | find_zones(run, drawn)
     found |= find_map(run, class_map, drawn)
     lines = {} if run.raster is not None else read_table(products.mosaic.path / "lines.json")
@@ -336,7 +337,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
 
 
 def _recording(run: SurveyRun, recorded: RecordedPasses, plan: FinePlan) -> dict[str, Any]:
-    """What was read of a recording, and what its passes would have taken of a camera beside the scan of every line."""
+    """Return what was read of a recording, and what its passes would have taken of a camera beside every line."""
     done, full, cost = [*run.plan.coarse, *plan.sweeps], run.plan.full, run.settings.cost
     whole = recorded.served(full) is not None
     return {
@@ -350,7 +351,7 @@ def _recording(run: SurveyRun, recorded: RecordedPasses, plan: FinePlan) -> dict
 
 
 def _pointing(ref: StageRef) -> dict[str, Any]:
-    """Corrections of one pass; what they leave is told only where windows are more than offsets and drifts."""
+    """Corrections of one pass; what they leave is given only where windows are more than offsets and drifts."""
     record = load_registration(ref)
     left = np.array([window["residual_px"] for window in record["windows"] if window.get("residual_px")])
     tells = len(left) > 2 * (len(record["sweeps"]) - len(record["untied"]) - 1)

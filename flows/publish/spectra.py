@@ -30,7 +30,7 @@ def draw_spectra(mosaic: Mosaic, found: ClassMap) -> bytes | None:
     if len(mosaic.wavelength_nm) < LEAST_BANDS or not np.isfinite(spectra).any():
         return None
     names = [name.replace("_", " ") for name in found.names]
-    palette = class_palette(len(found.names), found.colours)
+    palette = class_palette(found.colours)
     with mpl.rc_context({**STYLE, "font.size": 9}):
         figure = Figure(figsize=(9, 3.6), dpi=DPI, layout="constrained", facecolor=PAPER)
         axes = figure.subplots()

@@ -1,4 +1,4 @@
-"""What `spectralzoom survey` does and shows: the flow with a bar for each stage, then the receipt."""
+"""The verb `survey`: the flow with a bar for each stage, then the receipt."""
 
 from __future__ import annotations
 

@@ -16,7 +16,6 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 from pydantic import Field, PlainValidator, TypeAdapter, ValidationError
 
-from flows.settings import renamed
 from flows.settings.survey_settings import (
     BUILT_IN_SCENES,
     OF_A_CAMERA,
@@ -40,7 +39,7 @@ from flows.settings.values import EXTENT_PART, EXTENT_WHOLE, parse_moment, parse
 from pipeline.errors import BudgetError, PoseError, SettingsError
 from pipeline.rig.device_settings import MOST_PAIRS
 from pipeline.setting_fields import format_number, span_of
-from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, REMOVED_LAW
+from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW
 from storage.archive.staging import read_toml
 from storage.readers.recordings import find_recorded_run
 
@@ -67,7 +66,7 @@ class Declared:
 
     @property
     def expected(self) -> str:
-        """What it may be, as the end of "must be"; '' where only its own parser knows."""
+        """Return what it may be, as the end of "must be"; '' where only its own parser knows."""
         if self.choices:
             return f"one of {self.listed}"
         low, high = span_of(self.item)
@@ -151,7 +150,7 @@ BUILT_IN_WEIGHTS = "farm"
 
 
 def usual_of_recording(table: Mapping[str, object]) -> dict[str, Any]:
-    """Return what the settings beside ``sweeps`` are by default: those of the run that took them, where one is told.
+    """Return what the settings beside ``sweeps`` are by default: those of the run that took them, where one is named.
 
     So `survey --sweeps ARCHIVE/runs/NAME` alone plans as that run did. Cubes of files know nothing of a survey: without
     a budget or a scan every recorded line is read as it is.
@@ -310,9 +309,7 @@ def _parse_table(key: str, value: object, place: str, origin: Mapping[str, str])
 
 
 def _hint(full: str, known: Mapping[str, Declared], prefix: str) -> str:
-    """Return what an unknown key may mean: its present name, the nearest of its table, or of another table."""
-    if full in renamed.SETTINGS:
-        return f"; it is called '{renamed.SETTINGS[full]}' now"
+    """Return what an unknown key may mean: the nearest of its table, or of another table."""
     everywhere = [*SURVEY, *(f"{name}.{key}" for name, keys in TABLES.items() for key in keys)]
     short = full.removeprefix(prefix)
     near = [name for name in everywhere if name.split(".")[-1] == short]
@@ -327,7 +324,7 @@ def of_this_version(stored: Mapping[str, Any]) -> dict[str, Any]:
 
 def anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:
     """Relative paths of a file's settings, made to start at the file's folder."""
-    named = {*BUILT_IN_SCENES, REMOVED_LAW, RIG_FIELD}
+    named = {*BUILT_IN_SCENES, RIG_FIELD}
     anchored = dict(table)
     for key in PATHS:
         head, _, tail = key.rpartition(".")
@@ -409,7 +406,7 @@ def _rig_wrongs(settings: Settings) -> Iterator[str]:
 
 
 def _recorded_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
-    """What a recording needs, and what nothing else has."""
+    """Yield what a recording needs, and what nothing else has."""
     if settings.source != RECORDED:
         for name in OF_RECORDINGS:
             if getattr(settings, name) is not None:
@@ -476,7 +473,7 @@ def _sparing_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[s
 
 
 def place_of(key: str, origin: str | None) -> str:
-    """How a message names a setting: as a flag (without the table that holds it), or in its file."""
+    """Return how a message names a setting: as a flag (without the table that holds it), or in its file."""
     if origin == "flag":
         return "--" + key.rpartition(".")[2].replace("_", "-")
     return f"'{key}'" + (f" in {origin}" if origin else "")

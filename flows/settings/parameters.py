@@ -83,7 +83,7 @@ class SurveySettings(BaseModel):
     def of(cls, settings: Settings) -> SurveySettings:
         """Return the parameters of settings; within this process they are these very settings, passwords too."""
         table = anchor_paths(settings.to_dict(), Path.cwd())
-        usual = Settings().to_dict() | {"source": AUTO}  # another machine is told which it is
+        usual = Settings().to_dict() | {"source": AUTO}  # another machine needs its name
         given = {name: _changed(value, usual.get(name)) for name, value in table.items() if value != usual.get(name)}
         made: SurveySettings = cls.model_construct(**given)
         made._settings = settings

@@ -81,7 +81,7 @@ EPSG = "the number after EPSG:, such as 32632"
 
 @dataclass(frozen=True)
 class MapChoice:
-    """What map to draw of a posed survey; None leaves the choice to the pose."""
+    """Choice of the map of a posed survey; None leaves it to the pose."""
 
     epsg: int | None = stated(
         None, "Projected CRS in metres; the rig's UTM zone by default", "", 1024, 32_767, example=32632, why=EPSG
@@ -93,7 +93,7 @@ class MapChoice:
 
 @dataclass(frozen=True)
 class SignalChoice:
-    """What of spectra is kept: scores of the components that rise above the noise."""
+    """Choice of what is kept of spectra: scores of the components that rise above the noise."""
 
     step: float = stated(1.0, "Step in which scores are rounded, in standard deviations of the noise", "", 0.01, 10)
     false_alarm: float = stated(
@@ -119,7 +119,7 @@ class ZoneChoice:
         None, "Zones that are left out: no detail is asked for there, and no map drawn", example="no_go.geojson"
     )
     plots: str | None = stated(
-        None, "Plots with names: area, classes and confidence of each are told", example="plots.gpkg:plots"
+        None, "Plots with names: the receipt has area, classes and confidence of each", example="plots.gpkg:plots"
     )
     plots_name: str | None = stated(
         None, "Attribute that names the plots; name, plot, plot_id, id or label by default", example="name"
@@ -372,7 +372,7 @@ class Settings:
 
     @property
     def plain(self) -> bool:
-        """Whether all of the field is there at once, scanned or as a raster, in the place of two passes."""
+        """Return whether all of the field is there at once, scanned or as a raster, in the place of two passes."""
         return self.is_map or any(getattr(self, name) is not None for name in UNIFORM)
 
     @property
@@ -382,7 +382,7 @@ class Settings:
 
     @property
     def is_map(self) -> bool:
-        """Whether the scene is a raster whose pixels are taken as they are: no camera looks at it."""
+        """Return whether the scene is a raster whose pixels are taken as they are: no camera looks at it."""
         return self.source == RASTER
 
     @property

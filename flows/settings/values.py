@@ -1,6 +1,6 @@
 """Settings that are more than a number or a word: from text or TOML to the value, or what is wrong, without its place.
 
-A ValueError goes on from the setting's name ("must be ..."); a SettingsError is a sentence of its own.
+A ValueError continues the setting's name ("must be ..."); a SettingsError is a sentence of its own.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from pipeline.planning.uniform_scans import MIOU
 from pipeline.setting_fields import format_number, numbers_of
 from pipeline.simulator.effects.probe import Unit
 from pipeline.simulator.render import BY_NAME
-from pipeline.simulator.scenes.farm.farm_scene import refuse_removed
 from pipeline.simulator.selection.choice import named_effects
 from storage.archive.staging import is_name
 from storage.parallel.pool import WorkerPool
@@ -44,7 +43,7 @@ _OTHER_UNITS: dict[str, tuple[tuple[str, float], ...]] = {
 
 @dataclass(frozen=True)
 class Tolerance:
-    """What a simulation may leave out: the greatest change of any number, in noise sigmas or in DN."""
+    """Greatest change of any number by effects that a simulation leaves out, in noise sigmas or in DN."""
 
     value: float = 0.1
     unit: Unit = "sigma"
@@ -110,21 +109,17 @@ def parse_bytes(value: object) -> int:
 
 def parse_compute(value: object) -> str:
     """A fraction of what reading everything takes, such as 25%, or a number of multiply-adds such as 4e9."""
-    percent = _parse_percent(value)
+    percent = _amount(value, {"%": 1.0})
+    if percent is not None and 0 < percent <= 100:
+        return f"{percent!r}%".replace(".0%", "%")
     number = None if isinstance(value, str) and value.strip().endswith("%") else _to_float(value)
-    if percent is None and (number is None or not number >= 1):
+    if number is None or not number >= 1:
         hint = f"; for {100 * number:g} % write {100 * number:g}%" if number is not None and 0 < number < 1 else ""
         raise BudgetError(
             "must be a fraction of the multiply-adds of reading everything, above 0% and at most 100%, such as 25%, "
             f"or a number of them such as 4e9; got {value!r}{hint}"
         )
-    return percent or f"{number!r}"
-
-
-def _parse_percent(value: object) -> str | None:
-    """Text such as 25% of a fraction above 0 and at most all; None of anything else."""
-    percent = _amount(value, {"%": 1.0})
-    return f"{percent!r}%".replace(".0%", "%") if percent is not None and 0 < percent <= 100 else None
+    return f"{number!r}"
 
 
 def limit_of(text: str | None, whole: float) -> float:
@@ -283,10 +278,9 @@ def unit_guess(value: object, low: float, high: float, unit: str) -> str:
 
 
 def parse_scene(value: object) -> str:
-    """The name of a scene or of its file; that of a farm which is drawn no more is refused."""
+    """Return the name of a scene or of its file."""
     if not isinstance(value, str) or not value:
         raise ValueError("must be the name of a scene or of its file")
-    refuse_removed(value)
     return value
 
 

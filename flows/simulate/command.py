@@ -1,4 +1,4 @@
-"""What `spectralzoom simulate` does and shows: one scan of a scene as raw cubes, and the manifest of its effects."""
+"""The verb `simulate`: one scan of a scene as raw cubes, and the manifest of its effects."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def open_simulation(settings: Settings, *, coarse: bool = False) -> tuple[Captur
     if refused is not None:
         raise SettingsError(refused)
     scene, notes = open_scene(settings)
-    if scene.filled_px:  # a survey goes on without; a simulation would have to invent light
+    if scene.filled_px:  # a survey leaves them out; a simulation would have to invent light
         file = load_scene_file(
             settings.scene, bands=settings.bands, wavelengths=settings.wavelengths, labels_needed=False
         )

@@ -51,8 +51,7 @@ def run_check(
     Returns 0 where nothing failed, 3 where one of two works, 1 otherwise. Raises SettingsError: they cannot be used.
     """
     wanted = load_settings(settings)
-    rig = replace(wanted.rig, park_at_close=False)  # the square ends at 0; 0 by itself
-    rig = rig if port is None else replace(rig, port=port)
+    rig = wanted.rig if port is None else replace(wanted.rig, port=port)
     rig = rig if camera is None else _at(rig, camera)
     both = settings is not None or port is camera is None
     mirror_asked, camera_asked = both or port is not None, both or camera is not None

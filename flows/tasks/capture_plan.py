@@ -1,4 +1,4 @@
-"""What a survey captures whatever it sees: its first look, the scan of everything, and what they cost in seconds."""
+"""Captures that every survey of a field plans: its first pass, the scan of everything, and their seconds."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX
 
 @dataclass(frozen=True)
 class CapturePlan:
-    """What every survey of this field has in common: orientation, coarse and full sweeps, and their seconds.
+    """Plan that every survey of this field has in common: orientation, coarse and full sweeps, and their seconds.
 
     Of a uniform scan ``coarse`` are the sweeps of that, and there is nothing to go back for.
     """

@@ -73,7 +73,7 @@ class Drawing:
             unknown &= shown | (not self.part)
             drawn.log_probability[unknown] = np.nan  # of what these pixels show the classes say nothing
         del columns  # a memory takes their room
-        observation = self._observation(self._within_zones(region, drawn.log_probability), shown, seen)
+        observation = self._observation(region, drawn.log_probability, shown, seen)
         classes, confidence = drawn.classes, drawn.confidence
         comparison, old = None, None
         if self.memory is None:
@@ -98,16 +98,13 @@ class Drawing:
         unread = 0 if seen.out_of_range is None else int(np.count_nonzero(region.crop(seen.out_of_range)))
         return Drawn(unread, comparison)
 
-    def _within_zones(self, region: Region, log_probability: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Today's look, (y, x, class), with nothing said of pixels that zones leave out: a memory of them stays."""
-        if self.left_out is None:
-            return log_probability
-        away = np.load(self.left_out, mmap_mode="r")[region.read.rows, region.read.columns]
-        return np.where(away[..., None], np.float32(np.nan), log_probability)
-
     def _observation(
-        self, log_probability: NDArray[np.float32], shown: NDArray[np.bool_], seen: CoarsePass
+        self, region: Region, log_probability: NDArray[np.float32], shown: NDArray[np.bool_], seen: CoarsePass
     ) -> CurrentVisit:
+        """Return the current visit; pixels that zones or a part leave out are NaN, and keep their prior map."""
+        if self.left_out is not None:
+            away = np.load(self.left_out, mmap_mode="r")[region.read.rows, region.read.columns]
+            log_probability = np.where(away[..., None], np.float32(np.nan), log_probability)
         if self.part:
             log_probability = np.where(shown[..., None], log_probability, np.float32(np.nan))
         light, step, _ = self.captures[1]
@@ -132,7 +129,7 @@ class Drawing:
 
 @dataclass(frozen=True)
 class UnknownRule:
-    """Which pixels are called unknown: at which rate, and by which number."""
+    """Rule for pixels that are called unknown: at which rate, and by which number."""
 
     number: int  # of the class, after those of the weights
     rate: float  # of known pixels that may be
@@ -159,7 +156,7 @@ class UnknownRule:
 
 @dataclass(frozen=True)
 class Drawn:
-    """What was found while a region, or a field, was drawn."""
+    """Findings while a region, or a field, was drawn."""
 
     unread_px: int  # pixels that were seen, with values that the weights take for no reading
     comparison: TemporalAgreement | None  # with what was remembered; None of a field's first visit

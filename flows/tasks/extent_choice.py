@@ -1,4 +1,4 @@
-"""What of a remembered field a visit looks at: the lines that promise most there, and those that are due."""
+"""Choice of the part of a field with a prior map that a visit looks at: lines by expected gain, and those due."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class ExtentChoice:
 
     @property
     def sentence(self) -> str:
-        """What was chosen, for who asked."""
+        """Return what was chosen, for who asked."""
         seen = self.due - self.due_left
         due = f"; {seen} of the {self.due} patches that were due are among them" if self.due else ""
         return (
@@ -52,7 +52,7 @@ class ExtentChoice:
 
 @dataclass(frozen=True)
 class ExtentGains:
-    """What looks at the patches of a field are worth."""
+    """Expected gains of looks at the patches of a field."""
 
     record: ScanPerformance
     class_names: tuple[str, ...]
@@ -61,7 +61,7 @@ class ExtentGains:
     shown: Mask  # (patch,) that may be looked at
 
     def gains(self, step: int, exposure_ms: float) -> Floats:
-        """What a look at each patch adds to the mIoU, (patch,)."""
+        """Return what a look at each patch adds to the mIoU, (patch,)."""
         expected = self.record.expected(step, exposure_ms)
         iou = np.array([expected.get(name, expected[MIOU]) for name in self.class_names])
         return np.where(self.shown, self.expected_errors.expected_gain((1 - iou) / (1 + iou)), 0.0)
@@ -159,7 +159,7 @@ def _best_extent(layout: PassLayout, wanted: ExtentGains, seconds: float) -> tup
 def _swaths(
     prior: Prior, grid: SceneGrid, weights: Description, path: Path
 ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-    """What is believed of a field today if nobody looks, and how old that is, some rows of patches at a time."""
+    """Yield class probabilities of a field without a capture today, and their ages, some rows of patches at a time."""
     store, high = ProbabilityStore(prior.probabilities.path / "class_probabilities.zarr"), SWATH_PATCHES * grid.patch
     read = None if weights.reader is None else load_reader(path)
     for top in range(0, grid.height, high):

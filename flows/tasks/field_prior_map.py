@@ -1,4 +1,4 @@
-"""What is remembered of a field as its stores hold it, read region by region where it lies by today's look."""
+"""Prior map of a field as its stores hold it, read region by region where it lies by today's look."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Gap = tuple[int, int]  # what lies before the first and behind the last
 
 @dataclass(frozen=True)
 class FieldPriorMap:
-    """Where the memory of a field lies, and how it is to be read."""
+    """Address of the prior map of a field, and how it is read."""
 
     probabilities: Path
     mosaic: Path | None  # of the last look alone, whose days these are; None where its pixels have another size
@@ -75,7 +75,7 @@ def shifted(image: NDArray[np.float32], by: tuple[int, int]) -> NDArray[np.float
 
 
 def prior_map_lies(before: Sequence[EarlierRun], now: Path) -> FieldShift:
-    """How the field of stored coarse passes, the newest first, lies beside that of another, in fine px.
+    """Return how the field of stored coarse passes, the newest first, lies beside that of another, in fine px.
 
     All are compared in pixels that each of theirs divides.
     """
@@ -105,7 +105,7 @@ def _cells(shift_px: ArrayLike, factor: int) -> tuple[int, int]:
 
 
 def _moved(part: slice, by: int, size: int) -> tuple[slice, Gap]:
-    """Where a part of an axis of ``size`` lies before it is moved ``by``, and what of it lies beyond the ends."""
+    """Return where a part of an axis of ``size`` lies before it is moved ``by``, and its part beyond the ends."""
     start, stop = part.start - by, part.stop - by
     first, last = min(max(start, 0), size), min(max(stop, 0), size)
     whole = stop - start

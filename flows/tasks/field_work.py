@@ -134,7 +134,7 @@ def patch_features(
 
 
 def region_params(grid: SceneGrid) -> dict[str, Any]:
-    """What the result depends on where a field is cut: nothing where it is read whole."""
+    """Return what the result depends on where a field is cut: nothing where it is read whole."""
     return {} if len(plan_regions(grid, SHARD)) == 1 else {"regions": {"most_px": REGION_PX, "halo_px": HALO_PX}}
 
 

@@ -1,7 +1,7 @@
 """A Prefect server in this process: for this machine alone, gone with the process, its files in a folder.
 
-A server in a thread needs no second set of imports, and no guard that ends it when its parent was killed. It answers
-its own address only, wants a password, and refuses what pages of other origins ask for.
+A server in a thread needs no second set of imports, and no guard that ends it when its parent was killed. It wants a
+password, which no page of another origin knows.
 """
 
 from __future__ import annotations
@@ -11,12 +11,11 @@ import os
 import secrets
 import socket
 import sqlite3
-import stat
 import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Awaitable, Callable, Iterator, MutableMapping, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from contextvars import copy_context
 from http.client import HTTPException
@@ -35,7 +34,6 @@ if TYPE_CHECKING:
     import prefect.logging.handlers as prefect_handlers
     import prefect.server.api.server as prefect_server
     import prefect.settings as prefect_settings
-    import starlette.middleware.trustedhost as trustedhost
     import uvicorn
 else:
     prefect = deferred("prefect")
@@ -44,11 +42,9 @@ else:
     prefect_handlers = deferred("prefect.logging.handlers")
     prefect_server = deferred("prefect.server.api.server")
     prefect_settings = deferred("prefect.settings")
-    trustedhost = deferred("starlette.middleware.trustedhost")
     uvicorn = deferred("uvicorn")
 
 HOST = "127.0.0.1"
-NAMES = (HOST, "localhost")  # by which a browser of this machine may ask for it
 STARTED_WITHIN_S, ENDED_WITHIN_S = 120.0, 10.0
 PATIENCE_S = 10.0  # with a server that is named
 RECORDED_WITHIN_S = 5.0  # the states of a flow's last tasks
@@ -67,8 +63,6 @@ QUIET = {  # nothing outside this machine is asked; the terminal is left to the 
     "PREFECT_LOGGING_TO_API_WHEN_MISSING_FLOW": "ignore",
     "PREFECT_CLI_PROMPT": "false",
 }
-Scope = MutableMapping[str, Any]
-App = Callable[[Scope, Callable[[], Awaitable[Any]], Callable[[Any], Awaitable[None]]], Awaitable[None]]
 
 
 class ServerUnavailable(RuntimeError):  # noqa: N818 - a state of affairs: a survey runs without it
@@ -129,7 +123,7 @@ def _using(home: Path, port: int, *, schedules: bool) -> Iterator[str]:
         "PREFECT_API_BLOCKS_REGISTER_ON_START": "true" if schedules else "false",
         "PREFECT_SERVER_API_AUTH_STRING": password,
         "PREFECT_API_AUTH_STRING": password,
-        "PREFECT_SERVER_CORS_ALLOWED_ORIGINS": ",".join(own_origins(port)),
+        "PREFECT_SERVER_CORS_ALLOWED_ORIGINS": f"http://{HOST}:{port},http://localhost:{port}",
     }
     before = {name: os.environ.get(name) for name in wanted}
     os.environ.update(wanted)
@@ -157,10 +151,7 @@ def _start(listening: socket.socket, *, schedules: bool) -> tuple[uvicorn.Server
     finally:
         if collects:
             gc.enable()
-    # answers its own address (400 else: foreign DNS may point here) and pages alone
-    pages: Any = OwnPagesOnly(made, own_origins(listening.getsockname()[1]))
-    app: Any = trustedhost.TrustedHostMiddleware(pages, allowed_hosts=list(NAMES), www_redirect=False)
-    server = uvicorn.Server(uvicorn.Config(app, log_level="critical", lifespan="on"))
+    server = uvicorn.Server(uvicorn.Config(made, log_level="critical", lifespan="on"))
     thread = threading.Thread(
         target=copy_context().run, args=(server.run, [listening]), name="prefect-server", daemon=True
     )
@@ -228,55 +219,16 @@ def wait_until_recorded(flow_run: Any) -> None:
             time.sleep(0.1)
 
 
-def own_origins(port: int) -> list[str]:
-    """Return the origins of the server's own pages, as browsers send them."""
-    return [f"http://{name}:{port}" for name in NAMES]
-
-
-class OwnPagesOnly:
-    """Refuse what a page from elsewhere asks for (403), before the application sees it.
-
-    A browser names the page that asks in the header ``Origin``, for every request that may change something and for web
-    sockets; a request without one comes from no page, and has to know the password.
-    """
-
-    def __init__(self, app: App, origins: Sequence[str]) -> None:
-        self._app, self._origins = app, [origin.encode("ascii") for origin in origins]
-
-    async def __call__(
-        self, scope: Scope, receive: Callable[[], Awaitable[Any]], send: Callable[[Any], Awaitable[None]]
-    ) -> None:
-        """Answer, or hand on to the application."""
-        origins = [value for name, value in scope.get("headers", ()) if name == b"origin"]
-        if all(origin in self._origins for origin in origins):
-            await self._app(scope, receive, send)
-        elif scope["type"] == "websocket":
-            await send({"type": "websocket.close", "code": 1008})
-        else:
-            text = b"refused: asked for by a page of another address"
-            await send({"type": "http.response.start", "status": 403, "headers": [(b"content-type", b"text/plain")]})
-            await send({"type": "http.response.body", "body": text})
-
-
 def password_in(path: Path) -> str:
     """Return the password that a file keeps for this user alone; make one where there is none (SettingsError)."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        number = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
-        with os.fdopen(number, "w", encoding="ascii") as file:
-            file.write(f"spectralzoom:{secrets.token_urlsafe(24)}\n")
-    except FileExistsError:
-        pass
-    except OSError as error:
-        raise SettingsError(f"cannot keep the password of Prefect's pages in {path}: {error.strerror}") from error
     why = "is empty"
     try:
-        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), encoding="utf-8") as file:
-            kept = os.fstat(file.fileno())
-            if not stat.S_ISREG(kept.st_mode) or kept.st_mode & 0o077 or kept.st_uid not in (os.geteuid(), 0):
-                why = "is not a plain file that only you can read"
-            elif text := file.read(1000).strip():
-                return text
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not path.exists():
+            with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="ascii") as file:
+                file.write(f"spectralzoom:{secrets.token_urlsafe(24)}\n")
+        if text := path.read_text(encoding="utf-8").strip():
+            return text
     except (OSError, ValueError) as error:
         why = f"cannot be read ({error})"
     raise SettingsError(f"{path}, the password of Prefect's pages, {why}: remove it, a new one is made")

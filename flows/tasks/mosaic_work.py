@@ -33,7 +33,7 @@ def open_sweeps(signal: Path, registration: Path | None, camera: LineCamera) -> 
 
 @dataclass(frozen=True)
 class MosaicRecipe:
-    """What a mosaic is made of, by absolute paths: small, hashable, and good in every process that sees them."""
+    """Recipe of a mosaic, by absolute paths: small, hashable, and good in every process that sees them."""
 
     signal: Path  # folder of condensed sweeps
     camera: LineCamera
@@ -44,7 +44,7 @@ class MosaicRecipe:
 
     @property
     def folders(self) -> list[Path]:
-        """What has to be seen by whoever makes tiles."""
+        """Return the paths that workers must see."""
         given = (self.signal, self.geolocation, None if self.registration is None else self.registration.parent)
         return [path for path in given if path is not None]
 
@@ -67,7 +67,7 @@ class MosaicRecipe:
 
 @dataclass(frozen=True)
 class TileBudget:
-    """How many tiles are made at a time, and the memory that this takes [bytes]."""
+    """Number of tiles made at a time, and the memory that this takes [bytes]."""
 
     workers: int
     cache: int  # lines kept; by each process where there are several
@@ -91,7 +91,7 @@ def write_mosaic(
     wanted: NDArray[np.bool_] | None = None,
     report: Callable[[float], None] = lambda done: None,
 ) -> TileBudget:
-    """Rectify and blend sweeps into a stored mosaic; return how. Whoever makes the tiles, the same bytes come out.
+    """Rectify and blend sweeps into a stored mosaic; return how. Any worker's tiles give the same bytes.
 
     ``wanted`` are (y, x) pixels without which a tile is left out. Fewer tiles are made at a time where ``memory``
     [bytes] of this process and those that it starts, not of workers elsewhere, holds fewer. Raises SettingsError: not

@@ -1,4 +1,4 @@
-"""Who follows a survey: a terminal, the pages and logs of Prefect, or both."""
+"""Observers of a survey: a terminal, the pages and logs of Prefect, or both."""
 
 from __future__ import annotations
 

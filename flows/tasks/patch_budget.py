@@ -1,4 +1,4 @@
-"""What reading a field takes, and which patches of a uniform scan are read: those that promise most within budgets."""
+"""Costs of reading a field, and the patches of a uniform scan that are read: the best within budgets."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DIGITS = 2  # of the least fraction that a refusal names
 
 @dataclass(frozen=True)
 class ReadingCosts:
-    """What it takes to read one field by one network, region by region as surveys do."""
+    """Multiply-adds of reading one field by one network, region by region as surveys do."""
 
     config: SegmenterConfig
     grid: SceneGrid
@@ -58,9 +58,9 @@ class ReadingCosts:
 
 @dataclass(frozen=True)
 class PatchBudget:
-    """What may be spent on patches, and which there are to spend it on.
+    """Budget of patches, and the patches there are to spend it on.
 
-    Fractions are of reading every one of ``patch_index`` and choosing none. A memory that the map goes on from is
+    Fractions are of reading every one of ``patch_index`` and choosing none. A prior map of the survey is
     weighed whatever is seen, and does not count.
     """
 
@@ -116,7 +116,7 @@ class PatchBudget:
     def choose(self, scores: NDArray[np.floating]) -> NDArray[np.intp]:
         """Patches that are bought, best first, by the scores (patch,) of the padded grid; equal ones by number.
 
-        A smaller budget buys the first of what a larger one does. What promises nothing, or less than the least gain,
+        A smaller budget buys the first of what a larger one does. What gains nothing, or less than the least gain,
         is not bought; neither is what has no score (NaN).
         """
         expected_gain = np.asarray(scores, np.float64)[self.patch_index]

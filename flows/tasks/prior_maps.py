@@ -1,4 +1,4 @@
-"""The memory of a field that a survey goes on from: which earlier run, and how many days ago that was."""
+"""The prior map of a survey: which earlier run it is of, and how many days ago that was."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NONE, LATEST, AUTO = "none", "latest", "auto"
 NEWEST_RUNS = 60  # newest runs of a field among which the visit before is looked for
 MOST_EARLIER = 12  # by which a field is known that is looked at in parts
 PROBABILITIES = "class_probabilities"  # a product of runs
-MEMORY = "prior_map.json"  # beside a map that goes on from an earlier one: what became of the memory
+MEMORY = "prior_map.json"  # beside a map with a prior map: what became of that
 OF_THE_LIGHT = (  # settings that the same light has alike
     *("scene", "source", "seed", "size", "visit", "day", "hour", "effects", "pointing_px"),
     *("extent", "scan_step", "scan_exposure_ms", "coarse_exposure_ms", "budget", "policy"),
@@ -34,7 +34,7 @@ OF_THE_LIGHT = (  # settings that the same light has alike
 
 @dataclass(frozen=True)
 class EarlierRun:
-    """What a run saw of a field coarsely."""
+    """Coarse view of a field by an earlier run."""
 
     mosaic: StageRef
     factor: int  # fine px to a pixel of it, along either axis
@@ -57,7 +57,7 @@ class Prior:
 def find_prior(
     archive: Archive, settings: Settings, name: str, grid: SceneGrid, class_names: tuple[str, ...]
 ) -> tuple[Prior | None, tuple[str, ...]]:
-    """The run that a survey of ``name`` goes on from, and what to say of it; None where there is none.
+    """Return the run of the prior map of a survey of ``name``, and notes; None where there is none.
 
     Of the newest runs of the field it is the one looked at last before this visit: one that was taken later, and
     published earlier, is no memory of it. Raises SettingsError: a run that is named cannot be gone on from.
@@ -86,7 +86,7 @@ def _before(archive: Archive, settings: Settings, name: str) -> Iterator[Run]:
     """Return the newest runs of a field with class probabilities, the last captured before this visit first."""
     found: list[tuple[float, int, Run]] = []
     part, asked = run_stem(name), anchor_paths(settings.to_dict(), Path.cwd())
-    # Of a survey that leaves it to the memory where to look, that choice says nothing of its light.
+    # A survey may leave it to the prior map where to look: that choice says nothing of its light.
     chosen = ("extent", "scan_step", "scan_exposure_ms") if settings.extent == EXTENT_PART else ()
     light = [key for key in OF_THE_LIGHT if key not in chosen]
     for number, folder in enumerate(reversed(published_runs(archive.root))):
@@ -113,7 +113,7 @@ def _usable(
         return run.problem
     places = [run.products.get(name, "").split("/") for name in (PROBABILITIES, "mosaic")]
     if any(len(parts) < 3 for parts in places):
-        return "it left no class probabilities, as runs of earlier versions"
+        return "it left no class probabilities"
     try:
         probabilities, mosaic = (archive.find(parts[1], parts[2]) for parts in places)
         if probabilities is None or mosaic is None:
@@ -142,7 +142,7 @@ def _usable(
 
 
 def _factor(seen: Mosaic, grid: SceneGrid) -> int | None:
-    """How many fine px a pixel of an earlier mosaic is wide; None where the field has no such grid."""
+    """Return how many fine px a pixel of an earlier mosaic is wide; None where the field has no such grid."""
     fits = grid.patch % seen.factor == 0
     rows, columns = (-(-size // seen.factor) for size in (grid.height, grid.width))
     return (
@@ -153,7 +153,7 @@ def _factor(seen: Mosaic, grid: SceneGrid) -> int | None:
 
 
 def _earlier_runs(archive: Archive, run: Run, grid: SceneGrid) -> Iterator[EarlierRun]:
-    """What earlier runs saw of the rest of a field, where a run looked at a part of it and went on from them."""
+    """Yield what earlier runs saw of the rest of a field, where a run looked at a part of it and went on from them."""
     down, across = 0, 0
     for _ in range(MOST_EARLIER - 1):
         memory = run.receipt.get("memory")
@@ -198,7 +198,7 @@ def _days_since(run: Run, visit: str | None, moment: tuple[int, float] | None) -
 
 
 def prior_map_figures(store: Path) -> dict[str, Any] | None:
-    """What became of the memory that the map of a store goes on from; None of a field's first look."""
+    """Return what became of the prior map of a stored map; None of a field's first visit."""
     record = store / MEMORY
     return dict(read_table(record)) if record.is_file() else None
 

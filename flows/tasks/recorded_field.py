@@ -53,7 +53,7 @@ class OpenedRecording:
 
     @property
     def passes(self) -> RecordedPasses:
-        """What the passes of a plan can ask of it."""
+        """Return what the passes of a plan can ask of it."""
         return RecordedPasses(self.field.source)
 
     def scene(self) -> tuple[RasterScene, tuple[str, ...]]:

@@ -104,7 +104,7 @@ class _PlannedSweep(SimulatedSweep):
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureRun:
-    """What deciding on effects and capturing need to know."""
+    """Needs of deciding on effects and of capturing."""
 
     settings: Settings
     archive: Archive
@@ -126,12 +126,12 @@ class CaptureRun:
 
     @property
     def name(self) -> str:
-        """What the survey is called: its field, or its scene."""
+        """Return what the survey is called: its field, or its scene."""
         return self.settings.name or Path(self.scene.name).stem
 
     @property
     def source_key(self) -> dict[str, Any]:
-        """What the captured light depends on, beside the sweeps and the effects."""
+        """Return what the captured light depends on, beside the sweeps and the effects."""
         return {
             "source": self.source.name,
             "scene": self.scene.key,
@@ -144,7 +144,7 @@ class CaptureRun:
 
     @property
     def recorder(self) -> SweepRecorder:
-        """What takes the sweeps into the archive."""
+        """Return what takes the sweeps into the archive."""
         scene, settings = self.scene, self.settings
         bands = scene.wavelength_nm, scene.fwhm_nm
         return SweepRecorder(
@@ -189,12 +189,12 @@ class SurveyRun(CaptureRun):
 
     @property
     def map_scores(self) -> MapScores | None:
-        """How what maps expect of themselves came true, where that was measured."""
+        """Return how what maps expect of themselves came true, where that was measured."""
         return None if self.described.ood_detector is None else self.described.ood_detector.map_scores
 
     @property
     def device(self) -> str:
-        """Where the network computes."""
+        """Return where the network computes."""
         return self.settings.device
 
     @property
@@ -204,17 +204,17 @@ class SurveyRun(CaptureRun):
 
     @property
     def chooses(self) -> bool:
-        """Whether patches are chosen by their scores; where all are seen and read there is nothing to choose."""
+        """Return whether patches are chosen by their scores; where all are seen and read there is nothing to choose."""
         return not self.plan.plain or self.budget is not None
 
     @property
     def controls(self) -> bool:
-        """Whether other placements of patches are judged too; a uniform scan that is read whole places none."""
+        """Return whether other placements of patches are judged too; a uniform scan that is read whole places none."""
         return self.settings.controls and (self.chooses or self.raster is not None)
 
     @cached_property
     def labels(self) -> NDArray[np.uint8] | None:
-        """What to judge by, (y, x) in the weights' classes: trained pixels taken out. Draws the scene."""
+        """Return what to judge by, (y, x) in the weights' classes: trained pixels taken out. Draws the scene."""
         return judged_labels(self.scene, self.described)
 
     @cached_property
@@ -242,7 +242,7 @@ class SurveyRun(CaptureRun):
 
     @property
     def part(self) -> bool:
-        """Whether a part of the field alone is looked at."""
+        """Return whether a part of the field alone is looked at."""
         return self.settings.extent != EXTENT_WHOLE
 
     @property
@@ -262,7 +262,7 @@ class SurveyRun(CaptureRun):
 
     @property
     def unknown(self) -> UnknownRule | None:
-        """Which pixels are called unknown; None where the weights do not know what is familiar, or nobody asks."""
+        """Return which pixels are called unknown; None where the weights cannot tell, or the settings ask for none."""
         rate = self.settings.unknown_rate
         if self.ood_detector is None or rate is None:
             return None
@@ -276,7 +276,7 @@ class SurveyRun(CaptureRun):
 
     @property
     def map_choice(self) -> MapChoice:
-        """What map to draw on the ground."""
+        """Return what map to draw on the ground."""
         return self.settings.map
 
     def work_done(self, patch_index: NDArray[np.integer]) -> MultiplyAdds:
@@ -308,6 +308,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         raise SettingsError(refused)
     pixels, scene, notes, label_notes = _scene_for(model, settings, recorded, planning=planning)
     grid = SceneGrid(*scene.shape, described.config.patch, 1 if settings.budget is None else COARSE_FACTOR)
+    bands = len(scene.wavelength_nm)
     zones = open_zones(settings.zones, place_of_field(settings, scene), grid)
     outside = beyond_training(settings, scene, described, model.trained_on, path)
     ood_detector = model.asked_ood(settings.unknown)
@@ -317,37 +318,18 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     if settings.extent == EXTENT_PART:  # what is remembered says where to look: nothing else is asked for so early
         archive = open_archive(settings.out) if archive is None and is_archive(settings.out) else archive
         found = (None, ()) if archive is None else find_prior(archive, settings, name, grid, described.class_names)
-    prior = None if found is None else found[0]
-    extent, extent_notes = None, tuple[str, ...]()
-    if settings.extent == EXTENT_PART and prior is None:  # as it can be asked for again
-        settings = replace(settings, extent=EXTENT_WHOLE, max_age=None, skip_below_error=None)
-        extent_notes = ("nothing is remembered: the whole field is looked at",)
-    plan, scans, raster, plan_notes = CapturePlan.of_map(), ScanChoice(), None, tuple[str, ...]()
-    passes, bands = None if recorded is None else recorded.passes, len(scene.wavelength_nm)
-    layout = PassLayout.of(settings, grid, zones.shown, passes)
-    if settings.extent == EXTENT_PART and prior is not None:
-        assert settings.seconds is not None  # checked with the settings
-        layout, extent, words = choose_extent(
-            layout,
-            prior,
-            described,
-            path,
-            seconds=settings.seconds,
-            max_age=settings.max_age,
-            skip_below_error=settings.skip_below_error,
-        )
-        extent_notes = (words,)
+    passes = None if recorded is None else recorded.passes
+    planned = _PlannedCapture(settings)
     if pixels is None:
-        scans = choose_uniform_scan(layout, described, path, bands, settings)
-        layout, plan, settings, plan_notes = lay_out_passes(layout, scans.chosen, settings)
-    else:
-        raster = RasterPixels(pixels.read, pixels.missing, bands, grid)
-    settings = replace(settings, extent=layout.extent, scan_step=layout.step, scan_exposure_ms=layout.exposure_ms)
+        prior = None if found is None else found[0]
+        planned = _plan_capture(settings, grid, bands, path, described, prior, shown=zones.shown, passes=passes)
+    settings, plan = planned.settings, planned.plan
     costs = ReadingCosts(described.config, grid, bands)
     spending = settings.policy, settings.macs, settings.least_gain
     budget = PatchBudget.asked(costs, None if zones.fractions is None else zones.fractions > 0, *spending)
-    simulated, planned = make_source(scene, settings), (*plan.coarse, *plan.full)
-    source = field_source(scene, settings, simulated, planned) if recorded is None else recorded.field
+    simulated, sweeps = make_source(scene, settings), (*plan.coarse, *plan.full)
+    source = field_source(scene, settings, simulated, sweeps) if recorded is None else recorded.field
+    raster = None if pixels is None else RasterPixels(pixels.read, pixels.missing, bands, grid)
     if raster is None:
         check_memory(simulated, grid, plan, settings.memory, settings.pool)
     else:
@@ -356,30 +338,71 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     prior, prior_notes = found or find_prior(archive, settings, name, grid, described.class_names)
     if settings.prior != AUTO:  # what is meant when it is asked for again
         settings = replace(settings, prior=NONE if prior is None else prior.run)
-    said = (*notes, *zones.notes, *plan_notes, *prior_notes, *extent_notes, *outside, *label_notes)
     return SurveyRun(
         settings=settings,
         archive=archive,
         source=source,
         simulated=simulated,
         scene=scene,
-        planned=planned,
+        planned=sweeps,
         described=described,
         load=model.load,
         grid=grid,
         costs=costs,
         plan=plan,
         recorded=passes,
-        scans=scans,
+        scans=planned.scans,
         zones=zones,
         raster=raster,
         budget=budget,
-        extent=extent,
+        extent=planned.extent,
         prior=prior,
         ood_detector=ood_detector,
-        notes=said,
+        notes=(*notes, *zones.notes, *planned.notes, *prior_notes, *outside, *label_notes),
         refused=refused,
     )
+
+
+@dataclass(frozen=True)
+class _PlannedCapture:
+    """The lines of a survey, the choices that led to them, and the settings that ask for just these."""
+
+    settings: Settings
+    plan: CapturePlan = field(default_factory=CapturePlan.of_map)
+    scans: ScanChoice = field(default_factory=ScanChoice)
+    extent: ExtentChoice | None = None
+    notes: tuple[str, ...] = ()
+
+
+def _plan_capture(
+    settings: Settings,
+    grid: SceneGrid,
+    bands: int,
+    path: Path,
+    described: Description,
+    prior: Prior | None,
+    *,
+    shown: NDArray[np.bool_] | None,
+    passes: RecordedPasses | None,
+) -> _PlannedCapture:
+    """Choose the part of the field, then the uniform scan or two passes, for the weights of the file ``path``.
+
+    Raises what `choose_extent`, `choose_uniform_scan` and `lay_out_passes` raise.
+    """
+    extent, extent_notes, is_part = None, tuple[str, ...](), settings.extent == EXTENT_PART
+    if is_part and prior is None:  # as it can be asked for again
+        settings = replace(settings, extent=EXTENT_WHOLE, max_age=None, skip_below_error=None)
+        extent_notes = ("nothing is remembered: the whole field is looked at",)
+    layout = PassLayout.of(settings, grid, shown, passes)
+    if is_part and prior is not None:
+        assert settings.seconds is not None  # checked with the settings
+        limits = {"max_age": settings.max_age, "skip_below_error": settings.skip_below_error}
+        layout, extent, words = choose_extent(layout, prior, described, path, seconds=settings.seconds, **limits)
+        extent_notes = (words,)
+    scans = choose_uniform_scan(layout, described, path, bands, settings)
+    layout, plan, settings, plan_notes = lay_out_passes(layout, scans.chosen, settings)
+    settings = replace(settings, extent=layout.extent, scan_step=layout.step, scan_exposure_ms=layout.exposure_ms)
+    return _PlannedCapture(settings, plan, scans, extent, (*plan_notes, *extent_notes))
 
 
 def _scene_for(

@@ -1,4 +1,4 @@
-"""The uniform scan of a survey: which one the weights' record promises most of, and what its neighbours would give."""
+"""The uniform scan of a survey: which one is best by the weights' record, and what its neighbours would give."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a survey looks at, with the labels and the mask on its pixels, and who looks: the simulator or a rig."""
+"""Scene of a survey, with labels and mask on its pixels, and its source: the simulator or a rig."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import Once
 from pipeline.simulator.effects.effect import Effect
 from pipeline.simulator.rig_model import Sky
-from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, farm_scene, law_of_key
+from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, farm_scene
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Source
@@ -38,15 +38,10 @@ from storage.remote.opening import is_archive, open_archive
 # Peak of a survey of the farm without controls: 1.69 GB for 1280 x 1024 px, 3.10 GB for 2560 x 2560 px
 FARM_BYTES, FARM_BYTES_PER_PX = 1_350_000_000, 270
 POSE_WINS = "the scene's own place on the earth is set aside: [pose] says where it lies; leave [pose] out to keep it"
-SAME_HOUR = 0.5  # by which true solar time is at most off mean solar time, and whoever rounds it [h]
+SAME_HOUR = 0.5  # by which true solar time is at most off mean solar time, and rounding of both [h]
 
 
 DATE, NEW = "{date", "{new}"
-
-
-def is_pattern(scene: str) -> bool:
-    """Return whether a scene is named anew at each visit: by ``{date:%Y-%m-%d}``, by ``{new}``, or by both."""
-    return DATE in scene or NEW in scene
 
 
 def scene_of_visit(settings: Settings, moment: datetime) -> Settings:
@@ -56,7 +51,7 @@ def scene_of_visit(settings: Settings, moment: datetime) -> Settings:
     newest, by the time it was written, that no run of the archive surveyed. Raises SettingsError: braces that say
     neither; NoSceneYet: there is no such file; NothingToMend: all of them were surveyed.
     """
-    if not is_pattern(settings.scene):
+    if DATE not in settings.scene and NEW not in settings.scene:
         return settings
     try:
         named = settings.scene.format(date=moment, new=NEW)
@@ -104,7 +99,7 @@ def check_scene_there(scene: str, *, is_map: bool) -> None:
 def open_scene(settings: Settings, known: Sequence[str] | None = None) -> tuple[RasterScene, tuple[str, ...]]:
     """Open the scene, say what was assumed; SceneError, WavelengthError: its file, SettingsError: not for a farm.
 
-    Labels that nobody named, but that lie beside the scene, count where their classes are among the ``known`` ones.
+    Labels that no setting names, but that lie beside the scene, count where their classes are among the ``known`` ones.
     """
     if settings.scene == RIG_FIELD:
         return _field_before_rig(settings), ()
@@ -153,6 +148,7 @@ def open_map(settings: Settings, known: Sequence[str] | None = None) -> tuple[Sc
         filled_px=file.filled_px,
         missing=missing,
         geobox=file.geobox,
+        pixel_m=file.pixel_m,
         content=file.content,
     )
     scene, notes = _placed_once(scene, file.provenance, posed=settings.pose is not None)
@@ -165,7 +161,9 @@ def _judged_by_known(file: SceneFile, known: Sequence[str] | None) -> SceneFile:
     if not (file.labels_found and out_of_range):
         return file
     hint = f"of the class {out_of_range[0]!r}, which the weights do not know: name its classes in a scene.toml to judge"
-    return file.without_labels(f"the labels beside the scene are left out: they are {hint} by them")
+    note = f"the labels beside the scene are left out: they are {hint} by them"
+    nothing: dict[str, Any] = {"labels": None, "class_names": (), "class_values": ()}
+    return replace(file, **nothing, class_colours=file.class_colours[:0], provenance=(*file.provenance, note))
 
 
 def _placed_once(scene: RasterScene, notes: tuple[str, ...], *, posed: bool) -> tuple[RasterScene, tuple[str, ...]]:
@@ -262,16 +260,13 @@ def check_labels(scene: RasterScene, weights: Description) -> tuple[str, ...]:
     if missing:
         known = ", ".join(weights.class_names)
         hint = "use weights for these"
-        if (found := re.fullmatch(r"class_(\d+)|colour_([0-9a-f]{6})", missing[0])) is not None:  # nobody named it
+        if (found := re.fullmatch(r"class_(\d+)|colour_([0-9a-f]{6})", missing[0])) is not None:  # it has no name
             value = found[1] or list(bytes.fromhex(found[2]))
             hint += (
                 ", or say which class each value of the label file is, in a table [classes] of the scene.toml beside "
                 f"the scene's file: {weights.class_names[0]} = {value}"
             )
         raise SceneError(f"the labels have the class {missing[0]!r}, the weights know {known}; {hint}")
-    law, learnt = law_of_key(scene.key), law_of_key(str(weights.record.get("data")))
-    if None not in (law, learnt) and law != learnt:
-        return (f"the weights were trained on {learnt}, the scene is of {law}: expect a poorer map",)
     seen = seen_in_training(scene, weights)
     return () if seen is None else (f"accuracy is counted on {TRAINING_SCENE[seen]}",)
 
@@ -286,7 +281,7 @@ TRAINING_SCENE = {  # what a score on a scene of the training is a score of
 def seen_in_training(scene: RasterScene, weights: Description) -> str | None:
     """Return how much of a scene the weights were trained on, a key of `TRAINING_SCENE`; None for nothing.
 
-    Files are told by what they hold, whatever their names and whatever bands are read of them.
+    Files are identified by what they hold, whatever their names and whatever bands are read of them.
     """
     split = weights.record.get("split", {})
     if scene.key in split.get("pixels", {}):
@@ -311,7 +306,7 @@ def judged_labels(scene: RasterScene, weights: Description) -> NDArray[np.uint8]
 
 
 class FieldSource:
-    """Who looks at the field for a survey: the one seam between what is simulated and what is there.
+    """Source of a survey's lines: the one seam between what is simulated and what is there.
 
     As it stands a raster, which no camera looks at: its pixels are read from the file.
     """
@@ -320,11 +315,11 @@ class FieldSource:
     simulates = False  # whether effects are chosen for it, which then stand in what is stored of its lines
 
     def key(self, field: str) -> dict[str, Any]:
-        """What its light depends on, beside scene, camera, seed, sweeps and effects."""
+        """Return what its light depends on, beside scene, camera, seed, sweeps and effects."""
         return {}
 
     def saying(self, say: Callable[[str], None]) -> FieldSource:
-        """The same, telling somebody what it is at while no line comes."""
+        """The same, reporting what it is at while no line comes."""
         return self
 
     def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> FieldSource:
@@ -332,7 +327,7 @@ class FieldSource:
         return self
 
     def opened(self, spool: Path) -> AbstractContextManager[Source]:
-        """What lines come from, held on to; what it keeps on the way goes beside the lines in ``spool``.
+        """Return what lines come from, held on to; what it keeps on the way goes beside the lines in ``spool``.
 
         Raises SettingsError: it has no lines.
         """

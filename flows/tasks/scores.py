@@ -1,4 +1,4 @@
-"""How good the map of a run is, read from its receipt: scores that may be compared, the worst class, false classes."""
+"""Scores of a run's map, read from its receipt: those that may be compared, the worst class, false classes."""
 
 from __future__ import annotations
 

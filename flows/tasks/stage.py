@@ -62,7 +62,7 @@ class FieldFrame:
 
 @dataclass(frozen=True)
 class Product:
-    """What a stage stores: the folder of such stores, and the version of what is written, raised when that changes."""
+    """Product of a stage: the folder of such stores, and the version of what is written, raised when that changes."""
 
     name: str
     version: int
@@ -111,7 +111,7 @@ class Stage:
         return run(survey, self.name, *(ref for ref in inputs if ref is not None))
 
     def addresses(self, ref: StageRef) -> dict[str, str]:
-        """Where its store lies, or the files in it, by the names in receipts: the stage's own by default."""
+        """Return where its store lies, or the files in it, by the names in receipts: the stage's own by default."""
         if self.named is not None or not self.product.files:
             return {self.named or self.name: "/".join((ref.uri, *self.product.files))}
         return {Path(file).stem: f"{ref.uri}/{file}" for file in self.product.files}

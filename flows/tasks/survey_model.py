@@ -62,16 +62,16 @@ class SurveyModel:
 
     @property
     def trained_on(self) -> TrainedOn | None:
-        """What the weights were trained on, by their record or what is familiar to them; None where neither tells."""
+        """Return the training data of the weights, by their record or their out-of-distribution part, else None."""
         if TRAINED_ON in self.described.record:
             return TrainedOn.read(self.described.record[TRAINED_ON])
         return None if self.described.ood_detector is None else self.described.ood_detector.trained_on
 
     def asked_ood(self, unknown: str) -> OodPart | None:
-        """What is familiar, where pixels may be called unknown; WeightsError where it is asked and nobody knows it."""
+        """Return the out-of-distribution detector if unknown pixels are asked for (WeightsError: it is missing)."""
         if unknown not in (UNKNOWN_AUTO, UNKNOWN_OFF) and self.described.ood_detector is None:
             raise WeightsError(
-                f"--unknown {unknown}: nobody measured what is familiar to {self.path.name}; do so with: "
+                f"--unknown {unknown}: {self.path.name} has no record of familiar spectra; add one with: "
                 f"spectralzoom train DATASET --fit-ood {self.path} -o {self.path}, or leave --unknown out"
             )
         return None if unknown == UNKNOWN_OFF else self.described.ood_detector
@@ -103,7 +103,7 @@ DAYS, SUN_DEG, DARKER, SCALE, BAND_NM = 10, 3.0, 0.9, 1.5, 25.0  # as much besid
 def beyond_training(
     settings: Settings, scene: RasterScene, described: Description, trained: TrainedOn | None, path: Path
 ) -> tuple[str, ...]:
-    """One note of all that training did not see, or none; ``trained`` is None where nobody knows what it saw."""
+    """One note of all that training did not see, or none; ``trained`` is None where what it saw is unknown."""
     _, reached = described.basis.matrix(scene.wavelength_nm)
     known = np.ones_like(reached)  # columns that training reached
     if trained is not None and trained.bands_nm is not None:

@@ -33,7 +33,7 @@ WGS84 = 4326  # what GeoJSON without a CRS is in (RFC 7946), on a field of which
 
 @dataclass(frozen=True)
 class SurveyZones:
-    """What a survey keeps to, and the plots that it tells of, on the pixels of its field."""
+    """Zones that a survey keeps to, and the plots that it tells of, on the pixels of its field."""
 
     place: FieldPlace
     grid: SceneGrid
@@ -60,7 +60,7 @@ class SurveyZones:
 
     @cached_property
     def key(self) -> dict[str, str]:
-        """What results depend on, for the keys of stages; nothing where nothing is left out."""
+        """Return what results depend on, for the keys of stages; nothing where nothing is left out."""
         if self.kept is None:
             return {}
         no_go = {} if self.kept.no_go is None else {"no_go": array_digest(self.kept.no_go)}
@@ -68,7 +68,7 @@ class SurveyZones:
 
 
 def place_of_field(settings: Settings, scene: RasterScene) -> FieldPlace:
-    """Where the field lies: before a rig with a pose, on the grid of a georeferenced scene, or nobody knows where.
+    """Return the place of the field: before a rig with a pose, on the grid of a georeferenced scene, or none.
 
     Raises PoseError: from the pose no ground is seen, or the map's CRS does not suit it.
     """
@@ -119,7 +119,7 @@ def _read(source: str, place: FieldPlace, notes: list[str], named_by: str | None
     notes += found.notes
     if place.crs is None and found.crs is not None:
         raise ZoneError(
-            f"{source} is in {found.crs.name}, and nobody said where this field lies: give the rig's [pose], a "
+            f"{source} is in {found.crs.name}, and this field has no place: give the rig's [pose], a "
             "georeferenced scene, or polygons in pixels of the scene as GeoJSON without a CRS"
         )
     if place.crs is None:
@@ -132,7 +132,7 @@ def _read(source: str, place: FieldPlace, notes: list[str], named_by: str | None
 
 
 def _format_beside(found: ZoneFile, place: FieldPlace) -> str:
-    """Where polygons and field lie, of which none lies on it."""
+    """Return where polygons and field lie, of which none lies on it."""
     if found.crs is None or place.crs is None:
         unit, here, there = "px", _bounds([one.bounds for one in found.shapes.values()]), place.outline.bounds
         spans = [
@@ -159,7 +159,7 @@ def _bounds(of_each: Sequence[tuple[float, float, float, float]]) -> tuple[float
 
 
 def _format_pixels(place: FieldPlace) -> str:
-    """How large a pixel is, where somebody knows."""
+    """Return how large a pixel is, where that is known."""
     rows, columns = place.shape
     middle = place.pixel_areas_m2(slice(rows // 2, rows // 2 + 1), slice(columns // 2, columns // 2 + 1))
     return "" if middle is None else f" ({float(np.sqrt(middle[0, 0])):.3g} m)"

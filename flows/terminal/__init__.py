@@ -1,1 +1,1 @@
-"""What the terminal shows and what stops a command: progress, figures, safe text, signals, refusals of the machine."""
+"""Terminal and process: progress, figures, safe text, signals, refusals of the machine."""

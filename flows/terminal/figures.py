@@ -6,7 +6,8 @@ import math
 from typing import TypeGuard
 
 DASH = "–"  # noqa: RUF001
-LEAST_HECTARES = 0.1  # smaller areas are told in square metres
+MOST_PERCENT = 1000  # more is told as a factor
+LEAST_HECTARES = 0.1  # smaller areas are given in square metres
 
 
 def format_seconds(seconds: float | None) -> str:
@@ -56,9 +57,11 @@ def three_digits(value: float) -> str:
 
 
 def format_percent(fraction: float | None) -> str:
-    """A fraction as percent without decimals, one decimal below 10 %."""
+    """A fraction as percent without decimals, one decimal below 10 %; from ten times the whole on how many times."""
     if not _known(fraction):
         return DASH
+    if abs(fraction) >= MOST_PERCENT / 100:
+        return f"{three_digits(fraction)} times"
     return f"{100 * fraction:.1f} %" if abs(fraction) < 0.0995 else f"{100 * fraction:.0f} %"
 
 

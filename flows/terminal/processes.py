@@ -48,13 +48,13 @@ def _terminate(number: int, frame: FrameType | None) -> None:
     raise Terminated
 
 
-# Of exceptions that are no MemoryError: of torch and of threads; and, where memory is limited, of the loader.
+# Texts of exceptions that are no MemoryError: of torch and of threads; and, where memory is limited, of the loader.
 _OF_MEMORY = ("can't allocate memory", "not enough memory", "can't start new thread", "cannot allocate memory")
 _OF_LIMITED_MEMORY = ("failed to map segment", "could not find/load shared object")
 
 
 def format_refusal(error: BaseException) -> str | None:
-    """What was refused and what to do; None where the error is something else."""
+    """Return what was refused and what to do; None where the error is something else."""
     text, limit = str(error), resource.getrlimit(resource.RLIMIT_AS)[0]
     limited = limit != resource.RLIM_INFINITY
     known = (*_OF_MEMORY, *(_OF_LIMITED_MEMORY if limited else ()))
@@ -94,7 +94,7 @@ def place_caches(environment: MutableMapping[str, str] | None = None) -> Path | 
     """Name a private folder in the environment, for this process and those that it starts, where it is needed.
 
     It is `spectralzoom-UID` in the temporary folder, so that the next process finds what this one compiled: where it
-    is not ours alone, a new one that goes with this process. What is in it is run as code, so nobody else may write it.
+    is not ours alone, a new one that goes with this process. Its content is run as code: no other user may write it.
     ``environment`` is this process's own unless given. None where the usual one (XDG_CACHE_HOME, or ~/.cache) can be
     written. Raises SettingsError: nothing can be written, the temporary folder included.
     """
@@ -104,7 +104,7 @@ def place_caches(environment: MutableMapping[str, str] | None = None) -> Path | 
     except KeyError:
         home = None
     if not home:
-        environment["HOME"] = NO_HOME  # Prefect asks for one before anybody tells it where to keep its files
+        environment["HOME"] = NO_HOME  # Prefect asks for one before it is set where to keep its files
     usual = _usual_folder(environment)
     with suppress(OSError):
         if usual is not None:
@@ -129,7 +129,7 @@ def place_pages(environment: Mapping[str, str] | None = None) -> dict[str, str]:
 
 
 def _usual_folder(environment: Mapping[str, str]) -> Path | None:
-    """Where caches belong; None where there is no home to hold them."""
+    """Return where caches belong; None where there is no home to hold them."""
     named = Path(environment.get("XDG_CACHE_HOME", ""))
     if named.is_absolute():
         return named

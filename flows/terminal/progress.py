@@ -18,6 +18,7 @@ from rich.segment import Segment
 from rich.table import Column, Table
 from rich.text import Text
 
+from flows.terminal.figures import format_seconds
 from pipeline.errors import visible
 from storage.archive.whole_files import to_json
 
@@ -37,12 +38,12 @@ class Terminal(Console):
 
 
 def on_stderr() -> Terminal:
-    """Where progress and messages go."""
+    """Return where progress and messages go."""
     return Terminal(stderr=True, highlight=False)
 
 
 def on_stdout() -> Terminal:
-    """Where results go."""
+    """Return where results go."""
     return Terminal(file=sys.stdout, highlight=False, width=None if sys.stdout.isatty() else PIPED_WIDTH)
 
 
@@ -91,7 +92,7 @@ _listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
 
 @contextmanager
 def heard_by(listener: Listener | None) -> Iterator[None]:
-    """Have ``listener`` told, besides the terminal, how far each stage is that the block runs; None: nobody."""
+    """Report to ``listener``, too, how far each stage is that the block runs; None: to the terminal alone."""
     before = _listener.set(listener)
     try:
         yield
@@ -159,7 +160,9 @@ class StageProgress:
         due = time.monotonic() - self._said[stage] > LINE_EVERY_S
         if not self.console.is_terminal and (ended or due):
             self._said[stage] = time.monotonic()
-            self.console.print(f"{title}: {done:.0%} {escape(words)}".rstrip(), soft_wrap=True)
+            left = None if ended else self._bars.tasks[self._tasks[stage]].time_remaining
+            time_left = "" if left is None else f", {format_seconds(left)} left"
+            self.console.print(f"{title}: {done:.0%} {escape(words)}".rstrip() + time_left, soft_wrap=True)
 
     def watch(self, stage: str, state: str, done: float) -> None:
         """Show how far a stage of a survey is that runs, or how it ended: ran, cached, skipped, failed."""
@@ -176,7 +179,7 @@ class StageProgress:
 def one_after_the_other(console: Console) -> Iterator[Callable[[str, float, str], None]]:
     """Bars of parts that follow each other: a part has ended where the next begins, and the last with the block.
 
-    Gives what a part is told by: its title, how far it is (0..1), and a figure in words.
+    Gives what identifies a part: its title, how far it is (0..1), and a figure in words.
     """
     last = ""
     with StageProgress(console) as progress:

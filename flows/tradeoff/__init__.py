@@ -1,1 +1,1 @@
-"""What accuracy costs in time: one measure a stage, with knob, reference and error."""
+"""Trade-offs of accuracy against time: one measure a stage, with knob, reference and error."""

@@ -19,8 +19,8 @@ from flows.publish.panels import GRID, INK, PAPER, save_png
 from flows.terminal.figures import format_seconds
 from flows.terminal.processes import writing
 from flows.terminal.progress import table
-from flows.tradeoff.entries import Point, Result, measure_tradeoff
-from flows.tradeoff.stages import TRADEOFFS, find_tradeoff
+from flows.tradeoff.entries import Point, Result, Setting, Tradeoff, measure_tradeoff
+from flows.tradeoff.stages import SEGMENT, SURVEY, TRADEOFFS, find_tradeoff, segment_tradeoff, survey_tradeoff
 from flows.tradeoff.store import STORE, store_tradeoff
 from pipeline.errors import SettingsError
 from storage.archive.whole_files import to_json
@@ -43,20 +43,17 @@ def run_tradeoff(
 ) -> dict[str, Any]:
     """Measure the trade-off of one stage, or all; write tradeoff.json and .png into ``out`` and print the tables.
 
-    ``scene`` is a raster whose pixels `store` takes in place of a farm's lines, ``weights`` those that read it.
+    ``scene`` is what `segment`, `store` and `survey` take in place of a farm, ``weights`` those that read it. Raises
+    SettingsError: a stage that has no scene or weights, a scene without weights; else what the stages do.
     """
     if repeats is not None and repeats < 1:
         raise SettingsError(f"--repeats must be at least 1, got {repeats}")
     if seed < 0:
         raise SettingsError(f"--seed must be 0 or more, got {seed}")
-    if (scene or weights) and (stage != STORE.stage or not scene):
-        raise SettingsError(
-            f"--scene, and --weights with it, are for the stage store alone: spectralzoom tradeoff {STORE.stage} "
-            "--scene FILE --weights FILE"
-        )
-    wanted = [find_tradeoff(stage)] if stage else list(TRADEOFFS.values())
-    if scene:
-        wanted = [store_tradeoff(scene, weights)]
+    if scene or weights:
+        wanted = own_tradeoffs(stage, scene, weights)
+    else:
+        wanted = [find_tradeoff(stage)] if stage else list(TRADEOFFS.values())
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)  # before minutes are spent on what cannot be kept
     results = []
@@ -72,11 +69,28 @@ def run_tradeoff(
     return content
 
 
+def own_tradeoffs(stage: str | None, scene: str | None, weights: Path | None) -> list[Tradeoff]:
+    """Return the trade-offs of one's own scene and weights: of a stage, or of `segment` and `survey`.
+
+    Raises SettingsError: the stage has neither, or one of the two is missing.
+    """
+    if stage == STORE.stage and scene:
+        return [store_tradeoff(scene, weights)]
+    own = {SEGMENT.stage: segment_tradeoff, SURVEY.stage: survey_tradeoff}
+    if (stage is not None and stage not in own) or scene is None or weights is None:
+        raise SettingsError(
+            f"--scene FILE and --weights FILE go together, with the stages {', '.join(own)} and {STORE.stage} (this "
+            f"also without weights): spectralzoom tradeoff {SURVEY.stage} --scene FILE --weights FILE"
+        )
+    return [make(scene, weights) for name, make in own.items() if stage in (None, name)]
+
+
 def print_tradeoff(result: Result, console: Console) -> None:
     """Print the settings from the most to the least exact; those that no other beats are marked."""
     points = sorted(result.points, key=lambda point: point.error)
-    rows, figures = [_row(point) for point in points], ("error", *result.points[0].beside)
-    times = ("time",) if result.paid else (f"per {result.unit}", "price", "x first")
+    rows, figures = [_row(point, result) for point in points], ("error", *result.points[0].beside)
+    times = ("time",) if result.paid else ("price", "x first")
+    times = times if result.paid or result.modelled else (f"per {result.unit}", *times)
     headings = [name.replace(" ", "\n") for name in (*figures, *times)]
     pairs = zip(rows, points, strict=True)
     shown = [[f"{'' if point.pareto else '[dim]'}{escape(cell)}" for cell in row] for row, point in pairs]
@@ -85,11 +99,19 @@ def print_tradeoff(result: Result, console: Console) -> None:
     console.print(table(columns, shown, left=2, title=title, whole=columns), _caption(result))
 
 
-def _row(point: Point) -> list[str]:
+def _row(point: Point, result: Result) -> list[str]:
     times = [_short(point.ns_per_unit * 1e-9), _short(point.price_s), f"{point.ratio:.2f}"]
-    times = times if point.paid is None else times[1:2]  # what is paid stands among the figures
+    if point.paid is not None:  # what is paid stands among the figures
+        times = times[1:2]
+    elif result.modelled:  # seconds of a camera are none of a pixel
+        times = times[1:]
     further = [f"{one:.2g}" if abs(one) < 10 else f"{one:.1f}" for one in point.beside.values()]
-    return ["●" if point.pareto else "○", str(point.setting), f"{point.error:.3g}", *further, *times]
+    name = _named(point.setting, result.default)
+    return ["●" if point.pareto else "○", name, f"{point.error:.3g}", *further, *times]
+
+
+def _named(setting: Setting, default: Setting | None) -> str:
+    return f"{setting} (default)" if setting == default else str(setting)
 
 
 def _short(seconds: float) -> str:
@@ -147,7 +169,7 @@ def _draw_tradeoff(axes: Axes, result: Result) -> None:
             fill = "full" if point.pareto else "none"
             axes.plot(x, y, marker="o", color=colour, markersize=8, fillstyle=fill, zorder=3)
             axes.annotate(
-                str(point.setting).rpartition(", ")[2],
+                _named(point.setting, result.default).rpartition(", ")[2],
                 (x, y),
                 (6, 5),
                 textcoords="offset points",

@@ -110,6 +110,8 @@ class Tradeoff:
     ``level`` is an error below which more exactness is lost in something else, and its name; ``beside`` are more
     figures, of which ``paid`` names the one that counts as the price in place of time. All functions take what
     ``prepare`` gave for a seed, then a setting, then what ``run`` gave. ``missing`` says why a setting cannot run here.
+    ``settings_of`` gives the settings where they depend on what was prepared, ``default`` the one that surveys take
+    where nobody chooses.
     """
 
     stage: str
@@ -128,6 +130,8 @@ class Tradeoff:
     paid: str | None = None
     missing: Callable[[Setting], str | None] = lambda setting: None
     repeats: int = 5  # unless others are asked for
+    settings_of: Callable[[Any], tuple[Setting, ...]] | None = None
+    default: Callable[[Any], Setting | None] = lambda state: None
 
 
 @dataclass(frozen=True)
@@ -167,6 +171,7 @@ class Result:
     level: tuple[str, float] | None = None
     paid: str | None = None  # what is paid; None: time
     missing: Mapping[str, str] = field(default_factory=dict, hash=False)  # settings that did not run, and why
+    default: Setting | None = None  # what surveys take where nobody chooses
 
 
 def measure_tradeoff(tradeoff: Tradeoff, *, repeats: int | None = None, seed: int = 0) -> Result:
@@ -174,9 +179,10 @@ def measure_tradeoff(tradeoff: Tradeoff, *, repeats: int | None = None, seed: in
     repeats = tradeoff.repeats if repeats is None else repeats
     if repeats < 1:
         raise SettingsError(f"repeats must be at least 1, got {repeats}")
-    why = {setting: tradeoff.missing(setting) for setting in tradeoff.settings}
-    settings = [setting for setting, reason in why.items() if reason is None]
     state = tradeoff.prepare(seed)
+    asked = tradeoff.settings if tradeoff.settings_of is None else tradeoff.settings_of(state)
+    why = {setting: tradeoff.missing(setting) for setting in asked}
+    settings = [setting for setting, reason in why.items() if reason is None]
     with one_thread() as threads:
         load_before = mean_load()
         made = [tradeoff.run(state, setting) for setting in settings]
@@ -202,6 +208,7 @@ def measure_tradeoff(tradeoff: Tradeoff, *, repeats: int | None = None, seed: in
     return Result(
         *(*named, repeats, seed, machine, mark_pareto(points), tradeoff.modelled_s is not None, level, tradeoff.paid),
         missing={str(setting): reason for setting, reason in why.items() if reason is not None},
+        default=tradeoff.default(state),
     )
 
 

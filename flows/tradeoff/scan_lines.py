@@ -82,7 +82,7 @@ class ScanLines:
     camera: LineCamera
     wavelength_nm: NDArray[np.float64]
     values: Values  # (line, sample, band) scene values of the raw lines
-    truth: Values  # likewise without noise; the values themselves where nobody knows
+    truth: Values  # likewise without noise; the values themselves where it is unknown
     sigma: Values  # deviation of the noise of a value, as large or (band,)
     noise_dn: NDArray[np.float64]  # (band,) of raw numbers, on average
     rank: int  # components that rise above the noise

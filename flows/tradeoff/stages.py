@@ -5,16 +5,20 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.settings.load import load_settings
+from flows.settings.survey_settings import RASTER, Settings
 from flows.tasks.patch_budget import PatchBudget, ReadingCosts
-from flows.tasks.run import COARSE_FACTOR
-from flows.tasks.stages.accuracy import columns_of_all_patches
+from flows.tasks.run import COARSE_FACTOR, SurveyRun, open_run
+from flows.tasks.stages.accuracy import columns_of_all_patches, columns_of_raster
 from flows.tasks.survey_model import shipped_weights
 from flows.tradeoff.entries import Setting, Tradeoff
 from flows.tradeoff.store import STORE
@@ -31,9 +35,9 @@ from models.reading.inference import (
     segment,
 )
 from models.weights.files import Weights, load_weights
-from pipeline.errors import SettingsError
+from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.geometry.scan import Axis, CostModel, Sweep
 from pipeline.planning.coverage import cheapest_full, coarse_sweeps, full_sweeps, uniform_sweeps
 from pipeline.planning.fine_pass import plan_fine
@@ -53,6 +57,7 @@ from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.simulator.selection.choice import Decision, decide
 from pipeline.simulator.selection.survey_probe import probe_scene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_block
+from storage.archive.archive import Archive
 
 Values = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -123,6 +128,7 @@ RECTIFY = Tradeoff(
     unit="px*band",
     reference=f"waves of {PERIODS_PX[0]:g} to {PERIODS_PX[1]:g} px, evaluated at the output pixels",
     settings=("nearest", "bilinear", "catmull-rom"),
+    default=lambda _state: Settings().resampling,
     prepare=scatter_points,
     run=lambda state, kernel: resample(
         state.samples, np.ones(state.samples.shape[:2], bool), state.coordinates, cast("Kernel", kernel)
@@ -193,6 +199,7 @@ SIMULATE = Tradeoff(
     unit="px*band",
     reference="everything that the rig has, exact; on average over the noise",
     settings=(EXACT, *TOLERANCES),
+    default=lambda _state: Settings().tol.value,
     prepare=decide_for_lines,
     run=lambda state, setting: _simulate(state.scene, state.blocks, state.decisions[setting].chosen),
     judge=FarmLines.greatest_change,
@@ -208,9 +215,7 @@ SURVEY_SHAPE = (384, 512)
 SCANS = {format_scan(step, ms): (step, ms) for step in (1, 2, 4) for ms in (100.0, 50.0, 25.0, 12.0, 6.0)}
 BUDGETS = {f"two passes, budget {budget:g}": budget for budget in (0.8, 0.65, 0.5, 0.4)}
 PART_OF = (1, 25.0)  # step and exposure [ms] of the scan of which parts are read in detail
-PARTS = {
-    f"{format_scan(*PART_OF)} in part, {fraction} of the multiply-adds": fraction for fraction in ("50%", "35%", "25%")
-}
+PARTS = {f"{format_scan(*PART_OF)}, {fraction} of multiply-adds": fraction for fraction in ("50%", "35%", "25%")}
 
 
 @dataclass(frozen=True)
@@ -233,6 +238,12 @@ class PlannedField:
     labels: NDArray[np.uint8]
     bands: int
     scan_passes: Mapping[Setting, PlannedPass]
+    default: Setting | None = None  # the plan of a survey that asks for none
+
+    @property
+    def plans(self) -> tuple[Setting, ...]:
+        """All plans, in the order in which they were laid out."""
+        return tuple(self.scan_passes)
 
     def read(self, plan: Setting) -> DrawnMap:
         """Return the class map of a plan."""
@@ -279,40 +290,62 @@ def coarse_mosaic(source: SimulatedSource, coarse: list[Sweep], grid: SceneGrid)
     return np.concatenate([values for _, values, _ in rows])
 
 
-def plan_every_way(seed: int) -> PlannedField:
-    """Take a farm by every uniform scan, by parts of one, and in two passes of every budget."""
-    camera, cost = LineCamera(), CostModel()
-    scene = farm_scene(seed, SURVEY_SHAPE, camera=camera)
-    weights = load_weights(shipped_weights())
-    grid = SceneGrid(*SURVEY_SHAPE, weights.config.patch, COARSE_FACTOR)
-    source, bands = SimulatedSource(scene, Rig(camera), seed), len(scene.wavelength_nm)
+def open_field(seed: int, scene: str | None, weights: Path | None, source: str) -> SurveyRun:
+    """Open a field as a survey by its defaults does, or a farm without a ``scene``; nothing is written.
+
+    Raises SceneError: nobody says what is right on it; else as `flows.tasks.run.open_run`.
+    """
+    farm = {"scene": "farm", "size": "{1}x{0}".format(*SURVEY_SHAPE)}
+    asked = {**(farm if scene is None else {"scene": scene}), "source": source, "seed": seed, "weights": weights}
+    settings = load_settings(None, {name: str(one) for name, one in asked.items() if one is not None})
+    with tempfile.TemporaryDirectory(prefix="spectralzoom-tradeoff-") as empty:
+        run = open_run(settings, planning=True, archive=Archive(Path(empty), writes=False))
+    if run.labels is None or (run.labels == UNLABELLED).all():
+        raise SceneError(f"{scene} has no labels by which a map could be judged; lay a label file beside it")
+    return run
+
+
+def default_plan(run: SurveyRun) -> tuple[str, tuple[int, float] | None]:
+    """Return in words what a survey takes that asks for no plan, with step and exposure [ms] where it is one scan."""
+    if not run.plan.plain:
+        return f"two passes, budget {run.settings.budget:g}", None
+    scan = run.settings.scan_step or 1, run.settings.scan_exposure_ms or run.camera.exposure_ms
+    return format_scan(*scan), scan
+
+
+def plan_every_way(seed: int, scene: str | None = None, weights: Path | None = None) -> PlannedField:
+    """Take a farm, or one's own scene, by every uniform scan, by parts of one, and in two passes of every budget.
+
+    Budgets that do not pay for the coarse pass are left out.
+    """
+    run = open_field(seed, scene, weights, "sim")
+    camera, cost, source, bands = run.camera, run.settings.cost, run.simulated, len(run.scene.wavelength_nm)
+    grid, read_with = SceneGrid(*run.scene.shape, run.described.config.patch, COARSE_FACTOR), run.weights
     along, full, full_s = cheapest_full(grid, camera, cost)
+    default, chosen = default_plan(run)
     scan_passes: dict[Setting, PlannedPass] = {}
-    for words, (step, exposure_ms) in SCANS.items():
+    for words, (step, exposure_ms) in (SCANS | ({} if chosen is None else {default: chosen})).items():
         sweeps = uniform_sweeps(grid, camera, along, step=step, exposure_ms=exposure_ms)
         scan = Capture(exposure_ms / DEFAULT_EXPOSURE_MS, step)
-        scan_passes[words] = uniform_pass(weights, source, sweeps, grid, cost, scan)
+        scan_passes[words] = uniform_pass(read_with, source, sweeps, grid, cost, scan)
     whole = scan_passes[format_scan(*PART_OF)]
     scan_passes |= {words: part_of(whole, bands, fraction) for words, fraction in PARTS.items()}
     coarse = coarse_sweeps(grid, camera, along)
-    sweeps = uniform_sweeps(grid, camera, along, step=1, exposure_ms=camera.exposure_ms)
-    every = uniform_pass(weights, source, sweeps, grid, cost, Capture())
-    seen = coarse_prediction(
-        weights,
-        coarse_mosaic(source, coarse, grid),
-        scene.wavelength_nm,
-        grid,
-        capture=Capture(1.0, COARSE_FACTOR, COARSE_FACTOR),
-        factor=COARSE_FACTOR,
-    )
-    coarse_s, scores = cost.seconds(coarse, camera), score_patches("gain", seen)
-    for words, budget in BUDGETS.items():
+    coarse_s = cost.seconds(coarse, camera)
+    if paid := {words: budget for words, budget in BUDGETS.items() if budget * full_s >= coarse_s}:
+        sweeps = uniform_sweeps(grid, camera, along, step=1, exposure_ms=camera.exposure_ms)
+        every = uniform_pass(read_with, source, sweeps, grid, cost, Capture())
+        binned = Capture(1.0, COARSE_FACTOR, COARSE_FACTOR)
+        values, bands_nm = coarse_mosaic(source, coarse, grid), run.scene.wavelength_nm
+        seen = coarse_prediction(read_with, values, bands_nm, grid, capture=binned, factor=COARSE_FACTOR)
+        scores = score_patches(POLICY, seen)
+    for words, budget in paid.items():
         plan = plan_fine(grid, camera, cost, along, scores, budget_s=budget * full_s - coarse_s, full=full)
         columns = every.columns[np.searchsorted(every.patch_index, plan.patch_index)]
-        size = raw_bytes([*coarse, *plan.sweeps], camera, bands)
-        seconds = coarse_s + plan.seconds
-        scan_passes[words] = PlannedPass(seen, plan.patch_index, columns, weights, seconds, size, Capture())
-    return PlannedField(np.asarray(scene.labels, np.uint8), bands, scan_passes)
+        size, seconds = raw_bytes([*coarse, *plan.sweeps], camera, bands), coarse_s + plan.seconds
+        scan_passes[words] = PlannedPass(seen, plan.patch_index, columns, read_with, seconds, size, Capture())
+    assert run.labels is not None
+    return PlannedField(run.labels, bands, scan_passes, default)
 
 
 SURVEY = Tradeoff(
@@ -321,7 +354,9 @@ SURVEY = Tradeoff(
     error="1 - mIoU",
     unit="scene px",
     reference=f"labels of a farm of {SURVEY_SHAPE[1]} x {SURVEY_SHAPE[0]} px; two passes and parts by expected gain",
-    settings=(*SCANS, *PARTS, *BUDGETS),
+    settings=(),
+    settings_of=lambda field: field.plans,
+    default=lambda field: field.default,
     prepare=plan_every_way,
     run=PlannedField.read,
     judge=PlannedField.miss,
@@ -375,6 +410,39 @@ SEGMENT = Tradeoff(
     judge=PlannedField.miss,
     work=lambda state: float(state.labels.size),
 )
+
+
+def survey_tradeoff(scene: str, weights: Path) -> Tradeoff:
+    """Return the trade-off of `survey` on one's own scene, at which the simulated rig looks."""
+    words = f"labels of {Path(scene).name}, seen by the simulated rig; two passes and parts by expected gain"
+    return replace(SURVEY, prepare=lambda seed: plan_every_way(seed, scene, weights), reference=words)
+
+
+def fractions_of_raster(scene: str, weights: Path) -> PlannedField:
+    """Take a raster as it is, and choose every fraction of its patches by expected gain, as `survey --macs` does."""
+    keep_freed_memory()
+    run = open_field(0, scene, weights, RASTER)
+    assert run.raster is not None
+    assert run.labels is not None
+    columns = columns_of_raster(run.raster, run.weights, run.scene.wavelength_nm, memory=run.settings.memory)
+    seen = coarse_prediction_of_patches(run.weights, columns, run.grid)
+    scores, valid = score_patches(POLICY, seen), run.grid.valid_fraction().ravel() > 0
+    scan_passes: dict[Setting, PlannedPass] = {}
+    for fraction in FRACTIONS:
+        patch_index = frame_patches(scores, fraction, valid) if fraction < 1 else np.flatnonzero(valid)
+        scan_passes[fraction] = PlannedPass(seen, patch_index, columns[patch_index], run.weights)
+    return PlannedField(run.labels, len(run.scene.wavelength_nm), scan_passes, default=FRACTIONS[0])
+
+
+def segment_tradeoff(scene: str, weights: Path) -> Tradeoff:
+    """Return the trade-off of `segment` on the pixels of one's own raster."""
+    return replace(
+        SEGMENT,
+        prepare=lambda _seed: fractions_of_raster(scene, weights),
+        default=lambda field: field.default,
+        reference=f"labels of {Path(scene).name}; patches by {POLICY}, scored beforehand",
+        beside={"billion multiply-adds": PlannedField.billion_multiply_adds},
+    )
 
 
 TRADEOFFS = {one.stage: one for one in (RECTIFY, SEGMENT, SIMULATE, STORE, SURVEY)}

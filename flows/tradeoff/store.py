@@ -277,6 +277,7 @@ STORE = Tradeoff(
     unit="spectrum",
     reference=f"light and labels of a farm of {FIELD_SHAPE[1]} x {FIELD_SHAPE[0]} px, every line, {EXPOSURE_MS:g} ms",
     settings=tuple(WAYS),
+    default=lambda _scan: f"condensed, step {SignalChoice().step:g}",
     prepare=scan_farm,
     run=lambda scan, setting: WAYS[setting](scan),
     judge=judge,

@@ -1,4 +1,4 @@
-"""What `spectralzoom train` learns from: the built-in farm, a folder of labelled scenes, or one scene with a mask."""
+"""Data of `spectralzoom train`: the built-in farm, a folder of labelled scenes, or one scene with a mask."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from flows.terminal.figures import counted
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, FARM_NAMES, farm_scene, refuse_removed
+from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, FARM_NAMES, farm_scene
 from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
 from storage.readers.datasets import DataSet, load_data_set
 from storage.readers.scene_files import SceneFile
@@ -64,7 +64,7 @@ def scene_of_file(file: SceneFile, camera: LineCamera) -> RasterScene:
         key=file.light_hash,
         geobox=file.geobox,
     )
-    return replace(scene, regridded=file.regridded, content=file.content)
+    return replace(scene, regridded=file.regridded, content=file.content, pixel_m=file.pixel_m)
 
 
 def farm_test_data(scenes: int, camera: LineCamera) -> TrainingData:
@@ -126,9 +126,8 @@ def open_training_data(
     """Name the data: a built-in farm, or a path with the choices of `load_data_set`.
 
     Without a number, one scene in eight (4 at most) goes to validation; a data set of one scene has none. Raises
-    SettingsError: a choice that is for files was made for a farm, or the other way round; the farm was removed.
+    SettingsError: a choice that is for files was made for a farm, or the other way round.
     """
-    refuse_removed(dataset)
     if dataset in FARM_NAMES:
         for choice, value in choices.items():
             if value not in (None, ()):
@@ -172,7 +171,7 @@ def only_class(scene: RasterScene) -> str | None:
 
 
 def alike_notes(alone: Mapping[str, str]) -> tuple[str, ...]:
-    """Question scenes whose labels are all one class, given by their names: it may stand for what nobody labelled."""
+    """Question scenes whose labels are all one class, given by their names: it may mean unlabelled."""
     by_class: dict[str, list[str]] = {}
     for name, kind in alone.items():
         by_class.setdefault(kind, []).append(name)

@@ -1,4 +1,4 @@
-"""What `spectralzoom train` says of new weights: agreement with the labels of scenes kept for validation."""
+"""Figures of new weights: agreement with the labels of scenes kept for validation."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ SCAN_EXPOSURES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # of the reference; the las
 
 @dataclass(frozen=True)
 class ScanFigures:
-    """What scenes kept from training say of uniform scans."""
+    """Figures of uniform scans on scenes kept from training."""
 
     record: dict[str, Any]  # what their maps scored, for the record of the weights
     scores: MapScores  # how what maps expected of themselves came true
@@ -86,7 +86,7 @@ def judge_scans(
     seed: int,
     report: Report = lambda what, done, figure: None,
 ) -> ScanFigures | None:
-    """What maps of uniform scans that are read whole score on each scene, by step and exposure.
+    """Return what maps of uniform scans that are read whole score on each scene, by step and exposure.
 
     None without a scene, and without ``augmentation``: then training saw none but those of the reference. In the record
     ``miou`` and the IoU of each class are tables (step, exposure) of the scenes' means, ``spread`` the standard

@@ -1,4 +1,4 @@
-"""What weights say of what they were trained on, and what is familiar to them: measured as training ends, or later.
+"""The weights' own statements on their training and on what is in distribution, measured at its end, or later.
 
 `spectralzoom train --fit-ood` measures it for weights that are there: it looks at the scenes of their training again,
 as their record names them, and adds it to their file. The weights and all that was made with them stay what they are.
@@ -61,7 +61,7 @@ def trained_on(data: TrainingData, seen: SeenScenes, classes: tuple[str, ...]) -
 
 
 def measured_calibration(weights: Weights, frames: Sequence[Example], seed: int) -> dict[str, Any] | None:
-    """How sure of itself the map of a full scan may be, by scenes kept from training; None without one."""
+    """Return how sure of itself the map of a full scan may be, by scenes kept from training; None without one."""
     maps = []
     for frame in frames:
         grid = SceneGrid(*frame.shape, weights.config.patch, 1)
@@ -180,7 +180,7 @@ def _observed(weights: Weights, data: TrainingData, request: OodRequest, report:
         if not names:
             raise SettingsError(
                 f"--fit-ood {request.weights}: no scene was kept for validation when these weights were trained, so"
-                " that nobody can say how often a known pixel would be unknown; train them with --validation 1 or more"
+                " that their false-alarm rate is unknown; train them with --validation 1 or more"
             )
         found, about = observe_all(how, data, names, what, report, about)
         examples.append(as_read(found, weights.normalisation))

@@ -1,4 +1,4 @@
-"""What `spectralzoom init` does: it looks at images and labels, and writes a scene.toml of what they do not say.
+"""The verb `init`: it looks at images and labels, and writes a scene.toml of what they do not say.
 
 Of a folder of recorded sweeps it writes a survey.toml.
 """
@@ -94,6 +94,7 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
         "classes": [{"name": one.name, "value": one.value, "fraction": one.fraction} for one in draft.classes],
         "notes": list(draft.notes),
         "unseen": _unseen(draft),
+        "first": _first(path, draft),
         "next": _next(source, draft),
     }
 
@@ -115,8 +116,10 @@ def _wavelength_lines(draft: SceneDraft) -> list[str]:
     bands = draft.shape[2]
     if draft.wavelength_nm is None:
         return [
-            f"# {bands} bands, and nothing says their wavelengths: write them, and take away the #",
-            f"# wavelengths_nm = [450.0, ...]   # {bands} numbers [nm]",
+            f"# {bands} bands, and nothing says their wavelengths. Fill in one of these two lines, and take the # in",
+            "# front of it away:",
+            f"# wavelengths_nm = []   # {bands} numbers [nm] between the brackets, with commas",
+            f'# wavelengths_file = "bands.txt"   # a text file beside this one of {bands} rows, which begin with nm',
         ]
     if "assumed" not in draft.wavelength_origin:
         low, high = draft.wavelength_nm.min(), draft.wavelength_nm.max()
@@ -136,7 +139,11 @@ def _value_lines(draft: SceneDraft) -> list[str]:
         sure = value <= NO_READING or value > MOST_VALUE
         parts = f"nodata = {value!r}   # {fraction:.0%} of the first image's edge"
         lines.append(parts if sure else f"# {parts}; if it stands for no data there, take away the first #")
-    return lines + (["# scale = 0.0001   # if these numbers are reflectance times 10000"] * (draft.dtype.itemsize == 2))
+    if draft.dtype.itemsize == 2:
+        lines.append("# scale = 0.0001   # if these numbers are reflectance times 10000")
+    if not draft.placed:
+        lines.append("# pixel_m = 0.05   # side of a pixel on the ground [m], where it is known: gives hectares")
+    return lines
 
 
 def _class_lines(draft: SceneDraft) -> list[str]:
@@ -168,7 +175,7 @@ def _quoted(text: str) -> str:
 
 
 def _unseen(draft: SceneDraft) -> list[str]:
-    """What somebody has to look at: what could not be told from the files, or does not fit."""
+    """Return what needs a look: what the files do not say, or does not fit."""
     found, parts = draft.files, []
     if found.labels and found.bare:
         images = counted(len(found.bare), "image")
@@ -178,10 +185,17 @@ def _unseen(draft: SceneDraft) -> list[str]:
     if found.alone:
         parts.append(f"the image of {counted(len(found.alone), 'label file')}: {listed_names(found.alone)}")
     if draft.wavelength_nm is None:
-        parts.append(f"the wavelengths of {draft.shape[2]} bands: write wavelengths_nm into {SETTINGS_NAME}")
+        parts.append(f"the wavelengths of {draft.shape[2]} bands")
     if len(draft.classes) == 1:
         parts.append(f"a second class: all labels are {draft.classes[0].name}")
     return [*parts, *draft.unseen]
+
+
+def _first(path: Path, draft: SceneDraft) -> str | None:
+    """What has to be written before the next command runs; None where it runs at once."""
+    if draft.wavelength_nm is not None:
+        return None
+    return f"write the {draft.shape[2]} wavelengths into {path}: wavelengths_nm or wavelengths_file, as its lines say"
 
 
 def _next(source: str, draft: SceneDraft) -> str:

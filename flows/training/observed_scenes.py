@@ -1,4 +1,4 @@
-"""How scenes look in training and where weights are judged: by every line, on spectral columns.
+"""Looks at scenes in training and where weights are judged: by every line, as spectral features.
 
 Built-in farms are seen through the rig as a survey captures them: effects are chosen for each scene as surveys choose
 them by default, then the scan of everything is rendered, calibrated and rectified. A camera has
@@ -24,7 +24,7 @@ from pipeline.planning.coverage import cheapest_full
 from pipeline.rectify.region import mosaic_rows
 from pipeline.simulator.render import EFFECTS, Choice
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.farm.farm_scene import law_of_key
+from pipeline.simulator.scenes.farm.farm_scene import is_farm_key
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.selection.choice import decide
 from pipeline.simulator.selection.survey_probe import probe_survey
@@ -56,7 +56,7 @@ def observe_scene(
     scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis, rng: np.random.Generator
 ) -> Example:
     """Look at a labelled scene on the basis, noise by ``rng``; a farm by all lines. SceneError: no labels, or a gap."""
-    if law_of_key(scene.key) is None:
+    if not is_farm_key(scene.key):
         return observe(scene, camera, grid, basis, rng)
     seed = int(rng.integers(2**31))
     if scene.labels is None:

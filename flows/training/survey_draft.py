@@ -132,7 +132,9 @@ def show_draft(record: Mapping[str, Any], found: Sequence[str], console: Console
     for words in record["unseen"]:
         console.print(escape(f"not seen: {words}"), soft_wrap=True)
     console.print(escape(f"written: {record['file']}"), soft_wrap=True)
-    console.print(escape(f"next: {record['next']}"), soft_wrap=True)
+    if first := record.get("first"):
+        console.print(escape(f"first: {first}"), soft_wrap=True)
+    console.print(escape(f"{'then' if first else 'next'}: {record['next']}"), soft_wrap=True)
 
 
 CAMERA_NUMBERS = ("uint8", "uint16", "int16")
@@ -140,7 +142,7 @@ CAMERA_NUMBERS = ("uint8", "uint16", "int16")
 
 @dataclass(frozen=True)
 class SweepsDraft:
-    """What was seen of the sweeps of a folder."""
+    """Findings on the sweeps of a folder."""
 
     folder: Path
     cubes: tuple[Path, ...]

@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
-from flows.terminal.progress import one_after_the_other
+from flows.terminal.progress import one_after_the_other, table
 from flows.training.baselines import better_reading, judge_baselines
 from flows.training.data import Report, TrainingData, alike_notes, either_mask, open_training_data
 from flows.training.figures import judge_scans, validate
@@ -46,7 +45,7 @@ def train_weights(
     report: Report = lambda what, done, figure: None,
     tell: Callable[[str], None] = lambda note: None,
 ) -> dict[str, Any]:
-    """Train, validate and save; give the record that stands in the file. ``tell`` is told what was left out.
+    """Train, validate and save; give the record that stands in the file. ``tell`` is called with what was left out.
 
     Raises SceneError: no labels, one class only, or scenes whose bands or classes differ; SettingsError: a folder to
     write to that does not exist, a folder in the place of a file, sizes that do not fit, or a device that the machine
@@ -114,7 +113,7 @@ def train_weights(
 
 @dataclass(frozen=True)
 class Lesson:
-    """What there is to learn from: scenes as the network reads them, and the tensors that it begins with."""
+    """A lesson: scenes as the network reads them, and the tensors that it begins with."""
 
     about: About
     config: SegmenterConfig
@@ -178,7 +177,7 @@ def _learned(
 def _figures(
     weights: Weights, frames: list[Example], augmentation: CaptureAugmentation | None, seed: int, report: Report
 ) -> tuple[dict[str, Any], MapScores | None]:
-    """What the record says of scenes kept for validation; of uniform scans too, where training saw such looks."""
+    """Return the record's figures of scenes kept for validation; of uniform scans too, where training saw such."""
     figures = {"validation": validate(weights, frames, seed, lambda row: report("validating", 0.0, row))}
     if (calibration := measured_calibration(weights, frames, seed)) is not None:
         figures[CALIBRATION] = calibration
@@ -315,11 +314,12 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
             )
         return
     title = f"{figures['scenes']} scene{'s' if figures['scenes'] > 1 else ''} kept for validation"
-    caption = f"none: the overview alone; all: everything read in full; else {figures['share_of_seats']:.0%}"
-    table = Table("placement", "mIoU", "overall", title=title, caption=caption)
-    for name in ("none", "random", "sobel", "entropy", "gain", "all"):
-        table.add_row(name, *(f"{figures[name][figure]:.1%}" for figure in ("miou", "overall_accuracy")))
-    console.print(table)
+    rows = [
+        [name, *(f"{figures[name][figure]:.1%}" for figure in ("miou", "overall_accuracy"))]
+        for name in ("none", "random", "sobel", "entropy", "gain", "all")
+    ]
+    console.print(table(("placement", "mIoU", "overall"), rows, title=title))
+    console.print(f"none: the overview alone; all: everything read in full; else {figures['share_of_seats']:.0%}")
     if "readings" in record:
         readings = record["readings"]
         scores = readings["miou"] | (record["baselines"] or {})

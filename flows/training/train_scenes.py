@@ -1,4 +1,4 @@
-"""What a training is asked for, and what it sees of its scenes: looks at them, and what all have in common."""
+"""Request and scenes of a training: looks at its scenes, and what all have in common."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from pipeline.simulator.scenes.scene import RasterScene
 
 @dataclass(frozen=True)
 class TrainRequest:
-    """What to train on and how; ``patch`` and ``columns`` follow from the data where None."""
+    """Request of a training; ``patch`` and ``columns`` follow from the data where None."""
 
     dataset: str
     out: Path
@@ -57,7 +57,7 @@ class TrainRequest:
 
 @dataclass
 class About:
-    """What all scenes of a data set have in common, and what training saw of each."""
+    """Facts that all scenes of a data set have in common, and what training saw of each."""
 
     basis: SpectralBasis
     names: tuple[str, ...]
@@ -122,7 +122,7 @@ def observe_all(
 
 
 def as_read(seen: Sequence[Example], normalisation: Normalisation) -> list[Example]:
-    """What a network reads of looks by a basis that spans their bands, so that these reach every column of it."""
+    """Return the looks as a network reads them, by a basis that spans their bands and so reaches every column."""
     reached = np.ones(len(normalisation.centre), np.bool_)
     return [normalised(one, normalisation, reached) for one in seen]
 

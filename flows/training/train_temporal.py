@@ -158,7 +158,7 @@ class _Land:
         exposure_ms: float,
         rng: np.random.Generator,
     ) -> CurrentVisit:
-        """What a uniform scan would have shown, read by the weights."""
+        """Return what a uniform scan would have shown, read by the weights."""
         light = exposure_ms / REFERENCE_MS
         scan = augmentation.scan(self.columns, self.noise, light=light, step=step, rng=rng)[..., :-PLANES]
         _, every_class = map_of_columns(weights, scan, self.grid, Capture(light, step))
@@ -172,7 +172,7 @@ def judge_temporal(
     request: TemporalRequest,
     report: Report,
 ) -> list[dict[str, float]] | None:
-    """What maps score some days after a first visit, mIoU in the mean of lands that training did not see.
+    """Return what maps score some days after a first visit, mIoU in the mean of lands that training did not see.
 
     ``kept``: the map of before; ``observe``: today's look alone; ``prior_map``: both by the reader; ``surer``: without
     it; ``anew``: the field scanned again as it was at first. None without a land to judge on.

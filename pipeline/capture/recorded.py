@@ -162,7 +162,7 @@ class RecordedSource:
 
     @property
     def record(self) -> Mapping[str, Any]:
-        """What the recording consists of and what was assumed of it."""
+        """Return what the recording consists of and what was assumed of it."""
         sweeps = [{"name": one.sweep.name, "lines": one.sweep.lines} for one in self.sweeps]
         return {"recording": {"sweeps": sweeps, "notes": list(self.notes)}}
 
@@ -240,7 +240,13 @@ class RecordedSource:
 
     def _own(self, sweep: Sweep) -> int | None:
         """Number of the recorded sweep that is the one asked for, by its lines; its exposure decides among several."""
-        alike = [number for number, one in enumerate(self.sweeps) if _same_lines(one.sweep, sweep)]
+        lines = (sweep.along, sweep.lines, sweep.step, sweep.binning)
+        alike = [
+            number
+            for number, one in enumerate(one.sweep for one in self.sweeps)
+            if (one.along, one.lines, one.step, one.binning) == lines
+            and max(abs(one.swath_px - sweep.swath_px), abs(one.start_px - sweep.start_px)) <= SAME_PX
+        ]
         exposed = [number for number in alike if self.sweeps[number].sweep.exposure_ms == sweep.exposure_ms]
         return next(iter(exposed or alike), None)
 
@@ -283,7 +289,7 @@ class RecordedSource:
         return place, line, best
 
     def _can_serve(self, sweep: Sweep, one: RecordedSweep) -> bool:
-        """Whether a recorded sweep lies on the strip of a planned one, with samples and lines that are fine enough."""
+        """Return whether a recorded sweep lies on a planned one's strip, with fine enough samples and lines."""
         recorded = one.sweep
         return (
             recorded.along == sweep.along
@@ -387,15 +393,4 @@ def sum_references(references: References, samples: int) -> References:
         white=grouped(references.white).sum(axis=1, dtype=np.float32),
         bad=None if references.bad is None else np.asarray(grouped(references.bad).any(axis=1), np.bool_),
         flat=None if references.flat is None else grouped(references.flat).mean(axis=1, dtype=np.float32),
-    )
-
-
-def _same_lines(one: Sweep, other: Sweep) -> bool:
-    """Whether two sweeps have the same lines and samples; places are compared as derived sweeps state them."""
-    apart = max(abs(one.swath_px - other.swath_px), abs(one.start_px - other.start_px))
-    return apart <= SAME_PX and (one.along, one.lines, one.step, one.binning) == (
-        other.along,
-        other.lines,
-        other.step,
-        other.binning,
     )

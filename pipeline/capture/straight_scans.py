@@ -2,7 +2,7 @@
 
 The rectification places lines by their positions alone. Of a `Sweep` it takes ``along`` (which axis of the scene a line
 lies along), ``binning`` (pixels a sample), ``step`` (the distance of lines, for gaps, turns and the pitch of
-registration) and ``name``. ``swath_px``, ``start_px`` and ``lines`` matter to whoever plans, and to the choice of
+registration) and ``name``. ``swath_px``, ``start_px`` and ``lines`` matter to planning, and to the choice of
 recorded lines.
 """
 

@@ -172,7 +172,7 @@ def footprint(light: NDArray[np.floating], camera: LineCamera) -> NDArray[np.flo
 def expose(
     seen: NDArray[np.floating], camera: LineCamera, *, step: int, rng: np.random.Generator | None
 ) -> NDArray[np.float32]:
-    """What one exposure a line gives of a grid-aligned scene (y, x, band) [e-] behind the footprint; scan along y.
+    """Return one exposure a line of a grid-aligned scene (y, x, band) [e-] behind the footprint; scan along y.
 
     The coarse pass takes every ``step``-th line: the mirror moves ``step`` px during the one exposure and ``step``
     neighbouring samples are averaged, so that noise falls by sqrt(step), not by step. ``step=1`` is the fine pass.

@@ -5,7 +5,7 @@ of the plane of incidence. Scene tangents are xi = o_y / o_x (along the line) an
 reports the point, in units of tan 50 deg, where a ray falling along the rest normal would go (position (0, 0) is rest).
 
 float32 arrays stay float32, as devices keep them; everything else is worked out in float64. What the paper prints
-instead is in ``tests/pipeline/geometry/paper_equations.py``, and the errata E1 to E18 are told in docs/errata.md.
+instead is in ``tests/pipeline/geometry/paper_equations.py``, and docs/errata.md lists the errata E1 to E18.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pipeline.errors import PoseError, SettingsError, ShapeError
 Floats = NDArray[Any]  # float64, or float32 where that came in
 
 REST_TANGENT = float(np.tan(np.deg2rad(50.0)))
-# How far beyond the rim, and off length 1, a vector may lie by rounding, by the precision that it came in.
+# Rounding that may put a vector beyond the rim, or off length 1, by the precision that it came in.
 RIM_SLACK = {"float64": 1e-12, "float32": 1e-6}
 LENGTH_SLACK = {"float64": 1e-6, "float32": 1e-5}
 _HALF = float(np.sqrt(0.5))

@@ -184,7 +184,7 @@ class MemoryPart:
 
 @dataclass(frozen=True)
 class Load:
-    """What the memory holds at one time. A pair is an X and a Y; both channels lie in one vector, Y behind X."""
+    """Content of the memory at one time. A pair is an X and a Y; both channels lie in one vector, Y behind X."""
 
     parts: tuple[MemoryPart, ...]
 

@@ -1,4 +1,4 @@
-"""Where a field lies, for polygons: from map coordinates to pixels of the scene; how large it is, how finely seen.
+"""Places of fields, for polygons: from map coordinates to pixels of the scene; size and scale of a field.
 
 Polygons in pixels count from the scene's upper left corner, x to the right and y down; the first goes from 0 to 1.
 """
@@ -38,7 +38,7 @@ EDGE_PARTS = 64  # of a side of the outline: straight on the ground, bent on a m
 
 @dataclass(frozen=True)
 class GroundFootprint:
-    """What of the ground a field shows as far as it is mapped, from where.
+    """Part of the ground that a field shows as far as it is mapped, and the ranges to it.
 
     A long and narrow footprint that goes to the horizon ends where the map does.
     """
@@ -115,7 +115,7 @@ def footprint_of(view: GroundView, shape: tuple[int, int]) -> GroundFootprint:
 
 
 def areas_by_number(place: FieldPlace, numbers: NDArray[np.integer], count: int) -> Floats | None:
-    """Sum the ground under a field's pixels by their (y, x) numbers, (count,) [m2]; None where nobody knows it.
+    """Sum the ground under a field's pixels by their (y, x) numbers, (count,) [m2]; None where it is unknown.
 
     Pixels with a number below 0 or from ``count`` on are left out, and those that show no ground.
     """
@@ -132,7 +132,7 @@ def areas_by_number(place: FieldPlace, numbers: NDArray[np.integer], count: int)
 
 @dataclass(frozen=True)
 class NoPlace:
-    """A field of which nobody said where it lies: polygons are in pixels. It may be known how large one is."""
+    """A field without a place: polygons are in pixels. The size of a pixel may be known."""
 
     shape: tuple[int, int]
     pixel_m: float | None = None
@@ -140,7 +140,7 @@ class NoPlace:
 
     @property
     def outline(self) -> BaseGeometry:
-        """What the field shows, in the coordinates that polygons are given in."""
+        """Return what the field shows, in the coordinates that polygons are given in."""
         return shapely.box(0, 0, self.shape[1], self.shape[0])
 
     def to_pixels(self, shape: BaseGeometry) -> BaseGeometry:
@@ -148,7 +148,7 @@ class NoPlace:
         return shape
 
     def pixel_areas_m2(self, rows: slice, columns: slice) -> Floats | None:
-        """The ground under some pixels (row, column) [m2], NaN where they show none; None where nobody knows."""
+        """The ground under some pixels (row, column) [m2], NaN where they show none; None where it is unknown."""
         size = rows.stop - rows.start, columns.stop - columns.start
         return None if self.pixel_m is None else np.full(size, self.pixel_m**2)
 
@@ -184,7 +184,7 @@ class PlacedPicture:
         return shapely.affinity.affine_transform(shape, (~self.geobox.affine).to_shapely())
 
     def pixel_areas_m2(self, rows: slice, columns: slice) -> Floats | None:
-        """Of the ellipsoid, whatever the map's scale."""
+        """Return areas on the ellipsoid, whatever the map's scale."""
         return np.stack(list(pixel_rows_m2(self.geobox[rows, columns])))
 
     def scale(self, ifov_rad: float) -> FieldScale:
@@ -222,7 +222,7 @@ class PosedField:
         return shapely.Polygon(self.view.outline_px(size, self.grid.least_sink)[:, ::-1])
 
     def to_pixels(self, shape: BaseGeometry) -> BaseGeometry:
-        """By the ground's plane, and of that the part which the field shows: what lies behind the rig has no pixels."""
+        """Project by the ground's plane the part that the field shows: what lies behind the rig has no pixels."""
         shown = shapely.transform(
             self._seen(BORDER_PX), lambda points: self.view.scene_to_ground(points[:, ::-1])[:, :2]
         )

@@ -1,4 +1,4 @@
-"""Where a scene lies on the earth, as its file says: a GeoBox, what keys hold of it, coarser grids, areas, degrees."""
+"""Georeference of a scene, as its file says: GeoBox, entries of keys, coarser grids, areas, degrees."""
 
 from __future__ import annotations
 
@@ -51,20 +51,20 @@ def shift_px(grid: GeoBox, other: GeoBox) -> tuple[float, float] | None:
 
 
 def georeference_record(geobox: GeoBox | None) -> dict[str, Any]:
-    """What says a place in the keys of stores: nothing for a scene that has none, so that its keys stay."""
+    """Return what says a place in the keys of stores: nothing for a scene that has none, so that its keys stay."""
     if geobox is None:
         return {}
     return {"georeference": {"crs": crs_key(geobox), "transform": [float(number) for number in geobox.affine[:6]]}}
 
 
 def crs_key(geobox: GeoBox) -> str:
-    """What says a grid's CRS in one word: its EPSG code, or all of it as WKT where it has none."""
+    """Return what says a grid's CRS in one word: its EPSG code, or all of it as WKT where it has none."""
     assert geobox.crs is not None
     return geobox.crs.to_wkt() if geobox.crs.epsg is None else f"EPSG:{geobox.crs.epsg}"
 
 
 def crs_name(geobox: GeoBox) -> str:
-    """What people call a grid's CRS: its EPSG code, or its name where it has none."""
+    """Return what people call a grid's CRS: its EPSG code, or its name where it has none."""
     assert geobox.crs is not None
     return str(geobox.crs.proj.name) if geobox.crs.epsg is None else crs_key(geobox)
 
@@ -121,7 +121,7 @@ def crs_wkt(geobox: GeoBox) -> str:
 
 
 def to_degrees(geobox: GeoBox) -> Places:
-    """What gives (..., 2) latitude and longitude [deg] of a map's x and y."""
+    """Return what gives (..., 2) latitude and longitude [deg] of a map's x and y."""
     transformer = pyproj.Transformer.from_crs(crs_wkt(geobox), WGS84, always_xy=True)
     return lambda x, y: np.stack(transformer.transform(x, y)[::-1], axis=-1)
 
@@ -139,7 +139,7 @@ def degree_m(geobox: GeoBox) -> tuple[float, float]:
 
 
 def to_plane(geobox: GeoBox) -> tuple[Places, str]:
-    """What gives (..., 2) metres east and north of a map's x and y, and the CRS (WKT) that they are in.
+    """Return what gives (..., 2) metres east and north of a map's x and y, and the CRS (WKT) that they are in.
 
     The map's own where it is projected in metres, else the UTM zone of its middle.
     """

@@ -77,7 +77,7 @@ def map_crs(pose: RigPose, epsg: int | None = None) -> pyproj.CRS:
 
 
 def _made_for(crs: CRS, pose: RigPose) -> bool:
-    """Whether the rig stands in the CRS's area, which may reach across the date line."""
+    """Return whether the rig stands in the CRS's area, which may reach across the date line."""
     if crs.area_of_use is None:
         return True
     west, south, east, north = crs.area_of_use.bounds

@@ -36,7 +36,7 @@ ROWS_AT_ONCE = 256
 
 @dataclass(frozen=True, kw_only=True)
 class RigPose:
-    """Where the mirror's pivot stands, where it looks undeflected, and the plane of ground that it looks at.
+    """Place of the mirror's pivot, its undeflected direction, and the plane of ground that it looks at.
 
     Give ``height_m`` above the foot, or ``range_m`` to the ground along the undeflected direction.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -29,7 +29,7 @@ Mask = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 ROUND_THE_FIELD = 1.0  # times its size, on every side, up to which polygons are followed
 EDGE_PARTS = 256  # of that: a straight edge of one map is bent on another
-FAR_EAST_DEG = 90.0  # beyond this longitude of the field, those of polygons are told from it and not from Greenwich
+FAR_EAST_DEG = 90.0  # beyond this longitude of the field, those of polygons count from it and not from Greenwich
 
 
 def on_field(shape: BaseGeometry, crs: pyproj.CRS | None, place: FieldPlace) -> BaseGeometry:
@@ -107,7 +107,7 @@ def pixels_inside(
 
 @dataclass(frozen=True)
 class FieldZones:
-    """Which pixels a survey keeps to: those inside the area, where one is given, and in no zone that is left out."""
+    """Pixels that a survey keeps: those inside the area, where one is given, and in no zone that is left out."""
 
     kept: Mask  # (y, x)
     no_go: Mask | None = None  # (y, x), every pixel touched
@@ -153,23 +153,12 @@ class PlotFigures:
     plot: str
     pixels: int  # whose centres lie in it
     mapped_pixels: int  # of them, those with a class
-    area_m2: float | None  # of the mapped pixels; None where nobody knows how large they are
+    area_m2: float | None  # of the mapped pixels; None where their size is unknown
     confidence: float | None  # mean over the mapped pixels that have one
     fractions: dict[str, float | None]  # of the mapped ground, by class; of the pixels where that is not known
 
 
-def figures_of_plots(
-    plots: Mapping[str, BaseGeometry],
-    place: FieldPlace,
-    classes: NDArray[np.uint8],
-    confidence: NDArray[np.float32],
-    names: tuple[str, ...],
-) -> list[PlotFigures]:
-    """Work out the figures of every plot, in pixels of a (y, x) class map and by name. Plots may overlap."""
-    return [_figures(name, shape, place, classes, confidence, names) for name, shape in plots.items()]
-
-
-def _figures(
+def figures_of_plot(
     plot: str,
     shape: BaseGeometry,
     place: FieldPlace,
@@ -177,6 +166,7 @@ def _figures(
     confidence: NDArray[np.float32],
     names: tuple[str, ...],
 ) -> PlotFigures:
+    """Work out the figures of a plot of this name, in pixels of a (y, x) class map and by name. Plots may overlap."""
     rows, columns = _window(shape, classes.shape)
     size = rows.stop - rows.start, columns.stop - columns.start
     inside = pixels_inside([shape], size, origin=(rows.start, columns.start))

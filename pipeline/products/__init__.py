@@ -1,1 +1,1 @@
-"""What a map is turned into for those who use it: spectral indices, regions, prescriptions, areas."""
+"""Products of a map: spectral indices, regions, prescriptions, areas."""

@@ -65,7 +65,7 @@ class SpectralIndex:
 
     @property
     def wants_reflectance(self) -> bool:
-        """Whether values of another scale than 0 to 1 give another index, as where numbers are added to them."""
+        """Return whether values of another scale than 0 to 1 give another index, as where numbers are added to them."""
         rising = {band.symbol: 0.2 + 0.05 * number for number, band in enumerate(self.bands)}
         nm = {LAMBDA + band.symbol: band.centre_nm for band in self.bands}
         twice = {symbol: 2 * value for symbol, value in rising.items()}
@@ -114,7 +114,7 @@ NARROW = (
 def find_index(name: str) -> SpectralIndex:
     """Give an index by its name, in capitals or not.
 
-    Raises SettingsError: there is none of that name, or it wants what no camera gives; names like it are told.
+    Raises SettingsError: there is none of that name, or it needs what no camera gives; the message lists similar names.
     """
     own = {index.name.lower(): index for index in NARROW}
     if name.lower() in own:
@@ -156,7 +156,7 @@ def _listed(name: str) -> SpectralIndex:
 
 
 def _centre_nm(index: str, symbol: str) -> float:
-    """Where an index wants a band: as its paper says, else as Sentinel-2 has it, else in the middle of its range."""
+    """Return the wavelength of an index's band: by its paper, else of Sentinel-2, else the middle of its range."""
     band = spyndex.bands[symbol]
     satellite = getattr(band, "sentinel2a", None)
     usual = (band.min_wavelength + band.max_wavelength) / 2 if satellite is None else satellite.wavelength
@@ -208,7 +208,7 @@ def index_values(
 
 
 def white_level(values: NDArray[np.floating]) -> float:
-    """What is white in a cube's values: 1 where they are reflectance, else the value that one in a hundred is above."""
+    """Return the white of a cube's values: 1 for reflectance, else the value that one in a hundred is above."""
     known = values[np.isfinite(values)]
     bright = float(np.percentile(known, 99)) if known.size else 0.0
     return 1.0 if bright <= MOST_REFLECTANCE else bright

@@ -149,7 +149,7 @@ def find_regions(classes: Classes) -> tuple[NDArray[np.int32], RegionGraph]:
 def merge_small(classes: Classes, least_px: float) -> Classes:
     """Give every region of less than ``least_px`` pixels to the neighbour that it shares the longest border with.
 
-    Neighbours that are small as well go on together, as the class of the largest, until the whole is large enough.
+    Neighbours that are small as well stay together, as the class of the largest, until the whole is large enough.
     What has no neighbour with a class stays, however small. Of borders equally long the neighbour numbered first (from
     the upper left) is taken.
     """

@@ -33,14 +33,14 @@ class KnotCurve:
     """The line's centre as a smooth function of the knot coordinate: what Catmull-Rom makes of a track's knots.
 
     Values resampled by the Catmull-Rom kernel at the coordinate found here are then those of the point asked for,
-    where the scene is linear, however uneven the lines lie. Beyond the ends the curve goes on straight.
+    where the scene is linear, however uneven the lines lie. Beyond the ends the curve is straight.
     """
 
     scan_path: ScanPath
 
     @cached_property
     def even(self) -> bool:
-        """Whether the knot coordinate is a closed form."""
+        """Return whether the knot coordinate is a closed form."""
         return self.scan_path.straight and self.scan_path.uniform
 
     @cached_property
@@ -160,7 +160,7 @@ def _find_knots(curve: KnotCurve, a: Floats, b: Floats, tolerance: float) -> Flo
 
 
 def _miss(curve: KnotCurve, a: Floats, b: Floats, knot: Floats) -> tuple[Floats, Floats]:
-    """How far the curve lies beyond the centre that the point needs, and the slope of this over the knots."""
+    """Return how far the curve lies beyond the centre that the point needs, and the slope of this over the knots."""
     scan, scan_slope, across, across_slope = curve.at(knot)
     need, need_slope = _centre_and_slope(a, b, across)
     return scan - need, scan_slope - need_slope * across_slope

@@ -29,14 +29,14 @@ TAPS = {"catmull-rom": 4, "bilinear": 2, "nearest": 1}
 
 @dataclass(frozen=True)
 class Windows:
-    """What a block of points reads: ``tap`` x ``tap`` pixels from a corner on, weighted along both axes."""
+    """Pixels that a block of points reads: ``tap`` x ``tap`` from a corner on, weighted along both axes."""
 
     corner: NDArray[np.float64]  # (2, n) first line and sample; whole numbers, NaN where the point has none
     weight: NDArray[np.float32]  # (2, tap, n)
 
     @property
     def points(self) -> int:
-        """How many points there are."""
+        """Return how many points there are."""
         return int(self.weight.shape[2])
 
     @property

@@ -1,4 +1,4 @@
-"""One track's values at points, from no more lines and samples than they need, and their blend with others'."""
+"""One track's values at points, from only the lines and samples that they need, and their blend with others'."""
 
 from __future__ import annotations
 

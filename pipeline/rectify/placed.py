@@ -160,7 +160,7 @@ def _within_reach(
 
 
 def _knot_bound(scan_path: ScanPath, knots: float) -> float:
-    """How far knots lie off the middle of straight lines between two others, up to ``knots`` apart [step]."""
+    """Return how far knots lie off the middle of straight lines between two others, up to ``knots`` apart [step]."""
     if scan_path.uniform and scan_path.straight:
         return 0.0
     worst = 0.0
@@ -249,7 +249,7 @@ def place(
     """Find where the lines of a sweep lie.
 
     ``grid`` are pixels to make tie tables for, which a large mosaic is made with; None looks every point up directly.
-    ``usable`` (line,) are lines whose position may be believed, None takes ``lines.valid_line``; ``shift_px`` (line, 2)
+    ``usable`` (line,) are lines with a trusted position, None takes ``lines.valid_line``; ``shift_px`` (line, 2)
     pointing corrections along the line and along the scan [px]; ``gain`` (band,) the illumination correction of the
     sweep.
 
@@ -277,7 +277,7 @@ def _table(scan_path: ScanPath, lines: SweepLines, camera: LineCamera, grid: Pix
 
 @dataclass(frozen=True)
 class ColumnReach:
-    """What one track shows of some columns of the grid: rows between which each knot lies, and the samples there."""
+    """Knots and samples that one track shows of some columns of the grid: the rows between which each knot lies."""
 
     top: NDArray[np.float32]  # (knot,) first row, inf where the knot shows none of the columns
     bottom: NDArray[np.float32]
@@ -292,7 +292,7 @@ class ColumnReach:
 
 
 class ScanPathReach:
-    """Where the lines of a track lie on a grid, in pieces of 64 samples. Never too little, at most a piece too much."""
+    """Place of a track's lines on a grid, in pieces of 64 samples. Never too little, at most a piece too much."""
 
     def __init__(self, placed: Placed, scan_path: ScanPath, camera: LineCamera, grid: PixelGrid) -> None:
         sweep = placed.lines.sweep
@@ -310,7 +310,7 @@ class ScanPathReach:
         self._left, self._right = _spans((x - grid.origin_px[1]) / grid.spacing_px, margin)
 
     def in_columns(self, columns: slice) -> ColumnReach | None:
-        """What the track shows of some columns, or None where it shows nothing."""
+        """Return what the track shows of some columns, or None where it shows nothing."""
         hit = (self._left < columns.stop) & (self._right >= columns.start)
         pieces = np.flatnonzero(hit.any(axis=0))
         if not len(pieces):

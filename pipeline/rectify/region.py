@@ -26,7 +26,7 @@ Reaches = Sequence[Sequence[ColumnReach | None]]  # of each sweep, of each of it
 
 
 def column_reach(placed: Sequence[Placed], camera: LineCamera, grid: PixelGrid, columns: slice) -> Reaches:
-    """What every track of every sweep shows of some columns: made once, it serves all tiles of these columns."""
+    """Return what every track of every sweep shows of some columns: made once, it serves all tiles of these columns."""
     return [
         [ScanPathReach(one, scan_path, camera, grid).in_columns(columns) for scan_path, _ in one.scan_paths]
         for one in placed
@@ -177,7 +177,7 @@ def _column_groups(coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
 def _reader(
     one: Placed, scan_path: ScanPath, coordinates: NDArray[np.float64], cache: LineCache | None, likely: slice
 ) -> ReadWindow:
-    """How to read windows of a sweep: from the cache, or from one read of all lines that the points need."""
+    """Return how to read windows of a sweep: from the cache, or from one read of all lines that the points need."""
     if cache is not None:
         return lambda wanted, samples: cache.window(one.lines, wanted, samples, likely=likely)
     knot = coordinates[..., 0]
@@ -213,11 +213,6 @@ def plan_tiles(
 
 def _cuts(size: int, step: int) -> Iterator[slice]:
     return (slice(first, min(first + step, size)) for first in range(0, size, step))
-
-
-def tile_bytes(tile_shape: tuple[int, int], bands: int) -> int:
-    """Memory that one tile takes while it is made and written, raw lines not counted [bytes]."""
-    return COPIES * tile_shape[0] * tile_shape[1] * bands * 4
 
 
 def cache_bytes(placed: Sequence[Placed], tiles: Sequence[Tile], at_once: int) -> int:

@@ -25,7 +25,7 @@ BLOCK_PX = 16384  # smaller blocks pay calls, and larger ones gain nothing
 
 
 def divisor(total: NDArray[np.float32]) -> NDArray[np.float32]:
-    """What a sum is divided by, from the weight that was usable: 1 for all of it, up to rounding; NaN below half."""
+    """Return the divisor of a sum, from the weight that was usable: 1 for all of it, up to rounding; NaN below half."""
     whole = np.where(np.abs(total - 1) <= ROUNDING, np.float32(1), total)
     return np.where(whole >= LEAST_WEIGHT, whole, np.float32(np.nan))
 
@@ -198,7 +198,7 @@ def _places(mask: NDArray[np.bool_]) -> tuple[Rows, Rows]:
 
 
 def _windows_all(mask: NDArray[np.bool_], taps: int) -> NDArray[np.bool_]:
-    """Of each window's corner, whether the mask holds in all of it, (line, sample) -> less ``taps - 1`` both ways."""
+    """Mark corners of windows within which the mask holds, (line, sample) -> less ``taps - 1`` both ways."""
     for axis in (0, 1):
         size = max(mask.shape[axis] - taps + 1, 0)
         held = mask.take(range(size), axis=axis)

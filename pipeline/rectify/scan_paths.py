@@ -50,12 +50,12 @@ class ScanPath:
 
     @property
     def straight(self) -> bool:
-        """Whether all line centres lie on one parallel to the scan axis."""
+        """Return whether all line centres lie on one parallel to the scan axis."""
         return bool(np.ptp(self.across) < EVEN_STEPS * self.width)
 
     @property
     def uniform(self) -> bool:
-        """Whether all knots are ``width`` apart."""
+        """Return whether all knots are ``width`` apart."""
         even = self.scan[0] + self.width * np.arange(len(self.scan))
         return bool(np.abs(self.scan - even).max() < EVEN_STEPS * self.width)
 
@@ -197,10 +197,10 @@ def _with_stand_ins(
 
 @dataclass(frozen=True)
 class LineNumbers:
-    """What the time stamps of a sweep's frames say of its lines."""
+    """Numbers of the lines of a sweep, by the time stamps of its frames."""
 
-    number: NDArray[np.intp]  # (frame,) line of the plan, counted from the first believed frame; of that line's
-    # first frame where a frame came again; of the line before where the stamp is not believed
+    number: NDArray[np.intp]  # (frame,) line of the plan, counted from the first trusted frame; of that line's
+    # first frame where a frame came again; of the line before where the stamp is not trusted
     usable: NDArray[np.bool_]  # (frame,)
     lost: int  # lines between the first and the last for which no frame came
     repeated: int  # frames that came again under the same stamp
@@ -212,7 +212,7 @@ def number_lines(time_s: Floats, frame_s: float) -> LineNumbers:
     """Tell from time stamps (frame,), of mid exposure in the order of arrival [s], which line each frame is.
 
     A gap of more than 1.5 periods leaves numbers out. Of frames with equal stamps the first is kept. A stamp that goes
-    back is not believed: the longest ascending row of stamps is, and of equally long ones that with the earlier frames,
+    back is not trusted: the longest ascending row of stamps is, and of equally long ones that with the earlier frames,
     so that one wild stamp costs one line; so does a wild one that comes first or last. A late frame is used: its
     position is that of its own time. ``frame_s`` is the planned frame period; its true value is taken from the stamps,
     so that a slow clock makes no frame late.

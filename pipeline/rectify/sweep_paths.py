@@ -1,4 +1,4 @@
-"""Paths of captured sweeps: which lines may be believed, and where they lie once registration has corrected them."""
+"""Paths of captured sweeps: which lines are trusted, and where they lie once registration has corrected them."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ class StoredLines(SweepLines, Protocol):
 
     @property
     def source(self) -> str:
-        """What their source calls itself."""
+        """Return what their source calls itself."""
 
 
 @dataclass(frozen=True)
 class SweepPath:
-    """A captured sweep, which of its lines may be believed, and its corrections."""
+    """A captured sweep, which of its lines are trusted, and its corrections."""
 
     lines: StoredLines
     numbers: LineNumbers

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from pipeline.geometry.camera import LineCamera
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.placed import PixelGrid, Placed
-from pipeline.rectify.region import Reaches, Tile, cache_bytes, column_reach, mosaic_tile, tile_bytes
+from pipeline.rectify.region import COPIES, Reaches, Tile, cache_bytes, column_reach, mosaic_tile
 from pipeline.signal.lines import LineCache
 
 
 @dataclass(frozen=True)
 class MosaicWork:
-    """What a mosaic is made of, and with what."""
+    """Placed sweeps, camera and grid of a mosaic."""
 
     placed: Sequence[Placed]
     camera: LineCamera
@@ -29,21 +29,13 @@ class MosaicWork:
     kernel: Kernel = "catmull-rom"
 
     def reach(self, columns: slice) -> Reaches:
-        """What sweeps show of some columns of the grid, the same for all rows."""
+        """Return what sweeps show of some columns of the grid, the same for all rows."""
         return column_reach(self.placed, self.camera, self.grid, columns)
-
-    def make_tile(
-        self, rows: slice, columns: slice, reach: Reaches, cache: LineCache
-    ) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
-        """Return the (y, x, component) scores and (y, x) coverage of a part, NaN and 0 where nothing is seen."""
-        return mosaic_tile(
-            self.placed, self.camera, self.grid, rows, columns, kernel=self.kernel, cache=cache, reach=reach
-        )
 
     def tile_memory(self, tiles: Sequence[Tile], tile_shape: tuple[int, int], at_once: int) -> tuple[int, int]:
         """Return the bytes of one tile of (y, x) ``tile_shape`` in the making, and of stored lines that tiles share."""
         bands = self.placed[0].signal.bands if self.placed else 1
-        return tile_bytes(tile_shape, bands), cache_bytes(self.placed, tiles, at_once)
+        return COPIES * tile_shape[0] * tile_shape[1] * bands * 4, cache_bytes(self.placed, tiles, at_once)
 
 
 OpenWork = Callable[[], MosaicWork]  # hashable, and where several processes make tiles pickled: it holds paths
@@ -57,14 +49,17 @@ class TileMaker:
     cache: int
 
     def __call__(self, rows: slice, columns: slice) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
-        """Return values and coverage as `MosaicWork.make_tile` does."""
+        """Return the (y, x, component) scores and (y, x) coverage of a part, NaN and 0 where nothing is seen."""
         opened = opened_tiles(self)
-        return opened.work.make_tile(rows, columns, opened.reach(columns.start, columns.stop), opened.lines)
+        work, reach = opened.work, opened.reach(columns.start, columns.stop)
+        return mosaic_tile(
+            work.placed, work.camera, work.grid, rows, columns, kernel=work.kernel, cache=opened.lines, reach=reach
+        )
 
 
 @dataclass(frozen=True)
 class OpenedTiles:
-    """What makes tiles in one process."""
+    """Opened work that makes tiles in one process."""
 
     work: MosaicWork
     lines: LineCache
@@ -87,6 +82,6 @@ def opened_tiles(maker: TileMaker) -> OpenedTiles:
 
 
 def let_tiles_go() -> None:
-    """Give back the memory of the last mosaic's raw lines in this process, whose work goes on with something else."""
+    """Give back the memory of the last mosaic's raw lines in this process, before its next work."""
     opened_tiles.cache_clear()
     opened_work.cache_clear()

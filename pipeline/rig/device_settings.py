@@ -19,7 +19,7 @@ MOST_PAIRS = 8191  # cells of the vector memory are addressed by a byte offset o
 
 @dataclass(frozen=True)
 class CameraAddress:
-    """Where the camera is; as its maker sets it, unless changed there."""
+    """Address of the camera, as its maker sets it, unless changed there."""
 
     host: str = "10.0.65.50"
     port: int = 8100
@@ -28,7 +28,7 @@ class CameraAddress:
 
 @dataclass(frozen=True)
 class ControlPatience:
-    """How long a command may take from its first byte to the prompt, and how often reads are asked again."""
+    """Time that a command may take from its first byte to the prompt, and how often reads are asked again."""
 
     deadline_s: float = 5.0
     retries: int = 2
@@ -63,7 +63,7 @@ class FileServer:
 
 @dataclass(frozen=True)
 class CameraLimits:
-    """What is refused before the wire. Assumed, from a data sheet: set them for the camera at hand."""
+    """Limits that are checked before the wire. Assumed, from a data sheet: set them for the camera at hand."""
 
     least_exposure_ms: float = 0.5
     most_rate_hz: float = 350.0
@@ -107,7 +107,7 @@ def check_capture(frames: int, cubes: int, prefix: str) -> None:
 
 @dataclass(frozen=True)
 class Patience:
-    """How long a transaction may take, how often a read is asked again within that, and how long silence lasts. [s]"""
+    """Time that a transaction may take, how often a read is asked again within that, and how long silence lasts. [s]"""
 
     deadline_s: float = 1.0
     retries: int = 2
@@ -116,7 +116,7 @@ class Patience:
 
 @dataclass(frozen=True)
 class MirrorLink:
-    """What settings say of the mirror controller."""
+    """Settings of the link to the mirror controller."""
 
     port: str = stated("/dev/ttyACM0", "Port of the mirror controller; or socket://host:port")
     # public software opens 115200
@@ -133,8 +133,6 @@ class MirrorLink:
     strict_crc: bool = stated(False, "Refuse replies whose CRC does not fit, which is warned of otherwise")
     ends: Ends = assumed("exclusive", "What the mirror takes the end of a range for")  # erratum E14
     read_back: ReadBack = stated("sampled", "How much of a path is read back and compared")
-    check_status: bool = stated(True, "Ask for the mirror's status before each motion")
-    park_at_close: bool = stated(False, "Send the mirror to 0; 0 at the end")
     log_rate_hz: float = stated(
         10000.0, "Rate of measured positions, at most; without pulses they place the lines", "Hz", 0.1, 10_000
     )
@@ -143,7 +141,7 @@ class MirrorLink:
 
 @dataclass(frozen=True)
 class MirrorSettings(MirrorLink):
-    """How to reach the mirror controller, and what to believe of it; ``provenance`` says who confirmed what."""
+    """Settings of the mirror controller: its port and assumptions on it; ``provenance`` says who confirmed what."""
 
     vector_pairs: int = stated(CostModel.vector_pairs, "Positions that its memory holds", "", 1, MOST_PAIRS)
     provenance: str = "assumed"
@@ -157,7 +155,7 @@ class MirrorSettings(MirrorLink):
 
     @property
     def patience(self) -> Patience:
-        """How long transactions may take."""
+        """Return how long transactions may take."""
         return Patience(self.deadline_s, self.retries, self.quiet_s)
 
 
@@ -166,7 +164,7 @@ class SurveyRig(MirrorLink):
     """The table [rig] of a survey: both devices, the cable between them, and the white reference.
 
     Written for the documented protocols and tested against emulators; never run on hardware. ``provenance`` says which
-    of the assumed values somebody has confirmed.
+    of the assumed values are confirmed.
     """
 
     mirror_driver: str = stated(
@@ -226,16 +224,16 @@ class SurveyRig(MirrorLink):
 
     @property
     def mounting(self) -> Mounting:
-        """How the mirror is mounted."""
+        """Return how the mirror is mounted."""
         return Mounting(self.mirror_axes, self.mirror_clocking_deg, self.mirror_offset_x, self.mirror_offset_y)
 
     @property
     def camera(self) -> CameraAddress:
-        """Where the camera's control socket is."""
+        """Return where the camera's control socket is."""
         return CameraAddress(self.host, self.control_port, self.connect_s)
 
     @property
     def files(self) -> FileServer:
-        """Where the camera's files are."""
+        """Return where the camera's files are."""
         own = {name: getattr(self, name) for name in ("user", "password", "stall_s", "least_kb_s", "read_twice")}
         return FileServer(self.host, self.file_port, **own)

@@ -1,4 +1,4 @@
-"""Protocols of a rig's two devices: all that a survey asks of a mirror and of a camera, whoever makes them.
+"""Protocols of a rig's two devices: all that a survey asks of a mirror and of a camera of any maker.
 
 `MirrorController` and `HeadwallCamera` implement them. Times are those of the clock that a driver was opened with.
 Methods raise `RigError` or one of its kinds in :mod:`pipeline.rig.transports`; besides those every method may raise
@@ -174,4 +174,4 @@ class CameraDriver(Protocol):
         """Return the mean frames (sample, band) beside a capture, by ``dark`` and ``white``; empty without any."""
 
     def close(self) -> None:
-        """Let go of the camera; a capture goes on."""
+        """Let go of the camera; a capture continues."""

@@ -63,7 +63,7 @@ def failed(device: Device, asked: str, error: PipelineError) -> CheckRow:
 
 
 def works(rows: Sequence[CheckRow], device: Device) -> bool:
-    """Whether a device was asked something and nothing failed."""
+    """Return whether a device was asked something and nothing failed."""
     verdicts = [row.verdict for row in rows if row.device == device]
     return bool(verdicts) and "fail" not in verdicts
 
@@ -228,7 +228,7 @@ def _answered_frames(mirror: MirrorController) -> str:
 
 
 def _status(mirror: MirrorController, *, playing: bool) -> CheckRow:
-    """What a survey would meet: one waits as long for the mirror to come to rest."""
+    """Return what a survey would meet: one waits as long for the mirror to come to rest."""
     status = mirror.status()
     until = mirror.wire.clock.now() + SETTLE_S
     while Status.NOT_STABLE in status and not playing and mirror.wire.clock.now() < until:

@@ -85,11 +85,11 @@ class DeviceRefused(RigError):  # noqa: N818 - the name says what is the case
 
 
 class StateUnknown(RigError):  # noqa: N818 - the name says what is the case
-    """A device may or may not have moved; motions are frozen until somebody connects anew."""
+    """A device may or may not have moved; motions are frozen until the next connection."""
 
 
 class NotKept(RigError):  # noqa: N818 - the name says what is the case
-    """What a device sent could not be kept here: the disk refuses. The device still has it."""
+    """The disk refuses to keep what a device sent. The device still has it."""
 
 
 USB_ID = (0x0483, 0xA31E)  # vendor and product of the mirror controller
@@ -185,7 +185,7 @@ class SerialTransport:
             raise self._gone(error) from error
 
     def drain(self) -> bytes:
-        """Give what is there already, without waiting, and no more than some buffers: a port may never fall silent."""
+        """Give what is there already, without waiting, and at most some buffers: a port may never fall silent."""
         drained = b""
         try:
             while len(drained) < _MOST_DRAINED and (there := self._serial.in_waiting):
@@ -220,7 +220,7 @@ def _why_not(port: str, error: OSError) -> str:
 
 
 class SocketTransport:
-    """A :class:`Transport` to ``host:port``; SettingsError where that cannot be, DeviceGone where nobody is there."""
+    """A :class:`Transport` to ``host:port``; SettingsError where that cannot be, DeviceGone where no device answers."""
 
     def __init__(self, host: str, port: int, clock: Clock = SYSTEM_CLOCK, *, connect_s: float = 3.0) -> None:
         if not host or not 0 < port < 65536:
@@ -277,7 +277,7 @@ class SocketTransport:
         return data
 
     def drain(self) -> bytes:
-        """Give what is there already, without waiting, and no more than some buffers: a sender may never fall silent.
+        """Give what is there already, without waiting, and at most some buffers: a sender may never fall silent.
 
         DeviceGone: the connection is lost, or the other end closed it.
         """
@@ -358,12 +358,12 @@ class Wire:
                     self._empty_line("before asking again", deadline)
                     if self.clock.now() >= deadline:
                         raise
-                except BaseException:  # whoever is interrupted here does not know either
+                except BaseException:  # an interrupted caller does not know either
                     self.unknown = f"{name} was interrupted" if kind == "motion" else self.unknown
                     raise
 
     def _once(self, data: bytes, name: str, receiver: Receiver[Answer], silence_s: float, deadline: float) -> Answer:
-        """Send once, and wait until the device has said nothing for a while, or to the deadline where it goes on."""
+        """Send once, and wait until the device has been silent for a while, at most to the deadline."""
         began = self.clock.now()
         self._owed += 1
         self.transport.write(data, deadline)

@@ -268,7 +268,7 @@ def greatest_changes(
     """Write the greatest change of each stored number over its unit, (number,): of all shifts and bands.
 
     ``light`` and ``finest`` are (shift, number * binning, band), ``scale`` the unit (shift, number, band). Changes
-    count with their signs within a number, and as 0 where they are no more than ``rounding`` times the light.
+    count with their signs within a number, and as 0 where they are at most ``rounding`` times the light.
     """
     bands, least, fraction = light.shape[2], np.float32(rounding), np.float32(1 / binning)
     summed, most = np.empty(bands, np.float32), np.empty(bands, np.float32)
@@ -307,7 +307,7 @@ class PartedKernels(NamedTuple):
 
 
 class PixelTable(NamedTuple):
-    """How pixels lie in a table: how many along its inner and its outer axis, and whether lines lie along the outer."""
+    """Order of pixels in a table: counts along its inner and outer axis, and whether lines lie along the outer."""
 
     inner: int
     outer: int
@@ -358,7 +358,7 @@ def read_weights(
 ) -> None:
     """Write the weights (tap, n) of a kernel at places ``off`` px beside their pixel, linear between rows.
 
-    ``scale`` is (axis, n), ``off`` (axis, part, n): of which axis and part is told.
+    ``scale`` is (axis, n), ``off`` (axis, part, n): by axis and part.
     """
     taps, last_scale, last_row = table.weight.shape[1], table.scales - 1, np.float32(table.rows - 2)
     ahead, per_px = np.float32(table.left - table.first), np.float32(table.per_px)
@@ -394,7 +394,7 @@ def join_weights(outer: Radiance, inner: Radiance, more: bool, joint: Radiance) 
 
 @compiled(_VIEWS, OFFSETS, _FLOATS2, _FLOATS2, _LIGHT2)
 def _take_views(views: Floats, first: int, some: Floats, nearest: Floats, beside: Radiance) -> None:
-    """Write some views (6, n) from the first one on, the last again where there are no more, and their pixels."""
+    """Write some views (6, n) from the first one on, the last again where there are fewer, and their pixels."""
     last = views.shape[1] - 1
     for n in range(some.shape[1]):
         at = min(first + n, last)

@@ -1,4 +1,4 @@
-"""What the samples' electrons become: noise, the well, the converter's numbers."""
+"""Readout of the samples' electrons: noise, the well, the converter's numbers."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ class Readout:
 
     @cached_property
     def _merges(self) -> bool:
-        """Whether shot and read noise come of one draw."""
+        """Return whether shot and read noise come of one draw."""
         cheap = self._variant(SHOT.name) not in (OFF, EXACT)
         return cheap and self.read_noise_e >= LEAST_MERGED_READ_E and self.full_well_e is None
 

@@ -57,7 +57,7 @@ PROBES = 17  # lines of a sweep and samples of a line that tell how far a footpr
 class Choice:
     """Effects that are on, each with its variant, in the order of the chain; those of the readout may be among them.
 
-    ``slit``, ``smear`` and ``rotation`` are told by their names, the others by what they do.
+    ``slit``, ``smear`` and ``rotation`` are given by their names, the others by what they do.
     """
 
     effects: tuple[tuple[Effect, str], ...] = ()
@@ -131,7 +131,7 @@ def held_positions(block: SweepBlock, choice: Choice) -> Floats:
 
 
 def _views(block: SweepBlock, choice: Choice, shape: tuple[int, int]) -> Iterator[RayViews]:
-    """Where the samples look at each held position, (line, sample) each. [px of the scene]"""
+    """Yield where the samples look at each held position, (line, sample) each. [px of the scene]"""
     position, ifov = held_positions(block, choice), block.rig.camera.ifov_rad
     size = shape if block.sweep.along == "y" else shape[::-1]
     displacements = list(choice.doing("displaced"))
@@ -217,6 +217,6 @@ LIGHT: tuple[Effect, ...] = (
 READOUT: tuple[Effect, ...] = (DARK_CURRENT, DEFECTS, SHOT, READ_NOISE, SATURATION, QUANTISATION)
 EFFECTS: tuple[Effect, ...] = (*AIMS, *RAYS, *FOOTPRINT, *LIGHT, *READOUT)
 BY_NAME = MappingProxyType({effect.name: effect for effect in EFFECTS})
-# Of any camera behind a mirror, without noise and with; cheap: beside exact ones a farm changes by .015 sigma at most.
+# effects of any camera behind a mirror, without noise and with: a farm changes by .015 sigma at most beside exact ones
 QUIET = Choice.of({ROTATION: "rays", SLIT: "3x1", SMEAR: FOLDED, VIGNETTING: "held"})
 USUAL = Choice((*QUIET.effects, (SHOT, GAUSSIAN), (READ_NOISE, "exact")))

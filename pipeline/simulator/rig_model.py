@@ -1,4 +1,4 @@
-"""What the simulated rig is like beyond its camera, and what lies between it and the scene: numbers with their source.
+"""Model of the simulated rig beyond its camera, and of what lies between it and the scene: numbers with sources.
 
 Nothing here was measured on a unit: what is not of a data sheet (from memory) is assumed.
 """
@@ -37,7 +37,7 @@ class Optics:
 
 @dataclass(frozen=True)
 class MirrorMotion:
-    """How the mirror follows its commands, a second-order system fed from a vector memory, and what coats it."""
+    """Motion of the mirror, a second-order system fed from a vector memory, and its coating."""
 
     natural_hz: float = stated(20.0, "Full-scale bandwidth", "Hz", 0.1, 1e5, source="data sheet")
     damping: float = assumed(0.7, "Damping ratio", "", 0.01, 10.0)
@@ -55,7 +55,7 @@ class MirrorMotion:
 
 @dataclass(frozen=True)
 class Detector:
-    """What the sensor adds to the camera's own read noise, gain and well."""
+    """Noise and faults of the sensor beside the camera's own read noise, gain and well."""
 
     dark_e_per_s: float = assumed(200.0, "Dark current at 25 deg C", "e-/s", 0.0, 1e9)
     temperature_deg_c: float = assumed(
@@ -75,7 +75,7 @@ class Detector:
 
 @dataclass(frozen=True)
 class Air:
-    """What lies between rig and scene. A scene without a distance is light at the aperture: no air, no parallax."""
+    """Air between rig and scene. A scene without a distance is light at the aperture: no air, no parallax."""
 
     distance_m: float | None = stated(None, "Distance of the scene's middle", "m", LEAST_DISTANCE_M, example=30.0)
     relief: Relief = stated("flat", "How the scene's distance changes over it")

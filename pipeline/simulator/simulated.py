@@ -221,7 +221,7 @@ def take_references(scene: RasterScene, rig: Rig, choice: Choice, sweep: Sweep) 
     """Give mean dark and white frames (sample, band) with the sweep's binning, free of noise. [DN]
 
     The white frame is scaled from a shorter exposure, so that it does not saturate; it is taken with the mirror at
-    rest, by the light of the survey's start. Dead and hot elements are told as bad; the white reference's values are in
+    rest, by the light of the survey's start. Dead and hot elements count as bad; the white reference's values are in
     the rig's bands.
     """
     rig = rig.taking(sweep)

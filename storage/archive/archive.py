@@ -7,8 +7,8 @@
     spool/<key>/              lines of a capture under way
     .locks/                   held while something is made
 
-A folder whose name ends in ``.part`` is not finished: whoever makes the same thing next removes it. An archive in a
-bucket (`storage.remote.object_archive`) has the same addresses.
+A folder whose name ends in ``.part`` is not finished: the next process that makes the same thing removes it. An archive
+in a bucket (`storage.remote.object_archive`) has the same addresses.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from storage.archive.keys import (
     store_at,
     without_manifest,
 )
-from storage.archive.lineage import rests_on
+from storage.archive.lineage import Catalogue, rests_on
 from storage.archive.manifests import (
     check_files,
     cleared_facts,
@@ -44,6 +44,7 @@ from storage.archive.manifests import (
     read_manifest,
     write_manifest,
 )
+from storage.archive.records import Run
 from storage.archive.run_folders import RunDraft, date_of_store, finish_extensions, take_its_place
 from storage.archive.staging import (
     PART_SUFFIX,
@@ -93,7 +94,7 @@ class Archive:
 
     @property
     def name(self) -> str:
-        """What a person gives to open it again."""
+        """Return what a person gives to open it again."""
         return str(self.root)
 
     @property
@@ -108,7 +109,7 @@ class Archive:
         return store_at(self.root, stage, key)
 
     def locate(self, address: str) -> Path:
-        """Where on this machine a product lies by its address relative to the archive, as a receipt gives it.
+        """Return where on this machine a product lies by its address relative to the archive, as a receipt gives it.
 
         Raises IncompleteStoreError: its store is not there, its files were cleared away, or one of them is missing, cut
         short, a link or no file at all.
@@ -136,12 +137,12 @@ class Archive:
         return None if is_cleared(read_manifest(ref.path)) else ref
 
     def is_there(self, uri: str) -> bool:
-        """Whether a store's files are there, not only what tells of them."""
+        """Return whether a store's files are there, not only what tells of them."""
         path = self.root / uri
         return path.is_dir() and not is_cleared(read_manifest(path))
 
     def is_known(self, ref: StageRef) -> bool:
-        """Whether a store was published here, also where its files were cleared away since."""
+        """Return whether a store was published here, also where its files were cleared away since."""
         return (self.root / ref.uri).is_dir()
 
     @contextmanager
@@ -157,7 +158,7 @@ class Archive:
         """Give a folder to write into, and publish it when the block ends well.
 
         One process at a time makes a key; the others wait and then find ``done``. When the block fails, the folder is
-        removed and the archive is as before. Raises ArchiveError: the disk refuses; the message names the path and what
+        removed and the archive is unchanged. Raises ArchiveError: the disk refuses; the message names the path and what
         to do.
         """
         ref = self.ref(stage, key)
@@ -204,7 +205,7 @@ class Archive:
         return staged.ref, not staged.done
 
     def manifest(self, ref: StageRef) -> dict[str, Any]:
-        """What is known of a store: stage, key, version, params, inputs, created, libraries, files."""
+        """Return what is known of a store: stage, key, version, params, inputs, created, libraries, files."""
         return read_manifest(self.root / ref.uri)
 
     def stored_bytes(self, ref: StageRef) -> int:
@@ -228,7 +229,7 @@ class Archive:
         """Take one store away, for good; a key that is asked for again is made again.
 
         False where another process works on it and ``wait`` is false. ``unnamed`` says that no run may name it, which
-        in a bucket is looked after once more: here whoever clears up is alone.
+        in a bucket is looked after once more: here the process that clears up is alone.
         """
         with refusals(self.root, "remove from the archive"), self._locked(f"{ref.stage}-{ref.key}", wait=wait) as held:
             if held:
@@ -258,7 +259,7 @@ class Archive:
     def in_use(self, *, alone: bool = False) -> Iterator[bool]:
         """Keep others from clearing stores away while the block runs; many may do so at a time.
 
-        With ``alone`` ask to be the only one: gives False, at once, where somebody uses the archive.
+        With ``alone`` ask to be the only one: gives False, at once, where another process uses the archive.
         """
         with refusals(self.root, "write to the archive"):
             release = take_lock(self._lock_path("use"), wait=not alone, shared=not alone)
@@ -295,6 +296,18 @@ class Archive:
         """`size_of` stores and runs, by address."""
         return {uri: self.size_of(uri) for uri in uris}
 
+    def kept_bytes(self, run: Run, catalogue: Catalogue) -> int:
+        """Return the bytes kept for a run: of its folder, of the stores that it names and of those they rest on.
+
+        Manifests count, and a store whose files were cleared away has its manifest alone.
+        """
+        return sum(self.sizes([run.uri, *catalogue.named_and_below[run.uri]]).values())
+
+    def all_sizes(self, catalogue: Catalogue) -> dict[str, int]:
+        """Return the bytes of all files of every store and run, by address, also of stores that are only named."""
+        below = catalogue.named_and_below
+        return self.sizes(sorted({*catalogue.stores, *below, *(uri for uris in below.values() for uri in uris)}))
+
     def take_moved(self) -> int:
         """Bytes that went to and from a bucket since this was asked last, or the archive was opened."""
         return 0
@@ -306,14 +319,14 @@ class Archive:
         ]
 
     def leftovers(self, keep_days: float) -> dict[str, int]:
-        """What broken-off uploads left in a bucket for ``keep_days``: address and bytes; nothing in a folder."""
+        """Return what broken-off uploads left in a bucket for ``keep_days``: address and bytes; nothing in a folder."""
         return {}
 
     def drop_leftover(self, uri: str) -> None:
         """Remove one of `leftovers`."""
 
     def restore(self, uri: str) -> bool:
-        """Whether a broken store or run of a bucket could be written again as it is on this machine."""
+        """Return whether a broken store or run of a bucket could be written again as it is on this machine."""
         return False
 
     def drop_run(self, uri: str) -> None:
@@ -407,5 +420,5 @@ class Archive:
 
 
 def run_stem(name: str) -> str:
-    """What the folder of a run is called by its survey's name, after its time."""
+    """Return what the folder of a run is called by its survey's name, after its time."""
     return re.sub(r"[^A-Za-z0-9_-]+", "-", name).strip("-")[:60] or "run"

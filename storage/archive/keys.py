@@ -1,6 +1,6 @@
 """Keys of stages, a hash of what went in, so that the same work has the same address; and addresses in an archive.
 
-Stores and runs are told apart from what merely lies there, and the folder of an archive from what cannot be one.
+Tell stores and runs from other files, and the folder of an archive from other folders.
 """
 
 from __future__ import annotations
@@ -123,12 +123,12 @@ def published_runs(root: Path) -> list[Path]:
 
 
 def _is_published(folder: Path) -> bool:
-    """Whether a folder has a manifest, be it a damaged one, or a link."""
+    """Return whether a folder has a manifest, be it a damaged one, or a link."""
     return not folder.name.endswith(PART_SUFFIX) and os.path.lexists(folder / MANIFEST_NAME)
 
 
 def without_manifest(root: Path) -> list[Path]:
-    """What lies among stores and runs and is neither: folders that lost their manifest, and other people's files."""
+    """Return what lies among stores and runs and is neither: folders without a manifest, and other people's files."""
     inside = [*root.glob("stages/*/*"), *root.glob("runs/*")]
     loose = [path for path in root.glob("stages/*") if not path.is_dir()]
     return sorted(path for path in (*inside, *loose) if not path.name.endswith(PART_SUFFIX) and not _is_published(path))

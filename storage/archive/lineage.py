@@ -1,4 +1,4 @@
-"""What rests on what: every store and run of an archive as their manifests and receipts tell.
+"""Lineage: which stores every store and run of an archive rests on, by their manifests and receipts.
 
 Products by the names that people give them, and what differs between a store and the version of it before. Nothing here
 trusts what it reads: a damaged manifest is a store with a problem, an input that is not there a name.
@@ -66,11 +66,11 @@ class Catalogue:
         return found
 
     def ancestors(self, uris: Iterable[str]) -> set[str]:
-        """What these stores rest on, themselves not counted; with keys that are nowhere."""
+        """Return what these stores rest on, themselves not counted; with keys that are nowhere."""
         return reach(uris, self.inputs_of)
 
     def dependents(self, uris: Iterable[str]) -> set[str]:
-        """What rests on these stores, themselves not counted."""
+        """Return what rests on these stores, themselves not counted."""
         return reach(uris, lambda uri: self._made_of_it.get(uri, []))
 
     def inputs_first(self, uris: Iterable[str]) -> list[str]:
@@ -104,7 +104,7 @@ class Catalogue:
 
     @cached_property
     def recorded_by(self) -> dict[str, list[tuple[Run, str]]]:
-        """By store the runs that recorded the SHA-256 of its manifest, oldest first, with that."""
+        """Return for each store the runs that recorded the SHA-256 of its manifest, oldest first, with that."""
         found: dict[str, list[tuple[Run, str]]] = {}
         for run in self.runs:
             for uri, sha256 in run.recorded.items():
@@ -116,8 +116,22 @@ class Catalogue:
         """For each run the stores that it names, and what these rest on."""
         return {run.uri: set(run.names) | self.ancestors(run.names) for run in self.runs}
 
+    def kept_by_runs(self, sizes: Mapping[str, int]) -> dict[str, int]:
+        """Return `Archive.kept_bytes` of all runs, by address; ``sizes`` are of `Archive.all_sizes`."""
+        return {run: sum(sizes[uri] for uri in (run, *uris)) for run, uris in self.named_and_below.items()}
+
+    def own_by_runs(self, sizes: Mapping[str, int]) -> dict[str, int]:
+        """Return the bytes of each run's folder and of the stores that no other run names or rests on, by its address.
+
+        So much goes with it. ``sizes`` are of `Archive.all_sizes`.
+        """
+        return {
+            run: sizes[run] + sum(sizes[uri] for uri in uris if len(self.named_by(uri)) == 1)
+            for run, uris in self.named_and_below.items()
+        }
+
     def roles(self, uri: str) -> set[str]:
-        """What runs call the stage that made a store, such as capture_fine."""
+        """Return what runs call the stage that made a store, such as capture_fine."""
         return self._roles.get(uri.rpartition("/")[2], set())
 
     @cached_property
@@ -129,7 +143,7 @@ class Catalogue:
         return found
 
     def is_only_copy(self, uri: str) -> bool:
-        """Whether a store holds raw lines that cannot be had again; simulated ones can."""
+        """Return whether a store holds raw lines that cannot be had again; simulated ones can."""
         if uri.split("/")[1] not in RAW_STAGES:
             return False
         runs, store = self.named_by(uri), self.stores.get(uri)
@@ -269,7 +283,7 @@ def version_before(catalogue: Catalogue, uri: str) -> Store | None:
 
 
 def changes_between(catalogue: Catalogue, old: Store, new: Store) -> list[Change]:
-    """What differs, and for inputs that differ what differs in them, down to where it began."""
+    """Return what differs, and for inputs that differ what differs in them, down to where it began."""
     found: list[Change] = []
     seen, waiting = set[tuple[str, str]](), [(old, new)]
     while waiting:

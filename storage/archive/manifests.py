@@ -137,7 +137,7 @@ def cleared_facts(before: Mapping[str, Any], sha256: str) -> dict[str, Any]:
 
 
 def is_cleared(manifest: Mapping[str, Any]) -> bool:
-    """Whether a store's files were cleared away: whoever asks for it has it made again."""
+    """Return whether a store's files were cleared away: it is made again when it is needed."""
     return CLEARED in manifest
 
 
@@ -193,7 +193,7 @@ def broken_files(folder: Path, manifest: Mapping[str, Any], *, hashes: bool) -> 
 
 
 def file_problem(path: Path, entry: Mapping[str, Any], *, hashes: bool) -> str | None:
-    """What is not as the manifest's ``entry`` says of a file, in words that follow its name; None where it is whole."""
+    """Return what differs from the manifest's ``entry`` of a file, to follow its name; None where it is whole."""
     try:
         size = plain_size(path)
         if size != entry["size"]:

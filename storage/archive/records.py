@@ -1,4 +1,4 @@
-"""What one store or run has to say for itself: its manifest and receipt, read without trust.
+"""Records of single stores and runs: manifest and receipt, read without trust.
 
 A damaged manifest is a record with a problem; whatever else a file says where something was expected counts as nothing.
 """
@@ -72,7 +72,7 @@ class Store:
 
     @property
     def cleared(self) -> bool:
-        """Whether its files were cleared away, to be made again when they are asked for."""
+        """Return whether its files were cleared away, to be made again when they are asked for."""
         return is_cleared(self.facts)
 
     @property
@@ -106,7 +106,7 @@ class Run:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What the survey was asked for; from its manifest where that says so."""
+        """Return what the survey was asked for; from its manifest where that says so."""
         return _table(self.facts.get("settings")) or _table(self.receipt.get("settings"))
 
     @property
@@ -132,20 +132,20 @@ class Run:
 
     @property
     def simulated(self) -> bool:
-        """Whether its light came from the simulator, and so can be had again."""
+        """Return whether its light came from the simulator, and so can be had again."""
         return self.settings.get("source") == "sim"
 
 
 def read_store(ref: StageRef) -> Store:
     """One store by its manifest, damaged or not."""
     facts, problem = try_manifest(ref.path)
-    return Store(ref, facts, problem and f"{MANIFEST_NAME} cannot be believed: {problem}")
+    return Store(ref, facts, problem and f"{MANIFEST_NAME} is damaged: {problem}")
 
 
 def read_run(folder: Path, by_key: Mapping[str, list[str]]) -> Run:
     """One run by its manifest and receipt, damaged or not; ``by_key`` says which stores there are."""
     facts, broken = try_manifest(folder)
-    problem = broken and f"{MANIFEST_NAME} cannot be believed: {broken}"
+    problem = broken and f"{MANIFEST_NAME} is damaged: {broken}"
     receipt: dict[str, Any] = {}
     if broken is None:
         receipt, problem = _receipt(folder, facts)

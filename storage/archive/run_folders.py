@@ -48,7 +48,7 @@ _UNSUPPORTED = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP)
 def date_of_store(root: Path, uri: str) -> str:
     """When a store is made: now, or just after the last run that knows one of this address, if the clock was set back.
 
-    By its date `verify` tells a store that was made anew from one whose manifest somebody wrote.
+    By its date `verify` tells a store that was made anew from one whose manifest was written later.
     """
     now = datetime.now(UTC)
     folders = published_runs(root)
@@ -80,7 +80,7 @@ class RunDraft:
 
     @property
     def published(self) -> Path:
-        """Where the run lies once it is published."""
+        """Return where the run lies once it is published."""
         return self.folder.with_name(self.id)
 
     def __enter__(self) -> RunDraft:

@@ -1,4 +1,4 @@
-"""How files and folders come into an archive and leave it: names, refusals of the disk, syncing, renaming, locks.
+"""Files and folders on their way into an archive and out of it: names, refusals of the disk, syncing, locks.
 
 Files are opened as what they should be: no link is followed, and nothing else that can be opened waits. A pipe without
 a writer would hold a reader for ever, a device may give bytes without end, a link leads elsewhere. TOML that people
@@ -38,11 +38,11 @@ _APART = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 
 class NotPlainError(OSError):
-    """What should be a file, or a folder, is something else; ``strerror`` says what."""
+    """A link, a pipe or the like lies where a file or a folder is expected; ``strerror`` says which."""
 
 
 def kind_of(path: Path) -> str | None:
-    """What lies at a path, in words, the path's last name not followed; None where nothing does."""
+    """Return what lies at a path, in words, the path's last name not followed; None where nothing does."""
     try:
         return _kind(path.lstat().st_mode)
     except (FileNotFoundError, NotADirectoryError):
@@ -152,7 +152,7 @@ log = logging.getLogger(__name__)
 
 
 def is_name(name: str) -> bool:
-    """Whether this can be one folder's or file's name in an archive."""
+    """Return whether this can be one folder's or file's name in an archive."""
     return _NAME.fullmatch(name) is not None and not name.endswith(PART_SUFFIX)
 
 
@@ -181,13 +181,20 @@ def refusals(path: Path, doing: str) -> Iterator[None]:
 
 
 def disk_advice(error: OSError) -> str | None:
-    """What a refusal of the disk means and what to do about it; None where the error is another."""
+    """Return what a refusal of the disk means and what to do about it; None where the error is another."""
     return _ADVICE.get(error.errno or 0)
 
 
 def format_disk_error(error: OSError) -> str:
     """`disk_advice`, or what the system says."""
     return disk_advice(error) or f"{error.strerror or error}; free space or rights and run again"
+
+
+def write_all(descriptor: int, content: bytes) -> None:
+    """Write every byte; a full disk may take only some of them before it refuses."""
+    view = memoryview(content)
+    while view:
+        view = view[os.write(descriptor, view) :]
 
 
 def remove_tree(path: Path) -> None:
@@ -247,13 +254,12 @@ def file_hash(path: Path) -> str:
     return digest.hexdigest()
 
 
-def take_lock(path: Path, *, wait: bool = True, shared: bool = False, words: str = "") -> Callable[[], None] | None:
+def take_lock(path: Path, *, wait: bool = True, shared: bool = False) -> Callable[[], None] | None:
     """Hold ``path`` against other processes and threads until the function returned is called, or the process dies.
 
     None where another holds it and ``wait`` is false. Holders of a ``shared`` lock keep out only those that want it for
-    themselves. The file goes away with a lock that is not shared; letting go twice is harmless. ``words`` are written
-    into it for others to read, as far as the disk takes them. Raises ArchiveError: a link, or something else than a
-    file, is in its place: what it leads to is not touched.
+    themselves. The file goes away with a lock that is not shared; letting go twice is harmless. Raises ArchiveError: a
+    link, or something else than a file, is in its place: what it leads to is not touched.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     while True:
@@ -271,10 +277,6 @@ def take_lock(path: Path, *, wait: bool = True, shared: bool = False, words: str
             if _is_still(descriptor, path):
                 if not shared:  # else another may hold it yet
                     held.callback(_drop_name, path)  # called before the lock is let go
-                if words and os.fstat(descriptor).st_nlink == 1:  # with another name it may be somebody's file
-                    with suppress(OSError):  # a full disk keeps nobody from holding a lock
-                        os.ftruncate(descriptor, 0)
-                        os.pwrite(descriptor, words.encode(), 0)
                 return held.pop_all().close
 
 
@@ -301,13 +303,13 @@ def _misplaced(path: Path, expected: str) -> ArchiveError:
 
 
 def _drop_name(path: Path) -> None:
-    """Take a lock's file away; where the disk refuses it stays, and holds nobody up."""
+    """Take a lock's file away; where the disk refuses it stays, and blocks no process."""
     with suppress(OSError):
         path.unlink()
 
 
 def _is_still(descriptor: int, path: Path) -> bool:
-    """Whether an open file has its name yet: whoever held the lock before may have taken it away."""
+    """Return whether an open file has its name yet: the last holder of the lock may have removed it."""
     try:
         return os.path.samestat(path.lstat(), os.fstat(descriptor))
     except FileNotFoundError:

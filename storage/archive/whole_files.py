@@ -21,7 +21,7 @@ def written_aside(folder: Path, names: Sequence[str]) -> Iterator[Path]:
     """Give an empty folder to write ``names`` into; when the block ends well they replace those in ``folder``.
 
     What belongs together is never mixed: old files of all names but the first go before the first is replaced, and the
-    last one to appear vouches for the others. When the block fails, ``folder`` is as before. Raises ArchiveError: the
+    last one to appear vouches for the others. When the block fails, ``folder`` is unchanged. Raises ArchiveError: the
     folder is or lies below a file, or the disk refuses; the message names it and what to do.
     """
     with refusals(folder, "export to"):
@@ -67,7 +67,7 @@ def write_whole(path: Path, content: str) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove what killed writers left in a folder; nobody may be writing there."""
+    """Remove what killed writers left in a folder; no process may be writing there."""
     for part in folder.glob(f"{_PREFIX}*{PART_SUFFIX}"):
         remove_tree(part)
 

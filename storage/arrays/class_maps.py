@@ -1,4 +1,4 @@
-"""Maps of classes on the grid of a mosaic, and what is believed of each pixel; those of the ground: `ground_maps`.
+"""Maps of classes on the grid of a mosaic, and class probabilities of each pixel; those of the ground: `ground_maps`.
 
 Names of classes are CF flags. Of a pixel log-probabilities of its classes, how long ago it was looked at and by what
 light are kept, packed by CF's rules (scale_factor, add_offset), so that any reader of netCDF or Zarr gets numbers: a
@@ -61,7 +61,7 @@ class ClassMap:
 
 @dataclass(frozen=True)
 class ClassNames:
-    """What the classes of a map are called, and how they are drawn."""
+    """Names and colours of the classes of a map."""
 
     names: tuple[str, ...]
     colours: NDArray[np.uint8]  # (class, 3)
@@ -232,7 +232,7 @@ def write_probabilities_tile(
 def write_changes_tile(path: Path, origin: tuple[int, int], old_class: NDArray[np.uint8]) -> None:
     """Store (y, x) classes that pixels had, 255 where they have them still, of whole shards from ``origin`` on.
 
-    Raises ChunkError: the tile splits a shard; IncompleteStoreError: the store goes on from none, or is not there.
+    Raises ChunkError: the tile splits a shard; IncompleteStoreError: the store has no earlier visit, or is not there.
     """
     with damage_named(f"{path}/{OLD_CLASS}"):
         array = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)[OLD_CLASS]
@@ -297,7 +297,7 @@ class ProbabilityStore:
 
     @property
     def patch_px(self) -> int:
-        """Pixels a side of the patches that changes are told of."""
+        """Pixels a side of the patches of which it holds changes."""
         return int(self._group["changed"].attrs["patch_px"])  # type: ignore[arg-type]
 
     def changed(self) -> Floats | None:

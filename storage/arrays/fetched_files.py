@@ -1,4 +1,4 @@
-"""Camera files on their way here, in a folder: what has come stays, whatever ends the transfer, and goes on there.
+"""Camera files on their way here, in a folder: what has come stays, and the next transfer continues there.
 
 A file of the camera is named by its whole path there, notes about the files by a name alone. Bytes are written at the
 end and nowhere else; a file that came damaged goes as a whole. Notes are on the disk when ``append`` returns; of files
@@ -25,7 +25,15 @@ from pathlib import Path
 from urllib.parse import quote
 
 from pipeline.rig.transports import NotKept
-from storage.archive.staging import format_disk_error, open_plain, plain_reader, plain_size, read_plain, sync_path
+from storage.archive.staging import (
+    format_disk_error,
+    open_plain,
+    plain_reader,
+    plain_size,
+    read_plain,
+    sync_path,
+    write_all,
+)
 
 SYNC_BYTES = 1 << 24
 SUMS = "%sums"  # which no quoted name ends with
@@ -38,7 +46,7 @@ _LONGEST = 240  # of a file's name, in most file systems 255
 
 @dataclass
 class _Sums:
-    """How far a file is known to be as it was fetched, and how many records say so."""
+    """The part of a file that agrees with its sums, and how many records say so."""
 
     reached: int = 0
     crc32: int = 0
@@ -91,7 +99,7 @@ class FetchedFiles:
             if not before:
                 self.folder.mkdir(parents=True, exist_ok=True)
             with os.fdopen(open_plain(path, _APPEND), "ab", buffering=0) as file:
-                _write_all(file.fileno(), data)
+                write_all(file.fileno(), data)
                 waiting = self._unsynced.get(name, 0) + len(data)
                 if _is_note(name) or waiting >= SYNC_BYTES:
                     os.fdatasync(file.fileno())
@@ -128,7 +136,7 @@ class FetchedFiles:
         text, sums = _record(reached, crc32), _sums_of(path)
         try:
             with os.fdopen(open_plain(sums, _APPEND), "ab", buffering=0) as file:
-                _write_all(file.fileno(), text)
+                write_all(file.fileno(), text)
         except OSError:
             _cut(sums, known.records * _RECORD.size)
             raise
@@ -177,7 +185,7 @@ def _sums_of(path: Path) -> Path:
 
 
 def _agreeing(path: Path) -> tuple[_Sums, bool]:
-    """How far bytes and sums of a file agree, and whether anything of either has changed since.
+    """Return how far bytes and sums of a file agree, and whether anything of either has changed since.
 
     Each sum is of all bytes before it, so one that is lost is passed over.
     """
@@ -211,14 +219,8 @@ def _unread(path: Path, error: OSError) -> NotKept:
     )
 
 
-def _write_all(file: int, data: bytes) -> None:
-    view = memoryview(data)
-    while view:
-        view = view[os.write(file, view) :]
-
-
 def _cut(path: Path, size: int) -> None:
     try:
         os.truncate(path, size)
     except OSError:
-        return  # what is held is compared when the transfer goes on
+        return  # what is held is compared when the transfer continues

@@ -1,4 +1,4 @@
-"""Where images lie: their GeoBox, or the camera's angles, as a store's attributes and coordinates, written and read.
+"""Georeference of stored images: GeoBox or the camera's angles as attributes and coordinates, written and read.
 
 A GeoBox is said by CF's grid mapping with coordinates of pixel centres, and by GeoZarr's attributes ``proj:`` and
 ``spatial:``, so that plain xarray, rioxarray and odc-geo find the same. A grid that is turned has no centres along its
@@ -159,7 +159,7 @@ def geobox_of_group(group: zarr.Group) -> GeoBox | None:
 def find_geobox(
     attributes: Mapping[str, Any], arrays: Mapping[str, zarr.Array[Any]], shape: tuple[int, int], dims: tuple[str, str]
 ) -> GeoBox | None:
-    """Where an image of (y, x) ``shape`` lies, as its store says; None where it does not say CRS and grid.
+    """Return where an image of (y, x) ``shape`` lies, as its store says; None where it does not say CRS and grid.
 
     ``attributes`` are the image's and its group's, ``arrays`` what else lies in the group, ``dims`` the names of the
     image's axes. Asked are GeoZarr's ``proj:`` and ``spatial:transform``, the grid mapping with its GeoTransform, and

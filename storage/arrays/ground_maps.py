@@ -64,7 +64,7 @@ class StoredImage:
 
     @property
     def geobox(self) -> GeoBox | None:
-        """Where on the earth it lies; None where its store does not say."""
+        """Return where on the earth it lies; None where its store does not say."""
         return geobox_of_group(self.group)
 
     def rows(self) -> Iterator[tuple[int, NDArray[Any]]]:

@@ -1,4 +1,4 @@
-"""What all stored arrays have in common: Zarr v3 codecs and chunks, bands, CF and GeoZarr attributes, rounding.
+"""The common layout of stored arrays: Zarr v3 codecs and chunks, bands, CF and GeoZarr attributes, rounding.
 
 Chunks of 32 x 32 px with all bands, in shards of 64 rows, each chunk with its own crc32c: one patch is one range read,
 and a flipped bit is an error instead of a wrong number. Images without bands are one chunk a shard. Codecs to choose
@@ -52,7 +52,7 @@ NO_CLASS = {"classes": UNLABELLED, "confidence": np.nan}
 
 @dataclass(frozen=True)
 class AngularGrid:
-    """Where an image's pixels lie: tangents from the undeflected direction, the scene's centre; and on the earth."""
+    """Tangents of an image's pixels from the undeflected direction, the scene's centre; and their place on earth."""
 
     ifov_rad: float
     scene_shape: tuple[int, int]  # (y, x) of the fine grid [px]
@@ -74,7 +74,7 @@ class AngularGrid:
         }
 
     def record(self) -> dict[str, Any]:
-        """What `grid_of` needs to make this grid of angles again."""
+        """Return what `grid_of` needs to make this grid of angles again."""
         return {"ifov_rad": self.ifov_rad, "scene_shape": list(self.scene_shape), "factor": self.factor}
 
 

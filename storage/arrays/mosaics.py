@@ -33,14 +33,7 @@ from storage.arrays.layout import (
     write_image,
 )
 from storage.arrays.quicklooks import Quicklook, write_quicklook
-from storage.arrays.signal_cubes import (
-    LARGEST_SHORT,
-    check_condensed,
-    read_components,
-    score_spec,
-    steps_within,
-    write_components,
-)
+from storage.arrays.signal_cubes import LARGEST_SHORT, read_components, score_spec, steps_within, write_components
 from storage.parallel.pool import WorkerPool, run_blocks
 
 HALF = 0.5  # of a pixel's finer ones: of fewer seen it has no value
@@ -78,7 +71,7 @@ class MosaicWriter:
 
     @classmethod
     def reopen(cls, path: Path) -> MosaicWriter:
-        """Go on writing tiles of a mosaic that another writer has begun, in this process or another.
+        """Continue a mosaic that another writer has begun, in this process or another.
 
         Raises IncompleteStoreError: no mosaic has been begun there.
         """
@@ -168,12 +161,12 @@ def write_tiles(
 ) -> None:
     """Store what ``make`` gives for the rows and columns of ``places``, each in a task of its own.
 
-    Whoever makes the tiles, the same bytes come out. See `run_blocks` for what is raised.
+    Any worker's tiles give the same bytes. See `run_blocks` for what is raised.
     """
     task = _TileTask(make, writer.path.absolute())
     if pool.shares_memory:
         _reopened(task.out)  # before several threads ask for it
-    run_blocks(task, places, pool, keep=False, report=report, paths=[*paths, task.out])
+    run_blocks(task, places, pool, report=report, paths=[*paths, task.out])
     _reopened.cache_clear()
 
 
@@ -290,9 +283,8 @@ class Mosaic:
 
 
 def open_mosaic(path: Path) -> Mosaic:
-    """Open a mosaic. Raises IncompleteStoreError where it is missing, damaged or of an earlier version."""
+    """Open a mosaic. Raises IncompleteStoreError where it is missing or damaged."""
     group = open_group(path)
-    check_condensed(group, path)
     wavelength, fwhm = read_bands(group)
     with damage_named(str(path)):
         step = float(group["scores"].attrs["scale_factor"])  # type: ignore[arg-type]

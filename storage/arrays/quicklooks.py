@@ -1,4 +1,4 @@
-"""Quicklooks: a small picture stored beside every cube, so that nobody has to read a cube to show it.
+"""Quicklooks: a small picture stored beside every cube, which need not be read to show it.
 
 ::
 
@@ -186,7 +186,7 @@ def write_quicklook(group: zarr.Group, found: Quicklook) -> None:
 
 
 def quicklook_of(group: zarr.Group) -> Quicklook | None:
-    """The picture of an opened cube or mosaic, None where it has none (stores of before). The cube is not read.
+    """The picture of an opened cube or mosaic, None where it has none. The cube is not read.
 
     Raises IncompleteStoreError: the picture is damaged.
     """

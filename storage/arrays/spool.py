@@ -2,10 +2,10 @@
 
 ``<name>.lines`` begins with one JSON object on a line: what the lines belong to, with a checksum of its own. Records
 of one size follow, one a line: number, mirror X and Y, time, exposure, valid, a CRC-32, and the raw numbers (sample,
-band) uint16. The CRC goes on from that of the header, so that a record belongs to one sweep alone.
+band) uint16. The CRC continues that of the header, so that a record belongs to one sweep alone.
 
 A line counts when its record has its CRC. Records that do not count lie either behind the last that does, and are cut
-off: the capture goes on there; or before it: these lines are lost, and are put back in their places when the source
+off: the capture continues there; or before it: these lines are lost, and are put back in their places when the source
 gives them again.
 """
 
@@ -29,7 +29,7 @@ from pipeline.errors import RigError
 from pipeline.json_lines import read_checked, with_check
 from pipeline.source import Line
 from storage.archive.keys import plain
-from storage.archive.staging import format_disk_error, open_plain, plain_reader, sync_path
+from storage.archive.staging import format_disk_error, open_plain, plain_reader, sync_path, write_all
 
 ENDING = ".lines"
 SYNC_LINES = 64
@@ -73,7 +73,7 @@ class Spool:
 
     @classmethod
     def known(cls, path: Path) -> Spool | None:
-        """Open a spool by its own header, to be read; None where that cannot be believed."""
+        """Open a spool by its own header, to be read; None where that is damaged."""
         with plain_reader(path) as file:
             head = file.readline(_LONGEST_HEADER)
         facts = _header(head)
@@ -101,7 +101,7 @@ class Spool:
             if self._file is None:
                 self._file = self._writer(os.O_APPEND)
             try:
-                _write_all(self._file, record)
+                write_all(self._file.fileno(), record)
             except OSError:
                 self._cut_back()
                 raise
@@ -119,7 +119,7 @@ class Spool:
             record = self._record(line, number)
             with _refusals(self.path, number), self._writer() as file:
                 file.seek(self._place(number))
-                _write_all(file, record)
+                write_all(file.fileno(), record)
                 os.fdatasync(file.fileno())
             self.lost = [one for one in self.lost if one != number]
 
@@ -132,7 +132,7 @@ class Spool:
     def recover(self) -> int:
         """Find the good lines and those that are lost, cut off what a crash left torn behind the last good one.
 
-        Gives the number of the line to go on with. Raises RigError: the lines are of another sweep.
+        Gives the number of the next line. Raises RigError: the lines are of another sweep.
         """
         with plain_reader(self.path) as file:
             head = file.readline(_LONGEST_HEADER)
@@ -146,7 +146,7 @@ class Spool:
                 )
             LOG.warning("%s: its header has changed; lines that belong to this sweep are kept", self.path)
             with self._writer() as file:
-                _write_all(file, self._head)
+                write_all(file.fileno(), self._head)
         self.count = max(good, default=-1) + 1
         self.lost = sorted(set(range(self.count)) - set(good))
         if self.lost:
@@ -223,7 +223,7 @@ class Spool:
 
 
 def spool_problems(path: Path) -> Iterator[str]:
-    """What is not as it was captured of the lines at a path; a record that is not all there is no damage."""
+    """Yield what is not as it was captured of the lines at a path; a record that is not all there is no damage."""
     spool = Spool.known(path)
     if spool is None:
         with plain_reader(path) as file:
@@ -245,7 +245,7 @@ def line_values(numbers: Sequence[int]) -> str:
 
 
 def _header(head: bytes) -> dict[str, Any] | None:
-    """What a file's first line says its lines belong to; None where it cannot be believed."""
+    """Return what a file's first line says its lines belong to; None where it is damaged."""
     found = next(read_checked(head), None)
     if found is None or found.state != "whole" or found.content is None or found.text + b"\n" != head:
         return None
@@ -274,10 +274,3 @@ def _refusals(path: Path, lines: int) -> Iterator[None]:
         raise RigError(
             f"cannot write line {lines} to {path}: {format_disk_error(error)}; the {lines} lines before it are kept"
         ) from error
-
-
-def _write_all(file: BinaryIO, content: bytes) -> None:
-    """Write every byte; a full disk may take only some of them before it refuses."""
-    view = memoryview(content)
-    while view:
-        view = view[os.write(file.fileno(), view) :]

@@ -23,7 +23,6 @@ from pipeline.errors import ArchiveError, PoseError, ShapeError
 from storage.archive.whole_files import make_folder, write_whole, written_aside
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.cubes import RawCube
-from storage.arrays.georeference import map_attributes
 from storage.arrays.layout import SHARD_ROWS, AngularGrid
 from storage.readers.envi_files import DATA_TYPES
 
@@ -37,36 +36,17 @@ ANGULAR = (
 Blocks = Iterable[tuple[int, NDArray[Any]]]  # first row, (row, x) or (row, x, band) values, in order
 
 
-@dataclass(frozen=True)
-class Place:
-    """Where an image's pixels lie. Without a CRS the transform gives tangents of angles [rad]."""
-
-    transform: tuple[float, ...]  # a, b, c, d, e, f: pixel corners to x = a column + b row + c, y = d ... + f
-    crs_wkt: str | None = None
-
-    @classmethod
-    def on_map(cls, geobox: GeoBox) -> Place:
-        """Of an image on a map, as its Zarr store says it (PoseError: the grid has no CRS)."""
-        place = map_attributes(geobox)
-        return cls(tuple(place["spatial:transform"]), place["proj:wkt2"])
-
-    @classmethod
-    def on_angles(cls, grid: AngularGrid, shape: tuple[int, int]) -> Place:
-        """Of an image of (y, x) px on the camera's angular grid."""
-        return cls(tuple(grid.attributes(shape)["spatial:transform"]))
-
-    def geobox(self, shape: tuple[int, int]) -> GeoBox | None:
-        """The grid of an image of (y, x) px that lies here; None without a CRS."""
-        return None if self.crs_wkt is None else GeoBox(shape, Affine(*self.transform), self.crs_wkt)
+def angular_geobox(grid: AngularGrid, shape: tuple[int, int]) -> GeoBox:
+    """Return the grid of an image of (y, x) px in tangents of the camera's angles [rad], without a CRS."""
+    return GeoBox(shape, Affine(*grid.attributes(shape)["spatial:transform"]), None)
 
 
 @dataclass(frozen=True)
 class CogImage:
-    """What one file is to hold."""
+    """Grid, bands and legend of one file."""
 
-    shape: tuple[int, int]  # (y, x) [px]
+    geobox: GeoBox  # without a CRS in tangents of angles [rad]
     dtype: str
-    place: Place
     bands: tuple[str, ...]  # their descriptions
     nodata: float
     legend: ClassNames | None = None  # of an image of classes: overviews take the commonest, not the mean
@@ -119,7 +99,7 @@ def _refusals_of_gdal(path: Path) -> Iterator[None]:
 
 def _write_plain(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> None:
     """An uncompressed TIFF in strips, block by block, from which GDAL makes the other."""
-    y, x = image.shape
+    (y, x), crs = image.geobox.shape, image.geobox.crs
     profile = {
         "driver": "GTiff",
         "height": y,
@@ -127,8 +107,8 @@ def _write_plain(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> 
         "count": len(image.bands),
         "dtype": image.dtype,
         "nodata": image.nodata,
-        "transform": rasterio.Affine(*image.place.transform),
-        "crs": image.place.crs_wkt,
+        "transform": image.geobox.affine,
+        "crs": None if crs is None else crs.to_wkt(),
         "BIGTIFF": "IF_SAFER",
     }
     with rasterio.open(path, "w", **profile) as file:
@@ -253,14 +233,14 @@ def _listed(words: list[str]) -> str:
 
 
 def has_map_info(geobox: GeoBox) -> bool:
-    """Whether ENVI's header can say where an image lies: north is up, and the CRS counts metres."""
+    """Return whether ENVI's header can say where an image lies: north is up, and the CRS counts metres."""
     a, b, _, d, e, _ = (float(number) for number in geobox.affine[:6])
     metres = geobox.crs is not None and geobox.crs.projected and "metre" in geobox.crs.units
     return metres and not b and not d and a > 0 > e
 
 
 def _map_fields(geobox: GeoBox) -> Iterator[tuple[str, str]]:
-    """Where the upper left pixel's corner lies, the pixels' sides, and the CRS as the WKT that ENVI reads."""
+    """Yield where the upper left pixel's corner lies, the pixels' sides, and the CRS as the WKT that ENVI reads."""
     a, _, c, _, e, f = (float(number) for number in geobox.affine[:6])
     if not has_map_info(geobox) or geobox.crs is None:
         raise PoseError(f"ENVI's map info takes a grid with north up and a CRS, got {geobox!r}")

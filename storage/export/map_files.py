@@ -65,7 +65,7 @@ def write_polygons(
     kind = path.suffix
     names = [path.with_suffix(part).name for part in reversed(SHAPE_PARTS)] if kind == ".shp" else [path.name]
     with _writing(path, names, when) as aside, warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "'crs' was not provided", UserWarning)  # that is told where it is missing
+        warnings.filterwarnings("ignore", "'crs' was not provided", UserWarning)  # a missing one has its own message
         frame = geopandas.GeoDataFrame(dict(columns), geometry=list(polygons), crs=crs)
         frame = frame.to_crs(4326) if kind == ".geojson" else frame
         frame.to_file(aside / path.name, layer=layer, engine="pyogrio", **_OPTIONS[kind])
@@ -120,7 +120,7 @@ class TaskGrid:
 
 @dataclass(frozen=True)
 class TaskText:
-    """What the task is called, and what it is for."""
+    """Names of a task, its field and its product."""
 
     task: str
     field: str

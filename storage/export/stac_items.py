@@ -82,7 +82,7 @@ _EVERYWHERE = [-180.0, -90.0, 180.0, 90.0]
 
 @dataclass(frozen=True)
 class Item:
-    """What one run's item says. Addresses of assets are relative to the item's folder."""
+    """Content of one run's item. Addresses of assets are relative to the item's folder."""
 
     id: str
     started: str  # ISO 8601

@@ -29,7 +29,7 @@ from storage.archive.staging import (
 )
 
 DAY_S = 86400.0
-IN_USE = "somebody is using the archive: run gc again when it is free"
+IN_USE = "the archive is in use: run gc again when it is free"
 What = Literal["store", "files", "spool", "unfinished", "upload"]  # files: raw lines of a run, by its setting `keep`
 
 
@@ -45,7 +45,7 @@ class Removal:
 
 @dataclass(frozen=True)
 class Clearance:
-    """What can go, in that order."""
+    """Things that can be removed, in that order."""
 
     removals: tuple[Removal, ...]
     kept: dict[str, str]  # what no run names and stays nevertheless, with the reason
@@ -132,7 +132,7 @@ def _spared(catalogue: Catalogue, named: set[str], keep_days: float, raw_too: bo
             kept[uri] = f"younger than {keep_days:g} days"
         elif not raw_too and catalogue.is_only_copy(uri):
             kept[uri] = "raw lines that cannot be had again; --raw-too removes them"
-    # What was made of them is younger still: by its dates it can be older only where the clock was set back.
+    # Stores made of them are younger still: by its dates it can be older only where the clock was set back.
     younger = [uri for uri, store in catalogue.stores.items() if _age_days(store, now) < keep_days]
     for uri in catalogue.dependents(younger) - named:
         kept.setdefault(uri, f"made of what is younger than {keep_days:g} days")
@@ -176,7 +176,7 @@ def _unfinished(root: Path) -> list[Removal]:
             if free := release is not None:
                 release()
         if free:
-            found.append(Removal(uri, "unfinished", bytes_below(path), "whoever made it is gone"))
+            found.append(Removal(uri, "unfinished", bytes_below(path), "its process has ended"))
     return found
 
 

@@ -22,7 +22,7 @@ Rerun = Callable[[dict[str, Any]], None]  # settings of a survey: runs and publi
 
 @dataclass(frozen=True)
 class RepairPlan:
-    """What a repair does. Addresses are relative to the archive, of stores with those that they were made of last."""
+    """Steps of a repair. Addresses are relative to the archive, of stores with those that they were made of last."""
 
     remade: tuple[str, ...]  # broken or missing stores
     hopeless: dict[str, str]  # broken and left as they are, with the reason
@@ -32,7 +32,7 @@ class RepairPlan:
 
 @dataclass
 class Repaired:
-    """What a repair did."""
+    """Outcome of a repair."""
 
     plan: RepairPlan
     remade: list[str] = field(default_factory=list)
@@ -41,7 +41,7 @@ class Repaired:
 
     @property
     def complete(self) -> bool:
-        """Whether nothing broken is left."""
+        """Return whether nothing broken is left."""
         return not (self.plan.hopeless or self.failed)
 
 
@@ -71,7 +71,7 @@ def repair(
 
     ``findings`` are those of `verify_archive`. ``rerun`` runs a survey by its settings, as the receipt has them, into
     this archive, and finds there what is whole. ``versions`` are the stages' as they are made now: stores of others are
-    not made again, and stay. Raises ArchiveError: somebody else uses the archive, or the disk or bucket refuses.
+    not made again, and stay. Raises ArchiveError: another process uses the archive, or the disk or bucket refuses.
     """
     with archive.in_use(alone=True) as alone:
         if not alone:

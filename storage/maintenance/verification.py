@@ -1,7 +1,7 @@
 """Reading a whole archive again: every byte against its manifest, every manifest against its seal and its runs.
 
-What is no file where one should be, such as a link or a pipe, is told and never opened. Of a broken file of an array it
-is told which part it holds.
+A link or a pipe in the place of a file is reported and never opened. Of a broken file of an array it
+says which part it holds.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _NO_ARRAY = (OSError, ValueError, KeyError, TypeError, IndexError, RecursionErro
 
 
 def name_damage(store: Path, name: str) -> str:
-    """What is known of a broken file of a store, in words to follow its name; empty where it belongs to no array.
+    """Return the known part of a store in a broken file, to follow its name; empty where it belongs to no array.
 
     For example ``(values: rows 0 to 63, columns 0 to 639)``; a dimension of which it has everything is left out.
     """
@@ -69,10 +69,10 @@ Progress = Callable[[str, float], None]  # address of what is being read, how fa
 
 @dataclass(frozen=True)
 class Finding:
-    """What ``verify`` says of one store or run; ``problem`` is None where every byte is as published.
+    """Finding of ``verify`` on one store or run; ``problem`` is None where every byte is as published.
 
     ``missing``: something names or rests on a store that is not there. ``stray``: what is no part of the archive.
-    ``growing``: something of a spool that cannot be believed; the rest of it is used.
+    ``growing``: something of a spool that is damaged; the rest of it is used.
     """
 
     uri: str
@@ -127,7 +127,7 @@ def verify_growing(root: Path) -> Iterator[Finding]:
 
 
 def _spool_problems(folder: Path) -> Iterator[str]:
-    """What is not as it was written in the folder of a capture under way: lines, and the rig's files beside them."""
+    """Yield what has changed in the folder of a capture under way: lines, and the rig's files beside them."""
     for path in (one for one in (*_inside(folder), *(file for inner in _inside(folder) for file in _inside(inner)))):
         name = path.relative_to(folder).as_posix()
         try:
@@ -140,7 +140,7 @@ def _spool_problems(folder: Path) -> Iterator[str]:
                 where = f"{name.removesuffix(SUMS)} is not as it was fetched from byte {at} on"
                 yield f"{where}; it is asked for again when the capture goes on"
         except (FileNotFoundError, NotPlainError):
-            continue  # its lines are published; or it is a link and the like, which is told of every such thing
+            continue  # its lines are published; or it is a link and the like, which is reported for all of them
         except OSError as error:
             yield f"{name} cannot be read: {error.strerror}"
 
@@ -150,7 +150,7 @@ def _inside(folder: Path) -> list[Path]:
 
 
 def _changed_since(catalogue: Catalogue, uri: str) -> bool:
-    """Whether something was added to a run after the catalogue was read."""
+    """Return whether something was added to a run after the catalogue was read."""
     run = None if uri in catalogue.stores else next((run for run in catalogue.runs if run.uri == uri), None)
     if run is None:
         return False
@@ -158,20 +158,20 @@ def _changed_since(catalogue: Catalogue, uri: str) -> bool:
 
 
 def _problems(folder: Path) -> Iterator[str]:
-    """What is wrong with one published folder, file by file."""
+    """Yield what is wrong with one published folder, file by file."""
     manifest, problem = try_manifest(folder)
     if problem is not None:
-        yield f"{MANIFEST_NAME} cannot be believed: {problem}"
+        yield f"{MANIFEST_NAME} is damaged: {problem}"
         return
     for name, problem in broken_files(folder, manifest, hashes=True):
         yield f"{name} {problem}{name_damage(folder, name) if name in manifest['files'] else ''}"
 
 
 def _identity_problems(catalogue: Catalogue, uri: str) -> Iterator[str]:
-    """Whether a store is the one that its place and the runs say."""
+    """Yield whether a store is the one that its place and the runs say."""
     store = catalogue.stores.get(uri)
     if store is None or store.problem is not None or kind_of(store.ref.path / MANIFEST_NAME) != "a file":
-        return  # which is told of already
+        return  # which is reported already
     stated = f"stages/{store.facts.get('stage')}/{store.facts.get('key')}"
     if stated != uri:
         yield f"its {MANIFEST_NAME} is that of {stated}; move it back, or take it out of the archive"
@@ -199,7 +199,7 @@ def _misplaced(catalogue: Catalogue, root: Path) -> Iterator[Finding]:
 
 
 def _missing(catalogue: Catalogue) -> Iterator[Finding]:
-    """What runs name and stores rest on, and is not there."""
+    """Yield what runs name and stores rest on, and is not there."""
     there, told = set(catalogue.stores), set[str]()
     for run in catalogue.runs:
         for uri in sorted(run.names - there - told):

@@ -79,7 +79,7 @@ def memory_refusal(least: int, memory: int, why: str) -> SettingsError:
 
 @dataclass(frozen=True)
 class WorkerPool:
-    """Who makes blocks: ``threads``, ``processes``, or the workers of a dask scheduler at ``tcp://host:port``."""
+    """Workers that make blocks: ``threads``, ``processes``, or those of a dask scheduler at ``tcp://host:port``."""
 
     scheduler: str = "threads"
     workers: int | None = None  # at a time; None is one a core. A scheduler elsewhere has workers of its own
@@ -95,12 +95,12 @@ class WorkerPool:
 
     @property
     def elsewhere(self) -> bool:
-        """Whether the workers belong to a scheduler that somebody else started."""
+        """Return whether the workers belong to a scheduler that was started elsewhere."""
         return "://" in self.scheduler
 
     @property
     def shares_memory(self) -> bool:
-        """Whether work may hold open files and arrays; otherwise it holds paths and is pickled."""
+        """Return whether work may hold open files and arrays; otherwise it holds paths and is pickled."""
         return self.scheduler == "threads"
 
     @property
@@ -123,7 +123,7 @@ class WorkerPool:
             yield self
         except Exception:
             raise
-        except BaseException:  # nobody waits for blocks that are being made
+        except BaseException:  # blocks that are being made are abandoned
             held.dismiss()
             raise
         finally:
@@ -141,13 +141,13 @@ THREADS = WorkerPool()
 
 @dataclass
 class _Open:
-    """The workers of an open worker pool, once somebody needs them."""
+    """The workers of an open worker pool, once they are needed."""
 
     users: int = 0
     team: Executor | None = None
 
     def dismiss(self) -> None:
-        """Let workers go at once: whoever needs them next gets others."""
+        """Let workers go at once: the next use starts others."""
         team, self.team = self.team, None
         if isinstance(team, ProcessPoolExecutor):
             for process in list((team._processes or {}).values()):
@@ -165,9 +165,7 @@ def run_blocks(
     items: Sequence[Item],
     pool: WorkerPool = THREADS,
     *,
-    keep: bool = True,
     report: Report = lambda done: None,
-    each: Callable[[Item, Result], None] | None = None,
     paths: Sequence[Path] = (),
 ) -> list[Result]:
     """Call ``make`` with every item, each in a task of its own.
@@ -177,19 +175,16 @@ def run_blocks(
 
     On threads ``make`` is anything that may be called from several at once. Otherwise it and the items are pickled:
     they hold absolute paths, never arrays or open files, and writing a block twice must give the same bytes.
-    ``each`` is called with an item and its result, one at a time, in the order in which they end, ``report`` with the
-    share done after each. Workers elsewhere are asked whether they see the same in ``paths``, the folders that the work
-    reads or writes; from those in a staged store (``*.part``) goes what a killed worker left of a file that another
-    wrote again. Gives the results in the order of the items; none without ``keep``. Raises SettingsError: no scheduler
+    ``report`` is called with the share done after each. Workers elsewhere are asked if they see the same in ``paths``,
+    the folders that the work reads or writes; from those in a staged store (``*.part``) goes what a killed worker left
+    of a file that another wrote again. Gives the results in the order of the items. Raises SettingsError: no scheduler
     answers, or its workers see other files or run other versions. WorkerError: workers died, more often than a block is
     tried again.
     """
     results: dict[int, Any] = {}
 
     def ended(number: int, result: Any) -> None:
-        if each is not None:
-            each(items[number], result)
-        results[number] = result if keep else None
+        results[number] = result
         report(len(results) / len(items))
 
     workers = min(pool.count, len(items))
@@ -206,7 +201,7 @@ def run_blocks(
             if any(part.endswith(PART_SUFFIX) for part in folder.parts):
                 for file in folder.rglob("*.partial"):  # zarr gives a shard its name when it is whole
                     file.unlink(missing_ok=True)
-    return [results[number] for number in range(len(items))] if keep else []
+    return [results[number] for number in range(len(items))]
 
 
 def _send_away(
@@ -233,13 +228,13 @@ def _send_away(
         try:
             workers = team.check(paths) if isinstance(team, Cluster) else pool.count
             _send(team, make, items, list(left), AHEAD * workers, tick)
-        except (BrokenExecutor, WorkerError, CancelledError) as error:
+        except (BrokenExecutor, WorkerError, CancelledError, dask_distributed.KilledWorker) as error:
             held.dismiss()
             deaths += 1
             if pool.elsewhere and isinstance(error, CancelledError):
                 gone = f"--scheduler {pool.scheduler}: the scheduler is gone"
                 raise WorkerError(f"{gone}; the same command goes on once it is there again") from None
-            if not isinstance(error, BrokenExecutor):
+            if isinstance(error, WorkerError | CancelledError):
                 raise
             if deaths == TRIES or pool.elsewhere:
                 who = f"--scheduler {pool.scheduler}" if pool.elsewhere else f"{pool.count} worker processes"
@@ -330,7 +325,7 @@ class Cluster(Executor):
 
     def __init__(self, scheduler: str) -> None:
         self.name = f"--scheduler {scheduler}"
-        for name in ("distributed", "distributed.client"):  # lost connections are told once, by an error
+        for name in ("distributed", "distributed.client"):  # lost connections are reported once, by an error
             logging.getLogger(name).setLevel(logging.CRITICAL)
         try:
             self.client: Any = dask_distributed.Client(scheduler, timeout=ANSWER_S, set_as_default=False)  # type: ignore[no-untyped-call]
@@ -339,25 +334,15 @@ class Cluster(Executor):
                 f"{self.name}: expected a dask scheduler there, none answered within {ANSWER_S:g} s "
                 f"({type(error).__name__}); start `dask scheduler`, or use --scheduler processes"
             ) from None
+        self._tasks: Any = self.client.get_executor(pure=False)  # type: ignore[no-untyped-call]
 
     def submit(self, make: Callable[..., Any], /, *given: Any, **named: Any) -> Future[Any]:
         """Send one block."""
-        future, task = Future[Any](), self.client.submit(make, *given, **named, pure=False)
-
-        def end(task: Any) -> None:
-            if task.cancelled():
-                future.set_exception(CancelledError())
-            elif (error := task.exception()) is not None:
-                dead = isinstance(error, dask_distributed.KilledWorker)
-                future.set_exception(BrokenExecutor(str(error)) if dead else error)
-            else:
-                future.set_result(task.result())
-
-        task.add_done_callback(end)
-        return future
+        sent: Future[Any] = self._tasks.submit(make, *given, **named)
+        return sent
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Let the workers go, which go on living."""
+        """Let go of the workers, which keep running."""
         self.client.close()
 
     def count(self) -> int:
@@ -399,14 +384,14 @@ class Cluster(Executor):
 
 
 def about_here(folders: Sequence[str]) -> dict[str, str]:
-    """What this process runs, on how many threads, and what it sees in some folders, by name."""
+    """Return what this process runs, on how many threads, and what it sees in some folders, by name."""
     threads = {THREADS_OF: os.environ.get(THREADS_OF, "not set")}
     return versions_here() | threads | {folder: _seen(folder) for folder in folders}
 
 
 @cache
 def versions_here() -> dict[str, str]:
-    """What this process runs, by name, as it was when first asked: so it runs whatever changes on the disk."""
+    """Return what this process runs, by name, as it was when first asked: so it runs whatever changes on the disk."""
     root, found = Path(__file__).parents[2], hashlib.sha256()
     for path in sorted(path for room in ROOMS for path in (root / room).rglob("*.py")):
         found.update(path.relative_to(root).as_posix().encode() + path.read_bytes())

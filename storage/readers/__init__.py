@@ -1,1 +1,1 @@
-"""What people bring: scenes and cubes of any format, their labels and settings, with what a file says of itself."""
+"""Readers of people's own files: scenes and cubes of any format, their labels and settings."""

@@ -143,7 +143,7 @@ def _other_place(
             " orthorectified by its geolocation grids (glt_x, glt_y) first",
         )
     if {"lat", "latitude"} & names:
-        return None, ("its place is told by a latitude and longitude of each pixel, which are not read",)
+        return None, ("its place is given by a latitude and longitude of each pixel, which are not read",)
     return None, ()
 
 
@@ -289,7 +289,7 @@ def _read(path: Path, name: str, part: Any) -> NDArray[Any]:
 
 
 def _words(about: Mapping[str, Any], item: Any) -> dict[str, Any]:
-    """What an array says in other words than CF's: names of its axes, NEON's scale, no-data value and units."""
+    """Return what an array says in other words than CF's: names of its axes, NEON's scale, no-data value and units."""
     dims = [dim[0].name.removeprefix("/") if len(dim) else dim.label for dim in item.dims]
     words: dict[str, Any] = {"_ARRAY_DIMENSIONS": dims} if any(dims) else {}
     scale = about.get("Scale_Factor") or about.get("Scale Factor")  # divides values, where CF's scale_factor multiplies
@@ -424,15 +424,11 @@ def _check_names(content: mmap.mmap) -> None:
     while content[126:128] in (b"IM", b"MI") and place + 48 <= len(content):
         kind, size, *_, axes = struct.unpack(order + "8I", content[place : place + 32])[:8]
         name = place + 32 + axes + -axes % 8  # after flags and axes
-        if kind == 14 and (name + 8 > len(content) or _length(content[name : name + 8], order) > len(content) - name):
+        tag = content[name : name + 8]
+        named, length = struct.unpack(order + "II", tag) if len(tag) == 8 else (0, len(content))
+        if kind == 14 and (4 if named >> 16 else length) > len(content) - name:  # up to four bytes stand in the tag
             raise ValueError(f"the variable at byte {place} is cut off")
         place += 8 + size
-
-
-def _length(tag: bytes, order: str) -> int:
-    """Return the bytes of an element by its tag; those of up to four bytes stand in the tag itself."""
-    kind, size = struct.unpack(order + "II", tag)
-    return 4 if kind >> 16 else int(size)
 
 
 @contextmanager

@@ -73,7 +73,7 @@ def reading(path: Path, kind: str, cure: str = "copy it again") -> Iterator[None
     except KeyError as error:
         raise SceneError(f"{path} lacks what files of its kind have: {error}; copy it again") from error
     except Exception as error:
-        why = error.__cause__ or error  # rasterio's own says no more than that it failed
+        why = error.__cause__ or error  # rasterio's own says only that it failed
         raise SceneError(
             f"{path} cannot be read as {kind}: {type(why).__name__}: {why}; is it damaged? {cure}"
         ) from error
@@ -87,7 +87,7 @@ ReadLines = Callable[[int, int], NDArray[Any]]
 
 @dataclass(frozen=True)
 class LineFacts:
-    """What is known of each line; None where nothing is known of any."""
+    """Known facts of each line; None where nothing is known of any."""
 
     valid: NDArray[np.bool_] | None = None  # (line,) the file holds it whole; None where it holds all
     time_s: NDArray[np.float64] | None = None  # (line,) since the first stamp; NaN where not known
@@ -98,7 +98,7 @@ class LineFacts:
 
 @dataclass(frozen=True)
 class Bands:
-    """What is known of the bands; None where nothing is."""
+    """Known facts of the bands; None where nothing is."""
 
     wavelength_nm: NDArray[np.float64] | None = None  # (band,)
     fwhm_nm: NDArray[np.float64] | None = None  # (band,)

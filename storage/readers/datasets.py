@@ -54,7 +54,7 @@ class DataSet:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was left out: scenes without labels, and labels without a scene."""
+        """Return what was left out: scenes without labels, and labels without a scene."""
         bare = [Path(self.files[name]) for name in self.unlabelled]
         told = [f"of {len(self.files)} scenes {len(bare)} without labels left out: {listed_names(bare)}"]
         lone = [f"label files without a scene, {len(self.alone)}: {listed_names(self.alone)}"]
@@ -219,7 +219,7 @@ def _match_by_settings(folder: Path, settings: SceneSettings) -> MatchedFiles:
     told: dict[Path, Path] = {}
     for entry in entries:
         if "{number}" in str(settings.labels) and scene_number(entry) is None:
-            continue  # whoever reads the scene is told
+            continue  # reading the scene reports it
         address = label_file(entry, settings)[0]
         if address is not None:
             told[entry] = address

@@ -79,7 +79,7 @@ class EnviCube:
     path: Path
     header: EnviHeader
     values: NDArray[Any]
-    lost_lines: int  # that the header promises and the file does not hold whole
+    lost_lines: int  # that the header states and the file does not hold whole
     notes: tuple[str, ...]
 
 
@@ -115,7 +115,7 @@ def open_envi_cube(path: str | Path) -> EnviCube:
     strides = {
         "bil": (bands * samples * item, item, samples * item),
         "bip": (samples * bands * item, bands * item, item),
-        "bsq": (samples * item, item, promised * samples * item if bands > 1 else item),  # lines may be any promise
+        "bsq": (samples * item, item, promised * samples * item if bands > 1 else item),  # lines may be any number
     }[header.interleave]
     content = np.memmap(data_path, np.uint8, mode="r")
     values: NDArray[Any] = np.ndarray((held, samples, bands), header.dtype, content, header.offset, strides)

@@ -50,7 +50,7 @@ class MatchedFiles:
 
 
 def scene_entries(folder: Path) -> list[Path]:
-    """Files and Zarr stores that may be scenes or labels, by name; hidden ones are nobody's."""
+    """Files and Zarr stores that may be scenes or labels, by name; hidden ones are left out."""
     return sorted(
         entry
         for entry in folder.iterdir()
@@ -60,7 +60,7 @@ def scene_entries(folder: Path) -> list[Path]:
 
 
 def image_folder(folder: Path) -> Path:
-    """Where the images of a folder lie: in a folder ``images`` in it, where there is one, or in itself."""
+    """Return where the images of a folder lie: in a folder ``images`` in it, where there is one, or in itself."""
     inner = sorted(entry for entry in folder.iterdir() if is_image_folder(entry) and entry.is_dir())
     return next((entry for entry in inner if entry.name == "images"), inner[0] if inner else folder)
 
@@ -106,13 +106,13 @@ def find_label(scene: Path) -> Path | None:
 
 
 def is_label_name(path: Path) -> bool:
-    """Whether a file's name says that it holds labels: ``001_mask.png``, ``labels.png``."""
+    """Return whether a file's name says that it holds labels: ``001_mask.png``, ``labels.png``."""
     stem = path.stem.lower()
     return stem in LABEL_WORDS or _LABEL_WORD.search(stem) is not None
 
 
 def folders_within(folder: Path) -> str:
-    """Words for the folders of a folder in which images lie, for whoever looks for some; nothing where none does."""
+    """Return words for the folders of a folder in which images lie; empty where none does."""
     inner = [entry for entry in sorted(folder.iterdir()) if entry.is_dir() and not is_store(entry)]
     found = [entry for entry in inner if not entry.name.startswith(".") and scene_entries(image_folder(entry))]
     return f"; there are some in its folders {listed_names(found)}: name one" if found else ""
@@ -126,7 +126,7 @@ def listed_names(paths: Iterable[Path]) -> str:
 
 
 def is_store(entry: Path) -> bool:
-    """Whether a folder is one scene: a Zarr store."""
+    """Return whether a folder is one scene: a Zarr store."""
     return entry.suffix.lower() == ".zarr" and entry.is_dir()
 
 

@@ -31,7 +31,7 @@ MIXED = (
     "JPEG, soft edges and scaling mix values; save the labels again as PNG, with hard edges and by nearest neighbour,"
     " or is this the picture itself?"
 )
-_MANY_UNKNOWN = 16  # values that are no class: nobody forgot so many
+_MANY_UNKNOWN = 16  # values that are no class: too many to be forgotten ones
 
 # Eight colours that stay apart for most kinds of colour blindness (Okabe and Ito, 2008), in an order for maps.
 _EIGHT_COLOURS = (
@@ -230,7 +230,7 @@ def colour_of(code: int) -> Colour:
 def found_codes(codes: NDArray[np.int64], none: int | None, is_colour: bool, where: str) -> dict[str, ClassValue]:
     """One class for each value in the file, ascending: ``class_N`` after a number, ``colour_RRGGBB`` after a colour.
 
-    A name follows from the value alone: a file without some of the classes names the others as before.
+    A name follows from the value alone: a file without some of the classes names the others alike.
     """
     found = [int(code) for code in np.unique(codes) if code != none and code >= 0]
     if len(found) > MOST_FOUND_CLASSES:

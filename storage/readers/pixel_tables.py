@@ -20,7 +20,7 @@ from storage.readers.array_cubes import FileArray
 MOST_UNEVEN = 16  # times that a picture is longer than wide
 SIZES = (("nrow", "ncol"), ("nrows", "ncols"), ("rows", "cols"), ("height", "width"), ("lines", "samples"), ("h", "w"))
 CLEARLY = 0.8  # times as rough: an order of pixels that gives a picture so much smoother is the right one
-SMOOTHED_BANDS = 8  # by which the order of pixels is told
+SMOOTHED_BANDS = 8  # from which the order of pixels is found
 ORDERS: Mapping[Literal["C", "F"], str] = {
     "F": "down its columns as MATLAB counts pixels",
     "C": "along its rows as numpy counts pixels",
@@ -28,19 +28,13 @@ ORDERS: Mapping[Literal["C", "F"], str] = {
 
 
 def check_picture(shape: tuple[int, ...], where: object) -> None:
-    """Question a table of numbers that is given for a scene of one band (SceneError)."""
-    if max(shape) >= MOST_UNEVEN * min(shape) and max(shape) >= 1000:
-        raise SceneError(
-            f"{where} is a table of {shape[0]} x {shape[1]} numbers, expected a picture (y, x) or a cube (y, x, band)."
-            f" {_reshaping(shape)}"
-        )
-
-
-def _reshaping(shape: tuple[int, ...]) -> str:
-    """Say how a table of spectra becomes a cube, in either order of its pixels."""
+    """Question a table of numbers that is given for a scene of one band, and say how it becomes a cube (SceneError)."""
+    if max(shape) < max(MOST_UNEVEN * min(shape), 1000):
+        return
     bands, turned = min(shape), ".T" if shape[0] < shape[1] else ""
-    return (
-        f"If its {'columns' if turned else 'rows'} are spectra, store variables nRow and nCol beside it, or a cube: "
+    raise SceneError(
+        f"{where} is a table of {shape[0]} x {shape[1]} numbers, expected a picture (y, x) or a cube (y, x, band)."
+        f" If its {'columns' if turned else 'rows'} are spectra, store variables nRow and nCol beside it, or a cube: "
         f"numpy.reshape(values{turned}, (height, width, {bands}), order='F') where pixels follow each other down the "
         "columns of the picture, as in MATLAB, and order='C' where along its rows. Look at one band: in the wrong "
         "order it is scrambled, or mirrored at its diagonal where height and width are alike"

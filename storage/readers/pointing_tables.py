@@ -1,4 +1,4 @@
-"""Where recorded lines looked, out of files: a table with a row a line, or a vector that the mirror played.
+"""Pointing of recorded lines, out of files: a table with a row a line, or a vector that the mirror played.
 
 A table is CSV (commas, semicolons or tabs) or Parquet. Its columns are, beside ``line`` (from 0), ``sweep``, ``time``
 (of mid exposure, since the sweep's start) [s], ``exposure_ms`` and ``valid`` (0 or 1), exactly one of these kinds:
@@ -62,7 +62,7 @@ LARGEST_TABLE = 1 << 28  # bytes; a row has about 60
 
 @dataclass(frozen=True)
 class LinePointing:
-    """Where the lines of one sweep looked; ``position`` of lines that are not valid may be made up."""
+    """Mirror positions or places of the lines of one sweep; ``position`` of lines that are not valid may be made up."""
 
     kind: Kind
     position: Floats  # (line, 2) mirror X and Y of the model, or (line, 1) place along a scan without a mirror

@@ -120,7 +120,7 @@ def read_polygons(source: str) -> PolygonLayer:
 
 
 def polygons_of(shape: BaseGeometry) -> BaseGeometry:
-    """What of a geometry has an area, as one polygon or several; lines and points that mending left are dropped."""
+    """Return the parts of a geometry that have an area, as one polygon or several; lines and points are dropped."""
     parts = [one for one in shapely.get_parts(shape) if one.geom_type in POLYGONS]
     inner = [polygons_of(one) for one in shapely.get_parts(shape) if one.geom_type == "GeometryCollection"]
     return shapely.union_all([*parts, *inner]) if len(parts) + len(inner) != 1 else (parts + inner)[0]
@@ -143,7 +143,7 @@ def _layer_of(path: Path, layer: str | None) -> str | None:
 
 
 def _names(content: PolygonLayer, named_by: str | None, source: str) -> list[str]:
-    """What each polygon is called."""
+    """Return what each polygon is called."""
     numbers = [str(row + 1) for row in content.rows]
     by_word = {name.lower(): name for name in reversed(content.fields)}
     if named_by is not None and named_by not in content.fields:

@@ -37,7 +37,7 @@ class RecordedFile:
 
     @property
     def folder(self) -> Path:
-        """Where its companions lie."""
+        """Return where its companions lie."""
         return self.path if self.path.is_dir() and find_zarr_store(self.path) is None else self.path.parent
 
 

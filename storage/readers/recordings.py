@@ -111,7 +111,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class RecordedWith:
-    """What a user says of the files of a recording; None is looked for beside them, or assumed with a note."""
+    """Statements of the user on the files of a recording; None is looked for beside them, or assumed with a note."""
 
     pointing: Path | None = None  # a table or vector, or a folder with one for each cube
     dark: Path | None = None
@@ -387,7 +387,7 @@ def find_raw_cubes(address: str | Path) -> list[Path] | None:
 
 
 def _is_raw_cube(path: Path) -> bool:
-    """Whether a folder is a store that a survey wrote its lines into; other stores are judged by who reads them."""
+    """Return whether a folder is a store of a survey's lines; other stores are left to their readers."""
     if not (path / "zarr.json").is_file():
         return False
     try:

@@ -1,4 +1,4 @@
-"""What files of images and labels show of themselves, looked at before anybody has written a scene.toml for them."""
+"""Drafts of scenes: what files of images and labels show, for a scene.toml that is still to be written."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class FoundClass:
 
 @dataclass(frozen=True)
 class SceneDraft:
-    """What was seen of the scenes that one scene.toml speaks for."""
+    """Findings on the scenes that one scene.toml describes."""
 
     folder: Path  # of scene.toml
     files: MatchedFiles
@@ -62,6 +62,7 @@ class SceneDraft:
     nodata: float | None  # as the file itself says
     dtype: np.dtype[Any]  # of its values, once the file's own scale was applied
     edge: tuple[float, float] | None  # value that fills the edge, and its fraction of it
+    placed: bool  # whether the file says where its pixels lie on the earth
     missing: float  # fraction of NaN among the values looked at
     classes: tuple[FoundClass, ...] = ()
     notes: tuple[str, ...] = ()  # what readers made of the first image
@@ -112,6 +113,7 @@ def draft_scene(address: str | Path, report: Report = lambda done, name: None) -
         nodata=source.nodata,
         dtype=source.dtype,
         edge=edge,
+        placed=source.geobox is not None,
         missing=missing,
         classes=classes,
         notes=(*series, *source.notes),
@@ -161,7 +163,7 @@ def _pattern(found: MatchedFiles, folder: Path) -> str | None:
 def _classes(
     found: MatchedFiles, shape: tuple[int, int, int], unseen: list[str], report: Report
 ) -> tuple[FoundClass, ...]:
-    """All values of the label files, as classes; what cannot be read or has another size than its image is told."""
+    """All values of the label files, as classes; notes name what cannot be read or has another size than its image."""
     counts: Counter[int] = Counter()
     greys: Counter[int] = Counter()  # of files without colours, while others have some
     for number, (image, label) in enumerate(found.labels.items()):
@@ -213,7 +215,7 @@ def _polygon_classes(found: MatchedFiles, unseen: list[str], report: Report) -> 
 
 
 def _check_edge(source: CubeSource) -> tuple[tuple[float, float] | None, float]:
-    """What fills the edge of a cube, and the fraction of NaN in the rows that were read for it."""
+    """Return what fills the edge of a cube, and the fraction of NaN in the rows that were read for it."""
     height = source.shape[0]
     starts = sorted({round(at) for at in np.linspace(0, height - 1, min(_ROWS_OF_EDGE, height))})
     rows: Sequence[NDArray[np.generic]] = [source.read(start, start + 1) for start in starts]

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 ReadRows = Callable[[int, int], NDArray[np.float32]]
 USUAL_NODATA = -9999.0  # what programs write for no data, and no sensor reads
-_SAMPLED = 1 << 20  # values, evenly spread, by which the range of a scene is told
+_SAMPLED = 1 << 20  # values, evenly spread, from which the range of a scene is estimated
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +52,8 @@ class SceneFile:
     class_values: tuple[ClassValue, ...] = ()  # what each class is in the label file: a number or a colour
     class_colours: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))  # (class, 3)
     geobox: GeoBox | None = None  # where the pixels lie on the earth
-    labels_found: bool = False  # by the file's name: nobody stated them
+    pixel_m: float | None = None  # side of a pixel on the ground, as scene.toml says, of a scene without a place
+    labels_found: bool = False  # by the file's name: no setting names them
     regridded: bool = False  # labels came on another grid and were brought to the scene's
     kept: NDArray[np.float32] | None = field(default=None, repr=False)  # all values, where they were kept
 
@@ -73,17 +74,6 @@ class SceneFile:
             class_colours=found.colours,
             labels_found=by_name,
             regridded=found.regridded,
-        )
-
-    def without_labels(self, note: str) -> SceneFile:
-        """The same scene as if it had no labels; the note says why."""
-        return replace(
-            self,
-            labels=None,
-            class_names=(),
-            class_colours=self.class_colours[:0],
-            class_values=(),
-            provenance=(*self.provenance, note),
         )
 
     def with_labels(self, labels: NDArray[np.uint8], note: str) -> SceneFile:
@@ -143,103 +133,92 @@ def _open(
     file, variable = split_variable(address)
     source, settings = open_cube(address), find_scene_settings(file)
     height, width, count = source.shape
-    calibrated = source.dark is not None and source.white is not None
     chosen, bad_note = _chosen_bands(bands, settings, count, file, source.bad_bands)
     _refuse_bands_first(file, source.shape, wavelengths or settings.wavelengths_nm)
     light = settle_wavelengths(file, chosen, count, stated=wavelengths, settings=settings, known=source.bands)
-    nodata = settings.nodata if settings.nodata is not None or calibrated else source.nodata
-    assumed = nodata is None and not calibrated and source.dtype.kind in "if"
-    nodata = USUAL_NODATA if assumed else nodata
-    void = source.void
-    gap_notes: tuple[str, ...] = ()
-    if void is not None:
-        gap_notes = (f"{int(void.sum())} transparent or masked pixels have no value, and no class in a map",)
-        if void.all():
-            void, gap_notes = None, ("every pixel is transparent or masked, which is not believed",)
-
-    scaling, scale_note = "", tuple[str, ...]()
-    if (settings.scale, settings.offset) != (1.0, 0.0):
-        scaling = f"scene.toml scale {settings.scale!r} offset {settings.offset!r}"
-        scale_note = (
-            f"values are the file's times {settings.scale:g} plus {settings.offset:g}, as {settings.path} says",
-        )
-
-    def scaled(values: NDArray[np.float32]) -> NDArray[np.float32]:
-        return unpacked(values, settings.scale, settings.offset, None) if scaling else values
-
-    def gaps(first: int, last: int) -> NDArray[np.bool_] | None:
-        return None if void is None else void[first:last]
-
-    def read(first: int, last: int) -> NDArray[np.float32]:
-        """Give rows (y, x, band), NaN where the file has no value."""
-        _, values, _ = _converted(scene_lines(source, first, last), chosen, nodata, gaps(first, last))
-        values[np.isinf(values)] = np.nan
-        return scaled(values)
-
+    assert light.wavelength_nm is not None
+    values = FileValues.of(source, chosen, settings)
     if keep:
         check_memory(address, 8 * height * width * count)  # as float32, and once more while the scene is made
-    counted = ValueCount(file, chosen, nodata, (height, width))
-    values = np.empty((height, width, len(chosen)), np.float32) if keep else None
+    kept = np.empty((height, width, len(chosen)), np.float32) if keep else None
+    counted = ValueCount(file, values)
     for first in range(0, height, BLOCK_LINES):
-        last = min(first + BLOCK_LINES, height)
-        taken = counted.take(scene_lines(source, first, last), gaps(first, last))
-        if values is not None:
-            values[first:last] = scaled(taken)
-    missing_notes = counted.notes(assumed=assumed)
+        taken = counted.take(first, min(first + BLOCK_LINES, height))
+        if kept is not None:
+            kept[first : first + len(taken)] = values.scaled(taken)
+    missing_notes = counted.notes()
     found, label_note, by_name = _labels_of(
         file, source.shape[:2], source.geobox, labels, settings, classes, labels_needed
     )
-    assert light.wavelength_nm is not None
-    stated = nodata if assumed and counted.void else settings.nodata
     content = _content_hash(file, source.files)
-    light_hash = _light_hash(content, variable, source, chosen, light, stated, void, scaling)
     some = () if chosen == list(range(count)) else (f"bands {bands_text(chosen)} of {count}, counted from 0",)
-    over = ("values are over the white reference",) if calibrated else ()
+    how, gaps = values.notes(settings.path)
     scene = SceneFile(
         name=file.stem,
         path=file,
         wavelength_nm=light.wavelength_nm,
         fwhm_nm=light.fwhm_nm,
         shape=(height, width),
-        read=read,
+        read=values.read,
         missing=counted.missing,
         filled_px=counted.filled_px,
-        light_hash=light_hash,
+        light_hash=_light_hash(content, variable, values, light, used=counted.void > 0, stated=settings.nodata),
         content=(content if variable is None else _digest(content, variable),),
-        provenance=(
-            *some,
-            *bad_note,
-            *source.notes,
-            *over,
-            *scale_note,
-            light.origin,
-            *gap_notes,
-            *missing_notes,
-            *label_note,
-        ),
+        provenance=(*some, *bad_note, *source.notes, *how, light.origin, *gaps, *missing_notes, *label_note),
         geobox=source.geobox,
-        kept=values,
+        pixel_m=None if source.geobox is not None else settings.pixel_m,
+        kept=kept,
     )
     return scene.labelled(found, by_name=by_name)
 
 
+def _stated_scaling(scale: float, offset: float) -> str:
+    """Return what scene.toml does to the numbers, for hashes; empty where it does nothing."""
+    return "" if (scale, offset) == (1.0, 0.0) else f"{SETTINGS_NAME} scale {scale!r} offset {offset!r}"
+
+
+def with_stated_values(source: CubeSource, address: str | Path) -> CubeSource:
+    """Return a cube whose numbers are what the ``scene.toml`` beside it says: no data, scale and offset.
+
+    Scaled numbers are float32, NaN where there is no data, as a survey of the file has them. Raises SceneError: a scale
+    is stated for numbers that have dark or white frames.
+    """
+    settings = find_scene_settings(split_variable(address)[0])
+    scaling = _stated_scaling(settings.scale, settings.offset)
+    stated = () if settings.nodata is None else (f"{SETTINGS_NAME} nodata {settings.nodata!r}",)
+    nodata = source.nodata if settings.nodata is None else settings.nodata
+    source = replace(source, nodata=nodata, scaling=" ".join(filter(None, (source.scaling, *stated, scaling))))
+    if not scaling:
+        return source
+    if source.dark is not None or source.white is not None:
+        raise SceneError(
+            f"{settings.path} has a scale or offset, and {address} dark or white frames: a camera's own numbers are "
+            "stored as they are; take scale and offset out of it, and state them where values are made of the numbers"
+        )
+    note = f"values are the file's times {settings.scale:g} plus {settings.offset:g}, as {SETTINGS_NAME} says"
+    nodata, plain = USUAL_NODATA if nodata is None and source.dtype.kind in "if" else nodata, source.read
+
+    def read(start: int, stop: int) -> NDArray[np.float32]:
+        """Give some lines (line, sample, band), NaN where the file has no value."""
+        return unpacked(plain(start, stop), settings.scale, settings.offset, nodata)
+
+    return replace(source, read=read, dtype=np.dtype(np.float32), nodata=None, notes=(*source.notes, note))
+
+
 def _light_hash(
-    content: str,
-    variable: str | None,
-    source: CubeSource,
-    chosen: list[int],
-    light: Bands,
-    nodata: float | None,
-    void: NDArray[np.bool_] | None,
-    scaling: str,
+    content: str, variable: str | None, values: FileValues, light: Bands, *, used: bool, stated: float | None
 ) -> str:
-    """Return the hash of values and wavelengths: of the files, and of all that says what their numbers mean."""
+    """Return the hash of values and wavelengths: of the files, and of all that says what their numbers mean.
+
+    An assumed no-data value counts where it is ``used``, else the ``stated`` one.
+    """
     assert light.wavelength_nm is not None
     widths = None if light.fwhm_nm is None else light.fwhm_nm.tolist()
-    stated: tuple[str, ...] = () if nodata is None else (f"nodata {nodata!r}",)
-    stated += () if void is None else (f"void {hashlib.sha256(np.packbits(void).tobytes()).hexdigest()}",)
-    stated += tuple(one for one in (source.scaling, scaling) if one)
-    return _digest(content, variable, chosen, light.wavelength_nm.tolist(), widths, *stated)
+    nodata, void = values.nodata if values.assumed and used else stated, values.void
+    said: tuple[str, ...] = () if nodata is None else (f"nodata {nodata!r}",)
+    said += () if void is None else (f"void {hashlib.sha256(np.packbits(void).tobytes()).hexdigest()}",)
+    said += tuple(one for one in (values.source.scaling, values.scaling) if one)
+    return _digest(content, variable, values.bands, light.wavelength_nm.tolist(), widths, *said)
 
 
 def _refuse_bands_first(path: Path, shape: tuple[int, ...], wavelengths: Sequence[float] | None) -> None:
@@ -253,7 +232,7 @@ def _refuse_bands_first(path: Path, shape: tuple[int, ...], wavelengths: Sequenc
 
 
 def _content_hash(file: Path, files: tuple[Path, ...]) -> str:
-    """Of all files that the numbers came from; within a folder their names count, too."""
+    """Return the hash of all files that the numbers came from; within a folder their names count, too."""
     if files == (file,):
         return file_hash(file)
     within = [file.is_dir() and entry.is_relative_to(file) for entry in files]
@@ -331,7 +310,7 @@ def load_field_labels(address: str | Path, shape: tuple[int, int]) -> tuple[Labe
 
 
 def _one_class_note(found: Labels) -> tuple[str, ...]:
-    """Question labels that are all alike: the one value may stand for what nobody has labelled."""
+    """Question labels that are all alike: the one value may mean unlabelled."""
     there = np.unique(found.index[found.index != UNLABELLED])
     if len(there) != 1:
         return ()
@@ -350,34 +329,84 @@ def _digest(*parts: object) -> str:
 # --- values -----------------------------------------------------------------------------------------------------------
 
 
-def _converted(
-    rows: NDArray[Any], chosen: Sequence[int], nodata: float | None, void: NDArray[np.bool_] | None
-) -> tuple[NDArray[Any], NDArray[np.float32], NDArray[np.bool_] | None]:
-    """Return the chosen bands in the file's numbers and as float32 with NaN, and which of them are no data."""
-    picked = rows if list(chosen) == list(range(rows.shape[2])) else rows[..., list(chosen)]
-    if void is not None:
-        picked = np.where(void[..., None], picked.dtype.type(0), picked)  # whatever lies under gaps is no value
-    with np.errstate(over="ignore"):
-        values = np.array(picked, np.float32, order="C")
-    if void is not None:
-        values[void] = np.nan
-    if nodata is None:
-        return picked, values, None
-    # Compared as numbers: -9999 in the numbers of the file would wrap to 55537 where they are uint16.
-    with np.errstate(over="ignore"):
-        empty = np.asarray(picked == nodata if np.isfinite(nodata) else np.isnan(values), np.bool_)
-    values[empty] = np.nan
-    return picked, values, empty
+@dataclass(frozen=True)
+class FileValues:
+    """The numbers of a file in the chosen bands as the values of a scene, NaN where there is none."""
+
+    source: CubeSource
+    bands: list[int]
+    nodata: float | None
+    assumed: bool  # nothing states the no-data value
+    void: NDArray[np.bool_] | None  # (y, x) transparent or masked
+    scale: float  # of scene.toml
+    offset: float
+
+    @classmethod
+    def of(cls, source: CubeSource, bands: list[int], settings: SceneSettings) -> FileValues:
+        """Take the no-data value of scene.toml, of the file, or the usual one; a mask of everything does not count."""
+        calibrated = source.dark is not None and source.white is not None
+        nodata = settings.nodata if settings.nodata is not None or calibrated else source.nodata
+        assumed = nodata is None and not calibrated and source.dtype.kind in "if"
+        void = None if source.void is None or source.void.all() else source.void
+        return cls(source, bands, USUAL_NODATA if assumed else nodata, assumed, void, settings.scale, settings.offset)
+
+    @property
+    def scaling(self) -> str:
+        """Return what scene.toml does to the numbers, for hashes."""
+        return _stated_scaling(self.scale, self.offset)
+
+    def notes(self, settings: Path | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Return sentences on what is done to the numbers, by the scene.toml ``settings``; and on gaps."""
+        how, void = list[str](), self.source.void
+        if self.source.dark is not None and self.source.white is not None:
+            how.append("values are over the white reference")
+        if self.scaling:
+            how.append(f"values are the file's times {self.scale:g} plus {self.offset:g}, as {settings} says")
+        if void is None:
+            return tuple(how), ()
+        if self.void is None:
+            return tuple(how), ("every pixel is transparent or masked: the mask is left out",)
+        return tuple(how), (f"{int(void.sum())} transparent or masked pixels have no value, and no class in a map",)
+
+    def converted(self, first: int, stop: int) -> tuple[NDArray[Any], NDArray[np.float32], NDArray[np.bool_] | None]:
+        """Return rows in the file's numbers and as float32 with NaN, (y, x, band), and which of them are no data."""
+        rows = scene_lines(self.source, first, stop)
+        picked = rows if self.bands == list(range(rows.shape[2])) else rows[..., self.bands]
+        void = None if self.void is None else self.void[first:stop]
+        if void is not None:
+            picked = np.where(void[..., None], picked.dtype.type(0), picked)  # whatever lies under gaps is no value
+        with np.errstate(over="ignore"):
+            values = np.array(picked, np.float32, order="C")
+        if void is not None:
+            values[void] = np.nan
+        if self.nodata is None:
+            return picked, values, None
+        # Compared as numbers: -9999 in the numbers of the file would wrap to 55537 where they are uint16.
+        with np.errstate(over="ignore"):
+            empty = np.asarray(picked == self.nodata if np.isfinite(self.nodata) else np.isnan(values), np.bool_)
+        values[empty] = np.nan
+        return picked, values, empty
+
+    def scaled(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return values as scene.toml scales them."""
+        return unpacked(values, self.scale, self.offset, None) if self.scaling else values
+
+    def read(self, first: int, stop: int) -> NDArray[np.float32]:
+        """Return rows (y, x, band), NaN where the file has no value."""
+        _, values, _ = self.converted(first, stop)
+        values[np.isinf(values)] = np.nan
+        return self.scaled(values)
 
 
 class ValueCount:
     """Count what is missing or no reading among the values of a file, given from the top down."""
 
-    def __init__(self, path: Path, chosen: Sequence[int], nodata: float | None, shape: tuple[int, int]) -> None:
+    def __init__(self, path: Path, values: FileValues) -> None:
+        shape, chosen = values.source.shape[:2], values.bands
         self.missing = np.zeros(shape, np.bool_)  # (y, x) pixels without a value in more than half of their bands
         self.void = 0  # samples that have the no-data value
         self.filled_px = 0  # pixels without a value in a band
-        self._path, self._chosen, self._nodata = path, list(chosen), nodata
+        self._path, self._values, self._chosen = path, values, chosen
         self._every = max(1, shape[0] * shape[1] * len(chosen) // _SAMPLED)
         self._seen = np.zeros(len(chosen), np.bool_)  # bands with a value somewhere
         self._infinite = self._absent = self._size = self._row = self._beyond = 0
@@ -385,9 +414,9 @@ class ValueCount:
         self._first_infinite = ""
         self._lit: list[NDArray[np.float32]] = []
 
-    def take(self, rows: NDArray[Any], void: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
-        """Count the next (y, x, band) rows of the file, and return what `as_values` does."""
-        picked, values, empty = _converted(rows, self._chosen, self._nodata, void)
+    def take(self, first: int, stop: int) -> NDArray[np.float32]:
+        """Count the next rows of the file, and return their values (y, x, band), not scaled."""
+        picked, values, empty = self._values.converted(first, stop)
         if (out_of_range := beyond_range(picked)) is not None and empty is not None:
             picked = np.where(empty, picked.dtype.type(0), picked)
         self.void += 0 if empty is None else int(np.count_nonzero(empty))
@@ -419,12 +448,12 @@ class ValueCount:
                 y, x, band = found.place
                 self._first_beyond = Beyond(found.count, (self._row + y, x, band), found.value)
 
-    def notes(self, *, assumed: bool = False) -> tuple[str, ...]:
-        """Return a sentence for each thing that is missing, once all rows were taken; the no-data value is ``assumed``.
+    def notes(self) -> tuple[str, ...]:
+        """Return a sentence for each thing that is missing, once all rows were taken.
 
         Raises SceneError: a value is no reading, a band has no value anywhere, or no value is finite.
         """
-        path, first, notes = self._path, self._first_beyond, list[str]()
+        path, first, nodata, notes = self._path, self._first_beyond, self._values.nodata, list[str]()
         if first is not None:
             found = Beyond(self._beyond, first.place, first.value)
             raise SceneError(
@@ -432,11 +461,11 @@ class ValueCount:
                 f"it stands for no data, write nodata = {found.value!s} into a {SETTINGS_NAME} beside the file, else "
                 "leave the band out with --bands, or give the values in a larger unit"
             )
-        if self._nodata is not None and not assumed:
-            notes.append(f"{self.void} samples have the file's no-data value {self._nodata:g}")
+        if nodata is not None and not self._values.assumed:
+            notes.append(f"{self.void} samples have the file's no-data value {nodata:g}")
         elif self.void:
             notes.append(
-                f"{self.void} samples are {self._nodata:g}, which is taken for no data though nothing says so; where it"
+                f"{self.void} samples are {nodata:g}, which is taken for no data though nothing says so; where it"
                 f" is a reading, state another number as nodata in a {SETTINGS_NAME}"
             )
         if self._infinite:

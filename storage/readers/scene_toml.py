@@ -32,6 +32,7 @@ _EXPECTED = {
     "nodata": "a number such as -9999 or 1e30",
     "scale": "a number above 0 such as 0.0001",
     "offset": "a number such as -0.1",
+    "pixel_m": "a number of metres above 0 such as 0.05",
     "labels": _FILE,
     "unlabelled": "a whole number or a colour [r, g, b] in 0..255",
     "class_attribute": "the name of an attribute in quotes",
@@ -53,6 +54,7 @@ class SceneSettings(BaseModel):
     nodata: _Number | None = None  # the number that stands for no value
     scale: Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)] = 1.0  # values = file's * scale + offset
     offset: Annotated[float, Field(strict=True, allow_inf_nan=False)] = 0.0
+    pixel_m: Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)] | None = None  # side, on the ground
     labels: StrictStr | None = None  # beside scene.toml; may hold {number}, {name}; "": there are none
     unlabelled: _Value | None = None
     class_attribute: StrictStr | None = None  # of labels that are polygons: which attribute says the class

@@ -182,7 +182,7 @@ def write_ingested_cube(
 ) -> None:
     """Store a cube as ``cube.zarr`` and ``quicklook.png`` in a folder, 64 lines at a time.
 
-    Its attributes have its name and the files that it came from; ``report`` is told how far it is, 0..1. Raises
+    Its attributes have its name and the files that it came from; ``report`` is called with how far it is, 0..1. Raises
     SceneError: lines cannot be read.
     """
     kind = stored_dtype(source, lambda done: report(0.3 * done))

@@ -3,10 +3,10 @@
 A store's or run's manifest has the same address in the bucket; its files lie below ``<address>/<attempt>/``, the
 attempt being the beginning of the SHA-256 of the manifest that lists them: two writers never mix theirs. A store is
 published in the working copy first, then uploaded; a conditional put of its manifest, last, publishes it for everybody:
-whoever comes first wins, for ever, and others take what stands. Files are fetched when somebody asks where they lie.
+the first one wins, for ever, and others take what stands. Files are fetched when their path is asked for.
 
 What was made is kept in the working copy where the bucket stops answering, and the same command uploads it. All of the
-working copy that is in the bucket may be deleted at any time while nobody works on it.
+working copy that is in the bucket may be deleted at any time while no process works on it.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class ObjectArchive(Archive):
         return super().manifest_hashes(given)
 
     def locate(self, address: str) -> Path:
-        """Where on this machine a product lies by its address relative to the archive; fetched if need be."""
+        """Return where on this machine a product lies by its address relative to the archive; fetched if need be."""
         self._fetch(in_text(address) or "/".join(address.split("/")[:2]))
         return super().locate(address)
 
@@ -114,7 +114,7 @@ class ObjectArchive(Archive):
         """Take one store away for good, here and in the bucket; see `Archive.discard`.
 
         Its manifest goes first. With ``unnamed`` it comes back where a run that names it has been published since this
-        archive was opened; whoever publishes a run looks for its stores after that.
+        archive was opened; publishing a run looks for its stores after that.
         """
         manifest = f"{ref.uri}/{MANIFEST_NAME}"
         standing = self.objects.read(manifest)
@@ -217,7 +217,7 @@ class ObjectArchive(Archive):
         self._later_runs |= {self.root / uri for uri in changed}
 
     def _bring(self, uri: str) -> None:
-        with suppress(IncompleteStoreError):  # whoever reads it says so
+        with suppress(IncompleteStoreError):  # its reader says so
             if _is_address(uri) and self._find(uri) and uri.startswith("runs/"):
                 self._fetch_files(uri, [RECEIPT])
 
@@ -300,7 +300,7 @@ class ObjectArchive(Archive):
         self._send(uri)
 
     def _is_whole(self, uri: str) -> bool:
-        """Whether all of a store is here, by its manifest and the sizes of its files; no, where those were cleared."""
+        """Return whether all of a store is here, by its manifest and the sizes of its files; not if it was cleared."""
         manifest, problem = try_manifest(self.root / uri)
         return problem is None and not is_cleared(manifest) and not self._lacks(uri, manifest)
 
@@ -308,12 +308,12 @@ class ObjectArchive(Archive):
         return [name for name, one in manifest["files"].items() if _size(self.root / uri / name) != one["size"]]
 
     def _is_dated(self, uri: str, listed: Listed) -> bool:
-        """Whether the manifest here has size and date of an object, as one has that was brought from the bucket."""
+        """Return whether the manifest here has size and date of an object, as one brought from the bucket has."""
         path = self.root / uri / MANIFEST_NAME
         return _size(path) == listed.size and int(path.stat().st_mtime) == int(listed.changed.timestamp())
 
     def _find(self, uri: str, *, keep: bool = False) -> bool:
-        """Whether a manifest stands in the bucket, which is here then; of one that was cleared no, to ``keep`` ours.
+        """Return whether a manifest stands in the bucket, and bring it; a cleared one does not count, to ``keep`` ours.
 
         Raises IncompleteStoreError: it is damaged.
         """
@@ -412,7 +412,7 @@ class ObjectArchive(Archive):
             objects.write(f"{uri}/{MANIFEST_NAME}", text)
             objects.remove([path for path in there if ATTEMPT.fullmatch(path) and not path.startswith(f"{place}/")])
         elif not objects.create(f"{uri}/{MANIFEST_NAME}", text):
-            self._find(uri)  # whoever came first; or it was this upload, of which the answer was lost
+            self._find(uri)  # another was first; or it was this upload, of which the answer was lost
             return
         self._standing[uri] = text
         if uri.startswith("runs/") and (dated := objects.read_dated(f"{uri}/{MANIFEST_NAME}")) is not None:
@@ -439,7 +439,7 @@ class ObjectArchive(Archive):
 
 
 def _is_address(uri: str) -> bool:
-    """Whether an object's name can be an address in an archive: what a bucket lists is not trusted."""
+    """Return whether an object's name can be an address in an archive: what a bucket lists is not trusted."""
     return all(is_name(part) for part in uri.split("/"))
 
 
@@ -449,7 +449,7 @@ def _files_at(uri: str, manifest: bytes) -> str:
 
 
 def _manifests(there: Mapping[str, Listed]) -> dict[str, Listed]:
-    """What is published, by address."""
+    """Return what is published, by address."""
     depths = {"stages": 4, "runs": 3}
     named = {
         path.removesuffix(f"/{MANIFEST_NAME}"): one
@@ -479,10 +479,10 @@ def _lay_out(objects: Objects, root: Path, uri: str) -> None:
 
 
 def _problems(objects: Objects, there: Mapping[str, Listed], folder: Path, place: str) -> Iterator[str]:
-    """What is wrong with one published folder, whose files lie at ``place``, object by object."""
+    """Yield what is wrong with one published folder, whose files lie at ``place``, object by object."""
     manifest, problem = try_manifest(folder)
     if problem is not None:
-        yield f"{MANIFEST_NAME} cannot be believed: {problem}"
+        yield f"{MANIFEST_NAME} is damaged: {problem}"
         return
     broken: dict[str, str] = {}
     for name, entry in manifest["files"].items():
@@ -531,7 +531,7 @@ def open_object_archive(text: str | Path, *, create: bool = True, write: bool = 
 def _find_mark(objects: Objects, *, create: bool) -> None:
     """See that a prefix has the mark that makes it an archive; where ``create``, write it if need be.
 
-    A store that lets anybody overwrite it is refused.
+    A store that anyone may overwrite is refused.
     """
     name = objects.place.url
     if create and objects.create(MARK, MARK_TEXT):
@@ -550,7 +550,7 @@ def _find_mark(objects: Objects, *, create: bool) -> None:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RemoteRef(StageRef):
-    """A store that may not be on this machine yet: whoever asks for its path has it fetched, and waits."""
+    """A store that may not be on this machine yet: asking for its path fetches it, and waits."""
 
     fetch: Callable[[str], None]
 

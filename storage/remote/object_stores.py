@@ -77,14 +77,14 @@ class ObjectPlace:
         """Folder on this machine in which the archive is worked on; its last part is what the archive is called."""
         base = os.environ.get("SPECTRALZOOM_WORK")
         if base is None:
-            base = os.environ.get("XDG_DATA_HOME") or str(Path.home() / ".local" / "fraction")
+            base = os.environ.get("XDG_DATA_HOME") or str(Path.home() / ".local" / "share")
             base = f"{base}/spectralzoom/s3"
         mark = hashlib.sha256(f"{self.endpoint or ''} {self.url}".encode()).hexdigest()[:12]
         return Path(base).expanduser().absolute() / mark / (self.prefix.rpartition("/")[2] or self.bucket)
 
 
 def is_remote(root: str | Path) -> bool:
-    """Whether an archive's name is an address on S3, and no folder's (SettingsError: it is one of another kind)."""
+    """Return whether an archive's name is an address on S3, and no folder's (SettingsError: of another kind)."""
     found = _ADDRESS.fullmatch(str(root)) is not None
     if "://" in str(root) and not found:
         raise SettingsError(f"{str(root)!r} is no place for an archive; expected a folder, or s3://bucket/prefix")
@@ -123,7 +123,7 @@ def _endpoint() -> str | None:
     allowed = os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true", "yes")
     if parts.scheme == "http" and parts.hostname not in LOOPBACK and not allowed:
         raise SettingsError(
-            f"AWS_ENDPOINT_URL={text}: over plain http anybody on the way can read and change the data; use https, or "
+            f"AWS_ENDPOINT_URL={text}: over plain http others on the way can read and change the data; use https, or "
             "set AWS_ALLOW_HTTP=true"
         )
     return text
@@ -177,7 +177,7 @@ def _first_line(error: BaseException) -> str:
 
 @dataclass(frozen=True)
 class Listed:
-    """What a listing says of one object; ``changed`` is by the store's clock."""
+    """Size of one object, and when it ``changed`` by the store's clock."""
 
     size: int
     changed: datetime
@@ -234,7 +234,7 @@ class Objects:
         return True
 
     def write(self, name: str, source: Path | bytes) -> None:
-        """Write an object from a file, whatever was there; nobody sees a part of it."""
+        """Write an object from a file, whatever was there; readers never see a part of it."""
         with answers_of(self.place):
             self.store.put(name, source, chunk_size=PART_BYTES, max_concurrency=2)
         self._count(len(source) if isinstance(source, bytes) else source.stat().st_size)

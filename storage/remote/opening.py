@@ -22,7 +22,7 @@ def open_archive(address: str | Path, *, create: bool = True, write: bool = True
 
 
 def is_archive(address: str | Path) -> bool:
-    """Whether there is something to open: an archive, or a file that will be refused.
+    """Return whether there is something to open: an archive, or a file that will be refused.
 
     Raises UnreachableError: that cannot be told of an address on S3.
     """

@@ -2,7 +2,8 @@
 
 The comment before a block says what is other than written, `<!-- test: WORDS -->`:
 
-    with FLAGS      the flags are added to each command: smaller, and nobody waits for a server
+    with FLAGS      the flags are added to each command: smaller, and nobody waits for a server; FEW are bands of the
+                    farm that suffice for its weights
     parses          not run: every command's words are read by its own parser, every target and file is there
     bucket          s3://bucket/prefix is an archive on the S3 server of the tests
     tree FLAGS      run, in one process, with a copy of the four folders to which the page's files and changes were
@@ -34,6 +35,7 @@ from flows.cli.main import main
 from flows.settings.load import load_settings
 from storage.readers.scene_toml import load_scene_settings
 from tests.docs.pages import ROOT, Block
+from tests.flows.conftest import FEW_BANDS
 
 COMMANDS, TREE = ("sh",), ("pipeline", "models", "storage", "flows")
 SHOWN = ("text",)  # what programs print, and pictures made of letters: nothing to run
@@ -98,7 +100,8 @@ class Reader:
         assert program == "spectralzoom", f"{block.place}: only spectralzoom is run; say what is to parse"
         if word == "tree":
             return  # run together
-        given = [found for one in (*words[1:], *shlex.split(rest)) for found in self._matching(one)]
+        flags = shlex.split(rest.replace("FEW", FEW_BANDS))
+        given = [found for one in (*words[1:], *flags) for found in self._matching(one)]
         if word == "bucket":
             assert self.bucket is not None
             given = [one.replace(BUCKET, self.bucket) for one in given]

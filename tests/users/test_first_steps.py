@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import resource
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -123,7 +125,7 @@ def test_init_takes_a_land_cover_file_for_the_labels_of_all_dates(tmp_path: Path
     toml = (tmp_path / "scene.toml").read_text()
     assert 'labels = "LULC.npy"' in toml
     (tmp_path / "scene.toml").write_text("wavelengths_nm = [460, 550, 640]\n" + toml)
-    assert f"next: spectralzoom train {tmp_path} " in ended.out
+    assert f"then: spectralzoom train {tmp_path} " in ended.out
     trained = command_line("train", tmp_path, "-o", tmp_path / "w.safetensors", *SMALL)
     assert trained.code == 0, trained.err
 
@@ -135,11 +137,42 @@ def test_init_sees_the_dates_of_a_series(tmp_path: Path, command_line: Any) -> N
     ended = command_line("init", tmp_path)
     series = tmp_path / "series.npy"
     assert f"note: {series} has 5 steps of time; each is a scene, {series}:0 to {series}:4" in ended.out
-    assert f"next: spectralzoom train {series}:0 " in ended.out
+    assert f"then: spectralzoom train {series}:0 " in ended.out
     toml = (tmp_path / "scene.toml").read_text()
     (tmp_path / "scene.toml").write_text("wavelengths_nm = [460, 550, 640]\n" + toml)
     trained = command_line("train", f"{series}:0", "-o", tmp_path / "w.safetensors", *SMALL)
     assert trained.code == 0, trained.err
+
+
+@pytest.mark.parametrize("way", ["list", "file"])
+def test_init_names_the_wavelengths_that_its_next_command_needs(
+    tmp_path: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch, way: str
+) -> None:
+    """Each of the two lines that it tells to fill in makes the command that it advises run."""
+    monkeypatch.chdir(tmp_path)
+    np.save(tmp_path / "field.npy", image().astype(np.float32))
+    np.save(tmp_path / "field_labels.npy", CLASSES)
+    told = json.loads(command_line("init", ".", "--json").out)
+    toml = tmp_path / "scene.toml"
+    assert (
+        told["first"] == "write the 3 wavelengths into scene.toml: wavelengths_nm or wavelengths_file, as its lines say"
+    )
+    line = "# wavelengths_nm = []" if way == "list" else '# wavelengths_file = "bands.txt"'
+    assert line in toml.read_text()
+    toml.write_text(toml.read_text().replace(line, line.removeprefix("# ").replace("[]", "[460, 550, 640]")))
+    (tmp_path / "bands.txt").write_text("460 10\n550 10\n640 10\n")
+    trained = command_line(*shlex.split(told["next"])[1:], *SMALL)
+    assert trained.code == 0, trained.err
+
+
+def test_init_asks_nothing_before_a_command_that_runs(tmp_path: Path, command_line: Any) -> None:
+    """Pictures have the wavelengths of their colours: what comes next is the training."""
+    for number in (1, 2):
+        Image.fromarray(image().astype(np.uint8)).save(tmp_path / f"{number}.png")
+        Image.fromarray(CLASSES).save(tmp_path / f"{number}_mask.png")
+    ended = command_line("init", tmp_path)
+    assert f"next: spectralzoom train {tmp_path} " in ended.out
+    assert "first:" not in ended.out
 
 
 @pytest.mark.parametrize("there", [False, True])

@@ -187,10 +187,10 @@ def test_transparent_pixels_are_no_data_to_the_end(tmp_path: Path, weights: Path
     np.testing.assert_array_equal(np.isfinite(fine.values()), np.repeat(seen[..., None], 3, axis=2))
     assert run.receipt["pixels"]["map_without_a_class"] == gap.sum()
     geobox = GeoBox(SHAPE, NORTH_UP, "EPSG:32632")
-    ground = run.receipt["ground"]
-    assert sum(ground["areas_ha"].values()) == pytest.approx((~gap).sum() * 0.05**2 / 1e4, rel=2e-3)  # UTM's scale
+    hectares = sum(run.receipt["areas"]["ha"].values())
+    assert hectares == pytest.approx((~gap).sum() * 0.05**2 / 1e4, rel=2e-3)  # UTM's scale
     whole = np.sum(list(pixel_rows_m2(geobox)))
-    assert sum(ground["areas_ha"].values()) * 1e4 == pytest.approx(whole * (~gap).mean(), rel=1e-6)
+    assert hectares * 1e4 == pytest.approx(whole * (~gap).mean(), rel=1e-6)
     with opened(run, "attention") as attention:
         assert (attention["score"].values[:2, :3] == 0).all()  # patches of 8 px without a pixel of the scene
 
@@ -285,5 +285,5 @@ def test_a_real_scene_goes_from_file_to_export(tmp_path: Path, real_data: Path, 
         assert corners_px(file.transform, transform, shape) < 0.1
         classes = file.read(1)
     assert (classes[empty] == 255).all()
-    ground = run.receipt["ground"]
-    assert sum(ground["areas_ha"].values()) == pytest.approx((classes != 255).sum() * 25 / 1e4, rel=5e-3)
+    hectares = sum(run.receipt["areas"]["ha"].values())
+    assert hectares == pytest.approx((classes != 255).sum() * 25 / 1e4, rel=5e-3)

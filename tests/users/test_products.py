@@ -222,7 +222,7 @@ def test_a_table_of_areas_adds_up(posed: Products) -> None:
     names = [row["class"] for row in table]
     counts = np.bincount(posed.store("ground_map")["classes"].values.ravel(), minlength=256)
     assert [int(row["pixels"]) for row in table] == counts[: len(names)].tolist()
-    hectares = posed.receipt["ground"]["areas_ha"]
+    hectares = posed.receipt["areas"]["ha"]
     np.testing.assert_allclose([float(row["hectares"]) for row in table], [hectares[name] for name in names], rtol=1e-5)
     for column in ("fraction", "estimated_fraction"):
         assert sum(float(row[column]) for row in table) == pytest.approx(1, abs=1e-4)

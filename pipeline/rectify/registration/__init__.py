@@ -1,1 +1,1 @@
-"""Where sweeps really looked: shifts of overlaps, solved over all of them, and fine sweeps on the mosaic."""
+"""Registration of sweeps: shifts of overlaps, solved over all of them, and fine sweeps on the mosaic."""

@@ -1,8 +1,8 @@
 """From shifts of windows to corrections: of sweeps, by least squares over all of their overlaps, and of a whole field.
 
 How a whole field lies beside an earlier look at it, moved and turned, windows of two coarse images say. Crops grow
-between two looks, shadows go round and leaves fall: a window may say what is not so. What most windows say together is
-believed.
+between two looks, shadows go round and leaves fall: a window may say what is not so. What most windows say together
+counts.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ else:
 
 Floats = NDArray[np.float64]
 
-ERROR_FLOOR_PX = 0.05  # no window is believed better: lines jitter
+ERROR_FLOOR_PX = 0.05  # no window counts as better: lines jitter
 OUTLIER_ERRORS = 2.0  # beyond it a window pulls no harder
 WRONG_ERRORS = 10.0  # beyond it a window is left out
 DRIFT_PRIOR_PX = 10.0  # over half a sweep; decides where one window alone would have to tell drift from offset
@@ -40,7 +40,7 @@ WINDOWS = 3  # along either side of a field
 LEAST_WINDOW_PX = 24  # on a side; a smaller field is compared as one
 WINDOW_REACH_PX = 8.0  # what the shift of one window may differ by from that of the field
 AGREE_PX, LOOSELY_PX = 0.5, 1.5  # within which windows say the same, and do so loosely
-LOOSE_SHIFT_PX, LOOSE_EDGE_PX = 2.0, 3.0  # that what they say loosely is believed from: growth looks like less
+LOOSE_SHIFT_PX, LOOSE_EDGE_PX = 2.0, 3.0  # from which on their loose estimates count: growth looks like less
 TRIED_DEG = (-8.0, 8.0, -16.0, 16.0)  # by which a field may be turned of which windows say nothing as it lies
 LEAST_WINDOWS, LEAST_FRACTION = 4, 0.6  # that have to agree, and of those that say something
 TRIALS = 200
@@ -48,7 +48,7 @@ TRIALS = 200
 
 @dataclass(frozen=True)
 class SweepShift:
-    """Where a sweep's line centres lie beside the reported ones, in scene px along the line and the scan."""
+    """Shift of a sweep's line centres against the reported ones, in scene px along the line and the scan."""
 
     name: str
     offset: Floats  # (2,) at the middle of the sweep [px]
@@ -65,7 +65,7 @@ class SweepShift:
 
 @dataclass(frozen=True)
 class WindowShift:
-    """How far the moving sweep of a pair looks beside the reference sweep, seen in one window of their overlap.
+    """Shift of the moving sweep of a pair against the reference sweep, seen in one window of their overlap.
 
     A shift of the line centre by d moves the place that the window's sample sees by ``turn @ d``: nearly the same, but
     the line turns with its centre, which at its end is 1.7 px for 50.
@@ -174,20 +174,20 @@ def _robust(system: Floats, measured: Floats, error: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class FieldShift:
-    """What brings an earlier image onto a later one: ``shift`` rows and columns [px], then ``turned_deg`` about it."""
+    """Motion of an earlier image onto a later one: ``shift`` rows and columns [px], then ``turned_deg`` about it."""
 
     shift: tuple[float, float] = (0.0, 0.0)
     turned_deg: float = 0.0
 
     def edge_px(self, shape: tuple[int, ...]) -> float:
-        """How far the corners of a field of (y, x) ``shape`` move by the turn alone."""
+        """Return how far the corners of a field of (y, x) ``shape`` move by the turn alone."""
         return math.radians(abs(self.turned_deg)) * math.hypot(*shape[:2]) / 2
 
 
 def field_shift(now: NDArray[np.floating], before: NDArray[np.floating], *, reach_px: float) -> FieldShift:
     """Find how ``before`` lies beside ``now``, two (y, x) broad-band images of one field with NaN where nothing is.
 
-    No more than ``reach_px`` is looked for. Nothing is said where no two looks agree on it: fields that changed all
+    Offsets up to ``reach_px`` are looked for. Nothing is said where no two looks agree on it: fields that changed all
     over, or that show nothing.
     """
     whole = pair_shift(now, before, prior_px=reach_px)
@@ -214,7 +214,7 @@ Pairs = list[tuple[NDArray[np.float64], NDArray[np.float64]]]  # middle of a win
 
 
 def _of_windows(now: NDArray[np.floating], before: NDArray[np.floating]) -> Pairs:
-    """What windows say that say anything."""
+    """Return what windows say that say anything."""
     edges = [np.linspace(0, size, WINDOWS + 1).astype(int).tolist() for size in now.shape]
     pairs: Pairs = []
     for (top, bottom), (left, right) in product(pairwise(edges[0]), pairwise(edges[1])):
@@ -228,7 +228,7 @@ def _of_windows(now: NDArray[np.floating], before: NDArray[np.floating]) -> Pair
 def _agreed(
     pairs: Pairs, start: NDArray[np.float64], shape: tuple[int, ...], within_px: float
 ) -> tuple[int, FieldShift]:
-    """How many windows agree, and on what; 0 and nothing where too few do."""
+    """Return how many windows agree, and on what; 0 and nothing where too few do."""
     if len(pairs) < LEAST_WINDOWS:
         return 0, FieldShift()
     middle = np.array(shape[:2]) / 2

@@ -26,7 +26,7 @@ LEAST_GROUPS = 5
 
 @dataclass(frozen=True)
 class LightRatio:
-    """How much brighter one sweep was than another where both saw the same ground."""
+    """Brightness of one sweep over that of another where both saw the same ground."""
 
     reference: int  # number of the sweep
     moving: int
@@ -79,7 +79,7 @@ def solve_lights(ratios: Sequence[LightRatio], sweeps: int, wavelength_nm: Float
     known = [ratio for ratio in ratios if np.isfinite(ratio.log_ratio).any()]
     low, high = float(np.min(wavelength_nm)), float(np.max(wavelength_nm))
     span = (2 * np.asarray(wavelength_nm, np.float64) - low - high) / max(high - low, 1e-9)
-    most = len(np.unique(wavelength_nm)) - 1  # no more polynomials than there are bands
+    most = len(np.unique(wavelength_nm)) - 1  # at most as many polynomials as bands
     basis = np.polynomial.legendre.legvander(span, min(ORDER, most)).astype(np.float64)
     answer = np.zeros((sweeps, basis.shape[1]))
     if known:

@@ -44,7 +44,7 @@ class BroadSweep:
     ) -> BroadSweep:
         """Read and calibrate a sweep's lines, 64 at a time, keeping the mean of ``bands`` bands spread over all.
 
-        ``usable`` (line,) are lines whose position may be believed; None takes ``lines.valid_line``.
+        ``usable`` (line,) are lines with a trusted position; None takes ``lines.valid_line``.
         """
         position = np.asarray(lines.position, np.float64)
         usable = (lines.valid_line if usable is None else usable) & np.isfinite(position).all(axis=1)
@@ -116,7 +116,7 @@ class PlacedImage:
 
     @cached_property
     def turn_at_middle(self) -> Floats:
-        """How the place that the middle sample of the middle usable line sees moves with the line's centre, (2, 2)."""
+        """Return how the place seen by the middle sample of the middle line moves with the line's centre, (2, 2)."""
         usable = np.flatnonzero(self.broad.usable)
         return self._turn(int(usable[len(usable) // 2]), (self.broad.image.shape[1] - 1) / 2)
 

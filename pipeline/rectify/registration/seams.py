@@ -144,7 +144,7 @@ def measure_windows(
 
 
 def _measured(window: Window, found: PairShift, images: Sequence[PlacedImage]) -> WindowShift | None:
-    """What a window says of its two sweeps, in scene px; None unless something was found."""
+    """Return what a window says of its two sweeps, in scene px; None unless something was found."""
     if found.status != "found":
         return None
     middle = [(low + high) / 2 for low, high in (window.along_px, window.scan_px)]

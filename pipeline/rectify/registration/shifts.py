@@ -40,7 +40,7 @@ TINY = 1e-30
 
 @dataclass(frozen=True)
 class PairShift:
-    """What two images of an overlap say about the shift between them; the figures are NaN where nothing was compared.
+    """Shift between two images of an overlap; the figures are NaN where nothing was compared.
 
     ``found`` is the only status with a shift. ``undecidable``: another shift explains the overlap as well within the
     noise (periodic texture), one direction has no structure (an edge, plain rows), or the best shift is beyond the
@@ -135,7 +135,7 @@ def _standardised(image: NDArray[np.floating]) -> Floats | None:
 
 
 def _is_textured(image: Floats) -> bool:
-    """Whether near pixels are alike, or opposite; white noise is not texture, for a footprint is wider than a pixel."""
+    """Tell whether near pixels are alike, or opposite; white noise is no texture: a footprint is wider than a pixel."""
     for lag in (1, 2):
         for one, other in ((image[lag:], image[:-lag]), (image[:, lag:], image[:, :-lag])):
             both = np.isfinite(one) & np.isfinite(other)

@@ -38,7 +38,7 @@ _SAMPLES = 16  # looked at together
 
 @dataclass(frozen=True)
 class CubeHeader:
-    """What a header says of 16-bit lines, band after band within each."""
+    """Sizes and layout of 16-bit lines, band after band within each, by a header."""
 
     samples: int
     lines: int
@@ -54,7 +54,7 @@ class CubeHeader:
 
 @dataclass(frozen=True)
 class CubeLines:
-    """Lines of one file. ``lost`` are those that its header promises and it does not hold whole."""
+    """Lines of one file. ``lost`` are those that its header states and it does not hold whole."""
 
     values: NDArray[np.uint16]  # (line, sample, band), a view of the bytes
     lost: int
@@ -110,7 +110,7 @@ def cube_lines(header: CubeHeader, data: bytes) -> CubeLines:
 def read_capture(names: Iterable[str], read: Read) -> CapturedLines:
     """Put a capture's files together, by their names in the folder, which may stand before them.
 
-    RigError where there is no line, a header is missing, wrong or promises less, or the files do not belong together.
+    RigError where there is no line, a header is missing, wrong or states less, or the files do not belong together.
     """
     by_name = {name.rsplit("/", 1)[-1]: name for name in names}
     raw = sorted((int(match[1]), name) for name in by_name if (match := _PART.fullmatch(name)))
@@ -201,7 +201,7 @@ def _placed(parts: list[tuple[int, CubeLines]], notes: list[str]) -> list[tuple[
 
 
 def _times(by_name: Mapping[str, str], first: int, cube: CubeLines, read: Read, notes: list[str]) -> LineTimes | None:
-    """What the part's index says of its lines; None where there is none that can be read."""
+    """Return what the part's index says of its lines; None where there is none that can be read."""
     name = next((name for name in by_name if (match := FRAME_INDEX.fullmatch(name)) and int(match[1]) == first), None)
     if name is None:
         notes.append(f"there is no frame index for raw_{first}")

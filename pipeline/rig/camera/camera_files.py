@@ -26,7 +26,7 @@ _SIZE = re.compile(r"213 +(\d{1,18})\s*")
 
 
 class DamagedTransfer(RigError):  # noqa: N818 - the name says what is the case
-    """What came is no FTP or not the file, as it is where bytes are lost, doubled or put in between: asked again."""
+    """A transfer is no FTP or not the file, as it is where bytes are lost, doubled or put in between: asked again."""
 
 
 class FileSession(ftplib.FTP):
@@ -63,8 +63,8 @@ class FileSession(ftplib.FTP):
     def pieces(self, name: str, start: int, size: int) -> Generator[bytes]:
         """Give the bytes of a file from ``start`` on, to its end.
 
-        DamagedTransfer where the file goes on after ``size`` bytes, or ends before them; DeadlinePassed where less than
-        ``least_kb_s`` came.
+        DamagedTransfer where the file continues after ``size`` bytes, or ends before them; DeadlinePassed where less
+        than ``least_kb_s`` came.
         """
         reached = start
         with self.transfercmd(f"RETR {name}", start or None) as connection:
@@ -126,7 +126,7 @@ class FileSession(ftplib.FTP):
 
     @property
     def heard(self) -> str:
-        """What came of the reply that was waited for last."""
+        """Return what came of the reply that was waited for last."""
         return f"{MOST_REPLY - self._most} bytes of a reply came" if self._most < MOST_REPLY else "nothing came"
 
     def _too_slow(self, name: str, gained: int) -> str:
@@ -141,7 +141,7 @@ class FileSession(ftplib.FTP):
 
 @contextmanager
 def open_session(server: FileServer) -> Iterator[FileSession]:
-    """A session that is logged in; what goes wrong inside is told in our words.
+    """A session that is logged in; its errors are raised as RigError.
 
     DeviceRefused where the server says no, DamagedTransfer where it speaks no FTP, DeadlinePassed or DeviceGone where
     it is not there.
@@ -208,7 +208,7 @@ def check_remote_name(name: str) -> None:
 
 
 class Kept(Protocol):
-    """Where fetched bytes go: files named as on the camera, of which a part may be there already."""
+    """Store of fetched bytes: files named as on the camera, of which a part may be there already."""
 
     def size(self, name: str) -> int:
         """Bytes held of a file; 0 of one that is not there."""
@@ -253,7 +253,7 @@ def fetch_files(
     """Fetch files one after the other until ``kept`` holds them whole.
 
     What is held from an earlier call is compared before anything is added to it. A transfer that breaks off is taken
-    up again; what has come stays in ``kept`` however this ends, unless it is damaged, and a later call goes on there.
+    up again; what has come stays in ``kept`` however this ends, unless it is damaged, and a later call continues there.
 
     Raises RigError where a file is not the one of which a part is held, is larger than it can be, or comes damaged each
     time; DeviceRefused where the server does not give it, or takes another password; DeadlinePassed or DeviceGone where

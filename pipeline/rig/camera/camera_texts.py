@@ -1,7 +1,7 @@
 """Texts that cameras write beside their numbers: ENVI headers taken apart into fields, and frame indices.
 
 A header is ``key = value`` lines after the word ENVI; values in braces may run over lines and be nested. Headwall adds
-lines that begin with ``;``, some of which hold settings of their own. What a header must say is for whoever reads it:
+lines that begin with ``;``, some of which hold settings of their own. Each reader checks what its header must say:
 files from anywhere (``storage.readers.envi_files``), or a camera's own (``camera_cubes``).
 
 ``frameIndex_<n>.txt`` lies beside ``raw_<n>``: a heading, then a line a frame with its number and its time in
@@ -170,7 +170,7 @@ class FrameIndex:
 
 @dataclass(frozen=True)
 class LineTimes:
-    """What an index says of the lines of one file; -1 or NaN where it says nothing."""
+    """Times of the lines of one file by its index; -1 or NaN where it says nothing."""
 
     frame: NDArray[np.int64]  # (line,)
     stamp_us: NDArray[np.int64]  # (line,)
@@ -260,7 +260,7 @@ def _rows(lines: Iterable[str]) -> _Rows:
 
 
 def _exposure_column(heading: str) -> tuple[int | None, float]:
-    """Which column holds exposures, and what one of its units is in ms; they are ms where nothing is said."""
+    """Return which column holds exposures, and what one of its units is in ms; they are ms where nothing is said."""
     titles = [word for word in _BETWEEN_COLUMNS.split(heading) if word]
     if len(titles) < 2:
         titles = heading.split()

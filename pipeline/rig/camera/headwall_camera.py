@@ -80,7 +80,7 @@ class HeadwallCamera:
         self.patience = ControlPatience() if patience is None else patience
         self.limits = CameraLimits() if limits is None else limits
         self.clock = clock
-        self.unknown = ""  # why nobody knows whether a capture runs; empty where it is known
+        self.unknown = ""  # why it is unknown whether a capture runs; empty where it is known
         self._connect = connect
         self._line: Transport | None = None
         self._reader = ReplyReader()
@@ -175,7 +175,7 @@ class HeadwallCamera:
         return {kind: mean_frame(cube.values) for kind, cube in cubes.items()}
 
     def close(self) -> None:
-        """Say exit and hang up. A capture goes on; nothing is raised."""
+        """Say exit and hang up. A capture continues; nothing is raised."""
         with self._lock:
             if self._line is not None:
                 try:

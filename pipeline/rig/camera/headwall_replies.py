@@ -37,7 +37,7 @@ TIMES_ALIKE = 0.01  # of a time: cameras round them to what their clock gives
 
 @dataclass(frozen=True)
 class Said:
-    """What came before one prompt: the command it repeats, if any, and the reply, if it is one."""
+    """Text before one prompt: the command it repeats, if any, and the reply, if it is one."""
 
     echo: str
     reply: dict[str, Any] | None
@@ -93,7 +93,7 @@ class ReplyReader:
         return said
 
     def _prompt_at(self) -> int:
-        """Where the first prompt is: at a line's start, or right behind a reply (a text in a reply may hold one)."""
+        """Return the place of the first prompt: at a line's start, or right behind a reply (a reply may hold one)."""
         while (at := self._held.find(PROMPT, self._searched)) >= 0:
             if at == 0 or self._held[at - 1] in b"\r\n":
                 return at
@@ -177,7 +177,7 @@ def check_times_set(response: Any, asked_ms: Mapping[str, float]) -> None:
 
 
 def as_truth(response: Any) -> bool:
-    """Whether it captures; MisfitError where this answers another command."""
+    """Return whether it captures; MisfitError where this answers another command."""
     value = response.get("capturing") if isinstance(response, dict) else response
     if not isinstance(value, bool):
         raise MisfitError("a reply that is neither true nor false")

@@ -38,7 +38,7 @@ _WINDOW = 7  # neighbours that say whether a stamp strayed: up to three strays i
 
 @dataclass(frozen=True)
 class FrameTimes:
-    """What the camera says of its lines; -1 where it says nothing. Lines are in the order in which they were taken."""
+    """Frame times by the camera; -1 where it says nothing. Lines are in the order in which they were taken."""
 
     number: Ints  # (line,) frame numbers, the capture's first frame 0
     stamp_us: Ints  # (line,) by the camera's clock, taken for the exposure's start: its papers do not say which moment
@@ -51,7 +51,7 @@ def mend_times(frames: FrameTimes) -> tuple[Ints, Ints, list[str]]:
 
     Frames come at a steady rate or later, never sooner: a stamp off its neighbours' by half a period strayed, and
     where all after one are early the clock was set back. Both follow their neighbours then; so do lines without a
-    stamp. A later stamp is believed, since a frame may have been dropped.
+    stamp. A later stamp counts, since a frame may have been dropped.
     """
     number, notes = whole_numbers(frames.number)
     if (number < 0).all():
@@ -105,7 +105,7 @@ def _strayed(late: Floats, period_us: float) -> Bools:
 
 @dataclass(frozen=True)
 class MirrorScanPath:
-    """Where the mirror was, by its clock: positions that its log measured, or those of a path that it played."""
+    """Path of the mirror, by its clock: positions that its log measured, or those of a path that it played."""
 
     time_s: Floats  # (sample,) in order
     position: Floats  # (sample, 2) device X and Y
@@ -167,7 +167,7 @@ def lines_by_time(
     """Take the track's position at mid exposure of each line, counted from the commands' times.
 
     ``began_s`` is when the log or the path began, ``capture_s`` when the capture did, by one clock. What passes between
-    a command and the first frame is not known, so a constant offset of the lines stays, for whoever registers sweeps
+    a command and the first frame is not known, so a constant offset of the lines stays, for registration
     that go both ways. A stamp that goes back or is missing is made up from its neighbours.
     """
     stamp, number, notes = mend_times(frames)
@@ -305,7 +305,7 @@ def path_of(sweep: Sweep, lines: tuple[int, int], camera: LineCamera, *, trigger
 
 
 def can_trigger(pulses: Pulses, sweep: Sweep) -> bool:
-    """Whether the pulses at the mirror's input step through this sweep: one a position is needed."""
+    """Return whether the pulses at the mirror's input step through this sweep: one a position is needed."""
     return pulses == "position" or (pulses == "frame" and sweep.step == 1)
 
 
@@ -349,7 +349,7 @@ class PlacedLines:
     stamp_us: NDArray[np.int64]  # (row,) by the camera's clock; -1 where it says nothing
 
     def is_valid(self, line: int) -> bool:
-        """Whether a line, counted from the capture's first, is there with its position."""
+        """Return whether a line, counted from the capture's first, is there with its position."""
         row = int(self.row[line])
         return row >= 0 and bool(self.tied.valid[row])
 
@@ -366,7 +366,7 @@ def place_lines(
     UntiedError where nothing, or what contradicts itself, ties frames to the mirror.
     """
     held = int(np.flatnonzero(captured.valid)[-1]) + 1
-    number = captured.times.frame[:held]  # from the capture's start; rows in order if none is told or can be missing
+    number = captured.times.frame[:held]  # from the capture's start; rows in order if none is given or can be missing
     if (number >= 0).any():
         number = np.where(number >= 0, number - captured.first_frame, -1)
     elif len(captured.values) == path.lines:

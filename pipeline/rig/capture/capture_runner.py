@@ -3,8 +3,8 @@
 The journal says what the rig has acknowledged of a stage's captures, one JSON object a line beside the files fetched
 from the camera. A process that is killed leaves it behind; the next one reads which folder on the camera holds which
 lines, so that nothing the rig acknowledged is captured twice. Each line has a checksum. A torn line counts as not
-written, and so does one that has changed since; but then a capture of which no end is told is not gone on with: what
-the mirror stands at now need not be what it stood at after that.
+written, and so does one that has changed since; but then a capture whose end is missing is not continued: the mirror
+may stand elsewhere now.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from pipeline.source import AT_REST
 LOG = logging.getLogger(__name__)
 _TIE_POINTS = ("method", "residual_us", "residual_px", "offset_s")
 SLACK_S = 5.0  # by which a capture may take longer than its frames
-WRITING_S = 120.0  # that a camera may go on writing what it has, once it was told to stop
+WRITING_S = 120.0  # that a camera may keep writing what it has after a stop
 POLL_S = 0.05
 _CELL = np.dtype(">f4")
 
@@ -55,7 +55,7 @@ Say = Callable[[str], None]  # what the rig is at, in a few words
 class CaptureJournal:
     """Records in ``kept``, read once and added to.
 
-    ``references`` is the folder that holds dark and white frames, ``damage`` what cannot be believed of the journal.
+    ``references`` is the folder that holds dark and white frames, ``damage`` which lines of the journal are damaged.
     """
 
     def __init__(self, kept: Kept) -> None:
@@ -168,7 +168,7 @@ class CaptureJournal:
 
 
 def say_nothing(words: str) -> None:
-    """Tell nobody what the rig is at."""
+    """Report no progress of the rig."""
 
 
 @dataclass(frozen=True)
@@ -239,7 +239,7 @@ class CaptureRunner:
         return self._journal.ended(taken)
 
     def wait(self, taken: CaptureRecord) -> None:
-        """Wait until a capture is over; one that goes on too long is stopped, and what it has counts.
+        """Wait until a capture is over; one that takes too long is stopped, and what it has counts.
 
         RigError where it does not end, though it was told to.
         """
@@ -254,7 +254,7 @@ class CaptureRunner:
                         f"the camera still captures {taken.folder}, {WRITING_S:g} s after it was told to stop; see "
                         "what it does, then run again: what it has is fetched then"
                     )
-                LOG.warning("the capture %s goes on for too long and is stopped", taken.folder)
+                LOG.warning("the capture %s takes too long and is stopped", taken.folder)
                 camera.stop()
                 until, stopped = clock.now() + WRITING_S, True
             clock.sleep(min(max(began + wanted - clock.now(), POLL_S), 1.0))
@@ -295,7 +295,7 @@ class CaptureRunner:
     def _configure(self, camera: LineCamera) -> None:
         times_ms = camera.exposure_ms, camera.frame_ms
         if times_ms != self._times_ms:
-            self._times_ms = None  # nobody knows which it has, should it not answer
+            self._times_ms = None  # unknown, should it not answer
             self.devices.camera.configure(*times_ms)
         self._times_ms = times_ms
 

@@ -7,7 +7,7 @@ without them it is the one that the mirror's log measured. Time is by the camera
 
 Over an emulated rig lines are those of the simulated source it looks with, bit for bit, in however many captures: their
 noise is keyed by the sweep's name and the line's number, which captures are called by. Times differ where a load falls
-in the midst of a sweep: the simulated one goes on without a break, a rig has to stop for it.
+in the midst of a sweep: the simulated one continues without a break, a rig has to stop for it.
 
 Whatever the rig has acknowledged is in a journal beside the fetched files, so a later call with the same ``kept`` takes
 up a transfer where it broke off, and captures only what the camera does not have.
@@ -62,7 +62,7 @@ class RigSource:
     open_devices
         Connects both; they are closed when a session, or a call outside of one, ends.
     kept
-        Where the camera's files and the journal go. With that of an earlier process its captures are gone on with.
+        Where the camera's files and the journal go. With that of an earlier process its captures are continued.
     vector_pairs
         Positions that the mirror's memory holds.
     say
@@ -89,13 +89,13 @@ class RigSource:
         self.vector_pairs = vector_pairs
         self._open, self._kept, self._say = open_devices, kept, say
         self._journal = CaptureJournal(kept)
-        self._unknown: list[str] = []  # why nobody knows what the rig does; shared by all that are made from this one
+        self._unknown: list[str] = []  # why the rig's state is unknown; shared by all that are made from this one
         self._runner: CaptureRunner | None = None
         self._whole: dict[str, tuple[References, tuple[str, ...]]] = {}  # of all samples, and notes, by folder
 
     @property
     def record(self) -> dict[str, Any]:
-        """What captures with this ``kept`` were like: how lines were tied to the mirror, by which settings."""
+        """Return what captures with this ``kept`` were like: how lines were tied to the mirror, by which settings."""
         told: dict[str, Any] = {
             name: getattr(self.rig, name) for name in ("pulses", "ends", "read_back", "strict_crc", "provenance")
         }
@@ -113,7 +113,7 @@ class RigSource:
         return other
 
     def saying(self, say: Say) -> RigSource:
-        """Give the same source that tells somebody what the rig is at."""
+        """Give the same source with a report of what the rig is at."""
         other = copy(self)
         other._say, other._runner = say, None
         return other
@@ -229,7 +229,7 @@ class RigSource:
         return References(dark, white, whole.white_reference, bad, by_mirror=self.rig.white_at_rest)
 
     def _known_references(self, runner: CaptureRunner, folder: str) -> tuple[References, tuple[str, ...]] | None:
-        """The frames of an earlier session; None where the camera has them no more: it was emptied, or is another."""
+        """The frames of an earlier session; None where the camera no longer has them: it was emptied, or is another."""
         try:
             return self._whole_references(runner, folder)
         except RigError as error:
@@ -284,7 +284,7 @@ class RigSource:
             )
 
     def _time_s(self, sweep: Sweep, number: int, stamp_us: int) -> float:
-        """Of mid exposure since the sweep's first line began, by the camera's stamps; by its rate without them."""
+        """Return the mid exposure since the sweep's first line began, by the camera's stamps, else by its rate."""
         known, exposed = stamp_us >= 0, exposing(self.camera, sweep)
         origin = self._journal.origin_us(sweep, stamp_us if known and number == 0 else None)
         if known and origin is not None:
@@ -292,7 +292,7 @@ class RigSource:
         return exposed.mid_exposure_s(float(number))
 
     def _give_up(self, taken: CaptureRecord, line: int, why: str, *, last: bool) -> None:
-        """Expect no more of a capture: what it lacks is captured again, unless that has been tried already."""
+        """Give a capture up: what it lacks is captured again, unless that has been tried already."""
         self._journal.spend(taken, why)
         if last:
             raise RigError(

@@ -72,7 +72,7 @@ class EmulatedCapture:
         return np.stack([begins, begins + self.exposure_s], axis=-1)
 
     def running(self, now_s: float) -> bool:
-        """Whether frames are still to come."""
+        """Return whether frames are still to come."""
         return self.most_frames is None or self.due(now_s) < self.most_frames
 
     def stop(self, now_s: float) -> None:
@@ -137,7 +137,7 @@ def _bil(frames: Raw) -> bytes:
 
 @dataclass(frozen=True)
 class CameraUnit:
-    """What the emulated camera is like."""
+    """Properties of the emulated camera."""
 
     root: str = "/captured"
     disk_bytes: int = 480 * 10**9
@@ -146,7 +146,7 @@ class CameraUnit:
 
 
 class CameraDevice:
-    """One camera. Frames are looked at when somebody asks, so ``positions`` must answer for times gone by.
+    """One camera. Frames are made when they are asked for, so ``positions`` must answer for times gone by.
 
     ``lines`` gives lines (line, sample, band) uint16 of mirror positions (line, 2) and times (line,) by ``clock``;
     ``positions`` gives mirror positions of times, at rest where none is given.
@@ -169,7 +169,7 @@ class CameraDevice:
         self._lock = threading.RLock()
 
     def greet(self) -> list[Chunk]:
-        """What a new connection is sent."""
+        """Return what a new connection is sent."""
         return [Chunk(0.0, b"Hyperspec control" + PROMPT)]
 
     def command(self, line: str) -> list[Chunk] | None:
@@ -185,7 +185,7 @@ class CameraDevice:
             return [Chunk(0.0, f"{line}\r\n{json.dumps(said)}".encode() + PROMPT)]
 
     def is_capturing(self) -> bool:
-        """Whether a capture runs."""
+        """Return whether a capture runs."""
         return bool(self.captures) and self.captures[-1].running(self.clock.now())
 
     def exposures(self, from_s: float, to_s: float) -> NDArray[np.float64]:
@@ -312,7 +312,7 @@ class CameraConnection:
         self._held = b""
 
     def feed(self, data: bytes) -> tuple[list[Chunk], bool]:
-        """Take bytes; give replies, and whether the connection goes on."""
+        """Take bytes; give replies, and whether the connection stays open."""
         self._held += data
         chunks: list[Chunk] = []
         while (end := self._held.find(b"\r")) >= 0:

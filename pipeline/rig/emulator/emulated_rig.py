@@ -65,7 +65,7 @@ from pipeline.simulator.simulated import SimulatedSource, render_lines
 from pipeline.source import AT_REST
 
 REFERENCE_FRAMES = 32
-_AT_ONCE = 8  # frames looked at while nobody else may speak to the camera
+_AT_ONCE = 8  # frames looked at while the camera takes no other request
 
 
 @dataclass(frozen=True)
@@ -214,7 +214,7 @@ class SceneCamera(CameraDevice):
         return np.concatenate(found)
 
     def is_capturing(self) -> bool:
-        """Whether a capture runs, or its frames are still being written."""
+        """Return whether a capture runs, or its frames are still being written."""
         if super().is_capturing():
             return True
         return self.aside and any(len(capture.pending(self.clock.now(), 1)) for capture in self.captures[-1:])
@@ -265,7 +265,7 @@ class SceneCamera(CameraDevice):
 
 
 def _prefix(capture: EmulatedCapture) -> str:
-    """What a capture's folder is called, without its number."""
+    """Return what a capture's folder is called, without its number."""
     return capture.folder.rsplit("/", 1)[-1].rpartition("_")[0]
 
 
@@ -414,7 +414,7 @@ class EmulatedRig:
     kept
         So many finished captures keep their files; 0 is all.
     mounting
-        How the mirror is mounted, whatever drivers believe.
+        How the mirror is mounted, whatever drivers assume.
 
     A subclass may have devices and servers of other kinds, such as ones that fail.
     """
@@ -442,7 +442,7 @@ class EmulatedRig:
 
     @property
     def state(self) -> str:
-        """What both devices do now, in words."""
+        """Return what both devices do now, in words."""
         x, y = self.mirror.positions(self.clock.now())
         last = f", last: {self.mirror.acts[-1].request.words}" if self.mirror.acts else ""
         camera = "capturing" if self.camera.is_capturing() else "idle"
@@ -477,7 +477,7 @@ class ServedRig(Closing):
         self._thread.start()
 
     def close(self) -> None:
-        """Let go of the pty and the sockets; whoever is connected sees the devices go."""
+        """Let go of the pty and the sockets; clients see the devices go."""
         self._ended.set()
         self._thread.join()
         self._server.close()

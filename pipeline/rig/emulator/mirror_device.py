@@ -285,12 +285,12 @@ def _vector_unit(state: MirrorState, channel: int) -> dict[int, Register]:
 
 
 def _item(holder: Any, key: int) -> tuple[Callable[[], Any], Callable[[Any], object]]:
-    """How an item of a list or of a dictionary is read and written."""
+    """Return how an item of a list or of a dictionary is read and written."""
     return partial(operator.getitem, holder, key), partial(operator.setitem, holder, key)
 
 
 def _attribute(holder: object, name: str, kind: type = int) -> tuple[Callable[[], Any], Callable[[Any], object]]:
-    """How an attribute is read and written."""
+    """Return how an attribute is read and written."""
     return partial(getattr, holder, name), lambda value: setattr(holder, name, kind(value))
 
 
@@ -300,7 +300,7 @@ Pulses = Callable[[float, float], Floats]  # (pulse, 2) rises and falls of pulse
 
 
 class Mode(Enum):
-    """How the controller is spoken to."""
+    """Modes of the controller's protocol."""
 
     SIMPLE = "simple"
     PRO = "pro"
@@ -309,7 +309,7 @@ class Mode(Enum):
 
 @dataclass(frozen=True)
 class Request:
-    """What came: a line of simple mode without its end, a frame, or bytes between boundaries that are none."""
+    """A request as it came: a line of simple mode without its end, a frame, or bytes that are neither."""
 
     mode: Mode
     line: str = ""
@@ -323,7 +323,7 @@ class Request:
 
     @property
     def words(self) -> str:
-        """What was asked, for people: the line, or the command's name."""
+        """Return what was asked, for people: the line, or the command's name."""
         if self.frame is None:
             return self.line or "bytes that are no frame"
         known = {command.value: command.name for command in Command}
@@ -332,7 +332,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Act:
-    """A request that was carried out, for whoever checks what happened, and when. [s]"""
+    """A request that was carried out, and when, for tests. [s]"""
 
     time_s: float
     request: Request

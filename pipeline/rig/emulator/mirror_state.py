@@ -32,7 +32,7 @@ MOST_STEPS = 20_000  # steps that are played one by one; of a longer silence onl
 
 @dataclass(frozen=True)
 class Stiffness:
-    """What an axis is like. The defaults are those of the simulated mirror: data sheet and assumed."""
+    """Dynamics of an axis. The defaults are those of the simulated mirror: data sheet and assumed."""
 
     natural_hz: float = 20.0
     damping: float = 0.7
@@ -58,7 +58,7 @@ class AxisMotion:
 
     @property
     def commanded(self) -> float:
-        """What the axis goes to."""
+        """Return what the axis goes to."""
         return self._command[-1]
 
     def command(self, time_s: float, place: float) -> None:
@@ -205,7 +205,7 @@ STABLE_WITHIN = 1e-4  # of the disk's radius; about 1 px of the view
 
 @dataclass(frozen=True)
 class MirrorUnit:
-    """What one emulated controller is. None of it was read from a real one."""
+    """Properties of one emulated controller. None of them was read from a real one."""
 
     model: str = "MR-E-2"
     version: str = "EMULATOR 1.0"
@@ -292,7 +292,7 @@ class MirrorState:
             axis.command(time_s, place)
 
     def _wanted(self, channel: int) -> float:
-        """Where a channel's input says; where it says nothing, the axis stays."""
+        """Return where a channel's input says; where it says nothing, the axis stays."""
         registers, followed = ChannelRegisters(channel), self.inputs[channel]
         if self.controls[channel] == registers.xy_system:
             if followed == registers.static_system:
@@ -314,7 +314,7 @@ class PositionLogger:
 
     @property
     def running(self) -> bool:
-        """Whether rows are still taken down."""
+        """Return whether rows are still taken down."""
         return self._began_s is not None and self._stopped_s is None and self.rows < self._state.unit.log_rows
 
     @property

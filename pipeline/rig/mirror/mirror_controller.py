@@ -153,8 +153,8 @@ class MotionLog:
     """Positions that the controller measured at a steady rate.
 
     ``started_s`` is when the start was acknowledged, by the driver's clock, and ``start_error_s`` how much earlier it
-    may have been: the time of the request itself. Offset and drift against frame times are for whoever ties lines to
-    positions.
+    may have been: the time of the request itself. Offset and drift against frame times are found where lines
+    get their positions.
     """
 
     position: NDArray[np.float32]  # (sample, 2) X and Y
@@ -170,7 +170,7 @@ KNOWN_MODELS = ("MR-E", "MRE")  # begin the ids of the controllers that the docu
 class MirrorController(Closing):
     """A mirror controller on a port. :meth:`connect` first; use it as a context, or close it.
 
-    Motions (goto, run, park) are sent once. One that is not acknowledged raises StateUnknown, and so does every later
+    Motions (goto, run) are sent once. One that is not acknowledged raises StateUnknown, and so does every later
     one of this object; what only reads, and :meth:`halt`, still work. Every method that speaks to the device raises
     DeviceRefused, DeadlinePassed or DeviceGone besides what it says itself, and RigError before connect.
     """
@@ -205,14 +205,14 @@ class MirrorController(Closing):
         return found
 
     def identity(self) -> Identity:
-        """What the controller said it is when it was connected; RigError where it is not connected."""
+        """Return what the controller said it is when it was connected; RigError where it is not connected."""
         self._check_connected()
         assert self._identity is not None
         return self._identity
 
     @property
     def found_in_pro(self) -> bool:
-        """Whether it was in pro mode as it was connected: an earlier session, or another program, had been there."""
+        """Return whether it was in pro mode when it was connected: an earlier session or another program left it so."""
         return self._modes.found_in_pro
 
     def status(self) -> Status:
@@ -307,7 +307,7 @@ class MirrorController(Closing):
         self._link.tell(set_values({channel.vector(VectorRegister.RUN): 0 for channel in (X, Y)}), "halting the path")
 
     def is_playing(self) -> bool:
-        """Whether a unit plays a path."""
+        """Return whether a unit plays a path."""
         self._check_connected()
         registers = [channel.vector(VectorRegister.RUN) for channel in (X, Y)]
         return any(map(cell_int, self._link.ask(get_values(registers), "whether a path plays", read_values)))
@@ -347,25 +347,15 @@ class MirrorController(Closing):
         position = self.settings.mounting.to_model(measured).astype(np.float32, copy=False)
         return MotionLog(position, rate_hz, after, after - before)
 
-    def park(self) -> None:
-        """Send the mirror to 0; 0, as :meth:`goto` does."""
-        self.goto(0.0, 0.0)
-
     def close(self) -> None:
-        """Let go of the port; park before, where the settings say so and motions are not frozen."""
-        try:
-            if self.settings.park_at_close and self._identity is not None:
-                self.park()
-        except RigError as error:
-            LOG.warning("not parked: %s", error)
-        finally:
-            self._identity = None
-            self.wire.transport.close()
+        """Let go of the port; the mirror stays where it is."""
+        self._identity = None
+        self.wire.transport.close()
 
     def _move(self, values: dict[int, Value], name: str) -> None:
         self._check_connected()
         self.wire.check_known(name)
-        if self.settings.check_status and (status := self.status()).stops_motion:
+        if (status := self.status()).stops_motion:
             raise RigError(f"{name} is refused on {self.wire.port}; {status.sentence}; mend that first")
         self._link.move(set_values(values), name)
 

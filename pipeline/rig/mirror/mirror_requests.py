@@ -193,7 +193,7 @@ class ProLink:
     def _answer(
         self, found: Frame | Damaged, sent: Frame, name: str, parse: Callable[[bytes], Answer]
     ) -> Answer | None:
-        """What a frame says to the request; None, and a line in the log, where it is no answer to it."""
+        """Return what a frame says to the request; None, and a line in the log, where it is no answer to it."""
         port = self.wire.port
         if isinstance(found, Damaged):
             LOG.warning("%s, while waiting for %s: %s: %s", port, name, found.reason, found.data.hex(" "))
@@ -227,7 +227,7 @@ class ProLink:
 
 @dataclass(frozen=True)
 class Identity:
-    """What a controller says it is; a field is empty where it does not know the request."""
+    """Identity of a controller, as it states it; a field is empty where it does not know the request."""
 
     device: str
     version: str
@@ -326,7 +326,7 @@ class Modes:
     def _greet(self) -> None:
         try:
             self._lines.do(START, "greeting")
-        except DeviceRefused as error:  # the greeting ended a line that somebody had begun
+        except DeviceRefused as error:  # the greeting ended a line that was begun before
             LOG.info("%s; greeting it once more", error)
             self._lines.do(START, "greeting")
 

@@ -29,7 +29,7 @@ ERROR_FLAG = 0x80  # command of a reply that says no
 
 
 class Command(IntEnum):
-    """What a frame asks for."""
+    """Commands of frames."""
 
     FIRMWARE_ID = 0x01
     STATUS = 0x02
@@ -329,7 +329,7 @@ VECTOR_MEMORY = 0x2600  # one vector, shared by the channels
 
 
 class Unit(IntEnum):
-    """What the numbers of an input are."""
+    """Units of an input's numbers."""
 
     CURRENT = 0
     FEEDBACK = 1
@@ -337,7 +337,7 @@ class Unit(IntEnum):
 
 
 class Trigger(IntEnum):
-    """Which edges at the trigger input step through the vector memory."""
+    """Edges at the trigger input that step through the vector memory."""
 
     OFF = 0
     BOTH_EDGES = 1
@@ -371,7 +371,7 @@ class Status(IntFlag):
 
     @property
     def words(self) -> list[str]:
-        """What is on, in words for whoever stands before the rig; bits without a known meaning by their number."""
+        """Return the bits that are on, in words; bits without a known meaning by their number."""
         known = [bit.says for bit in Status if bit in self]
         rest = int(self) & ~sum(Status)
         return known + [f"bit {place}, whose meaning is not known" for place in range(32) if rest >> place & 1]
@@ -383,7 +383,7 @@ class Status(IntFlag):
 
     @property
     def stops_motion(self) -> bool:
-        """Whether something is on, now, with which the mirror does not go where it is sent."""
+        """Return whether something is on, now, with which the mirror does not go where it is sent."""
         return bool(self & _STOPS)
 
 

@@ -1,4 +1,4 @@
-"""What blurs the image or shifts it band by band: diffraction, the lens itself, defocus, keystone."""
+"""Effects that blur the image or shift it band by band: diffraction, the lens itself, defocus, keystone."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Diffraction(Blur):
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound over all positions of the sweeps: the pattern is a sum of Gaussians of many widths.
 
-        Each changes the image by no more than its variance does.
+        Each changes the image at most as much as its variance does.
         """
         fraction, size = airy_gaussians()
         found = [_waves(rig, probe.wavelength_nm, normal) for normal in normals_met(probe.sweeps, rig.camera)]

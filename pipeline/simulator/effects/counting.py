@@ -208,7 +208,7 @@ class DarkCurrent(Effect):
 
 
 def warmth(temperature_deg_c: float) -> float:
-    """By how much more dark current flows than at 25 deg C, where the rig's numbers are stated.
+    """Return the dark current over that at 25 deg C, where the rig's numbers are stated.
 
     Electrons set free in silicon's depleted layer [1]: twice as many 8.4 deg C above 25, and 3.6 deg C above -80. Valid
     from -80 to 50 deg C: in warmer sensors current that diffuses from the bulk, with the whole gap, takes over [2].
@@ -285,7 +285,7 @@ def _mask(unit: int, kind: str, samples: int, bands: int, *, fraction: float) ->
 
 @dataclass(frozen=True)
 class Saturation(Effect):
-    """What is above the well or the converter's full scale is lost. Off, the converter clips all the same.
+    """Light above the well or the converter's full scale is lost. Off, the converter clips all the same.
 
     Raw lines are numbers of so many bits, so every line is clipped whatever a probe of a few lines found.
     """
@@ -313,7 +313,7 @@ class Saturation(Effect):
 
 
 def well_reached(rig: Rig, read_noise_e: float) -> bool:
-    """Whether a well overflows before the converter ends, 8 deviations of the read noise counted in."""
+    """Return whether a well overflows before the converter ends, 8 deviations of the read noise counted in."""
     camera = rig.camera
     end_e = (camera.full_scale_dn + 1 - camera.dark_dn) * camera.electrons_per_dn
     return rig.detector.full_well_e < end_e + 8 * read_noise_e
@@ -355,7 +355,7 @@ class Shot(Effect):
         total = float(np.hypot(np.sqrt(brightest), read))
         if variant == GAUSSIAN:
             worst = max(chip_variation(0.0), chip_variation(read))
-            # Of one sample: 2 TV <= sqrt(divergence), which sums with samples.
+            # for one sample: 2 TV <= sqrt(divergence), which sums with samples.
             apart = 2 * worst / np.sqrt(CHIP_SAMPLES) * np.sqrt(probe.binning)
             why = (
                 f"{CHIP_SAMPLES:.0e} numbers have a total variation of at most {worst:.2g} from exact ones"

@@ -1,4 +1,4 @@
-"""What an effect is: a name, variants from exact to cheap, a bound on the error of each, a cost, and what it does.
+"""Effects in general: a name, variants from exact to cheap, a bound on the error of each, a cost, and an action.
 
 It works at one of six places of the chain, in this order: the mirror looks elsewhere (``Aim``), rays meet the scene
 elsewhere (``Displacement``), the footprint is blurred or shifted band by band (``Blur``), light is multiplied
@@ -39,7 +39,7 @@ class Bound:
 
 
 class Merged(NamedTuple):
-    """What an effect costs beside a variant of another, with which it shares a draw, or kernels. [ns]"""
+    """Cost of an effect beside a variant of another, with which it shares a draw, or kernels. [ns]"""
 
     other: str
     variant: str
@@ -47,7 +47,7 @@ class Merged(NamedTuple):
 
 
 class Effect(Protocol):
-    """What the decision needs to know, by name. Variants go from exact to cheap; off is none of them.
+    """Interface of an effect to the decision, by name. Variants go from exact to cheap; off is none of them.
 
     ``merged(rig)`` says what it shares with another's work, ``cost_at(probe, rig)`` its cost where that follows the
     light.
@@ -55,7 +55,7 @@ class Effect(Protocol):
 
     @property
     def name(self) -> str:
-        """What flags, manifest and streams call it."""
+        """Return what flags, manifest and streams call it."""
 
     @property
     def cost_ns(self) -> Mapping[str, float]:
@@ -154,7 +154,7 @@ class SweepBlock:
     @cached_property
     def normals(self) -> Floats:
         """(line, 3) of the mirror at mid exposure, as planned; ``-n_z`` is the cosine of incidence of the chief ray."""
-        # Of the whole sweep: the product with the axes rounds otherwise for a single line than for several.
+        # for the whole sweep: the product with the axes rounds otherwise for a single line than for several.
         whole: Floats = position_to_normal(line_positions(self.sweep, self.rig.camera))
         return whole[self.numbers]
 

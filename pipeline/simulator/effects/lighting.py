@@ -1,4 +1,4 @@
-"""How the scene is lit and seen: the sun's course, clouds, and reflectance by the angle of view."""
+"""Light on the scene and towards the rig: the sun's course, clouds, and reflectance by the angle of view."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a line lies in the scene and what its samples cover: rotation, slit and pixel, motion smear."""
+"""Geometry of a line in the scene, and what its samples cover: rotation, slit and pixel, motion smear."""
 
 from __future__ import annotations
 
@@ -84,12 +84,12 @@ class SlitBox(Effect):
     """The footprint of slit and pixel, a box in closed form. Off, a sample sees what its middle ray meets.
 
     Variants tell into how many boxes that do not lie turned, across and along, it is parted; from two across on they
-    have its covariance. Those of a stated error take, for each sweep, as few as misplace no more of the light than
+    have its covariance. Those of a stated error take, for each sweep, as few as misplace at most as much light as
     that.
     """
 
     name = "slit"
-    # Beside the rig's blurs, at a strip of 320 px: `python tests/benchmarks costs`. One box is no dearer than none.
+    # measured at a strip of 320 px: `python tests/benchmarks costs`. One box is no dearer than none.
     cost_ns = MappingProxyType({"9x3": 10.0, "5x2": 3.4, "3x1": 0.5, "1-percent": 0.3, "3-percent": 0.2, UPRIGHT: 0.0})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:

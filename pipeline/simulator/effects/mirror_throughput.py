@@ -1,4 +1,4 @@
-"""How much light the tilted mirror passes: as the aperture stop (vignetting), and by its coating (polarisation)."""
+"""Light that the tilted mirror passes: as the aperture stop (vignetting), and by its coating (polarisation)."""
 
 from __future__ import annotations
 

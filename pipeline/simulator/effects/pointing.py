@@ -1,4 +1,4 @@
-"""Where the mirror looks beside its plan: staircase, lag, jitter, hysteresis, drift, errors of whole sweeps.
+"""Pointing errors of the mirror: staircase, lag, jitter, hysteresis, drift, errors of whole sweeps.
 
 The mirror's own faults (jitter, hysteresis, thermal drift) follow from a rig's numbers. Pointing errors put whole
 sweeps, each by itself, beside the places that the mirror reports: what registration is there to find.
@@ -199,7 +199,7 @@ def _along_and_scan(rig: Rig) -> tuple[float, float]:
 
 
 class Pointing(Aim, ABC):
-    """How far a mirror looks beside the places that it reports: an aim of the chain, on wherever there is one."""
+    """An aim of the chain, on wherever there is one: the mirror looks beside the places that it reports."""
 
     name = "pointing"
     cost_ns = MappingProxyType({"exact": 0.2})
@@ -207,7 +207,7 @@ class Pointing(Aim, ABC):
     @property
     @abstractmethod
     def reach_px(self) -> tuple[float, float]:
-        """How far it looks beside at most, along the line and the scan [px]."""
+        """Return how far it looks beside at most, along the line and the scan [px]."""
 
     @abstractmethod
     def of_lines(self, sweep_name: str, lines: range) -> Floats:
@@ -227,7 +227,7 @@ class Pointing(Aim, ABC):
 
 @dataclass(frozen=True)
 class PointingErrors(Pointing):
-    """How far the mirror looks beside the place that it reports, in px of the scene along the line and the scan.
+    """Errors of the mirror's reported places, in px of the scene along the line and the scan.
 
     Every sweep has an offset drawn evenly from ``-offset_px`` to ``offset_px`` in either axis, and every line a
     normal deviate of ``jitter_px`` rms in either. Each is drawn from a stream of its own, keyed (seed, sweep name) and
@@ -423,17 +423,13 @@ def responses(time: Floats, damping: float) -> tuple[Floats, Floats]:
             impulse = decay * time * np.sinc(turn / np.pi)
             rest = decay * np.cos(turn) + damping * impulse
         else:
-            slow = _slow_rate(damping)
-            apart, decay = 2 * math.sqrt((damping - 1) * (damping + 1)) * time, np.exp(-slow * time)
+            root = math.sqrt((damping - 1) * (damping + 1))
+            slow = 1 / (damping + root)  # zeta - sqrt(zeta^2 - 1) without its cancellation
+            apart, decay = 2 * root * time, np.exp(-slow * time)
             impulse = decay * time * np.where(apart > 0, -np.expm1(-apart) / np.where(apart > 0, apart, 1.0), 1.0)
             rest = decay + slow * impulse
     early = time * (1 + 2 * damping) < _SERIES_BELOW
     return impulse, np.where(early, _early_rise(np.where(early, time, 0.0), damping), 1 - rest)
-
-
-def _slow_rate(damping: float) -> float:
-    """The smaller of the two rates of an overdamped system, zeta - sqrt(zeta^2 - 1) without its cancellation."""
-    return 1 / (damping + math.sqrt((damping - 1) * (damping + 1)))
 
 
 def _early_rise(time: Floats, damping: float) -> Floats:

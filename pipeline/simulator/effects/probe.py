@@ -1,4 +1,4 @@
-"""What effects are decided from: a summary of scene and rig, units of stored numbers, ranges of gains over wavelength.
+"""Basis of decisions on effects: a summary of scene and rig, units of stored numbers, gains over wavelength.
 
 A number of a raw line sums neighbouring samples, and has the noise of that sum. All is counted per sample: light as the
 mean over the samples of a sum, noise as that of the mean. A change of the one over the other is the change of the
@@ -50,7 +50,7 @@ class Probe:
 
     All but the electrons are over the unit of the tolerance: one standard deviation of the noise of the number that is
     stored, or one DN of it. Where that sums ``binning`` samples, a maximum is of the mean of their sizes over the noise
-    of their mean: a change of whatever sign at each of them is bounded, and no more than needed where they differ.
+    of their mean: a change of whatever sign at each of them is bounded, and only as far as needed where they differ.
     Axis 0 of ``slope`` and ``curvature`` is (along the line, along the scan).
     """
 
@@ -85,7 +85,7 @@ class Probe:
     def within(self, reach_px: float) -> Probe:
         """Give the probe of what lies no farther from the samples: it has the greatest slope, curvature and span there.
 
-        Farther than has been looked, light changes by no more than the greatest difference in a px.
+        Farther than has been looked, light changes by at most the greatest difference in a px.
         """
         if self.anywhere is None or reach_px == 0:
             return self

@@ -359,7 +359,7 @@ def _most_halo(probe: Probe, rig: Rig, spread: float) -> float:
 
     It is at most the light that the kernel takes elsewhere than an even one would, times the range of signals: the
     brightest less the darkest, and never more than twice the greatest way from the mean. That is ``spread`` units,
-    each no more than the unit at the brightest sample.
+    each at most the unit at the brightest sample.
     """
     elsewhere = _uneven_fraction((rig.camera.samples, len(probe.wavelength_nm)), rig.optics.stray_halo_px)
     per_dn = rig.camera.electrons_per_dn

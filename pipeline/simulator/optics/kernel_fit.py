@@ -87,7 +87,7 @@ _RADII = np.concatenate([np.geomspace(0.002, 0.1, 10), np.linspace(0.13, 1.3, 18
 _TURNS = (np.arange(8) + 0.5) * np.pi / 8
 _ALONG = np.concatenate([np.outer(_RADII, np.cos(_TURNS)).ravel(), _RADII, 0 * _RADII])
 _SCAN = np.concatenate([np.outer(_RADII, np.sin(_TURNS)).ravel(), 0 * _RADII, _RADII])
-# What is wrong of waves longer than 20 px adds up over wide fields: they count up to three times.
+# Errors of waves longer than 20 px add up over wide fields: they count up to three times.
 _STRICT = 1 + 2 / (1 + (np.hypot(_ALONG, _SCAN) / 0.05) ** 2)
 _ALIKE_PX = 0.2  # by which widths may differ of kernels that share a window
 
@@ -198,7 +198,7 @@ def _ladder(widest: Floats, core: float, ratio: float) -> list[tuple[float, int]
 
 
 def _steps(shift: Floats) -> Floats:
-    """How far neighbouring nodes lie apart, (2, 1): what is between two of them is wider than either."""
+    """Return how far neighbouring nodes lie apart, (2, 1): what is between two of them is wider than either."""
     if shift.shape[1] == 1:
         return np.zeros((2, 1))
     return np.asarray(np.abs(np.diff(shift, axis=1)).max(axis=1, keepdims=True))
@@ -219,7 +219,7 @@ def _nodes(moments: Floats, place: Floats, count: int) -> Floats:
 
 
 def _seen_at(level: int) -> Floats:
-    """What the pixels of a level, linear between each other, pass of the waves, (wave,)."""
+    """Return what the pixels of a level, linear between each other, pass of the waves, (wave,)."""
     passed: Floats = (np.sinc(level * _ALONG) * np.sinc(level * _SCAN)) ** 2
     while level > 1:
         level //= 2
@@ -228,14 +228,14 @@ def _seen_at(level: int) -> Floats:
 
 
 def _gaussian(shift: Floats, variance: Floats) -> Transfer:
-    """What Gaussians pass of the waves, (wave, kernel), with their phases."""
+    """Return what Gaussians pass of the waves, (wave, kernel), with their phases."""
     turned = np.outer(_ALONG, shift[0]) + np.outer(_SCAN, shift[1])
     spread = np.outer(_ALONG**2, variance[0]) + np.outer(_SCAN**2, variance[1])
     return np.exp(-2j * np.pi * turned - 2 * np.pi**2 * spread)
 
 
 def _passed(kernels: Kernels, own: Floats) -> Transfer:
-    """What kernels pass of the waves behind slit and pixel, (wave, kernel)."""
+    """Return what kernels pass of the waves behind slit and pixel, (wave, kernel)."""
     left = kernels.variance - THINNED * (kernels.level**2 - 1)
     seen = {level: _seen_at(level) for level in set(kernels.level.tolist())}
     through = own[:, None] * np.stack([seen[level] for level in kernels.level.tolist()], axis=1)
@@ -243,7 +243,7 @@ def _passed(kernels: Kernels, own: Floats) -> Transfer:
 
 
 def _wanted(moments: Floats, own: Floats) -> Transfer:
-    """What bands pass of the waves, (wave, band), for moments (6, band)."""
+    """Return what bands pass of the waves, (wave, band), for moments (6, band)."""
     across = np.hypot(np.outer(_ALONG, moments[4]), np.outer(_SCAN, moments[5]))
     return (own * _seen_at(1))[:, None] * _gaussian(moments[:2], moments[2:4]) * pupil_contrast(across)
 
@@ -261,7 +261,7 @@ def _fractions(passed: Transfer, wanted: Transfer) -> Floats:
 
 @dataclass(frozen=True)
 class Moments:
-    """What a blur does to each band, (2, band) each: along the line and the scan.
+    """Moments of a blur in each band, (2, band) each: along the line and the scan.
 
     A shift [px], a Gaussian of a variance [px^2], and diffraction at an elliptic pupil, told by the wavelength over the
     pupil's widths [px]; None without any. The pattern of a pupil has no variance: no Gaussian stands for it. ``disc``
@@ -315,7 +315,7 @@ class Footprint:
 
     @property
     def mixing(self) -> Floats:
-        """How much each kernel counts in each band, (kernel, band); of sum 1 in each."""
+        """Return how much each kernel counts in each band, (kernel, band); of sum 1 in each."""
         return self.fractions @ self.between
 
     def afar(self, along: Floats, scan: Floats) -> Floats:
@@ -426,7 +426,7 @@ def blurred_weight(width: float, variance: Floats, held: int = 1) -> tuple[Float
 class TapTable(NamedTuple):
     """Weights (row, tap) of the taps around a position, row after row, for every kernel and in it for every scale.
 
-    A position is told by its distance ``place`` from the first tap, which lies ``left`` px before the centre's pixel.
+    A position is given by its distance ``place`` from the first tap, which lies ``left`` px before the centre's pixel.
     """
 
     weight: Weights
@@ -440,7 +440,7 @@ class TapTable(NamedTuple):
 
     @property
     def taps(self) -> int:
-        """How many pixels along the axis a position reads."""
+        """Return how many pixels along the axis a position reads."""
         return int(self.weight.shape[1])
 
     @staticmethod

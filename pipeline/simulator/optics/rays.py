@@ -23,7 +23,7 @@ REST_NORMAL: Floats = np.array([np.sqrt(0.5), 0.0, -np.sqrt(0.5)])
 
 @dataclass(frozen=True)
 class RayViews:
-    """Where samples look, and how far the scene point moves per px of the camera, along the line and across; (n,) each.
+    """Directions of samples, and how far the scene point moves per px of the camera, along and across; (n,) each.
 
     ``along`` and ``scan`` are tangents or px; the others are px of the scene over px of the camera: ``along_run`` and
     ``scan_run`` for a ray moved along the line, ``along_turn`` and ``scan_turn`` for one moved across it.

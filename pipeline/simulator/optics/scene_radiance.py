@@ -78,7 +78,7 @@ class Looker:
 
     @cached_property
     def gatherers(self) -> list[tuple[int, NDArray[np.intp], Gatherer]]:
-        """What sums pixels of which level through which kernels."""
+        """Return what sums pixels of which level through which kernels."""
         windows, whole = self.footprint.windows(), self.footprint
         return [(level, some, Gatherer(whole.part(level, some), self._extremes)) for level, some in windows]
 

@@ -59,7 +59,7 @@ class Gatherer:
 
     @property
     def parts(self) -> int:
-        """How many boxes each kernel is summed over."""
+        """Return how many boxes each kernel is summed over."""
         return int(self._kernels.place.shape[1])
 
     def gather(

@@ -1,1 +1,1 @@
-"""What the simulated rig looks at."""
+"""Scenes for the simulated rig."""

@@ -63,7 +63,7 @@ class SceneRaster:
         """Give the planes blurred, and every ``level``-th pixel of them: 1, 2, 4, 8, ...
 
         Beyond 1 the scene's first pixel comes after `THINNED_MARGIN` others, and as many follow: where blurred pixels
-        end all is edge, so that repeating the outermost one goes on as repeating the scene's edge does. From each level
+        end all is edge, so that repeating the outermost one equals repeating the scene's edge. From each level
         to the next every second pixel is left, after the binomial kernel of nine taps (variance 2, Burt, Adelson,
         1983): what it passes of waves that fewer pixels would show as others is below 2 % from 0.3 cycles per px on.
         Light is kept.
@@ -190,7 +190,7 @@ class RasterScene:
 
     @property
     def labelled(self) -> bool:
-        """Whether there are labels; draws nothing."""
+        """Return whether there are labels; draws nothing."""
         return self.raster.labelled
 
     @property

@@ -1,1 +1,1 @@
-"""Which effects are computed, and how: by bounds on what they would change, weighed by their cost, and checked."""
+"""Choice of the effects that are computed: by bounds on what they would change, weighed by cost, and checked."""

@@ -49,7 +49,7 @@ class ReachedCells:
 
     @property
     def covers(self) -> bool:
-        """Whether sweeps see all of the scene."""
+        """Return whether sweeps see all of the scene."""
         return not self.apart_px.any()
 
     def rows_within(self, first: int, last: int, nearest_px: float, farthest_px: float) -> Mask:
@@ -199,7 +199,7 @@ def blended_surroundings(probe: Probe, rig: Rig, moving: Sequence[Effect]) -> Pr
 
 
 def _blended(probe: Probe, reach_px: float, way_px: float, parts: Sequence[tuple[float, float]]) -> Detail:
-    """What lies within a reach once the image has been moved by so much and blurred by parts (share, sd)."""
+    """Return what lies within a reach once the image has been moved by so much and blurred by parts (share, sd)."""
     near = probe.within(reach_px + way_px)
     slope, curvature, span = near.slope, near.curvature, near.span
     spectral = near_spectral = np.stack([near.spectral_slope, near.spectral_curvature])

@@ -30,7 +30,7 @@ TOTAL = "all effects"
 
 @dataclass(frozen=True)
 class Treatment:
-    """What was decided for one effect, and why.
+    """Decision on one effect, and its reason.
 
     ``small``: off, within the tolerance. ``needed``: leaving it out exceeds the tolerance alone; ``spent``: with the
     others.

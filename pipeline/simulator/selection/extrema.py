@@ -1,7 +1,7 @@
-"""Where a scene is steepest, most curved, brightest and darkest, in and beside what sweeps see: worth a close look.
+"""Extrema of a scene: where it is steepest, most curved, brightest and darkest, in and beside the sweeps.
 
 Works on the scene's own pixels, strip by strip, with the slit's box along the scan; it is fast and right to a pixel,
-and leaves the exact numbers to whoever looks closer. Of components a few bands stand for all; where bands have planes
+and leaves the exact numbers to closer looks. Of components a few bands stand for all; where bands have planes
 of their own, each is looked at, tile by tile: see `BandTiles`.
 """
 
@@ -46,7 +46,7 @@ class PixelOptics:
 
     @property
     def halo(self) -> int:
-        """How far kernels, differences and sums reach. [px]"""
+        """Return how far kernels, differences and sums reach. [px]"""
         return len(self.slit) // 2 + len(self.pixel) // 2 + 1 + self.binning // 2
 
     def noise(self, light: Radiance) -> Radiance:
@@ -149,7 +149,7 @@ class BandTiles:
         self._scene, self._spectra, self._optics, self._tile = scene, spectra, optics, tile
         self._groups = band_groups(len(spectra))
         self._wavelength_nm = np.asarray(scene.wavelength_nm, np.float64)
-        # Of tiers and measures: worth, row, column and band of tiles, (4, group, tile) of each strip.
+        # by tiers and measures: worth, row, column and band of tiles, (4, group, tile) of each strip.
         self._found: dict[tuple[int, int], list[Floats]] = {}
 
     def add(self, first: int, planes: Radiance, tiers: Mapping[int, NDArray[np.bool_]]) -> None:
@@ -225,7 +225,7 @@ class BandTiles:
         return found
 
     def _taken(self, rows: NDArray[np.bool_], column: int) -> NDArray[np.bool_]:
-        """Which pixels of a tile count, (row, column); none beyond the scene."""
+        """Return which pixels of a tile count, (row, column); none beyond the scene."""
         some = rows[:, column : column + self._tile]
         return np.pad(some, [(0, self._tile - size) for size in some.shape])
 

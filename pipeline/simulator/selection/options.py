@@ -1,4 +1,4 @@
-"""What the decision chooses from: for every effect, off and each variant with its error and cost.
+"""Options of the decision: for every effect, off and each variant with its error and cost.
 
 A bound is the change of a stored number in units of its noise (or in DN), at the worst binning of the survey. Where a
 drawn displacement or gain moves the light (jitter, turbulence, wind), it is on the change with the same draws. Where
@@ -47,7 +47,7 @@ LIGHT_EFFECTS = frozenset({"slit", "smear", "rotation"})  # that the renderer it
 Floats = NDArray[np.float64]
 # Half of the integrals of |s dG/ds| and |s^2 d^2G/ds^2| for either axis, and, for both, of 2 |s^2 d^2G/ds dx|.
 _PER_LOG, _PER_LOG_TWICE, _PER_LOG_AND_PX = 0.5, 1.1, 2.3
-FINEST_PER_PX = 8.0  # derivatives along the image grow by no more per order: they are differences a quarter px apart
+FINEST_PER_PX = 8.0  # derivatives along the image grow by at most this per order: differences a quarter px apart
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Menu:
 
 
 def acts_on_light(effect: Effect) -> bool:
-    """Whether it comes before the readout: what it changes, later gains multiply."""
+    """Return whether it comes before the readout: what it changes, later gains multiply."""
     return effect.name in LIGHT_EFFECTS or any(hasattr(effect, action) for action in LINEAR_ACTIONS)
 
 
@@ -140,7 +140,7 @@ def _options_of(probe: Probe, rig: Rig, effects: Sequence[Effect]) -> tuple[Menu
 
 
 def _moves_light(effect: Effect) -> bool:
-    """Whether light comes from elsewhere by it; the slit's is in the probe already."""
+    """Return whether light comes from elsewhere by it; the slit's is in the probe already."""
     acts = any(hasattr(effect, action) for action in ("aim", "displaced", "moments"))
     return acts or effect.name in LIGHT_EFFECTS - {"slit"}
 
@@ -186,7 +186,7 @@ def _even_probe(probe: Probe, derivatives: float) -> Probe:
 
 
 def _gain_range(effect: Effect, probe: Probe, rig: Rig) -> GainRange | None:
-    """By what an effect multiplies light; where a gain does not say, 1 more or less its bound on level 1."""
+    """Return the range of an effect's gain; where a gain does not say, 1 more or less its bound on level 1."""
     if hasattr(effect, "gain_range"):
         stated: GainRange = effect.gain_range(probe, rig)
         return stated
@@ -212,7 +212,7 @@ def cost_of(menus: Iterable[Menu], options: Mapping[str, Option]) -> float:
 
 @dataclass(frozen=True)
 class Growth:
-    """By how much gains multiply an error, with the unit that follows the light."""
+    """Growth of an error through the gains, with the unit that follows the light."""
 
     probe: Probe
     rig: Rig

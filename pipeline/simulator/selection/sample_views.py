@@ -97,11 +97,6 @@ def line_sums(camera: LineCamera, binning: int) -> int:
     return min(camera.samples // binning, max(LINE_SAMPLES // binning, _LEAST_SUMS))
 
 
-def patch_views(binning: int) -> int:
-    """Give how many samples a patch around a place has."""
-    return len(_patch(binning)) * binning
-
-
 def views_of_lines(sweeps: tuple[Sweep, ...], camera: LineCamera, room: int) -> SampleViews:
     """Lines spread over all sweeps, the most oblique among them, of samples evenly from end to end.
 
@@ -189,14 +184,14 @@ def _held(sweep: Sweep) -> Sweep:
     return replace(sweep, step=1, lines=sweep.lines * sweep.step, binning=1)
 
 
-def _patch(binning: int) -> Floats:
+def sample_offsets(binning: int) -> Floats:
     """Steps of a patch around a place: stored numbers along the line and lines along the scan, (number, 2)."""
     beside = _BESIDE if binning == 1 else 1
     return np.stack(np.meshgrid(np.arange(-beside, beside + 1.0), np.arange(-1.0, 2.0)), axis=-1).reshape(-1, 2)
 
 
 def _patches(sweep: Sweep, number: int, camera: LineCamera, line: Floats, sample: Floats, *, held: bool) -> SampleViews:
-    patch, binning = _patch(sweep.binning), sweep.binning
+    patch, binning = sample_offsets(sweep.binning), sweep.binning
     middle = sample if binning == 1 else (sample + 0.5) / binning - 0.5
     sums = np.rint(middle[:, None] + patch[:, 0]).ravel()
     lines = (line[:, None] + patch[:, 1]).ravel()
@@ -229,8 +224,8 @@ def line_means(
     """Give the mean over samples and bands of every position that any sweep holds, (position,) [e-].
 
     Of the pixels that middle rays meet: a slit, and positions that one line holds, give means between these. Positions
-    go on beyond a sweep's ends as far as its slit reaches, and as far as ``beside_px``: by so much the lines lie beside
-    their strip as well.
+    continue beyond a sweep's ends as far as its slit reaches, and as far as ``beside_px``, by which lines also lie
+    beside their strip.
     """
     spectra = scene.electrons * np.float32(camera.exposure_ms / DEFAULT_EXPOSURE_MS)
     mean = spectra / spectra.shape[0] if spectra.ndim == 1 else spectra.mean(axis=1)

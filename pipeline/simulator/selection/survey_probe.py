@@ -39,8 +39,8 @@ from pipeline.simulator.selection.sample_views import (
     joined,
     light_seen,
     line_means,
-    patch_views,
     places_beyond,
+    sample_offsets,
     views_of_lines,
     views_of_places,
 )
@@ -232,7 +232,7 @@ def _spectral_derivatives(level: Radiance, wavelength_nm: Floats, scale: Radianc
 
 
 def _above(difference: Radiance, high: Radiance) -> Radiance:
-    """0 where a difference is no more than rounding."""
+    """0 where a difference is at most rounding."""
     return np.where(difference > _ROUNDING * np.abs(high), difference, np.float32(0))
 
 
@@ -293,7 +293,7 @@ def probe_scene(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Uni
     binning, camera, bands = binnings.pop(), rig.camera, len(scene.wavelength_nm)
     room = max(min(MOST_VALUES // bands, MOST_SAMPLES), 64)
     lines = views_of_lines(taken, camera, room // 3)
-    most = (room - room // 3) // (patch_views(binning) * len({sweep.along for sweep in taken}))
+    most = (room - room // 3) // (len(sample_offsets(binning)) * binning * len({sweep.along for sweep in taken}))
     most = max(most, 1 if binning == 1 else _LEAST_PLACES)
     cells = reached_cells(scene.shape, camera, taken)
     counts = (most, *(max(most // 4, 1) for _ in REACHES), _FAR_PLACES)

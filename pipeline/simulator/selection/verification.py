@@ -125,7 +125,7 @@ class _Change:
 
     @property
     def unexplained(self) -> float:
-        """What arithmetic can not have made; endless where light is no number."""
+        """Return what arithmetic can not have made; endless where light is no number."""
         return math.inf if math.isnan(self.change) else self.change - self.rounding
 
 

@@ -16,6 +16,8 @@ from rich.console import Console
 
 from flows.archive.commands import command, contents, explain, gc, ls, run_verify
 from flows.settings.load import load_settings
+from flows.settings.survey_settings import Settings
+from flows.terminal.figures import format_bytes
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from pipeline.errors import ArchiveError
 from storage.archive.archive import Archive
@@ -50,13 +52,17 @@ def test_ls_shows_runs_and_stores(two_budgets: Path, capsys: pytest.CaptureFixtu
     assert first["state"] == second["state"] == "there"
     assert 0 < first["miou"] < 1
     assert first["bytes"] > second["bytes"] > 10_000
+    shared = content["shared_bytes"]
+    assert first["bytes"] - first["own_bytes"] == second["bytes"] - second["own_bytes"] == shared > 10_000
+    assert content["bytes"] == first["own_bytes"] + second["own_bytes"] + shared
     assert [len(content["stages"][stage]) for stage in ("capture", "rectify", "segment")] == [3, 1, 2]
     assert content["stages"]["rectify"][0]["runs"] == 2
     ls(two_budgets)
     out = capsys.readouterr().out
     assert first["id"] in out
     assert content["stages"]["rectify"][0]["key"] in out
-    assert "2 runs, 17 stores" in out
+    assert format_bytes(first["own_bytes"]) in out
+    assert f"2 runs, 17 stores, {format_bytes(content['bytes'])}, {format_bytes(shared)} of it in several runs" in out
     ls(two_budgets)
     out = capsys.readouterr().out
     assert max(map(len, out.splitlines())) <= 80
@@ -139,10 +145,7 @@ def test_explain_bears_damage_and_circles(tmp_path: Path, capsys: pytest.Capture
         with archive.publish("segment", key, inputs=[given]):
             pass
     (top,) = _json(capsys, lambda: explain(tmp_path, small.map.uri, as_json=True))["lineage"]
-    assert [one["problem"].split(":")[0] for one in top["inputs"]] == [
-        "is not there",
-        "manifest.json cannot be believed",
-    ]
+    assert [one["problem"].split(":")[0] for one in top["inputs"]] == ["is not there", "manifest.json is damaged"]
     (top,) = _json(capsys, lambda: explain(tmp_path, "aaaa", as_json=True))["lineage"]
     assert top["inputs"][0]["inputs"][0]["see"] == "in a circle"
     for product in (small.map.uri, small.raw.uri, "aaaa"):
@@ -182,17 +185,20 @@ def test_verify_repairs_by_surveying_again(archive: Path, capsys: pytest.Capture
     assert "21 of 21 stores and runs are as published" in capsys.readouterr().out
 
 
-def test_verify_says_what_it_could_not_repair(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_verify_says_what_it_could_not_repair(
+    archive: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The scene's file has gone: the store is missing then, and the exit code tells."""
     opened = Archive.open(archive)
     (mosaic,) = opened.refs("rectify")
     flip(mosaic.path / "lines.json")
 
-    def fail(settings: dict[str, Any]) -> None:
-        assert settings["scene"].endswith("scene.png")
+    def fail(settings: Settings, console: Console) -> None:
+        assert str(settings.scene).endswith("scene.png")
         raise ArchiveError("no such scene")
 
-    assert run_verify(archive, QUIET, remake=True, rerun=fail) == FAILED
+    monkeypatch.setattr("flows.publish.survey_command.run_survey", fail)
+    assert run_verify(archive, QUIET, remake=True) == FAILED
     out = capsys.readouterr().out
     assert "no such scene" in out
     assert "some could not be made anew" in out

@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 
 from flows.archive.history import FieldHistory, read_history, render_history, time_of_visit
+from flows.terminal.figures import format_percent
 from storage.archive.archive import Archive
 from storage.archive.records import Run
 from storage.arrays.class_maps import load_class_map
@@ -32,6 +33,15 @@ def archive(tmp_path_factory: pytest.TempPathFactory, survey_png: Any) -> Path:
     survey_png(root, name="north", visit="2026-06-01T10:00:00Z")
     survey_png(root, name="south")
     return root
+
+
+def row(**facts: Any) -> dict[str, Any]:
+    """A run of a history that scored 50 of 100."""
+    return {
+        **{"run": "runs/x", "created": "2026-06-01T10:00:00Z", "visited": "2026-06-01T10:00:00Z", "unit": "fraction"},
+        **{"areas": {}, "savings": dict.fromkeys(("capture_s", "lines", "bytes_kept", "multiply_adds"))},
+        **{"miou": 0.5, "overall_accuracy": 0.5, "training_scene": None, **facts},
+    }
 
 
 def test_runs_are_one_history(archive: Path) -> None:
@@ -69,6 +79,30 @@ def test_pages_load_nothing_and_lead_to_reports(archive: Path, command_line: Any
     assert all(words in text for words in ("2026-06-01 10:00", "Fraction of the map"))
 
 
+def test_scores_on_a_scene_of_the_training_are_marked() -> None:
+    """In the table, with the words of terminal and report below it, and in the chart as lines of their own."""
+    pages = {
+        seen: render_history(FieldHistory("north", "a", [row(training_scene=seen)]), "runs")
+        for seen in (None, "all", "other pixels")
+    }
+    assert ">50.0</td>" in pages[None]
+    assert "judged on" not in pages[None]
+    assert ">50.0*</td>" in pages["all"]
+    assert "* judged on a scene of the training, which says nothing of other fields." in pages["all"]
+    assert ">50.0***</td>" in pages["other pixels"]
+    (chart,), (other,) = (re.findall(r'class="chart" src="([^"]+)"', pages[seen]) for seen in (None, "all"))
+    assert chart != other
+
+
+def test_a_fraction_of_many_times_the_whole_is_told_as_a_factor() -> None:
+    """A field of 8 x 8 px keeps more than it captured: its chart counts times, not 170 717 percent."""
+    saved = {"capture_s": None, "lines": None, "multiply_adds": None, "bytes_kept": 1707.17}
+    assert format_percent(saved["bytes_kept"]) == "1\u202f710 times"
+    assert format_percent(9.99) == "999 %"
+    page = render_history(FieldHistory("north", "a", [row(savings=saved)]), "runs")
+    assert page.count("data:image/png") == 2
+
+
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
@@ -101,11 +135,9 @@ def test_a_report_that_cannot_be_written(
 def test_whatever_a_receipt_claims_is_drawn_or_left_out(moment: str, fractions: list[float], drawn: int) -> None:
     """Dates of any year and numbers of any size make no chart that fails or warns; equal rows give equal pages."""
     rows = [
-        {"run": "runs/x", "created": moment, "visited": moment, "unit": "fraction", "areas": {"so$il": fraction},
-         "savings": dict.fromkeys(("capture_s", "lines", "bytes_kept", "multiply_adds")), "miou": None,
-         "overall_accuracy": None}
+        row(created=moment, visited=moment, areas={"so$il": fraction}, miou=None, overall_accuracy=None)
         for fraction in fractions
-    ]  # fmt: skip
+    ]
     page = render_history(FieldHistory("north", "archive", rows), "")
     assert page.count("data:image/png") == drawn
     assert page == render_history(FieldHistory("north", "archive", rows), "")

@@ -165,6 +165,32 @@ def test_what_was_ingested_is_a_scene(tmp_path: Path, raw: NDArray[np.uint16]) -
     assert again["lost_lines"] == 2
 
 
+def test_a_stated_scale_holds_for_the_store(tmp_path: Path, raw: NDArray[np.uint16]) -> None:
+    """The store surveys as the file beside its scene.toml does: scaled, and without a value where there is no data."""
+    numbers = raw.astype(np.int16)
+    numbers[3, 4], numbers[5] = -1, -9999
+    path = write_envi(tmp_path / "a.img", numbers)
+    (tmp_path / "scene.toml").write_text("nodata = -1\n")
+    unscaled = ingest(path, tmp_path / "archive")
+    assert opened(unscaled).attrs["nodata"] == -1
+    (tmp_path / "scene.toml").write_text("scale = 0.0001\noffset = -0.1\n")
+    record = ingest(path, tmp_path / "archive")
+    assert record["key"] != unscaled["key"]
+    stored, scene = load_scene_file(Path(record["path"]) / "cube.zarr"), load_scene_file(path)
+    np.testing.assert_array_equal(stored.values, scene.values)
+    assert np.isnan(stored.values[5]).all()
+    np.testing.assert_allclose(stored.values[3, 4], -0.1001, rtol=1e-6)
+    assert "values are the file's times 0.0001 plus -0.1, as scene.toml says" in record["notes"]
+
+
+def test_a_scale_of_raw_numbers_is_refused(tmp_path: Path, raw: NDArray[np.uint16]) -> None:
+    """Dark and white frames belong to numbers as the camera gave them."""
+    path, dark = write_envi(tmp_path / "a.img", raw), write_envi(tmp_path / "dark.img", raw[:1] // 8)
+    (tmp_path / "scene.toml").write_text("scale = 0.0001\n")
+    with pytest.raises(SceneError, match=r"scene.toml has a scale .* take scale and offset out of it"):
+        ingest(path, tmp_path / "archive", dark=dark)
+
+
 def test_real_files_come_back_bit_by_bit(tmp_path: Path, real_data: Path) -> None:
     """A GeoTIFF read some rows at a time, and raw frames of a space-borne imager."""
     path = real_data / "rgbn" / "rgbn.tif"

@@ -13,9 +13,12 @@ import pytest
 from rich.console import Console
 
 from flows.archive.plan_command import StageForecast, forecast, plan_content, show_plan
+from flows.archive.plan_estimate import KEPT_FROM, estimated_bytes
+from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
 from flows.tasks.run import open_run
+from flows.terminal.figures import format_seconds
 from flows.terminal.progress import put_out
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from pipeline.simulator.simulated import SimulatedSource
@@ -205,3 +208,62 @@ def test_a_damaged_plan_of_sweeps_blocks_what_reads_it(
     assert (fine.state, "plan.json has changed" in fine.why) == ("blocked", True)
     with pytest.raises(IncompleteStoreError, match=r"plan\.json has changed.*verify --repair"):
         survey_png(archive)
+
+
+MEASURED = {  # pixels, bands, bytes captured, farm or not: bytes kept
+    (32 * 32, 200, 0, False): 507_743,
+    (145 * 145, 200, 0, False): 1_839_601,
+    (515 * 403, 4, 0, False): 3_230_020,
+    (32 * 32, 200, 8_960_000, False): 1_682_845,
+    (320 * 256, 270, 50_983_686, True): 4_902_150,
+    (1280 * 1024, 270, 725_000_000, True): 21_700_000,
+}
+
+
+@pytest.mark.parametrize("field", MEASURED, ids=str)
+def test_the_estimate_of_bytes_kept_is_within_what_it_says(field: tuple[int, int, int, bool]) -> None:
+    """Six surveys kept half to twice of it; a limit of the scores lowers it."""
+    pixels, bands, captured, is_farm = field
+    estimate = estimated_bytes(pixels, bands, captured, is_farm=is_farm)
+    assert 0.5 <= MEASURED[field] / estimate <= 2
+    assert estimated_bytes(pixels, bands, captured, is_farm=is_farm, most=1000) < estimate
+
+
+def test_a_new_archive_has_estimates(settings: Settings, tmp_path: Path, make_weights: Any) -> None:
+    """Each says from what it is; what nothing tells has no figure. The second survey of a kind knows the first."""
+    asked = replace(settings, source="raster", budget=None, out=str(tmp_path / "archive"))
+    before = plan_content(asked)["estimate"]
+    assert list(before) == ["bytes_kept", "multiply_adds", "miou", "cpu_s"]
+    assert before["bytes_kept"]["known_from"] == KEPT_FROM
+    assert before["cpu_s"]["value"] is before["miou"]["value"] is None
+    assert before["miou"]["known_from"] == "no scene was kept for validation when the weights were trained"
+    receipt = run_survey(asked, Console(quiet=True)).receipt
+    assert before["multiply_adds"]["value"] == receipt["savings"]["multiply_adds"]["done"]
+    again = replace(asked, labels=None, seed=3)
+    after = plan_content(again)["estimate"]
+    spent = sum(row["cpu_s"] for row in receipt["stages"] if row["name"] != "evaluate")
+    assert after["cpu_s"]["value"] == pytest.approx(spent)
+    assert after["bytes_kept"]["value"] == receipt["data_bytes"]["kept"]
+    other = plan_content(replace(asked, weights=str(make_weights(layers=2))))["estimate"]
+    assert other["cpu_s"]["value"] is None
+
+
+def test_estimates_of_a_capture_are_what_it_takes_at_most(settings: Settings, archive: Path, tmp_path: Path) -> None:
+    """Of two passes seconds, bytes and multiply-adds; once the fine pass is planned just those of the survey."""
+    (folder,) = (archive / "runs").iterdir()
+    receipt = json.loads((folder / "receipt.json").read_text())
+    told = {
+        "capture_s": receipt["savings"]["capture_s"]["done"],
+        "bytes_captured": receipt["data_bytes"]["captured"],
+        "multiply_adds": receipt["savings"]["multiply_adds"]["done"],
+    }
+    ahead = plan_content(replace(settings, out=str(tmp_path / "new")))["estimate"]
+    planned = plan_content(replace(settings, out=str(archive)))["estimate"]
+    for name, value in told.items():
+        assert ahead[name]["at_most"]
+        assert value <= ahead[name]["value"] * (1 + 1e-9), name
+        assert (planned[name]["value"], planned[name]["at_most"]) == (pytest.approx(value), False), name
+    shown = io.StringIO()
+    show_plan(plan_content(replace(settings, out=str(tmp_path / "new"))), Console(file=shown, width=160))
+    assert "Estimates: nothing of this has run" in shown.getvalue()
+    assert f"at most {format_seconds(ahead['capture_s']['value'])}" in shown.getvalue()

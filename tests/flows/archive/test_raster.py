@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import warnings
 from collections.abc import Callable
 from io import StringIO
@@ -25,6 +26,7 @@ from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.tasks.run import open_run
 from flows.tasks.stages.accuracy import columns_of_all_patches, columns_of_raster
+from flows.terminal.figures import format_area, format_count
 from pipeline.errors import PipelineError, SceneError, SettingsError
 from storage.archive.archive import Archive
 from storage.arrays.mosaics import open_mosaic
@@ -166,6 +168,33 @@ def test_a_receipt_of_a_raster_tells_of_no_camera(surveyed: Raster, scene_files:
     assert receipt["field"]["camera_s"] is receipt["field"]["lines"] is receipt["field"]["view_deg"] is None
     assert [row["name"] for row in receipt["stages"]] == [*("condense_raster", "score", "segment", "evaluate")]
     assert [found.problem for found in verify_archive(Archive.open(tmp_path / "archive"))] == [None] * 5
+
+
+@pytest.mark.parametrize("pixel_m", [None, 10.0])
+def test_areas_are_told_without_a_place(surveyed: Raster, tmp_path: Path, pixel_m: float | None) -> None:
+    """Pixels and percent of each class, of all that have one; hectares once scene.toml says how large a pixel is."""
+    write_tif(tmp_path / "field.tif", patchy_scene((32, 40), 3, 0)[0], None)
+    (tmp_path / "scene.toml").write_text("" if pixel_m is None else f"pixel_m = {pixel_m}\n")
+    published = surveyed(tmp_path / "field.tif", wavelengths=",".join(map(str, RGB_NM)))
+    pixels = published.receipt["areas"]["px"]
+    assert sum(pixels.values()) == 32 * 40
+    page = (published.folder / "report.html").read_text(encoding="utf-8")
+    table = page.partition('<section id="areas">')[2].partition("</section>")[0]
+    most = max(pixels, key=pixels.__getitem__)
+    assert f"<td>{most.replace('_', ' ')}</td><td>{format_count(pixels[most])}</td>" in table
+    files = run_export(tmp_path / "archive", None, tmp_path / "out", envi=False, console=QUIET)["files"]
+    with (tmp_path / "out" / files["areas"]).open() as text:
+        rows = {row["class"]: row for row in csv.DictReader(text)}
+    assert {name: int(row["pixels"]) for name, row in rows.items()} == pixels
+    if pixel_m is None:
+        assert "ha" not in published.receipt["areas"]
+        assert "<th>area</th>" not in table
+        assert {row["hectares"] for row in rows.values()} == {""}
+        return
+    hectares = {name: count * 0.01 for name, count in pixels.items()}
+    assert published.receipt["areas"]["ha"] == pytest.approx(hectares)
+    assert f"<td>{format_area(hectares[most])}</td>" in table
+    assert float(rows[most]["hectares"]) == pytest.approx(hectares[most], rel=1e-5)
 
 
 def test_what_is_read_whole_scores_as_all_of_it(surveyed: Raster, scene_files: Path) -> None:

@@ -9,7 +9,6 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from rich.console import Console
 
@@ -19,7 +18,6 @@ from flows.archive.reprocess_command import _survey, run_reprocess
 from flows.settings.survey_settings import Settings
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from pipeline.errors import SettingsError, WeightsError
-from pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from tests.conftest import Survey, WeightsMaker
@@ -229,20 +227,3 @@ def test_fields_of_one_file_name_are_told_apart(
         survey_png(tmp_path / "archive", scene="scene.png", labels=None)
     monkeypatch.chdir(tmp_path)
     assert reprocess.states(tmp_path / "archive") == [("scene", "skipped")] * 2
-
-
-def test_an_older_farm_law_is_not_current(
-    tmp_path: Path,
-    survey_png: Survey,
-    make_weights: WeightsMaker,
-    reprocess: Reprocess,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The farm's light is made by rules that have a version of their own."""
-    weights = make_weights(tuple(np.linspace(450, 850, 6)), names=CLASSES)
-    survey_png(
-        tmp_path / "a", scene="farm", labels=None, weights=str(weights), size="192x128", bands="20,60,110,160,210,250"
-    )
-    assert reprocess.states(tmp_path / "a") == [("farm", "skipped")]
-    monkeypatch.setattr(generations, "law_of_key", lambda key: None)  # a law that is drawn no more
-    assert reprocess.states(tmp_path / "a", dry_run=True) == [("farm", "would run")]

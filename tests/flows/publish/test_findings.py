@@ -24,7 +24,7 @@ from storage.arrays.class_maps import ClassMap
 from tests.conftest import CLASSES, Survey
 
 PLACE = NoPlace((2, 4), pixel_m=10.0)  # a hundredth of a hectare a pixel
-GROUND: dict[str, Any] = {"crs": "EPSG:32632", "resolution_m": 0.12, "areas_ha": {"bare_soil": 1.0, "weed": 0.0}}
+GROUND: dict[str, Any] = {"crs": "EPSG:32632", "resolution_m": 0.12}
 SEEN = TrainedOn(3, (460.0, 640.0), (3.0, 100.0), 2, CLASSES, (96, 300), (24.0, 60.0), 0.12)
 BIAS = np.array([-0.4, 0.1, 0.0])
 SCORES = MapScores((1,), (50.0, 100.0), np.stack([[0 * BIAS, BIAS]]), np.array([[0.02, 0.01]]), 4)
@@ -48,10 +48,20 @@ def test_changed_hectares_are_told_from_class_to_class() -> None:
     assert [(round(area, 6), *pair) for area, *pair in found] == [(0.02, "soil", "crop"), (0.005, "soil", "unknown")]
 
 
+def test_words_tell_the_pixels_of_each_class_and_hectares_where_they_are_known() -> None:
+    """Classes that the map lacks are left out; a map without a class says so."""
+    areas: dict[str, Any] = {"px": {"bare_soil": 30, "crop": 10, "weed": 0}}
+    pixels = "bare soil 30 px (75 %), crop 10 px (25 %)"
+    assert finding_rows({"areas": areas}) == [("classes", pixels)]
+    with_ha = areas | {"ha": {"bare_soil": 0.3, "crop": 0.1, "weed": 0.0}}
+    assert finding_rows({"areas": with_ha}) == [("classes", f"bare soil 0.3 ha, crop 0.1 ha; {pixels}")]
+    assert finding_rows({"areas": {"px": {"weed": 0}}}) == [("classes", "no pixel has a class")]
+
+
 def test_words_tell_what_changed_and_what_is_old() -> None:
     """From which class to which, with hectares; days with what is older; of a first capture nothing of either."""
     later = {"changes_ha": [[0.5, "crop", "bare_soil"], [0.0004, "weed", "crop"]], "older_ha": {"1": 0.25, "7": 0.0}}
-    first = "EPSG:32632; 0.12 m a pixel; bare soil 1 ha"
+    first = "EPSG:32632; 0.12 m a pixel"
     assert finding_rows({"ground": GROUND | {"older_ha": {"1": 0.0}}}) == [("on the ground", first)]
     ((_, words),) = finding_rows({"ground": GROUND | later})
     assert words == (

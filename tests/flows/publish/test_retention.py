@@ -18,7 +18,7 @@ from flows.archive.commands import gc
 from flows.publish.retention import clear_raw_lines
 from flows.terminal.processes import DONE, PARTLY
 from storage.archive.archive import Archive
-from storage.archive.kept_bytes import kept_bytes
+from storage.archive.lineage import Catalogue
 from storage.archive.records import read_run
 from storage.arrays import signal_cubes
 from storage.maintenance.garbage import IN_USE
@@ -80,7 +80,7 @@ def of_gc(capsys: pytest.CaptureFixture[str], root: Path, **flags: Any) -> tuple
 def is_counted(archive: Archive) -> bool:
     """Whether the newest receipt tells the bytes that are kept now."""
     run = read_run(archive.runs()[-1], {})
-    return bool(run.receipt["data_bytes"]["kept"] == kept_bytes(archive, run))
+    return bool(run.receipt["data_bytes"]["kept"] == archive.kept_bytes(run, Catalogue.read(archive.root)))
 
 
 def test_lines_stay_for_their_time(archive: Archive, capsys: pytest.CaptureFixture[str]) -> None:

@@ -40,8 +40,10 @@ import sys
 from prefect import serve
 from prefect.types.entrypoint import EntrypointType
 import flows.survey
-made = getattr(flows.survey, sys.argv[1]).to_deployment(sys.argv[2], entrypoint_type=EntrypointType.MODULE_PATH)
-serve(made, print_starting_message=False)
+names = [word.split("/") for word in sys.argv[1:]]
+kind = EntrypointType.MODULE_PATH
+made = [getattr(flows.survey, flow).to_deployment(name, entrypoint_type=kind) for flow, name in names]
+serve(*made, print_starting_message=False)
 """
 
 pytestmark = pytest.mark.usefixtures("no_effects", "scheduling")
@@ -204,12 +206,13 @@ def test_two_fields_that_are_due_at_once_take_turns_at_the_rig(tmp_path: Path) -
 
 
 @contextmanager
-def serving(flow: str, name: str, api: str) -> Iterator[None]:
-    """Serve a flow as a deployment in a process of its own."""
+def serving(api: str, *names: str) -> Iterator[None]:
+    """Serve flows as deployments: each run is a process of its own."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "PREFECT_RUNNER_POLL_FREQUENCY": "1", "PREFECT_API_URL": api}
-    with subprocess.Popen([sys.executable, "-c", SERVES, flow, name], cwd=ROOT, env=environment) as process:
+    with subprocess.Popen([sys.executable, "-c", SERVES, *names], cwd=ROOT, env=environment) as process:
         try:
-            wait_for(f"{flow}/{name}")
+            for name in names:
+                wait_for(name)
             yield
         finally:
             process.kill()
@@ -247,7 +250,7 @@ def test_the_rig_and_the_reading_machine_are_two_deployments(
 
     file = field_file("north", effects="none")
     given = {"settings_file": str(file), "name": "north", "visit": "2026-06-01T04:00:00Z", "prior": "none"}
-    with serving("capture", "rig", scheduling), serving("survey", "apart", scheduling):
+    with serving(scheduling, "capture/rig", "survey/apart"):
         state = asked_for("survey/apart", settings=given, capture_deployment="capture/rig")
     assert state.is_completed(), state.message
     with client() as asked:
@@ -273,11 +276,14 @@ def prefect_cli(folder: Path, *words: str) -> str:
 
 def test_the_file_of_deployments_is_complete(scheduling: str) -> None:
     """`prefect deploy --all --no-prompt` makes all three, with schedule, pools and limits, and parameters that fit."""
+    from prefect.client.schemas.actions import WorkPoolCreate
+
     from flows.archive.reprocess_flow import reprocess
     from flows.survey import survey
 
-    for pool in ("reading", "rig"):
-        prefect_cli(ROOT, "work-pool", "create", pool, "--type", "process", "--overwrite")
+    with client() as asked:
+        for pool in ("reading", "rig"):
+            asked.create_work_pool(WorkPoolCreate(name=pool, type="process"))
     prefect_cli(ROOT, "deploy", "--all", "--no-prompt")
     with client() as asked:
         north, rig, archive = map(asked.read_deployment_by_name, ("survey/north", "capture/rig", "reprocess/archive"))

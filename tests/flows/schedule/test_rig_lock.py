@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -12,19 +13,22 @@ from pathlib import Path
 import pytest
 
 from flows.tasks import rig_lock as rig_locks
-from flows.tasks.rig_lock import RigLock, rig_lock
+from flows.tasks.rig_lock import lock_name, rig_to_oneself
 from pipeline.errors import ArchiveError, RigError
 from storage.archive.staging import take_lock
 
 ROOT = Path(__file__).parents[3]
 PORT = f"/dev/ttyTEST{os.getpid()}"  # two runs of these tests on one machine are two rigs
 TAKES = """
-import os, sys
-os.access = lambda *given, **named: False  # /run/lock is for others
-from flows.tasks.rig_lock import rig_lock
-lock = rig_lock(sys.argv[1])
-print(lock.take("a survey"), flush=True)
-sys.stdin.read()
+import sys
+from flows.tasks.rig_lock import rig_to_oneself
+try:
+    with rig_to_oneself(sys.argv[1], "a survey"):
+        print(True, flush=True)
+        sys.stdin.read()
+except OSError:
+    print(False, flush=True)
+    sys.stdin.read()
 """
 
 
@@ -53,37 +57,36 @@ def takers(folder: Path, count: int) -> Iterator[list[tuple[subprocess.Popen[str
             process.communicate()
 
 
+def holder(port: str) -> str:
+    """Whoever holds a rig, by the refusal; empty where it is free."""
+    try:
+        with rig_to_oneself(port, "a question"):
+            return ""
+    except RigError as error:
+        return re.sub(r"^the rig is in use by (.*); wait until that survey has ended, or end it$", r"\1", str(error))
+
+
 def test_three_users_with_folders_of_their_own(tmp_path: Path) -> None:
-    """With /run/lock shut and another TMPDIR each, one of three has the rig, and it is free once that one is killed."""
+    """With another TMPDIR each, one of three has the rig, and it is free once that one is killed."""
     with takers(tmp_path, 3) as tried:
         assert [took for _, took in tried] == [True, False, False]
-        lock, holder = rig_lock(PORT), tried[0][0]
-        assert not lock.take("a survey")
-        assert lock.holder() == f"a survey (process {holder.pid})"
-        holder.kill()
-        holder.wait()
-        assert lock.take("by hand")
-        assert rig_lock(PORT).holder() == f"by hand (process {os.getpid()})"
-        lock.release()
-    assert rig_lock(PORT).holder() == "another process"
+        first = tried[0][0]
+        assert holder(PORT) == f"a survey (process {first.pid})"
+        first.kill()
+        first.wait()
+        with rig_to_oneself(PORT, "by hand"):
+            assert holder(PORT) == f"by hand (process {os.getpid()})"
+    assert holder(PORT) == ""
 
 
-def test_locks_are_of_the_port_and_say_their_holder(tmp_path: Path) -> None:
-    """A link to the device is the device; words of a killed process are not kept."""
+def test_locks_are_of_the_port(tmp_path: Path) -> None:
+    """A link to the device is the device; long addresses are told apart."""
     (tmp_path / "tty").touch()
     (tmp_path / "by-id").symlink_to(tmp_path / "tty")
-    assert rig_lock(str(tmp_path / "by-id")).place == rig_lock(str(tmp_path / "tty")).place
-    one, other = (rig_lock(f"socket://{'a' * 200}:{port}") for port in (5000, 5001))
-    assert one.take("a survey")
-    assert other.take("a survey")
-    one.release()
-    other.release()
-    path = tmp_path / "rig.lock"
-    path.write_text("a survey of a field with a very long name indeed (process 1)\n")
-    lock = RigLock(path)
-    assert lock.take("x")
-    assert path.read_text() == f"x (process {os.getpid()})\n"
-    lock.release()
+    assert lock_name(str(tmp_path / "by-id")) == lock_name(str(tmp_path / "tty"))
+    one, other = (f"socket://{'a' * 200}:{port}" for port in (5000, 5001))
+    with rig_to_oneself(one, "a survey"), rig_to_oneself(other, "a survey"):
+        assert holder(one) == holder(other) == f"a survey (process {os.getpid()})"
 
 
 def test_a_rig_that_cannot_be_locked_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,41 +96,11 @@ def test_a_rig_that_cannot_be_locked_is_not_used(monkeypatch: pytest.MonkeyPatch
         raise PermissionError(1, "Operation not permitted")
 
     monkeypatch.setattr(rig_locks.socket, "socket", refuse)
-    with pytest.raises(RigError, match=r"cannot lock the rig .*: Operation not permitted; .* goes on without"):
-        rig_lock(PORT).take("a survey")
-
-
-def test_a_system_without_such_names_uses_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Elsewhere than on Linux a file at a fixed place is the lock, whatever TMPDIR says, and links are refused."""
-    monkeypatch.setattr(rig_locks.sys, "platform", "darwin")
-    place = rig_lock("/dev/cu.usb").place
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
-    assert rig_lock("/dev/cu.usb").place == place == Path("/tmp/spectralzoom-rig-dev-cu.usb.lock")
-    monkeypatch.setattr(rig_locks, "FIXED_FOLDER", tmp_path)
-    lock, other = rig_lock("/dev/cu.usb"), rig_lock("/dev/cu.usb")
-    assert lock.take("a survey")
-    assert not other.take("a survey")
-    assert other.holder() == f"a survey (process {os.getpid()})"
-    lock.release()
-
-
-@pytest.mark.parametrize("kind", ["to a file", "to nothing", "hard"])
-def test_what_a_lock_points_at_is_left_alone(tmp_path: Path, kind: str) -> None:
-    """A link in the lock's place is refused by name; a file that has another name too is locked and not written."""
-    target, path = tmp_path / "precious", tmp_path / "rig.lock"
-    if kind != "to nothing":
-        target.write_text("bytes")
-    lock = RigLock(path)
-    if kind == "hard":
-        path.hardlink_to(target)
-        assert lock.take("a survey")
-        lock.release()
-    else:
-        path.symlink_to(target)
-        with pytest.raises(ArchiveError, match=r"rig\.lock is a link, expected a lock file of its own; see where it"):
-            lock.take("a survey")
-    assert target.exists() == (kind != "to nothing")
-    assert not target.exists() or target.read_text() == "bytes"
+    with (
+        pytest.raises(RigError, match=r"cannot lock the rig .*: Operation not permitted; .* need Linux"),
+        rig_to_oneself(PORT, "a survey"),
+    ):
+        pass
 
 
 def test_locks_of_an_archive_follow_no_link(tmp_path: Path) -> None:

@@ -37,8 +37,9 @@ RECORD = {
     "miou": [[0.99, 0.98], [0.97, 0.95], [0.9, 0.8]],
     "per_class_iou": {"class_1": [[0.99, 0.97], [0.96, 0.94], [0.9, 0.8]]},
 }
-WHOLE: dict[str, Any] = {"budget": None, "scan_step": "2", "scan_exposure_ms": "25", "name": "north"}
-PART: dict[str, Any] = {"budget": None, "extent": "part", "prior": "latest", "name": "north", "seconds": "1.98"}
+FIELD: dict[str, Any] = {"budget": None, "name": "north", "accuracy": False}
+WHOLE = {**FIELD, "scan_step": "2", "scan_exposure_ms": "25"}
+PART = {**FIELD, "extent": "part", "prior": "latest", "seconds": "1.98"}
 FIRST, LATER, LAST = "2026-06-01T10:00:00Z", "2026-06-04T10:00:00Z", "2026-06-07T10:00:00Z"
 
 
@@ -155,14 +156,9 @@ def test_of_what_is_sure_enough_nothing_is_looked_at(
     runs = sorted(visited.glob("runs/*"))
     flags = {**PART, "visit": LAST, "weights": str(recorded)}
     asked = {
-        **{name: value for name, value in flags.items() if value is not None},
-        **{
-            "scene": str(scene_files / "scene.png"),
-            "source": "sim",
-            "out": str(visited),
-            "engine": "plain",
-            "skip_below_error": "50%",
-        },
+        **{name: value for name, value in flags.items() if value},
+        **{"scene": str(scene_files / "scene.png"), "source": "sim", "out": str(visited)},
+        **{"engine": "plain", "skip_below_error": "50%"},
     }
     with pytest.raises(NothingToMend, match=f"the map of {runs[-1].name} stands"):
         survey_png(visited, **{**flags, "skip_below_error": "50%"})
@@ -205,7 +201,7 @@ def test_what_is_beyond_another_fields_part_has_no_class(
     scene = {"scene": str(tmp_path / "other.png"), "labels": str(tmp_path / "labels.png")}
     other = survey_png(visited, **PART, **scene, visit=LAST, weights=str(recorded))
     assert other.receipt["memory"]["put_aside"] == "another field"
-    assert "the rest is as before" not in (other.folder / "report.html").read_text(encoding="utf-8")
+    assert "the rest is unchanged" not in (other.folder / "report.html").read_text(encoding="utf-8")
     classes = product(visited, other, "class_map").classes.values
     assert 1 - other.receipt["extent"]["fraction"] <= (classes == 255).mean() < 1
 

@@ -37,7 +37,7 @@ from tests.prior_work import without_effects
 pytestmark = pytest.mark.usefixtures("no_effects")
 
 QUIET = Console(quiet=True)
-UNIFORM: dict[str, Any] = {"budget": None, "scan_step": "2", "name": "north"}
+UNIFORM: dict[str, Any] = {"budget": None, "scan_step": "2", "name": "north", "accuracy": False}
 FIRST, LATER, BETWEEN = "2026-06-01T10:00:00Z", "2026-06-04T10:00:00Z", "2026-06-02T22:00:00Z"
 
 
@@ -137,14 +137,8 @@ def test_a_field_of_another_size_is_no_memory(visited: Path, survey_png: Survey,
 
 def test_another_field_under_the_same_name_is_put_aside(visited: Path, survey_png: Survey, tmp_path: Path) -> None:
     """Its map is the one of a survey without memory, and receipt and page say why."""
-    values, labels = patchy_scene((96, 128), 3, seed=77)
-    Image.fromarray(values.astype(np.uint8)).save(tmp_path / "other.png")
-    Image.fromarray(labels).save(tmp_path / "labels.png")
-    flags = {
-        "scene": str(tmp_path / "other.png"),
-        "labels": str(tmp_path / "labels.png"),
-        "visit": "2026-06-07T10:00:00Z",
-    }
+    Image.fromarray(patchy_scene((96, 128), 3, seed=77)[0].astype(np.uint8)).save(tmp_path / "other.png")
+    flags = {"scene": str(tmp_path / "other.png"), "labels": None, "visit": "2026-06-07T10:00:00Z"}
     words, wrong = words_of(visited, survey_png, **flags, prior="latest")
     alone = survey_png(tmp_path / "alone", **{**UNIFORM, **flags})
     assert wrong.receipt["memory"]["put_aside"] == "another field"
@@ -239,25 +233,27 @@ def test_a_reader_in_the_weights_is_used(visited: Path, survey_png: Survey, weig
 
 def test_a_survey_in_two_passes_remembers_where_it_did_not_look(survey_png: Survey, tmp_path: Path) -> None:
     """Patches without fine lines keep their memory, and grow older."""
-    out, two = tmp_path / "archive", {"name": "north", "budget": "0.75", "prior": "latest"}
+    out, two = tmp_path / "archive", {**UNIFORM, "scan_step": None, "budget": "0.75", "prior": "latest"}
     survey_png(out, **two, visit=FIRST)
     later = survey_png(out, **two, visit=LATER)
     probabilities = xr.open_zarr(out / later.receipt["products"]["class_probabilities"], consolidated=False)
     assert set(np.unique(probabilities.age.values).tolist()) == {0.0, 3.0}
 
 
+def moved(folder: Path) -> list[dict[str, Any]]:
+    """Flags of one field twice, the second time 12 px lower and 20 px further left."""
+    values, _ = patchy_scene((160, 192), 3, seed=5)
+    flags = {**UNIFORM, "labels": None, "prior": "latest"}
+    for name, part in {"before": np.s_[12:140, 0:160], "now": np.s_[0:128, 20:180]}.items():
+        Image.fromarray(values[part].astype(np.uint8)).save(folder / f"{name}.png")
+    return [{**flags, "scene": str(folder / f"{name}.png")} for name in ("before", "now")]
+
+
 def test_a_rig_that_was_moved_finds_its_memory(survey_png: Survey, tmp_path: Path) -> None:
     """A field that lies 12 px lower and 20 px further left than it did: its memory is brought there, edges are new."""
-    values, labels = patchy_scene((160, 192), 3, seed=5)
-    places = {"before": np.s_[12:140, 0:160], "now": np.s_[0:128, 20:180]}
-    flags = {}
-    for name, part in places.items():
-        Image.fromarray(values[part].astype(np.uint8)).save(tmp_path / f"{name}.png")
-        Image.fromarray(labels[part]).save(tmp_path / f"{name}-labels.png")
-        flags[name] = {"scene": str(tmp_path / f"{name}.png"), "labels": str(tmp_path / f"{name}-labels.png")}
-    out = tmp_path / "archive"
-    survey_png(out, **UNIFORM, **flags["before"], visit=FIRST)
-    words, later = words_of(out, survey_png, **flags["now"], visit=LATER, prior="latest")
+    out, (before, now) = tmp_path / "archive", moved(tmp_path)
+    survey_png(out, **before, visit=FIRST)
+    words, later = words_of(out, survey_png, **now, visit=LATER)
     assert later.receipt["memory"]["shift_px"] == [12, -20]
     assert "lay 23 px beside it" in words
     probabilities = xr.open_zarr(out / later.receipt["products"]["class_probabilities"], consolidated=False)
@@ -266,11 +262,7 @@ def test_a_rig_that_was_moved_finds_its_memory(survey_png: Survey, tmp_path: Pat
 
 def test_a_rig_that_was_moved_between_two_parts_is_noticed(survey_png: Survey, tmp_path: Path) -> None:
     """Where they share nothing today's lines are laid onto those of the visit before the last."""
-    values, _ = patchy_scene((160, 192), 3, seed=5)
-    for name, part in {"before": np.s_[12:140, 0:160], "now": np.s_[0:128, 20:180]}.items():
-        Image.fromarray(values[part].astype(np.uint8)).save(tmp_path / f"{name}.png")
-    out, given = tmp_path / "archive", {**UNIFORM, "labels": None, "name": "north", "prior": "latest"}
-    before, now = ({**given, "scene": str(tmp_path / f"{name}.png")} for name in ("before", "now"))
+    out, (before, now) = tmp_path / "archive", moved(tmp_path)
     survey_png(out, **before, visit=FIRST)
     middle = survey_png(out, **before, visit=LATER, extent="0:0-20")
     later = survey_png(out, **now, visit="2026-06-07T10:00:00Z", extent="0:40-64")

@@ -200,6 +200,7 @@ def test_products_open_with_plain_xarray(farm: Done) -> None:
         assert cube["exposure_ms"].values.tolist() == [100.0] * cube.sizes["line"]
 
 
+@pytest.mark.usefixtures("no_effects")
 def test_without_a_fine_patch_the_map_is_the_coarse_prediction(survey_png: Any, weights: Path, tmp_path: Path) -> None:
     """A budget that pays for the coarse pass alone gives the classes of the overview of its repeated pixels."""
     done = Done(survey_png(tmp_path, budget="0.45"), tmp_path)

@@ -411,7 +411,7 @@ def test_another_device_is_not_moved(command_line: CommandLine, tmp_path: Path, 
     scene, _ = open_scene(settings)
     rig = FaultyRig(make_source(scene, settings), FastClock(20), mirror_faults=[make_fault(fault, at=0)])
     with rig.serve() as served:
-        told = {"port": served.port, "host": served.host, "control_port": served.camera_port, "park_at_close": True}
+        told = {"port": served.port, "host": served.host, "control_port": served.camera_port}
         assert words in told_on_the_command_line(command_line, tmp_path, **told)
     asked = {act.request.command for act in rig.mirror.acts}
     assert not asked & {Command.SET_VALUE, Command.SET_VALUES, Command.SET_VECTOR}

@@ -18,6 +18,7 @@ from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from pipeline.errors import BudgetError, SettingsError, WeightsError
 from tests.conftest import Survey, WeightsMaker
+from tests.prior_work import with_effects
 
 RECORD = {
     "scenes": 3,
@@ -27,7 +28,10 @@ RECORD = {
     "spread": [[0.02] * 3, [0.03] * 3, [0.04] * 3],
     "per_class_iou": {"class_1": [[0.8, 0.7, 0.6], [0.7, 0.65, 0.5], [0.5, 0.4, 0.3]]},
 }
+pytestmark = pytest.mark.usefixtures("no_effects")
+
 QUIET = Console(quiet=True)
+BY_HAND: dict[str, Any] = {"budget": None, "scan_step": "2", "scan_exposure_ms": "25", "accuracy": False}
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +44,8 @@ def recorded(make_weights: WeightsMaker) -> Path:
 def scanned(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey, recorded: Path) -> tuple[Path, Any]:
     """One survey by hand of every second line, 25 ms."""
     out = tmp_path_factory.mktemp("scanned")
-    flags = {"budget": None, "scan_step": "2", "scan_exposure_ms": "25", "weights": str(recorded)}
-    return out, survey_png(out, **flags)
+    with with_effects():  # noise has scores of its own size
+        return out, survey_png(out, **BY_HAND, weights=str(recorded))
 
 
 def _store(out: Path, name: str) -> xr.Dataset:
@@ -220,12 +224,13 @@ def test_scores_keep_to_a_limit_of_bytes(
 ) -> None:
     """Coarser steps are taken, as few as suffice; each raw line is compared with them and cleared."""
     every = _scores_bytes(scanned[0])
-    flags = {"budget": None, "scan_step": "2", "scan_exposure_ms": "25", "weights": str(recorded)}
-    survey_png(tmp_path / "half", **flags, kept_bytes=str(int(0.6 * every)))
+    flags = {**BY_HAND, "weights": str(recorded)}
+    with with_effects():  # as the other has them
+        survey_png(tmp_path / "half", **flags, kept_bytes=str(int(0.6 * every)))
+        survey_png(tmp_path / "enough", **flags, kept_bytes=str(2 * every))
     assert _scores_bytes(tmp_path / "half") <= 0.65 * every
     assert _step(tmp_path / "half") > _step(scanned[0]) == 1
     assert not list(tmp_path.glob("half/stages/capture/*/*.zarr"))
-    survey_png(tmp_path / "enough", **flags, kept_bytes=str(2 * every))
     assert _step(tmp_path / "enough") == 1
 
 

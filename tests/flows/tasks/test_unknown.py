@@ -96,7 +96,7 @@ def test_unknown_pixels_count_as_wrong_and_are_no_class_of_the_mean(both: tuple[
 def test_without_it_every_bit_is_kept(
     both: tuple[Path, Path, dict[str, Any]], survey_png: Survey, weights: Path, tmp_path: Path
 ) -> None:
-    """Switched off, and by weights that nobody measured: the same keys, and the same bytes under them."""
+    """Switched off, and by weights without a record of familiar spectra: the same keys, and the same bytes."""
     survey_png(tmp_path, weights=str(weights), effects="none")
     assert _files(tmp_path, "segment") == _files(both[1], "segment")
     assert not set(_files(both[0], "segment")) & set(_files(both[1], "segment"))
@@ -154,7 +154,7 @@ def test_pixels_without_a_value_have_no_class_rather_than_an_unknown_one(
 
 def test_a_rate_needs_weights_that_were_measured(survey_png: Survey, weights: Path, tmp_path: Path) -> None:
     """With the command that measures them; nothing is left behind."""
-    with pytest.raises(WeightsError, match=r"--unknown 1%: nobody measured .* --fit-ood"):
+    with pytest.raises(WeightsError, match=r"--unknown 1%: .* has no record of familiar spectra.* --fit-ood"):
         survey_png(tmp_path / "out", weights=str(weights), unknown="1%")
     assert not (tmp_path / "out").exists()
 

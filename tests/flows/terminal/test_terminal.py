@@ -74,6 +74,7 @@ def _history(words: str) -> FieldHistory:
         "miou": 0.5,
         "unit": "fraction",
         "overall_accuracy": None,
+        "training_scene": None,
         "savings": {"capture_s": 0.5},
         "areas": {words: 1.0},
         "capture_seconds": {"done": None, "full": None},
@@ -191,6 +192,16 @@ def test_time_left_stands_behind_the_words(monkeypatch: pytest.MonkeyPatch) -> N
     told = progress_of(lambda one: one.show("training", 0.5, "failed", ended=True), **{**TERMINAL, "width": 120})
     assert "failed" in told
     assert "failed  left" not in told
+
+
+def test_a_line_of_a_log_says_how_long_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a stage that goes on, and no longer once it has ended."""
+    monkeypatch.setattr("rich.progress.Task.time_remaining", 75.0)
+    monkeypatch.setattr("flows.terminal.progress.LINE_EVERY_S", -1.0)
+    assert progress_of(lambda one: one.show("rectify", 0.5, "step 28")).splitlines() == [
+        "mosaic: 50% step 28, 75 s left"
+    ]
+    assert progress_of(lambda one: one.show("rectify", 1.0, "ran", ended=True)).splitlines() == ["mosaic: 100% ran"]
 
 
 def test_a_narrow_terminal_keeps_bars_and_times() -> None:

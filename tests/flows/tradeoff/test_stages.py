@@ -3,13 +3,31 @@
 from __future__ import annotations
 
 import math
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
+from flows.publish.survey_command import run_survey
+from flows.settings.load import load_settings
 from flows.tradeoff import stages
+from flows.tradeoff.command import run_tradeoff
 from flows.tradeoff.entries import Tradeoff, measure_tradeoff
-from flows.tradeoff.stages import EXACT, PERIODS_PX, RECTIFY, SEGMENT, SIMULATE, TOLERANCES, draw_waves
+from flows.tradeoff.stages import (
+    EXACT,
+    PERIODS_PX,
+    RECTIFY,
+    SEGMENT,
+    SIMULATE,
+    TOLERANCES,
+    default_plan,
+    draw_waves,
+    fractions_of_raster,
+    open_field,
+)
+from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 
 
@@ -51,3 +69,31 @@ def test_more_patches_draw_a_better_map(monkeypatch):
     monkeypatch.setattr(stages, "FARM_SHAPE", (128, 192))
     found = errors(SEGMENT, SEGMENT.prepare(0))
     assert 0 < found[1.0] < found[0.0] < 1
+
+
+def test_own_scenes_are_measured_by_their_labels(scene_files: Path, weights: Path, tmp_path: Path) -> None:
+    """A raster by fractions of its patches, and as the rig sees it by every scan; the default of each is marked."""
+    scene = str(tmp_path / "scene.png")
+    shutil.copy(scene_files / "scene.png", scene)
+    shutil.copy(scene_files / "labels.png", tmp_path / "scene_labels.png")
+    quiet = Console(quiet=True)
+    content = run_tradeoff(None, tmp_path / "out", 1, 0, quiet, scene=scene, weights=weights)
+    parts, scans = content["tradeoffs"]
+    assert (parts["stage"], parts["default"]) == ("segment", 1.0)
+    assert (scans["stage"], scans["default"]) == ("survey", default_plan(open_field(0, scene, weights, "sim"))[0])
+    for one in (parts, scans):
+        errors = {point["setting"]: point["error"] for point in one["points"]}
+        assert one["default"] in errors
+        assert all(0 <= error <= 1 for error in errors.values())
+    whole = run_survey(
+        load_settings(None, {"scene": scene, "weights": str(weights), "out": str(tmp_path / "a")}), quiet
+    )
+    errors = {point["setting"]: point["error"] for point in parts["points"]}
+    assert errors[1.0] == pytest.approx(1 - whole.receipt["accuracy"]["miou"], abs=1e-3)
+
+
+def test_a_scene_without_labels_has_no_tradeoff(scene_files: Path, weights: Path, tmp_path: Path) -> None:
+    """One message that says what is missing."""
+    shutil.copy(scene_files / "scene.png", tmp_path / "bare.png")
+    with pytest.raises(SceneError, match="has no labels by which a map could be judged; lay a label file beside it"):
+        fractions_of_raster(str(tmp_path / "bare.png"), weights)

@@ -104,11 +104,16 @@ def test_what_cannot_run_is_told_and_left_out(monkeypatch: pytest.MonkeyPatch, t
 
 
 def test_scenes_that_do_not_fit_are_refused(tmp_path: Path) -> None:
-    """Another stage has no scene, weights alone read none, and numbers with parts are no raw ones."""
-    quiet = Console(quiet=True)
-    for stage, scene in (("rectify", "cube.npy"), (None, "cube.npy"), ("store", None)):
-        with pytest.raises(SettingsError, match="for the stage store alone"):
-            run_tradeoff(stage, tmp_path, 1, 0, quiet, scene=scene, weights=Path("w.safetensors"))
+    """Another stage has no scene, one without the other says nothing, and numbers with parts are no raw ones."""
+    quiet, weights = Console(quiet=True), Path("w.safetensors")
+    for stage, scene, read_by in (
+        ("rectify", "cube.npy", weights),
+        ("survey", "cube.npy", None),
+        (None, "cube.npy", None),
+        ("store", None, weights),
+    ):
+        with pytest.raises(SettingsError, match="--scene FILE and --weights FILE go together, with the stages segment"):
+            run_tradeoff(stage, tmp_path, 1, 0, quiet, scene=scene, weights=read_by)
     with pytest.raises(SceneError, match="no whole ones from 0 to 65534"):
         scan_raster(cube_of(tmp_path / "cube.npy", offset=0.5), None)
 

@@ -173,6 +173,23 @@ def test_table_goes_from_the_most_exact_setting_down():
     assert json.loads(to_json(asdict(result)))["points"][0]["beside"] == {"squared": 0.0625, "none": None}
 
 
+def test_the_default_is_marked() -> None:
+    """In the table, in the figure and in the JSON, and nothing where no setting is one."""
+    result = measure_tradeoff(replace(SERIES, default=lambda truth: 16000.0), repeats=1)
+    assert "16000.0 (default)" in printed(result)
+    assert printed(result).count("(default)") == 1
+    (axes,) = tradeoff_figure([result]).axes
+    assert [text.get_text() for text in axes.texts if "default" in text.get_text()] == ["16000.0 (default)"]
+    assert asdict(result)["default"] == 16000.0
+    assert "(default)" not in printed(measure_tradeoff(SERIES, repeats=1))
+
+
+def test_settings_may_follow_from_what_was_prepared() -> None:
+    """Those that are given for what was prepared run, and no others."""
+    found = measure_tradeoff(replace(SERIES, settings=(), settings_of=lambda truth: (10.0, 20.0)), repeats=1)
+    assert [point.setting for point in found.points] == [10.0, 20.0]
+
+
 def test_figure_tells_winners_from_beaten():
     """Winners are filled, the beaten hollow; a family is one line, its members named at their points."""
     told = (("scan, 1 ms", 0.0, 2.0), ("scan, 2 ms", 1e-3, 1.0), ("two passes, half", 0.5, 3.0))

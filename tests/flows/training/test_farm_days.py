@@ -12,20 +12,18 @@ import pytest
 
 from flows.archive.compare_command import compare, find_run
 from flows.archive.stale_runs import asked_again, newest_runs
-from flows.settings.load import load_settings, parse_settings
+from flows.settings.load import parse_settings
 from flows.settings.survey_settings import Settings
-from flows.tasks.scene import check_labels, farm_refusal, open_scene
+from flows.tasks.scene import farm_refusal, open_scene
 from flows.training.data import farm_days, farm_test_data, open_training_data, read_farm_name
 from flows.training.observed_scenes import observe_scene
-from models.network.sizes import SegmenterConfig
 from models.network.spectral import SpectralBasis
 from models.training.examples import observe
-from models.weights.files import Description
 from pipeline.errors import ArchiveError, SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.simulator.scenes.farm.farm_plan import CLASSES
-from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, REMOVED_LAW, farm_scene
+from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW
 from pipeline.simulator.scenes.farm.land import sun_over_farm
 from pipeline.simulator.scenes.scene import RasterScene
 from storage.archive.archive import Archive
@@ -60,7 +58,6 @@ def test_two_days_of_a_field_are_one_land() -> None:
 @pytest.mark.parametrize(
     ("table", "words"),
     [
-        ({"scene": REMOVED_LAW}, r"farm@1 was removed: take farm \(farm@2\)"),
         ({"scene": "field.png", "hour": 9.5}, "'hour' = 9.5 is for the scene farm@2"),
         ({"scene": FARM_LAW, "day": 0}, "'day' must be a whole number from 1 to 366, got 0"),
         ({"scene": FARM_LAW, "hour": 25}, "'hour' must be a number from 0 to 24 h"),
@@ -70,18 +67,6 @@ def test_days_that_are_none_are_refused(table: dict[str, Any], words: str) -> No
     """By the settings, before any scene is opened."""
     with pytest.raises(SettingsError, match=words):
         parse_settings(table)
-
-
-def test_the_removed_farm_is_no_file(tmp_path: Path) -> None:
-    """A settings file that names it is refused; its runs are told apart by their seeds."""
-    (tmp_path / "field.toml").write_text(f'scene = "{REMOVED_LAW}"\n')
-    with pytest.raises(SettingsError, match="farm@1 was removed"):
-        load_settings(tmp_path / "field.toml")
-    archive = Archive.open(tmp_path)
-    keys = [f"farm@1/seed={seed}/shape=8x8/bands=9" for seed in (0, 1)]
-    made = [_publish(archive, key, scene=REMOVED_LAW) for key in keys]
-    with pytest.raises(SceneError, match="of different fields"):
-        compare(tmp_path, *made)
 
 
 def test_moments_are_told_apart_and_night_is_refused() -> None:
@@ -94,15 +79,6 @@ def test_moments_are_told_apart_and_night_is_refused() -> None:
     }
     assert [len(notes) for notes in said.values()] == [0, 1, 1]
     assert "of day 172, 11 h, while the light drifts as from sky.started, day 233" in list(said.values())[1][0]
-
-
-def test_weights_of_another_farm_are_told() -> None:
-    """They know the classes, but not how these look."""
-    scene = farm_scene(0, (20, 30))
-    for law, count in ((REMOVED_LAW, 1), (FARM_LAW, 0), ("folder", 0)):
-        config = SegmenterConfig(classes=len(CLASSES), columns=6, patch=8, width=4)
-        weights = Description(config, SpectralBasis(450, 850, 6), CLASSES, {"data": law})
-        assert len(check_labels(scene, weights)) == count
 
 
 def _publish(archive: Archive, key: str, **settings: Any) -> str:
@@ -127,25 +103,19 @@ def test_days_of_one_land_are_compared(tmp_path: Path) -> None:
         compare(tmp_path, made[0], made[2])
 
 
-def test_a_farm_is_asked_for_again_by_its_law(tmp_path: Path) -> None:
-    """Whatever ``farm`` means by now, the land is the run's; the default day is the same field as when it is named."""
+def test_the_usual_day_of_a_farm_is_one_field(tmp_path: Path) -> None:
+    """By either name of the farm, and whether the day is named or not; another day is another field."""
     archive = Archive.open(tmp_path)
-    second = "farm@2/seed=0/day=172/shape=8x8/hour=11/bands=9"
+    key = "farm@2/seed=0/day=172/shape=8x8/hour=11/bands=9"
     made = [
-        _publish(archive, "farm@1/seed=0/shape=8x8/bands=9", scene="farm"),
-        _publish(archive, second, scene="farm"),
-        _publish(archive, second, scene="farm@2", day=172),
-        _publish(archive, second.replace("172", "173"), scene="farm@2", day=173),
-        _publish(archive, "farm@1/seed=0/shape=8x8/bands=9", scene="farm@1"),
+        _publish(archive, key, scene="farm"),
+        _publish(archive, key, scene="farm@2", day=172),
+        _publish(archive, key.replace("172", "173"), scene="farm@2", day=173),
     ]
     newest = newest_runs(Catalogue.read(tmp_path))
-    assert [one.run.folder.name for one in newest] == made[2:]
-    old, *others = Catalogue.read(tmp_path).runs
-    again = [asked_again(run, tmp_path, None) for run in others[:-1]]
-    assert [(one.scene, one.day) for one in again] == [(FARM_LAW, None), (FARM_LAW, 172), (FARM_LAW, 173)]
-    for removed in (old, others[-1]):
-        with pytest.raises(SettingsError, match="farm@1 was removed"):
-            asked_again(removed, tmp_path, None)
+    assert [one.run.folder.name for one in newest] == made[1:]
+    again = [asked_again(run, tmp_path, None) for run in Catalogue.read(tmp_path).runs]
+    assert [(one.scene, one.day) for one in again] == [("farm", None), (FARM_LAW, 172), (FARM_LAW, 173)]
 
 
 def test_training_days_cover_the_season() -> None:

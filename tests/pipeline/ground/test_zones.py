@@ -17,7 +17,7 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.ground.field_places import NoPlace, PlacedPicture, PosedField
 from pipeline.ground.map_grid import ground_grid
 from pipeline.ground.view import GroundView, RigPose
-from pipeline.ground.zones import field_zones, figures_of_plots, on_field, pixels_inside
+from pipeline.ground.zones import field_zones, figures_of_plot, on_field, pixels_inside
 
 SHAPE = (60, 80)
 corners = st.lists(st.tuples(st.floats(-20, 100), st.floats(-20, 80)), min_size=3, max_size=8)
@@ -165,7 +165,10 @@ def test_a_plot_is_as_sure_as_its_pixels_that_are() -> None:
     """Three pixels of 0.5, 0.7 and 0.9, one of the class unknown: the mean is of the three; of none it is None."""
     classes, confidence = np.array([[0, 0], [0, 1]], np.uint8), np.array([[0.5, 0.7], [0.9, np.nan]], np.float32)
     plots = {"all": shapely.box(0, 0, 2, 2), "out_of_range": shapely.box(1, 1, 2, 2)}
-    whole, out_of_range = figures_of_plots(plots, NoPlace((2, 2)), classes, confidence, ("crop", "unknown"))
+    whole, out_of_range = (
+        figures_of_plot(name, shape, NoPlace((2, 2)), classes, confidence, ("crop", "unknown"))
+        for name, shape in plots.items()
+    )
     assert (whole.pixels, whole.confidence) == (4, pytest.approx(0.7))
     assert (whole.fractions["unknown"], out_of_range.fractions["unknown"], out_of_range.confidence) == (0.25, 1.0, None)
 

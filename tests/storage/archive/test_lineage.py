@@ -58,7 +58,7 @@ def test_any_manifest_can_be_read_or_is_told_damaged(tmp_path: Path, archive: Ar
     catalogue = Catalogue.read(tmp_path)
     problem = catalogue.stores[small.mosaic.uri].problem
     assert problem is not None
-    assert problem.startswith("manifest.json cannot be believed")
+    assert problem.startswith("manifest.json is damaged")
     assert catalogue.inputs_of(small.mosaic.uri) == []
     broken = [one.uri for one in verify_archive(archive) if one.problem is not None]
     assert broken == [small.mosaic.uri]

@@ -19,7 +19,7 @@ from pipeline.errors import ArchiveError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.layout import AngularGrid
-from storage.export.image_files import ANGULAR, CogImage, Place, write_cog
+from storage.export.image_files import ANGULAR, CogImage, angular_geobox, write_cog
 from tests.storage.export.stac_rules import is_cog
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
@@ -50,16 +50,16 @@ def rows_of(values: NDArray[Any]) -> Iterator[tuple[int, NDArray[Any]]]:
         yield first, values[first : first + 64]
 
 
-def class_image(shape: tuple[int, int], place: Place | None = None) -> CogImage:
-    """What a file of classes holds."""
-    return CogImage(shape, "uint8", place or Place.on_map(on_map(shape)), ("class",), UNLABELLED, LEGEND, {"run": "r1"})
+def class_image(geobox: GeoBox) -> CogImage:
+    """Return a file of classes."""
+    return CogImage(geobox, "uint8", ("class",), UNLABELLED, LEGEND, {"run": "r1"})
 
 
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:25832", "EPSG:3035", "EPSG:32733"])
 def test_rasterio_reads_what_was_written(tmp_path: Path, crs: str) -> None:
     """Values, CRS, transform, nodata, band names and tags of a map are those given."""
     values, box = classes_of(FEW), on_map(FEW, crs)
-    write_cog(tmp_path / "a.tif", class_image(FEW, Place.on_map(box)), rows_of(values))
+    write_cog(tmp_path / "a.tif", class_image(box), rows_of(values))
     with rasterio.open(tmp_path / "a.tif") as file:
         np.testing.assert_array_equal(file.read(1), values)
         assert file.crs == rasterio.crs.CRS.from_string(crs)
@@ -72,17 +72,17 @@ def test_without_a_pose_the_transform_is_in_radians(tmp_path: Path) -> None:
     """On the angular grid there is no CRS, pixels lie where the Zarr attributes say, and y grows downwards."""
     values = np.random.default_rng(0).random(FEW).astype(np.float32)
     values[:5] = np.nan
-    place = Place.on_angles(AngularGrid(1e-4, FEW), FEW)
+    geobox = angular_geobox(AngularGrid(1e-4, FEW), FEW)
     write_cog(
         tmp_path / "a.tif",
-        CogImage(FEW, "float32", place, ("confidence",), np.nan, tags={"place": ANGULAR}),
+        CogImage(geobox, "float32", ("confidence",), np.nan, tags={"place": ANGULAR}),
         rows_of(values),
     )
     with rasterio.open(tmp_path / "a.tif") as file:
         np.testing.assert_array_equal(file.read(1), values)
         assert file.crs is None
         assert np.isnan(file.nodata)
-        assert file.transform[:6] == place.transform == pytest.approx((1e-4, 0, -35e-4, 0, 1e-4, -45e-4))
+        assert file.transform[:6] == geobox.affine[:6] == pytest.approx((1e-4, 0, -35e-4, 0, 1e-4, -45e-4))
         assert "[rad]" in file.tags()["place"]
         assert "no CRS" in file.tags()["place"]
 
@@ -91,7 +91,7 @@ def test_without_a_pose_the_transform_is_in_radians(tmp_path: Path) -> None:
 def test_a_large_image_is_cloud_optimised(tmp_path: Path, dtype: str) -> None:
     """Tiles, halving overviews down to one tile, directories first: every check passes, also with three bands."""
     values = np.random.default_rng(1).integers(0, 200, (1100, 600, 3)).astype(dtype)
-    image = CogImage((1100, 600), dtype, Place.on_angles(GRID, (1100, 600)), ("r", "g", "b"), 0)
+    image = CogImage(angular_geobox(GRID, (1100, 600)), dtype, ("r", "g", "b"), 0)
     write_cog(tmp_path / "a.tif", image, rows_of(values))
     assert is_cog(tmp_path / "a.tif")
     with rasterio.open(tmp_path / "a.tif") as file:
@@ -104,7 +104,7 @@ def test_overviews_of_classes_are_no_mean_of_colours(tmp_path: Path) -> None:
     """The commonest class: three white pixels and a black one are white, though grey is nearer to their mean."""
     greys = ClassNames(("black", "grey", "white"), np.repeat(np.array([[0], [180], [255]], "u1"), 3, axis=1))
     values = np.tile(np.array([[0, 2], [2, 2]], np.uint8), (300, 280))
-    image = replace(class_image(values.shape), legend=greys)
+    image = replace(class_image(on_map(values.shape)), legend=greys)
     write_cog(tmp_path / "a.tif", image, rows_of(values))
     with rasterio.open(tmp_path / "a.tif", overview_level=0) as file:
         assert set(np.unique(file.read(1))) == {2}
@@ -114,7 +114,7 @@ def test_confidence_of_overviews_leaves_out_what_is_not_known(tmp_path: Path) ->
     """The mean of two known pixels and two NaN is the mean of the known."""
     values = np.full((1300, 1100), 0.25, np.float32)
     values[1::2] = np.nan
-    image = CogImage(values.shape, "float32", Place.on_angles(GRID, values.shape), ("confidence",), np.nan)
+    image = CogImage(angular_geobox(GRID, values.shape), "float32", ("confidence",), np.nan)
     write_cog(tmp_path / "a.tif", image, rows_of(values))
     with rasterio.open(tmp_path / "a.tif", overview_level=0) as file:
         assert (file.read(1) == 0.25).all()
@@ -123,14 +123,14 @@ def test_confidence_of_overviews_leaves_out_what_is_not_known(tmp_path: Path) ->
 @pytest.mark.parametrize("shape", [FEW, (512, 512), (513, 40), (700, 600)])
 def test_an_image_of_nothing_is_whole_too(tmp_path: Path, shape: tuple[int, int]) -> None:
     """Where every pixel is nodata the file still has its pixels and its layout."""
-    image = CogImage(shape, "float32", Place.on_map(on_map(shape)), ("confidence",), np.nan)
+    image = CogImage(on_map(shape), "float32", ("confidence",), np.nan)
     write_cog(tmp_path / "a.tif", image, rows_of(np.full(shape, np.nan, np.float32)))
     assert is_cog(tmp_path / "a.tif")
 
 
 def test_classes_have_colours_and_names(tmp_path: Path) -> None:
     """Colour table, tags, and GDAL's own category names, which a VRT made by GDAL repeats."""
-    write_cog(tmp_path / "a.tif", class_image(FEW), rows_of(classes_of(FEW)))
+    write_cog(tmp_path / "a.tif", class_image(on_map(FEW)), rows_of(classes_of(FEW)))
     with rasterio.open(tmp_path / "a.tif") as file:
         table = file.colormap(1)
         tags = file.tags(1)
@@ -154,13 +154,13 @@ def test_classes_have_colours_and_names(tmp_path: Path) -> None:
 def test_blocks_that_do_not_fill_the_image_change_nothing(tmp_path: Path, rows: Any, words: str) -> None:
     """Missing, shifted or wider blocks are refused; the file of before stays, byte for byte."""
     for size in ((40, 30), FEW):
-        write_cog(tmp_path / "a.tif", class_image(size), rows_of(classes_of(size)))
+        write_cog(tmp_path / "a.tif", class_image(on_map(size)), rows_of(classes_of(size)))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.tif", "a.tif.aux.xml"]  # nothing of the first
     with rasterio.open(tmp_path / "a.tif") as file:
         assert file.shape == FEW
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     with pytest.raises(ShapeError, match=words):
-        write_cog(tmp_path / "a.tif", class_image(FEW), iter(rows))
+        write_cog(tmp_path / "a.tif", class_image(on_map(FEW)), iter(rows))
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
@@ -179,7 +179,7 @@ def test_a_file_that_the_disk_cut_short_gets_no_name(
 
     monkeypatch.setattr(module, "copy", cut)
     values = np.random.default_rng(2).random(FEW).astype(np.float32)
-    image = CogImage(FEW, "float32", Place.on_map(on_map(FEW)), ("confidence",), np.nan)
+    image = CogImage(on_map(FEW), "float32", ("confidence",), np.nan)
     with pytest.raises(ArchiveError, match=r"a\.tif (cannot be written|does not read back as written)"):
         write_cog(tmp_path / "a.tif", image, rows_of(values))
     assert list(tmp_path.iterdir()) == []

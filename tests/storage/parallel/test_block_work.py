@@ -74,11 +74,8 @@ def test_threads_give_results_in_order(workers: int, count: int) -> None:
 
 
 def test_processes_give_results_in_order(processes: WorkerPool) -> None:
-    """Other processes give what threads give; each result is shown once, whether it is kept or not."""
-    shown: dict[int, int] = {}
-    assert run_blocks(square, range(20), processes, each=shown.__setitem__) == [square(item) for item in range(20)]
-    assert shown == {item: square(item) for item in range(20)}
-    assert run_blocks(square, range(20), processes, keep=False) == []
+    """Other processes give what threads give."""
+    assert run_blocks(square, range(20), processes) == [square(item) for item in range(20)]
 
 
 def test_workers_are_kept_and_have_one_thread(processes: WorkerPool) -> None:
@@ -250,7 +247,7 @@ if __name__ == "__main__":
     with WorkerPool(sys.argv[1]).open() as pool:
         started = begin(pool)
         try:
-            run_blocks(nap, range(9), pool, each=lambda number, result: started[0].kill())
+            run_blocks(nap, range(9), pool, report=lambda done: started[0].kill())
         except WorkerError as error:
             print(error)
         end(started)

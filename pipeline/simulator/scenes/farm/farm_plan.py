@@ -61,7 +61,7 @@ _WEEDS_ELSEWHERE = {"stubble": (1.0, 6.0), "grass": (0.2, 2.0), "soil": (0.5, 4.
 
 @dataclass(frozen=True)
 class Ground:
-    """What varies over the whole farm, (y, x) each, sd about 1 except ``light`` (fraction of full light)."""
+    """Variation over the whole farm, (y, x) each, sd about 1 except ``light`` (fraction of full light)."""
 
     moisture: Field
     vigour: Field
@@ -190,11 +190,11 @@ class FieldPlan:
 
     @property
     def crop(self) -> Crop | None:
-        """What is sown; None on grass, fallow and old stubble."""
+        """Return what is sown; None on grass, fallow and old stubble."""
         return CROPS.get(self.use)
 
     def land_on(self, day: int) -> Land:
-        """What the field is on a day."""
+        """Return what the field is on a day."""
         return land_on(self.use, day, self.late_days)
 
     def materials_on(self, day: int) -> set[str]:

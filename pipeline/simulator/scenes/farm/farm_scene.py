@@ -25,7 +25,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.lazy import Once
 from pipeline.simulator.scenes.farm.farm_plan import (
@@ -57,7 +56,7 @@ from pipeline.simulator.scenes.farm.spectra import WHITE_REFERENCE_REFLECTANCE, 
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
 
 # A law is what a seed is drawn by; it stands first in a scene's key, and one that is out there never changes.
-FARM_LAW, REMOVED_LAW = "farm@2", "farm@1"
+FARM_LAW = "farm@2"
 FARM_NAMES = ("farm", FARM_LAW)
 PIXEL_M = 0.12  # on the ground
 FARM_SHAPE = (1024, 1280)  # (y, x) unless another is asked for [px]
@@ -69,19 +68,9 @@ BARE_CROWN = 0.62  # cover of a crown without leaves
 SHADOW = 0.78  # of the ground under a crown's shadow that no direct sun reaches
 
 
-def refuse_removed(name: str) -> None:
-    """Raise SettingsError where a name is that of the farm that is drawn no more."""
-    if name == REMOVED_LAW:
-        raise SettingsError(
-            f"the built-in scene {REMOVED_LAW} was removed: take farm ({FARM_LAW}), which is another land; runs of "
-            f"{REMOVED_LAW} can still be listed, verified, reported and exported, but not surveyed or judged again"
-        )
-
-
-def law_of_key(key: str) -> str | None:
-    """Give the law that a farm with this key was drawn by, the removed one too; None of any other scene."""
-    law = key.partition("/")[0]
-    return law if law in (REMOVED_LAW, FARM_LAW) else None
+def is_farm_key(key: str) -> bool:
+    """Return whether a scene's key is of a farm."""
+    return key.partition("/")[0] == FARM_LAW
 
 
 def farm_scene(

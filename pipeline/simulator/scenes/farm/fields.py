@@ -1,4 +1,4 @@
-"""What the fields look like on a day: stands in rows, lodged patches, stubble, meadows, bare soil; and how rows lie."""
+"""Fields on a day: stands in rows, lodged patches, stubble, meadows, bare soil; and the course of rows."""
 
 from __future__ import annotations
 

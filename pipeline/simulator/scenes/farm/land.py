@@ -262,7 +262,7 @@ class Crop:
 
 
 class Land(NamedTuple):
-    """What a field is on a day, and for how many days: since emergence, harvest, tillage or mowing."""
+    """State of a field on a day, and for how many days: since emergence, harvest, tillage or mowing."""
 
     phase: Phase
     days: float
@@ -298,7 +298,7 @@ class Sun:
 
     @property
     def cast(self) -> Points:
-        """Where the tip of a post 1 px high throws its shadow, (y, x) from its foot [px]: away from the sun."""
+        """Return where the tip of a post 1 px high throws its shadow, (y, x) from its foot [px]: away from the sun."""
         azimuth, length = np.deg2rad(self.azimuth_deg), 1 / np.tan(np.deg2rad(self.elevation_deg))
         return np.array([np.cos(azimuth) * length, -np.sin(azimuth) * length])
 
@@ -381,7 +381,7 @@ def lodged_fraction(day: float) -> float:
 
 
 def days_since_turned(use: str, day: float, late: float) -> float:
-    """Days since weeds were last killed on a field by tillage, sowing included; a whole year where nobody tills."""
+    """Days since weeds were last killed on a field by tillage, sowing included; a whole year without tillage."""
     if use in CROPS:
         crop = CROPS[use]
         return min(since(day, crop.tillage + late), since(day, crop.emergence + late - 9))

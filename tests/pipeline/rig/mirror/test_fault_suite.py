@@ -124,7 +124,7 @@ class Session:
             (self.driver.index, 0),
             (self.driver.read_log, 0),
             (self.driver.temperature, 0),
-            (self.driver.park, 1),
+            (lambda: self.goes(0.0, 0.0), 1),
         ]
         for act, motions in steps:
             if not self.does(act, motions):

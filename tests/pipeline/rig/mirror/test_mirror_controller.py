@@ -41,8 +41,6 @@ def play(mirror: MirrorController) -> None:
 DONE_AS_ASKED: dict[str, tuple[list[Pair], Call, dict[str, Any], object]] = {
     "who is there": ([], lambda mirror: mirror.identity(), {}, Identity("MR-E-2", "1.2.4065", "ABCD0123")),
     "going, in one frame": ([w.WELL, THERE], lambda mirror: mirror.goto(0.5, -0.25), {}, None),
-    "going, whatever the status": ([THERE], lambda mirror: mirror.goto(0.5, -0.25), {"check_status": False}, None),
-    "parking is going to 0; 0": ([w.WELL, pair(w.PARK, w.DONE)], lambda mirror: mirror.park(), {}, None),
     "a path, X before Y, half open, begun in one frame": (
         [w.IDLE, w.LOAD, w.READ_BACK, w.HALT, w.SET_X, w.SET_Y, w.WELL, pair(w.RUN, w.DONE)],
         play,
@@ -64,13 +62,6 @@ DONE_AS_ASKED: dict[str, tuple[list[Pair], Call, dict[str, Any], object]] = {
     ),
     "the cell of X": ([INDEX], lambda mirror: mirror.index(), {}, 2),
     "letting go": ([], lambda mirror: mirror.close(), {}, None),
-    "letting go, parked": (
-        [w.WELL, pair(w.PARK, w.DONE)],
-        lambda mirror: mirror.close(),
-        {"park_at_close": True},
-        None,
-    ),
-    "letting go, parked in vain": ([w.WARM], lambda mirror: mirror.close(), {"park_at_close": True}, None),
 }
 
 
@@ -142,7 +133,7 @@ def test_what_cannot_be_is_refused_or_said(name: str):
 def test_nothing_is_sent_before_connecting():
     """All that speaks to the device wants it connected, and to the controller that the settings expect."""
     mirror = MirrorController(ScriptedTransport([], ManualClock()), clock=ManualClock())
-    for call in (mirror.identity, mirror.status, mirror.temperature, mirror.park, mirror.halt, mirror.index):
+    for call in (mirror.identity, mirror.status, mirror.temperature, mirror.halt, mirror.index):
         with pytest.raises(RigError, match="scripted is not connected; call connect first"):
             call()
     with scripted(w.CONNECT) as transport, pytest.raises(RigError, match=r"whose id holds 'MR-E-9' .* got 'MR-E-2'"):
@@ -186,13 +177,12 @@ def test_an_unacknowledged_motion_freezes():
     late = Late(1.02, bytes.fromhex(w.DONE))
     script = [*w.CONNECT, w.IDLE, w.LOAD, w.WELL, (bytes.fromhex(w.GOTO), [late]), w.WELL, w.HALT]
     with scripted(script) as transport:
-        mirror = connected(transport, read_back="none", park_at_close=True)
+        mirror = connected(transport, read_back="none")
         mirror.load_path(w.PATH)
         with pytest.raises(StateUnknown, match=r"going to 0.5; -0.25 was sent to scripted and may have happened"):
             mirror.goto(0.5, -0.25)
-        for call in (mirror.park, lambda: mirror.goto(0, 0)):
-            with pytest.raises(StateUnknown, match="going to 0; 0 is refused"):
-                call()
+        with pytest.raises(StateUnknown, match="going to 0; 0 is refused"):
+            mirror.goto(0, 0)
         with pytest.raises(StateUnknown, match="running a path is refused"):
             mirror.run(0, 3, 10.0)
         assert mirror.status() == Status(0)
@@ -237,7 +227,7 @@ SETTINGS = MirrorSettings(port="/dev/mirror", baud=256000, with_crc=True, strict
 
 
 def test_opening_connects_or_lets_go_of_the_port(monkeypatch: pytest.MonkeyPatch):
-    """Port and speed are those of the settings; without the controller it is let go of, unparked."""
+    """Port and speed are those of the settings; without the controller it is let go of."""
     silent = (b"START\r\n", b"")
     with scripted(w.CONNECT) as transport:
         give(monkeypatch, transport)
@@ -252,7 +242,7 @@ def test_opening_connects_or_lets_go_of_the_port(monkeypatch: pytest.MonkeyPatch
     with scripted(w.CONNECT) as transport:
         give(monkeypatch, transport)
         with pytest.raises(RigError, match="expected a controller whose id holds 'MR-9'"):
-            open_mirror(replace(SETTINGS, expected_id="MR-9", park_at_close=True), transport.clock)
+            open_mirror(replace(SETTINGS, expected_id="MR-9"), transport.clock)
         assert transport.closed
 
 

@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.errors import SceneError, SettingsError, WavelengthError
+from pipeline.errors import SceneError, WavelengthError
 from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.scenes.farm.farm_plan import CLASS_COLOURS, CLASSES, farm_plan
-from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, farm_scene, law_of_key, refuse_removed
+from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, farm_scene, is_farm_key
 from pipeline.simulator.scenes.farm.spectra import MATERIALS
 from pipeline.simulator.scenes.scene import RasterScene
 
@@ -120,18 +120,11 @@ def test_planes_are_the_plans_materials() -> None:
     assert farm_scene(0, bands=3, day=225).electrons.shape == (len(plan.materials), 3)
 
 
-def test_a_key_tells_its_law() -> None:
-    """That of the removed farm too, for archives hold it; a file's tells none."""
-    assert law_of_key(farm_scene(0, (8, 8)).key) == FARM_LAW == "farm@2"
-    assert law_of_key("farm@1/seed=4/shape=20x30/bands=270/full_well=20155") == "farm@1"
-    assert law_of_key("3f2a") is None
-
-
-def test_the_removed_farm_is_refused() -> None:
-    """By its name alone, with what to take and what its archives are still good for."""
-    refuse_removed("farm")
-    with pytest.raises(SettingsError, match=r"farm@1 was removed: take farm \(farm@2\).*can still be listed, verified"):
-        refuse_removed("farm@1")
+def test_a_key_tells_a_farm() -> None:
+    """By the law that it begins with; a file's tells none."""
+    assert FARM_LAW == "farm@2"
+    assert is_farm_key(farm_scene(0, (8, 8)).key)
+    assert not is_farm_key("3f2a")
 
 
 @pytest.mark.parametrize(
