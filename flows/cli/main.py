@@ -7,9 +7,10 @@ import sys
 import tempfile
 import traceback
 
-from cyclopts import CycloptsError
+from cyclopts import CycloptsError, UnknownOptionError
 
 from flows.cli.app import GOES_ON, VERBS, build_app, say, stderr
+from flows.settings.renamed import FLAGS
 from flows.terminal.processes import TERMINATED, Terminated, format_refusal, place_caches, terminable
 from pipeline.errors import PipelineError, SettingsError
 
@@ -58,6 +59,10 @@ def _run(arguments: list[str]) -> int:
 def _usage(error: CycloptsError) -> str:
     what = str(error).partition(" Available commands:")[0]  # cut off in the middle: the help has them all
     verb = " ".join(("spectralzoom", *(error.command_chain or ())))
+    if isinstance(error, UnknownOptionError):
+        word = (error.token.keyword or error.token.value).partition("=")[0]
+        now = FLAGS.get(word.removeprefix("--"))
+        what = what if now is None else f"Unknown option: {word}; {now}"
     return f"{what.rstrip('.')}; see {verb} --help"
 
 

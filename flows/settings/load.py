@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 from pydantic import Field, PlainValidator, TypeAdapter, ValidationError
 
+from flows.settings import renamed
 from flows.settings.survey_settings import (
     BUILT_IN_SCENES,
     OF_A_CAMERA,
@@ -309,7 +310,9 @@ def _parse_table(key: str, value: object, place: str, origin: Mapping[str, str])
 
 
 def _hint(full: str, known: Mapping[str, Declared], prefix: str) -> str:
-    """Return what an unknown key may mean: the nearest of its table, or of another table."""
+    """Return what an unknown key may mean: its present name, the nearest of its table, or of another table."""
+    if full in renamed.SETTINGS:
+        return f"; it is called '{renamed.SETTINGS[full]}' now"
     everywhere = [*SURVEY, *(f"{name}.{key}" for name, keys in TABLES.items() for key in keys)]
     short = full.removeprefix(prefix)
     near = [name for name in everywhere if name.split(".")[-1] == short]

@@ -33,7 +33,14 @@ from storage.arrays.layout import (
     write_image,
 )
 from storage.arrays.quicklooks import Quicklook, write_quicklook
-from storage.arrays.signal_cubes import LARGEST_SHORT, read_components, score_spec, steps_within, write_components
+from storage.arrays.signal_cubes import (
+    LARGEST_SHORT,
+    check_condensed,
+    read_components,
+    score_spec,
+    steps_within,
+    write_components,
+)
 from storage.parallel.pool import WorkerPool, run_blocks
 
 HALF = 0.5  # of a pixel's finer ones: of fewer seen it has no value
@@ -283,8 +290,9 @@ class Mosaic:
 
 
 def open_mosaic(path: Path) -> Mosaic:
-    """Open a mosaic. Raises IncompleteStoreError where it is missing or damaged."""
+    """Open a mosaic. Raises IncompleteStoreError where it is missing, damaged or of an earlier version."""
     group = open_group(path)
+    check_condensed(group, path)
     wavelength, fwhm = read_bands(group)
     with damage_named(str(path)):
         step = float(group["scores"].attrs["scale_factor"])  # type: ignore[arg-type]

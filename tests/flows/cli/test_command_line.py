@@ -71,15 +71,23 @@ def test_every_flag_says_what_it_is(verb: str) -> None:
     assert [name for name, words in _flags(verb).items() if not words] == []
 
 
+DARKEST = "Unknown option: --darkest-ms; it is called --min-exposure-ms now"
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (["survy"], 'Unknown command "survy". Did you mean "survey"?; see spectralzoom --help'),
+        (
+            ["survey", "--compute", "25%"],
+            "Unknown option: --compute; it is called --macs now; see spectralzoom survey --help",
+        ),
+        (["train", "farm", "-o", "a.safetensors", "--darkest-ms", "3"], f"{DARKEST}; see spectralzoom train --help"),
         (["survey", "--budgt", "1"], "Unknown option: --budgt. Did you mean --budget?; see spectralzoom survey --help"),
     ],
 )
 def test_a_wrong_word_is_one_line(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """With the nearest right one, and where all of them stand; no list that is cut off."""
+    """With the nearest right one, or why it went, and where all of them stand; no list that is cut off."""
     with pytest.raises(SystemExit) as ended:
         cli.main(words)
     assert ended.value.code == 2

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from flows.settings import renamed
 from flows.settings.documents import example_toml, settings_table
 from flows.settings.load import SURVEY, TABLES, load_settings, parse_settings
 from flows.settings.survey_settings import MapChoice, Settings
@@ -117,6 +118,28 @@ def test_unknown_key_is_refused_with_the_nearest(toml, line, near):
     """A misspelt key is named together with the file and the key that was probably meant."""
     with pytest.raises(SettingsError, match=rf"unknown setting.*survey\.toml; did you mean {near}"):
         load_settings(toml(line))
+
+
+@pytest.mark.parametrize(
+    ("line", "name"),
+    [
+        ("kernel = 'nearest'", "resampling"),
+        ("look = 'part'", "extent"),
+        ("[detector]\nwell_e = 1e4", "detector.full_well_e"),
+        ("[rig]\npanel = 0.9", "rig.white_reference"),
+    ],
+)
+def test_a_former_name_says_the_present_one(toml, line, name):
+    """A settings file of an earlier version needs one look."""
+    with pytest.raises(SettingsError, match=rf"unknown setting .*; it is called '{name}' now"):
+        load_settings(toml(line))
+
+
+def test_present_names_are_settings() -> None:
+    """What a former name is said to be called now is a setting."""
+    known = {*SURVEY, *(f"{table}.{name}" for table, names in TABLES.items() for name in names)}
+    assert set(renamed.SETTINGS.values()) <= known
+    assert not set(renamed.SETTINGS) & known
 
 
 @pytest.mark.parametrize(
