@@ -212,7 +212,13 @@ def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
     settings, step = run.settings, run.settings.scan_step
     memory = prior_map_figures(ref.path)
     remembers = memory is not None and memory["put_aside"] is None
-    if run.map_scores is None or step is None or settings.extent != EXTENT_WHOLE or run.budget is not None or remembers:
+    if (
+        run.map_scores is None
+        or step is None
+        or settings.extent != EXTENT_WHOLE
+        or run.settings.macs is not None
+        or remembers
+    ):
         return None
     names = run.described.class_names
     store = ProbabilityStore(ref.path / "class_probabilities.zarr")

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from flows.tasks.field_prior_map import FieldPriorMap
 from flows.tasks.field_work import FieldWork, WeightsFile, coarse_region, patch_features
 from models.network.spectral import Capture
-from models.reading.inference import CoarsePass, segment
+from models.policies.policies import score_patches
+from models.reading.inference import CoarsePass, read_coarse_prediction, segment
 from models.reading.ood import OodDetector
 from models.reading.prior_map import (
     CurrentVisit,
@@ -53,6 +54,8 @@ class Drawing:
     left_out: Path | None = None  # (y, x) pixels of which zones have no map drawn
     unknown: UnknownRule | None = None  # which pixels are called unknown
     part: bool = False  # of the field was looked at: of the rest today's look says nothing
+    least_gain: float | None = None  # from which on patches are read in full; None: those that ``attention`` ranks
+    policy: str = "gain"  # by which that is judged
 
     def __call__(self, region: Region) -> Drawn:
         """Read what was seen of the region coarsely and finely, and store the part of the map that is kept."""
@@ -60,6 +63,10 @@ class Drawing:
         weights, detail = self.weights.load(), open_mosaic(self.detail)
         overview, full = self.captures
         seen, chosen = coarse_region(weights, self.mosaic, region, overview), chosen_patches(self.attention)
+        if self.least_gain is not None:
+            seen = read_coarse_prediction(weights, seen)
+            gain, here = score_patches(self.policy, seen), region.numbers_here(chosen)
+            chosen = chosen[(here >= 0) & (gain[here] >= self.least_gain)]
         patch_index, columns = patch_features(weights, detail, chosen, seen, region)
         drawn = segment(weights, seen, columns, patch_index, capture=full, every_class=True)
         shown = self._shown(region, detail, patch_index)
@@ -96,7 +103,11 @@ class Drawing:
             self.probabilities, origin, *map(region.crop, (after.log_probability, after.age_days, after.light))
         )
         unread = 0 if seen.out_of_range is None else int(np.count_nonzero(region.crop(seen.out_of_range)))
-        return Drawn(unread, comparison)
+        if self.least_gain is None:
+            return Drawn(unread, comparison)
+        read = np.zeros(gain.shape, np.bool_)
+        read[patch_index] = True
+        return Drawn(unread, comparison, (region.crop_patches(gain), region.crop_patches(read)))
 
     def _observation(
         self, region: Region, log_probability: NDArray[np.float32], shown: NDArray[np.bool_], seen: CoarsePass
@@ -117,7 +128,7 @@ class Drawing:
         the part is no look, and would stand where something better is remembered.
         """
         grid, p = region.grid, region.grid.patch
-        detailed = np.zeros((int(np.prod(grid.patch_shape)), p, p), np.bool_)
+        detailed = np.full((int(np.prod(grid.patch_shape)), p, p), self.mosaic == self.detail)
         detailed[patch_index] = True
         if self.part:
             reached = patch_pixels(grid, detail.coverage(region.read.rows, region.read.columns) > 0)
@@ -160,6 +171,8 @@ class Drawn:
 
     unread_px: int  # pixels that were seen, with values that the weights take for no reading
     comparison: TemporalAgreement | None  # with what was remembered; None of a field's first visit
+    # (patch_y, patch_x) expected gains and which patches were read in full, where that was decided on the way
+    reading: tuple[NDArray[np.float64], NDArray[np.bool_]] | None = None
 
 
 def draw_field(field: FieldWork, work: Drawing, report: Callable[[float], None]) -> Drawn:
@@ -172,4 +185,12 @@ def draw_field(field: FieldWork, work: Drawing, report: Callable[[float], None])
     paths = (work.mosaic, work.detail, work.attention, work.out, work.probabilities, *prior_map)
     parts: list[Drawn] = run_blocks(work, field.regions, pool, report=report, paths=paths)
     compared = [part.comparison for part in parts if part.comparison is not None]
-    return Drawn(sum(part.unread_px for part in parts), reduce(add, compared) if compared else None)
+    reading = None
+    if work.least_gain is not None:
+        shape = field.regions[0].field.patch_shape
+        reading = np.zeros(shape), np.zeros(shape, np.bool_)
+        for region, part in zip(field.regions, parts, strict=True):
+            assert part.reading is not None
+            for whole, own in zip(reading, part.reading, strict=True):
+                whole[region.kept_patches.rows, region.kept_patches.columns] = own
+    return Drawn(sum(part.unread_px for part in parts), reduce(add, compared) if compared else None, reading)

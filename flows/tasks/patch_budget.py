@@ -6,7 +6,6 @@ import math
 from bisect import bisect_right
 from dataclasses import astuple, dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,8 +51,11 @@ class ReadingCosts:
         """
         drawn = self.of_map(patch_index)
         readings = 2 if policy in GLANCING_POLICIES else 1
-        score = sum(score_multiply_adds(policy, self.config, region.grid) for region in self._regions)
-        return replace(drawn, overview=readings * drawn.overview, score=score)
+        return replace(drawn, overview=readings * drawn.overview, score=self.score(policy))
+
+    def score(self, policy: str) -> int:
+        """Count what the policy takes to score all patches, once the overview is read."""
+        return sum(score_multiply_adds(policy, self.config, region.grid) for region in self._regions)
 
 
 @dataclass(frozen=True)
@@ -129,15 +131,6 @@ class PatchBudget:
     def most_patches(self) -> NDArray[np.intp]:
         """As many patches as the limits pay for, whatever they promise."""
         return self.choose(np.full(math.prod(self.grid.patch_shape), np.inf))
-
-    def figures(self, patch_index: NDArray[np.integer]) -> dict[str, Any]:
-        """Return the multiply-adds of these patches beside those of reading everything, for a receipt."""
-        return {
-            "asked": {"macs": self.macs, "least_gain": self.least_gain},
-            "patches": len(patch_index),
-            "of_patches": len(self.patch_index),
-            "multiply_adds": {"done": self.operations_of(patch_index), "everything": self.everything},
-        }
 
     @property
     def _most(self) -> float:

@@ -40,13 +40,14 @@ from flows.tasks.stage import FieldFrame, Report
 from flows.tasks.stages.capture import SweepRecorder
 from flows.tasks.survey_model import SurveyModel, beyond_training, weights_path
 from flows.tasks.zones import SurveyZones, open_zones, place_of_field
+from models.evaluation.cascade import CascadeTable
 from models.evaluation.expected_scores import MapScores
 from models.network.machine import PROCESSOR, choose_device
 from models.network.sizes import MultiplyAdds
 from models.network.spectral import Capture
 from models.reading.regions import plan_regions
 from models.weights.checksummed_files import SEAL
-from models.weights.files import Description, Weights
+from models.weights.files import CASCADE, Description, Weights
 from models.weights.parts import OodPart, ReaderPart
 from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.errors import SceneError, SettingsError
@@ -203,9 +204,32 @@ class SurveyRun(CaptureRun):
         return {"weights": self.weights_key, **({} if self.device == PROCESSOR else {"device": self.device})}
 
     @property
+    def least_gain(self) -> float | None:
+        """Expected gain from which on patches of a uniform scan or a raster are read in full; None where all are.
+
+        It follows from the loss that the settings allow where they name neither gain nor multiply-adds.
+        """
+        settings, row = self.settings, self.cascade_row
+        if not self.plan.plain or settings.macs is not None or self.part:
+            return None
+        if settings.least_gain is not None:
+            return settings.least_gain
+        return (
+            None
+            if row is None or settings.policy != "gain"
+            else CascadeTable.read(self.described.record[CASCADE]).least_gain[row]
+        )
+
+    @property
+    def cascade_row(self) -> int | None:
+        """Row of the weights' table of losses that the settings ask for; None where there is none."""
+        content = self.described.record.get(CASCADE)
+        return None if content is None else CascadeTable.read(content).row_within(self.settings.expected_loss / 100)
+
+    @property
     def chooses(self) -> bool:
         """Return whether patches are chosen by their scores; where all are seen and read there is nothing to choose."""
-        return not self.plan.plain or self.budget is not None
+        return not self.plan.plain or self.budget is not None or self.least_gain is not None
 
     @property
     def controls(self) -> bool:
@@ -281,11 +305,41 @@ class SurveyRun(CaptureRun):
 
     def work_done(self, patch_index: NDArray[np.integer]) -> MultiplyAdds:
         """Count the scores of the field, unless all is read, and the map with fine patches at these patches."""
-        costs = self.costs
-        done = costs.with_scores(patch_index, self.settings.policy) if self.chooses else costs.of_map(patch_index)
+        done = self.costs.of_map(patch_index)
+        if self.least_gain is not None:  # as the map is drawn: the overview is read once
+            done = replace(done, score=self.costs.score(self.settings.policy))
+        elif self.chooses:
+            done = self.costs.with_scores(patch_index, self.settings.policy)
         if self.prior is None or self.reader is None:
             return done
         return replace(done, detail=done.detail + self.reader.sizes.multiply_adds(self.grid.height * self.grid.width))
+
+    def reading_figures(self, patch_index: NDArray[np.integer]) -> dict[str, Any]:
+        """Return what was asked of a full reading, its patches, and its multiply-adds beside those of everything."""
+        settings, everything = self.settings, self.kept_patches
+        asked = {"macs": settings.macs, "least_gain": self.least_gain, "expected_loss": settings.expected_loss}
+        costs = {"done": self.work_done(patch_index).total, "everything": self.costs.of_map(everything).total}
+        figures = {"patches": len(patch_index), "of_patches": len(everything), "multiply_adds": costs}
+        return {"asked": asked, **figures}
+
+    @property
+    def kept_patches(self) -> NDArray[np.intp]:
+        """Numbers of the patches that zones leave."""
+        valid, fractions = self.grid.valid_patches(), self.zones.fractions
+        return valid if fractions is None else valid[fractions[valid] > 0]
+
+    @property
+    def likely_patches(self) -> NDArray[np.intp]:
+        """As many patches as a uniform scan or a raster is likely to have read in full, by what the weights record.
+
+        With a limit of multiply-adds these are the most that it pays for; with a gain that nothing is recorded of, all.
+        """
+        if self.budget is not None:
+            return self.budget.most_patches
+        row, every = self.cascade_row, self.kept_patches
+        if row is None or self.least_gain is None or self.settings.least_gain is not None:
+            return every
+        return every[: round(CascadeTable.read(self.described.record[CASCADE]).fraction[row] * len(every))]
 
 
 def open_run(settings: Settings, *, planning: bool = False, archive: Archive | None = None) -> SurveyRun:
@@ -326,7 +380,8 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     settings, plan = planned.settings, planned.plan
     costs = ReadingCosts(described.config, grid, bands)
     spending = settings.policy, settings.macs, settings.least_gain
-    budget = PatchBudget.asked(costs, None if zones.fractions is None else zones.fractions > 0, *spending)
+    shown = None if zones.fractions is None else zones.fractions > 0
+    budget = None if settings.macs is None else PatchBudget.asked(costs, shown, *spending)
     simulated, sweeps = make_source(scene, settings), (*plan.coarse, *plan.full)
     source = field_source(scene, settings, simulated, sweeps) if recorded is None else recorded.field
     raster = None if pixels is None else RasterPixels(pixels.read, pixels.missing, bands, grid)

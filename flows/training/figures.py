@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flows.training.data import Report
+from models.evaluation.cascade import CascadeTable, ReadTwice
 from models.evaluation.expected_scores import Floats, MapScores, ScoredMap, expected_counts
 from models.evaluation.metrics import (
     agreement,
@@ -23,7 +24,8 @@ from models.evaluation.metrics import (
 from models.evaluation.placement import CONTROL_FRACTION, Controls, Counts, run_controls
 from models.network.sizes import PLANES
 from models.network.spectral import Capture, patches_of
-from models.reading.inference import coarse_prediction_of_columns, map_of_columns
+from models.policies.policies import score_patches
+from models.reading.inference import coarse_prediction_of_columns, map_of_columns, segment
 from models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation
 from models.training.examples import Example
 from models.weights.files import Weights
@@ -57,6 +59,19 @@ def validate(weights: Weights, examples: Iterable[Example], seed: int, show: Sho
         "all": agreement(whole.every),
         **whole.as_dict(),
     }
+
+
+def judge_cascade(weights: Weights, examples: Iterable[Example]) -> dict[str, Any] | None:
+    """Return what reading a part of the patches in full loses, as a `CascadeTable`; None without a scene."""
+    scenes = []
+    for example in examples:
+        grid, cells, labels = _parts(weights, example)
+        seen = coarse_prediction_of_columns(weights, example.columns.astype(np.float32), grid)
+        nothing, everything = np.empty(0, np.int64), grid.valid_patches()
+        overview, full = (segment(weights, seen, cells[index], index).classes for index in (nothing, everything))
+        gain = score_patches("gain", seen).reshape(grid.patch_shape)
+        scenes.append(ReadTwice(overview, full, gain, labels, grid.patch))
+    return asdict(CascadeTable.judged(scenes, weights.config.classes)) if scenes else None
 
 
 SCAN_EXPOSURES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # of the reference; the last judged is the darkest trained

@@ -18,7 +18,7 @@ from torch import Tensor
 from flows.terminal.progress import one_after_the_other, table
 from flows.training.baselines import better_reading, judge_baselines
 from flows.training.data import Report, TrainingData, alike_notes, either_mask, open_training_data
-from flows.training.figures import judge_scans, validate
+from flows.training.figures import judge_cascade, judge_scans, validate
 from flows.training.fit_ood import SeenScenes, measure_and_add, measured_calibration, trained_on
 from flows.training.train_scenes import About, TrainRequest, as_read, network_config, observe_all
 from models.evaluation.expected_scores import MapScores
@@ -31,7 +31,7 @@ from models.training.spectral_start import LabelledPixels, linear_discriminants
 from models.training.start_weights import Start, StartFile
 from models.training.train import Progress, train
 from models.weights.checksummed_files import read_checkpoint
-from models.weights.files import CALIBRATION, Weights, save_weights, with_record
+from models.weights.files import CALIBRATION, CASCADE, Weights, save_weights, with_record
 from models.weights.parts import MAP_SCORES, TRAINED_ON
 from pipeline.errors import SceneError, SettingsError, ShapeError
 from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
@@ -179,6 +179,8 @@ def _figures(
 ) -> tuple[dict[str, Any], MapScores | None]:
     """Return the record's figures of scenes kept for validation; of uniform scans too, where training saw such."""
     figures = {"validation": validate(weights, frames, seed, lambda row: report("validating", 0.0, row))}
+    if (cascade := judge_cascade(weights, frames)) is not None:
+        figures[CASCADE] = cascade
     if (calibration := measured_calibration(weights, frames, seed)) is not None:
         figures[CALIBRATION] = calibration
         weights = with_record(weights, calibration=calibration)

@@ -43,6 +43,7 @@ FORMAT = "spectralzoom-weights/4"
 OF_COMPONENTS = ("centres", "covariance", "shot", "read")
 OF_LIMITS = ("rates", "light", "fine", "coarse")
 SPREAD = "normalisation.spread"
+CASCADE = "cascade"  # of a record: what reading a part of the patches in full loses
 CALIBRATION = "calibration"  # of a record: how sure of themselves maps may be, and the temperature, where one is needed
 KINDS = {"F32": "torch.float32", "U8": "torch.uint8"}  # by safetensors' names
 

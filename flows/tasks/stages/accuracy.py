@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from flows.tasks.capture_plan import CapturePlan
 from flows.tasks.field_work import coarse_region
-from flows.tasks.patch_budget import SHARD, PatchBudget
+from flows.tasks.patch_budget import SHARD
 from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
 from flows.tasks.stages.attention import load_plan
 from flows.tasks.stages.effects import source_with
@@ -65,7 +65,7 @@ def evaluate(
     frame: FieldFrame,
     plan: CapturePlan,
     zones: SurveyZones,
-    budget: PatchBudget | None,
+    chooses: bool,
     captures: tuple[Capture, Capture],
     simulated: SimulatedSource,
     source_key: Mapping[str, Any],
@@ -104,10 +104,12 @@ def evaluate(
                 columns = columns_of_all_patches(
                     source, plan.full, grid, weights, memory=memory, resampling=resampling, report=first_part
                 )
-            fraction = CONTROL_FRACTION
-            if budget is not None:  # as many as were kept of a uniform scan
-                fraction = len(load_plan(attention).patch_index) / len(budget.patch_index)
-            rows, among = count(1), None if zones.fractions is None else zones.fractions > 0
+            fraction, valid = CONTROL_FRACTION, grid.valid_fraction().ravel() > 0
+            among = valid if zones.fractions is None else valid & (zones.fractions > 0)
+            if chooses and plan.plain:  # as many as were read of a uniform scan
+                read = len(load_plan(attention, class_map).patch_index)
+                fraction = read / max(int(among.sum()), 1)
+            rows = count(1)
             found = run_controls(
                 weights,
                 read_coarse_prediction(weights, seen),

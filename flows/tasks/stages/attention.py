@@ -29,9 +29,10 @@ from pipeline.planning.fine_pass import FinePlan, plan_fine
 from pipeline.planning.uniform_scans import format_scan
 from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table, write_table
-from storage.arrays.mosaics import Attention, open_mosaic, write_attention
+from storage.arrays.mosaics import Attention, chosen_patches, open_mosaic, write_attention
 from storage.readers.raster_fields import RasterPixels
 
+READING = "attention.zarr"  # beside a map, where patches were chosen while it was drawn
 ATTENTION = Product("score", version=9, files=("attention.zarr", "plan.json"), by_weights=True)
 Scores = NDArray[np.float64]
 
@@ -177,9 +178,13 @@ def kept_within(budget: PatchBudget, scores: Scores, seen: FinePlan) -> FinePlan
     return replace(seen, patch_index=np.sort(bought), reason=reason, expected_gain=expected_gain, wanted_gain=wanted)
 
 
-def load_plan(attention: StageRef) -> FinePlan:
-    """Read the plan of an attention store."""
+def load_plan(attention: StageRef, class_map: StageRef | None = None) -> FinePlan:
+    """Read the plan of an attention store, with the patches that were chosen while ``class_map`` was drawn, if any."""
     plan = read_table(attention.path / "plan.json")
+    if class_map is not None and (store := class_map.path / READING).exists():
+        chosen, everything = chosen_patches(store), len(plan["patch_index"])
+        words = f"{plan['reason']}; {len(chosen)} of {everything} patches are read in full"
+        plan |= {"patch_index": chosen, "reason": words}
     kept = {
         "sweeps": [Sweep(**sweep) for sweep in plan["sweeps"]],
         "patch_index": np.array(plan["patch_index"], np.intp),

@@ -14,6 +14,7 @@ from flows.tasks.field_prior_map import FieldPriorMap, prior_map_lies, whole_pix
 from flows.tasks.field_work import FieldWork, region_params
 from flows.tasks.prior_maps import MEMORY, Prior
 from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
+from flows.tasks.stages.attention import READING
 from flows.tasks.zones import SurveyZones
 from models.network.spectral import Capture
 from models.reading.prior_map import TemporalAgreement, changed_fractions
@@ -34,6 +35,7 @@ from storage.arrays.class_maps import (
     write_changes,
 )
 from storage.arrays.layout import NO_CLASS, blank_pixels
+from storage.arrays.mosaics import Attention, write_attention
 
 CLASS_MAP = Product("segment", version=14, files=("class_map.zarr", "class_probabilities.zarr"), by_weights=True)
 OUT_OF_RANGE = "out_of_range.json"  # beside a map, where values were no readings
@@ -56,13 +58,16 @@ def segment(
     unknown: UnknownRule | None,
     captures: tuple[Capture, Capture],
     part: bool,
+    least_gain: float | None,
+    policy: str,
     model_key: dict[str, Any],
     report: Report,
 ) -> Wanted:
     """Draw the class map region by region, in detail where patches were chosen; no class where the scene has no value.
 
     ``fine`` is the mosaic of the second pass, where there is one: else the first shows the field's own pixels.
-    ``captures`` say how the pixels of the overview were captured, and those that are read in full.
+    ``captures`` say how the pixels of the overview were captured, and those that are read in full. With ``least_gain``
+    patches are chosen region by region, by what the policy expects of them.
     """
     grid, left_out, inputs = frame.grid, zones.left_out, [mosaic, attention, *([] if fine is None else [fine])]
 
@@ -92,6 +97,8 @@ def segment(
             away,
             unknown,
             part,
+            least_gain,
+            policy,
         )
         drawn = draw_field(work, drawing, report)
         if prior is not None:
@@ -100,6 +107,12 @@ def segment(
             if figures["put_aside"] is not None and drawn.comparison is not None:
                 drop_changes(probabilities)
                 drawn = draw_field(work, replace(drawing, memory=None), report)
+        if drawn.reading is not None:
+            gain, read = drawn.reading
+            rank = np.full(gain.size, -1, np.int32)
+            best = np.argsort(np.where(read, -gain, np.inf).ravel(), kind="stable")[: np.count_nonzero(read)]
+            rank[best] = np.arange(len(best))
+            write_attention(path / READING, Attention(gain, rank.reshape(gain.shape), policy))
         if drawn.unread_px:
             write_table(path / OUT_OF_RANGE, {"px": drawn.unread_px})
         if frame.missing is not None:
@@ -118,6 +131,8 @@ def segment(
         params["unknown"] = {"familiar": ood_detector.key, **asdict(unknown)}
     if part:
         params["part"] = True
+    if least_gain is not None:
+        params["least_gain"] = [least_gain, policy]
     if prior is None:
         return Wanted(build, params, inputs)
     key = None if reader is None else reader.key
