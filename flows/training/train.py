@@ -13,6 +13,7 @@ from typing import Any
 from rich.console import Console
 
 from flows.terminal.progress import one_after_the_other, table
+from flows.training.baselines import judge_baselines
 from flows.training.data import Report, TrainingData, alike_notes, either_mask, open_training_data
 from flows.training.figures import judge_scans, validate
 from flows.training.fit_ood import SeenScenes, measure_and_add, measured_calibration, trained_on
@@ -79,6 +80,7 @@ def train_weights(
     frames = as_read(kept, lesson.normalisation)
     whole = SeenScenes(lesson.examples, frames, about.wavelength_nm, request.settings.darkest_ms, request.settings.seed)
     trained = trained_on(data, whole, about.names)
+    baselines = judge_baselines(lesson.examples, frames, len(about.names), request.settings.seed, report)
     figures, scores = _figures(weights, frames, lesson.augmentation, request.settings.seed, report)
     record = {
         "command": request.command,
@@ -90,6 +92,7 @@ def train_weights(
         "training": summary,
         "device": device,
         **figures,
+        "baselines": baselines,
         **({} if lesson.begun is None else {"begun_from": lesson.begun.record}),
     }
     save_weights(with_record(weights, **record), request.out)
@@ -298,6 +301,9 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
     ]
     console.print(table(("placement", "mIoU", "overall"), rows, title=title))
     console.print(f"none: the coarse pass alone; all: fine everywhere; else fine at {figures['share_of_seats']:.0%}")
+    if record["baselines"] is not None:
+        beside = ", ".join(f"{name} {100 * miou:.1f}" for name, miou in record["baselines"].items())
+        console.print(f"mIoU by mean spectra of 5 x 5 px, of the same scenes: {beside}", soft_wrap=True)
 
 
 def print_start(begun: Mapping[str, Any], console: Console) -> None:
