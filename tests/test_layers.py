@@ -52,6 +52,7 @@ OWNERS = {
 }
 DISTRIBUTIONS = {
     "PIL": "pillow",
+    "sklearn": "scikit-learn",
     "serial": "pyserial",
     "skimage": "scikit-image",
     "odc": "odc-geo",

@@ -19,6 +19,7 @@ from flows.terminal.figures import DASH, counted, format_bytes, format_count, fo
 from flows.terminal.progress import table
 from pipeline.planning.fine_pass import FinePlan
 from pipeline.planning.prices import BYTES_PER_SAMPLE, prices_of, raw_bytes
+from pipeline.signal.subspace import SMALL_FIELD
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run
 
@@ -31,11 +32,11 @@ LABELS: Mapping[str, tuple[str, Callable[[float | None], str]]] = {
     "miou": ("mIoU", lambda score: format_prediction(score, None) or DASH),
     "cpu_s": ("processor time", format_seconds),
 }
-# Bytes kept, as six surveys had them: of receipt and report, beside them for a pixel of the side of their pictures, of
-# the map for a pixel, and of the scores of a spectrum: of the farm, whose lands are few, and of files by their bands.
+# Bytes kept, fitted to seven surveys (docs/kept.md): receipt and report, their pictures for a pixel of a side, the map
+# for a pixel, and the scores of a spectrum, which follow the bands of a file.
 PAGE, PICTURE_SIDE, MAP_PIXEL = 300_000, 1600.0, 5.0
-FARM_SCORES, FILE_SCORES, BANDS_POWER = 12.0, 2.4, 0.57
-KEPT_FROM = "pixels, spectra and bands, by six surveys, which kept 0.5 to 2 times as much"
+FARM_SCORES, LARGE_FARM_SCORES, FILE_SCORES, BANDS_POWER = 17.0, 4.5, 2.4, 0.57
+KEPT_FROM = "pixels, spectra and bands, by surveys of seven fields, which kept 0.5 to 2 times as much"
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ def estimate_survey(run: SurveyRun, fine: FinePlan | None, catalogue: Catalogue)
 
 
 def _of_camera(run: SurveyRun, fine: FinePlan | None) -> dict[str, Estimate]:
-    """Seconds and bytes of the passes; of a fine pass that is not planned yet, what the budget leaves at most."""
+    """Return seconds and bytes of the passes; of a fine pass that is not planned yet, the most there is for it."""
     plan, camera, bands = run.plan, run.camera, len(run.scene.wavelength_nm)
     open_end = fine is None and not plan.plain
     captured = raw_bytes([*plan.coarse, *(fine.sweeps if fine else ())], camera, bands)
@@ -125,7 +126,8 @@ def estimated_bytes(pixels: int, bands: int, captured: float, *, is_farm: bool, 
     ``captured`` are bytes of raw lines, 0 of a raster; ``most`` limits those of the scores.
     """
     spectra = pixels + captured / (BYTES_PER_SAMPLE * bands)  # of the mosaic and of the lines
-    scores = spectra * (FARM_SCORES if is_farm else FILE_SCORES * bands**BANDS_POWER)
+    of_farm = FARM_SCORES if pixels < SMALL_FIELD else LARGE_FARM_SCORES
+    scores = spectra * (of_farm if is_farm else FILE_SCORES * bands**BANDS_POWER)
     scores = scores if most is None else min(scores, most)
     return PAGE + PICTURE_SIDE * math.sqrt(pixels) + MAP_PIXEL * pixels + scores
 
@@ -141,7 +143,7 @@ def _processor_time(run: SurveyRun, like: Run | None) -> Estimate:
 
 
 def _last_alike(run: SurveyRun, catalogue: Catalogue) -> Run | None:
-    """The newest run from such a source that was read with the same weights, of which the size is told."""
+    """Return the newest run from such a source that was read with the same weights, if its receipt has a size."""
     for one in reversed(catalogue.runs):
         segmented = next((row for row in one.stages if row.get("name") == "segment"), {})
         alike = one.receipt.get("source") == run.source.name and segmented.get("state") == "ran"

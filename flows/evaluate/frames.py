@@ -111,7 +111,7 @@ class Candidate:
         return chosen and record.get("data") == law and name in train
 
     def pixels_of(self, scene: RasterScene) -> str | None:
-        """Those pixels of a scene that taught these weights, packed; None where a mask kept none of them out."""
+        """Return the pixels of a scene that these weights were trained on, packed; None where it was all of them."""
         pixels: str | None = self.split.get("pixels", {}).get(scene.key)
         return pixels
 

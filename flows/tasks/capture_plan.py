@@ -39,7 +39,7 @@ class CapturePlan:
 
     @staticmethod
     def of_map() -> CapturePlan:
-        """Nothing is captured of a raster: all of its pixels are there, and no second is spent on them."""
+        """Return the plan of a raster: no sweeps and no seconds, since all of its pixels are there."""
         return CapturePlan("x", [], [], 0.0, 0.0, 0.0, 0.0, 0.0, plain=True)
 
 

@@ -53,7 +53,7 @@ class PatchRows:
 
     @staticmethod
     def of(sweeps: Sequence[Sweep], grid: SceneGrid, camera: LineCamera) -> PatchRows:
-        """Those of the patches of a field, each in the sweep whose lines have it nearest to their middle."""
+        """Assign each patch of a field to the sweep whose lines have it nearest to their middle."""
         patch_index = grid.valid_patches()
         along_x = sweeps[0].along == "x"
         down, across = np.divmod(patch_index, grid.patch_shape[1])

@@ -198,7 +198,7 @@ def reference_scan(scans: Sequence[UniformScan]) -> UniformScan:
 
 
 def frontier(scans: Sequence[UniformScan]) -> list[UniformScan]:
-    """Those scans than which none is as cheap and scores more, by ascending seconds."""
+    """Return the Pareto front of scans in seconds and score, by ascending seconds."""
     kept: list[UniformScan] = []
     for scan in sorted(scans, key=lambda one: (one.seconds, -one.expected[MIOU])):
         if not kept or scan.expected[MIOU] > kept[-1].expected[MIOU]:

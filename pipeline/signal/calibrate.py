@@ -30,7 +30,7 @@ class Fill:
     fraction: Floats32  # of ``after``
 
     def among(self, first: int, stop: int) -> Fill:
-        """Those whose elements lie from ``first`` to before ``stop``."""
+        """Return the part from element ``first`` to before ``stop``."""
         here = slice(*np.searchsorted(self.element, (first, stop)))
         return Fill(self.element[here], self.before[here], self.after[here], self.fraction[here])
 

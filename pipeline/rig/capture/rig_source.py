@@ -191,7 +191,7 @@ class RigSource:
                 waiting = waiting[len(given) :]
 
     def _found_again(self, runner: CaptureRunner, held: CaptureRecord, wanted: Sequence[int]) -> dict[int, Line]:
-        """Those of the lines that a capture gives yet, by number."""
+        """Return the wanted lines that a held capture still has, by number."""
         found: dict[int, Line] = {}
         try:
             for line in self._read(runner, runner.recovered(held), wanted[0]):

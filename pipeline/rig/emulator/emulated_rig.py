@@ -82,7 +82,7 @@ class OffPlanAim(Aim):
         return self.shift_px[block.numbers - self.first]
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Nothing is known beforehand of where an emulated mirror goes."""
+        """Return a bound of 0: the error of an emulated mirror is not known beforehand."""
         return Bound(0.0, "follows the emulated mirror")
 
 

@@ -251,7 +251,7 @@ class GainRange:
 
     @staticmethod
     def of(factors: Floats, wavelength_nm: Floats, *, uneven: float, added_e: Floats | None = None) -> GainRange:
-        """Those of (state, band) factors that stand for all that there are, with (state, band) light added."""
+        """Summarise (state, band) factors by their extremes and differences, with (state, band) light added."""
         added = np.zeros((1, factors.shape[1])) if added_e is None else added_e
         own, of_added = _differences(factors, wavelength_nm), _differences(added, wavelength_nm)
         return GainRange(factors.min(axis=0), factors.max(axis=0), uneven, *own, added.max(axis=0), *of_added)

@@ -280,7 +280,7 @@ class Moments:
 
     @staticmethod
     def together(blurs: Sequence[Moments], bands: int) -> Moments:
-        """Those of blurs one after the other. At most one of them is diffraction, and one a disc."""
+        """Return the moments of blurs in sequence. At most one of them is diffraction, and one a disc."""
         none = np.zeros((2, bands))
         shift, variance = sum((one.shift for one in blurs), none), sum((one.variance for one in blurs), none)
         waves = next((one.waves for one in blurs if one.waves is not None), None)

@@ -216,16 +216,18 @@ MEASURED = {  # pixels, bands, bytes captured, farm or not: bytes kept
     (515 * 403, 4, 0, False): 3_230_020,
     (32 * 32, 200, 8_960_000, False): 1_682_845,
     (320 * 256, 270, 50_983_686, True): 4_902_150,
-    (1280 * 1024, 270, 725_000_000, True): 21_700_000,
+    (384 * 320, 270, 56_332_800, True): 5_373_602,
+    (1280 * 1024, 270, 725_068_800, True): 20_403_329,
 }
 
 
 @pytest.mark.parametrize("field", MEASURED, ids=str)
 def test_the_estimate_of_bytes_kept_is_within_what_it_says(field: tuple[int, int, int, bool]) -> None:
-    """Six surveys kept half to twice of it; a limit of the scores lowers it."""
+    """Surveys of files kept half to twice of it, those of farms are nearer; a limit of the scores lowers it."""
     pixels, bands, captured, is_farm = field
     estimate = estimated_bytes(pixels, bands, captured, is_farm=is_farm)
-    assert 0.5 <= MEASURED[field] / estimate <= 2
+    within = 1.4 if is_farm else 2.0
+    assert 1 / within <= MEASURED[field] / estimate <= within
     assert estimated_bytes(pixels, bands, captured, is_farm=is_farm, most=1000) < estimate
 
 

@@ -22,11 +22,13 @@ from flows.tasks.run import open_run
 from flows.tasks.survey_model import shipped_weights
 from flows.training import train as flow
 from flows.training import train_scenes
+from flows.training.baselines import judge_baselines
 from flows.training.data import pack_mask, unpack_mask
 from flows.training.fit_ood import OodRequest, measure_ood
 from flows.training.train import joined_split, run_train, train_weights
 from flows.training.train_scenes import TrainRequest, observe_all, suggested_patch
 from models.evaluation.expected_scores import MapScores
+from models.training.examples import Example
 from models.training.start_weights import StartFile
 from models.training.train import TrainingSettings
 from models.weights.files import describe_weights, load_ood, load_weights
@@ -164,6 +166,32 @@ def test_training_shows_the_figures_of_validation(folder: Path, out: Path):
     for name in rows:
         assert all(0 <= figures[name][figure] <= 1 for figure in ("miou", "overall_accuracy"))
         assert name in shown.getvalue()
+    record = describe_weights(out).record
+    assert set(record["baselines"]) == {"logistic regression", "random forest"}
+    assert set(record["readings"]["miou"]) == {"network", "linear discriminants"}
+    beside = record["baselines"] | record["readings"]["miou"]
+    assert all(f"{name} {100 * miou:.1f}" in shown.getvalue() for name, miou in beside.items())
+
+
+def test_classifiers_beside_a_training_know_spectra_that_differ() -> None:
+    """Two classes far apart are told apart, two of one law no better than by chance; one alone says nothing."""
+    rng, labels = np.random.default_rng(0), np.repeat(np.arange(2, dtype=np.uint8), 20)[:, None].repeat(40, 1)
+    values = rng.normal(0, 1, (40, 40, 3))
+
+    def example(spectra: np.ndarray, truth: np.ndarray) -> Example:
+        return Example("e", np.asarray(spectra, np.float32), truth, truth.shape)
+
+    def judged(spectra: np.ndarray, truth: np.ndarray) -> dict[str, float] | None:
+        one = example(spectra, truth)
+        return judge_baselines([one], [one], 2, 0, lambda what, done, figure: None)
+
+    mixed = rng.permutation(labels.ravel()).reshape(labels.shape)
+    far, alike = judged(values + 9 * labels[..., None], labels), judged(values, mixed)
+    assert far is not None
+    assert alike is not None
+    assert min(far.values()) > 0.95
+    assert alike["logistic regression"] < 0.45
+    assert judged(values, np.zeros_like(labels)) is None
 
 
 def test_a_survey_says_that_a_scene_was_trained_on(folder: Path, out: Path) -> None:
