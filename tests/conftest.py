@@ -68,6 +68,9 @@ def random_weights(wavelength_nm: tuple[float, ...], names: tuple[str, ...] = CL
             with torch.no_grad():
                 last.weight -= last.weight.mean(dim=1, keepdim=True)  # brightness of all channels speaks for no class
         with torch.no_grad():
+            for number, row in enumerate(model.spectral.weight):  # a class for each hue, so that maps have several
+                turn = 2 * np.pi * (number / len(names) + np.arange(len(row)) / len(row))
+                row[:, 0, 0] = torch.from_numpy(6 * np.cos(turn))
             for head in (model.overview_head, model.full_head):
                 for up in head.up:
                     up.weight *= 0.1  # a pixel's own light decides

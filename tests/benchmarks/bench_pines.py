@@ -212,14 +212,14 @@ def _seen_by_camera(folder: Path) -> Values:
 
 
 def _through_camera(folder: Path, path: Path) -> list[Result]:
-    from flows.evaluate.frames import capture_passes
+    from flows.evaluate.frames import see_frame
     from models.weights.files import load_weights
     from pipeline.geometry.camera import LineCamera
 
     weights, scene = load_weights(path), _scene(folder)
     if scene.key not in weights.record.get("split", {}).get("pixels", {}):
         raise ValueError(f"{path} was not trained with --train-mask on {SCENE}: its test pixels may have taught it")
-    scan_pass = capture_passes(scene, scene.name, weights, LineCamera(), 0)
+    scan_pass = see_frame(scene, scene.name, weights, LineCamera(), 0)
     return _judged("camera", weights, scan_pass.seen, scan_pass.fine, scan_pass.labels)
 
 

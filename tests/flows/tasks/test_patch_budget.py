@@ -191,7 +191,7 @@ def test_a_plan_tells_what_the_budgets_pay_for(scene_files: Path, tiny: Path, tm
     content = plan_content(load_settings(None, {**given_settings, "scan_step": "1", "macs": "80%"}))
     costs = content["kept"]["multiply_adds"]
     assert 0.75 < costs["done"] / costs["everything"] <= 0.8
-    assert f"detail: at most {content['kept']['patches']} of 192 patches" in format_kept(content["kept"])
+    assert f"full reading: likely {content['kept']['patches']} of 192 patches" in format_kept(content["kept"])
 
 
 def test_scores_without_an_overview_cost_none() -> None:
@@ -224,5 +224,5 @@ def test_a_policy_that_asks_the_overview_reads_it_once_more(policy: str, scan_pa
 
 def test_a_plain_scan_is_read_and_nothing_scored() -> None:
     """What its map takes, whatever the policy of the settings is."""
-    run: Any = SimpleNamespace(costs=COSTS, chooses=False, prior=None)
+    run: Any = SimpleNamespace(costs=COSTS, chooses=False, prior=None, least_gain=None)
     assert SurveyRun.work_done(run, np.arange(PATCHES)) == COSTS.of_map(np.arange(PATCHES))
