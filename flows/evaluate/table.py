@@ -19,7 +19,7 @@ CAPTION = (
     "K: fraction of the valid patches, each free of the others. mIoU over the counts of all frames, mean over the "
     "classes of the labels; overall: fraction of pixels that are right; ± the spread of seeds, else of random draws. "
     "[ ] 95 % of {draws} draws: paired bootstrap over frames, and over seeds where there are several. * uses labels. "
-    "captured: the chosen patches' fraction of the gain of the oracle's. Multiply-adds a frame, in closed form."
+    "captured: the chosen patches' fraction of the gain of the oracle's. MACs: multiply-adds a frame, in closed form."
 )
 
 
@@ -42,7 +42,7 @@ def print_evaluation(content: dict[str, Any], console: Console) -> None:
 
 def _accuracy(content: dict[str, Any]) -> Table:
     shared = ("placement", "K", "mIoU", "overall", "average", "kappa")
-    columns = (*shared, "to all", "to random", "gap", "captured", "multiply-adds")
+    columns = (*shared, "to all", "to random", "captured", "MACs")
     rows = []
     for row in content["rows"]:
         cells = (
@@ -54,7 +54,6 @@ def _accuracy(content: dict[str, Any]) -> Table:
             f"{row['kappa']:.2f}",
             format_difference(row["against_all"]),
             format_difference(row["against_random"]),
-            format_percent(row["gap_closed"]),
             format_percent(row["captured_gain"]),
             format_count(row["cost"]["multiply_adds"]["done"]),
         )

@@ -218,6 +218,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
     coarse = np.concatenate([mosaic.spectra(strip, chosen) for strip in mosaic.row_blocks(run.factor)])
     decided = products["segment"].path / READING
     attention = load_attention(decided if decided.exists() else products["score"].path / READING)
+    changed = attention.changed
     found = load_class_map(products["segment"].path / "class_map.zarr")
     order = np.argsort(attention.rank.ravel(), kind="stable")
     accuracy = receipt.get("accuracy")
@@ -241,7 +242,8 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
         raw_lines=sum(cube.sweep.lines for cube in strips),
         rectified=_both_scales(run, products, plan, chosen, coarse),
         wavelength_nm=run.scene.wavelength_nm[chosen],
-        score=attention.score,
+        score=attention.score if changed is None else np.where(attention.rank >= 0, changed, np.nan),
+        changed=changed is not None,
         patch_px=run.grid.patch,
         patch_index=order[attention.rank.ravel()[order] >= 0],
         blocks=tuple(block_of(sweep, run) for sweep in plan.sweeps),

@@ -64,7 +64,7 @@ class Drawing:
         overview, full = self.captures
         seen, chosen = coarse_region(weights, self.mosaic, region, overview), chosen_patches(self.attention)
         if self.least_gain is not None:
-            seen = read_coarse_prediction(weights, seen)
+            seen = predicted = read_coarse_prediction(weights, seen)
             gain, here = score_patches(self.policy, seen), region.numbers_here(chosen)
             chosen = chosen[(here >= 0) & (gain[here] >= self.least_gain)]
         patch_index, columns = patch_features(weights, detail, chosen, seen, region)
@@ -105,9 +105,13 @@ class Drawing:
         unread = 0 if seen.out_of_range is None else int(np.count_nonzero(region.crop(seen.out_of_range)))
         if self.least_gain is None:
             return Drawn(unread, comparison)
-        read = np.zeros(gain.shape, np.bool_)
+        read, changed = np.zeros(gain.shape, np.bool_), np.zeros(gain.shape, np.float32)
         read[patch_index] = True
-        return Drawn(unread, comparison, (region.crop_patches(gain), region.crop_patches(read)))
+        kept = region.crop_patches
+        before = predicted.probability.argmax(axis=-1)[: region.grid.height, : region.grid.width]
+        other = (drawn.classes != before) & (drawn.classes != UNLABELLED)
+        changed[patch_index] = patch_pixels(region.grid, other)[patch_index].mean(axis=(1, 2))
+        return Drawn(unread, comparison, FullReading(kept(gain), kept(read), kept(changed)))
 
     def _observation(
         self, region: Region, log_probability: NDArray[np.float32], shown: NDArray[np.bool_], seen: CoarsePass
@@ -166,13 +170,21 @@ class UnknownRule:
 
 
 @dataclass(frozen=True)
+class FullReading:
+    """What the full network was asked and did, (patch_y, patch_x) each."""
+
+    gain: NDArray[np.float64]  # that the policy expected
+    read: NDArray[np.bool_]  # patches that it read
+    changed: NDArray[np.float32]  # fraction of their pixels whose class it changed
+
+
+@dataclass(frozen=True)
 class Drawn:
     """Findings while a region, or a field, was drawn."""
 
     unread_px: int  # pixels that were seen, with values that the weights take for no reading
     comparison: TemporalAgreement | None  # with what was remembered; None of a field's first visit
-    # (patch_y, patch_x) expected gains and which patches were read in full, where that was decided on the way
-    reading: tuple[NDArray[np.float64], NDArray[np.bool_]] | None = None
+    reading: FullReading | None = None  # where patches were chosen on the way
 
 
 def draw_field(field: FieldWork, work: Drawing, report: Callable[[float], None]) -> Drawn:
@@ -188,9 +200,9 @@ def draw_field(field: FieldWork, work: Drawing, report: Callable[[float], None])
     reading = None
     if work.least_gain is not None:
         shape = field.regions[0].field.patch_shape
-        reading = np.zeros(shape), np.zeros(shape, np.bool_)
+        reading = FullReading(np.zeros(shape), np.zeros(shape, np.bool_), np.zeros(shape, np.float32))
         for region, part in zip(field.regions, parts, strict=True):
             assert part.reading is not None
-            for whole, own in zip(reading, part.reading, strict=True):
-                whole[region.kept_patches.rows, region.kept_patches.columns] = own
+            for name, whole in vars(reading).items():
+                whole[region.kept_patches.rows, region.kept_patches.columns] = getattr(part.reading, name)
     return Drawn(sum(part.unread_px for part in parts), reduce(add, compared) if compared else None, reading)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from flows.evaluate.frames import SeenFrame, see_frame, open_frames
+from flows.evaluate.frames import SeenFrame, open_frames, see_frame
 from models.weights.files import Weights, load_weights, save_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.scenes.scene import RasterScene

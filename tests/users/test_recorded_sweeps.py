@@ -91,9 +91,7 @@ def write_sweeps(out: Path, published: Published, folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("asked", PASSES.values(), ids=PASSES)
-def test_sweeps_of_the_rig_give_its_map(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: dict[str, Any]
-) -> None:
+def test_sweeps_of_the_rig_give_its_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: dict[str, Any]) -> None:
     """Written as ENVI and CSV and surveyed as a recording, or out of the archive itself: the class map by hash."""
     weights, made = tmp_path / "reflectance.safetensors", random_weights((640.0, 550.0, 460.0))
     centre, spread = (np.full_like(made.normalisation.centre, level) for level in (0.3, 0.05))

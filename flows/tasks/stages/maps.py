@@ -107,12 +107,12 @@ def segment(
             if figures["put_aside"] is not None and drawn.comparison is not None:
                 drop_changes(probabilities)
                 drawn = draw_field(work, replace(drawing, memory=None), report)
-        if drawn.reading is not None:
-            gain, read = drawn.reading
-            rank = np.full(gain.size, -1, np.int32)
-            best = np.argsort(np.where(read, -gain, np.inf).ravel(), kind="stable")[: np.count_nonzero(read)]
-            rank[best] = np.arange(len(best))
-            write_attention(path / READING, Attention(gain, rank.reshape(gain.shape), policy))
+        if (full := drawn.reading) is not None:
+            rank = np.full(full.gain.size, -1, np.int32)
+            best = np.argsort(np.where(full.read, -full.gain, np.inf).ravel(), kind="stable")
+            rank[best[: np.count_nonzero(full.read)]] = np.arange(np.count_nonzero(full.read))
+            found = Attention(full.gain, rank.reshape(full.gain.shape), policy, full.changed)
+            write_attention(path / READING, found)
         if drawn.unread_px:
             write_table(path / OUT_OF_RANGE, {"px": drawn.unread_px})
         if frame.missing is not None:

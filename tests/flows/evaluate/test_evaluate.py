@@ -319,7 +319,7 @@ def test_figures_are_printed(judged: Judged, data: Path, capsys: pytest.CaptureF
     """Rows, classes and what the figures mean, from what was kept; with --json one object on stdout."""
     run_evaluate(judged[0], Console(stderr=True))
     shown = capsys.readouterr()
-    for words in ("oracle*", "multiply-adds", "crop", "uses labels", "paired bootstrap"):
+    for words in ("oracle*", "MACs", "crop", "uses labels", "paired bootstrap"):
         assert words in shown.out
     assert "evaluation.json" in shown.err
     weights = write_weights(tmp_path / "w.safetensors")
