@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.tasks.field_prior_map import FieldPriorMap
-from flows.tasks.field_work import FieldWork, WeightsFile, coarse_region, patch_features
+from flows.tasks.field_work import FieldWork, WeightsFile, coarse_region, patch_features, seen_patches
 from models.network.spectral import Capture
 from models.policies.policies import score_patches
 from models.reading.inference import CoarsePass, read_coarse_prediction, segment
@@ -67,7 +67,10 @@ class Drawing:
             seen = predicted = read_coarse_prediction(weights, seen)
             gain, here = score_patches(self.policy, seen), region.numbers_here(chosen)
             chosen = chosen[(here >= 0) & (gain[here] >= self.least_gain)]
-        patch_index, columns = patch_features(weights, detail, chosen, seen, region)
+        if self.mosaic == self.detail:
+            patch_index, columns = seen_patches(chosen, seen, region)
+        else:
+            patch_index, columns = patch_features(weights, detail, chosen, seen, region)
         drawn = segment(weights, seen, columns, patch_index, capture=full, every_class=True)
         shown = self._shown(region, detail, patch_index)
         assert drawn.log_probability is not None

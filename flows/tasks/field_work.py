@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from flows.tasks.patch_budget import SHARD
 from models.network.machine import PROCESSOR
-from models.network.spectral import Capture, dead_pixels
+from models.network.spectral import Capture, dead_pixels, patches_of
 from models.policies.policies import GLANCING_POLICIES, score_patches
 from models.reading.inference import CoarsePass, CoarsePrediction, read_coarse_pass, read_coarse_prediction
 from models.reading.ood import OodDetector
@@ -131,6 +131,20 @@ def patch_features(
                 y, x = seen.grid.patch_origin(patch_number)[..., None] + np.arange(p)
                 patch[~there] = seen.columns[np.ix_(y, x)][~there]
     return patch_index[:kept], columns[:kept]
+
+
+def seen_patches(
+    field_index: NDArray[np.integer], seen: CoarsePass, region: Region
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Numbers and columns (patch, p, p, column) of the field's chosen patches that the overview's capture shows.
+
+    A patch of which nothing was seen is left out.
+    """
+    numbers = region.numbers_here(field_index)
+    numbers = numbers[numbers >= 0]
+    if seen.filled is not None:
+        numbers = numbers[~patches_of(seen.filled, region.grid.patch)[numbers].all(axis=(1, 2))]
+    return numbers, seen.patches(numbers)
 
 
 def region_params(grid: SceneGrid) -> dict[str, Any]:

@@ -60,6 +60,7 @@ from pipeline.lazy import Once, deferred
 from pipeline.rectify.placed import PixelGrid, place
 from pipeline.rectify.region import plan_tiles
 from pipeline.rectify.tiles import MosaicWork
+from pipeline.signal.subspace import SMOOTH
 from pipeline.simulator.effects.pointing import PointingErrors
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
@@ -209,22 +210,18 @@ class SurveyRun(CaptureRun):
 
         It follows from the loss that the settings allow where they name neither gain nor multiply-adds.
         """
-        settings, row = self.settings, self.cascade_row
+        settings, allowed = self.settings, self.cascade
         if not self.plan.plain or settings.macs is not None or self.part:
             return None
         if settings.least_gain is not None:
             return settings.least_gain
-        return (
-            None
-            if row is None or settings.policy != "gain"
-            else CascadeTable.read(self.described.record[CASCADE]).least_gain[row]
-        )
+        return None if allowed is None or settings.policy != "gain" else allowed[0]
 
     @property
-    def cascade_row(self) -> int | None:
-        """Row of the weights' table of losses that the settings ask for; None where there is none."""
+    def cascade(self) -> tuple[float, float] | None:
+        """Least gain and fraction of patches that lose what the settings allow; None without a table of losses."""
         content = self.described.record.get(CASCADE)
-        return None if content is None else CascadeTable.read(content).row_within(self.settings.expected_loss / 100)
+        return None if content is None else CascadeTable.read(content).within(self.settings.expected_loss / 100)
 
     @property
     def chooses(self) -> bool:
@@ -336,10 +333,10 @@ class SurveyRun(CaptureRun):
         """
         if self.budget is not None:
             return self.budget.most_patches
-        row, every = self.cascade_row, self.kept_patches
-        if row is None or self.least_gain is None or self.settings.least_gain is not None:
+        allowed, every = self.cascade, self.kept_patches
+        if allowed is None or self.least_gain is None or self.settings.least_gain is not None:
             return every
-        return every[: round(CascadeTable.read(self.described.record[CASCADE]).fraction[row] * len(every))]
+        return every[: round(allowed[1] * len(every))]
 
 
 def open_run(settings: Settings, *, planning: bool = False, archive: Archive | None = None) -> SurveyRun:
@@ -378,7 +375,8 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         prior = None if found is None else found[0]
         planned = _plan_capture(settings, grid, bands, path, described, prior, shown=zones.shown, passes=passes)
     settings, plan = planned.settings, planned.plan
-    costs = ReadingCosts(described.config, grid, bands)
+    read = min(bands, SMOOTH)  # the network reads components, as many as smooth directions or fewer
+    costs = ReadingCosts(described.config, grid, read, apart=settings.budget is not None)
     spending = settings.policy, settings.macs, settings.least_gain
     shown = None if zones.fractions is None else zones.fractions > 0
     budget = None if settings.macs is None else PatchBudget.asked(costs, shown, *spending)

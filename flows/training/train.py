@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from torch import Tensor
 
 from flows.terminal.progress import one_after_the_other, table
-from flows.training.baselines import better_reading, judge_baselines
+from flows.training.baselines import judge_baselines
 from flows.training.data import Report, TrainingData, alike_notes, either_mask, open_training_data
 from flows.training.figures import judge_cascade, judge_scans, validate
 from flows.training.fit_ood import SeenScenes, measure_and_add, measured_calibration, trained_on
@@ -27,7 +26,7 @@ from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation
 from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from models.training.examples import Example, measured_normalisation
-from models.training.spectral_start import LabelledPixels, linear_discriminants
+from models.training.spectral_start import LabelledPixels, better_reading, linear_discriminants
 from models.training.start_weights import Start, StartFile
 from models.training.train import Progress, train
 from models.weights.checksummed_files import read_checkpoint
@@ -123,7 +122,7 @@ class Lesson:
     begun: Start | None
 
     @cached_property
-    def start(self) -> Mapping[str, Tensor]:
+    def start(self) -> Mapping[str, Any]:
         """What the network begins with: earlier weights, or the linear discriminants of its scenes."""
         begun = {} if self.begun is None else self.begun.state
         if "spectral.weight" in begun:

@@ -38,10 +38,17 @@ class CascadeTable:
             fractions.append(sum(read) / sum(one.gain.size for one in scenes))
         return CascadeTable(LEAST_GAINS, tuple(losses), tuple(fractions))
 
-    def row_within(self, loss: float) -> int | None:
-        """Return the row of the highest least gain that loses no more, nor any below it; None where each does."""
-        within = np.cumprod(np.asarray(self.loss) <= loss)
-        return int(within.sum()) - 1 if within.any() else None
+    def within(self, loss: float) -> tuple[float, float] | None:
+        """Return the highest least gain that loses no more, and the fraction that is read by it; None where each does.
+
+        Between the last row within the loss and the first beyond it, gains are interpolated by their logarithm.
+        """
+        rows = int(np.cumprod(np.asarray(self.loss) <= loss).sum())
+        if rows == 0:
+            return None
+        ends = slice(rows - 1, rows + 1)
+        gain = np.interp(loss, self.loss[ends], np.log(self.least_gain[ends]))
+        return float(np.exp(gain)), float(np.interp(loss, self.loss[ends], self.fraction[ends]))
 
 
 @dataclass(frozen=True)

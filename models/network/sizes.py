@@ -110,11 +110,11 @@ class MultiplyAdds:
 
 
 def multiply_adds(
-    config: SegmenterConfig, grid: SceneGrid, patches: int, bands: int, *, score: int = 0
+    config: SegmenterConfig, grid: SceneGrid, patches: int, bands: int, *, score: int = 0, apart: bool = False
 ) -> MultiplyAdds:
     """Count a field of ``bands`` bands or components, ``patches`` patches read in full; their policy took ``score``.
 
-    Spectral features are counted for the overview, and again for each patch.
+    Spectral features are counted once, or again for each patch where patches were captured ``apart``.
     """
     basis = bands * config.columns
     rows, columns = (-(-size // TOKEN_PX) for size in grid.padded_shape)
@@ -122,7 +122,9 @@ def multiply_adds(
     inputs, drawn = config.columns + PLANES, (config.overview_width + config.columns) * config.classes
     bottom = 2 * level_widths(config.overview_width, TOKEN_PX)[-1] * BOTTOM**2 * config.dim  # to a token and back
     overview = cell * (basis + drawn) + _pyramid(inputs, config.overview_width, TOKEN_PX) + bottom
-    patch = p * p * (basis + config.width * config.classes) + _pyramid(inputs + config.overview_width, config.width, p)
+    patch = p * p * (apart * basis + config.width * config.classes) + _pyramid(
+        inputs + config.overview_width, config.width, p
+    )
     return MultiplyAdds(tokens * overview + _transformer(config, tokens), score, patches * patch)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -41,13 +43,18 @@ def test_losses_stand_beside_fractions() -> None:
     assert table.loss[0] < 0 < table.loss[-1]
 
 
-@pytest.mark.parametrize(("loss", "row"), [(0.0, 1), (0.1, 1), (0.25, 2), (1.0, 3), (-0.5, None)])
-def test_the_highest_gain_within_a_loss(loss: float, row: int | None) -> None:
-    """No row beyond one that loses more, be it less itself."""
+@pytest.mark.parametrize(
+    ("loss", "wanted"),
+    [(0.0, (0.02, 0.5)), (0.1, (math.sqrt(0.02 * 0.03), 0.4)), (0.2, (0.03, 0.3)), (1.0, (0.04, 0.1)), (-0.5, None)],
+)
+def test_the_highest_gain_within_a_loss(loss: float, wanted: tuple[float, float] | None) -> None:
+    """Between two rows by the logarithm of the gain; none beyond the last."""
     table = CascadeTable((0.01, 0.02, 0.03, 0.04), (-0.1, 0.0, 0.2, 0.3), (0.9, 0.5, 0.3, 0.1))
-    assert table.row_within(loss) == row
+    assert table.within(loss) == (wanted if wanted is None else pytest.approx(wanted))
 
 
 def test_a_worse_row_ends_the_search() -> None:
     """Noise of few scenes does not open a higher gain behind it."""
-    assert CascadeTable((0.01, 0.02, 0.03), (0.0, 0.5, 0.1), (0.9, 0.5, 0.3)).row_within(0.2) == 0
+    found = CascadeTable((0.01, 0.02, 0.03), (0.0, 0.5, 0.1), (0.9, 0.5, 0.3)).within(0.2)
+    assert found is not None
+    assert 0.01 < found[0] < 0.02
