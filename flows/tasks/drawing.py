@@ -164,8 +164,11 @@ class UnknownRule:
         """Unknown pixels of a region's scene, (y, x): by its patches, captured as ``full``, and by the rest."""
         grid, p = seen.grid, seen.grid.patch
         found = np.zeros(grid.padded_shape, np.bool_)
-        if len(patch_index) < len(grid.valid_patches()):
+        alike = seen.capture == full  # a uniform scan: patches have the columns of the overview
+        if alike or len(patch_index) < len(grid.valid_patches()):
             found[...] = ood_detector.unknown(seen.columns, rate=self.rate, capture=seen.capture, bands=bands)
+        if alike:
+            return found[: grid.height, : grid.width]
         fine = ood_detector.unknown(patches, rate=self.rate, capture=full, bands=bands)
         for patch, (y, x) in zip(fine, grid.patch_origin(patch_index), strict=True):
             found[y : y + p, x : x + p] = patch

@@ -109,8 +109,7 @@ class ChannelNorm(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         exact = torch.promote_types(x.dtype, torch.float32)
-        size = torch.linalg.vector_norm(x, dim=1, keepdim=True, dtype=exact)
-        scale = torch.rsqrt(size.square() / x.shape[1] + 1e-6)
+        scale = torch.rsqrt(x.to(exact).square().mean(dim=1, keepdim=True) + 1e-6)
         return x * scale * self.weight[None, :, None, None]
 
 

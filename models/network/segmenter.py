@@ -77,6 +77,7 @@ class Segmenter(nn.Module):
 
         Tokens that are not ``living``, (tokens,) bool of the one scene, are left out: no other token reads them.
         """
+        image = image.contiguous()  # two layers read it
         height, width = image.shape[2:]
         gap = -width % TOKEN_PX, -height % TOKEN_PX
         if any(gap):
@@ -93,8 +94,10 @@ class Segmenter(nn.Module):
         context = self.from_token(read.transpose(1, 2).reshape(grid.shape))
         features[-1] = features[-1] + F.pixel_shuffle(context, BOTTOM)
         drawn = self.overview_head(features)[:, :, :height, :width]
-        around = F.avg_pool2d(image[:, : self.config.columns], AROUND_PX, 1, AROUND_PX // 2, count_include_pad=False)
-        logits = self.overview_classes(F.gelu(drawn)) + self.spectral(around)[:, :, :height, :width]
+        alone = self.spectral(image[:, : self.config.columns])  # the logits' mean is that of the mean spectrum
+        for size in ((AROUND_PX, 1), (1, AROUND_PX)):
+            alone = F.avg_pool2d(alone, size, 1, (size[0] // 2, size[1] // 2), count_include_pad=False)
+        logits = self.overview_classes(F.gelu(drawn)) + alone[:, :, :height, :width]
         return Overview(drawn, logits)
 
     def _coded(self, grid: Tensor, origin: Tensor | None) -> Tensor:

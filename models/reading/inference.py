@@ -201,6 +201,8 @@ def read_coarse_prediction(weights: Weights, coarse_pass: CoarsePass) -> CoarseP
             capture=coarse_pass.capture,
             origin=coarse_pass.origin,
             living=coarse_pass.living,
+            out_of_range=coarse_pass.out_of_range,
+            filled=coarse_pass.filled,
             gain=weights.segmenter.score(overview)[0].cpu().numpy(),
             read=Read(weights.segmenter, coarse_pass, overview),
         )
