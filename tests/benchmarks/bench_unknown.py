@@ -58,7 +58,9 @@ def rows() -> list[Row]:
             for scan_pass in ("every line, 100 ms", "every line, 5 ms"):
                 fraction = (
                     100
-                    * _survey({"scene": str(path), "weights": str(WEIGHTS), **PROBES[scan_pass]}, "auto")["fraction"]
+                    * _survey(
+                        {"scene": str(path), "source": "sim", "weights": str(WEIGHTS), **PROBES[scan_pass]}, "auto"
+                    )["fraction"]
                 )
                 found.append(Row(f"{name}, {scan_pass}: unknown", f"{fraction:.1f} %", ">= 90 %", fraction >= 90))
                 print(f"{found[-1].what}: {found[-1].figure}", flush=True)

@@ -211,13 +211,13 @@ def test_headline_is_one_paragraph_with_the_figures():
     assert "93.4 % of its pixels are right" in text
     assert headline(make_receipt(), 0.0).startswith("The camera captured nothing again: no run of fine lines fits")
     assert "truth" not in headline(make_receipt(labels=False))
-    words = "Its worst class is bare weed with 60.0: the coarse pass alone gives 20.0, detail everywhere 80.0."
+    words = "Its worst class is bare weed with 60.0: the overview alone gives 20.0, a full reading 80.0."
     assert headline(make_receipt()).endswith(words)
     receipt = make_receipt()
     receipt["accuracy"]["all"] = {"miou": None, "per_class_iou": {}}
     text = headline(receipt)
-    assert "the coarse pass alone gives 50.0. Its worst class" in text
-    assert text.endswith("bare weed with 60.0: the coarse pass alone gives 20.0.")
+    assert "the overview alone gives 50.0. Its worst class" in text
+    assert text.endswith("bare weed with 60.0: the overview alone gives 20.0.")
 
 
 PNG = b"\x89PNG\r\n\x1a\nnot a real picture"
