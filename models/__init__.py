@@ -1,1 +1,1 @@
-"""The two-scale segmenter in torch: tokens, encoder, decoder, attention policies, training, metrics, weights."""
+"""The segmenter in torch: overview and full network, attention policies, training, metrics, weights."""

@@ -56,15 +56,25 @@ def pytest_collection() -> Generator[None, object, object]:
 def random_weights(wavelength_nm: tuple[float, ...], names: tuple[str, ...] = CLASSES, **sizes: Any) -> Weights:
     """Weights of a tiny segmenter as chance made them, for bands at these wavelengths."""
     basis = SpectralBasis.spanning(np.array(wavelength_nm), 4)
-    small = {"patch": 8, "factor": 4, "width": 8, "dim": 16, "layers": 1, "heads": 2}
+    small = {"patch": 8, "width": 8, "overview_width": 4, "dim": 16, "layers": 1, "heads": 2}
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(5)
         model = Segmenter(SegmenterConfig(len(names), basis.columns, **{**small, **sizes})).eval()
         for parameter in model.parameters():
             if not parameter.any():  # training starts some terms from zero; here nothing is idle
                 torch.nn.init.normal_(parameter, std=0.3)
-        for last in (model.coarse_classes, model.fine_classes):  # light decides, so that maps have every class
+        for last in (model.overview_classes, model.full_classes):  # light decides, so that maps have every class
             torch.nn.init.normal_(last.weight, std=2.0)
+            with torch.no_grad():
+                last.weight -= last.weight.mean(dim=1, keepdim=True)  # brightness of all channels speaks for no class
+        with torch.no_grad():
+            for number, row in enumerate(model.spectral.weight):  # a class for each hue, so that maps have several
+                turn = 2 * np.pi * (number / len(names) + np.arange(len(row)) / len(row))
+                row[:, 0, 0] = torch.from_numpy(6 * np.cos(turn))
+            for head in (model.overview_head, model.full_head):
+                for up in head.up:
+                    up.weight *= 0.1  # a pixel's own light decides
+                    up.bias.zero_()
             torch.nn.init.zeros_(last.bias)
     one = np.ones(basis.columns, np.float32)
     normalisation = Normalisation(110 * one, 40 * one, np.eye(basis.columns, dtype=np.float32))

@@ -137,7 +137,7 @@ def forecast(settings: Settings, preview: Path | None = None) -> Forecast:
         if preview is not None:
             with refusals(preview.parent, "write the preview"):
                 plan_preview.draw_preview(preview, run, fine, _last_map(run, catalogue), figure_lines(figures))
-    kept = None if run.budget is None else run.budget.figures(run.budget.most_patches)
+    kept = run.reading_figures(run.likely_patches) if run.plan.plain and run.chooses else None
     estimates = estimate_survey(run, fine, catalogue)
     return Forecast(planner.rows, run.refused, run.scans, figures, estimates, kept)
 
@@ -319,7 +319,7 @@ def format_kept(kept: Mapping[str, Any]) -> str:
     """Return how much of a uniform scan the budgets pay for at most."""
     read = kept["multiply_adds"]["done"] / kept["multiply_adds"]["everything"]
     return (
-        f"detail: at most {kept['patches']} of {kept['of_patches']} patches, for {format_percent(read)} of the "
+        f"full reading: likely {kept['patches']} of {kept['of_patches']} patches, for {format_percent(read)} of the "
         "multiply-adds of reading everything"
     )
 

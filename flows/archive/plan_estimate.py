@@ -83,11 +83,8 @@ def _of_camera(run: SurveyRun, fine: FinePlan | None) -> dict[str, Estimate]:
 
 def _multiply_adds(run: SurveyRun, fine: FinePlan | None) -> Estimate:
     """Count the model over the patches that are read in detail, as far as it is known which these are."""
-    shown = run.zones.shown
-    patch_index: NDArray[np.integer] = run.grid.valid_patches() if shown is None else np.flatnonzero(shown)
-    if run.budget is not None:
-        patch_index = run.budget.most_patches
-    elif fine is not None:
+    patch_index: NDArray[np.integer] = run.likely_patches
+    if not run.plan.plain and fine is not None:
         patch_index = fine.patch_index
     done = run.work_done(patch_index).total
     return Estimate(done, "the size of network and field", at_most=fine is None and run.chooses)

@@ -72,13 +72,14 @@ def train(
     minutes: float = 36.0,
     scenes: int | None = None,
     patch: int | None = None,
-    factor: int = 4,
+    width: int = 20,
+    overview_width: int = 8,
     columns: int = 24,
     init: Path | None = None,
     train_temporal: Path | None = None,
     fit_ood: Path | None = None,
-    dim: int = 128,
-    layers: int = 4,
+    dim: int = 64,
+    layers: int = 3,
     heads: int = 4,
     mlp_ratio: int = 3,
     crop: int | None = None,
@@ -118,8 +119,10 @@ def train(
         How many scenes of the built-in farm, on days from April to October; 48 by default.
     patch
         Size of a patch [px]; by default 16 for the farm, 8 to 32 for files, by their size.
-    factor
-        How many times coarser the coarse pass is than the fine one.
+    width
+        Channels of the full network at a patch's own pixels.
+    overview_width
+        Channels of the overview, which reads every pixel.
     columns
         How many numbers a pixel's spectrum is brought to, whatever bands a camera has.
     init
@@ -189,8 +192,9 @@ def train(
             validation,
             scenes,
             patch,
-            factor,
             columns,
+            width,
+            overview_width,
             tokens={"dim": dim, "layers": layers, "heads": heads, "mlp_ratio": mlp_ratio},
             init=init,
             choices=choices,

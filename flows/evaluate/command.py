@@ -14,14 +14,13 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from flows.evaluate.frames import (
-    COST,
     Candidate,
     EvaluateRequest,
     Show,
-    capture_passes,
     checked_request,
     open_candidates,
     open_frames,
+    see_frame,
     sort_frames,
 )
 from flows.evaluate.judge import Record, Trial, judge_frame, seeds_of, summarise
@@ -42,7 +41,7 @@ else:
     table = deferred("flows.evaluate.table")  # matplotlib
     panels = deferred("flows.publish.panels")
 
-KEPT_VERSION = 4  # of what a kept result says
+KEPT_VERSION = 5  # of what a kept result says
 
 
 def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = False) -> dict[str, Any]:
@@ -92,7 +91,7 @@ def evaluate_weights(request: EvaluateRequest, show: Show = lambda what, done, w
         ],
         "frames": list(jobs.frames),
         "left_out": jobs.left_out,
-        "settings": {**asked, "camera": asdict(candidates[0].camera), "cost_model": asdict(COST)},
+        "settings": {**asked, "camera": asdict(candidates[0].camera)},
         "seeds": [[candidates[number].path.name for number in one] for one in seeds_of(runs)],
         **summarise(runs, candidates[0].described.class_names, trial, request.draws),
         "data_notes": [*data.notes, *alike_notes(jobs.alike), *scene_notes(jobs.empty, jobs.regridded)],
@@ -129,14 +128,14 @@ def _judged(
             ) -> Record:
                 if index not in loaded:
                     loaded[index] = load_weights(one.path).on(device)
-                scan_pass = capture_passes(scene, name, loaded[index], one.camera, request.seed)
-                return judge_frame(trial, scan_pass, loaded[index], one.camera)
+                seen = see_frame(scene, name, loaded[index], one.camera, request.seed)
+                return judge_frame(trial, seen, loaded[index])
 
             # the farm's labels follow from its key and are not drawn for this
             labels = None if data.files is None or scene.labels is None else zlib.crc32(scene.labels.tobytes())
             follows_from = {
                 **{"weights": one.key, "frame": name, "scene": scene.key, "labels": labels, **asdict(trial)},
-                **{"camera": asdict(one.camera), "cost": asdict(COST)},
+                "camera": asdict(one.camera),
                 **({} if device == PROCESSOR else {"device": device}),
             }
             runs[index].append(kept.made(follows_from, judged))

@@ -28,14 +28,12 @@ from models.weights.files import Description, Weights, describe_weights
 from pipeline.errors import EmptySceneError, PipelineError, SceneError, SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
-from pipeline.geometry.scan import CostModel
 from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
 from pipeline.simulator.scenes.scene import RasterScene
 
 FRACTIONS = (0.05, 0.10, 0.15, 0.20, 0.35)
 JUDGED = tuple(name for name in POLICIES if name != "mask")  # that needs a file of one's own
 USUAL = ("gain", "entropy", "sobel", "random")
-COST = CostModel()
 
 
 @dataclass(frozen=True)
@@ -128,7 +126,7 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class ScenePasses:
+class SeenFrame:
     """One frame in the spectral features of certain weights, with their coarse prediction."""
 
     name: str
@@ -182,19 +180,19 @@ def open_frames(
     return TrainingData(data.law, names, (), (), data.camera, data.files, data.notes)
 
 
-def capture_passes(scene: RasterScene, name: str, weights: Weights, camera: LineCamera, seed: int) -> ScenePasses:
+def see_frame(scene: RasterScene, name: str, weights: Weights, camera: LineCamera, seed: int) -> SeenFrame:
     """Look at a frame with the camera of the training; the noise follows from the seed and the frame's name."""
     config = weights.config
-    grid = SceneGrid(*scene.shape, config.patch, config.factor)
+    grid = SceneGrid(*scene.shape, config.patch, 1)
     rng = np.random.default_rng([seed, 0xE7A1, zlib.crc32(name.encode())])
     observed = observe_scene(scene, camera, grid, weights.basis, rng)
     _, reached = weights.basis.matrix(scene.wavelength_nm)
     example = normalised(observed, weights.normalisation, reached)
     labels = judged_labels(scene, Description(config, weights.basis, weights.class_names, weights.record))
     assert labels is not None  # sort_frames
-    seen = coarse_prediction_of_columns(weights, np.ascontiguousarray(example.coarse, np.float32), grid)
-    fine = patches_of(example.fine, config.patch).astype(np.float32)
-    return ScenePasses(name, seen, fine, labels, len(scene.wavelength_nm))
+    seen = coarse_prediction_of_columns(weights, example.columns, grid)
+    fine = patches_of(example.columns, config.patch).astype(np.float32)
+    return SeenFrame(name, seen, fine, labels, len(scene.wavelength_nm))
 
 
 Show = Callable[[str, float, str], None]

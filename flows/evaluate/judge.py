@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.evaluate.frames import COST, ScenePasses
+from flows.evaluate.frames import SeenFrame
 from models.evaluation.metrics import (
     average_accuracy,
     confusion,
@@ -31,11 +31,6 @@ from models.network.sizes import multiply_adds
 from models.policies.policies import score_multiply_adds, score_patches
 from models.reading.inference import segment
 from models.weights.files import Weights
-from pipeline.errors import PoseError
-from pipeline.geometry.camera import LineCamera
-from pipeline.planning.coverage import cheapest_full, coarse_sweeps
-from pipeline.planning.fine_pass import runs_showing
-from pipeline.planning.prices import BYTES_PER_SAMPLE
 from pipeline.planning.selection import frame_patches
 
 ORACLE = "oracle"
@@ -56,75 +51,44 @@ class Trial:
     seed: int = 0
 
 
-def judge_frame(trial: Trial, scan_pass: ScenePasses, weights: Weights, camera: LineCamera) -> Record:
-    """Judge the map of every row, with its costs."""
-    grid = scan_pass.seen.grid
-    gain = oracle_gain(weights, scan_pass.seen, scan_pass.fine, scan_pass.labels)
-    seconds = _seconds_of_patches(scan_pass, camera)
+def judge_frame(trial: Trial, frame: SeenFrame, weights: Weights) -> Record:
+    """Judge the map of every row, with its multiply-adds."""
+    grid = frame.seen.grid
+    gain = oracle_gain(weights, frame.seen, frame.fine, frame.labels)
     rows = []
-    for policy, draw, fraction, patch_index in _placed(trial, scan_pass, gain):
-        samples = float(np.prod(grid.coarse_shape)) + float(
-            grid.valid_fraction().ravel()[patch_index].sum() * grid.patch**2
-        )
+    for policy, draw, fraction, patch_index in _placed(trial, frame, gain):
         scored = 0 if policy in (*ENDS, ORACLE) else score_multiply_adds(policy, weights.config, grid)
         bought, best = gain_sums(gain, patch_index, grid.valid_patches())
-        drawn = segment(weights, scan_pass.seen, scan_pass.fine[patch_index], patch_index).classes
-        counts = confusion(scan_pass.labels, drawn, weights.config.classes).tolist()
+        drawn = segment(weights, frame.seen, frame.fine[patch_index], patch_index).classes
         row = {
-            **{
-                "policy": policy,
-                "draw": draw,
-                "fraction": fraction,
-                "patches": len(patch_index),
-                "gain": bought,
-                "best_gain": best,
-            },
-            **{"counts": counts, "samples": samples},
-            "bytes": samples * scan_pass.bands * BYTES_PER_SAMPLE,
-            "multiply_adds": multiply_adds(weights.config, grid, len(patch_index), scan_pass.bands, score=scored).total,
+            "policy": policy,
+            "draw": draw,
+            "fraction": fraction,
+            "patches": len(patch_index),
+            "gain": bought,
+            "best_gain": best,
+            "counts": confusion(frame.labels, drawn, weights.config.classes).tolist(),
+            "multiply_adds": multiply_adds(weights.config, grid, len(patch_index), frame.bands, score=scored).total,
         }
-        rows.append(row | seconds(policy, patch_index))
-    return {"frame": scan_pass.name, "shape": [grid.height, grid.width], "rows": rows}
+        rows.append(row)
+    return {"frame": frame.name, "shape": [grid.height, grid.width], "rows": rows}
 
 
-def _placed(
-    trial: Trial, scan_pass: ScenePasses, gain: NDArray[np.float64]
-) -> Iterator[tuple[str, int, float, PatchIndex]]:
+def _placed(trial: Trial, frame: SeenFrame, gain: NDArray[np.float64]) -> Iterator[tuple[str, int, float, PatchIndex]]:
     """Give (policy, draw, share, patches) of each row; chance is drawn several times."""
-    allowed = scan_pass.seen.grid.valid_fraction().ravel() > 0
+    allowed = frame.seen.grid.valid_fraction().ravel() > 0
     yield "none", 0, 0.0, np.empty(0, np.intp)
     yield "all", 0, 1.0, np.flatnonzero(allowed)
     for policy in (*trial.policies, ORACLE):
         for draw in range(RANDOM_DRAWS if policy == "random" else 1):
             seed = trial.seed + 1000 * (draw + 1)
-            scores = gain if policy == ORACLE else score_patches(policy, scan_pass.seen, seed=seed)
+            scores = gain if policy == ORACLE else score_patches(policy, frame.seen, seed=seed)
             for fraction in trial.fractions:
                 yield policy, draw, fraction, frame_patches(scores, fraction, allowed)
 
 
-def _seconds_of_patches(scan_pass: ScenePasses, camera: LineCamera) -> Callable[[str, PatchIndex], Record]:
-    """Price patches by the cost model: coarse pass and runs of lines, or the full scan where that is cheaper.
-
-    All patches are the full scan alone. None of each figure where the field is beyond the mirror's range.
-    """
-    grid = scan_pass.seen.grid
-    try:
-        along, _, full_s = cheapest_full(grid, camera, COST)
-        coarse_s = COST.seconds(coarse_sweeps(grid, camera, along), camera)
-    except PoseError:
-        return lambda policy, patch_index: {"capture_s": None, "full_s": None}
-
-    def priced(policy: str, patch_index: PatchIndex) -> Record:
-        if policy == "all" or not len(patch_index):
-            return {"capture_s": full_s if policy == "all" else coarse_s, "full_s": full_s}
-        fine_s = COST.seconds(runs_showing(grid, camera, COST, along, patch_index), camera)
-        return {"capture_s": coarse_s + min(fine_s, full_s), "full_s": full_s}
-
-    return priced
-
-
 Runs = Sequence[Sequence[Record]]  # of each weights, or of each seed, the records of its frames
-COSTS = ("patches", "samples", "bytes", "multiply_adds", "capture_s", "full_s")
+COSTS = ("patches", "multiply_adds")
 
 
 @dataclass(frozen=True)
@@ -251,10 +215,8 @@ def _cost(row: Row, whole: Row) -> Record:
     """Give what a frame takes in the mean, of each cost, and its fraction of that of every patch."""
     found = {}
     for name in COSTS:
-        known = ([one[name] for one in some.parts if one.get(name) is not None] for some in (row, whole))
-        done, full = (float(np.mean(values)) if values else None for values in known)
-        if done is not None:
-            found[name] = {"done": done, "ratio": done / full if full else None}
+        done, full = (float(np.mean([one[name] for one in some.parts])) for some in (row, whole))
+        found[name] = {"done": done, "ratio": done / full if full else None}
     return found
 
 

@@ -11,26 +11,15 @@ from rich.table import Table
 
 from flows.evaluate.judge import ENDS
 from flows.publish.panels import GRID, INK, PAPER
-from flows.terminal.figures import (
-    DASH,
-    counted,
-    format_bytes,
-    format_count,
-    format_percent,
-    format_points,
-    format_seconds,
-)
+from flows.terminal.figures import counted, format_count, format_percent, format_points
 from flows.terminal.progress import table
 
 SHOWN_FRACTION = 0.10  # of the patches, or the nearest one tried: what is shown where one share has to do
 CAPTION = (
     "K: fraction of the valid patches, each free of the others. mIoU over the counts of all frames, mean over the "
-    "classes "
-    "of the labels; overall: fraction of pixels that are right; ± the spread of seeds, else of random draws. [ ] 95 "
-    "% of "
-    "{draws} draws: paired bootstrap over frames, and over seeds where there are several. * uses labels. captured: the "
-    "chosen patches' fraction of the gain of the oracle's. Data before compression; multiply-adds in closed form; "
-    "seconds by the cost model, coarse pass included, by runs of lines or the full scan where that is cheaper."
+    "classes of the labels; overall: fraction of pixels that are right; ± the spread of seeds, else of random draws. "
+    "[ ] 95 % of {draws} draws: paired bootstrap over frames, and over seeds where there are several. * uses labels. "
+    "captured: the chosen patches' fraction of the gain of the oracle's. MACs: multiply-adds a frame, in closed form."
 )
 
 
@@ -47,13 +36,13 @@ def print_evaluation(content: dict[str, Any], console: Console) -> None:
     for line in lines:
         console.print(escape(line), soft_wrap=True)
     console.print(_accuracy(content))
-    console.print(_costs(content))
     console.print(_classes(content))
     console.print(escape(CAPTION.format(draws=content["settings"]["draws"])), soft_wrap=True, style="dim")
 
 
 def _accuracy(content: dict[str, Any]) -> Table:
-    columns = ("placement", "K", "mIoU", "overall", "average", "kappa", "to all", "to random", "gap", "captured")
+    shared = ("placement", "K", "mIoU", "overall", "average", "kappa")
+    columns = (*shared, "to all", "to random", "captured", "MACs")
     rows = []
     for row in content["rows"]:
         cells = (
@@ -65,41 +54,16 @@ def _accuracy(content: dict[str, Any]) -> Table:
             f"{row['kappa']:.2f}",
             format_difference(row["against_all"]),
             format_difference(row["against_random"]),
-            format_percent(row["gap_closed"]),
             format_percent(row["captured_gain"]),
+            format_count(row["cost"]["multiply_adds"]["done"]),
         )
         rows.append([f"[dim]{cell}" if row["uses_labels"] else cell for cell in cells])
-    return table(columns, rows, whole=columns)
-
-
-def _costs(content: dict[str, Any]) -> Table:
-    columns = ("placement", "K", "data", "of all", "multiply-adds", "of all", "seconds", "of full scan")
-    rows = [
-        [
-            row["policy"],
-            format_percent(row["fraction"]),
-            format_bytes(row["cost"]["bytes"]["done"]),
-            format_percent(row["cost"]["bytes"]["ratio"]),
-            format_count(row["cost"]["multiply_adds"]["done"]),
-            format_percent(row["cost"]["multiply_adds"]["ratio"]),
-            *_seconds(row["cost"]),
-        ]
-        for row in content["rows"]
-    ]
     return table(columns, rows, whole=columns)
 
 
 def _miou(row: dict[str, Any]) -> str:
     spread = row["spread"] if row["spread"] is not None else row["draws_spread"]
     return format_points(row["miou"]) + ("" if spread is None else f" ±{100 * spread:.1f}")
-
-
-def _seconds(cost: dict[str, Any]) -> tuple[str, str]:
-    """Seconds of capture and their fraction of the full scan's; unknown beyond the mirror's range."""
-    if "capture_s" not in cost:
-        return DASH, DASH
-    done, full = cost["capture_s"]["done"], cost["full_s"]["done"]
-    return format_seconds(done), format_percent(done / full)
 
 
 def _classes(content: dict[str, Any]) -> Table:
@@ -128,21 +92,18 @@ def format_difference(interval: dict[str, float | None] | None) -> str:
 
 
 def evaluation_figure(content: dict[str, Any]) -> Figure:
-    """Draw mIoU over the bytes of the captures and over their seconds, where these are known: a line a policy."""
-    panels = [("bytes", "MB a frame, before compression", 1e6)]
-    if "capture_s" in content["rows"][0]["cost"]:
-        panels.append(("capture_s", "capture seconds a frame, coarse pass included", 1.0))
-    figure = Figure(figsize=(7.0 * len(panels), 5.0), dpi=110, layout="constrained", facecolor=PAPER)
+    """Draw mIoU over the multiply-adds a frame: a line a policy."""
+    figure = Figure(figsize=(8.0, 5.0), dpi=110, layout="constrained", facecolor=PAPER)
+    axes = figure.subplots()
     ends = {row["policy"]: 100 * row["miou"] for row in content["rows"] if row["policy"] in ENDS}
-    for axes, (cost, label, unit) in zip(figure.subplots(1, len(panels), squeeze=False).flat, panels, strict=True):
-        for name, style in (("none", ":"), ("all", "-")):
-            axes.axhline(ends[name], color=INK, linewidth=1.0, linestyle=style, label=name)
-        for policy in dict.fromkeys(row["policy"] for row in content["rows"] if row["policy"] not in ENDS):
-            own = [row for row in content["rows"] if row["policy"] == policy]
-            points = sorted((row["cost"][cost]["done"] / unit, 100 * row["miou"]) for row in own)
-            axes.plot(*zip(*points, strict=True), marker="o", markersize=5, label=policy)
-        axes.set(xlabel=label, ylabel="mIoU [%]", facecolor=PAPER)
-        axes.grid(color=GRID)
-        axes.legend(frameon=False)
+    for name, style in (("none", ":"), ("all", "-")):
+        axes.axhline(ends[name], color=INK, linewidth=1.0, linestyle=style, label=name)
+    for policy in dict.fromkeys(row["policy"] for row in content["rows"] if row["policy"] not in ENDS):
+        own = [row for row in content["rows"] if row["policy"] == policy]
+        points = sorted((row["cost"]["multiply_adds"]["done"] / 1e9, 100 * row["miou"]) for row in own)
+        axes.plot(*zip(*points, strict=True), marker="o", markersize=5, label=policy)
+    axes.set(xlabel="multiply-adds a frame [10$^9$]", ylabel="mIoU [%]", facecolor=PAPER)
+    axes.grid(color=GRID)
+    axes.legend(frameon=False)
     figure.suptitle(f"{content['dataset']}: {counted(len(content['frames']), 'frame')}", x=0.01, ha="left", color=INK)
     return figure

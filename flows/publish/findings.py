@@ -191,10 +191,10 @@ def find_map(run: SurveyRun, ref: StageRef, drawn: ClassMap) -> dict[str, Any]:
         found["unknown"] = {"pixels": count, "fraction": fraction, "rate": rate}
     if run.zones.left_out is not None:
         unclassed &= ~run.zones.left_out
-    unread = read_table(path)["coarse_px"] if (path := ref.path / OUT_OF_RANGE).is_file() else 0
+    unread = read_table(path)["px"] if (path := ref.path / OUT_OF_RANGE).is_file() else 0
     pixels = {
         "scene_without_a_value": run.scene.filled_px,
-        "coarse_px_no_reading": unread,
+        "px_no_reading": unread,
         "map_without_a_class": int(np.count_nonzero(unclassed)),
     }
     if any(pixels.values()):
@@ -212,7 +212,13 @@ def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
     settings, step = run.settings, run.settings.scan_step
     memory = prior_map_figures(ref.path)
     remembers = memory is not None and memory["put_aside"] is None
-    if run.map_scores is None or step is None or settings.extent != EXTENT_WHOLE or run.budget is not None or remembers:
+    if (
+        run.map_scores is None
+        or step is None
+        or settings.extent != EXTENT_WHOLE
+        or run.settings.macs is not None
+        or remembers
+    ):
         return None
     names = run.described.class_names
     store = ProbabilityStore(ref.path / "class_probabilities.zarr")

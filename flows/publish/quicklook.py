@@ -65,6 +65,7 @@ class QuicklookData:
     confidence: NDArray[np.floating] | None = None  # (y, x) 0..1, shown where there is no truth
     along: Axis = "x"  # of the scene along which the raw lines lie
     note: str = ""  # at the end of the title line, such as the accuracy
+    changed: bool = False  # ``score`` is the fraction of a patch's pixels that the full network changed, NaN elsewhere
     scan: bool = False  # a uniform scan, which looked nowhere twice
     raster: bool = False  # no lines were taken: ``raw`` is the image of its coarse means
 
@@ -193,6 +194,11 @@ def _draw_attention(axes: Axes, data: QuicklookData) -> None:
     for colour, thickness in (("black", 2.0), (_PATCH_COLOUR, 1.0)):
         axes.add_collection(LineCollection(segments, colors=colour, linewidths=thickness, capstyle="projecting"))
     _frame(axes, (height, width))
+    if data.changed:
+        _heat_key(heat, (f"{low:.0%}", f"{high:.0%}"))
+        mean = float(np.nanmean(data.score)) if len(data.patch_index) else 0.0
+        words = f"{len(data.patch_index)} patches by {data.policy} (cyan); {mean:.0%} of their pixels changed class"
+        return _caption(axes, "2  Read in full, and what changed", words)
     _heat_key(heat, ("low", "high"))
     words = f"{len(data.patch_index)} patches chosen by {data.policy} (cyan)"
     if data.scan:

@@ -21,7 +21,7 @@ from storage.archive.whole_files import to_json
 Receipt = dict[str, Any]
 AccuracyIs = Literal["judged", "pending", "left out", "without labels"]  # pending: it is worked out after the map
 Facts = dict[str, Any]
-COSTS = ("lines", "samples", "capture_s", "tokens", "multiply_adds")
+COSTS = ("lines", "samples", "capture_s", "patches", "multiply_adds")
 
 
 class _Part(BaseModel):
@@ -38,12 +38,11 @@ class Saving(_Part):
 
 
 class MultiplyAddsSaving(Saving):
-    """Multiply-adds, also by what they were for: coarse prediction, scores, fine patches, map."""
+    """Multiply-adds, also by what they were for: overview, scores, the full network."""
 
-    coarse_prediction: float
+    overview: float
     score: float
-    encode: float
-    decode: float
+    detail: float
 
 
 class CaptureSaving(Saving):
@@ -61,7 +60,7 @@ class Savings(_Part):
     lines: Saving | None = None
     samples: Saving | None = None
     capture_s: CaptureSaving | None = None
-    tokens: Saving
+    patches: Saving
     multiply_adds: MultiplyAddsSaving
 
 

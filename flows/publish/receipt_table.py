@@ -32,7 +32,7 @@ COST_LABELS = {
     "capture_s": ("time at the camera", format_seconds),
     "lines": ("lines", format_count),
     "samples": ("samples on the field", format_count),
-    "tokens": ("model's tokens", format_count),
+    "patches": ("patches read in full", format_count),
     "multiply_adds": ("model's multiply-adds", format_count),
 }
 BYTE_LABELS = {
@@ -126,9 +126,7 @@ def headline(receipt: Receipt, captured_again: float | None = None) -> str:
         words.append("The map is not judged yet: its accuracy is added once it is.")
     if (accuracy := receipt.get("accuracy")) is not None:
         alone = scan and "kept" not in receipt  # everything is read
-        others = (
-            {} if alone else {"the coarse pass alone gives": accuracy["none"], "detail everywhere": accuracy["all"]}
-        )
+        others = {} if alone else {"the overview alone gives": accuracy["none"], "a full reading": accuracy["all"]}
         beside = [f"{name} {format_points(one['miou'])}" for name, one in others.items() if one["miou"] is not None]
         right = format_points(accuracy.get("overall_accuracy"))
         seen = f" on {TRAINING_SCENE[receipt['training_scene']]}" if "training_scene" in receipt else ""

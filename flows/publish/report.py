@@ -150,9 +150,7 @@ def render_report(
     shown = [Picture(quicklook, "The survey at a glance."), *pictures]
     scene = split_variable(receipt["settings"]["scene"])[0].name
     split: Mapping[str, Any] = receipt["savings"]["multiply_adds"]
-    parts = [
-        name for name in ("coarse_prediction", "score", "encode", "decode") if split["done"] and split[name] is not None
-    ]
+    parts = [name for name in ("overview", "score", "detail") if split["done"] and split[name] is not None]
     total, accuracy = receipt.get("effects_total"), receipt.get("accuracy")
     return render_page(
         "report.html",

@@ -32,7 +32,7 @@ from flows.tasks.run import SurveyRun, now
 from flows.tasks.scan_choice import as_figures
 from flows.tasks.scene import seen_in_training
 from flows.tasks.stages.accuracy import load_accuracy
-from flows.tasks.stages.attention import load_plan
+from flows.tasks.stages.attention import READING, load_plan
 from flows.tasks.stages.effects import load_manifest
 from flows.tasks.stages.on_ground import STORE
 from flows.tasks.stages.placement import load_registration, pixels_of_patches, seen_fractions
@@ -68,7 +68,7 @@ class Published:
 
 def publish_run(survey: OpenSurvey) -> Published:
     """Write receipt.json, quicklook.png and report.html into a run folder and publish it as a whole."""
-    plan = load_plan(survey.products["score"])
+    plan = load_plan(survey.products["score"], survey.products["segment"])
     with survey.run.archive.new_run(survey.run.name) as draft:
         receipt = make_receipt(survey, plan, f"runs/{draft.id}")
         return _publish(survey, draft, plan, receipt)
@@ -91,7 +91,7 @@ def extend_with_accuracy(survey: OpenSurvey, draft: RunDraft, accuracy: StageRef
         settings={name: asked[name] for name in names},
         judged=now(),
     )
-    return _publish(survey, draft, load_plan(survey.products["score"]), receipt)
+    return _publish(survey, draft, load_plan(survey.products["score"], survey.products["segment"]), receipt)
 
 
 def load_receipt(folder: Path) -> Receipt:
@@ -141,6 +141,8 @@ def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
     stores: dict[str, str] = {}
     for name, ref in products.items():
         stores |= STAGES[name].addresses(ref)
+    if (products["segment"].path / READING).exists():  # patches were chosen while the map was drawn
+        stores["attention"] = f"{products['segment'].uri}/{READING}"
     files = ("receipt.json", "quicklook.png", "report.html", *([PLOTS_FILE] if run.zones.plots is not None else []))
     unjudged: AccuracyIs = "pending" if run.settings.accuracy else "left out"
     accuracy_is = "judged" if accuracy is not None else unjudged if run.scene.labelled else "without labels"
@@ -200,12 +202,10 @@ def _savings(run: SurveyRun, plan: FinePlan) -> dict[str, Any]:
 
 
 def _model_savings(run: SurveyRun, plan: FinePlan) -> dict[str, Any]:
-    """Tokens and multiply-adds of the map beside those of reading every patch."""
+    """Patches that are read in full, and multiply-adds, beside those of reading every patch."""
     did, scan = run.work_done(plan.patch_index), run.costs.of_map(run.grid.valid_patches())
-    config, valid = run.weights.config, len(run.grid.valid_patches())
-    cells, each = int(np.prod(run.grid.padded_shape)) // (config.patch * config.factor) ** 2, config.token_side**2
     return {
-        "tokens": SavingEntry(each * (cells + len(plan.patch_index)), each * (cells + valid), "predicted").as_dict(),
+        "patches": SavingEntry(len(plan.patch_index), len(run.grid.valid_patches()), "predicted").as_dict(),
         "multiply_adds": {**SavingEntry(did.total, scan.total, "predicted").as_dict(), **asdict(did)},
     }
 
@@ -216,7 +216,9 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
     chosen = list(bands)
     mosaic = open_mosaic(products.mosaic.path / "mosaic.zarr")
     coarse = np.concatenate([mosaic.spectra(strip, chosen) for strip in mosaic.row_blocks(run.factor)])
-    attention = load_attention(products["score"].path / "attention.zarr")
+    decided = products["segment"].path / READING
+    attention = load_attention(decided if decided.exists() else products["score"].path / READING)
+    changed = attention.changed
     found = load_class_map(products["segment"].path / "class_map.zarr")
     order = np.argsort(attention.rank.ravel(), kind="stable")
     accuracy = receipt.get("accuracy")
@@ -233,14 +235,15 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
         survey=run.name,
         seed=run.settings.seed,
         about=_format_asked(run),
-        policy=None if run.plan.plain and run.budget is None else run.settings.policy,
+        policy=run.settings.policy if run.chooses else None,
         scan=run.plan.plain,
         raster=run.raster is not None,
         raw=(coarse,) if run.raster is not None else tuple(_calibrated(run, cube, chosen) for cube in strips),
         raw_lines=sum(cube.sweep.lines for cube in strips),
         rectified=_both_scales(run, products, plan, chosen, coarse),
         wavelength_nm=run.scene.wavelength_nm[chosen],
-        score=attention.score,
+        score=attention.score if changed is None else np.where(attention.rank >= 0, changed, np.nan),
+        changed=changed is not None,
         patch_px=run.grid.patch,
         patch_index=order[attention.rank.ravel()[order] >= 0],
         blocks=tuple(block_of(sweep, run) for sweep in plan.sweeps),
@@ -292,7 +295,7 @@ def _both_scales(
 
 def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     """``plan``, and what not every survey has: see `flows.publish.receipt.FINDINGS`."""
-    plan = load_plan(products["score"])
+    plan = load_plan(products["score"], products["segment"])
     figures: dict[str, Any] = {
         "kind": plan.kind,
         "reason": plan.reason,
@@ -306,8 +309,8 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     found: dict[str, Any] = {"field": field_figures(run, plan), "plan": figures}
     if run.recorded is not None:
         found["recording"] = _recording(run, run.recorded, plan)
-    if run.budget is not None:
-        found["kept"] = run.budget.figures(plan.patch_index)
+    if run.plan.plain and run.chooses:
+        found["kept"] = run.reading_figures(plan.patch_index)
     if (memory := prior_map_figures(products["segment"].path)) is not None:
         found["memory"] = memory
     if run.settings.extent != EXTENT_WHOLE:

@@ -214,8 +214,7 @@ def load_settings(
         inner = table.get(name)
         if isinstance(inner, Mapping):
             table[name] = {**recorded.pop(name, {}), **inner}
-    cheap = {"policy": CHEAP_POLICY} if "macs" in given and not {"least_gain", "policy"} & given else {}
-    asked = {**cheap, **(usual or {}), **recorded, **table}
+    asked = {**(usual or {}), **recorded, **table}
     for wrong in (*_camera_of_a_map(asked, origin), *_contradictions(given, origin)):
         raise SettingsError(wrong)
     passes = any(name in given and not _is_usual(table[name], SURVEY[name], origin.get(name)) for name in OF_TWO_PASSES)
@@ -357,7 +356,6 @@ def _contradictions(given: set[str], origin: Mapping[str, str]) -> Iterator[str]
         yield f"{by_hand[0]} is for a uniform scan: give --scan-step too (1 for every line), or --coarse-exposure-ms"
 
 
-CHEAP_POLICY = "sobel"  # of the coarse image alone: gain would have the network read it twice
 IN_NAT = ("gain", "entropy")  # policies whose scores are gains, or the most that these can be
 
 

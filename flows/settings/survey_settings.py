@@ -278,6 +278,14 @@ class Settings:
         example=0.02,
         why=ALL_OF_IT,
     )
+    expected_loss: float = stated(
+        0.3,
+        "Points of mIoU that reading a part of the patches in full may lose, by the weights' record; 0 reads all of "
+        "them, as weights without that record do",
+        "points",
+        0,
+        100,
+    )
     coarse_exposure_ms: float | None = stated(
         None, "Exposure of a coarse line; by default the camera's", "ms", 0.5, 10_000, example=25.0
     )

@@ -15,10 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.tasks.field_prior_map import FieldPriorMap
-from flows.tasks.field_work import FieldWork, WeightsFile, coarse_region, patch_features
-from models.reading.inference import CoarsePass, segment
+from flows.tasks.field_work import FieldWork, WeightsFile, coarse_region, patch_features, seen_patches
+from models.network.spectral import Capture
+from models.policies.policies import score_patches
+from models.reading.inference import CoarsePass, read_coarse_prediction, segment
 from models.reading.ood import OodDetector
-from models.reading.prior_map import CurrentVisit, TemporalAgreement, changed_from, compare, first_probabilities, fuse
+from models.reading.prior_map import (
+    CurrentVisit,
+    TemporalAgreement,
+    changed_from,
+    compare,
+    first_probabilities,
+    fuse,
+    pooled,
+)
 from models.reading.regions import Region
 from pipeline.geometry.grid import UNLABELLED, patch_pixels
 from pipeline.rectify.tiles import let_tiles_go
@@ -39,26 +49,35 @@ class Drawing:
     attention: Path  # whose ranks say which patches are read in detail
     out: Path  # of the class map
     probabilities: Path
-    light: float  # exposure of a line that is read in detail, as a fraction of the reference
-    step: int  # pixels from such a line to the next
+    captures: tuple[Capture, Capture]  # of the overview's pixels, and of those read in full
     memory: FieldPriorMap | None = None  # what is remembered of the field
     left_out: Path | None = None  # (y, x) pixels of which zones have no map drawn
     unknown: UnknownRule | None = None  # which pixels are called unknown
     part: bool = False  # of the field was looked at: of the rest today's look says nothing
+    least_gain: float | None = None  # from which on patches are read in full; None: those that ``attention`` ranks
+    policy: str = "gain"  # by which that is judged
 
     def __call__(self, region: Region) -> Drawn:
         """Read what was seen of the region coarsely and finely, and store the part of the map that is kept."""
         let_tiles_go()
         weights, detail = self.weights.load(), open_mosaic(self.detail)
-        seen, chosen = coarse_region(weights, self.mosaic, region), chosen_patches(self.attention)
-        patch_index, columns = patch_features(weights, detail, chosen, seen, region)
-        drawn = segment(weights, seen, columns, patch_index, every_class=True)
+        overview, full = self.captures
+        seen, chosen = coarse_region(weights, self.mosaic, region, overview), chosen_patches(self.attention)
+        if self.least_gain is not None:
+            seen = predicted = read_coarse_prediction(weights, seen)
+            gain, here = score_patches(self.policy, seen), region.numbers_here(chosen)
+            chosen = chosen[(here >= 0) & (gain[here] >= self.least_gain)]
+        if self.mosaic == self.detail:
+            patch_index, columns = seen_patches(chosen, seen, region)
+        else:
+            patch_index, columns = patch_features(weights, detail, chosen, seen, region)
+        drawn = segment(weights, seen, columns, patch_index, capture=full, every_class=True)
         shown = self._shown(region, detail, patch_index)
         assert drawn.log_probability is not None
         unknown = None
         if self.unknown is not None:
             ood_detector, bands = self.weights.load_ood(), len(detail.wavelength_nm)
-            unknown = self.unknown.pixels(ood_detector, seen, columns, patch_index, bands) & (
+            unknown = self.unknown.pixels(ood_detector, seen, columns, patch_index, bands, full) & (
                 drawn.classes != UNLABELLED
             )
             unknown &= shown | (not self.part)
@@ -86,8 +105,16 @@ class Drawing:
         write_probabilities_tile(
             self.probabilities, origin, *map(region.crop, (after.log_probability, after.age_days, after.light))
         )
-        unread = 0 if seen.out_of_range is None else int(np.count_nonzero(region.crop_coarse(seen.out_of_range)))
-        return Drawn(unread, comparison)
+        unread = 0 if seen.out_of_range is None else int(np.count_nonzero(region.crop(seen.out_of_range)))
+        if self.least_gain is None:
+            return Drawn(unread, comparison)
+        read, changed = np.zeros(gain.shape, np.bool_), np.zeros(gain.shape, np.float32)
+        read[patch_index] = True
+        kept = region.crop_patches
+        before = predicted.probability.argmax(axis=-1)[: region.grid.height, : region.grid.width]
+        other = (drawn.classes != before) & (drawn.classes != UNLABELLED)
+        changed[patch_index] = patch_pixels(region.grid, other)[patch_index].mean(axis=(1, 2))
+        return Drawn(unread, comparison, FullReading(kept(gain), kept(read), kept(changed)))
 
     def _observation(
         self, region: Region, log_probability: NDArray[np.float32], shown: NDArray[np.bool_], seen: CoarsePass
@@ -98,7 +125,8 @@ class Drawing:
             log_probability = np.where(away[..., None], np.float32(np.nan), log_probability)
         if self.part:
             log_probability = np.where(shown[..., None], log_probability, np.float32(np.nan))
-        return CurrentVisit(log_probability, shown, seen.seen_columns, self.light, self.step)
+        light, step, _ = self.captures[1]
+        return CurrentVisit(log_probability, shown, pooled(seen.seen_columns), light, int(step))
 
     def _shown(self, region: Region, detail: Mosaic, patch_index: NDArray[np.int64]) -> NDArray[np.bool_]:
         """(y, x) pixels of a region that were looked at in detail.
@@ -107,7 +135,7 @@ class Drawing:
         the part is no look, and would stand where something better is remembered.
         """
         grid, p = region.grid, region.grid.patch
-        detailed = np.zeros((int(np.prod(grid.patch_shape)), p, p), np.bool_)
+        detailed = np.full((int(np.prod(grid.patch_shape)), p, p), self.mosaic == self.detail)
         detailed[patch_index] = True
         if self.part:
             reached = patch_pixels(grid, detail.coverage(region.read.rows, region.read.columns) > 0)
@@ -119,13 +147,10 @@ class Drawing:
 
 @dataclass(frozen=True)
 class UnknownRule:
-    """Rule for pixels that are called unknown: at which rate, in which light, and by which number."""
+    """Rule for pixels that are called unknown: at which rate, and by which number."""
 
     number: int  # of the class, after those of the weights
     rate: float  # of known pixels that may be
-    light: float  # of a line that is read in detail, as a fraction of the reference
-    coarse_light: float  # of a coarse line
-    step: int
 
     def pixels(
         self,
@@ -134,27 +159,38 @@ class UnknownRule:
         patches: NDArray[np.float32],
         patch_index: NDArray[np.int64],
         bands: int,
+        full: Capture,
     ) -> NDArray[np.bool_]:
-        """Unknown pixels of a region's scene, (y, x): by its patches, and by the coarse pass beside them."""
+        """Unknown pixels of a region's scene, (y, x): by its patches, captured as ``full``, and by the rest."""
         grid, p = seen.grid, seen.grid.patch
         found = np.zeros(grid.padded_shape, np.bool_)
-        if len(patch_index) < len(grid.valid_patches()):
-            coarse = ood_detector.unknown(
-                seen.columns, rate=self.rate, light=self.coarse_light, step=None, bands=bands, factor=grid.factor
-            )
-            found[...] = np.repeat(np.repeat(coarse, grid.factor, axis=0), grid.factor, axis=1)
-        fine = ood_detector.unknown(patches, rate=self.rate, light=self.light, step=self.step, bands=bands)
+        alike = seen.capture == full  # a uniform scan: patches have the columns of the overview
+        if alike or len(patch_index) < len(grid.valid_patches()):
+            found[...] = ood_detector.unknown(seen.columns, rate=self.rate, capture=seen.capture, bands=bands)
+        if alike:
+            return found[: grid.height, : grid.width]
+        fine = ood_detector.unknown(patches, rate=self.rate, capture=full, bands=bands)
         for patch, (y, x) in zip(fine, grid.patch_origin(patch_index), strict=True):
             found[y : y + p, x : x + p] = patch
         return found[: grid.height, : grid.width]
 
 
 @dataclass(frozen=True)
+class FullReading:
+    """What the full network was asked and did, (patch_y, patch_x) each."""
+
+    gain: NDArray[np.float64]  # that the policy expected
+    read: NDArray[np.bool_]  # patches that it read
+    changed: NDArray[np.float32]  # fraction of their pixels whose class it changed
+
+
+@dataclass(frozen=True)
 class Drawn:
     """Findings while a region, or a field, was drawn."""
 
-    unread_px: int  # coarse pixels that were seen, with values that the weights take for no reading
+    unread_px: int  # pixels that were seen, with values that the weights take for no reading
     comparison: TemporalAgreement | None  # with what was remembered; None of a field's first visit
+    reading: FullReading | None = None  # where patches were chosen on the way
 
 
 def draw_field(field: FieldWork, work: Drawing, report: Callable[[float], None]) -> Drawn:
@@ -167,4 +203,12 @@ def draw_field(field: FieldWork, work: Drawing, report: Callable[[float], None])
     paths = (work.mosaic, work.detail, work.attention, work.out, work.probabilities, *prior_map)
     parts: list[Drawn] = run_blocks(work, field.regions, pool, report=report, paths=paths)
     compared = [part.comparison for part in parts if part.comparison is not None]
-    return Drawn(sum(part.unread_px for part in parts), reduce(add, compared) if compared else None)
+    reading = None
+    if work.least_gain is not None:
+        shape = field.regions[0].field.patch_shape
+        reading = FullReading(np.zeros(shape), np.zeros(shape, np.bool_), np.zeros(shape, np.float32))
+        for region, part in zip(field.regions, parts, strict=True):
+            assert part.reading is not None
+            for name, whole in vars(reading).items():
+                whole[region.kept_patches.rows, region.kept_patches.columns] = getattr(part.reading, name)
+    return Drawn(sum(part.unread_px for part in parts), reduce(add, compared) if compared else None, reading)

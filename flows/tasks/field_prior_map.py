@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from flows.tasks.field_work import coarse_region
 from flows.tasks.prior_maps import EarlierRun
-from models.reading.prior_map import ClassProbabilities, PriorMap, in_classes
+from models.network.sizes import CELL_PX
+from models.reading.prior_map import ClassProbabilities, PriorMap, in_classes, pooled
 from models.reading.regions import Region
 from models.weights.files import Weights
 from pipeline.rectify.registration.alignment import FieldShift, field_shift
@@ -47,8 +48,8 @@ class FieldPriorMap:
             values = in_classes(values, self.classes)
         lies = None
         if self.mosaic is not None:
-            coarse = coarse_region(weights, self.mosaic, region).seen_columns
-            lies = shifted(coarse, _cells(self.shift_px, region.grid.factor))
+            coarse = pooled(coarse_region(weights, self.mosaic, region).seen_columns)
+            lies = shifted(coarse, _cells(self.shift_px, CELL_PX))
         return PriorMap(ClassProbabilities(values, age, np.nan_to_num(light)), lies, self.days)
 
 
@@ -73,13 +74,12 @@ def shifted(image: NDArray[np.float32], by: tuple[int, int]) -> NDArray[np.float
     return _framed(image[parts[0][0], parts[1][0]], (parts[0][1], parts[1][1]))
 
 
-def prior_map_lies(before: Sequence[EarlierRun], now: Path, factor: int) -> FieldShift:
+def prior_map_lies(before: Sequence[EarlierRun], now: Path) -> FieldShift:
     """Return how the field of stored coarse passes, the newest first, lies beside that of another, in fine px.
 
-    ``factor``: Fine px to a pixel of the other. Looks by other weights may have other pixels: all are compared in
-    pixels that each of theirs divides.
+    All are compared in pixels that each of theirs divides.
     """
-    cell = math.lcm(factor, *(scan_pass.factor for scan_pass in before))
+    cell = math.lcm(CELL_PX, open_mosaic(now).factor, *(scan_pass.factor for scan_pass in before))
 
     def picture(mosaic: Path) -> NDArray[np.float32]:
         return open_mosaic(mosaic).brightness(cell)

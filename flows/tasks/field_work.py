@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from flows.tasks.patch_budget import SHARD
 from models.network.machine import PROCESSOR
-from models.network.spectral import dead_pixels
+from models.network.spectral import Capture, dead_pixels, patches_of
 from models.policies.policies import GLANCING_POLICIES, score_patches
 from models.reading.inference import CoarsePass, CoarsePrediction, read_coarse_pass, read_coarse_prediction
 from models.reading.ood import OodDetector
-from models.reading.regions import HALO_CELLS, REGION_PX, Region, most_bytes, plan_regions
+from models.reading.regions import HALO_PX, REGION_PX, Region, most_bytes, plan_regions
 from models.weights.checksummed_files import SEAL
 from models.weights.files import Weights, describe_weights, load_ood, load_reader, load_weights
 from pipeline.errors import WeightsError
@@ -74,12 +74,13 @@ class Scoring:
     weights: WeightsFile
     mosaic: Path
     policy: str
+    capture: Capture
 
     def __call__(self, region: Region) -> NDArray[np.float64]:
         """Scores of the patches that are kept, (patch_y, patch_x)."""
         let_tiles_go()
         weights = self.weights.load()
-        scan_pass = coarse_region(weights, self.mosaic, region)
+        scan_pass = coarse_region(weights, self.mosaic, region, self.capture)
         if self.policy in GLANCING_POLICIES:
             seen = read_coarse_prediction(weights, scan_pass)
         else:  # nothing but the coarse image is asked for
@@ -89,12 +90,19 @@ class Scoring:
         return region.crop_patches(score_patches(self.policy, seen))
 
 
-def coarse_region(weights: Weights, mosaic: Path, region: Region) -> CoarsePass:
-    """Read the part of a stored mosaic that a region needs in coarse pixels, some rows at a time."""
+def coarse_region(weights: Weights, mosaic: Path, region: Region, capture: Capture = Capture()) -> CoarsePass:  # noqa: B008
+    """Read the part of a stored mosaic that a region needs, some rows at a time; coarse pixels are repeated."""
     seen = open_mosaic(mosaic)
-    strips = seen.row_blocks(region.grid.factor, region.coarse.rows, region.coarse.columns)
+    part = region.read.over(seen.factor)
     return read_coarse_pass(
-        weights, strips, seen.wavelength_nm, region.grid, origin=region.origin, components=seen.components
+        weights,
+        seen.row_blocks(None, part.rows, part.columns),
+        seen.wavelength_nm,
+        region.grid,
+        capture=capture,
+        factor=seen.factor,
+        origin=region.origin,
+        components=seen.components,
     )
 
 
@@ -104,7 +112,7 @@ def patch_features(
     """Numbers and normalised spectral columns (patch, p, p, column) of a region's patches, some read at a time.
 
     ``field_index`` are those of the field that were chosen, ``detail`` the mosaic of its own pixels. A mirror that
-    looks beside the plan leaves pixels of a patch unseen: they take the columns of the coarse pixel over them. A patch
+    looks beside the plan leaves pixels of a patch unseen: they take the columns that the overview reads there. A patch
     of which nothing was seen is left out.
     """
     numbers = region.numbers_here(field_index)
@@ -121,14 +129,27 @@ def patch_features(
         for patch, patch_number, there in zip(columns[part], patch_index[part], reached[some], strict=True):
             if not there.all():  # where no line reached a pixel of a patch
                 y, x = seen.grid.patch_origin(patch_number)[..., None] + np.arange(p)
-                coarse = seen.columns[np.ix_(y // seen.grid.factor, x // seen.grid.factor)]
-                patch[~there] = coarse[~there]
+                patch[~there] = seen.columns[np.ix_(y, x)][~there]
     return patch_index[:kept], columns[:kept]
+
+
+def seen_patches(
+    field_index: NDArray[np.integer], seen: CoarsePass, region: Region
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Numbers and columns (patch, p, p, column) of the field's chosen patches that the overview's capture shows.
+
+    A patch of which nothing was seen is left out.
+    """
+    numbers = region.numbers_here(field_index)
+    numbers = numbers[numbers >= 0]
+    if seen.filled is not None:
+        numbers = numbers[~patches_of(seen.filled, region.grid.patch)[numbers].all(axis=(1, 2))]
+    return numbers, seen.patches(numbers)
 
 
 def region_params(grid: SceneGrid) -> dict[str, Any]:
     """Return what the result depends on where a field is cut: nothing where it is read whole."""
-    return {} if len(plan_regions(grid, SHARD)) == 1 else {"regions": {"most_px": REGION_PX, "halo": HALO_CELLS}}
+    return {} if len(plan_regions(grid, SHARD)) == 1 else {"regions": {"most_px": REGION_PX, "halo_px": HALO_PX}}
 
 
 @dataclass(frozen=True)
@@ -140,14 +161,18 @@ class FieldWork:
     pool: WorkerPool
     memory: int  # of this process and those that it starts, together [bytes]
 
-    def score(self, policy: str, mosaic: Path, report: Callable[[float], None]) -> NDArray[np.float64]:
-        """Score every patch of the padded grid by the coarse mosaic alone, (patch_y, patch_x).
+    def score(
+        self, policy: str, mosaic: Path, capture: Capture, report: Callable[[float], None]
+    ) -> NDArray[np.float64]:
+        """Score every patch of the padded grid by the first mosaic alone, (patch_y, patch_x).
 
         Raises SettingsError: not even one region at a time fits the memory.
         """
         pool = self.pool_for(np.empty(0, np.int64), len(open_mosaic(mosaic).components))
         path = mosaic.resolve()
-        parts = run_blocks(Scoring(self.weights, path, policy), self.regions, pool, report=report, paths=[path])
+        parts = run_blocks(
+            Scoring(self.weights, path, policy, capture), self.regions, pool, report=report, paths=[path]
+        )
         scores = np.zeros(self.regions[0].field.patch_shape)
         for region, part in zip(self.regions, parts, strict=True):
             scores[region.kept_patches.rows, region.kept_patches.columns] = part

@@ -6,7 +6,6 @@ import math
 from bisect import bisect_right
 from dataclasses import astuple, dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +29,7 @@ class ReadingCosts:
     config: SegmenterConfig
     grid: SceneGrid
     bands: int
+    apart: bool = False  # patches are captured in a pass of their own
 
     @cached_property
     def _regions(self) -> list[Region]:
@@ -39,7 +39,7 @@ class ReadingCosts:
         """Count the map drawn with fine patches at these patches of the field."""
         counts = [int(np.count_nonzero(region.numbers_here(patch_index) >= 0)) for region in self._regions]
         parts = [
-            astuple(multiply_adds(self.config, region.grid, count, self.bands))
+            astuple(multiply_adds(self.config, region.grid, count, self.bands, apart=self.apart))
             for region, count in zip(self._regions, counts, strict=True)
         ]
         return MultiplyAdds(*(sum(part) for part in zip(*parts, strict=True)))
@@ -47,13 +47,16 @@ class ReadingCosts:
     def with_scores(self, patch_index: NDArray[np.integer], policy: str) -> MultiplyAdds:
         """Count the same and what the policy takes to score all patches.
 
-        Stages keep nothing of the model for each other, so that each reads the coarse pass anew: ``coarse_prediction``
-        holds what map and scores took for it.
+        Stages keep nothing of the model for each other, so that each reads the overview anew: ``overview`` holds what
+        map and scores took for it.
         """
         drawn = self.of_map(patch_index)
         readings = 2 if policy in GLANCING_POLICIES else 1
-        score = sum(score_multiply_adds(policy, self.config, region.grid) for region in self._regions)
-        return replace(drawn, coarse_prediction=readings * drawn.coarse_prediction, score=score)
+        return replace(drawn, overview=readings * drawn.overview, score=self.score(policy))
+
+    def score(self, policy: str) -> int:
+        """Count what the policy takes to score all patches, once the overview is read."""
+        return sum(score_multiply_adds(policy, self.config, region.grid) for region in self._regions)
 
 
 @dataclass(frozen=True)
@@ -80,8 +83,8 @@ class PatchBudget:
     ) -> PatchBudget | None:
         """Say what may be spent; None where all of the scan is read in detail.
 
-        ``shown`` (patch,) are the patches that zones leave; None: all. Raises BudgetError: not even the coarse pass
-        is paid for; names the least that is.
+        ``shown`` (patch,) are the patches that zones leave; None: all. Raises BudgetError: not even the overview is
+        paid for; names the least that is.
         """
         if macs is None and least_gain is None:
             return None
@@ -94,7 +97,7 @@ class PatchBudget:
             if macs is not None and macs.endswith("%"):
                 least = f"{math.ceil(10**DIGITS * 100 * coarse / budget.everything) / 10**DIGITS:g}%"
             raise BudgetError(
-                f"--macs {macs} does not pay for the coarse pass and the scores of its patches, {coarse:.4g} of "
+                f"--macs {macs} does not pay for the overview and the scores of its patches, {coarse:.4g} of "
                 f"{budget.everything:.4g} multiply-adds; the least is --macs {least}"
             )
         return None if not least_gain and budget._most >= budget.everything else budget
@@ -129,15 +132,6 @@ class PatchBudget:
     def most_patches(self) -> NDArray[np.intp]:
         """As many patches as the limits pay for, whatever they promise."""
         return self.choose(np.full(math.prod(self.grid.patch_shape), np.inf))
-
-    def figures(self, patch_index: NDArray[np.integer]) -> dict[str, Any]:
-        """Return the multiply-adds of these patches beside those of reading everything, for a receipt."""
-        return {
-            "asked": {"macs": self.macs, "least_gain": self.least_gain},
-            "patches": len(patch_index),
-            "of_patches": len(self.patch_index),
-            "multiply_adds": {"done": self.operations_of(patch_index), "everything": self.everything},
-        }
 
     @property
     def _most(self) -> float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from functools import cached_property
@@ -39,17 +38,19 @@ from flows.tasks.scene import (
 )
 from flows.tasks.stage import FieldFrame, Report
 from flows.tasks.stages.capture import SweepRecorder
-from flows.tasks.survey_model import SurveyModel, beyond_training, weights_offered, weights_path
+from flows.tasks.survey_model import SurveyModel, beyond_training, weights_path
 from flows.tasks.zones import SurveyZones, open_zones, place_of_field
+from models.evaluation.cascade import CascadeTable
 from models.evaluation.expected_scores import MapScores
 from models.network.machine import PROCESSOR, choose_device
 from models.network.sizes import MultiplyAdds
+from models.network.spectral import Capture
 from models.reading.regions import plan_regions
 from models.weights.checksummed_files import SEAL
-from models.weights.files import Description, Weights
+from models.weights.files import CASCADE, Description, Weights
 from models.weights.parts import OodPart, ReaderPart
 from pipeline.capture.recorded_passes import RecordedPasses
-from pipeline.errors import NoScanPaidFor, SceneError, SettingsError
+from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
@@ -59,6 +60,7 @@ from pipeline.lazy import Once, deferred
 from pipeline.rectify.placed import PixelGrid, place
 from pipeline.rectify.region import plan_tiles
 from pipeline.rectify.tiles import MosaicWork
+from pipeline.signal.subspace import SMOOTH
 from pipeline.simulator.effects.pointing import PointingErrors
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
@@ -77,6 +79,7 @@ else:
     rig_field = deferred("flows.tasks.rig_field")
 
 
+COARSE_FACTOR = 4  # pixels a side that the coarse one of two passes stands for
 USUAL_COMPONENTS = 32  # of condensed lines, before they are known
 
 
@@ -202,9 +205,28 @@ class SurveyRun(CaptureRun):
         return {"weights": self.weights_key, **({} if self.device == PROCESSOR else {"device": self.device})}
 
     @property
+    def least_gain(self) -> float | None:
+        """Expected gain from which on patches of a uniform scan or a raster are read in full; None where all are.
+
+        It follows from the loss that the settings allow where they name neither gain nor multiply-adds.
+        """
+        settings, allowed = self.settings, self.cascade
+        if not self.plan.plain or settings.macs is not None or self.part:
+            return None
+        if settings.least_gain is not None:
+            return settings.least_gain
+        return None if allowed is None or settings.policy != "gain" else allowed[0]
+
+    @property
+    def cascade(self) -> tuple[float, float] | None:
+        """Least gain and fraction of patches that lose what the settings allow; None without a table of losses."""
+        content = self.described.record.get(CASCADE)
+        return None if content is None else CascadeTable.read(content).within(self.settings.expected_loss / 100)
+
+    @property
     def chooses(self) -> bool:
         """Return whether patches are chosen by their scores; where all are seen and read there is nothing to choose."""
-        return not self.plan.plain or self.budget is not None
+        return not self.plan.plain or self.budget is not None or self.least_gain is not None
 
     @property
     def controls(self) -> bool:
@@ -245,21 +267,27 @@ class SurveyRun(CaptureRun):
         return self.settings.extent != EXTENT_WHOLE
 
     @property
-    def light(self) -> tuple[float, int]:
-        """Exposure of a line that is read in detail as a fraction of the reference, and pixels to the next."""
-        exposure_ms = self.settings.scan_exposure_ms if self.plan.plain else None
-        return (exposure_ms or self.camera.exposure_ms) / DEFAULT_EXPOSURE_MS, self.settings.scan_step or 1
+    def captures(self) -> tuple[Capture, Capture]:
+        """How the pixels of the overview were captured, and those that are read in full."""
+        settings, usual = self.settings, self.camera.exposure_ms
+        if self.plan.plain:
+            scan = Capture((settings.scan_exposure_ms or usual) / DEFAULT_EXPOSURE_MS, settings.scan_step or 1)
+            return scan, scan
+        coarse = Capture((settings.coarse_exposure_ms or usual) / DEFAULT_EXPOSURE_MS, self.factor, self.factor)
+        return coarse, Capture(usual / DEFAULT_EXPOSURE_MS)
+
+    @property
+    def capture(self) -> Capture:
+        """How the pixels of the overview were captured."""
+        return self.captures[0]
 
     @property
     def unknown(self) -> UnknownRule | None:
         """Return which pixels are called unknown; None where the weights cannot tell, or the settings ask for none."""
-        settings, rate = self.settings, self.settings.unknown_rate
+        rate = self.settings.unknown_rate
         if self.ood_detector is None or rate is None:
             return None
-        coarse_ms = settings.scan_exposure_ms if self.plan.plain else settings.coarse_exposure_ms
-        coarse_light = (coarse_ms or self.camera.exposure_ms) / DEFAULT_EXPOSURE_MS
-        light, step = self.light
-        return UnknownRule(self.described.config.classes, rate, light, coarse_light, step)
+        return UnknownRule(self.described.config.classes, rate)
 
     @property
     def ground_grid(self) -> GroundGrid:
@@ -274,11 +302,41 @@ class SurveyRun(CaptureRun):
 
     def work_done(self, patch_index: NDArray[np.integer]) -> MultiplyAdds:
         """Count the scores of the field, unless all is read, and the map with fine patches at these patches."""
-        costs = self.costs
-        done = costs.with_scores(patch_index, self.settings.policy) if self.chooses else costs.of_map(patch_index)
+        done = self.costs.of_map(patch_index)
+        if self.least_gain is not None:  # as the map is drawn: the overview is read once
+            done = replace(done, score=self.costs.score(self.settings.policy))
+        elif self.chooses:
+            done = self.costs.with_scores(patch_index, self.settings.policy)
         if self.prior is None or self.reader is None:
             return done
-        return replace(done, decode=done.decode + self.reader.sizes.multiply_adds(self.grid.height * self.grid.width))
+        return replace(done, detail=done.detail + self.reader.sizes.multiply_adds(self.grid.height * self.grid.width))
+
+    def reading_figures(self, patch_index: NDArray[np.integer]) -> dict[str, Any]:
+        """Return what was asked of a full reading, its patches, and its multiply-adds beside those of everything."""
+        settings, everything = self.settings, self.kept_patches
+        asked = {"macs": settings.macs, "least_gain": self.least_gain, "expected_loss": settings.expected_loss}
+        costs = {"done": self.work_done(patch_index).total, "everything": self.costs.of_map(everything).total}
+        figures = {"patches": len(patch_index), "of_patches": len(everything), "multiply_adds": costs}
+        return {"asked": asked, **figures}
+
+    @property
+    def kept_patches(self) -> NDArray[np.intp]:
+        """Numbers of the patches that zones leave."""
+        valid, fractions = self.grid.valid_patches(), self.zones.fractions
+        return valid if fractions is None else valid[fractions[valid] > 0]
+
+    @property
+    def likely_patches(self) -> NDArray[np.intp]:
+        """As many patches as a uniform scan or a raster is likely to have read in full, by what the weights record.
+
+        With a limit of multiply-adds these are the most that it pays for; with a gain that nothing is recorded of, all.
+        """
+        if self.budget is not None:
+            return self.budget.most_patches
+        allowed, every = self.cascade, self.kept_patches
+        if allowed is None or self.least_gain is None or self.settings.least_gain is not None:
+            return every
+        return every[: round(allowed[1] * len(every))]
 
 
 def open_run(settings: Settings, *, planning: bool = False, archive: Archive | None = None) -> SurveyRun:
@@ -293,24 +351,15 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     recorded = open_recorded(settings) if settings.source == RECORDED else None
     settings = settings if recorded is None else recorded.settings
     settings = replace(settings, device=choose_device(settings.device))
-    offered = weights_offered(settings)
-    for better in offered[:-1]:
-        with suppress(NoScanPaidFor):
-            return _run_by(better, settings, recorded, planning=planning, archive=archive)
-    return _run_by(offered[-1], settings, recorded, planning=planning, archive=archive)
-
-
-def _run_by(
-    path: Path, settings: Settings, recorded: OpenedRecording | None, *, planning: bool, archive: Archive | None
-) -> SurveyRun:
-    """Open what a survey needs that is read with the weights of a file, as `open_run`."""
+    path = weights_path(settings)
     model = SurveyModel.open(path, settings.device, settings.unknown, planning=planning)
     described = model.described
     refused = farm_refusal(settings)
     if refused is not None and not planning:
         raise SettingsError(refused)
     pixels, scene, notes, label_notes = _scene_for(model, settings, recorded, planning=planning)
-    grid, bands = SceneGrid(*scene.shape, described.config.patch, described.config.factor), len(scene.wavelength_nm)
+    grid = SceneGrid(*scene.shape, described.config.patch, 1 if settings.budget is None else COARSE_FACTOR)
+    bands = len(scene.wavelength_nm)
     zones = open_zones(settings.zones, place_of_field(settings, scene), grid)
     outside = beyond_training(settings, scene, described, model.trained_on, path)
     ood_detector = model.asked_ood(settings.unknown)
@@ -326,9 +375,11 @@ def _run_by(
         prior = None if found is None else found[0]
         planned = _plan_capture(settings, grid, bands, path, described, prior, shown=zones.shown, passes=passes)
     settings, plan = planned.settings, planned.plan
-    costs = ReadingCosts(described.config, grid, bands)
+    read = min(bands, SMOOTH)  # the network reads components, as many as smooth directions or fewer
+    costs = ReadingCosts(described.config, grid, read, apart=settings.budget is not None)
     spending = settings.policy, settings.macs, settings.least_gain
-    budget = PatchBudget.asked(costs, None if zones.fractions is None else zones.fractions > 0, *spending)
+    shown = None if zones.fractions is None else zones.fractions > 0
+    budget = None if settings.macs is None else PatchBudget.asked(costs, shown, *spending)
     simulated, sweeps = make_source(scene, settings), (*plan.coarse, *plan.full)
     source = field_source(scene, settings, simulated, sweeps) if recorded is None else recorded.field
     raster = None if pixels is None else RasterPixels(pixels.read, pixels.missing, bands, grid)
@@ -389,8 +440,7 @@ def _plan_capture(
 ) -> _PlannedCapture:
     """Choose the part of the field, then the uniform scan or two passes, for the weights of the file ``path``.
 
-    Raises what `choose_extent`, `choose_uniform_scan` and `lay_out_passes` raise; NoScanPaidFor: other weights read
-    uniform scans of this camera.
+    Raises what `choose_extent`, `choose_uniform_scan` and `lay_out_passes` raise.
     """
     extent, extent_notes, is_part = None, tuple[str, ...](), settings.extent == EXTENT_PART
     if is_part and prior is None:  # as it can be asked for again
@@ -403,8 +453,6 @@ def _plan_capture(
         layout, extent, words = choose_extent(layout, prior, described, path, seconds=settings.seconds, **limits)
         extent_notes = (words,)
     scans = choose_uniform_scan(layout, described, path, bands, settings)
-    if settings.undecided and scans.chosen is None and path != weights_offered(settings)[-1]:
-        raise NoScanPaidFor(f"{path.name} reads uniform scans, and its record tells of none of this camera")
     layout, plan, settings, plan_notes = lay_out_passes(layout, scans.chosen, settings)
     settings = replace(settings, extent=layout.extent, scan_step=layout.step, scan_exposure_ms=layout.exposure_ms)
     return _PlannedCapture(settings, plan, scans, extent, (*plan_notes, *extent_notes))

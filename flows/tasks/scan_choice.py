@@ -8,11 +8,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from flows.settings.survey_settings import MOST_STEP, USUAL_BUDGET, Settings
+from flows.settings.survey_settings import Settings
 from flows.settings.values import EXTENT_WHOLE, parse_goals
 from flows.tasks.capture_plan import CapturePlan, PassLayout
-from flows.tasks.survey_model import weights_offered
-from models.weights.files import Description, describe_weights
+from models.weights.files import Description
 from pipeline.errors import BudgetError, NotRecordedError, SettingsError, WeightsError
 from pipeline.geometry.scan import Sweep
 from pipeline.planning.uniform_scans import (
@@ -61,8 +60,7 @@ def choose_uniform_scan(
     Where a plain scan is asked for without a step, the choice is `chosen`, within its seconds and bytes and by its
     goal. Where the capture is undecided it is the cheapest scan nearly as good as any, if there is a record. Of a
     recorded field the scans are those that its lines serve, as they were exposed. What was chosen once stands in the
-    layout, and is kept when an archive is read again with other weights, of which ``path`` is the file. What is offered
-    is the same whichever of several files is asked: each step by the record of the weights that would read it.
+    layout, and is kept when an archive is read again with other weights, of which ``path`` is the file.
     Raises WeightsError: the choice is left to weights without a record of scans; BudgetError: no scan costs as little,
     or reaches the goals; SettingsError: a goal of a class that the weights lack, or a camera that exposes shorter than
     the record knows; PoseError: the field is beyond the mirror's range.
@@ -86,14 +84,10 @@ def choose_uniform_scan(
     camera, cost = layout.camera, layout.cost
     sweeps: dict[int, list[Sweep]] = {}  # of the uniform scans of every step; of a recording those that its lines serve
     taken_ms = None if layout.recorded is None else [camera.exposure_ms]
-    offered, scans = list[UniformScan](), list[UniformScan]()  # of them those that these weights read
-    for step, (reader, told) in _records_by_step(record, path, settings).items():
+    for step in record.steps:
         with nullcontext() if layout.recorded is None else suppress(NotRecordedError):
             sweeps[step] = layout.uniform(step, layout.exposure_ms).sweeps()[1]
-            one = {step: sweeps[step]}
-            found = uniform_scans(told, one, camera, cost, bands, seconds=limits.seconds, exposures_ms=taken_ms)
-            offered += found
-            scans += found if reader == path else []
+    scans = uniform_scans(record, sweeps, camera, cost, bands, seconds=limits.seconds, exposures_ms=taken_ms)
     chosen, exposure_ms = None, layout.exposure_ms or camera.exposure_ms
     if layout.extent != EXTENT_WHOLE:  # of a part of a field the record says nothing
         pass
@@ -108,24 +102,7 @@ def choose_uniform_scan(
         chosen = choose_scan(scans, replace(limits, goals=goals))
     elif settings.undecided and scans:
         chosen = reference_scan(scans)
-    return ScanChoice(tuple(offered), chosen)
-
-
-def _records_by_step(
-    record: ScanPerformance, path: Path, settings: Settings
-) -> dict[int, tuple[Path, ScanPerformance]]:
-    """Return the file and the record of the weights that would read a scan of each step; ``record`` is of ``path``.
-
-    Weights of one's own read all steps; those that come with SpectralZoom read some each.
-    """
-    found, records = {}, {path: record}
-    for step in range(1, MOST_STEP + 1):
-        (reader,) = weights_offered(replace(settings, scan_step=step))
-        if reader not in records:
-            records[reader] = ScanPerformance.read(describe_weights(reader).record["scans"])
-        if step in records[reader].steps:
-            found[step] = (reader, records[reader])
-    return found
+    return ScanChoice(tuple(scans), chosen)
 
 
 def lay_out_passes(
@@ -133,21 +110,17 @@ def lay_out_passes(
 ) -> tuple[PassLayout, CapturePlan, Settings, tuple[str, ...]]:
     """Lay out the scan that was chosen, or two passes; the settings that ask for just these, and notes.
 
-    Where nothing decides, two passes have half of the seconds of every line; of a field so small that its coarse pass
-    takes longer every line is captured. Raises what `PassLayout.plan` does.
+    Where neither settings nor a record decide, every line is captured. Raises what `PassLayout.plan` does.
     """
     if chosen is not None and layout.step is None:
         layout = replace(layout, step=chosen.step, exposure_ms=chosen.exposure_ms)
     if settings.plain or layout.step is not None:
         return layout, layout.plan(None), settings, ()
-    if not settings.undecided:
+    if settings.budget is not None:
         return layout, layout.plan(settings.budget), settings, ()
-    try:
-        return layout, layout.plan(USUAL_BUDGET), replace(settings, budget=USUAL_BUDGET), ()
-    except BudgetError:
-        every = layout.uniform(1)
-        note = "every line is captured: in half of the seconds of that there is no time for a coarse pass"
-        return every, every.plan(None), settings, (note,)
+    every = layout.uniform(1)
+    note = "every line is captured: the weights have no record of scans by which fewer would be chosen"
+    return every, every.plan(None), settings, (note,)
 
 
 def as_figures(scan: UniformScan | None) -> dict[str, Any] | None:

@@ -61,7 +61,7 @@ def format_worst_class(accuracy: Mapping[str, Any], *, alone: bool = False) -> s
     name = worst.name.replace("_", " ")
     if alone:
         return f"Its worst class is {name} with {format_points(worst.this)}."
-    full = "" if worst.all is None else f", detail everywhere {format_points(worst.all)}"
+    full = "" if worst.all is None else f", a full reading {format_points(worst.all)}"
     return (
         f"Its worst class is {name} with {format_points(worst.this)}: the coarse pass alone "
         f"gives {format_points(worst.none)}{full}."

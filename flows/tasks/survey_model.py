@@ -23,8 +23,6 @@ from pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
 from pipeline.simulator.scenes.farm.land import sun_over_farm
 from pipeline.simulator.scenes.scene import RasterScene
 
-UNIFORM_STEPS = (1, 2)  # pixels from line to line of what the weights for uniform scans read
-
 
 @dataclass(frozen=True)
 class SurveyModel:
@@ -80,41 +78,23 @@ class SurveyModel:
 
 
 def weights_path(settings: Settings) -> Path:
-    """Return where the weights lie that a survey is read with, as soon as its scan is chosen."""
-    return weights_offered(settings)[0]
+    """Return the file of weights that a survey is read with: one of its own, or the one that comes with SpectralZoom.
 
-
-def weights_offered(settings: Settings) -> tuple[Path, ...]:
-    """Weights that a survey may be read with, the better first; another pays for less where it reads fewer lines.
-
-    Those that the settings name, or the house's own for its scenes. Raises SettingsError: none are given for one's own
-    scene.
+    Raises SettingsError: none is given for one's own scene.
     """
     if settings.weights not in (None, *BUILT_IN_SCENES):
-        return (Path(str(settings.weights)),)
+        return Path(str(settings.weights))
     if settings.weights is None and settings.scene not in BUILT_IN_SCENES:
         raise SettingsError(
             f"--weights is missing: the weights that come with SpectralZoom know the built-in farm only;"
             f" train some for {settings.scene} with: spectralzoom train DATASET -o my.safetensors"
         )
-    plain, two_passes = shipped_weights(plain=True), shipped_weights()
-    if settings.undecided:
-        return plain, two_passes
-    if not settings.plain:
-        return (two_passes,)
-    if settings.scan_step is None:
-        return plain, two_passes
-    return (plain,) if settings.scan_step in UNIFORM_STEPS else (two_passes,)
+    return shipped_weights()
 
 
-def shipped_weights(*, plain: bool = False) -> Path:
-    """The weights that come with the house: those that ``plain`` scans are read with, or those for two passes.
-
-    The coarse pixels of the first are 2 px wide, which leaves less to be read in detail, but lines farther apart than
-    that no coarse pass is made of; those of the other are 4 px wide, so that a coarse pass has few lines.
-    """
-    name = "farm-scan.safetensors" if plain else "farm.safetensors"
-    return Path(str(resources.files("models") / "shipped" / name))
+def shipped_weights() -> Path:
+    """Return the weights that come with SpectralZoom."""
+    return Path(str(resources.files("models") / "shipped" / "farm.safetensors"))
 
 
 DAYS, SUN_DEG, DARKER, SCALE, BAND_NM = 10, 3.0, 0.9, 1.5, 25.0  # as much beside its ranges is still within training

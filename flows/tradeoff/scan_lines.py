@@ -16,6 +16,7 @@ from flows.tasks.stages.accuracy import columns_of_raster, columns_of_sweeps
 from flows.tasks.survey_model import shipped_weights
 from flows.training.data import scene_of_file
 from models.evaluation.metrics import confusion, mean_iou
+from models.network.spectral import Capture
 from models.reading.inference import coarse_prediction_of_patches, segment
 from models.weights.files import Weights, describe_weights, load_weights
 from pipeline.errors import SceneError
@@ -31,6 +32,7 @@ from pipeline.simulator.readout import dark_frame, read_out
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_block
 from pipeline.source import References
 from storage.readers.raster_fields import RasterPixels
@@ -109,8 +111,8 @@ def block_means_of(values: Values, side: int) -> NDArray[np.float32]:
 
 def scan_farm(seed: int, shape: tuple[int, int] = FIELD_SHAPE, camera: LineCamera | None = None) -> ScanLines:
     """Scan a farm of one swath, every line at 10 ms, with the light that the lines had before it was read out."""
-    camera, weights = camera or LineCamera(), load_weights(shipped_weights(plain=True))
-    grid = SceneGrid(*shape, weights.config.patch, weights.config.factor)
+    camera, weights = camera or LineCamera(), load_weights(shipped_weights())
+    grid = SceneGrid(*shape, weights.config.patch, 1)
     source = SimulatedSource(farm_scene(seed, shape, camera=camera), Rig(camera), seed)
     along, _, _ = cheapest_full(grid, camera, CostModel())
     (sweep,) = uniform_sweeps(grid, camera, along, step=1, exposure_ms=EXPOSURE_MS)
@@ -127,7 +129,7 @@ def scan_farm(seed: int, shape: tuple[int, int] = FIELD_SHAPE, camera: LineCamer
         columns = columns_of_sweeps(
             [plain], camera, source.wavelength_nm, grid, weights, memory=MEMORY, resampling="catmull-rom"
         )
-        return _miou(weights, columns, grid, labels)
+        return _miou(weights, columns, grid, labels, Capture(EXPOSURE_MS / DEFAULT_EXPOSURE_MS))
 
     dark = dark_frame(block, source.choice)
     truth, sigma = _calibrated(light / per_dn + dark, lines), _calibrated(noise_dn + dark, lines)
@@ -157,7 +159,7 @@ def scan_raster(path: str, weights_path: Path | None) -> ScanLines:
         if weights_path is None or file.labels is None:
             return float("nan")
         weights = load_weights(weights_path)
-        grid = SceneGrid(*file.shape, weights.config.patch, weights.config.factor)
+        grid = SceneGrid(*file.shape, weights.config.patch, 1)
         raster = RasterPixels(lambda first, last: restored[first:last].copy(), file.missing, restored.shape[2], grid)
         columns = columns_of_raster(raster, weights, file.wavelength_nm, memory=4 * MEMORY)
         labels = judged_labels(scene_of_file(file, LineCamera()), describe_weights(weights_path))
@@ -186,8 +188,15 @@ def _as_they_are(shape: tuple[int, ...]) -> References:
     return References(frame, frame + 1, np.ones(shape[2], np.float32))
 
 
-def _miou(weights: Weights, columns: Values, grid: SceneGrid, labels: NDArray[np.uint8]) -> float:
+def _miou(
+    weights: Weights,
+    columns: Values,
+    grid: SceneGrid,
+    labels: NDArray[np.uint8],
+    capture: Capture = Capture(),  # noqa: B008
+) -> float:
     """Draw the map of all patches and judge it."""
     patch_index = grid.valid_patches()
-    drawn = segment(weights, coarse_prediction_of_patches(weights, columns, grid), columns[patch_index], patch_index)
+    seen = coarse_prediction_of_patches(weights, columns, grid, capture)
+    drawn = segment(weights, seen, columns[patch_index], patch_index)
     return mean_iou(confusion(labels, drawn.classes, weights.config.classes))

@@ -14,17 +14,18 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.load import CHEAP_POLICY, load_settings
+from flows.settings.load import load_settings
 from flows.settings.survey_settings import RASTER, Settings
 from flows.tasks.patch_budget import PatchBudget, ReadingCosts
-from flows.tasks.run import SurveyRun, open_run
+from flows.tasks.run import COARSE_FACTOR, SurveyRun, open_run
 from flows.tasks.stages.accuracy import columns_of_all_patches, columns_of_raster
-from flows.tasks.survey_model import UNIFORM_STEPS, shipped_weights
+from flows.tasks.survey_model import shipped_weights
 from flows.tradeoff.entries import Setting, Tradeoff
 from flows.tradeoff.store import STORE
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.machine import keep_freed_memory
 from models.network.sizes import multiply_adds
+from models.network.spectral import Capture
 from models.policies.policies import score_patches
 from models.reading.inference import (
     CoarsePrediction,
@@ -52,7 +53,7 @@ from pipeline.simulator.readout import dark_frame, read_out
 from pipeline.simulator.render import EFFECTS, expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
-from pipeline.simulator.scenes.scene import RasterScene
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.simulator.selection.choice import Decision, decide
 from pipeline.simulator.selection.survey_probe import probe_scene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_block
@@ -227,6 +228,7 @@ class PlannedPass:
     weights: Weights  # that read it
     seconds: float = 0.0
     bytes_raw: int = 0
+    capture: Capture | None = None  # of the patches, where they were captured otherwise than what the overview reads
 
 
 @dataclass(frozen=True)
@@ -246,7 +248,9 @@ class PlannedField:
     def read(self, plan: Setting) -> DrawnMap:
         """Return the class map of a plan."""
         scan_pass = self.scan_passes[plan]
-        return segment(scan_pass.weights, scan_pass.seen, scan_pass.columns, scan_pass.patch_index)
+        return segment(
+            scan_pass.weights, scan_pass.seen, scan_pass.columns, scan_pass.patch_index, capture=scan_pass.capture
+        )
 
     def miss(self, plan: Setting, drawn: DrawnMap) -> float:
         """Return 1 - mIoU of a map."""
@@ -262,21 +266,21 @@ class PlannedField:
 
 
 def uniform_pass(
-    weights: Weights, source: SimulatedSource, sweeps: list[Sweep], grid: SceneGrid, cost: CostModel
+    weights: Weights, source: SimulatedSource, sweeps: list[Sweep], grid: SceneGrid, cost: CostModel, capture: Capture
 ) -> PlannedPass:
-    """Read a uniform scan whole; its coarse pass are the means of its own pixels, on a field of whole cells."""
+    """Read a uniform scan whole."""
     columns = columns_of_all_patches(source, sweeps, grid, weights, memory=MEMORY, resampling="catmull-rom")
     patch_index, size = grid.valid_patches(), raw_bytes(sweeps, source.camera, len(source.wavelength_nm))
     seconds = cost.seconds(sweeps, source.camera)
-    seen = coarse_prediction_of_patches(weights, columns, grid)
+    seen = coarse_prediction_of_patches(weights, columns, grid, capture)
     return PlannedPass(seen, patch_index, columns[patch_index], weights, seconds, size)
 
 
 def part_of(scan_pass: PlannedPass, bands: int, compute: str) -> PlannedPass:
-    """Return the same scan with the patches alone that edges promise most of, for a fraction of the multiply-adds."""
+    """Return the same scan with the patches alone of the highest expected gain, for a fraction of the multiply-adds."""
     costs = ReadingCosts(scan_pass.weights.config, scan_pass.seen.grid, bands)
-    budget = PatchBudget(costs, scan_pass.patch_index, CHEAP_POLICY, compute)
-    kept = np.sort(budget.choose(score_patches(CHEAP_POLICY, scan_pass.seen)))
+    budget = PatchBudget(costs, scan_pass.patch_index, POLICY, compute)
+    kept = np.sort(budget.choose(score_patches(POLICY, scan_pass.seen)))
     return replace(scan_pass, patch_index=kept, columns=scan_pass.columns[np.searchsorted(scan_pass.patch_index, kept)])
 
 
@@ -316,30 +320,30 @@ def plan_every_way(seed: int, scene: str | None = None, weights: Path | None = N
     """
     run = open_field(seed, scene, weights, "sim")
     camera, cost, source, bands = run.camera, run.settings.cost, run.simulated, len(run.scene.wavelength_nm)
-    two_passes, of_scans = (load_weights(weights or shipped_weights(plain=plain)) for plain in (False, True))
-    sizes = (one.config for one in (two_passes, of_scans))
-    grid, finer = (SceneGrid(*run.scene.shape, one.patch, one.factor) for one in sizes)
+    grid, read_with = SceneGrid(*run.scene.shape, run.described.config.patch, COARSE_FACTOR), run.weights
     along, full, full_s = cheapest_full(grid, camera, cost)
-    default, scan = default_plan(run)
+    default, chosen = default_plan(run)
     scan_passes: dict[Setting, PlannedPass] = {}
-    for words, (step, exposure_ms) in (SCANS | ({} if scan is None else {default: scan})).items():
-        read_with, on = (of_scans, finer) if step in UNIFORM_STEPS else (two_passes, grid)
-        sweeps = uniform_sweeps(on, camera, along, step=step, exposure_ms=exposure_ms)
-        scan_passes[words] = uniform_pass(read_with, source, sweeps, on, cost)
+    for words, (step, exposure_ms) in (SCANS | ({} if chosen is None else {default: chosen})).items():
+        sweeps = uniform_sweeps(grid, camera, along, step=step, exposure_ms=exposure_ms)
+        scan = Capture(exposure_ms / DEFAULT_EXPOSURE_MS, step)
+        scan_passes[words] = uniform_pass(read_with, source, sweeps, grid, cost, scan)
     whole = scan_passes[format_scan(*PART_OF)]
     scan_passes |= {words: part_of(whole, bands, fraction) for words, fraction in PARTS.items()}
     coarse = coarse_sweeps(grid, camera, along)
     coarse_s = cost.seconds(coarse, camera)
     if paid := {words: budget for words, budget in BUDGETS.items() if budget * full_s >= coarse_s}:
         sweeps = uniform_sweeps(grid, camera, along, step=1, exposure_ms=camera.exposure_ms)
-        every = uniform_pass(two_passes, source, sweeps, grid, cost)
-        seen = coarse_prediction(two_passes, coarse_mosaic(source, coarse, grid), run.scene.wavelength_nm, grid)
+        every = uniform_pass(read_with, source, sweeps, grid, cost, Capture())
+        binned = Capture(1.0, COARSE_FACTOR, COARSE_FACTOR)
+        values, bands_nm = coarse_mosaic(source, coarse, grid), run.scene.wavelength_nm
+        seen = coarse_prediction(read_with, values, bands_nm, grid, capture=binned, factor=COARSE_FACTOR)
         scores = score_patches(POLICY, seen)
     for words, budget in paid.items():
         plan = plan_fine(grid, camera, cost, along, scores, budget_s=budget * full_s - coarse_s, full=full)
         columns = every.columns[np.searchsorted(every.patch_index, plan.patch_index)]
-        size = raw_bytes([*coarse, *plan.sweeps], camera, bands)
-        scan_passes[words] = PlannedPass(seen, plan.patch_index, columns, two_passes, coarse_s + plan.seconds, size)
+        size, seconds = raw_bytes([*coarse, *plan.sweeps], camera, bands), coarse_s + plan.seconds
+        scan_passes[words] = PlannedPass(seen, plan.patch_index, columns, read_with, seconds, size, Capture())
     assert run.labels is not None
     return PlannedField(run.labels, bands, scan_passes, default)
 
@@ -349,7 +353,7 @@ SURVEY = Tradeoff(
     knob="plan",
     error="1 - mIoU",
     unit="scene px",
-    reference=f"labels of a farm of {SURVEY_SHAPE[1]} x {SURVEY_SHAPE[0]} px; two passes by gain, parts by edges",
+    reference=f"labels of a farm of {SURVEY_SHAPE[1]} x {SURVEY_SHAPE[0]} px; two passes and parts by expected gain",
     settings=(),
     settings_of=lambda field: field.plans,
     default=lambda field: field.default,
@@ -365,7 +369,7 @@ SURVEY = Tradeoff(
 )
 
 
-# segment: a farm seen coarsely and finely
+# segment: a farm of which a part is read in full
 
 FARM_SHAPE = (384, 480)
 FRACTIONS = (1.0, 0.35, 0.2, 0.15, 0.1, 0.05, 0.0)
@@ -375,18 +379,17 @@ POLICY = "gain"
 def sources_of_farm(seed: int) -> tuple[Weights, SceneGrid, SimulatedSource, Axis, list[Sweep]]:
     """Draw a farm and plan its full scan; gives weights, grid, source, direction of the lines and sweeps."""
     weights, camera = load_weights(shipped_weights()), LineCamera()
-    grid = SceneGrid(*FARM_SHAPE, weights.config.patch, weights.config.factor)
+    grid = SceneGrid(*FARM_SHAPE, weights.config.patch, 1)
     along, full, _ = cheapest_full(grid, camera, CostModel())
     return weights, grid, SimulatedSource(farm_scene(seed, FARM_SHAPE), Rig(camera), seed), along, list(full)
 
 
 def plan_every_fraction(seed: int) -> PlannedField:
-    """Take a farm coarsely and finely everywhere, and choose every fraction of its patches by their scores."""
+    """Scan a farm by every line, and choose every fraction of its patches by their scores."""
     keep_freed_memory()  # as surveys do
-    weights, grid, source, along, full = sources_of_farm(seed)
-    mosaic = coarse_mosaic(source, coarse_sweeps(grid, source.camera, along), grid)
-    seen = coarse_prediction(weights, mosaic, source.wavelength_nm, grid)
+    weights, grid, source, _, full = sources_of_farm(seed)
     columns = columns_of_all_patches(source, full, grid, weights, memory=MEMORY, resampling="catmull-rom")
+    seen = coarse_prediction_of_patches(weights, columns, grid)
     scores, valid = score_patches(POLICY, seen), grid.valid_fraction().ravel() > 0
     scan_passes: dict[Setting, PlannedPass] = {}
     for fraction in FRACTIONS:
@@ -411,19 +414,19 @@ SEGMENT = Tradeoff(
 
 def survey_tradeoff(scene: str, weights: Path) -> Tradeoff:
     """Return the trade-off of `survey` on one's own scene, at which the simulated rig looks."""
-    words = f"labels of {Path(scene).name}, seen by the simulated rig; two passes by gain, parts by edges"
+    words = f"labels of {Path(scene).name}, seen by the simulated rig; two passes and parts by expected gain"
     return replace(SURVEY, prepare=lambda seed: plan_every_way(seed, scene, weights), reference=words)
 
 
 def fractions_of_raster(scene: str, weights: Path) -> PlannedField:
-    """Take a raster as it is, and choose every fraction of its patches by edges, as `survey --macs` does."""
+    """Take a raster as it is, and choose every fraction of its patches by expected gain, as `survey --macs` does."""
     keep_freed_memory()
     run = open_field(0, scene, weights, RASTER)
     assert run.raster is not None
     assert run.labels is not None
     columns = columns_of_raster(run.raster, run.weights, run.scene.wavelength_nm, memory=run.settings.memory)
     seen = coarse_prediction_of_patches(run.weights, columns, run.grid)
-    scores, valid = score_patches(CHEAP_POLICY, seen), run.grid.valid_fraction().ravel() > 0
+    scores, valid = score_patches(POLICY, seen), run.grid.valid_fraction().ravel() > 0
     scan_passes: dict[Setting, PlannedPass] = {}
     for fraction in FRACTIONS:
         patch_index = frame_patches(scores, fraction, valid) if fraction < 1 else np.flatnonzero(valid)
@@ -437,7 +440,7 @@ def segment_tradeoff(scene: str, weights: Path) -> Tradeoff:
         SEGMENT,
         prepare=lambda _seed: fractions_of_raster(scene, weights),
         default=lambda field: field.default,
-        reference=f"labels of {Path(scene).name}; patches by {CHEAP_POLICY}, scored beforehand",
+        reference=f"labels of {Path(scene).name}; patches by {POLICY}, scored beforehand",
         beside={"billion multiply-adds": PlannedField.billion_multiply_adds},
     )
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flows.training.data import Report
+from models.evaluation.cascade import CascadeTable, ReadTwice
 from models.evaluation.expected_scores import Floats, MapScores, ScoredMap, expected_counts
 from models.evaluation.metrics import (
     agreement,
@@ -21,9 +22,11 @@ from models.evaluation.metrics import (
     mean_iou,
 )
 from models.evaluation.placement import CONTROL_FRACTION, Controls, Counts, run_controls
-from models.network.spectral import patches_of
-from models.reading.inference import coarse_prediction_of_columns, map_of_columns
-from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
+from models.network.sizes import PLANES
+from models.network.spectral import Capture, patches_of
+from models.policies.policies import score_patches
+from models.reading.inference import coarse_prediction_of_columns, map_of_columns, segment
+from models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation
 from models.training.examples import Example
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
@@ -37,7 +40,7 @@ def validate(weights: Weights, examples: Iterable[Example], seed: int, show: Sho
     rows = []
     for example in examples:
         grid, cells, labels = _parts(weights, example)
-        seen = coarse_prediction_of_columns(weights, example.coarse, grid)
+        seen = coarse_prediction_of_columns(weights, example.columns.astype(np.float32), grid)
         rows.append(run_controls(weights, seen, cells, labels, fraction=CONTROL_FRACTION, seed=seed, report=show))
     if not rows:
         return None
@@ -56,6 +59,19 @@ def validate(weights: Weights, examples: Iterable[Example], seed: int, show: Sho
         "all": agreement(whole.every),
         **whole.as_dict(),
     }
+
+
+def judge_cascade(weights: Weights, examples: Iterable[Example]) -> dict[str, Any] | None:
+    """Return what reading a part of the patches in full loses, as a `CascadeTable`; None without a scene."""
+    scenes = []
+    for example in examples:
+        grid, cells, labels = _parts(weights, example)
+        seen = coarse_prediction_of_columns(weights, example.columns.astype(np.float32), grid)
+        nothing, everything = np.empty(0, np.int64), grid.valid_patches()
+        overview, full = (segment(weights, seen, cells[index], index).classes for index in (nothing, everything))
+        gain = score_patches("gain", seen).reshape(grid.patch_shape)
+        scenes.append(ReadTwice(overview, full, gain, labels, grid.patch))
+    return asdict(CascadeTable.judged(scenes, weights.config.classes)) if scenes else None
 
 
 SCAN_EXPOSURES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # of the reference; the last judged is the darkest trained
@@ -95,8 +111,7 @@ def judge_scans(
     known = [example for example in examples if example.noise is not None]
     if not known or augmentation is None:
         return None
-    factor = weights.config.factor
-    steps = [step for step in augmentation.steps if factor % step == 0]
+    steps = [step for step in STEPS if all(len(one.labels) % step == 0 for one in known)]
     lighter = [
         fraction * REFERENCE_MS for fraction in SCAN_EXPOSURES if fraction * REFERENCE_MS > augmentation.darkest_ms
     ]
@@ -144,9 +159,9 @@ def _scanned(
     """Draw the map of a scene's uniform scan, read whole, and set it beside the labels."""
     assert example.noise is not None
     grid, _, labels = _parts(weights, example)
-    plain, classes = example.fine.astype(np.float32), weights.config.classes
-    fine, means = augmentation.scan(plain, example.noise, grid.factor, light=light, step=step, rng=rng)
-    drawn, every_class = map_of_columns(weights, means, fine, grid)
+    plain, classes = example.columns.astype(np.float32), weights.config.classes
+    scan = augmentation.scan(plain, example.noise, light=light, step=step, rng=rng)[..., :-PLANES]
+    drawn, every_class = map_of_columns(weights, scan, grid, Capture(light, step))
     valid = (labels != UNLABELLED) & np.isfinite(drawn.confidence)
     sure = confidence_counts(drawn.confidence[valid], drawn.classes[valid] == labels[valid])
     expected = expected_counts([every_class[valid]], classes)
@@ -154,8 +169,8 @@ def _scanned(
 
 
 def _parts(weights: Weights, example: Example) -> tuple[SceneGrid, Patches, NDArray[np.uint8]]:
-    grid = SceneGrid(*example.shape, weights.config.patch, weights.config.factor)
-    return grid, patches_of(example.fine, grid.patch).astype(np.float32), example.labels[: grid.height, : grid.width]
+    grid = SceneGrid(*example.shape, weights.config.patch, 1)
+    return grid, patches_of(example.columns, grid.patch).astype(np.float32), example.labels[: grid.height, : grid.width]
 
 
 def _added(parts: list[Counts]) -> Counts:

@@ -64,8 +64,8 @@ def measured_calibration(weights: Weights, frames: Sequence[Example], seed: int)
     """Return how sure of itself the map of a full scan may be, by scenes kept from training; None without one."""
     maps = []
     for frame in frames:
-        grid = SceneGrid(*frame.shape, weights.config.patch, weights.config.factor)
-        _, every_class = map_of_columns(weights, frame.coarse, frame.fine, grid)
+        grid = SceneGrid(*frame.shape, weights.config.patch, 1)
+        _, every_class = map_of_columns(weights, frame.columns.astype(np.float32), grid)
         maps.append(JudgedMap.of(every_class, frame.labels[: grid.height, : grid.width]))
     return judge_confidence(maps, seed) if maps else None
 
@@ -169,7 +169,6 @@ def _observed(weights: Weights, data: TrainingData, request: OodRequest, report:
         request.dataset,
         request.out,
         patch=config.patch,
-        factor=config.factor,
         columns=config.columns,
         choices=request.choices,
         settings=TrainingSettings(seed=seed),

@@ -1,7 +1,7 @@
-"""Looks at scenes in training and where weights are judged: coarse and fine everywhere, as spectral features.
+"""Looks at scenes in training and where weights are judged: by every line, as spectral features.
 
 Built-in farms are seen through the rig as a survey captures them: effects are chosen for each scene as surveys choose
-them by default, then the coarse pass and the scan of everything are rendered, calibrated and rectified. A camera has
+them by default, then the scan of everything is rendered, calibrated and rectified. A camera has
 looked at scene files already: they pass the footprint and the noise alone, by `models.training.examples.observe`.
 """
 
@@ -20,7 +20,7 @@ from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
 from pipeline.geometry.scan import CostModel, Sweep
-from pipeline.planning.coverage import cheapest_full, coarse_sweeps
+from pipeline.planning.coverage import cheapest_full
 from pipeline.rectify.region import mosaic_rows
 from pipeline.simulator.render import EFFECTS, Choice
 from pipeline.simulator.rig_model import Rig
@@ -62,20 +62,14 @@ def observe_scene(
     if scene.labels is None:
         raise SceneError(f"scene {scene.name} has no labels; training needs them")
     rig, cost = Rig(camera), CostModel()
-    along, full, _ = cheapest_full(grid, camera, cost)
-    coarse = coarse_sweeps(grid, camera, along)
-    planned = [*coarse, *full]
-    chosen = chosen_effects(scene, rig, planned)
-    source = SimulatedSource(scene, rig, seed, chosen, clock=sweep_starts(planned, camera, cost))
+    _, full, _ = cheapest_full(grid, camera, cost)
+    source = SimulatedSource(scene, rig, seed, chosen_effects(scene, rig, full), clock=sweep_starts(full, camera, cost))
     matrix, _ = basis.matrix(scene.wavelength_nm)
-    height, width = grid.padded_shape
-    small = (height // grid.factor, width // grid.factor)
     labels = np.full(grid.padded_shape, UNLABELLED, np.uint8)
     labels[: grid.height, : grid.width] = scene.labels
     return Example(
         scene.name,
         np.asarray(pad_by_reflection(_columns(source, full, grid, matrix), grid.padded_shape), np.float32),
-        np.asarray(pad_by_reflection(_columns(source, coarse, grid, matrix), small), np.float32),
         labels,
         (grid.height, grid.width),
         noise_of(scene, matrix, camera),

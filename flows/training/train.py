@@ -7,15 +7,17 @@ import shlex
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from flows.terminal.progress import one_after_the_other, table
 from flows.training.baselines import judge_baselines
 from flows.training.data import Report, TrainingData, alike_notes, either_mask, open_training_data
-from flows.training.figures import judge_scans, validate
+from flows.training.figures import judge_cascade, judge_scans, validate
 from flows.training.fit_ood import SeenScenes, measure_and_add, measured_calibration, trained_on
 from flows.training.train_scenes import About, TrainRequest, as_read, network_config, observe_all
 from models.evaluation.expected_scores import MapScores
@@ -24,10 +26,11 @@ from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation
 from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from models.training.examples import Example, measured_normalisation
+from models.training.spectral_start import LabelledPixels, better_reading, linear_discriminants
 from models.training.start_weights import Start, StartFile
 from models.training.train import Progress, train
 from models.weights.checksummed_files import read_checkpoint
-from models.weights.files import CALIBRATION, Weights, save_weights, with_record
+from models.weights.files import CALIBRATION, CASCADE, Weights, save_weights, with_record
 from models.weights.parts import MAP_SCORES, TRAINED_ON
 from pipeline.errors import SceneError, SettingsError, ShapeError
 from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
@@ -80,7 +83,12 @@ def train_weights(
     frames = as_read(kept, lesson.normalisation)
     whole = SeenScenes(lesson.examples, frames, about.wavelength_nm, request.settings.darkest_ms, request.settings.seed)
     trained = trained_on(data, whole, about.names)
-    baselines = judge_baselines(lesson.examples, frames, len(about.names), request.settings.seed, report)
+    beside: dict[str, Any] = {}
+    if frames:
+        if lesson.begun is None:
+            weights, beside["readings"] = better_reading(weights, lesson.start, frames)
+        counts = lesson.examples, frames, len(about.names), request.settings.seed
+        beside["baselines"] = judge_baselines(*counts, report)
     figures, scores = _figures(weights, frames, lesson.augmentation, request.settings.seed, report)
     record = {
         "command": request.command,
@@ -92,7 +100,7 @@ def train_weights(
         "training": summary,
         "device": device,
         **figures,
-        "baselines": baselines,
+        **beside,
         **({} if lesson.begun is None else {"begun_from": lesson.begun.record}),
     }
     save_weights(with_record(weights, **record), request.out)
@@ -112,6 +120,15 @@ class Lesson:
     examples: list[Example]
     augmentation: CaptureAugmentation | None  # None where all light is that of the reference
     begun: Start | None
+
+    @cached_property
+    def start(self) -> Mapping[str, Any]:
+        """What the network begins with: earlier weights, or the linear discriminants of its scenes."""
+        begun = {} if self.begun is None else self.begun.state
+        if "spectral.weight" in begun:
+            return begun
+        pixels = LabelledPixels.drawn(self.examples, np.random.default_rng([0x1DA]))
+        return {**begun, **linear_discriminants(pixels, self.config.classes)}
 
 
 def _lesson(
@@ -147,7 +164,7 @@ def _learned(
         lesson.normalisation.gain_shift,
         request.settings,
         progress,
-        start=None if lesson.begun is None else lesson.begun.state,
+        start=lesson.start,
         augmentation=lesson.augmentation,
         checkpoint=checkpoint,
         device=choose_device(request.device),
@@ -161,6 +178,8 @@ def _figures(
 ) -> tuple[dict[str, Any], MapScores | None]:
     """Return the record's figures of scenes kept for validation; of uniform scans too, where training saw such."""
     figures = {"validation": validate(weights, frames, seed, lambda row: report("validating", 0.0, row))}
+    if (cascade := judge_cascade(weights, frames)) is not None:
+        figures[CASCADE] = cascade
     if (calibration := measured_calibration(weights, frames, seed)) is not None:
         figures[CALIBRATION] = calibration
         weights = with_record(weights, calibration=calibration)
@@ -251,7 +270,8 @@ def _check_counts(request: TrainRequest) -> None:
         "--crop": settings.crop,
         "--scenes": request.scenes,
         "--patch": request.patch,
-        "--factor": request.factor,
+        "--width": request.width,
+        "--overview-width": request.overview_width,
         "--columns": request.columns,
         **{"--" + name.replace("_", "-"): size for name, size in request.tokens.items()},
     }
@@ -300,10 +320,12 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
         for name in ("none", "random", "sobel", "entropy", "gain", "all")
     ]
     console.print(table(("placement", "mIoU", "overall"), rows, title=title))
-    console.print(f"none: the coarse pass alone; all: fine everywhere; else fine at {figures['share_of_seats']:.0%}")
-    if record["baselines"] is not None:
-        beside = ", ".join(f"{name} {100 * miou:.1f}" for name, miou in record["baselines"].items())
-        console.print(f"mIoU by mean spectra of 5 x 5 px, of the same scenes: {beside}", soft_wrap=True)
+    console.print(f"none: the overview alone; all: everything read in full; else {figures['share_of_seats']:.0%}")
+    if "readings" in record:
+        readings = record["readings"]
+        scores = readings["miou"] | (record["baselines"] or {})
+        beside = ", ".join(f"{name} {100 * miou:.1f}" for name, miou in scores.items())
+        console.print(f"mIoU of the whole scenes by each reading: {beside}; kept: {readings['kept']}", soft_wrap=True)
 
 
 def print_start(begun: Mapping[str, Any], console: Console) -> None:

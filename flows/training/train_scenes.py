@@ -43,9 +43,9 @@ class TrainRequest:
     validation: int | None = None
     scenes: int | None = None  # of a built-in farm; by its law where None
     patch: int | None = None
-    factor: int = 4
     columns: int = 24
-    width: int = 24
+    width: int = 20
+    overview_width: int = 8
     tokens: dict[str, Any] = field(default_factory=dict)  # dim, layers, heads, mlp_ratio, where not the usual ones
     init: Path | None = None  # weights to begin from
     choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths, masks
@@ -111,7 +111,7 @@ def observe_all(
             known.alike[name] = alone
         if scene.regridded:
             known.regridded.append(name)
-        grid = SceneGrid(*scene.shape, known.patch, request.factor)
+        grid = SceneGrid(*scene.shape, known.patch, 1)
         rng = np.random.default_rng([request.settings.seed, 0x0B5, number])
         seen.append(observe_scene(scene, request.camera, grid, known.basis, rng))
     if about is None:
@@ -153,9 +153,9 @@ def network_config(request: TrainRequest, about: About) -> SegmenterConfig:
             classes=len(about.names),
             columns=about.basis.columns,
             patch=about.patch,
-            factor=request.factor,
             width=request.width,
+            overview_width=request.overview_width,
             **request.tokens,
         )
     except ValueError as error:
-        raise SettingsError(f"{error}; choose another --patch or --factor, --dim or --heads") from error
+        raise SettingsError(f"{error}; choose another --patch, --dim or --heads") from error

@@ -19,10 +19,12 @@ from flows.terminal.progress import one_after_the_other
 from flows.training.data import Report
 from flows.training.observed_scenes import observe_finely
 from models.evaluation.metrics import confusion, mean_iou
+from models.network.sizes import PLANES
+from models.network.spectral import Capture
 from models.network.temporal_reader import TemporalReader
 from models.reading.inference import map_of_columns
-from models.reading.prior_map import CurrentVisit, PriorMap, first_probabilities, fuse
-from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation, ColumnNoise, drawn_step
+from models.reading.prior_map import CurrentVisit, PriorMap, first_probabilities, fuse, pooled
+from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation, ColumnNoise
 from models.training.temporal import PastPass, TemporalTraining, Visit, train_reader
 from models.training.train import Progress
 from models.weights.files import Weights, add_reader, load_weights
@@ -38,7 +40,7 @@ VISITS = 5  # to each land
 DAYS, LAST_DAY = (95, 290), 318  # of the year: of first visits, and of any
 GAPS = (0, 1, 1, 2, 3, 3, 5, 6, 6, 7, 7, 10, 14)  # days between two
 HOURS = (9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0)
-STEPS = {1: 0.3, 2: 0.5, 4: 0.2}  # how often lines are so many pixels apart
+SPACINGS = {1: 0.3, 2: 0.5, 4: 0.2}  # how often lines are so many pixels apart
 DARKEST_MS, BRIGHTEST_MS = 3.0, 50.0
 PASSES = 2  # of each visit
 JUDGED_DAY, JUDGED_AFTER, JUDGED_LANDS = 172, (1, 3, 7), 3
@@ -88,7 +90,7 @@ def train_temporal(request: TemporalRequest, report: Report = lambda what, done,
     def progress(now: Progress) -> None:
         report("training", now.done, f"step {now.step}, loss {now.loss:.3f}")
 
-    reader, steps = train_reader(lands, request.settings, weights.config.factor, progress)
+    reader, steps = train_reader(lands, request.settings, progress)
     record = {
         "command": request.command,
         "lands": [FIRST_SEED + number for number in range(request.lands)],
@@ -121,7 +123,7 @@ def _visit(
     seen = _Land.observed(weights, shape, seed, day, hour)
     drawn = []
     for _ in range(PASSES):
-        step = drawn_step(STEPS, weights.config.factor, rng)
+        step = int(rng.choice(list(SPACINGS), p=list(SPACINGS.values())))
         exposure_ms = float(np.exp(rng.uniform(np.log(DARKEST_MS), np.log(BRIGHTEST_MS))))
         observation = seen.observe(weights, augmentation, step, exposure_ms, rng)
         probability = np.exp(observation.log_probability).astype(np.float16)
@@ -142,7 +144,7 @@ class _Land:
     def observed(weights: Weights, shape: tuple[int, int], seed: int, day: int, hour: float) -> _Land:
         camera = LineCamera()
         scene = farm_scene(seed, shape, camera=camera, day=day, hour=hour)
-        grid = SceneGrid(*shape, weights.config.patch, weights.config.factor)
+        grid = SceneGrid(*shape, weights.config.patch, 1)
         seen, noise = observe_finely(scene, camera, grid, weights.basis, 1000 * seed + day)
         padded = np.asarray(pad_by_reflection(seen, grid.padded_shape), np.float32)
         columns = weights.normalisation.apply(padded, np.ones(weights.basis.columns, np.bool_))
@@ -157,10 +159,10 @@ class _Land:
         rng: np.random.Generator,
     ) -> CurrentVisit:
         """Return what a uniform scan would have shown, read by the weights."""
-        grid, light = self.grid, exposure_ms / REFERENCE_MS
-        fine, means = augmentation.scan(self.columns, self.noise, grid.factor, light=light, step=step, rng=rng)
-        _, every_class = map_of_columns(weights, means, fine, grid)
-        return CurrentVisit(every_class, np.ones(self.labels.shape, np.bool_), means, light, step)
+        light = exposure_ms / REFERENCE_MS
+        scan = augmentation.scan(self.columns, self.noise, light=light, step=step, rng=rng)[..., :-PLANES]
+        _, every_class = map_of_columns(weights, scan, self.grid, Capture(light, step))
+        return CurrentVisit(every_class, np.ones(self.labels.shape, np.bool_), pooled(scan), light, step)
 
 
 def judge_temporal(

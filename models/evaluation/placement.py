@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from models.evaluation.metrics import agreement, confusion, gap_closed, mean_iou
 from models.network.sizes import MOST_GAIN
+from models.network.spectral import Capture, patches_of
 from models.policies.policies import score_patches
-from models.reading.inference import CoarsePrediction, captured, origin_of, reading_of, segment
+from models.reading.inference import CoarsePrediction, captured, overview_of, patch_logits, segment
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED, patch_pixels
 from pipeline.lazy import deferred
@@ -49,14 +50,12 @@ def oracle_gain(
     truth = patch_pixels(grid, labels, UNLABELLED)
     gain, valid = np.zeros(len(truth)), grid.valid_patches()
     patches, patch_index = captured(fine[valid], valid)
-    model, first = weights.segmenter.eval(), 0
     with torch.inference_mode():
-        reading = reading_of(weights, seen)
-        numbers = torch.from_numpy(patch_index).to(model.device)
-        for after in model.read_fine_in_chunks(reading, patches, numbers, origin_of(seen)):
+        overview, first = overview_of(weights, seen), 0
+        before = patches_of(overview.logits[0].permute(1, 2, 0).cpu().numpy(), p).transpose(0, 3, 1, 2)
+        for after in patch_logits(weights, overview, patches, patch_index, seen.capture):
             some = patch_index[first : first + len(after)]
-            before = model.bring_up(model.around_patches(reading.logits, numbers[first : first + len(after)][None]))
-            lower = _losses(before.cpu().numpy(), truth[some]) - _losses(after.cpu().numpy(), truth[some])
+            lower = _losses(before[some], truth[some]) - _losses(after.numpy(), truth[some])
             gain[some] = lower.sum(axis=(1, 2)) / p**2
             first += len(after)
     return np.clip(gain, -MOST_GAIN, MOST_GAIN)
@@ -120,6 +119,7 @@ def run_controls(
     *,
     fraction: float,
     seed: int,
+    capture: Capture | None = None,
     policies: tuple[str, ...] = ("gain", "entropy", "sobel"),
     among: NDArray[np.bool_] | None = None,
     report: Callable[[str], None] = lambda row: None,
@@ -127,14 +127,15 @@ def run_controls(
     """Segment with no patch, every patch, and ``fraction`` of the valid patches placed by each policy and at random.
 
     ``fine`` (patch, p, p, column) are normalised columns of every patch of the padded grid, ``labels`` (y, x) class
-    indices, 255 unlabelled. ``among`` are the patches (patch,) that may be chosen, None for all.
+    indices, 255 unlabelled. ``capture`` says how they were captured, None as the overview's pixels; ``among`` which
+    (patch,) may be chosen, None for all.
     """
     valid = seen.grid.valid_fraction().ravel() > 0
     valid = valid if among is None else valid & among
 
     def counts(row: str, patch_index: NDArray[np.integer]) -> Counts:
         report(row)
-        drawn = segment(weights, seen, fine[patch_index], patch_index)
+        drawn = segment(weights, seen, fine[patch_index], patch_index, capture=capture)
         return confusion(labels, drawn.classes, weights.config.classes)
 
     def placed(policy: str, number: int = 0) -> NDArray[np.integer]:

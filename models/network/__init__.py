@@ -1,1 +1,1 @@
-"""The two-scale segmenter: tokens, encoder, decoder, how it reads a scene, and what that costs."""
+"""The segmenter: overview and full network, how they read a scene, and what that costs."""

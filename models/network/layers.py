@@ -1,9 +1,4 @@
-"""Parts of the networks: codes of places, the transformer over tokens, and a patch's pixels down to them and back.
-
-In the transformer coarse tokens read each other and fine tokens read both; nothing flows from fine to coarse. So what a
-coarse pass says is computed once: the coarse prediction keeps the keys and values of its tokens, and a second pass pays
-for its own tokens only, however often places are added.
-"""
+"""Parts of the networks: codes of places, the transformer over tokens, and the way from pixels to features and back."""
 
 from __future__ import annotations
 
@@ -14,17 +9,15 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
 
-from models.network.sizes import BOTTOM
 from pipeline.errors import ShapeError
 
-LONGEST_PERIOD = 128.0  # patches; the shortest is 2
-Memory = tuple[Tensor, Tensor]  # keys and values of one layer, (B, heads, N, d / heads)
+LONGEST_PERIOD = 128.0  # cells of a token; the shortest is 2
 
 
 def code_2d(yx: Tensor, dim: int) -> Tensor:
-    """Sines and cosines of both coordinates, (..., 2) patches -> (..., dim) float32.
+    """Sines and cosines of both coordinates, (..., 2) cells -> (..., dim) float32.
 
-    Angular frequencies run geometrically from pi (period 2 patches) to pi/64. Computed in float64 and cast once: at
+    Angular frequencies run geometrically from pi (period 2 cells) to pi/64. Computed in float64 and cast once: at
     1e7 px the error stays below 1e-6, where float32 angles would be off by half a turn.
     Raises ShapeError for a width that does not divide by 4, or places in half precision.
     """
@@ -52,24 +45,17 @@ class TokenAttention(nn.Module):
         self.query_norm = nn.RMSNorm(dim // heads, eps=1e-6)
         self.key_norm = nn.RMSNorm(dim // heads, eps=1e-6)
 
-    def forward(self, x: Tensor, before: Memory | None) -> tuple[Tensor, Memory]:
-        """(B, N, d) tokens that read ``before`` and each other -> (B, N, d), and their own keys and values."""
-        b, n, d = x.shape
-        q, own = self.ask(x)
-        keys, values = own if before is None else (torch.cat(pair, dim=2) for pair in zip(before, own, strict=True))
-        mixed = F.scaled_dot_product_attention(q, keys, values)
-        joined: Tensor = self.out(mixed.transpose(1, 2).reshape(b, n, d))
-        return joined, own
-
-    def ask(self, x: Tensor) -> tuple[Tensor, Memory]:
-        """Queries (B, heads, N, d / heads) of (B, N, d) tokens, and their own keys and values."""
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, N, d) tokens that read each other -> (B, N, d)."""
         b, n, d = x.shape
         q, k, v = self.qkv(x).view(b, n, 3, self.heads, d // self.heads).permute(2, 0, 3, 1, 4)
-        return self.query_norm(q), (self.key_norm(k), v)
+        mixed = F.scaled_dot_product_attention(self.query_norm(q), self.key_norm(k), v)
+        joined: Tensor = self.out(mixed.transpose(1, 2).reshape(b, n, d))
+        return joined
 
 
 class EncoderBlock(nn.Module):
-    """Pre-norm transformer block, (B, N, d) -> (B, N, d), and what later tokens may read of them."""
+    """Pre-norm transformer block, (B, N, d) -> (B, N, d)."""
 
     def __init__(self, dim: int, heads: int, mlp_ratio: int) -> None:
         super().__init__()
@@ -78,27 +64,26 @@ class EncoderBlock(nn.Module):
         self.norm2 = nn.LayerNorm(dim)
         self.mlp = nn.Sequential(nn.Linear(dim, mlp_ratio * dim), nn.GELU(), nn.Linear(mlp_ratio * dim, dim))
 
-    def forward(self, x: Tensor, before: Memory | None) -> tuple[Tensor, Memory]:
-        read, own = self.attention(self.norm1(x), before)
-        x = x + read
-        return x + self.mlp(self.norm2(x)), own
+    def forward(self, x: Tensor) -> Tensor:
+        x = x + self.attention(self.norm1(x))
+        mixed: Tensor = x + self.mlp(self.norm2(x))
+        return mixed
 
 
 class Encoder(nn.Module):
-    """A stack of blocks over tokens of any scale."""
+    """A stack of blocks over tokens."""
 
     def __init__(self, dim: int, layers: int, heads: int, mlp_ratio: int) -> None:
         super().__init__()
         self.blocks = nn.ModuleList(EncoderBlock(dim, heads, mlp_ratio) for _ in range(layers))
         self.norm = nn.LayerNorm(dim)
 
-    def forward(self, x: Tensor, before: list[Memory] | None = None) -> tuple[Tensor, list[Memory]]:
-        """Encode (B, N, d) tokens that read ``before`` (one entry a layer) and each other."""
-        memory: list[Memory] = []
-        for layer, block in enumerate(self.blocks):
-            x, own = block(x, None if before is None else before[layer])
-            memory.append(own)
-        return self.norm(x), memory
+    def forward(self, x: Tensor) -> Tensor:
+        """Encode (B, N, d) tokens that read each other."""
+        for block in self.blocks:
+            x = block(x)
+        encoded: Tensor = self.norm(x)
+        return encoded
 
 
 def cut(image: Tensor, patch: int) -> Tensor:
@@ -124,8 +109,7 @@ class ChannelNorm(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         exact = torch.promote_types(x.dtype, torch.float32)
-        size = torch.linalg.vector_norm(x, dim=1, keepdim=True, dtype=exact)
-        scale = torch.rsqrt(size.square() / x.shape[1] + 1e-6)
+        scale = torch.rsqrt(x.to(exact).square().mean(dim=1, keepdim=True) + 1e-6)
         return x * scale * self.weight[None, :, None, None]
 
 
@@ -142,44 +126,38 @@ class Residual(nn.Module):
         return mixed
 
 
-class PatchStem(nn.Module):
-    """Patches of spectral columns to features at every level and ``side`` x ``side`` tokens."""
+class Stem(nn.Module):
+    """The way down: an image to features at every level, each half as large as the one before."""
 
-    def __init__(self, columns: int, widths: list[int], dim: int, side: int) -> None:
+    def __init__(self, inputs: int, widths: list[int]) -> None:
         super().__init__()
-        self.enter = nn.Conv2d(columns, widths[0], 1)
+        self.enter = nn.Conv2d(inputs, widths[0], 1)
         self.blocks = nn.ModuleList(Residual(width) for width in widths)
         self.down = nn.ModuleList(nn.Conv2d(upper, lower, 2, stride=2) for upper, lower in pairwise(widths))
-        self.token = nn.Conv2d(widths[-1], dim, BOTTOM // side, stride=BOTTOM // side)
 
-    def forward(self, patches: Tensor) -> tuple[list[Tensor], Tensor]:
-        """(P, columns, p, p) -> features of each level, finest first, and tokens (P, side^2, dim), row by row."""
-        x = self.enter(patches.contiguous(memory_format=torch.channels_last))  # convolutions run up to 3x as fast on it
+    def forward(self, image: Tensor) -> list[Tensor]:
+        """(B, inputs, y, x) -> features of each level, finest first."""
+        x = self.enter(image.contiguous(memory_format=torch.channels_last))  # convolutions run up to 3x as fast on it
         features = []
         for level, block in enumerate(self.blocks):
             if level:
                 x = self.down[level - 1](x)
             x = block(x)
             features.append(x)
-        # In bfloat16, channels last, a kernel that covers its whole input gives wrong sums (torch 2.13, CPU).
-        tokens = self.token(x.contiguous())
-        return features, tokens.flatten(2).transpose(1, 2)
+        return features
 
 
-class PatchHead(nn.Module):
-    """What tokens learned, and the stem's features, back up to features per pixel of each patch."""
+class Head(nn.Module):
+    """The way up: features of each level, and what was added to the lowest, to features of each pixel."""
 
-    def __init__(self, widths: list[int], dim: int, side: int) -> None:
+    def __init__(self, widths: list[int]) -> None:
         super().__init__()
-        self.side = side
-        self.context = nn.Conv2d(dim, widths[-1] * (BOTTOM // side) ** 2, 1)
         self.up = nn.ModuleList(nn.Conv2d(lower, 4 * upper, 1) for upper, lower in pairwise(widths))
         self.blocks = nn.ModuleList(Residual(width) for width in widths[:-1])
 
-    def forward(self, features: list[Tensor], tokens: Tensor) -> Tensor:
-        """Features of each level (P, c, y, x) and tokens (P, side^2, dim) -> (P, width, p, p)."""
-        grid = tokens.transpose(1, 2).reshape(-1, tokens.shape[-1], self.side, self.side)
-        x: Tensor = features[-1] + F.pixel_shuffle(self.context(grid), BOTTOM // self.side)
+    def forward(self, features: list[Tensor]) -> Tensor:
+        """Features of each level, finest first, (B, c, y, x) -> (B, width, y, x) of the finest."""
+        x = features[-1]
         for level in range(len(features) - 2, -1, -1):
             x = features[level] + F.pixel_shuffle(self.up[level](F.gelu(x)), 2)
             x = self.blocks[level](x)

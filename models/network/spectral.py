@@ -6,7 +6,7 @@ Pixels without a reading are filled from the rest of their patch; of which more 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ LONGEST_NM, SHORTEST_NM = 3000.0, 200.0
 SPREAD_FLOOR = 1e-3  # least spread of a column, as a fraction of the median spread
 VARIANCE_FLOOR = 1e-5  # least variance of a direction that whitening brings to 1, as a fraction of the largest
 Kind = TypeVar("Kind", bound=np.generic)
+PLANE_SCALES = np.array([4.0, 2.0, 2.0])  # of the logarithms of exposure, line spacing, binned samples
 MOST_DEAD = 0.5  # a token with more dead pixels than this fraction is not read
 MOST_COLUMN = 1e12  # of normalised columns: no reading gives more, and squares of more would end the range of float32
 
@@ -197,6 +198,25 @@ class Normalisation:
         return np.asarray((self.centre / self.spread) @ self.whitening, np.float32)
 
 
+class Capture(NamedTuple):
+    """How pixels were captured; without arguments by every line of the reference exposure."""
+
+    light: float = 1.0  # exposure as a fraction of the reference
+    step: float = 1  # line spacing [px]
+    binned: float = 1  # samples to a pixel
+
+    @property
+    def planes(self) -> NDArray[np.float32]:
+        """What the network reads beside spectral features, (3,): 0 for what is at least the reference."""
+        return np.asarray(np.log2(np.maximum([1 / self.light, self.step, self.binned], 1)) / PLANE_SCALES, np.float32)
+
+
+def with_planes(columns: NDArray[np.floating], capture: Capture) -> NDArray[np.float32]:
+    """Spectral features (..., column) with how they were captured behind them, (..., column + 3)."""
+    planes = np.broadcast_to(capture.planes, (*columns.shape[:-1], len(PLANE_SCALES)))
+    return np.concatenate([columns, planes], axis=-1, dtype=np.float32)
+
+
 def all_alive(columns: NDArray[np.floating]) -> bool:
     """Whether no pixel is dead, without a copy of the columns."""
     return not columns.size or bool(columns.min() >= -MOST_COLUMN and columns.max() <= MOST_COLUMN)
@@ -220,11 +240,9 @@ def fill_dead(patches: NDArray[np.floating], dead: NDArray[np.bool_]) -> NDArray
     return filled
 
 
-def readable(dead: NDArray[np.bool_], side: int = 1) -> NDArray[np.bool_]:
-    """Which of ``side`` x ``side`` tokens a patch can be read, (P, y, x) dead pixels -> (P, side^2), row by row."""
-    count, height, width = dead.shape
-    cells = dead.reshape(count, side, height // side, side, width // side)
-    return np.asarray(cells.mean(axis=(2, 4)) <= MOST_DEAD, np.bool_).reshape(count, side * side)
+def readable(dead: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which patches can be read, (P, y, x) dead pixels -> (P,)."""
+    return np.asarray(dead.mean(axis=(1, 2)) <= MOST_DEAD, np.bool_)
 
 
 def patches_of(image: NDArray[Kind], patch: int) -> NDArray[Kind]:

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
 
-from models.network.sizes import GATES, OTHERS, TemporalSizes
+from models.network.sizes import CELL_PX, GATES, OTHERS, TemporalSizes
 
 FAINT = 10.0  # logarithms of probabilities are read down to minus this
 STARTS = (2.2, 0.0, -1.0)  # of the gates, before anything is learned
@@ -58,7 +58,7 @@ class TemporalReader(nn.Module):
         change = (coarse_now - coarse_before) * comparable
         below = F.gelu(self.coarse_enter(torch.cat([coarse_now * comparable, change, comparable], dim=1)))
         below = F.gelu(self.coarse_leave(below))
-        below = F.interpolate(below, scale_factor=float(self.sizes.factor), mode="nearest")
+        below = F.interpolate(below, scale_factor=float(CELL_PX), mode="nearest")
         today = observation * seen
         taken = torch.stack([light.log(), step.log2()], dim=1)[:, :, None, None].expand(-1, 2, *size)
         scaled = [(part / 4).clamp(-FAINT / 4, 0) for part in (prior_map, today)]

@@ -10,6 +10,7 @@ import scipy
 from numpy.typing import NDArray
 
 from models.network.sizes import SCORER_WIDTH, SegmenterConfig, scorer_inputs
+from models.network.spectral import patches_of
 from models.reading.inference import CoarsePrediction
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import SceneGrid, patch_pixels
@@ -52,9 +53,9 @@ def score_patches(
 
 def score_multiply_adds(policy: str, config: SegmenterConfig, grid: SceneGrid) -> int:
     """Multiply-adds of scoring every patch of a grid."""
-    pixels = (grid.padded_shape[0] // config.factor) * (grid.padded_shape[1] // config.factor)
-    if policy == "gain":  # entropy and pooling per coarse pixel, then the network per patch
-        inputs, patches = scorer_inputs(config), pixels // (config.patch // config.factor) ** 2
+    pixels = grid.padded_shape[0] * grid.padded_shape[1]
+    if policy == "gain":  # entropy and pooling per pixel, then the network per patch
+        inputs, patches = scorer_inputs(config), pixels // config.patch**2
         per_patch = SCORER_WIDTH * (inputs + 9 + SCORER_WIDTH + 1) + 1
         return pixels * (2 + config.classes + inputs) + patches * per_patch
     score = _PIXEL_SCORES.get(policy)
@@ -95,15 +96,15 @@ GLANCING_POLICIES = ("gain", "entropy")  # those that ask what the network made 
 
 
 def _patch_means(pixels: NDArray[np.float64], seen: CoarsePrediction) -> Scores:
-    """Mean over the coarse pixels of each patch that lie on the scene (their share decides at the border)."""
-    grid, cells = seen.grid, seen.grid.patch // seen.grid.factor
-    sizes = zip((grid.height, grid.width), pixels.shape, strict=True)
-    down, across = (np.clip(px / grid.factor - np.arange(n), 0.0, 1.0) for px, n in sizes)
-    coarse = down[:, None] * across[None, :]  # fraction of each coarse pixel that lies on the scene
-    rows, columns = grid.patch_shape
-    weighted = (pixels * coarse).reshape(rows, cells, columns, cells).sum(axis=(1, 3))
-    fraction = coarse.reshape(rows, cells, columns, cells).sum(axis=(1, 3))
-    means: Scores = np.divide(weighted, fraction, out=np.zeros((rows, columns)), where=fraction > 0)
+    """Mean over the pixels of each patch that lie on the scene."""
+    grid = seen.grid
+    on_scene = np.zeros(grid.padded_shape)
+    on_scene[: grid.height, : grid.width] = 1.0
+    total, count = (
+        patches_of(image, grid.patch).sum(axis=(1, 2)).reshape(grid.patch_shape)
+        for image in (pixels * on_scene, on_scene)
+    )
+    means: Scores = np.divide(total, count, out=np.zeros(grid.patch_shape), where=count > 0)
     return means
 
 

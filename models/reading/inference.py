@@ -1,16 +1,17 @@
-"""Use of a trained segmenter on one scene: predict coarsely, then continue with the fine patches."""
+"""Use of a trained segmenter on one scene: an overview of everything, then a full reading of chosen patches."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import itertools
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from models.network.sizes import SegmenterConfig
-from models.network.spectral import all_alive, dead_pixels, fill_dead, patches_of, readable
+from models.network.sizes import PATCHES_AT_ONCE, TOKEN_PX
+from models.network.spectral import Capture, all_alive, dead_pixels, fill_dead, patches_of, readable, with_planes
 from models.weights.files import Weights
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
@@ -21,17 +22,20 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-    from models.network.segmenter import CoarseReading, Segmenter
+    from models.network.segmenter import Overview, Segmenter
 else:
     torch = deferred("torch")
+
+ROWS_DRAWN = 64  # at once
 
 
 @dataclass(frozen=True)
 class CoarsePass:
-    """The coarse pass of a scene, or of a region of a field, on the padded coarse grid."""
+    """What the overview reads of a scene, or of a region of a field, on the padded grid."""
 
     grid: SceneGrid
     columns: NDArray[np.float32]  # (y, x, column) normalised
+    capture: Capture = field(default=Capture(), kw_only=True)
     origin: tuple[int, int] = field(default=(0, 0), kw_only=True)  # row and column of the field's patch it begins at
     living: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (token,) which are read; None: all
     out_of_range: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (y, x) of the scene: seen, and unread
@@ -44,21 +48,29 @@ class CoarsePass:
             self.columns if self.filled is None else np.where(self.filled[..., None], np.float32(np.nan), self.columns)
         )
 
+    def patches(self, patch_index: NDArray[np.integer]) -> NDArray[np.float32]:
+        """The columns of some patches, (patch, p, p, column)."""
+        return np.asarray(patches_of(self.columns, self.grid.patch)[patch_index], np.float32)
+
 
 @dataclass(frozen=True)
 class Read:
-    """A reading of a coarse pass, by whom and of what: the fine patches go on from there."""
+    """An overview, by whom and of what: the full network corrects it."""
 
     by: Segmenter
-    columns: NDArray[np.float32]
-    origin: tuple[int, int]
-    reading: CoarseReading
-    living: NDArray[np.bool_] | None = None
+    of: CoarsePass
+    overview: Overview
+
+    def counts_for(self, weights: Weights, coarse_pass: CoarsePass) -> bool:
+        """Whether these weights would read the same of this coarse pass."""
+        alike = self.of.columns is coarse_pass.columns and self.of.living is coarse_pass.living
+        told = self.of.origin == coarse_pass.origin and self.of.capture == coarse_pass.capture
+        return self.by is weights.segmenter and alike and told
 
 
 @dataclass(frozen=True)
 class CoarsePrediction(CoarsePass):
-    """What the coarse pass alone says of a scene, on the padded coarse grid."""
+    """What the overview says of a scene, on the padded grid."""
 
     probability: NDArray[np.float32]  # (y, x, class)
     gain: NDArray[np.float32] | None = field(default=None, kw_only=True)  # (patch_y, patch_x) expected [nat per px]
@@ -81,14 +93,20 @@ class DrawnMap:
 
 
 def coarse_prediction(
-    weights: Weights, coarse: NDArray[np.floating], wavelength_nm: NDArray[np.floating], grid: SceneGrid
+    weights: Weights,
+    values: NDArray[np.floating],
+    wavelength_nm: NDArray[np.floating],
+    grid: SceneGrid,
+    *,
+    capture: Capture = Capture(),  # noqa: B008 - a value
+    factor: int = 1,
 ) -> CoarsePrediction:
-    """Read the coarse mosaic alone.
+    """Read an overview of scene values (y, x, band), in pixels of ``factor`` fine ones; NaN where none was captured.
 
-    ``coarse`` (y, x, band) are scene values of the coarse pass, of shape ``grid.coarse_shape``; NaN where nothing was
-    captured. What is no reading by the weights' `most_value` counts as NaN.
+    A value that is no reading by the weights' `most_value` counts as NaN.
     """
-    return read_coarse_prediction(weights, read_coarse_pass(weights, [coarse], wavelength_nm, grid))
+    seen = read_coarse_pass(weights, [values], wavelength_nm, grid, capture=capture, factor=factor)
+    return read_coarse_prediction(weights, seen)
 
 
 def read_coarse_pass(
@@ -97,16 +115,18 @@ def read_coarse_pass(
     wavelength_nm: NDArray[np.floating],
     grid: SceneGrid,
     *,
+    capture: Capture = Capture(),  # noqa: B008 - a value
+    factor: int = 1,
     origin: tuple[int, int] = (0, 0),
     components: Components | None = None,
 ) -> CoarsePass:
-    """Bring the coarse mosaic to the spectral columns of the weights, some rows at a time.
+    """Bring a mosaic to the spectral columns of the weights, some rows at a time; coarse pixels are repeated.
 
-    ``strips`` are (y, x, band) parts of the mosaic from the top down, together of the shape ``grid.coarse_shape``, or
-    (y, x, component) scores of ``components``; ``origin`` is the row and column of the patch of a larger field in which
-    the grid begins.
+    ``strips`` are (y, x, band) parts of the mosaic from the top down, together the scene in pixels of ``factor`` fine
+    ones a side, or (y, x, component) scores of ``components``; ``origin`` is the row and column of the patch of a
+    larger field in which the grid begins.
     """
-    rows, width = grid.coarse_shape
+    s, (rows, width) = factor, (-(-grid.height // factor), -(-grid.width // factor))
     columns, filled = np.empty((rows, width, weights.config.columns), np.float32), 0
     known = np.zeros((rows, width), np.bool_)
     for strip in strips:
@@ -117,60 +137,74 @@ def read_coarse_pass(
             columns[filled:last] = weights.columns_of_scores(strip, components, wavelength_nm)
         known[filled:last] = ~np.isnan(strip).all(axis=-1)
         filled = last
-    y, x = grid.padded_shape
-    columns = np.ascontiguousarray(pad_by_reflection(columns, (y // grid.factor, x // grid.factor)), np.float32)
+    wild = (dead_pixels(columns) & known).repeat(s, 0).repeat(s, 1)[: grid.height, : grid.width]
+    fine = columns.repeat(s, 0).repeat(s, 1)[: grid.height, : grid.width] if s > 1 else columns
+    columns = np.ascontiguousarray(pad_by_reflection(fine, grid.padded_shape), np.float32)
     dead = dead_pixels(columns)
-    wild = dead[:rows, :width] & known
     return CoarsePass(
         grid,
         columns,
+        capture=capture,
         origin=origin,
-        living=_mend(columns, weights.config),
+        living=_mend(columns, grid.patch),
         out_of_range=wild if wild.any() else None,
         filled=dead if dead.any() else None,
     )
 
 
-def _mend(columns: NDArray[np.float32], config: SegmenterConfig) -> NDArray[np.bool_] | None:
-    """Fill dead pixels of coarse columns from their patch, in place, and tell which tokens live (None: all)."""
+def _mend(columns: NDArray[np.float32], p: int) -> NDArray[np.bool_] | None:
+    """Fill dead pixels from their patch, in place, and tell which tokens live (None: all)."""
     dead = dead_pixels(columns)
     if not dead.any():
         return None
-    p, holes = config.patch, patches_of(dead, config.patch)
+    holes = patches_of(dead, p)
     for number in np.flatnonzero(holes.any(axis=(1, 2))):  # one by one: a copy of a field may not fit the memory
         y, x = (p * int(at) for at in divmod(number, columns.shape[1] // p))
         columns[y : y + p, x : x + p] = fill_dead(columns[None, y : y + p, x : x + p], holes[number][None])[0]
-    return readable(holes, config.token_side).ravel()
+    whole = np.pad(dead, [(0, -size % TOKEN_PX) for size in dead.shape], mode="edge")
+    return readable(patches_of(whole, TOKEN_PX))
 
 
-def coarse_prediction_of_columns(weights: Weights, columns: NDArray[np.generic], grid: SceneGrid) -> CoarsePrediction:
-    """Read normalised columns of the padded coarse grid, (y, x, column); dead ones count as in a mosaic."""
+def coarse_prediction_of_columns(
+    weights: Weights,
+    columns: NDArray[np.generic],
+    grid: SceneGrid,
+    capture: Capture = Capture(),  # noqa: B008 - a value
+) -> CoarsePrediction:
+    """Read normalised columns of the padded grid, (y, x, column); dead ones count as in a mosaic."""
     given = np.ascontiguousarray(columns, np.float32)
     mended = given if all_alive(given) else given.copy()
-    return read_coarse_prediction(weights, CoarsePass(grid, mended, living=_mend(mended, weights.config)))
+    living = _mend(mended, grid.patch)
+    return read_coarse_prediction(weights, CoarsePass(grid, mended, capture=capture, living=living))
 
 
-def coarse_prediction_of_patches(weights: Weights, columns: NDArray[np.float32], grid: SceneGrid) -> CoarsePrediction:
-    """Read the means over coarse pixels of all patches of the padded grid, (patch, p, p, column), as a uniform scan."""
-    down, across = grid.patch_shape
-    p, s = grid.patch, grid.factor
-    cells = columns.reshape(down, across, p // s, s, p // s, s, -1).mean(axis=(3, 5), dtype=np.float32)
-    small = cells.swapaxes(1, 2).reshape(down * p // s, across * p // s, -1)
-    return coarse_prediction_of_columns(weights, small, grid)
+def coarse_prediction_of_patches(
+    weights: Weights,
+    patches: NDArray[np.float32],
+    grid: SceneGrid,
+    capture: Capture = Capture(),  # noqa: B008 - a value
+) -> CoarsePrediction:
+    """Read normalised columns of all patches of the padded grid, (patch, p, p, column)."""
+    (down, across), (y, x) = grid.patch_shape, grid.padded_shape
+    image = patches.reshape(down, across, grid.patch, grid.patch, -1).swapaxes(1, 2).reshape(y, x, -1)
+    return coarse_prediction_of_columns(weights, image, grid, capture)
 
 
 def read_coarse_prediction(weights: Weights, coarse_pass: CoarsePass) -> CoarsePrediction:
-    """Read a coarse pass alone."""
+    """Read the overview of a coarse pass."""
     with torch.inference_mode():
-        reading = _read_coarse(weights, coarse_pass)
+        overview = overview_of(weights, coarse_pass)
         return CoarsePrediction(
             coarse_pass.grid,
             coarse_pass.columns,
-            np.ascontiguousarray(reading.logits[0].softmax(dim=0).permute(1, 2, 0).cpu().numpy()),
+            np.ascontiguousarray(overview.logits[0].softmax(dim=0).permute(1, 2, 0).cpu().numpy()),
+            capture=coarse_pass.capture,
             origin=coarse_pass.origin,
             living=coarse_pass.living,
-            gain=weights.segmenter.score(reading)[0].cpu().numpy(),
-            read=Read(weights.segmenter, coarse_pass.columns, coarse_pass.origin, reading, coarse_pass.living),
+            out_of_range=coarse_pass.out_of_range,
+            filled=coarse_pass.filled,
+            gain=weights.segmenter.score(overview)[0].cpu().numpy(),
+            read=Read(weights.segmenter, coarse_pass, overview),
         )
 
 
@@ -180,49 +214,68 @@ def segment(
     patches: NDArray[np.floating],
     patch_index: NDArray[np.integer],
     *,
+    capture: Capture | None = None,
     every_class: bool = False,
 ) -> DrawnMap:
-    """Draw the class map from the coarse pass and the fine patches, of the scene's own size.
+    """Draw the class map from the overview and the patches that are read in full, of the scene's own size.
 
-    ``patches`` (patch, p, p, column) are normalised columns of the fine pass. A dead pixel (see `dead_pixels`) counts
-    as the mean of its patch; a patch of which more than half is dead counts as not captured. ``patch_index`` (patch,)
-    are their numbers on the grid, each once; without one the map is the coarse prediction brought up to the fine grid.
-    With ``every_class`` the map holds the log-probabilities of all classes too.
+    ``patches`` (patch, p, p, column) are normalised columns, captured as ``capture`` says, or as the overview's where
+    None. A dead pixel (see `dead_pixels`) counts as the mean of its patch; a patch of which more than half is dead
+    counts as not captured. ``patch_index`` (patch,) are their numbers on the grid, each once; without one the map is
+    the overview's. With ``every_class`` the map holds the log-probabilities of all classes too.
 
     Raises ShapeError for a patch given twice or outside the grid.
     """
-    numbers = np.asarray(patch_index, np.int64)
+    numbers = np.ascontiguousarray(patch_index, np.int64)
     check_patch_index(numbers, seen.grid)
     own, numbers = captured(patches, numbers)
-    p = weights.config.patch
     with torch.inference_mode():
-        reading = reading_of(weights, seen)
-        drawn = draw_coarse(_tempered(reading.logits.cpu(), weights), seen.grid, every_class=every_class)
-        places = iter(seen.grid.patch_origin(numbers))
-        for read in weights.segmenter.eval().read_fine_in_chunks(
-            reading, own, torch.from_numpy(numbers), origin_of(seen)
+        overview = overview_of(weights, seen)
+        logits = overview.logits[0].cpu().clone()
+        for (y, x), read in zip(
+            seen.grid.patch_origin(numbers),
+            itertools.chain.from_iterable(
+                patch_logits(weights, overview, own, numbers, seen.capture if capture is None else capture)
+            ),
+            strict=True,
         ):
-            logits = _tempered(read.cpu(), weights)
-            confidence, classes = (part.numpy() for part in decide(logits, dim=1))
-            every = logits.log_softmax(dim=1).permute(0, 2, 3, 1).numpy() if every_class else confidence
-            for sure, values, all_of_it, (y, x) in zip(confidence, classes, every, places, strict=False):
-                drawn.classes[y : y + p, x : x + p] = values
-                drawn.confidence[y : y + p, x : x + p] = sure
-                if drawn.log_probability is not None:
-                    drawn.log_probability[y : y + p, x : x + p] = all_of_it
-    return drawn.of_scene(seen.grid)
+            logits[:, y : y + read.shape[1], x : x + read.shape[2]] = read
+        return draw(_tempered(logits, weights), every_class=every_class).of_scene(seen.grid)
+
+
+def patch_logits(
+    weights: Weights,
+    overview: Overview,
+    patches: NDArray[np.floating],
+    patch_index: NDArray[np.int64],
+    capture: Capture,
+) -> Iterator[Tensor]:
+    """Logits of patches (patch, p, p, column) read in full, (some, class, p, p) at a time.
+
+    Chunks fit the processor's caches; what is not finite counts as 0, the median.
+    """
+    network = weights.segmenter
+    for first in range(0, len(patches), PATCHES_AT_ONCE):
+        chunk = torch.from_numpy(with_planes(patches[first : first + PATCHES_AT_ONCE], capture)).nan_to_num_(
+            0.0, 0.0, 0.0
+        )
+        index = torch.from_numpy(patch_index[first : first + PATCHES_AT_ONCE])[None].to(network.device)
+        yield network.read_patches(overview, chunk.permute(0, 3, 1, 2)[None].to(network.device), index)[0].cpu()
 
 
 def map_of_columns(
-    weights: Weights, coarse: NDArray[np.generic], fine: NDArray[np.floating], grid: SceneGrid
+    weights: Weights,
+    columns: NDArray[np.floating],
+    grid: SceneGrid,
+    capture: Capture = Capture(),  # noqa: B008 - a value
 ) -> tuple[DrawnMap, NDArray[np.float32]]:
-    """Read a scene whole, by normalised columns (y, x, column) of the padded grids; its map, and all log-probabilities.
+    """Read a scene whole, by normalised columns (y, x, column) of the padded grid; its map, and all log-probabilities.
 
     Raises as `segment`.
     """
     patch_index = grid.valid_patches()
-    cells = patches_of(fine, grid.patch)[patch_index].astype(np.float32)
-    drawn = segment(weights, coarse_prediction_of_columns(weights, coarse, grid), cells, patch_index, every_class=True)
+    seen = coarse_prediction_of_columns(weights, columns, grid, capture)
+    drawn = segment(weights, seen, seen.patches(patch_index), patch_index, every_class=True)
     assert drawn.log_probability is not None
     return drawn, drawn.log_probability
 
@@ -239,7 +292,7 @@ def captured(
     dead = dead_pixels(patches)
     if not dead.any():
         return patches, patch_index
-    shown = readable(dead)[:, 0]
+    shown = readable(dead)
     return fill_dead(patches[shown], dead[shown]), patch_index[shown]
 
 
@@ -253,45 +306,30 @@ def check_patch_index(patch_index: NDArray[np.int64], grid: SceneGrid) -> None:
         raise ShapeError(f"patch {repeated[0]} is given more than once; give each patch one patch")
 
 
-def reading_of(weights: Weights, coarse_pass: CoarsePass) -> CoarseReading:
-    """Read a coarse pass. Nothing flows back from fine patches, so a reading that a glance kept is not made twice."""
-    if isinstance(coarse_pass, CoarsePrediction) and (kept := coarse_pass.read) is not None:
-        same = (
-            kept.by is weights.segmenter and kept.columns is coarse_pass.columns and kept.living is coarse_pass.living
-        )
-        if same and kept.origin == coarse_pass.origin:
-            return kept.reading
-    return _read_coarse(weights, coarse_pass)
+def overview_of(weights: Weights, coarse_pass: CoarsePass) -> Overview:
+    """Read the overview of a coarse pass; one that a coarse prediction kept is not made twice."""
+    kept = coarse_pass.read if isinstance(coarse_pass, CoarsePrediction) else None
+    if kept is not None and kept.counts_for(weights, coarse_pass):
+        return kept.overview
+    network = weights.segmenter.eval()
+    image = torch.from_numpy(with_planes(coarse_pass.columns, coarse_pass.capture)).permute(2, 0, 1)[None]
+    living = None if coarse_pass.living is None else torch.from_numpy(coarse_pass.living).to(network.device)
+    patches = TOKEN_PX / coarse_pass.grid.patch  # of a token
+    origin = torch.tensor([coarse_pass.origin], dtype=torch.float64) / patches
+    return network.read_overview(image.to(network.device), origin, living)
 
 
-def _read_coarse(weights: Weights, coarse_pass: CoarsePass) -> CoarseReading:
-    image = torch.from_numpy(coarse_pass.columns).permute(2, 0, 1)[None]
-    living = None if coarse_pass.living is None else torch.from_numpy(coarse_pass.living)
-    return weights.segmenter.eval().read_coarse_in_chunks(image, origin_of(coarse_pass), living)
-
-
-def origin_of(coarse_pass: CoarsePass) -> Tensor | None:
-    """Patch of the field in which a look begins, (1, 2); None at the field's own corner."""
-    return torch.tensor([coarse_pass.origin]) if any(coarse_pass.origin) else None
-
-
-def draw_coarse(logits: Tensor, grid: SceneGrid, *, every_class: bool = False) -> DrawnMap:
-    """Bring coarse logits up to the padded fine grid and decide, in strips of rows."""
-    y, x = grid.padded_shape
-    every = np.empty((y, x, logits.shape[1]), np.float32) if every_class else None
+def draw(logits: Tensor, *, every_class: bool = False) -> DrawnMap:
+    """Decide on the class of each pixel by logits (class, y, x), some rows at a time."""
+    _, y, x = logits.shape
+    every = np.empty((y, x, len(logits)), np.float32) if every_class else None
     drawn = DrawnMap(np.empty((y, x), np.uint8), np.empty((y, x), np.float32), every)
-    cell = grid.patch
-    padded = torch.nn.functional.pad(logits, (0, 0, 1, 1), mode="replicate")
-    padded = padded.contiguous(memory_format=torch.channels_last)
-    for top in range(0, y // grid.factor, cell):
-        strip = torch.nn.functional.interpolate(
-            padded[:, :, top : top + cell + 2], scale_factor=grid.factor, mode="bilinear", align_corners=False
-        )[0, :, grid.factor : -grid.factor]
-        confidence, classes = decide(strip, dim=0)
-        rows = slice(top * grid.factor, (top + cell) * grid.factor)
+    for top in range(0, y, ROWS_DRAWN):
+        rows = slice(top, top + ROWS_DRAWN)
+        confidence, classes = decide(logits[:, rows], dim=0)
         drawn.classes[rows], drawn.confidence[rows] = classes.numpy(), confidence.numpy()
         if drawn.log_probability is not None:
-            drawn.log_probability[rows] = strip.log_softmax(dim=0).permute(1, 2, 0).numpy()
+            drawn.log_probability[rows] = logits[:, rows].log_softmax(dim=0).permute(1, 2, 0).numpy()
     return drawn
 
 

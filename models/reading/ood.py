@@ -14,6 +14,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from models.network.spectral import Capture
+
 Floats = NDArray[np.float32]
 Exact = NDArray[np.float64]
 PIXELS_AT_ONCE = 1 << 14  # so many lie in the processor's cache with their columns
@@ -31,7 +33,7 @@ class Limits:
     fine: Exact  # (step, light, rate)
     coarse: Exact  # (light, rate) of a coarse pass
 
-    def at(self, rate: float, light: float, step: int | None) -> float:
+    def at(self, rate: float, light: float, step: float | None) -> float:
         """The distance for a rate, even in the logarithms of rate and light; ``step`` None is the coarse pass.
 
         Light and rates beyond those that were measured count as the nearest that was, other steps as the next wider.
@@ -66,17 +68,14 @@ class OodDetector:
         parts = np.stack([back @ _whitening(one) for one in spread]) / np.sqrt(columns)
         return LitDetector(*(one.astype(np.float32) for one in (base, self.centres @ base, parts)))
 
-    def unknown(
-        self, columns: NDArray[np.floating], *, rate: float, light: float, step: int | None, bands: int, factor: int = 1
-    ) -> NDArray[np.bool_]:
+    def unknown(self, columns: NDArray[np.floating], *, rate: float, capture: Capture, bands: int) -> NDArray[np.bool_]:
         """Pixels (..., column) that lie farther away than all but a fraction ``rate`` of known ones, (...).
 
-        ``light``: Exposure as a fraction of the reference. ``step``: As of `Limits.at`. ``bands``: Of the camera.
-        ``factor``: Readings that a pixel of a coarse pass is the mean of. A pixel without columns is not unknown.
+        ``bands``: Of the camera. A binned pixel is the mean of as many readings. One without columns is not unknown.
         """
-        limit = self.limits.at(rate, light, step)
-        readings = (factor if step is None else 1) * min(1.0, bands / self.bands)  # fewer bands are as fewer readings
-        distance = self.lit(light, readings).distance(columns)
+        limit = self.limits.at(rate, capture.light, None if capture.binned > 1 else capture.step)
+        readings = capture.binned * min(1.0, bands / self.bands)  # fewer bands are as fewer readings
+        distance = self.lit(capture.light, readings).distance(columns)
         with np.errstate(invalid="ignore"):
             return np.asarray(distance > limit, np.bool_)
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from models.evaluation.expected_scores import expected_counts
 from models.evaluation.metrics import confusion, kappa, overall_accuracy
+from models.network.sizes import CELL_PX
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import deferred
 from pipeline.products.areas import BLOCK_PX
@@ -64,7 +65,7 @@ class CurrentVisit:
 
     log_probability: Floats  # (y, x, class); NaN where nothing can be said
     seen: NDArray[np.bool_]  # (y, x) where it went in detail
-    coarse: Floats  # (y / s, x / s, column) normalised; NaN where nothing was seen
+    coarse: Floats  # (y / 2, x / 2, column) by `pooled`; NaN where nothing was seen
     light: float  # exposure of a line as a fraction of the reference
     step: int  # pixels from line to line
 
@@ -76,6 +77,17 @@ class PriorMap:
     probabilities: ClassProbabilities
     coarse: Floats | None  # as `CurrentVisit`'s, of the last look; None where it cannot be compared
     days: float
+
+
+def pooled(columns: Floats) -> Floats:
+    """Bring spectral features (y, x, column) to the pixels that a reader sees: means of 2 x 2, of those known."""
+    y, x = (-size % CELL_PX for size in columns.shape[:2])
+    whole = np.pad(columns, [(0, y), (0, x), (0, 0)], mode="edge") if y or x else columns
+    parts = np.stack([whole[i::CELL_PX, j::CELL_PX] for i in range(CELL_PX) for j in range(CELL_PX)])
+    known = np.isfinite(parts)
+    sums = np.where(known, parts, np.float32(0)).sum(axis=0)
+    count = known.sum(axis=0, dtype=np.float32)
+    return np.where(count > 0, sums / np.maximum(count, 1), np.float32(np.nan))
 
 
 def first_probabilities(observation: CurrentVisit) -> ClassProbabilities:
@@ -94,7 +106,7 @@ def fuse(memory: PriorMap, observation: CurrentVisit, reader: TemporalReader | N
     today = observation.log_probability
     y = len(today)
     kept, ages, light = np.empty_like(today), *np.empty((2, *observation.seen.shape), np.float32)
-    s = 1 if reader is None else reader.sizes.factor
+    s = CELL_PX
     high, halo = max(ROWS // s, 1) * s, -(-(3 * s + SEEN_PX) // s) * s
     for top in range(
         0, y, high
@@ -114,7 +126,7 @@ CARRIED_AS_BY = (0.05, 2)  # the light and step of a look that sees nothing, for
 def carried(memory: PriorMap, reader: TemporalReader | None) -> ClassProbabilities:
     """Bring a memory to today without a look: what is believed where nobody goes, and how surely."""
     shape = memory.probabilities.log_probability.shape
-    s, columns = (1, 1) if reader is None else (reader.sizes.factor, reader.sizes.columns)
+    s, columns = CELL_PX, 1 if reader is None else reader.sizes.columns
     unseen, coarse = np.zeros(shape[:2], np.bool_), (-(-shape[0] // s), -(-shape[1] // s), columns)
     nothing = CurrentVisit(_nothing(shape), unseen, _nothing(coarse), *CARRIED_AS_BY)
     return fuse(memory, nothing, reader)
@@ -211,7 +223,7 @@ def _read(
     rows: slice,
 ) -> Floats:
     """What the reader says of images of some rows, which begin with a coarse pixel."""
-    s, (y, x) = reader.sizes.factor, images[2].shape
+    s, (y, x) = CELL_PX, images[2].shape
     down, across = -(-y // s), -(-x // s)
     cells = slice(rows.start // s, rows.start // s + down)
     now = observation.coarse[cells, :across]

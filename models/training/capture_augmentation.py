@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from models.network.spectral import Normalisation
+from models.network.spectral import Capture, Normalisation, with_planes
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS
 
 REFERENCE_MS = DEFAULT_EXPOSURE_MS  # exposures are told as fractions of this one, at which looks are made
-STEPS = MappingProxyType({1: 0.5, 2: 0.4, 4: 0.1})  # how often crops have lines so many pixels apart
+STEPS = MappingProxyType({1: 0.45, 2: 0.3, 4: 0.2, 8: 0.05})  # how often crops have lines so many pixels apart
+UNIFORM, INTERLACED, TWO_PASSES = range(3)
+KINDS_OF_CAPTURE = (0.65, 0.2, 0.15)  # how often
+BINNED = 4  # lines and samples of a coarse pass to a pixel
 DARKEST_COARSE_MS = 10.0  # of a coarse pass, whose samples are read in fours
 TINY = 1e-9  # added to correlations, which rounding may leave with an eigenvalue below 0
 Matrix = NDArray[np.float64]
@@ -62,60 +64,65 @@ class ColumnNoise:
 
 
 class CaptureAugmentation:
-    """Turns crops of the reference exposure into what shorter exposures and wider steps would have shown."""
+    """Turns crops of the reference exposure into what shorter exposures and wider line spacings would have shown.
 
-    def __init__(
-        self,
-        normalisation: Normalisation,
-        *,
-        darkest_ms: float = 3.0,
-        steps: Mapping[int, float] = STEPS,
-        own_coarse: float = 0.3,
-    ) -> None:
-        """``steps``: how often lines are so many pixels apart; ``own_coarse``: how often there is a coarse pass."""
-        self.normalisation, self.darkest_ms, self.own_coarse = normalisation, darkest_ms, own_coarse
-        self.steps = steps
+    What is given back has the planes of `models.network.spectral.Capture` behind the spectral features.
+    """
+
+    def __init__(self, normalisation: Normalisation, *, darkest_ms: float = 3.0) -> None:
+        self.normalisation, self.darkest_ms = normalisation, darkest_ms
         self.unwhiten = np.linalg.inv(normalisation.whitening.astype(np.float64)).astype(np.float32)
 
-    def draw(
-        self, fine: Columns, coarse: Columns, noise: ColumnNoise, factor: int, rng: np.random.Generator
-    ) -> tuple[Columns, Columns]:
-        """Show a crop as a look drawn by chance: exposure (its logarithm is even), step, and a coarse pass or none.
+    def draw(self, columns: Columns, noise: ColumnNoise, rng: np.random.Generator) -> tuple[Columns, Columns]:
+        """Show a crop (y, x, column) as a capture drawn by chance: what the overview reads, and the full network.
 
-        ``fine`` and ``coarse`` are whitened columns of the reference exposure, the coarse pixels ``factor`` times as
-        wide; what comes back has their shapes.
+        A uniform scan; two of them, of which one covers a rectangle (lines captured between others); or two passes,
+        where the overview reads binned pixels and the full network a scan. Exposures are even in their logarithm.
         """
-        light = _drawn_light(self.darkest_ms, rng)
-        step = drawn_step(self.steps, factor, rng)
-        plain, means = self.scan(fine, noise, factor, light=light, step=step, rng=rng)
-        if rng.random() >= self.own_coarse:
-            return plain, means
-        light = _drawn_light(max(self.darkest_ms, DARKEST_COARSE_MS), rng)
-        return plain, self.coarse_pass(coarse, noise, factor, light=light, rng=rng)
+        kind = rng.choice(3, p=KINDS_OF_CAPTURE)
+        odds = {step: often for step, often in STEPS.items() if len(columns) % step == 0}
+        step = int(rng.choice(list(odds), p=np.array(list(odds.values())) / sum(odds.values())))
+        image = self.scan(columns, noise, light=self._light(rng), step=step, rng=rng)
+        if kind == TWO_PASSES:
+            light = max(self._light(rng), DARKEST_COARSE_MS / REFERENCE_MS)
+            return self.coarse_pass(columns, noise, light=light, rng=rng), image
+        if kind == INTERLACED and step > 1:
+            finer = step // int(rng.choice([own for own in (2, 4, 8) if own <= step]))
+            (top, bottom), (left, right) = (
+                sorted(rng.integers(0, size // step + 1, 2) * step) for size in image.shape[:2]
+            )
+            part = np.s_[top:bottom, left:right]
+            if bottom > top and right > left:
+                image[part] = self.scan(columns[part], noise, light=self._light(rng), step=finer, rng=rng)
+        return image, image
 
-    def coarse_pass(
-        self, coarse: Columns, noise: ColumnNoise, factor: int, *, light: float, rng: np.random.Generator
-    ) -> Columns:
-        """Show a coarse pass of the reference exposure as one of another, ``light`` its fraction of the reference."""
-        own = self._noisy(coarse @ self.unwhiten, noise, light, rng, samples=factor, readings=factor)
-        return np.asarray(own @ self.normalisation.whitening, np.float32)
+    def _light(self, rng: np.random.Generator) -> float:
+        """An exposure between the darkest and the reference, as a fraction of that."""
+        return float(np.exp(rng.uniform(np.log(self.darkest_ms / REFERENCE_MS), 0.0)))
 
     def scan(
-        self, fine: Columns, noise: ColumnNoise, factor: int, *, light: float, step: int, rng: np.random.Generator
-    ) -> tuple[Columns, Columns]:
-        """Show a crop as a uniform scan: fine pixels by lines ``step`` px apart, and the coarse ones that they make.
+        self, columns: Columns, noise: ColumnNoise, *, light: float, step: int, rng: np.random.Generator
+    ) -> Columns:
+        """Show a crop as a uniform scan of lines ``step`` px apart, rows between them by interpolation.
 
-        ``light`` is the exposure as a fraction of the reference; ``step`` divides ``factor``.
+        ``light`` is the exposure as a fraction of the reference; ``step`` is a power of two that divides the rows.
         """
-        scaled, whitening = fine @ self.unwhiten, self.normalisation.whitening
+        scaled = columns @ self.unwhiten
         if step > 1:
             scaled = scaled.reshape(-1, step, *scaled.shape[1:]).mean(axis=1)
         scaled = self._noisy(scaled, noise, light, rng, samples=step)
-        rows, columns = scaled.shape[0] * step // factor, scaled.shape[1] // factor
-        means = scaled.reshape(rows, factor // step, columns, factor, -1).mean(axis=(1, 3))
         for _ in range(step.bit_length() - 1):
             scaled = _twice_the_rows(scaled)
-        return np.asarray(scaled @ whitening, np.float32), np.asarray(means @ whitening, np.float32)
+        return with_planes(scaled @ self.normalisation.whitening, Capture(light, step))
+
+    def coarse_pass(self, columns: Columns, noise: ColumnNoise, *, light: float, rng: np.random.Generator) -> Columns:
+        """Show a crop as a pass of lines ``BINNED`` px apart, so many samples binned, each pixel repeated."""
+        scaled = columns @ self.unwhiten
+        y, x, _ = scaled.shape
+        means = scaled.reshape(y // BINNED, BINNED, x // BINNED, BINNED, -1).mean(axis=(1, 3))
+        means = self._noisy(means, noise, light, rng, samples=BINNED**2, readings=BINNED)
+        repeated = np.repeat(np.repeat(means, BINNED, axis=0), BINNED, axis=1)
+        return with_planes(repeated @ self.normalisation.whitening, Capture(light, BINNED, BINNED))
 
     def _noisy(
         self,
@@ -137,18 +144,6 @@ class CaptureAugmentation:
         mixing = np.linalg.cholesky(noise.correlation() + TINY * np.eye(len(noise.shot))).T.astype(np.float32)
         drawn = rng.standard_normal(scaled.shape, np.float32) @ mixing
         return np.asarray(scaled + size.astype(np.float32) * drawn, np.float32)
-
-
-def drawn_step(steps: Mapping[int, float], factor: int, rng: np.random.Generator) -> int:
-    """Draw how far apart lines are, by odds, among steps that divide ``factor``: coarse pixels are means of lines."""
-    offered = {step: odds for step, odds in steps.items() if factor % step == 0}
-    odds = np.array(list(offered.values()))
-    return int(rng.choice(list(offered), p=odds / odds.sum()))
-
-
-def _drawn_light(darkest_ms: float, rng: np.random.Generator) -> float:
-    """An exposure between the darkest and the reference, as a fraction of that."""
-    return float(np.exp(rng.uniform(np.log(darkest_ms / REFERENCE_MS), 0.0)))
 
 
 def _twice_the_rows(image: Columns) -> Columns:

@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from models.network.layers import cut
-from models.network.spectral import Normalisation, SpectralBasis
+from models.network.sizes import TOKEN_PX
+from models.network.spectral import Capture, Normalisation, SpectralBasis, with_planes
 from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation, ColumnNoise
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera, expose, footprint
@@ -19,18 +19,15 @@ from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 
 NOISY = 0.25  # fraction of the crops that get the noise of a shorter exposure
-HALO = 8  # rows around a strip that the footprint reaches, a multiple of every factor up to 8
+HALO, STRIP_ROWS = 8, 64  # rows around a strip that the footprint reaches, and of a strip at most
 
 
 @dataclass(frozen=True)
 class Example:
-    """One labelled scene in both looks. Sizes are whole cells of patch * factor px; columns until they are normalised
-    are float32.
-    """
+    """One labelled scene by every line of the reference exposure. Sizes are whole patches."""
 
     name: str
-    fine: NDArray[np.floating]  # (y, x, column), float16 once it is normalised
-    coarse: NDArray[np.float32]  # (y / s, x / s, column)
+    columns: NDArray[np.floating]  # (y, x, column) spectral features: float32, float16 once they are normalised
     labels: NDArray[np.uint8]  # (y, x), 255 unlabelled
     shape: tuple[int, int]  # of the scene before padding
     noise: ColumnNoise | None = None
@@ -39,7 +36,7 @@ class Example:
 def observe(
     scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis, rng: np.random.Generator
 ) -> Example:
-    """Look at a labelled scene with the camera's own operator, fine and coarse, and project onto the basis.
+    """Image a labelled scene with the camera's own operator, and project onto the basis.
 
     Goes in strips of rows; each strip draws its noise from a stream of its own.
 
@@ -52,18 +49,16 @@ def observe(
     labels = np.full(grid.padded_shape, UNLABELLED, np.uint8)
     labels[: grid.height, : grid.width] = scene.labels
     rows, width = grid.padded_shape
-    s, cell = grid.factor, grid.patch * grid.factor
-    fine = np.empty((rows, width, basis.columns), np.float32)
-    coarse = np.empty((rows // s, width // s, basis.columns), np.float32)
+    strip = math.gcd(rows, STRIP_ROWS)
+    columns = np.empty((rows, width, basis.columns), np.float32)
     exposure = camera.exposure_ms / DEFAULT_EXPOSURE_MS
     scale = (scene.white_reference / (scene.white_reference_electrons * exposure)).astype(np.float32)
-    for top, stream in zip(range(0, rows, cell), rng.spawn(rows // cell), strict=True):
-        first, last = max(top - HALO, 0), min(top + cell + HALO, rows)
-        blurred = footprint(planes[first:last], camera)[top - first : top - first + cell]
+    for top, stream in zip(range(0, rows, strip), rng.spawn(rows // strip), strict=True):
+        first, last = max(top - HALO, 0), min(top + strip + HALO, rows)
+        blurred = footprint(planes[first:last], camera)[top - first : top - first + strip]
         electrons = electrons_of(scene, blurred, camera)
-        fine[top : top + cell] = (expose(electrons, camera, step=1, rng=stream) * scale) @ matrix
-        coarse[top // s : (top + cell) // s] = (expose(electrons, camera, step=s, rng=stream) * scale) @ matrix
-    return Example(scene.name, fine, coarse, labels, (grid.height, grid.width), noise_of(scene, matrix, camera))
+        columns[top : top + strip] = (expose(electrons, camera, step=1, rng=stream) * scale) @ matrix
+    return Example(scene.name, columns, labels, (grid.height, grid.width), noise_of(scene, matrix, camera))
 
 
 def noise_of(scene: RasterScene, matrix: NDArray[np.float32], camera: LineCamera) -> ColumnNoise:
@@ -80,8 +75,8 @@ def electrons_of(scene: RasterScene, planes: NDArray[np.float32], camera: LineCa
 
 
 def measured_normalisation(observations: list[Example], exposure_ms: float = REFERENCE_MS) -> Normalisation:
-    """Normalisation over the fine passes of all scenes (every third pixel of every third row), for looks so exposed."""
-    sample = np.concatenate([seen.fine[::3, ::3].reshape(-1, seen.fine.shape[-1]) for seen in observations])
+    """Normalisation over all scenes (every third pixel of every third row), for captures so exposed."""
+    sample = np.concatenate([seen.columns[::3, ::3].reshape(-1, seen.columns.shape[-1]) for seen in observations])
     noises = [seen.noise for seen in observations if seen.noise is not None]
     if exposure_ms >= REFERENCE_MS or not noises:
         return Normalisation.measured(sample)
@@ -92,22 +87,22 @@ def measured_normalisation(observations: list[Example], exposure_ms: float = REF
 
 def normalised(seen: Example, normalisation: Normalisation, reached: NDArray[np.bool_]) -> Example:
     """Return a scene with normalised columns."""
-    fine = np.clip(normalisation.apply(seen.fine, reached), -60000, 60000).astype(np.float16)
-    return replace(seen, fine=fine, coarse=normalisation.apply(seen.coarse, reached))
+    columns = np.clip(normalisation.apply(seen.columns, reached), -60000, 60000).astype(np.float16)
+    return replace(seen, columns=columns)
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Crops for one training step."""
+    """Crops for one training step, with the planes of their capture."""
 
-    coarse: Tensor  # (B, J, y / s, x / s)
-    fine: Tensor  # (B, patches, J, p, p), every patch of the crop
+    image: Tensor  # (B, J + PLANES, y, x) that the overview reads
+    detail: Tensor  # (B, J + PLANES, y, x) that the full network reads
     labels: Tensor  # (B, y, x) int64
-    origin: Tensor  # (B, 2) random offsets of the places [patches]
+    origin: Tensor  # (B, 2) random offsets of the places [tokens]
 
     def on(self, device: str) -> Batch:
         """The same where a device computes."""
-        return Batch(*(one.to(device) for one in (self.coarse, self.fine, self.labels, self.origin)))
+        return Batch(*(one.to(device) for one in (self.image, self.detail, self.labels, self.origin)))
 
 
 class CropSampler:
@@ -116,19 +111,17 @@ class CropSampler:
     def __init__(
         self,
         examples: list[Example],
-        config_patch: int,
-        factor: int,
+        patch: int,
         crop: int,
         *,
         noise: float = 0.0,
         augmentation: CaptureAugmentation | None = None,
     ) -> None:
         """``noise`` is the most that is added, in spreads of the normalised columns, unless ``augmentation`` add it."""
-        cell = config_patch * factor
         smallest = min(min(example.labels.shape) for example in examples)
+        cell = max(TOKEN_PX, patch) if smallest >= TOKEN_PX else patch
         self.size = max(cell, min(crop, smallest) // cell * cell)
-        self.examples, self.patch, self.factor, self.noise = examples, config_patch, factor, noise
-        self.augmentation = augmentation
+        self.examples, self.patch, self.noise, self.augmentation = examples, patch, noise, augmentation
         areas = np.array([np.count_nonzero(example.labels != UNLABELLED) for example in examples], np.float64)
         if not areas.any():
             raise SceneError(f"none of {len(examples)} scenes has a labelled pixel; training needs some")
@@ -137,15 +130,14 @@ class CropSampler:
     def draw(self, count: int, rng: np.random.Generator, gain_shift: NDArray[np.float32]) -> Batch:
         """Give ``count`` crops. ``gain_shift`` is centre / spread: what brightness does to normalised columns."""
         crops = [self._crop(rng, gain_shift) for _ in range(count)]
-        coarse, fine, labels = (torch.stack([torch.from_numpy(crop[i]) for crop in crops]) for i in range(3))
-        origin = torch.from_numpy(rng.integers(0, 4096, (count, 2)))
-        return Batch(coarse, cut(fine, self.patch), labels, origin)
+        image, detail, labels = (torch.stack([torch.from_numpy(crop[i]) for crop in crops]) for i in range(3))
+        return Batch(image, detail, labels, torch.from_numpy(rng.integers(0, 4096, (count, 2))))
 
     def _crop(self, rng: np.random.Generator, gain_shift: NDArray[np.float32]) -> tuple[NDArray[np.generic], ...]:
-        s, size = self.factor, self.size
+        size = self.size
         example = self.examples[rng.choice(len(self.examples), p=self.fraction)]
         for _ in range(20):  # a crop without a label teaches nothing
-            y, x = (rng.integers(0, (side - size) // s + 1) * s for side in example.labels.shape)
+            y, x = (int(rng.integers(0, side - size + 1)) for side in example.labels.shape)
             labels = example.labels[y : y + size, x : x + size]
             if (labels != UNLABELLED).any():
                 break
@@ -156,16 +148,13 @@ class CropSampler:
             turned = image.swapaxes(0, 1) if transpose else image
             return turned[:: 1 - 2 * down, :: 1 - 2 * across]
 
-        coarse = turn(example.coarse[y // s : (y + size) // s, x // s : (x + size) // s]).astype(np.float32) * gain
-        fine = turn(example.fine[y : y + size, x : x + size]).astype(np.float32) * gain
-        shift = (gain - 1) * gain_shift
+        columns = turn(example.columns[y : y + size, x : x + size]).astype(np.float32) * gain + (gain - 1) * gain_shift
         if self.augmentation is not None and example.noise is not None:
-            fine, coarse = self.augmentation.draw(fine + shift, coarse + shift, example.noise, s, rng)
-            channels = [np.ascontiguousarray(image.transpose(2, 0, 1)) for image in (coarse, fine)]
-            return channels[0], channels[1], np.ascontiguousarray(turn(labels)).astype(np.int64)
-        channels_first = [np.ascontiguousarray((image + shift).transpose(2, 0, 1)) for image in (coarse, fine)]
-        if rng.random() < NOISY:  # a coarse pixel gathers s times the light of a fine one, in as many readings
-            noise = rng.uniform(0, self.noise)
-            for image, sigma in zip(channels_first, (noise / math.sqrt(s), noise), strict=True):
-                image += np.float32(sigma) * rng.standard_normal(image.shape, np.float32)
-        return channels_first[0], channels_first[1], np.ascontiguousarray(turn(labels)).astype(np.int64)
+            image, detail = self.augmentation.draw(columns, example.noise, rng)
+        else:
+            if rng.random() < NOISY:
+                noise = np.float32(rng.uniform(0, self.noise))
+                columns += noise * rng.standard_normal(columns.shape, np.float32)
+            image = detail = with_planes(columns, Capture())
+        channels = [np.ascontiguousarray(one.transpose(2, 0, 1)) for one in (image, detail)]
+        return channels[0], channels[1], np.ascontiguousarray(turn(labels)).astype(np.int64)

@@ -17,23 +17,14 @@ import torch.nn.functional as F  # noqa: N812 - its usual name
 from numpy.typing import NDArray
 from torch import Tensor
 
+from models.network.layers import cut
 from models.network.segmenter import Segmenter
 from models.network.sizes import MOST_GAIN, SegmenterConfig
 from models.training.examples import Batch
 from pipeline.geometry.grid import UNLABELLED
 
-COARSE_PREDICTION_WEIGHT, SCORER_WEIGHT = (
-    0.4,
-    1.0,
-)  # of the map without a patch, and of the scorer, beside the map with patches
-FRACTIONS = (
-    (0.05, 0.15),
-    (0.1, 0.25),
-    (0.2, 0.25),
-    (0.35, 0.15),
-    (0.5, 0.1),
-    (1.0, 0.1),
-)  # (of the patches, how often)
+OVERVIEW_WEIGHT, SCORER_WEIGHT = 0.6, 1.0  # of the map without a patch, and of the scorer, beside that with patches
+FRACTIONS = ((0.1, 0.2), (0.25, 0.35), (0.5, 0.25), (1.0, 0.2))  # (of the patches, how often)
 HUBER_NAT = 0.1  # errors of the scorer above this count linearly
 RANK_WEIGHT = 0.2
 RANK_NAT = 0.05  # two patches that differ by less are hardly put in order
@@ -73,39 +64,37 @@ def batch_loss(
     model: Segmenter, batch: Batch, weight: Tensor, rng: np.random.Generator, phase: Phase, *, soft_dice: bool
 ) -> Tensor:
     """Return the loss of one batch: of the map with some patches, of the coarse prediction, and of the scores."""
-    reading = model.read_coarse(batch.coarse, batch.origin)
-    score = model.score(reading).flatten(1)
-    patch_index = draw_patches(reading.logits.detach(), score.detach(), model.config, rng, phase)
-    fine = batch.fine.gather(1, patch_index[:, :, None, None, None].expand(-1, -1, *batch.fine.shape[2:]))
-    patches = model.read_fine(reading, fine, patch_index, batch.origin)
-    empty, nothing = patch_index[:, :0], patches[:, :0]
-    drawn = model.composite(reading.logits, patches, patch_index), model.composite(reading.logits, nothing, empty)
-    with_patches, without = (pixel_losses(logits, batch.labels) for logits in drawn)
+    overview = model.read_overview(batch.image, batch.origin)
+    score = model.score(overview).flatten(1)
+    patch_index = draw_patches(overview.logits.detach(), score.detach(), model.config, rng, phase)
+    cells = cut(batch.detail, model.config.patch)
+    chosen = cells.gather(1, patch_index[:, :, None, None, None].expand(-1, -1, *cells.shape[2:]))
+    drawn = model.composite(overview.logits, model.read_patches(overview, chosen, patch_index), patch_index)
+    with_patches, without = (pixel_losses(logits, batch.labels) for logits in (drawn, overview.logits))
     gain = F.avg_pool2d((without - with_patches).detach()[:, None], model.config.patch).flatten(1)
     known = F.max_pool2d((batch.labels != UNLABELLED).float()[:, None], model.config.patch).flatten(1) > 0
     scoring = scoring_loss(score.gather(1, patch_index), gain.gather(1, patch_index), known.gather(1, patch_index))
     maps = [
         map_loss(logits, losses, batch.labels, weight, soft_dice=soft_dice)
-        for logits, losses in zip(drawn, (with_patches, without), strict=True)
+        for logits, losses in zip((drawn, overview.logits), (with_patches, without), strict=True)
     ]
-    return maps[0] + COARSE_PREDICTION_WEIGHT * maps[1] + SCORER_WEIGHT * scoring
+    return maps[0] + OVERVIEW_WEIGHT * maps[1] + SCORER_WEIGHT * scoring
 
 
 def draw_patches(
-    coarse_prediction: Tensor, score: Tensor, config: SegmenterConfig, rng: np.random.Generator, phase: Phase
+    overview: Tensor, score: Tensor, config: SegmenterConfig, rng: np.random.Generator, phase: Phase
 ) -> Tensor:
     """Draw (B, K) distinct patch numbers; with some chance they are placed by entropy or by gain.
 
-    ``coarse_prediction`` are logits of the coarse pixels (B, classes, H/s, W/s), ``score`` the gain of the patches (B,
-    patches).
+    ``overview`` are its logits (B, classes, H, W), ``score`` the expected gain of the patches (B, patches).
     """
     fractions, odds = zip(*FRACTIONS, strict=True)
     count = max(1, round(float(rng.choice(fractions, p=odds)) * score.shape[1]))
     chance = torch.from_numpy(rng.random(score.shape)).to(score.dtype).to(score.device)
     placed = rng.choice(3, p=(phase.random, phase.entropy, phase.gain))
     if placed == 1:
-        entropy = torch.special.entr(coarse_prediction.float().softmax(dim=1)).sum(dim=1)
-        score = F.avg_pool2d(entropy[:, None], config.patch // config.factor).flatten(1)
+        entropy = torch.special.entr(overview.float().softmax(dim=1)).sum(dim=1)
+        score = F.avg_pool2d(entropy[:, None], config.patch).flatten(1)
     expected_gain = chance if placed == 0 else score + 0.1 * score.abs().mean() * chance
     return expected_gain.argsort(dim=1, descending=True, stable=True)[:, :count]
 

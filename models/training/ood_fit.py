@@ -9,9 +9,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from models.network.sizes import PLANES
 from models.network.spectral import Normalisation
 from models.reading.ood import Exact, Limits, OodDetector
-from models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation, ColumnNoise
+from models.training.capture_augmentation import BINNED, REFERENCE_MS, STEPS, CaptureAugmentation, ColumnNoise
 from models.training.examples import Example
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
@@ -46,9 +47,7 @@ def fit_ood(
     if not validation:
         raise SceneError("no scene was kept from training, so that nobody can say how often a known pixel is unknown")
     rng = np.random.default_rng([seed, 0xFA3])
-    augmentation = CaptureAugmentation(
-        normalisation, darkest_ms=darkest_ms, steps=STEPS if darkest_ms < REFERENCE_MS else {1: 1.0}
-    )
+    augmentation = CaptureAugmentation(normalisation, darkest_ms=darkest_ms)
     gathered = []
     for number, example in enumerate(train):
         gathered += _drawn_spectra(example, normalisation, rng, SPECTRA // len(train) + 1)
@@ -81,29 +80,15 @@ def _noise_of_columns(noise: ColumnNoise, centres: Exact, normalisation: Normali
 def _drawn_spectra(
     example: Example, normalisation: Normalisation, rng: np.random.Generator, most: int
 ) -> list[tuple[Spectra, Classes]]:
-    """Labelled pixels of a scene in a brightness drawn as for training, at most so many of a class; a fifth coarse."""
+    """Labelled pixels of a scene in a brightness drawn as for training, at most so many of a class."""
     gain = np.float32(rng.normal(1.0, GAIN))
-    shift = (gain - 1) * normalisation.gain_shift
-    fine, coarse = (np.asarray(image, np.float32) * gain + shift for image in (example.fine, example.coarse))
+    image = np.asarray(example.columns, np.float32) * gain + (gain - 1) * normalisation.gain_shift
     parts = []
-    for image, labels, count in ((fine, example.labels, most), (coarse, _coarse_labels(example), most // 4 + 1)):
-        for number in np.unique(labels[labels != UNLABELLED]):
-            own = image[labels == number]
-            chosen = own[rng.choice(len(own), min(count, len(own)), replace=False)]
-            parts.append((chosen, np.full(len(chosen), number, np.uint8)))
+    for number in np.unique(example.labels[example.labels != UNLABELLED]):
+        own = image[example.labels == number]
+        chosen = own[rng.choice(len(own), min(most, len(own)), replace=False)]
+        parts.append((chosen, np.full(len(chosen), number, np.uint8)))
     return parts
-
-
-def _factor(example: Example) -> int:
-    return int(example.labels.shape[0] // example.coarse.shape[0])
-
-
-def _coarse_labels(example: Example) -> Classes:
-    """The class in the middle of each coarse pixel, (y, x); none where a pixel of it has none."""
-    s, (y, x) = _factor(example), example.coarse.shape[:2]
-    cells = example.labels.reshape(y, s, x, s)
-    whole = (cells != UNLABELLED).all(axis=(1, 3))
-    return np.where(whole, cells[:, s // 2, :, s // 2], UNLABELLED).astype(np.uint8)
 
 
 def components(pixels: Spectra, classes: Classes, seed: int) -> tuple[Exact, Exact]:
@@ -149,27 +134,38 @@ def measured_limits(
     """Distances that fractions of labelled pixels of scenes lie beyond, for each step and light of the looks."""
     noisy = all(example.noise is not None for example in examples)
     light = [one for one in LIGHT if one * REFERENCE_MS >= augmentation.darkest_ms] if noisy else [1.0]
-    steps = tuple(sorted(step for step in augmentation.steps if _factor(examples[0]) % step == 0)) if noisy else (1,)
+    varied = noisy and augmentation.darkest_ms < REFERENCE_MS
+    steps = tuple(step for step in STEPS if all(len(one.labels) % step == 0 for one in examples)) if varied else (1,)
     fine, coarse = np.empty((len(steps), len(light), len(RATES))), np.empty((len(light), len(RATES)))
     for j, fraction in enumerate(light):
         for i, step in enumerate(steps):
             distances = []
             for one in examples:
-                pixels = np.asarray(one.fine, np.float32)
+                pixels = np.asarray(one.columns, np.float32)
                 if one.noise is not None:
-                    pixels, _ = augmentation.scan(pixels, one.noise, _factor(one), light=fraction, step=step, rng=rng)
+                    pixels = augmentation.scan(pixels, one.noise, light=fraction, step=step, rng=rng)[..., :-PLANES]
                 distances.append(ood_detector.lit(fraction).distance(pixels[one.labels != UNLABELLED]))
             fine[i, j] = _beyond(distances)
             report((j * len(steps) + i + 1) / (len(steps) * len(light)))
-        distances = []
-        for one in examples:
-            pixels = one.coarse
-            if one.noise is not None:
-                pixels = augmentation.coarse_pass(pixels, one.noise, _factor(one), light=fraction, rng=rng)
-            known = _coarse_labels(one) != UNLABELLED
-            distances.append(ood_detector.lit(fraction, _factor(one)).distance(pixels[known]))
-        coarse[j] = _beyond(distances)
+        coarse[j] = _beyond([_binned_distances(ood_detector, one, augmentation, fraction, rng) for one in examples])
     return Limits(np.array(RATES), np.array(light), steps, fine, coarse)
+
+
+def _binned_distances(
+    ood_detector: OodDetector,
+    example: Example,
+    augmentation: CaptureAugmentation,
+    light: float,
+    rng: np.random.Generator,
+) -> NDArray[np.float32]:
+    """Distances of the labelled pixels of a coarse pass; those of one class throughout."""
+    size = tuple(side // BINNED * BINNED for side in example.labels.shape)
+    labels = example.labels[: size[0], : size[1]].reshape(size[0] // BINNED, BINNED, size[1] // BINNED, BINNED)
+    known = (labels != UNLABELLED).all(axis=(1, 3))
+    pixels = np.asarray(example.columns[: size[0], : size[1]], np.float32)
+    noise = example.noise or ColumnNoise(np.zeros(pixels.shape[2]), np.zeros((pixels.shape[2],) * 2))
+    coarse = augmentation.coarse_pass(pixels, noise, light=light, rng=rng)[::BINNED, ::BINNED, :-PLANES]
+    return ood_detector.lit(light, BINNED).distance(coarse[known])
 
 
 def _beyond(distances: list[NDArray[np.float32]]) -> NDArray[np.float64]:

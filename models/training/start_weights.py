@@ -19,9 +19,9 @@ from models.network.spectral import REACH, Normalisation, SpectralBasis
 from models.weights.files import NORMALISATION, describe_weights, read_tensors
 from pipeline.errors import SettingsError
 
-FIRST_KERNELS = ("coarse_stem.enter.weight", "fine_stem.enter.weight")
+FIRST_KERNELS = ("overview_stem.enter.weight", "full_stem.enter.weight", "spectral.weight")
 SAME_SPREAD = 0.1  # columns of the same data differ by no more, as a fraction
-CLASS_HEADS = ("coarse_classes", "fine_classes", "scorer")  # the scorer reads probabilities of classes
+CLASS_HEADS = ("overview_classes", "full_classes", "spectral", "scorer")  # the scorer reads probabilities of classes
 BESIDE = ("class_colours", *(f"normalisation.{name}" for name in NORMALISATION))  # no part of the network
 
 
@@ -55,11 +55,11 @@ def for_columns(
     if change.shape[0] == change.shape[1] and np.allclose(change, np.eye(len(change)), atol=1e-5):
         return fitted, how
     for name in FIRST_KERNELS:
-        kernel = state[name]
+        kernel, beside = state[name].tensor_split([change.shape[1]], dim=1)
         mixed = torch.einsum("ocyx,jc->ojyx", kernel.double(), torch.from_numpy(change))
         before, after = (one.flatten(1).norm(dim=1).clamp(min=1e-12) for one in (kernel.double(), mixed))
         smaller = torch.ones_like(after) if same_data else (before / after).clamp(max=1.0)
-        fitted[name] = (mixed * smaller[:, None, None, None]).to(kernel.dtype)
+        fitted[name] = torch.cat([(mixed * smaller[:, None, None, None]).to(kernel.dtype), beside], dim=1)
         how[name] = f"{kernel.shape[1]} to {change.shape[0]} spectral columns by wavelength"
     return fitted, how
 

@@ -19,7 +19,7 @@ import torch.nn.functional as F  # noqa: N812 - its usual name
 from numpy.typing import NDArray
 from torch import Tensor
 
-from models.network.sizes import TemporalSizes
+from models.network.sizes import CELL_PX, TemporalSizes
 from models.network.temporal_reader import TemporalReader
 from models.reading.prior_map import FAINTEST, LIGHT_FADES_DAYS
 from models.training.objective import class_weights, map_loss
@@ -85,14 +85,11 @@ class _Batch:
 
 
 def train_reader(
-    lands: Sequence[Sequence[Visit]],
-    settings: TemporalTraining,
-    factor: int,
-    report: Callable[[Progress], None] = lambda now: None,
+    lands: Sequence[Sequence[Visit]], settings: TemporalTraining, report: Callable[[Progress], None] = lambda now: None
 ) -> tuple[TemporalReader, int]:
     """Train on visits to lands, each land's in the order of its days; give the averaged reader and the steps taken."""
     first = lands[0][0].scan_passes[0]
-    sizes = TemporalSizes(first.probability.shape[-1], first.coarse.shape[-1], factor)
+    sizes = TemporalSizes(first.probability.shape[-1], first.coarse.shape[-1])
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         reader = TemporalReader(sizes).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -107,7 +104,7 @@ def train_reader(
         for group in optimiser.param_groups:
             group["lr"] = settings.learning_rate * rate
         optimiser.zero_grad()
-        value = _learn(reader, _sequences(lands, settings, factor, rng), weight, rng)
+        value = _learn(reader, _sequences(lands, settings, rng), weight, rng)
         torch.nn.utils.clip_grad_norm_(reader.parameters(), 1.0)
         optimiser.step()
         step += 1
@@ -122,7 +119,7 @@ def train_reader(
 
 def _learn(reader: TemporalReader, visits: Sequence[_Batch], weight: Tensor, rng: np.random.Generator) -> float:
     """Bring memories through visits, and learn at each but the first from its labels, as maps do; the mean loss."""
-    start, factor = visits[0], reader.sizes.factor
+    start, factor = visits[0], CELL_PX
     state, coarse = start.observation, start.coarse
     age = torch.zeros_like(start.seen)
     rests_on = age + _light_a_pixel(start)
@@ -163,11 +160,9 @@ def _wrong(state: Tensor, coarse: Tensor, factor: int, rng: np.random.Generator)
     return moved.where(those, state), coarse.roll((down, across), (2, 3)).where(those, coarse)
 
 
-def _sequences(
-    lands: Sequence[Sequence[Visit]], settings: TemporalTraining, factor: int, rng: np.random.Generator
-) -> list[_Batch]:
+def _sequences(lands: Sequence[Sequence[Visit]], settings: TemporalTraining, rng: np.random.Generator) -> list[_Batch]:
     """Crops of lands through several visits, turned and mirrored alike."""
-    drawn = [_sequence(lands[int(rng.integers(len(lands)))], settings, factor, rng) for _ in range(settings.batch)]
+    drawn = [_sequence(lands[int(rng.integers(len(lands)))], settings, rng) for _ in range(settings.batch)]
     batches = []
     for number in range(settings.visits):
         parts = list(zip(*(one[number] for one in drawn), strict=True))
@@ -180,12 +175,12 @@ def _sequences(
 
 
 def _sequence(
-    land: Sequence[Visit], settings: TemporalTraining, factor: int, rng: np.random.Generator
+    land: Sequence[Visit], settings: TemporalTraining, rng: np.random.Generator
 ) -> list[tuple[NDArray[np.generic] | float, ...]]:
     """One crop through visits of a land, the last again where there are too few."""
     side, shape = settings.crop, land[0].labels.shape
     first = int(rng.integers(0, max(len(land) - settings.visits, 0) + 1))
-    visits = [land[min(first + number, len(land) - 1)] for number in range(settings.visits)]
+    factor, visits = CELL_PX, [land[min(first + number, len(land) - 1)] for number in range(settings.visits)]
     y, x = (factor * int(rng.integers(0, (size - side) // factor + 1)) for size in shape)
     fine = np.s_[y : y + side, x : x + side]
     small = np.s_[y // factor : (y + side) // factor, x // factor : (x + side) // factor]

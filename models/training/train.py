@@ -1,4 +1,4 @@
-"""Training of the two-scale segmenter on crops: steps, averages, checkpoints."""
+"""Training of the segmenter on crops: steps, averages, checkpoints."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ class Trainer:
         for larger in {phase.larger for phase in PHASES}:
             crop = round(settings.crop * math.sqrt(larger))
             self.samplers[larger] = CropSampler(
-                examples, config.patch, config.factor, crop, noise=settings.noise, augmentation=augmentation
+                examples, config.patch, crop, noise=settings.noise, augmentation=augmentation
             )
         self.weight = class_weights([one.labels for one in examples], config.classes, settings.weight_cap).to(device)
         self.course = Course()
@@ -270,7 +270,7 @@ def run_identity(
     digest = hashlib.sha256(json.dumps([asdict(config), asdict(settings)], sort_keys=True).encode())
     for example in examples:
         digest.update(example.name.encode())
-        digest.update(np.ascontiguousarray(example.coarse).tobytes())
+        digest.update(np.ascontiguousarray(example.columns).tobytes())
         digest.update(np.ascontiguousarray(example.labels).tobytes())
     for name, tensor in (start or {}).items():
         digest.update(name.encode())

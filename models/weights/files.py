@@ -39,10 +39,11 @@ else:
     segmenter = deferred("models.network.segmenter")
 
 NORMALISATION = ("centre", "spread", "whitening")
-FORMAT = "spectralzoom-weights/3"
+FORMAT = "spectralzoom-weights/4"
 OF_COMPONENTS = ("centres", "covariance", "shot", "read")
 OF_LIMITS = ("rates", "light", "fine", "coarse")
 SPREAD = "normalisation.spread"
+CASCADE = "cascade"  # of a record: what reading a part of the patches in full loses
 CALIBRATION = "calibration"  # of a record: how sure of themselves maps may be, and the temperature, where one is needed
 KINDS = {"F32": "torch.float32", "U8": "torch.uint8"}  # by safetensors' names
 
@@ -63,7 +64,7 @@ class Description:
 
 @dataclass(frozen=True)
 class Weights:
-    """A two-scale segmenter with all it needs: basis, normalisation, classes, and the record of its training."""
+    """A segmenter with all it needs: basis, normalisation, classes, and the record of its training."""
 
     segmenter: Segmenter
     basis: SpectralBasis

@@ -93,7 +93,7 @@ class ReaderPart:
     def read(key: str, about: Mapping[str, Any], config: SegmenterConfig) -> ReaderPart:
         """Read an entry of a description. KeyError, TypeError, ValueError: missing, or not for such a network."""
         sizes = TemporalSizes(**about["sizes"])
-        if (sizes.classes, sizes.columns, sizes.factor) != (config.classes, config.columns, config.factor):
+        if (sizes.classes, sizes.columns) != (config.classes, config.columns):
             raise ValueError(f"its reader of prior maps is for another network: {sizes}")
         if not 0 < sizes.width <= MOST_WIDTH or not 0 < sizes.coarse_width <= MOST_WIDTH:
             raise ValueError(f"its reader of prior maps is {sizes.width} and {sizes.coarse_width} wide")

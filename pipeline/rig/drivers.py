@@ -95,7 +95,7 @@ class MirrorDriver(Protocol):
 
 
 @dataclass(frozen=True)
-class Capture:
+class AcknowledgedCapture:
     """A capture that the camera acknowledged."""
 
     folder: str
@@ -128,7 +128,7 @@ class CameraDriver(Protocol):
         SettingsError : the camera does not take such times.
         """
 
-    def capture(self, frames: int, *, prefix: str = "") -> Capture:
+    def capture(self, frames: int, *, prefix: str = "") -> AcknowledgedCapture:
         """Begin a capture of ``frames`` frames; return once the camera acknowledged it.
 
         Parameters

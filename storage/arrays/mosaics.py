@@ -336,11 +336,12 @@ def _reflected(window: NDArray[np.float32], patch: int, size: int, axis: int) ->
 
 @dataclass(frozen=True)
 class Attention:
-    """Scores of all patches and the order in which patches were chosen."""
+    """Scores of all patches, the order in which patches were chosen, and what the full network changed there."""
 
     score: NDArray[np.float64]  # (patch_y, patch_x), NaN where there is none
     rank: NDArray[np.int32]  # (patch_y, patch_x), 0 = chosen first, -1 = not chosen
     policy: str
+    changed: NDArray[np.float32] | None = None  # (patch_y, patch_x) fraction of pixels of another class than before
 
 
 def write_attention(path: Path, attention: Attention) -> None:
@@ -356,12 +357,16 @@ def write_attention(path: Path, attention: Attention) -> None:
     write_image(group, "score", dims, np.asarray(attention.score, np.float64), about)
     about = {"long_name": "order in which the patch was chosen, from 0; -1 where it was not", "units": "1"}
     write_image(group, "rank", dims, np.asarray(attention.rank, np.int32), about)
+    if attention.changed is not None:
+        about = {"long_name": "fraction of pixels whose class the full network changed", "units": "1"}
+        write_image(group, "changed", dims, np.asarray(attention.changed, np.float32), about)
 
 
 def load_attention(path: Path) -> Attention:
     """Read scores and ranks. Raises IncompleteStoreError where they are missing or damaged."""
     group = open_group(path)
-    return Attention(read_array(group, "score"), read_array(group, "rank"), str(group.attrs.get("policy", "")))
+    changed = read_array(group, "changed") if "changed" in group else None
+    return Attention(read_array(group, "score"), read_array(group, "rank"), str(group.attrs.get("policy", "")), changed)
 
 
 def chosen_patches(path: Path) -> NDArray[np.int64]:

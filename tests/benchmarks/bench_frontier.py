@@ -25,11 +25,12 @@ from rich.console import Console
 
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
-from flows.tasks.survey_model import UNIFORM_STEPS, shipped_weights
+from flows.tasks.survey_model import shipped_weights
 from flows.tradeoff.stages import uniform_pass
 from flows.training.observed_scenes import chosen_effects
 from models.evaluation.expected_scores import MapScores, expected_counts
 from models.evaluation.metrics import confusion, mean_iou
+from models.network.spectral import Capture
 from models.reading.inference import segment
 from models.weights.files import Weights, describe_weights, load_weights
 from pipeline.geometry.camera import LineCamera
@@ -124,20 +125,16 @@ def large_rows(shape: tuple[int, int], goals: dict[float, float], weights: Weigh
         yield Row(f"--seconds {seconds:g}: {_promise(scan)}", _figure(judged), f">= {goal}", met)
 
 
-def _path(step: int) -> Path:
-    return shipped_weights(plain=step in UNIFORM_STEPS)
-
-
 @cache
-def shipped(step: int = 1) -> Weights:
-    """The weights that uniform scans are read with whose lines are so many px apart."""
-    return load_weights(_path(step))
+def shipped() -> Weights:
+    """The weights that come with SpectralZoom."""
+    return load_weights(shipped_weights())
 
 
 def chosen_scan(shape: tuple[int, int], seconds: float, weights: Weights | None = None) -> UniformScan:
     """The scan that a survey of so many seconds takes, by the weights for uniform scans or others."""
     weights = weights or shipped()
-    grid = SceneGrid(*shape, weights.config.patch, weights.config.factor)
+    grid = SceneGrid(*shape, weights.config.patch, 1)
     along, _, _ = cheapest_full(grid, CAMERA, COST)
     record = ScanPerformance.read(weights.record["scans"])
     sweeps = {step: uniform_sweeps(grid, CAMERA, along, step=step) for step in record.steps}
@@ -163,9 +160,9 @@ def _figure(judged: Judged) -> str:
 
 
 @cache
-def scores(step: int) -> MapScores:
-    """How what maps by the shipped weights for such lines expect of themselves came true."""
-    ood_detector = describe_weights(_path(step)).ood_detector
+def scores() -> MapScores:
+    """How what maps by the shipped weights expect of themselves came true."""
+    ood_detector = describe_weights(shipped_weights()).ood_detector
     assert ood_detector is not None
     assert ood_detector.map_scores is not None
     return ood_detector.map_scores
@@ -179,19 +176,20 @@ def _plain(seed: int, step: int, exposure_ms: float) -> PlanMap:
 
 def map_of(scene: RasterScene, seed: int, step: int, exposure_ms: float, weights: Weights | None = None) -> PlanMap:
     """The map of a scene's uniform scan; what it says of itself by the house's own weights alone."""
-    others, weights, rig = weights is not None, weights or shipped(step), Rig(CAMERA)
-    grid = SceneGrid(*scene.shape, weights.config.patch, weights.config.factor)
+    others, weights, rig = weights is not None, weights or shipped(), Rig(CAMERA)
+    grid = SceneGrid(*scene.shape, weights.config.patch, 1)
     along, _, _ = cheapest_full(grid, CAMERA, COST)
     sweeps = uniform_sweeps(grid, CAMERA, along, step=step, exposure_ms=exposure_ms)
     chosen = chosen_effects(scene, rig, sweeps)
     source = SimulatedSource(scene, rig, seed, chosen, clock=sweep_starts(sweeps, CAMERA, COST))
-    scan_pass = uniform_pass(weights, source, sweeps, grid, COST)
+    scan = Capture(exposure_ms / CAMERA.exposure_ms, step)
+    scan_pass = uniform_pass(weights, source, sweeps, grid, COST, scan)
     drawn = segment(weights, scan_pass.seen, scan_pass.columns, scan_pass.patch_index, every_class=True)
     judged = _judged(scene, drawn.classes, weights)
     if others:
         return PlanMap(scan_pass.seconds, judged)
     assert drawn.log_probability is not None
-    told = scores(step).expected(expected_counts([drawn.log_probability], weights.config.classes), step, exposure_ms)
+    told = scores().expected(expected_counts([drawn.log_probability], weights.config.classes), step, exposure_ms)
     assert told is not None
     return PlanMap(scan_pass.seconds, judged, 100 * told.miou, 100 * told.error)
 

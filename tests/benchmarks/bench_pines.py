@@ -212,46 +212,46 @@ def _seen_by_camera(folder: Path) -> Values:
 
 
 def _through_camera(folder: Path, path: Path) -> list[Result]:
-    from flows.evaluate.frames import capture_passes
+    from flows.evaluate.frames import see_frame
     from models.weights.files import load_weights
     from pipeline.geometry.camera import LineCamera
 
     weights, scene = load_weights(path), _scene(folder)
     if scene.key not in weights.record.get("split", {}).get("pixels", {}):
         raise ValueError(f"{path} was not trained with --train-mask on {SCENE}: its test pixels may have taught it")
-    scan_pass = capture_passes(scene, scene.name, weights, LineCamera(), 0)
+    scan_pass = see_frame(scene, scene.name, weights, LineCamera(), 0)
     return _judged("camera", weights, scan_pass.seen, scan_pass.fine, scan_pass.labels)
 
 
 def _of_the_file(folder: Path, split: Split) -> list[Result]:
-    """The segmenter trained on the spectra of the file, coarse pixels being their means."""
+    """The segmenter trained on the spectra of the file."""
     from models.network.segmenter import Segmenter
     from models.network.sizes import SegmenterConfig
     from models.network.spectral import SpectralBasis, patches_of
     from models.reading.inference import coarse_prediction_of_columns
     from models.training.examples import Example, measured_normalisation, normalised
+    from models.training.spectral_start import LabelledPixels, linear_discriminants
     from models.training.train import train
     from models.weights.files import Weights
     from pipeline.geometry.grid import SceneGrid, pad_by_reflection
 
     scene = _scene(folder)
     (height, width), basis = split.train.shape, SpectralBasis.spanning(scene.wavelength_nm)
-    grid = SceneGrid(height, width, patch=8, factor=4)
+    grid = SceneGrid(height, width, patch=8, factor=1)
     columns = (split.values / np.float32(split.values.max())) @ basis.matrix(scene.wavelength_nm)[0]
-    fine = np.asarray(pad_by_reflection(columns, grid.padded_shape), np.float32)
+    columns = np.asarray(pad_by_reflection(columns, grid.padded_shape), np.float32)
     labels = np.full(grid.padded_shape, UNLABELLED, np.uint8)
     labels[:height, :width] = split.train
-    coarse = np.asarray(patches_of(fine, grid.factor).mean(axis=(1, 2)), np.float32)
-    coarse = coarse.reshape(fine.shape[0] // grid.factor, -1, basis.columns)
-    observed = Example("pines", fine, coarse, labels, (height, width))
+    observed = Example("pines", columns, labels, (height, width))
     normalisation = measured_normalisation([observed])
     example = normalised(observed, normalisation, np.ones(basis.columns, bool))
-    config = SegmenterConfig(split.classes, basis.columns, grid.patch, grid.factor)
-    network, record = train(config, [example], normalisation.gain_shift, _settings())
+    config = SegmenterConfig(split.classes, basis.columns, grid.patch)
+    start = linear_discriminants(LabelledPixels.drawn([example], np.random.default_rng(0)), split.classes)
+    network, record = train(config, [example], normalisation.gain_shift, _settings(), start=start)
     assert isinstance(network, Segmenter)
     weights = Weights(network, basis, normalisation, scene.class_names, scene.class_colours, {"training": record})
-    patches = np.asarray(patches_of(example.fine, grid.patch), np.float32)
-    return _judged("file", weights, coarse_prediction_of_columns(weights, example.coarse, grid), patches, split.test)
+    patches = np.asarray(patches_of(example.columns, grid.patch), np.float32)
+    return _judged("file", weights, coarse_prediction_of_columns(weights, example.columns, grid), patches, split.test)
 
 
 def _judged(source: str, weights: Weights, seen: CoarsePrediction, fine: Values, labels: Labels) -> list[Result]:

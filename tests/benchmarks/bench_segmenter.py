@@ -23,22 +23,26 @@ from models.weights.files import Weights
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.selection import frame_patches
 
-FRAME = SceneGrid(966, 1296, 32, 4)
-FRAME_SIZES = {"classes": 3, "columns": 2, "patch": 32, "factor": 4}
-COST_GOALS = {0.05: 0.07, 0.10: 0.10, 0.15: 0.17, 0.20: 0.17, 0.35: None}
-FIELD = SceneGrid(384, 640, 16, 4)
-FIELD_SIZES = {"classes": 8, "columns": 24, "patch": 16, "factor": 4}
+FRAME = SceneGrid(966, 1296, 32, 1)
+FRAME_SIZES = {"classes": 3, "columns": 2, "patch": 32}
+SHARES = (0.05, 0.10, 0.15, 0.20, 0.35)
+MOST_BEYOND = 1.2  # processor time of a share over its multiply-adds, both as parts of reading every patch
+FIELD = SceneGrid(384, 640, 16, 1)
+FIELD_SIZES = {"classes": 8, "columns": 24, "patch": 16}
 MANY, FEW, MOST_BANDS_RATIO = 270, 4, 1.5
 ROUNDS = 5
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame to read: its coarse pass, and the patches of some of its patches."""
+    """A frame to read, and the numbers of its patches."""
 
     scan_pass: CoarsePass
-    patches: NDArray[np.float32]
     patch_index: NDArray[np.int64]
+
+    def drawn(self, weights: Weights, seen: CoarsePass, patch_index: NDArray[np.int64]) -> DrawnMap:
+        """Its map with some patches read in full."""
+        return segment(weights, seen, seen.patches(patch_index), patch_index)
 
 
 def rows() -> list[Row]:
@@ -58,32 +62,27 @@ def drawn_weights(**sizes: int) -> Weights:
     return Weights(model, SpectralBasis(400.0, 1000.0, columns), flat, names, colours)
 
 
-def drawn_frame(weights: Weights, grid: SceneGrid, fraction: float, rng: np.random.Generator) -> Frame:
-    """Noise, with so much of the patches in use."""
-    p, columns = grid.patch, weights.config.columns
-    y, x = (size // grid.factor for size in grid.padded_shape)
-    valid = grid.valid_patches()
-    patch_index = np.sort(rng.permutation(valid)[: round(fraction * len(valid))]).astype(np.int64)
-    patches = rng.standard_normal((len(patch_index), p, p, columns), dtype=np.float32)
-    return Frame(CoarsePass(grid, rng.standard_normal((y, x, columns), dtype=np.float32)), patches, patch_index)
+def drawn_frame(weights: Weights, grid: SceneGrid, rng: np.random.Generator) -> Frame:
+    """Noise."""
+    image = rng.standard_normal((*grid.padded_shape, weights.config.columns), dtype=np.float32)
+    return Frame(CoarsePass(grid, image), grid.valid_patches().astype(np.int64))
 
 
 def _bands() -> list[Row]:
     """The whole way from scene values to the map, with all bands and with a few of the same pixels."""
     weights, rng = drawn_weights(**FIELD_SIZES), np.random.default_rng(0)
     nm = np.linspace(400, 1000, MANY)
-    coarse = rng.uniform(0.1, 0.5, (*FIELD.coarse_shape, MANY)).astype(np.float32)
+    values = rng.uniform(0.1, 0.5, (FIELD.height, FIELD.width, MANY)).astype(np.float32)
     valid = FIELD.valid_patches()
     patch_index = np.sort(rng.permutation(valid)[: round(0.35 * len(valid))])
-    fine = rng.uniform(0.1, 0.5, (len(patch_index), FIELD.patch, FIELD.patch, MANY)).astype(np.float32)
     some = np.linspace(0, MANY - 1, FEW).astype(int)
-    few = np.ascontiguousarray(coarse[..., some]), np.ascontiguousarray(fine[..., some])
+    few = np.ascontiguousarray(values[..., some])
 
-    def draw(coarse: NDArray[np.float32], fine: NDArray[np.float32], nm: NDArray[np.float64]) -> DrawnMap:
-        seen = coarse_prediction(weights, coarse, nm, FIELD)
-        return segment(weights, seen, weights.columns(fine, nm), patch_index)
+    def draw(values: NDArray[np.float32], nm: NDArray[np.float64]) -> DrawnMap:
+        seen = coarse_prediction(weights, values, nm, FIELD)
+        return segment(weights, seen, seen.patches(patch_index), patch_index)
 
-    clocks = time_in_turn({"many": partial(draw, coarse, fine, nm), "few": partial(draw, *few, nm[some])}, ROUNDS)
+    clocks = time_in_turn({"many": partial(draw, values, nm), "few": partial(draw, few, nm[some])}, ROUNDS)
     found = ratio(clocks, "many", "few")
     spent = {name: clock.cpu_min_s for name, clock in clocks.items()}
     return [
@@ -99,19 +98,19 @@ def _bands() -> list[Row]:
 
 
 def _fractions() -> list[Row]:
-    """Glance, scores and map at each fraction of the patches over the map of every patch on its fastest path."""
+    """Overview, scores and map at each fraction of the patches over the map of every patch on its fastest path."""
     weights, rng = drawn_weights(**FRAME_SIZES), np.random.default_rng(0)
-    every = drawn_frame(weights, FRAME, 1.0, rng)
-    calls = {"all": lambda: segment(weights, every.scan_pass, every.patches, every.patch_index)}
+    every = drawn_frame(weights, FRAME, rng)
+    calls = {"all": lambda: every.drawn(weights, every.scan_pass, every.patch_index)}
     patches_of = {}
-    for fraction in COST_GOALS:
+    for fraction in SHARES:
         count = frame_patches(np.zeros(FRAME.valid_fraction().size), fraction, FRAME.valid_fraction().ravel() > 0)
         patches_of[fraction] = len(count)
         calls[f"{fraction:.0%}"] = partial(_adaptive, weights, every, len(count))
     clocks = time_in_turn(calls, ROUNDS)
     full = multiply_adds(weights.config, FRAME, len(every.patch_index), 2).total
     found = []
-    for fraction, goal in COST_GOALS.items():
+    for fraction in SHARES:
         cost = ratio(clocks, f"{fraction:.0%}", "all")
         score = score_multiply_adds("gain", weights.config, FRAME)
         macs = multiply_adds(weights.config, FRAME, patches_of[fraction], 2, score=score).total / full
@@ -119,10 +118,10 @@ def _fractions() -> list[Row]:
             Row(
                 f"CPU at {fraction:.0%} of the patches over every patch, frame of {FRAME.width} x {FRAME.height} px",
                 f"{cost:.3f}",
-                "" if goal is None else f"<= {goal}",
-                None if goal is None else cost <= goal,
+                f"<= {MOST_BEYOND} x multiply-adds",
+                cost <= MOST_BEYOND * macs,
                 f"multiply-adds {macs:.3f}; {clocks[f'{fraction:.0%}'].cpu_min_s:.3f} s against "
-                f"{clocks['all'].cpu_min_s:.2f} s, coarse prediction and scorer included",
+                f"{clocks['all'].cpu_min_s:.2f} s, overview and scorer included",
             )
         )
     return found
@@ -132,4 +131,4 @@ def _adaptive(weights: Weights, every: Frame, count: int) -> DrawnMap:
     seen = read_coarse_prediction(weights, every.scan_pass)
     scores = score_patches("gain", seen).ravel()[every.patch_index]
     best = np.sort(np.argsort(-scores, kind="stable")[:count])
-    return segment(weights, seen, every.patches[best], every.patch_index[best])
+    return every.drawn(weights, seen, every.patch_index[best])

@@ -31,7 +31,7 @@ PROBES: dict[str, dict[str, Any]] = {
     "two passes, budget 0.5": {"budget": 0.5},
     "every line, 5 ms": {"scan_step": 1, "scan_exposure_ms": 5},
 }
-WEIGHTS = shipped_weights(plain=True)
+WEIGHTS = shipped_weights()
 BANDS_NM = np.linspace(405.0, 995.0, 60)
 PINES = data_folder("indian_pines")
 BRIGHTNESS = 0.22  # mean reflectance of farms
@@ -58,7 +58,9 @@ def rows() -> list[Row]:
             for scan_pass in ("every line, 100 ms", "every line, 5 ms"):
                 fraction = (
                     100
-                    * _survey({"scene": str(path), "weights": str(WEIGHTS), **PROBES[scan_pass]}, "auto")["fraction"]
+                    * _survey(
+                        {"scene": str(path), "source": "sim", "weights": str(WEIGHTS), **PROBES[scan_pass]}, "auto"
+                    )["fraction"]
                 )
                 found.append(Row(f"{name}, {scan_pass}: unknown", f"{fraction:.1f} %", ">= 90 %", fraction >= 90))
                 print(f"{found[-1].what}: {found[-1].figure}", flush=True)

@@ -86,7 +86,7 @@ def test_a_capture_keeps_every_line(subject: Subject, tmp_path: Path) -> None:
 def test_training_goes_on(subject: Subject, tmp_path: Path) -> None:
     """It is broken off in a step; the same command ends well."""
     field, out = write_field(tmp_path / "field", (16, 16)), tmp_path / "w.safetensors"
-    sizes = "--validation 0 --steps 4 --crop 16 --patch 8 --factor 2 --dim 16 --layers 1 --batch 1"
+    sizes = "--validation 0 --steps 4 --crop 16 --patch 8 --dim 16 --layers 1 --batch 1"
     asked = ["train", str(field), "-o", str(out), *sizes.split()]
     ended = subject.nursery.run(asked, "end_before", place="models.training.train:_step", number=signal.SIGTERM, call=2)
     assert told(ended), ended.text

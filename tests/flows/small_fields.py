@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from flows.evaluate.frames import ScenePasses, capture_passes, open_frames
+from flows.evaluate.frames import SeenFrame, open_frames, see_frame
 from models.weights.files import Weights, load_weights, save_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.scenes.scene import RasterScene
@@ -37,9 +37,9 @@ def write_field(root: Path, size: tuple[int, int] = (24, 40), names: Sequence[st
     return root
 
 
-def write_weights(path: Path, seed: int = 0, factor: int = 2, **record: Any) -> Path:
+def write_weights(path: Path, seed: int = 0, **record: Any) -> Path:
     """Small random weights for the field's two classes."""
-    made = make_weights(seed, classes=2, columns=3, factor=factor)
+    made = make_weights(seed, classes=2, columns=3)
     for name, tensor in made.segmenter.state_dict().items():
         if name.endswith("classes.weight"):
             tensor *= 0.01  # else logits are in the hundreds, and gains all at their clip
@@ -53,7 +53,7 @@ def scene_at(data: Path, name: str = "001") -> RasterScene:
     return opened.scene(opened.train[0])
 
 
-def observed_passes(data: Path, path: Path, factor: int = 2, seed: int = 0) -> tuple[ScenePasses, Weights]:
+def observed_passes(data: Path, path: Path, seed: int = 0) -> tuple[SeenFrame, Weights]:
     """The first frame as small weights see it."""
-    weights = load_weights(write_weights(path, seed, factor=factor))
-    return capture_passes(scene_at(data), "001", weights, LineCamera(), 0), weights
+    weights = load_weights(write_weights(path, seed))
+    return see_frame(scene_at(data), "001", weights, LineCamera(), 0), weights

@@ -32,9 +32,9 @@ from pipeline.readings import MOST_VALUE, beyond_range, find_beyond, readings_al
 from tests.models.conftest import make_weights
 
 WEIGHTS = make_weights(0)
-GRID, NM = SceneGrid(48, 64, 8, 2), np.linspace(420, 980, 7)
+GRID, NM = SceneGrid(48, 64, 8, 1), np.linspace(420, 980, 7)
 MOST = WEIGHTS.normalisation.most_value
-COARSE = np.random.default_rng(0).uniform(0.1, 0.5, (*GRID.coarse_shape, 7)).astype(np.float32)
+VALUES = np.random.default_rng(0).uniform(0.1, 0.5, (*GRID.padded_shape, 7)).astype(np.float32)
 PATCHES = np.array([3, 9, 20, 21])
 FINE = np.random.default_rng(1).uniform(0.1, 0.5, (len(PATCHES), 8, 8, 7)).astype(np.float32)
 FAR = np.float32(np.finfo(np.float32).max)
@@ -61,8 +61,8 @@ def _alike(one: tuple[CoarsePrediction, DrawnMap], other: tuple[CoarsePrediction
 @settings(max_examples=40, deadline=None)
 @given(
     value=OUT_OF_RANGE,
-    y=st.integers(0, 23),
-    x=st.integers(0, 31),
+    y=st.integers(0, 47),
+    x=st.integers(0, 63),
     bands=st.sets(st.integers(0, 6), min_size=1),
     at=st.booleans(),
 )
@@ -72,12 +72,12 @@ def _alike(one: tuple[CoarsePrediction, DrawnMap], other: tuple[CoarsePrediction
 def test_a_out_of_range_value_is_as_if_it_had_not_been_captured(
     value: float, y: int, x: int, bands: set[int], at: bool
 ) -> None:
-    """A pixel of the coarse or of the fine pass, in some bands or all: every bit is as with NaN in its place."""
-    out_of_range, hole = (COARSE if at else FINE).copy(), (COARSE if at else FINE).copy()
+    """A pixel of what the overview reads or of a patch, in some bands or all: every bit is as with NaN in its place."""
+    out_of_range, hole = (VALUES if at else FINE).copy(), (VALUES if at else FINE).copy()
     place = (y, x, sorted(bands)) if at else (y % len(PATCHES), y % 8, x % 8, sorted(bands))
     out_of_range[place], hole[place] = value, np.nan
     with np.errstate(all="raise", under="ignore"):
-        one, other = (_drawn(*((cube, FINE) if at else (COARSE, cube))) for cube in (out_of_range, hole))
+        one, other = (_drawn(*((cube, FINE) if at else (VALUES, cube))) for cube in (out_of_range, hole))
     assert _alike(one, other)
     assert np.isfinite(one[0].probability).all()
     assert (one[1].classes < len(WEIGHTS.class_names)).all()
@@ -85,27 +85,27 @@ def test_a_out_of_range_value_is_as_if_it_had_not_been_captured(
 
 def test_out_of_range_pixels_are_counted() -> None:
     """By the pixel, where no band is a reading; NaN is none of them."""
-    coarse = COARSE.copy()
-    coarse[2, 5], coarse[7, 1], coarse[0, 0] = 1e30, -1e20, np.nan
-    scan_pass = read_coarse_pass(WEIGHTS, [coarse[:10], coarse[10:]], NM, GRID)
+    values = VALUES.copy()
+    values[2, 5], values[7, 1], values[0, 0] = 1e30, -1e20, np.nan
+    scan_pass = read_coarse_pass(WEIGHTS, [values[:10], values[10:]], NM, GRID)
     assert scan_pass.out_of_range is not None
     assert np.argwhere(scan_pass.out_of_range).tolist() == [[2, 5], [7, 1]]
-    assert read_coarse_pass(WEIGHTS, [COARSE], NM, GRID).out_of_range is None
+    assert read_coarse_pass(WEIGHTS, [VALUES], NM, GRID).out_of_range is None
 
 
 @pytest.mark.parametrize("fraction", [0.2, 1.0])
 def test_a_field_of_out_of_range_values_still_ends(fraction: float) -> None:
     """A fifth of the pixels, and all of them: as with NaN there, without a warning."""
-    where = np.random.default_rng(2).random(GRID.coarse_shape) < fraction
-    out_of_range, hole = COARSE.copy(), COARSE.copy()
+    where = np.random.default_rng(2).random(GRID.padded_shape) < fraction
+    out_of_range, hole = VALUES.copy(), VALUES.copy()
     out_of_range[where], hole[where] = 1e30, np.nan
     assert _alike(_drawn(out_of_range, FINE), _drawn(hole, FINE))
 
 
 @pytest.mark.parametrize("value", [10 * MOST_COLUMN, 1e18, 1e30, FAR, np.inf, -np.inf])
 def test_columns_that_no_reading_gives_are_dead(value: float) -> None:
-    """Given normalised already, to the coarse prediction or to the map, they count as NaN does."""
-    columns = np.random.default_rng(3).normal(0, 1, (*GRID.coarse_shape, 4)).astype(np.float32)
+    """Given normalised already, to the overview or to the map, they count as NaN does."""
+    columns = np.random.default_rng(3).normal(0, 1, (*GRID.padded_shape, 4)).astype(np.float32)
     patches = np.random.default_rng(4).normal(0, 1, (2, 8, 8, 4)).astype(np.float32)
     found = []
     for one in (value, np.nan):
@@ -130,9 +130,9 @@ def test_weights_that_overflow_draw_no_class() -> None:
     """Finite weights whose logits are not: the map says nothing there, instead of class 0."""
     weights: Weights = make_weights(0)
     with torch.no_grad():
-        weights.segmenter.coarse_classes.weight.fill_(3e38)
-        weights.segmenter.fine_classes.weight.fill_(3e38)
-    seen = coarse_prediction(weights, COARSE, NM, GRID)
+        weights.segmenter.overview_classes.weight.fill_(3e38)
+        weights.segmenter.full_classes.weight.fill_(3e38)
+    seen = coarse_prediction(weights, VALUES, NM, GRID)
     drawn = segment(weights, seen, weights.columns(FINE, NM), PATCHES)
     lost = np.isnan(drawn.confidence)
     assert lost.mean() > 0.5

@@ -20,7 +20,7 @@ from models.training.train import Progress
 from models.weights.files import Weights
 from pipeline.geometry.grid import SceneGrid
 
-SMALL: dict[str, Any] = {"classes": 3, "columns": 4, "patch": 8, "factor": 2, "width": 8, "coarse_width": 8} | {
+SMALL: dict[str, Any] = {"classes": 3, "columns": 4, "patch": 8, "width": 8, "overview_width": 8} | {
     "dim": 16,
     "heads": 2,
     "layers": 1,
@@ -33,29 +33,20 @@ def noise(seed: int, *shape: int) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-def scene_tensors(config: SegmenterConfig, rows: int = 2, columns: int = 3) -> tuple[Tensor, Tensor, Tensor]:
-    """Coarse image, every fine patch of a scene of ``rows`` x ``columns`` coarse patches, and their numbers."""
-    p, j, count = config.patch, config.columns, rows * columns * config.factor**2
-    return noise(0, 1, j, rows * p, columns * p), noise(1, 1, count, j, p, p), torch.arange(count)[None]
-
-
 def scene_columns(weights: Weights, height: int, width: int, seed: int = 0) -> tuple[CoarsePass, np.ndarray]:
-    """A look at a scene of noise, and a patch for every patch of its padded grid."""
-    p, s, columns = weights.config.patch, weights.config.factor, weights.config.columns
-    grid, rng = SceneGrid(height, width, p, s), np.random.default_rng(seed)
-    y, x = (side // s for side in grid.padded_shape)
-    coarse_pass = CoarsePass(grid, rng.standard_normal((y, x, columns), np.float32))
+    """A look at a scene of noise, and other noise for every patch of its padded grid."""
+    p, columns = weights.config.patch, weights.config.columns
+    grid, rng = SceneGrid(height, width, p, 1), np.random.default_rng(seed)
+    coarse_pass = CoarsePass(grid, rng.standard_normal((*grid.padded_shape, columns), np.float32))
     return coarse_pass, rng.standard_normal((int(np.prod(grid.patch_shape)), p, p, columns), np.float32)
 
 
-def block_example(size: int = 32, block: int = 8, fraction: float = 1.0) -> Example:
-    """Two classes in blocks, told apart by the first column, with noise in the second; a ``fraction`` is labelled."""
+def block_example(size: int = 32, block: int = 8) -> Example:
+    """Two classes in blocks, told apart by the first column, with noise in the second."""
     rng = np.random.default_rng(4)
     labels = np.kron(rng.integers(0, 2, (size // block, size // block)), np.ones((block, block))).astype(np.uint8)
-    fine = np.stack([2.0 * labels - 1, rng.normal(0, 1, labels.shape)], axis=-1)
-    coarse = fine.reshape(size // 2, 2, size // 2, 2, 2).mean(axis=(1, 3))
-    labels[rng.random(labels.shape) >= fraction] = 255
-    return Example("e", fine.astype(np.float16), coarse.astype(np.float32), labels, labels.shape)
+    columns = np.stack([2.0 * labels - 1, rng.normal(0, 1, labels.shape)], axis=-1)
+    return Example("e", columns.astype(np.float16), labels, labels.shape)
 
 
 def killed_after(step: int) -> Callable[[Progress], None]:
@@ -70,12 +61,12 @@ def killed_after(step: int) -> Callable[[Progress], None]:
 
 def make_network(seed: int = 0, **sizes: Any) -> Segmenter:
     """A small network of the given sizes; whatever training starts from zero is drawn too, so that nothing is idle."""
-    with torch.random.fork_rng(devices=[]):
+    with torch.random.fork_rng(devices=[]), torch.no_grad():
         torch.manual_seed(seed)
         model = Segmenter(SegmenterConfig(**{**SMALL, **sizes})).eval()
         for parameter in model.parameters():
-            if not parameter.any():
-                torch.nn.init.normal_(parameter, std=0.3)
+            idle = parameter == 0
+            parameter[idle] = torch.normal(0.0, 0.3, parameter.shape)[idle]
     return model
 
 
@@ -104,5 +95,5 @@ def make_weights(seed: int = 0, **sizes: Any) -> Weights:
 
 @pytest.fixture
 def tiny() -> Maker:
-    """Maker of small random weights: ``tiny(seed, classes=..., patch=..., factor=...)``."""
+    """Maker of small random weights: ``tiny(seed, classes=..., patch=...)``."""
     return make_weights

@@ -42,11 +42,12 @@ from tests.users.test_georeference import SHAPE, TURNED, corners_px, survey, wri
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, height_m=1400.0)
 QUIET = Console(quiet=True)
+BANDS = ",".join(map(str, range(5, 270, 11)))
 FLAGS = {
     "reflectance": True,
     "indices": "NDVI,SAVI",
     "polygons": True,
-    "prescription": "track=2.5,grass=1",
+    "prescription": "track=2.5,wheat_a=1",
     "cell": 3.0,
     "heading": 20.0,
     "least_fraction": 0.1,
@@ -78,8 +79,8 @@ class Products:
 def posed(tmp_path_factory: pytest.TempPathFactory) -> Products:
     """A small farm with a pose, so high that a pixel sees about a metre, and all of its products."""
     archive, out = tmp_path_factory.mktemp("products") / "field", tmp_path_factory.mktemp("maps").resolve()
-    given = {"size": "192x128", "bands": "20,60,100,115,150,200", "budget": "0.9", "engine": "plain", "seed": "1"}
-    given["unknown"] = "off"  # of six bands the weights of 270 know next to nothing
+    given = {"size": "192x128", "bands": BANDS, "budget": "0.9", "engine": "plain", "seed": "1"}
+    given["unknown"] = "off"  # of these bands the weights of 270 know little
     settings = load_settings(None, {**given, "out": str(archive), "controls": False})
     with without_effects():
         published = run_survey(replace(settings, pose=POSE), QUIET)
@@ -171,12 +172,12 @@ def test_prescribed_cells_hold_the_dose_of_their_classes(posed: Products) -> Non
     assert (cells.area <= 9.0 + 1e-6).all()
     assert np.isclose(cells.area, 9.0).mean() > 0.5  # the others lie at the field's edge
     x, y, classes, names = _classes_of_polygons(posed)
-    grass = (classes == names.index("grass")).ravel()
+    wheat = (classes == names.index("wheat_a")).ravel()
     tree = shapely.STRtree(shapely.points(x.ravel(), y.ravel()))
     sure = 0
     for cell, dose in zip(cells.geometry, cells.dose, strict=True):
         inside = tree.query(cell, predicate="contains")
-        fraction = grass[inside].mean() if len(inside) else 0.0
+        fraction = wheat[inside].mean() if len(inside) else 0.0
         if fraction > 0.5:  # far above the least fraction, whatever the small regions and borders did
             assert dose >= 1.0
             sure += 1
@@ -206,10 +207,10 @@ def test_task_data_hold_what_the_map_says(posed: Products) -> None:
     assert row[known].min() >= 0
     assert row[known].max() < grid.maximum_row
     assert column[known].max() < grid.maximum_column
-    grass, total = np.zeros(doses.shape), np.zeros(doses.shape)
+    wheat, total = np.zeros(doses.shape), np.zeros(doses.shape)
     np.add.at(total, (row[known], column[known]), 1)
-    np.add.at(grass, (row[known], column[known]), classes[known] == names.index("grass"))
-    mostly = (total > 4) & (grass > 0.5 * total)
+    np.add.at(wheat, (row[known], column[known]), classes[known] == names.index("wheat_a"))
+    mostly = (total > 4) & (wheat > 0.5 * total)
     assert mostly.sum() > 10
     assert (doses[mostly] >= 1.0).all()
     assert (doses[ndimage.maximum_filter(total, 3) == 0] == 0).all()  # a cell may have a part of a pixel

@@ -201,7 +201,7 @@ def test_a_run_is_judged_when_asked(run: OpenedRun) -> None:
 def test_weights_are_trained_and_judged(tmp_path: Path) -> None:
     """Two steps on three frames make a file that can be judged on the one that it was not trained on."""
     heard: set[str] = set()
-    small = {"dim": 16, "layers": 1, "heads": 2, "crop": 16, "batch": 1, "patch": 4, "factor": 2}
+    small = {"dim": 16, "layers": 1, "heads": 2, "crop": 16, "batch": 1, "patch": 4}
     data, told = write_field(tmp_path / "field", (32, 32)), lambda stage, done, total: heard.add(stage)
     made = spectralzoom.train(
         data, tmp_path / "mine.safetensors", steps=2, hold_out=["003"], validation=0, **small, progress=told

@@ -7,6 +7,7 @@ import os
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from flows.archive.reprocess_command import run_reprocess
 from flows.publish.run_folder import Published, load_receipt
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
+from models.weights.files import save_weights
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.rig_model import Rig
@@ -33,7 +35,7 @@ from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
 from storage.arrays.mosaics import open_mosaic
 from storage.export.image_files import write_recorded_files
 from storage.remote.opening import verify_archive
-from tests.conftest import Survey, WeightsMaker, patchy_scene
+from tests.conftest import Survey, WeightsMaker, patchy_scene, random_weights
 from tests.flows.conftest import CommandLine, be_version, command_line
 from tests.flows.tasks.test_survey_rig import emulated
 from tests.prior_work import without_effects
@@ -89,10 +91,11 @@ def write_sweeps(out: Path, published: Published, folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("asked", PASSES.values(), ids=PASSES)
-def test_sweeps_of_the_rig_give_its_map(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: Path, asked: dict[str, Any]
-) -> None:
+def test_sweeps_of_the_rig_give_its_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: dict[str, Any]) -> None:
     """Written as ENVI and CSV and surveyed as a recording, or out of the archive itself: the class map by hash."""
+    weights, made = tmp_path / "reflectance.safetensors", random_weights((640.0, 550.0, 460.0))
+    centre, spread = (np.full_like(made.normalisation.centre, level) for level in (0.3, 0.05))
+    save_weights(replace(made, normalisation=replace(made.normalisation, centre=centre, spread=spread)), weights)
     settings = rig_settings(tmp_path / "rig", weights, keep="raw", **asked)
     with emulated(settings, {}, monkeypatch, scene=field()):
         published = run_survey(settings, QUIET)

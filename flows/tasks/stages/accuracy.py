@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from flows.tasks.capture_plan import CapturePlan
 from flows.tasks.field_work import coarse_region
-from flows.tasks.patch_budget import SHARD, PatchBudget
+from flows.tasks.patch_budget import SHARD
 from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
 from flows.tasks.stages.attention import load_plan
 from flows.tasks.stages.effects import source_with
@@ -33,6 +33,7 @@ from models.evaluation.metrics import (
     kappa,
 )
 from models.evaluation.placement import CONTROL_FRACTION, run_controls
+from models.network.spectral import Capture
 from models.reading.inference import read_coarse_prediction, segment
 from models.reading.regions import plan_regions, whole_field
 from models.weights.files import Weights
@@ -52,7 +53,7 @@ from storage.arrays.class_maps import load_class_map
 from storage.readers.raster_fields import RasterPixels, patches_of
 
 RECORD = "accuracy.json"
-ACCURACY = Product("evaluate", version=10, files=(RECORD,), by_weights=True)
+ACCURACY = Product("evaluate", version=11, files=(RECORD,), by_weights=True)
 
 
 @stage("evaluate", "accuracy (not part of the survey)", ACCURACY)
@@ -60,12 +61,12 @@ def evaluate(
     mosaic: StageRef,
     attention: StageRef,
     class_map: StageRef,
-    *captures: StageRef,
+    *sources: StageRef,
     frame: FieldFrame,
     plan: CapturePlan,
     zones: SurveyZones,
-    budget: PatchBudget | None,
-    raster: RasterPixels | None,
+    chooses: bool,
+    captures: tuple[Capture, Capture],
     simulated: SimulatedSource,
     source_key: Mapping[str, Any],
     labels: NDArray[np.uint8],
@@ -79,9 +80,9 @@ def evaluate(
 ) -> Wanted:
     """Judge the map by the labels, and other placements, with the survey's effects; no part of the survey's cost.
 
-    ``captures`` are the effects of what was captured and where its sweeps lie; a raster has neither.
+    ``sources`` are the effects of what was captured and where its sweeps lie; a raster has neither.
     """
-    off = map_offset(simulated, captures[1:])
+    off = map_offset(simulated, sources[1:])
     labels = moved_labels(labels, off, plan.along)
 
     def build(path: Path) -> None:
@@ -92,26 +93,29 @@ def evaluate(
         counts = confusion(judged, classes, len(drawn.names))  # with the class unknown, which no label has
         result: dict[str, Any] = map_figures(names, counts) | {"confusion": counts.tolist()}
         image = mosaic.path / "mosaic.zarr"
-        result["none"] = map_figures(names, _confusion_of_coarse_map(weights, image, grid, judged))
+        result["none"] = map_figures(names, _confusion_of_overview(weights, image, grid, captures[0], judged))
         result |= {"all": {"miou": None, "per_class_iou": {}}, "gap_closed": None, "controls": {}}
         if controls:
-            if raster is not None:
-                columns = columns_of_raster(raster, weights, frame.wavelength_nm, memory=memory, report=first_part)
+            seen = coarse_region(weights, image, whole_field(grid), captures[0])
+            if plan.plain:
+                columns = seen.patches(np.arange(int(np.prod(grid.patch_shape))))
             else:
-                source = source_with(sure_source(simulated, off), captures[0])
-                sweeps = plan.coarse if plan.plain else plan.full
+                source = source_with(sure_source(simulated, off), sources[0])
                 columns = columns_of_all_patches(
-                    source, sweeps, grid, weights, memory=memory, resampling=resampling, report=first_part
+                    source, plan.full, grid, weights, memory=memory, resampling=resampling, report=first_part
                 )
-            fraction = CONTROL_FRACTION
-            if budget is not None:  # as many as were kept of a uniform scan
-                fraction = len(load_plan(attention).patch_index) / len(budget.patch_index)
-            rows, among = count(1), None if zones.fractions is None else zones.fractions > 0
+            fraction, valid = CONTROL_FRACTION, grid.valid_fraction().ravel() > 0
+            among = valid if zones.fractions is None else valid & (zones.fractions > 0)
+            if chooses and plan.plain:  # as many as were read of a uniform scan
+                read = len(load_plan(attention, class_map).patch_index)
+                fraction = read / max(int(among.sum()), 1)
+            rows = count(1)
             found = run_controls(
                 weights,
-                read_coarse_prediction(weights, coarse_region(weights, image, whole_field(grid))),
+                read_coarse_prediction(weights, seen),
                 columns,
                 judged,
+                capture=captures[1],
                 fraction=fraction,
                 seed=seed,
                 among=among,
@@ -127,17 +131,17 @@ def evaluate(
         report(0.6 * done)
 
     params = {**model_key, "labels": array_digest(labels), "controls": controls, "resampling": resampling, **source_key}
-    return Wanted(build, params, [mosaic, attention, class_map, *captures])
+    return Wanted(build, params, [mosaic, attention, class_map, *sources])
 
 
-def _confusion_of_coarse_map(
-    weights: Weights, mosaic: Path, grid: SceneGrid, labels: NDArray[np.uint8]
+def _confusion_of_overview(
+    weights: Weights, mosaic: Path, grid: SceneGrid, capture: Capture, labels: NDArray[np.uint8]
 ) -> NDArray[np.int64]:
-    """Count (class, class) pixels of the map that the coarse pass alone gives, region by region as surveys draw it."""
+    """Count (class, class) pixels of the map that the overview alone gives, region by region as surveys draw it."""
     empty = np.empty((0, grid.patch, grid.patch, weights.basis.columns), np.float32)
     counts = np.zeros((weights.config.classes,) * 2, np.int64)
     for region in plan_regions(grid, SHARD):
-        drawn = segment(weights, coarse_region(weights, mosaic, region), empty, np.empty(0, np.int64))
+        drawn = segment(weights, coarse_region(weights, mosaic, region, capture), empty, np.empty(0, np.int64))
         inside = labels[region.kept.rows, region.kept.columns]
         counts += confusion(inside, region.crop(drawn.classes), weights.config.classes)
     return counts

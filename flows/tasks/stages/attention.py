@@ -17,6 +17,7 @@ from flows.tasks.field_work import FieldWork, region_params
 from flows.tasks.patch_budget import PatchBudget
 from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
 from flows.tasks.zones import SurveyZones
+from models.network.spectral import Capture
 from models.policies.policies import SEEING_POLICIES, score_patches
 from models.reading.inference import CoarsePrediction
 from pipeline.capture.recorded_passes import RecordedPasses
@@ -28,10 +29,11 @@ from pipeline.planning.fine_pass import FinePlan, plan_fine
 from pipeline.planning.uniform_scans import format_scan
 from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table, write_table
-from storage.arrays.mosaics import Attention, open_mosaic, write_attention
+from storage.arrays.mosaics import Attention, chosen_patches, open_mosaic, write_attention
 from storage.readers.raster_fields import RasterPixels
 
-ATTENTION = Product("score", version=8, files=("attention.zarr", "plan.json"), by_weights=True)
+READING = "attention.zarr"  # beside a map, where patches were chosen while it was drawn
+ATTENTION = Product("score", version=9, files=("attention.zarr", "plan.json"), by_weights=True)
 Scores = NDArray[np.float64]
 
 
@@ -52,6 +54,7 @@ def score(
     seed: int,
     mask: NDArray[np.generic] | None,
     part: bool,
+    capture: Capture,
     model_key: dict[str, Any],
     report: Report,
 ) -> Wanted:
@@ -61,7 +64,7 @@ def score(
     def expected_gain() -> Scores:
         """Return the (patch,) worth of a fine look at each patch, by the fraction of it that zones leave."""
         if policy in SEEING_POLICIES:
-            scores = work.score(policy, mosaic.path / "mosaic.zarr", lambda done: report(0.5 * done)).ravel()
+            scores = work.score(policy, mosaic.path / "mosaic.zarr", capture, lambda done: report(0.5 * done)).ravel()
         else:
             nothing = np.empty((0, 0, 0), np.float32)
             scores = score_patches(policy, CoarsePrediction(grid, nothing, nothing), seed=seed, mask=mask)
@@ -113,7 +116,7 @@ def score(
         "seed": seed if policy == "random" else None,
         "mask": None if mask is None else array_digest(mask),
         **(captures if raster is None else {}),
-        **(region_params(grid) if policy in SEEING_POLICIES else {}),
+        **(region_params(grid) | {"capture": list(capture)} if policy in SEEING_POLICIES else {}),
         **({"plain": True} if plan.plain else {}),
         **({} if budget is None else {"patches": {name: getattr(budget, name) for name in SPARING}}),
         **zones.key,
@@ -168,19 +171,20 @@ def all_seen(grid: SceneGrid, sweeps: Sequence[Sweep], camera: LineCamera, *, pa
 
 def kept_within(budget: PatchBudget, scores: Scores, seen: FinePlan) -> FinePlan:
     """Return the plan of a uniform scan with the patches that the budget pays for; all patches were seen."""
-    bought, s = budget.choose(scores), budget.grid.factor
-    reason = (
-        f"{seen.reason}; {len(bought)} of {len(budget.patch_index)} patches are read in detail, the others "
-        f"as means of {s} x {s} px"
-    )
+    bought = budget.choose(scores)
+    reason = f"{seen.reason}; {len(bought)} of {len(budget.patch_index)} patches are read in full"
     finite = np.where(np.isfinite(scores), scores, 0.0)
     expected_gain, wanted = float(finite[bought].sum()), float(np.maximum(finite, 0.0).sum())
     return replace(seen, patch_index=np.sort(bought), reason=reason, expected_gain=expected_gain, wanted_gain=wanted)
 
 
-def load_plan(attention: StageRef) -> FinePlan:
-    """Read the plan of an attention store."""
+def load_plan(attention: StageRef, class_map: StageRef | None = None) -> FinePlan:
+    """Read the plan of an attention store, with the patches that were chosen while ``class_map`` was drawn, if any."""
     plan = read_table(attention.path / "plan.json")
+    if class_map is not None and (store := class_map.path / READING).exists():
+        chosen, everything = chosen_patches(store), len(plan["patch_index"])
+        words = f"{plan['reason']}; {len(chosen)} of {everything} patches are read in full"
+        plan |= {"patch_index": chosen, "reason": words}
     kept = {
         "sweeps": [Sweep(**sweep) for sweep in plan["sweeps"]],
         "patch_index": np.array(plan["patch_index"], np.intp),

@@ -14,7 +14,9 @@ from flows.tasks.field_prior_map import FieldPriorMap, prior_map_lies, whole_pix
 from flows.tasks.field_work import FieldWork, region_params
 from flows.tasks.prior_maps import MEMORY, Prior
 from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
+from flows.tasks.stages.attention import READING
 from flows.tasks.zones import SurveyZones
+from models.network.spectral import Capture
 from models.reading.prior_map import TemporalAgreement, changed_fractions
 from models.weights.parts import OodPart, ReaderPart
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
@@ -33,8 +35,9 @@ from storage.arrays.class_maps import (
     write_changes,
 )
 from storage.arrays.layout import NO_CLASS, blank_pixels
+from storage.arrays.mosaics import Attention, write_attention
 
-CLASS_MAP = Product("segment", version=13, files=("class_map.zarr", "class_probabilities.zarr"), by_weights=True)
+CLASS_MAP = Product("segment", version=14, files=("class_map.zarr", "class_probabilities.zarr"), by_weights=True)
 OUT_OF_RANGE = "out_of_range.json"  # beside a map, where values were no readings
 LEFT_OUT = "left_out.npy"  # beside a map while it is drawn: the pixels of which none is
 MOST_TURN_PX = 12.0  # that a field's corners may lie off by, as it is turned, so that its memory is of use
@@ -53,27 +56,25 @@ def segment(
     reader: ReaderPart | None,
     ood_detector: OodPart | None,
     unknown: UnknownRule | None,
-    light: tuple[float, int],
+    captures: tuple[Capture, Capture],
     part: bool,
+    least_gain: float | None,
+    policy: str,
     model_key: dict[str, Any],
     report: Report,
 ) -> Wanted:
     """Draw the class map region by region, in detail where patches were chosen; no class where the scene has no value.
 
     ``fine`` is the mosaic of the second pass, where there is one: else the first shows the field's own pixels.
-    ``light`` is the exposure of a line that is read in detail as a fraction of the reference, and the pixels to the
-    next.
+    ``captures`` say how the pixels of the overview were captured, and those that are read in full. With ``least_gain``
+    patches are chosen region by region, by what the policy expects of them.
     """
     grid, left_out, inputs = frame.grid, zones.left_out, [mosaic, attention, *([] if fine is None else [fine])]
 
     def build(path: Path) -> None:
         """Draw the map and what is believed; once more without the memory, where that is put aside."""
         out, probabilities = path / "class_map.zarr", path / "class_probabilities.zarr"
-        lies = (
-            FieldShift()
-            if prior is None
-            else prior_map_lies(prior.scan_passes, mosaic.path / "mosaic.zarr", grid.factor)
-        )
+        lies = FieldShift() if prior is None else prior_map_lies(prior.scan_passes, mosaic.path / "mosaic.zarr")
         memory = None if prior is None else memory_of(prior, lies, grid)
         if left_out is not None:
             np.save(path / LEFT_OUT, left_out)
@@ -91,11 +92,13 @@ def segment(
             chosen,
             out.resolve(),
             probabilities.resolve(),
-            *light,
+            captures,
             memory,
             away,
             unknown,
             part,
+            least_gain,
+            policy,
         )
         drawn = draw_field(work, drawing, report)
         if prior is not None:
@@ -104,8 +107,14 @@ def segment(
             if figures["put_aside"] is not None and drawn.comparison is not None:
                 drop_changes(probabilities)
                 drawn = draw_field(work, replace(drawing, memory=None), report)
+        if (full := drawn.reading) is not None:
+            rank = np.full(full.gain.size, -1, np.int32)
+            best = np.argsort(np.where(full.read, -full.gain, np.inf).ravel(), kind="stable")
+            rank[best[: np.count_nonzero(full.read)]] = np.arange(np.count_nonzero(full.read))
+            found = Attention(full.gain, rank.reshape(full.gain.shape), policy, full.changed)
+            write_attention(path / READING, found)
         if drawn.unread_px:
-            write_table(path / OUT_OF_RANGE, {"coarse_px": drawn.unread_px})
+            write_table(path / OUT_OF_RANGE, {"px": drawn.unread_px})
         if frame.missing is not None:
             blank_pixels(out, frame.missing, NO_CLASS)
             changes = {} if drawn.comparison is None else {OLD_CLASS: UNLABELLED}
@@ -117,14 +126,17 @@ def segment(
         (path / LEFT_OUT).unlink(missing_ok=True)
 
     params = {**model_key, "grid": asdict(grid), **region_params(grid), **frame.key, **zones.key}
+    params["captures"] = [list(one) for one in captures]
     if ood_detector is not None and unknown is not None:
         params["unknown"] = {"familiar": ood_detector.key, **asdict(unknown)}
     if part:
         params["part"] = True
+    if least_gain is not None:
+        params["least_gain"] = [least_gain, policy]
     if prior is None:
         return Wanted(build, params, inputs)
     key = None if reader is None else reader.key
-    params |= {"days": prior.days, "classes": list(prior.classes), "reader": key, "light": light}
+    params |= {"days": prior.days, "classes": list(prior.classes), "reader": key}
     if len(prior.scan_passes) > 1:
         params["shifts"] = [list(scan_pass.shift_px) for scan_pass in prior.scan_passes]
     return Wanted(build, params, [*inputs, prior.probabilities, *(one.mosaic for one in prior.scan_passes)])
@@ -135,7 +147,7 @@ def memory_of(prior: Prior, lies: FieldShift, grid: SceneGrid) -> FieldPriorMap 
     if lies.edge_px((grid.height, grid.width)) > MOST_TURN_PX:
         return None
     last, probabilities = prior.scan_passes[0], (prior.probabilities.path / "class_probabilities.zarr").resolve()
-    coarse = (last.mosaic.path / "mosaic.zarr").resolve() if grid.factor % last.factor == 0 else None
+    coarse = (last.mosaic.path / "mosaic.zarr").resolve()
     return FieldPriorMap(probabilities, coarse, prior.days, prior.classes, whole_pixels(lies))
 
 

@@ -13,9 +13,10 @@ from flows.tasks.survey_model import shipped_weights
 from flows.tradeoff.stages import uniform_pass
 from flows.training.observed_scenes import chosen_effects
 from models.evaluation.metrics import confusion, mean_iou
+from models.network.spectral import Capture
 from models.network.temporal_reader import TemporalReader
 from models.reading.inference import segment
-from models.reading.prior_map import ClassProbabilities, CurrentVisit, PriorMap, first_probabilities, fuse
+from models.reading.prior_map import ClassProbabilities, CurrentVisit, PriorMap, first_probabilities, fuse, pooled
 from models.training.capture_augmentation import REFERENCE_MS
 from models.weights.files import Weights, load_reader, load_weights
 from pipeline.geometry.camera import LineCamera
@@ -32,7 +33,7 @@ CAMERA, COST = LineCamera(), CostModel()
 ANEW, QUICK, REFERENCE = (1, 25.0), (2, 5.0), (1, 12.0)  # step and exposure [ms]
 FIRST_DAY, HOUR = 172, 11.0
 SEASON = [(110 + 6 * number, (11.0, 9.5, 13.0, 15.0)[number % 4]) for number in range(30)]
-WEIGHTS = shipped_weights(plain=True)
+WEIGHTS = shipped_weights()
 Classes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
@@ -73,16 +74,17 @@ def view_farm(seed: int, day: int, hour: float, how: tuple[int, float], noise: i
 
 def seen_by(scene: RasterScene, seed: int, how: tuple[int, float]) -> Seen:
     weights, (step, exposure_ms), rig = shipped(), how, Rig(CAMERA)
-    grid = SceneGrid(*SHAPE, weights.config.patch, weights.config.factor)
+    grid = SceneGrid(*SHAPE, weights.config.patch, 1)
     along, _, _ = cheapest_full(grid, CAMERA, COST)
     sweeps = uniform_sweeps(grid, CAMERA, along, step=step, exposure_ms=exposure_ms)
     clock = sweep_starts(sweeps, CAMERA, COST)
     source = SimulatedSource(scene, rig, seed, chosen_effects(scene, rig, sweeps), clock=clock)
-    scan_pass = uniform_pass(weights, source, sweeps, grid, COST)
+    scan_pass = uniform_pass(weights, source, sweeps, grid, COST, Capture(exposure_ms / REFERENCE_MS, step))
     drawn = segment(weights, scan_pass.seen, scan_pass.columns, scan_pass.patch_index, every_class=True)
     assert drawn.log_probability is not None
     seen = np.ones(SHAPE, np.bool_)
-    observation = CurrentVisit(drawn.log_probability, seen, scan_pass.seen.columns, exposure_ms / REFERENCE_MS, step)
+    columns = pooled(scan_pass.seen.columns)
+    observation = CurrentVisit(drawn.log_probability, seen, columns, exposure_ms / REFERENCE_MS, step)
     return Seen(observation, np.asarray(scene.labels, np.uint8), scan_pass.seconds)
 
 
@@ -95,7 +97,7 @@ def later(
     reader: bool = True,
     comparable: bool = True,
 ) -> ClassProbabilities:
-    """What is believed after a later look, whose coarse pixels are ``comparable`` to those of before."""
+    """What is believed after a later look, whose spectra are ``comparable`` to those of before."""
     memory = PriorMap(probabilities, before.observation.coarse if comparable else None, days)
     return fuse(memory, now.observation, shipped_temporal() if reader else None)
 

@@ -219,7 +219,11 @@ TRAINING = {
     "scenes of files": (2, "scene.png -o new.safetensors --scenes 3", "--scenes is for the built-in farm"),
     "-o is a folder": (2, "scene.png -o archive --labels labels.png", "archive is a folder, expected a file"),
     "no patch": (2, "scene.png -o new.safetensors --patch 0", "--patch must be above 0, got 0"),
-    "sizes do not fit": (2, "scene.png -o new.safetensors --labels labels.png --factor 3", "divide by the factor 3"),
+    "sizes do not fit": (
+        2,
+        "scene.png -o new.safetensors --labels labels.png --patch 12",
+        "times a power of two, got 12",
+    ),
     "too many for validation": (1, "scene.png -o new.safetensors --validation 3", "leave none of 1 to train on"),
     "band that is no number": (2, "scene.png -o new.safetensors --bands a", "whole numbers with commas, got 'a'"),
     "no -o": (2, "scene.png", "--out requires an argument"),

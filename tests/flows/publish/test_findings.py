@@ -135,7 +135,7 @@ def test_words_of_a_memory_tell_change_beyond_what_maps_differ_by() -> None:
 
 @pytest.mark.parametrize(
     "flags",
-    [{"budget": None, "scan_step": "2"}, {"budget": None, "scan_step": "1", "macs": "60%"}],
+    [{"budget": None, "scan_step": "2"}, {"budget": None, "scan_step": "1", "macs": "80%"}],
     ids=["another step", "read in part"],
 )
 def test_nothing_is_told_of_maps_of_which_nobody_knows(

@@ -31,7 +31,7 @@ def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
     """A receipt with hand-made figures; every path of the design is in it."""
     saving = {"done": 50, "full": 100, "ratio": 0.5, "full_is": "predicted"}
     savings: dict[str, object] = {name: dict(saving) for name in reversed(COSTS)}
-    savings["multiply_adds"] = {**saving, "coarse_prediction": 20, "score": 1, "encode": 19, "decode": 10}
+    savings["multiply_adds"] = {**saving, "overview": 20, "score": 1, "detail": 29}
     savings["capture_s"] = {"done": 104.0, "full": 209.0, "ratio": 104 / 209, "full_is": "predicted"}
     accuracy = {  # the map shows wheat, of which the truth has none
         "miou": np.float32(0.75),
@@ -140,7 +140,7 @@ def test_receipt_has_the_fields_of_the_design_and_reads_back():
     [
         ("versions",),
         ("stages", 0, "key"),
-        ("savings", "tokens"),
+        ("savings", "patches"),
         ("data_bytes", "kept"),
         ("savings", "lines", "full_is"),
         ("savings", "multiply_adds", "score"),
@@ -211,13 +211,13 @@ def test_headline_is_one_paragraph_with_the_figures():
     assert "93.4 % of its pixels are right" in text
     assert headline(make_receipt(), 0.0).startswith("The camera captured nothing again: no run of fine lines fits")
     assert "truth" not in headline(make_receipt(labels=False))
-    words = "Its worst class is bare weed with 60.0: the coarse pass alone gives 20.0, detail everywhere 80.0."
+    words = "Its worst class is bare weed with 60.0: the overview alone gives 20.0, a full reading 80.0."
     assert headline(make_receipt()).endswith(words)
     receipt = make_receipt()
     receipt["accuracy"]["all"] = {"miou": None, "per_class_iou": {}}
     text = headline(receipt)
-    assert "the coarse pass alone gives 50.0. Its worst class" in text
-    assert text.endswith("bare weed with 60.0: the coarse pass alone gives 20.0.")
+    assert "the overview alone gives 50.0. Its worst class" in text
+    assert text.endswith("bare weed with 60.0: the overview alone gives 20.0.")
 
 
 PNG = b"\x89PNG\r\n\x1a\nnot a real picture"

@@ -16,6 +16,7 @@ from flows.tasks.field_prior_map import FieldPriorMap
 from flows.tasks.field_work import FieldWork, Scoring, WeightsFile, region_params
 from flows.tasks.patch_budget import SHARD
 from flows.tasks.run import SurveyRun, open_run
+from models.network.sizes import CELL_PX
 from models.reading.regions import Region, plan_regions, whole_field
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
@@ -26,7 +27,7 @@ from storage.parallel.pool import WorkerPool
 
 Survey = Callable[..., object]
 MOST_PX = (64, 640)  # of 96 x 128 px: two regions
-ALL_CELLS = 3  # a halo that reaches over the whole field
+ALL_PX = 96  # a halo that reaches over the whole field
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +70,9 @@ def _draw(work: FieldWork, run: SurveyRun, stages: Path, out: Path) -> dict[str,
     )
     mosaic, detail = _mosaics(stages)
     attention = _store(stages, "score/*/attention.zarr")
-    drawing = Drawing(work.weights, mosaic, detail, attention, out, out.with_suffix(".class_probabilities"), 1.0, 1)
+    drawing = Drawing(
+        work.weights, mosaic, detail, attention, out, out.with_suffix(".class_probabilities"), run.captures
+    )
     draw_field(work, drawing, lambda done: None)
     consolidate_stores(out.parent)  # as a store is published
     return _contents(out)
@@ -86,12 +89,12 @@ def test_regions_that_see_the_field_draw_the_map_of_the_field(
     """With a halo over everything, to the byte, whoever draws them; the stage's own map is that of one region."""
     run, stages = surveyed
     stored = _contents(_store(stages, "segment/*/class_map.zarr"))
-    assert len(_work(run, pool, ALL_CELLS).regions) == 2
-    assert _draw(_work(run, pool, ALL_CELLS), run, stages, tmp_path / "m.zarr") == stored
+    assert len(_work(run, pool, ALL_PX).regions) == 2
+    assert _draw(_work(run, pool, ALL_PX), run, stages, tmp_path / "m.zarr") == stored
     assert _draw(run.work, run, stages, tmp_path / "one.zarr") == stored
 
 
-@pytest.mark.parametrize("halo", [0, 1])
+@pytest.mark.parametrize("halo", [0, 32])
 def test_every_pool_draws_the_same_regions(surveyed: tuple[SurveyRun, Path], tmp_path: Path, halo: int) -> None:
     """Two at a time or one after the other, the bytes are the same; every pixel has a class."""
     run, stages = surveyed
@@ -107,8 +110,10 @@ def test_scores_of_regions_make_those_of_the_field(surveyed: tuple[SurveyRun, Pa
     """With a halo over everything they are equal, patch by patch, and the stage's own where it used that policy."""
     run, stages = surveyed
     mosaic = _mosaics(stages)[0]
-    whole = run.work.score(policy, mosaic, lambda done: None)
-    assert (_work(run, WorkerPool(workers=2), ALL_CELLS).score(policy, mosaic, lambda done: None) == whole).all()
+    whole = run.work.score(policy, mosaic, run.capture, lambda done: None)
+    assert (
+        _work(run, WorkerPool(workers=2), ALL_PX).score(policy, mosaic, run.capture, lambda done: None) == whole
+    ).all()
     if policy == run.settings.policy:
         assert (load_attention(_store(stages, "score/*/attention.zarr")).score == whole).all()
 
@@ -117,11 +122,13 @@ def test_edges_need_one_patch_of_halo_and_work_travels_as_paths(surveyed: tuple[
     """With one coarse patch regions give the field's own edges; what another process gets is small."""
     run, stages = surveyed
     mosaic = _mosaics(stages)[0]
-    whole = run.work.score("sobel", mosaic, lambda done: None)
-    np.testing.assert_allclose(_work(run, WorkerPool(), 1).score("sobel", mosaic, lambda done: None), whole, rtol=1e-5)
+    whole = run.work.score("sobel", mosaic, run.capture, lambda done: None)
+    np.testing.assert_allclose(
+        _work(run, WorkerPool(), 32).score("sobel", mosaic, run.capture, lambda done: None), whole, rtol=1e-5
+    )
     run, stages = surveyed
     work = run.work
-    scoring = Scoring(work.weights, _mosaics(stages)[0], "entropy")
+    scoring = Scoring(work.weights, _mosaics(stages)[0], "entropy", run.capture)
     sent = pickle.dumps((scoring, work.regions[0]))
     there, region = pickle.loads(sent)
     assert len(sent) < 2000
@@ -136,15 +143,15 @@ def test_a_worker_goes_region_by_region(
     let_go: list[bool] = []
     for module in ("field_work", "drawing"):
         monkeypatch.setattr(f"flows.tasks.{module}.let_tiles_go", lambda: let_go.append(True))
-    work = _work(run, WorkerPool(workers=1), 1)
-    work.score("entropy", _mosaics(stages)[0], lambda done: None)
+    work = _work(run, WorkerPool(workers=1), 32)
+    work.score("entropy", _mosaics(stages)[0], run.capture, lambda done: None)
     assert len(let_go) == 2
     _draw(work, run, stages, tmp_path / "m.zarr")
     assert len(let_go) == 4
     run, stages = surveyed
     told: list[float] = []
-    work = _work(run, WorkerPool(workers=1), 1)
-    work.score("entropy", _mosaics(stages)[0], told.append)
+    work = _work(run, WorkerPool(workers=1), 32)
+    work.score("entropy", _mosaics(stages)[0], run.capture, told.append)
     assert told == [0.5, 1.0]
     regions: Sequence[Region] = work.regions
     assert sum(region.kept.shape[0] for region in regions) == 96
@@ -168,7 +175,7 @@ def test_no_more_regions_at_a_time_than_memory_holds(surveyed: tuple[SurveyRun, 
     """A worker pool shrinks to what fits, and stays as it is where all of it does."""
     work = replace(surveyed[0].work, pool=WorkerPool(workers=7))
     assert work.pool_for(np.arange(9), 3) is work.pool
-    pools = [replace(work, memory=size * 2**20).pool_for(np.arange(9), 3).workers for size in (513, 514, 600)]
+    pools = [replace(work, memory=size * 2**20).pool_for(np.arange(9), 3).workers for size in (516, 520, 600)]
     assert pools == sorted(pools, key=int)
     assert pools[0] < pools[-1] == 7
 
@@ -196,7 +203,7 @@ def test_a_memory_is_moved_and_leaves_nothing_behind(surveyed: tuple[SurveyRun, 
     classes = tuple(range(len(run.weights.class_names)))
     still = FieldPriorMap(probabilities, mosaic, 1.0, classes).of(region, run.weights)
     moved = FieldPriorMap(probabilities, mosaic, 1.0, classes, shift).of(region, run.weights)
-    coarse = tuple(round(by / run.grid.factor) for by in shift)
+    coarse = tuple(round(by / CELL_PX) for by in shift)
     assert still.coarse is not None
     assert moved.coarse is not None
     pairs = [

@@ -26,7 +26,7 @@ from pipeline.errors import BudgetError, SettingsError
 from pipeline.geometry.grid import SceneGrid
 from tests.conftest import RGB_NM, Survey, random_weights
 
-COSTS = ReadingCosts(SegmenterConfig(classes=5), SceneGrid(192, 256, 16, 4), 30)
+COSTS = ReadingCosts(SegmenterConfig(classes=5), SceneGrid(192, 256, 16, 1), 30)
 PATCHES = 12 * 16
 SCAN: dict[str, Any] = {"budget": None, "scan_step": "2", "scan_exposure_ms": "25"}
 fractions = st.floats(5, 100).map(lambda percent: f"{percent!r}%")
@@ -52,7 +52,7 @@ def _budget(**limits: object) -> PatchBudget:
     return found
 
 
-@given(scores, st.floats(12, 99), st.sampled_from(["gain", "sobel"]))
+@given(scores, st.floats(40, 99), st.sampled_from(["gain", "sobel"]))
 def test_no_budget_is_exceeded_and_no_patch_more_is_paid_for(
     given_scores: NDArray[np.float64], macs: float, policy: str
 ) -> None:
@@ -68,7 +68,7 @@ def test_no_budget_is_exceeded_and_no_patch_more_is_paid_for(
     np.testing.assert_array_equal(bought, promising[: len(bought)])
 
 
-@given(scores, st.floats(12, 99), st.floats(12, 99))
+@given(scores, st.floats(40, 99), st.floats(40, 99))
 def test_a_larger_budget_buys_what_a_smaller_one_does_and_more(
     given_scores: NDArray[np.float64], one: float, other: float
 ) -> None:
@@ -96,9 +96,9 @@ def test_what_promises_nothing_is_not_bought(worthless: float) -> None:
 def test_zones_leave_fewer_patches_to_fraction() -> None:
     """Only patches of which zones leave something are chosen, and shares are of reading those."""
     shown = np.arange(PATCHES) < PATCHES // 2
-    budget = _asked(shown, macs="60%")
+    budget = _asked(shown, macs="80%")
     assert budget is not None
-    assert budget.everything < _budget(macs="60%").everything
+    assert budget.everything < _budget(macs="80%").everything
     assert max(budget.choose(np.ones(PATCHES))) < PATCHES // 2
 
 
@@ -152,7 +152,7 @@ def test_what_is_no_budget_is_refused_in_a_sentence(
 
 def test_a_part_of_the_scan_is_read_in_detail(survey_png: Survey, tmp_path: Path) -> None:
     """The patches read are the best ones; receipt and page tell what they take, and what everything would have."""
-    published = survey_png(tmp_path, **SCAN, macs="40%", policy="sobel", controls=True)
+    published = survey_png(tmp_path, **SCAN, macs="80%", policy="sobel", controls=True)
     (attention,) = tmp_path.glob("stages/score/*/attention.zarr")
     patch_index = json.loads(attention.with_name("plan.json").read_text())["patch_index"]
     seen = xr.open_zarr(attention, consolidated=False)
@@ -161,9 +161,9 @@ def test_a_part_of_the_scan_is_read_in_detail(survey_png: Survey, tmp_path: Path
     assert sorted(patch_index) == sorted(best)
     kept, costs = published.receipt["kept"], published.receipt["savings"]["multiply_adds"]
     assert (kept["patches"], kept["of_patches"]) == (len(patch_index), 12 * 16)
-    assert 0.3 < costs["ratio"] <= 0.4
+    assert 0.7 < costs["ratio"] <= 0.8
     assert kept["multiply_adds"] == {"done": costs["done"], "everything": costs["full"]}
-    assert kept["asked"]["macs"] == "40%"
+    assert kept["asked"]["macs"] == "80%"
     accuracy = published.receipt["accuracy"]
     assert accuracy["controls_fraction"] == len(patch_index) / 192
     assert accuracy["controls"]["sobel"]["miou"] == pytest.approx(accuracy["miou"], abs=0.02)
@@ -175,7 +175,7 @@ def test_a_part_of_the_scan_is_read_in_detail(survey_png: Survey, tmp_path: Path
 
 def test_a_budget_is_refused_before_anything_is_captured(survey_png: Survey, tmp_path: Path) -> None:
     """No archive is begun for what cannot be paid for."""
-    with pytest.raises(BudgetError, match=r"--macs 1% does not pay for the coarse pass"):
+    with pytest.raises(BudgetError, match=r"--macs 1% does not pay for the overview"):
         survey_png(tmp_path / "out", **SCAN, macs="1%")
     assert not (tmp_path / "out").exists()
 
@@ -188,31 +188,17 @@ def test_a_plan_tells_what_the_budgets_pay_for(scene_files: Path, tiny: Path, tm
         "weights": str(tiny),
         "out": str(tmp_path),
     }
-    content = plan_content(load_settings(None, {**given_settings, "scan_step": "1", "macs": "50%"}))
+    content = plan_content(load_settings(None, {**given_settings, "scan_step": "1", "macs": "80%"}))
     costs = content["kept"]["multiply_adds"]
-    assert 0.45 < costs["done"] / costs["everything"] <= 0.5
-    assert f"detail: at most {content['kept']['patches']} of 192 patches" in format_kept(content["kept"])
+    assert 0.75 < costs["done"] / costs["everything"] <= 0.8
+    assert f"full reading: likely {content['kept']['patches']} of 192 patches" in format_kept(content["kept"])
 
 
-@pytest.mark.parametrize(
-    ("asked", "policy"),
-    [
-        ({}, "gain"),
-        ({"macs": "25%"}, "sobel"),
-        ({"macs": "25%", "policy": "entropy"}, "entropy"),
-        ({"macs": "25%", "least_gain": "0.1"}, "gain"),
-    ],
-)
-def test_scores_are_cheap_where_multiply_adds_are_short(asked: dict[str, str], policy: str) -> None:
-    """By default; who names a policy gets it, and a least gain is asked of scores that are gains."""
-    assert load_settings(None, {"seconds": "5", **asked}).policy == policy
-
-
-def test_scores_without_a_coarse_prediction_cost_no_coarse_prediction() -> None:
-    """Edges of the coarse image ask nothing of the network, which then reads the coarse pass for the map alone."""
+def test_scores_without_an_overview_cost_none() -> None:
+    """Edges of the image ask nothing of the network, which then reads the overview for the map alone."""
     patch_index = np.arange(9)
-    assert COSTS.with_scores(patch_index, "sobel").coarse_prediction == COSTS.of_map(patch_index).coarse_prediction
-    assert COSTS.with_scores(patch_index, "gain").coarse_prediction == 2 * COSTS.of_map(patch_index).coarse_prediction
+    assert COSTS.with_scores(patch_index, "sobel").overview == COSTS.of_map(patch_index).overview
+    assert COSTS.with_scores(patch_index, "gain").overview == 2 * COSTS.of_map(patch_index).overview
     assert replace(COSTS.with_scores(patch_index, "sobel"), score=0) == COSTS.of_map(patch_index)
 
 
@@ -222,26 +208,21 @@ def test_a_large_field_is_counted_region_by_region() -> None:
         costs.of_map(costs.grid.valid_patches())
         for costs in (replace(COSTS, grid=SceneGrid(side, side, 16, 4)) for side in (2560, 10240))
     )
-    assert 16 * small.decode < large.decode < 16 * 1.3 * small.decode
+    assert 16 * small.detail < large.detail < 16 * 1.1 * small.detail
     assert 16 * small.total < large.total < 16 * 1.3 * small.total
 
 
-@pytest.mark.parametrize(
-    ("policy", "scan_passes"),
-    [("gain", 2), ("entropy", 2), ("sobel", 1), ("random", 1), ("saliency", 1), ("vgg-static", 1)],
-)
-def test_a_policy_that_asks_the_coarse_prediction_reads_the_coarse_look_once_more(
-    policy: str, scan_passes: int
-) -> None:
+@pytest.mark.parametrize(("policy", "scan_passes"), [("gain", 2), ("entropy", 2), ("sobel", 1), ("random", 1)])
+def test_a_policy_that_asks_the_overview_reads_it_once_more(policy: str, scan_passes: int) -> None:
     """The map reads it anyway, from what is stored; scores of the coarse prediction read it before that."""
     score = score_multiply_adds(policy, COSTS.config, COSTS.grid)
     done = COSTS.with_scores(np.array([3, 8]), policy)
     closed = multiply_adds(COSTS.config, COSTS.grid, 2, COSTS.bands, score=score)
-    assert done.coarse_prediction == scan_passes * closed.coarse_prediction
-    assert (done.score, done.encode, done.decode) == (closed.score, closed.encode, closed.decode)
+    assert done.overview == scan_passes * closed.overview
+    assert (done.score, done.detail) == (closed.score, closed.detail)
 
 
 def test_a_plain_scan_is_read_and_nothing_scored() -> None:
     """What its map takes, whatever the policy of the settings is."""
-    run: Any = SimpleNamespace(costs=COSTS, chooses=False, prior=None)
+    run: Any = SimpleNamespace(costs=COSTS, chooses=False, prior=None, least_gain=None)
     assert SurveyRun.work_done(run, np.arange(PATCHES)) == COSTS.of_map(np.arange(PATCHES))

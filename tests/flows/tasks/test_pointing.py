@@ -85,13 +85,13 @@ def test_what_the_mirror_missed_is_told_and_detail_still_helps(surveyed: tuple[d
 
 
 def test_unseen_pixels_take_the_coarse_look(tmp_path: Path) -> None:
-    """What no line reached of a patch has the columns of the coarse pixel over it; a patch never seen is left out."""
-    grid = SceneGrid(12, 16, 4, 2)
+    """What no line reached of a patch has the columns that the overview reads there; a patch never seen is left out."""
+    grid = SceneGrid(12, 16, 4, 1)
     weights = SimpleNamespace(basis=SpectralBasis(500, 700, 2), columns_of_scores=lambda scores, law, nm: scores)
     patch_index = np.array([1, 6, 7])
     values = np.random.default_rng(0).normal(size=(3, 4, 4, 2)).astype(np.float16)
     values[0, :3, 1:], values[1] = np.nan, np.nan
-    coarse = np.random.default_rng(1).normal(size=(*np.array(grid.padded_shape) // 2, 2)).astype(np.float32)
+    coarse = np.random.default_rng(1).normal(size=(*grid.padded_shape, 2)).astype(np.float32)
     image = np.full((12, 16, 2), np.nan)
     for patch, (y, x) in zip(values, grid.patch_origin(patch_index), strict=True):
         image[y : y + 4, x : x + 4] = patch
@@ -103,8 +103,7 @@ def test_unseen_pixels_take_the_coarse_look(tmp_path: Path) -> None:
     np.testing.assert_allclose(columns[1], values[2], atol=1e-3)
     np.testing.assert_allclose(columns[0][:, 0], values[0][:, 0], atol=1e-3)
     np.testing.assert_allclose(columns[0][3], values[0][3], atol=1e-3)
-    over = coarse[:2, 2:4].repeat(2, axis=0).repeat(2, axis=1)  # patch 1 begins at row 0, column 4
-    np.testing.assert_array_equal(columns[0][:3, 1:], over[:3, 1:])
+    np.testing.assert_array_equal(columns[0][:3, 1:], coarse[:3, 5:8])  # patch 1 begins at row 0, column 4
 
 
 def found_of(**told: Any) -> dict[str, Any]:

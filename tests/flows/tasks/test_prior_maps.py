@@ -217,16 +217,16 @@ def test_a_reader_in_the_weights_is_used(visited: Path, survey_png: Survey, weig
     """Its key stands in the receipt and its multiply-adds count; one for others ends the survey before it begins."""
     own = Path(shutil.copy(weights, tmp_path / "own.safetensors"))
     config = load_weights(own).config
-    reader = TemporalReader(TemporalSizes(config.classes, config.columns, config.factor, 8, 4))
+    reader = TemporalReader(TemporalSizes(config.classes, config.columns, 8, 4))
     torch.nn.init.normal_(reader.leave.weight, std=0.2)
     add_reader(own, own, reader, {})
     flags = {**UNIFORM, "visit": "2026-06-07T10:00:00Z", "prior": "latest", "weights": str(own)}
     published = survey_png(visited, **flags)
     assert len(published.receipt["memory"]["reader"]) == 20
     first = survey_png(tmp_path / "alone", **{**flags, "prior": "none"})
-    decode = [one.receipt["savings"]["multiply_adds"]["decode"] for one in (published, first)]
+    decode = [one.receipt["savings"]["multiply_adds"]["detail"] for one in (published, first)]
     assert decode[0] - decode[1] == reader.sizes.multiply_adds(96 * 128)
-    add_reader(own, own, TemporalReader(TemporalSizes(3, 7, 4)), {})
+    add_reader(own, own, TemporalReader(TemporalSizes(3, 7)), {})
     with pytest.raises(WeightsError, match=r"own\.safetensors.* reader of prior maps is for another network"):
         survey_png(visited, **flags)
 

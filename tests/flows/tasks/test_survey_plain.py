@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 import xarray as xr
 from PIL import Image
 from rich.console import Console
@@ -21,6 +20,7 @@ from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.tasks.scene import open_scene
+from models.network.spectral import Capture
 from models.reading.inference import coarse_prediction
 from models.weights.files import load_weights, save_weights
 from pipeline.errors import SceneError
@@ -131,7 +131,7 @@ def test_savings_add_up_and_ranks_follow_the_scores(farm: Done) -> None:
         assert entry["ratio"] == pytest.approx(entry["done"] / entry["full"]), name
     assert savings["capture_s"]["done"] <= 0.9 * farm.receipt["field"]["camera_s"]["full_scan"] + 1e-9
     work = savings["multiply_adds"]
-    assert work["done"] == sum(work[part] for part in ("coarse_prediction", "score", "encode", "decode"))
+    assert work["done"] == sum(work[part] for part in ("overview", "score", "detail"))
     attention, detail = farm.open("attention"), farm.open("detail")
     score, rank = attention["score"].values.ravel(), attention["rank"].values.ravel()
     chosen = np.flatnonzero(rank >= 0)
@@ -202,16 +202,15 @@ def test_products_open_with_plain_xarray(farm: Done) -> None:
 
 @pytest.mark.usefixtures("no_effects")
 def test_without_a_fine_patch_the_map_is_the_coarse_prediction(survey_png: Any, weights: Path, tmp_path: Path) -> None:
-    """A budget that pays for the coarse pass alone gives the class of the coarse prediction, brought up bilinearly."""
+    """A budget that pays for the coarse pass alone gives the classes of the overview of its repeated pixels."""
     done = Done(survey_png(tmp_path, budget="0.45"), tmp_path)
     assert done.published.captured_again == 0
     mosaic = open_mosaic(tmp_path / done.receipt["products"]["mosaic"])
     drawn = done.open("class_map")["classes"].values
     grid = SceneGrid(*drawn.shape, 8, 4)
-    seen = coarse_prediction(load_weights(weights), mosaic.values(), mosaic.wavelength_nm, grid)
-    logits = torch.from_numpy(seen.probability).log().permute(2, 0, 1)[None]  # up to a constant a pixel
-    fine = torch.nn.functional.interpolate(logits, scale_factor=4.0, mode="bilinear", align_corners=False)
-    assert (fine.argmax(dim=1)[0].numpy() == drawn).mean() > 0.999
+    values, capture = mosaic.values(), Capture(1.0, 4, 4)
+    seen = coarse_prediction(load_weights(weights), values, mosaic.wavelength_nm, grid, capture=capture, factor=4)
+    assert (seen.probability.argmax(axis=-1)[: grid.height, : grid.width] == drawn).mean() > 0.999
     assert done.receipt["accuracy"]["miou"] == done.receipt["accuracy"]["none"]["miou"]
 
 
@@ -288,11 +287,7 @@ def test_no_data_neither_darkens_nor_becomes_a_class(survey_png: Any, tmp_path: 
     np.testing.assert_array_equal(drawn.classes == 255, gap)
     np.testing.assert_array_equal(np.isnan(drawn.confidence), gap)
     count = int(gap.sum())
-    assert one.receipt["pixels"] == {
-        "scene_without_a_value": count,
-        "coarse_px_no_reading": 0,
-        "map_without_a_class": count,
-    }
+    assert one.receipt["pixels"] == {"scene_without_a_value": count, "px_no_reading": 0, "map_without_a_class": count}
     assert one.receipt["accuracy"]["pixels"] == 64 * 96 - count
     assert "pixels" not in plain.receipt
     assert (_map(plain, whole).classes == drawn.classes)[~gap].mean() > 0.9  # light is what it was
@@ -316,7 +311,7 @@ def test_readings_that_the_weights_cannot_take_are_counted(survey_png: Any, tmp_
     scene = _scene(tmp_path / "s", None)
     found = _survey(survey_png, scene, weights=str(tmp_path / "w.safetensors"), policy="sobel")
     pixels = found.receipt["pixels"]
-    assert pixels["coarse_px_no_reading"] == 64 * 96 // 16
+    assert pixels["px_no_reading"] == 64 * 96
     assert pixels["map_without_a_class"] == 0
     store = scene.parent / "a" / Path(found.receipt["products"]["class_map"]).parent
-    assert json.loads((store / "out_of_range.json").read_text())["coarse_px"] == 64 * 96 // 16
+    assert json.loads((store / "out_of_range.json").read_text())["px"] == 64 * 96

@@ -64,7 +64,7 @@ def test_the_field_is_seen_once_and_whole(scanned: tuple[Path, Any]) -> None:
     seconds = published.receipt["savings"]["capture_s"]
     assert seconds["done"] == pytest.approx(0.025 * (lines + 2) + 0.25 + 1.6)
     assert (_store(out, "mosaic")["coverage"].values > 0).all()
-    assert published.receipt["savings"]["tokens"]["ratio"] == 1
+    assert published.receipt["savings"]["patches"]["ratio"] == 1
 
 
 def test_receipt_and_pages_tell_a_scan(scanned: tuple[Path, Any]) -> None:
@@ -261,11 +261,12 @@ def test_without_a_flag_the_cheapest_scan_nearly_as_good_as_any_is_taken(
     assert taken["expected_miou"] >= 0.94 - 0.005
 
 
-def test_without_a_flag_and_a_record_there_are_two_passes(survey_png: Survey, tmp_path: Path) -> None:
-    """In half of the seconds of every line, as the receipt's settings say."""
+def test_without_a_flag_and_a_record_every_line_is_captured(survey_png: Survey, tmp_path: Path) -> None:
+    """No record says what fewer lines would score; a note says so."""
     receipt = survey_png(tmp_path, budget=None).receipt
-    assert (receipt["settings"]["budget"], receipt["settings"]["scan_step"]) == (0.5, None)
-    assert receipt["savings"]["capture_s"]["ratio"] <= 0.5
+    assert (receipt["settings"]["budget"], receipt["settings"]["scan_step"]) == (None, 1)
+    assert receipt["savings"]["capture_s"]["ratio"] == 1
+    assert any("every line is captured" in note for note in receipt["settings"]["notes"])
 
 
 @pytest.mark.parametrize(("name", "value"), [("policy", "gain"), ("coarse_exposure_ms", "20")])

@@ -28,7 +28,7 @@ def test_a_reader_learns_whom_to_believe() -> None:
     lands = []
     for _ in range(4):
         labels = rng.integers(0, classes, (64, 64), dtype=np.uint8)
-        coarse = np.zeros((16, 16, columns), np.float16)
+        coarse = np.zeros((32, 32, columns), np.float16)
 
         def scan_pass(right: float, step: int, truth: np.ndarray = labels, still: np.ndarray = coarse) -> PastPass:
             said = np.where(rng.random(truth.shape) < right, truth, rng.integers(0, classes, truth.shape))
@@ -37,11 +37,11 @@ def test_a_reader_learns_whom_to_believe() -> None:
             return PastPass(step, 0.25, probability, still)
 
         lands.append([Visit(1.0, labels, [scan_pass(0.95, 1)]), Visit(4.0, labels, [scan_pass(0.3, 4)])])
-    reader, steps = train_reader(lands, TemporalTraining(steps=60, batch=4, crop=64, visits=2), 4)
+    reader, steps = train_reader(lands, TemporalTraining(steps=60, batch=4, crop=64, visits=2))
     assert steps == 60
     first, later = lands[0]
     images = [np.log(visit.scan_passes[0].probability.astype(np.float32)) for visit in (first, later)]
-    seen, coarse = np.ones((64, 64), np.bool_), np.zeros((16, 16, columns), np.float32)
+    seen, coarse = np.ones((64, 64), np.bool_), np.zeros((32, 32, columns), np.float32)
     before, now = (CurrentVisit(image, seen, coarse, 0.25, step) for image, step in zip(images, (1, 4), strict=True))
     after = fuse(PriorMap(first_probabilities(before), coarse, 3.0), now, reader)
     scores = [
@@ -62,22 +62,19 @@ def test_lands_are_visited_in_the_order_of_their_days() -> None:
         assert days[-1] <= 318
 
 
-@pytest.mark.parametrize("plain", [False, True])
-def test_the_command_trains_judges_and_says_how(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, plain: bool) -> None:
+def test_the_command_trains_judges_and_says_how(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A file for the weights that it was trained for, with seeds, settings and what it is worth on another land."""
     monkeypatch.setattr(
         "flows.training.observed_scenes.chosen_effects", lambda *given: USUAL
     )  # choosing takes seconds a look
     monkeypatch.setattr(remember, "VISITS", 2)
     monkeypatch.setattr(remember, "JUDGED_AFTER", (3,))
-    monkeypatch.setattr(remember, "STEPS", {4: 0.7, 1: 0.3})  # of which weights with coarse pixels of 2 px read one
-    out, weights = tmp_path / "farm.safetensors", shipped_weights(plain=plain)
+    out, weights = tmp_path / "farm.safetensors", shipped_weights()
     request = TemporalRequest("farm", weights, out, 1, 1, (128, 192), QUICK, "spectralzoom train")
     record = run_remember(request, Console(quiet=True))
     found = describe_weights(out).reader
     assert found is not None
     assert describe_weights(out).key == describe_weights(weights).key
-    assert load_reader(out).sizes.factor == (2 if plain else 4)
     assert dict(found.record) == record
     assert (record["lands"], record["steps"], record["command"]) == ([200_000], 2, "spectralzoom train")
     assert [row["days"] for row in record["validation"]] == [3.0]
@@ -108,11 +105,10 @@ def test_weights_of_other_classes_are_refused(tmp_path: Path, weights: Path) -> 
         train_temporal(TemporalRequest("farm", weights, tmp_path / "x.safetensors"))
 
 
-@pytest.mark.parametrize(("plain", "factor"), [(False, 4), (True, 2)])
-def test_the_shipped_weights_have_a_reader(plain: bool, factor: int) -> None:
+def test_the_shipped_weights_have_a_reader() -> None:
     """It fits them, was trained for them, and tells the lands that it has seen."""
-    weights = shipped_weights(plain=plain)
+    weights = shipped_weights()
     found = describe_weights(weights).reader
     assert found is not None
     assert min(found.record["lands"]) >= 200_000
-    assert found.sizes == load_reader(weights).sizes == TemporalSizes(11, 24, factor)
+    assert found.sizes == load_reader(weights).sizes == TemporalSizes(11, 24)

@@ -1,57 +1,49 @@
-"""Parts of the networks: the transformer, patches down to tokens and back up, and codes of places."""
+"""Parts of the networks: the transformer, images down their levels and back up, and images as patches."""
 
 from __future__ import annotations
 
 import pytest
 import torch
-from torch import Tensor
+from hypothesis import given
+from hypothesis import strategies as st
 
-from models.network.layers import Encoder, PatchHead, PatchStem
+from models.network.layers import Encoder, Head, Stem, cut, joined
 from models.network.sizes import level_widths
 from tests.models.conftest import noise
 
 
-@pytest.fixture
-def encoder() -> Encoder:
-    """Two blocks of width 16."""
+@torch.inference_mode()
+def test_tokens_read_each_other_in_no_order():
+    """Tokens in another order are read the same; one that changes changes the others."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(1)
-        return Encoder(16, 2, 2, 2).eval()
-
-
-def _tokens(count: int, seed: int = 5) -> Tensor:
-    return noise(seed, 1, count, 16)
-
-
-@torch.inference_mode()
-def test_what_is_kept_stands_for_the_tokens(encoder: Encoder):
-    """Later tokens read the memory as one causal reading of all tokens would let them."""
-    first, later = _tokens(5), _tokens(3, seed=6)
-    _, memory = encoder(first)
-    read, _ = encoder(later, memory)
-    changed, _ = encoder(later, [(keys.roll(1, 2), values.roll(1, 2)) for keys, values in memory])
-    assert (read - changed).abs().max() <= 2e-6  # a memory has no order
-    assert (read - encoder(later)[0]).abs().max() > 1e-3  # and is read
+        encoder = Encoder(16, 2, 2, 2).eval()
+    tokens, order = noise(5, 1, 8, 16), [3, 0, 7, 1, 6, 2, 5, 4]
+    read = encoder(tokens)
+    assert (encoder(tokens[:, order]) - read[:, order]).abs().max() <= 2e-6
+    tokens[:, 0] *= -1
+    assert (encoder(tokens) - read)[:, 1:].abs().max() > 1e-3
 
 
 @torch.inference_mode()
-@pytest.mark.parametrize(("patch", "side"), [(4, 1), (8, 1), (32, 2), (64, 4)])
-def test_a_patch_comes_back_at_its_size(patch: int, side: int):
-    """Features of every level, finest first, a token for each part, and the width per pixel again."""
+@pytest.mark.parametrize("patch", [4, 8, 32, 64])
+def test_an_image_comes_back_at_its_size(patch: int):
+    """Features of every level, finest first, down to 4 px, and the width per pixel again."""
     widths = level_widths(8, patch)
-    features, tokens = PatchStem(5, widths, 12, side)(torch.zeros(3, 5, patch, patch))
+    assert widths[:3] == [8, 16, 24][: len(widths)]
+    features = Stem(5, widths)(torch.zeros(3, 5, patch, 2 * patch))
     assert [tuple(level.shape) for level in features] == [
-        (3, width, patch >> i, patch >> i) for i, width in enumerate(widths)
+        (3, width, patch >> i, 2 * patch >> i) for i, width in enumerate(widths)
     ]
-    assert tokens.shape == (3, side**2, 12)
-    assert PatchHead(widths, 12, side)(features, tokens).shape == (3, 8, patch, patch)
+    assert features[-1].shape[2] == 4
+    assert Head(widths)(features).shape == (3, 8, patch, 2 * patch)
 
 
-@torch.inference_mode()
-def test_tokens_lie_row_by_row():
-    """What stands in one quarter of a patch of 32 px changes the tokens near it, and most its own."""
-    stem, patch = PatchStem(1, level_widths(8, 32), 12, 2), torch.zeros(1, 1, 32, 32)
-    still = stem(patch)[1][0]
-    patch[..., 2:14, 18:30] = 1.0  # above, right
-    moved = (stem(patch)[1][0] - still).abs().sum(dim=1)
-    assert moved.argmax() == 1
+@given(st.integers(1, 3), st.integers(1, 4), st.sampled_from([1, 4]))
+def test_patches_lie_row_by_row_and_make_the_image_again(rows: int, columns: int, patch: int):
+    """Cut and joined an image is what it was; the second patch lies right of the first."""
+    image = torch.arange(2 * 3 * rows * columns * patch**2).view(2, 3, rows * patch, columns * patch)
+    cells = cut(image, patch)
+    assert torch.equal(joined(cells, columns), image)
+    if columns > 1:
+        assert torch.equal(cells[:, 1], image[:, :, :patch, patch : 2 * patch])

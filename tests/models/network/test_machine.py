@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from models.network.layers import ChannelNorm, cut
 from models.network.machine import choose_device
-from models.network.segmenter import Segmenter, SegmenterConfig
+from models.network.spectral import Capture
+from models.reading.inference import overview_of, patch_logits
 from models.training.examples import Batch
 from models.training.objective import PHASES, draw_patches
+from models.weights.files import Weights
 from pipeline.errors import SettingsError
-
-CONFIG = SegmenterConfig(classes=3, columns=6, patch=8, width=8, coarse_width=8, dim=16, layers=2, heads=2)
+from tests.models.conftest import make_weights, scene_columns
 
 
 @pytest.fixture
@@ -50,31 +54,35 @@ def test_a_device_that_is_not_there_is_refused_in_a_sentence(machine: set[str], 
 
 
 @pytest.fixture
-def elsewhere() -> Segmenter:
+def elsewhere(monkeypatch: pytest.MonkeyPatch) -> Weights:
     """A network on a device of which torch keeps shapes alone, and which it refuses to mix with the processor."""
-    return Segmenter(CONFIG).to("meta").eval()
+    for kind in (ChannelNorm, torch.nn.RMSNorm):  # for their shapes torch would import its compiler
+        monkeypatch.setattr(kind, "forward", lambda norm, x: x)
+    return make_weights().on("meta")
 
 
 @torch.inference_mode()
-def test_what_a_map_is_drawn_from_is_brought_to_the_network(elsewhere: Segmenter) -> None:
-    """Images, patches, patches and origins come from the processor; what is read lies with the network."""
-    reading = elsewhere.read_coarse_in_chunks(torch.zeros(1, 6, 16, 16), torch.tensor([[2, 3]]), None)
-    assert reading.logits.device.type == elsewhere.score(reading).device.type == "meta"
-    patches, patch_index = np.zeros((2, 8, 8, 6), np.float32), torch.tensor([0, 5])
-    (read,) = elsewhere.read_fine_in_chunks(reading, patches, patch_index, torch.tensor([[2, 3]]))
-    assert read.device.type == "meta"
+def test_what_a_map_is_drawn_from_is_brought_to_the_network(elsewhere: Weights) -> None:
+    """Images, patches and their numbers come from the processor; the logits of patches are asked back from there."""
+    coarse_pass, patches = scene_columns(elsewhere, 16, 16)
+    overview = overview_of(elsewhere, replace(coarse_pass, origin=(2, 3)))
+    assert overview.logits.device.type == elsewhere.segmenter.score(overview).device.type == "meta"
+    with pytest.raises(NotImplementedError, match="copy out of meta tensor"):
+        next(patch_logits(elsewhere, overview, patches[:2], np.array([0, 3]), Capture()))
 
 
-def test_what_a_step_learns_from_is_brought_to_the_network(elsewhere: Segmenter) -> None:
+def test_what_a_step_learns_from_is_brought_to_the_network(elsewhere: Weights) -> None:
     """A batch of crops and the patches drawn of it, which chance on the processor has a part in."""
 
     def crops(*shape: int) -> Tensor:
         return torch.zeros(2, *shape, device="cpu")
 
-    batch = Batch(crops(6, 16, 16), crops(64, 6, 8, 8), crops(64, 64).long(), crops(2).long()).on("meta")
+    network = elsewhere.segmenter
+    batch = Batch(crops(7, 64, 64), crops(7, 64, 64), crops(64, 64).long(), crops(2).long()).on("meta")
     assert {one.device.type for one in vars(batch).values()} == {"meta"}
-    reading = elsewhere.read_coarse(batch.coarse, batch.origin)
-    score = elsewhere.score(reading).flatten(1)
-    patch_index = draw_patches(reading.logits, score, CONFIG, np.random.default_rng(0), PHASES[1])
-    fine = batch.fine.gather(1, patch_index[:, :, None, None, None].expand(-1, -1, *batch.fine.shape[2:]))
-    assert elsewhere.read_fine(reading, fine, patch_index, batch.origin).device.type == "meta"
+    overview = network.read_overview(batch.image, crops(2))
+    score = network.score(overview).flatten(1)
+    patch_index = draw_patches(overview.logits, score, network.config, np.random.default_rng(0), PHASES[1])
+    cells = cut(batch.detail, network.config.patch)
+    chosen = cells.gather(1, patch_index[:, :, None, None, None].expand(-1, -1, *cells.shape[2:]))
+    assert network.read_patches(overview, chosen, patch_index).device.type == "meta"

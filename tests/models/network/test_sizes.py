@@ -9,7 +9,7 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
 from models.network.segmenter import Segmenter
-from models.network.sizes import SegmenterConfig, TemporalSizes, multiply_adds
+from models.network.sizes import CELL_PX, PLANES, SegmenterConfig, TemporalSizes, multiply_adds
 from models.network.temporal_reader import TemporalReader
 from models.policies.policies import score_multiply_adds
 from pipeline.geometry.grid import SceneGrid
@@ -19,43 +19,47 @@ def _attention(q: Any, k: Any, v: Any, *args: Any, out_shape: Any = None, **kwar
     return sdpa_flop_count(q, k, v)
 
 
-@pytest.mark.parametrize(("patch", "factor", "patch_index"), [(16, 4, 7), (8, 2, 1), (32, 4, 3)])
-def test_closed_form_equals_the_counter(patch: int, factor: int, patch_index: int) -> None:
+@pytest.mark.parametrize(
+    ("sizes", "patch_index"),
+    [({"patch": 16}, 7), ({"patch": 8, "overview_width": 12}, 1), ({"patch": 32, "dim": 32, "layers": 1}, 3)],
+)
+def test_closed_form_equals_the_counter(sizes: dict[str, int], patch_index: int) -> None:
     """The closed form counts just what torch counts while the model runs."""
-    config = SegmenterConfig(classes=5, columns=6, patch=patch, factor=factor)
-    model = Segmenter(config).eval()
-    grid = SceneGrid(2 * patch * factor, 3 * patch * factor, patch, factor)
-    coarse = torch.zeros(1, 6, 2 * patch, 3 * patch)
+    config = SegmenterConfig(classes=5, columns=6, **sizes)
+    model, image = Segmenter(config).eval(), torch.zeros(1, 6 + PLANES, 64, 96)
     counter = FlopCounterMode(
         display=False, custom_mapping={torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: _attention}
     )
     with torch.inference_mode(), counter:
-        model(coarse, torch.zeros(1, patch_index, 6, patch, patch), torch.arange(patch_index)[None])
+        model(image, image, torch.arange(patch_index)[None], torch.zeros(1, 2))
+    grid = SceneGrid(64, 96, config.patch, 1)
     assert multiply_adds(config, grid, patch_index, 0).total == counter.get_total_flops() / 2
 
 
-@pytest.mark.parametrize("factor", [2, 4])
-def test_the_temporal_reader_costs_what_the_counter_counts(factor: int) -> None:
+def test_the_temporal_reader_costs_what_the_counter_counts() -> None:
     """Its closed form too, of fine and coarse pixels."""
-    sizes = TemporalSizes(classes=5, columns=6, factor=factor)
-    fine, coarse = torch.zeros(1, 1, 16, 24), torch.zeros(1, 6, 16 // factor, 24 // factor)
+    sizes = TemporalSizes(classes=5, columns=6)
+    fine, coarse = torch.zeros(1, 1, 16, 24), torch.zeros(1, 6, 16 // CELL_PX, 24 // CELL_PX)
     scores, one, counter = fine.expand(1, 5, 16, 24), torch.ones(1), FlopCounterMode(display=False)
     with torch.inference_mode(), counter:
         TemporalReader(sizes).eval()(scores, scores, fine, fine, fine, one, one, coarse, coarse, coarse[:, :1])
     assert sizes.multiply_adds(16 * 24) == counter.get_total_flops() / 2
 
 
-def test_more_patches_cost_more() -> None:
-    """The coarse prediction does not depend on the patches; encode and decode grow with them."""
-    config, grid = SegmenterConfig(classes=5), SceneGrid(256, 256, 16, 4)
-    few, many = (multiply_adds(config, grid, patch_index, 270) for patch_index in (1, 20))
-    assert few.coarse_prediction == many.coarse_prediction
-    assert few.encode < many.encode
-    assert few.decode < many.decode
+def test_each_patch_costs_the_same_and_the_overview_none_of_it() -> None:
+    """What the policy took is added; columns are made of each band, again for patches that were captured apart."""
+    config = SegmenterConfig(classes=5)
+    grid = SceneGrid(250, 256, 16, 4)
+    one, many, bare = (multiply_adds(config, grid, *given, score=9) for given in ((1, 270), (20, 270), (20, 0)))
+    assert one.overview == many.overview == bare.overview + 256**2 * 270 * config.columns
+    assert 20 * one.detail == many.detail == bare.detail
+    apart = multiply_adds(config, grid, 20, 270, apart=True)
+    assert apart.detail == bare.detail + 20 * 16**2 * 270 * config.columns
+    assert many.total == many.overview + many.detail + 9
 
 
 def test_edges_go_through_all_columns_once() -> None:
-    """Each column more adds one multiply-add a coarse pixel."""
+    """Each column more adds one multiply-add a pixel."""
     grid = SceneGrid(256, 256, 16, 4)
     few, many = (score_multiply_adds("sobel", SegmenterConfig(5, columns), grid) for columns in (2, 24))
-    assert many - few == 22 * 64 * 64
+    assert many - few == 22 * 256 * 256

@@ -13,8 +13,7 @@ from pipeline.geometry.grid import SceneGrid
 def _coarse_prediction(height: int = 32, width: int = 48, patch: int = 8, factor: int = 2) -> CoarsePrediction:
     """A flat scene of which the coarse prediction is equally unsure everywhere."""
     grid = SceneGrid(height, width, patch, factor)
-    y, x = (size // factor for size in grid.padded_shape)
-    columns, probability = np.full((y, x, 3), 0.7, np.float32), np.full((y, x, 4), 0.25, np.float32)
+    columns, probability = (np.full((*grid.padded_shape, n), 1 / n, np.float32) for n in (3, 4))
     return CoarsePrediction(grid, columns, probability, gain=np.ones(grid.patch_shape, np.float32))
 
 
@@ -31,7 +30,7 @@ def test_entropy_looks_where_the_coarse_prediction_is_unsure():
     """The patch over unsure pixels scores highest, by the mean over its own pixels."""
     seen = _coarse_prediction()
     seen.probability[...] = [1, 0, 0, 0]
-    seen.probability[4:8, 8:12] = [0.5, 0.5, 0, 0]  # the patch at row 1, column 2
+    seen.probability[8:16, 16:24] = [0.5, 0.5, 0, 0]  # the patch at row 1, column 2
     scores = score_patches("entropy", seen).reshape(4, 6)
     assert scores[1, 2] == pytest.approx(np.log(2))
     scores[1, 2] = 0
@@ -41,7 +40,7 @@ def test_entropy_looks_where_the_coarse_prediction_is_unsure():
 def test_sobel_looks_at_edges():
     """A step between two columns of patches scores in both and nowhere else."""
     seen = _coarse_prediction()
-    seen.columns[:, :8] = 0.1
+    seen.columns[:, :16] = 0.1
     scores = score_patches("sobel", seen).reshape(4, 6)
     assert (scores[:, [1, 2]] > 0.1).all()
     assert scores[:, [0, 3, 4, 5]] == pytest.approx(0, abs=1e-12)

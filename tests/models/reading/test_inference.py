@@ -1,4 +1,4 @@
-"""A trained segmenter on one scene: sizes, patches, borders, strips and pixels without a value."""
+"""A trained segmenter on one scene: sizes, places, captures, strips, and pixels without a value."""
 
 from __future__ import annotations
 
@@ -8,37 +8,49 @@ import numpy as np
 import pytest
 import torch
 
+from models.network.sizes import TOKEN_PX
+from models.network.spectral import Capture, with_planes
+from models.reading import inference
 from models.reading.inference import (
+    CoarsePass,
     CoarsePrediction,
     coarse_prediction,
+    coarse_prediction_of_columns,
+    coarse_prediction_of_patches,
+    draw,
+    map_of_columns,
     read_coarse_pass,
     read_coarse_prediction,
     segment,
 )
-from models.weights.files import Weights
+from models.weights.files import Weights, with_record
+from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
-from tests.models.conftest import Maker
+from tests.models.conftest import Maker, noise, plain_weights, scene_columns
 
 NM = np.linspace(400, 1000, 9)
 NONE = np.empty(0, np.int64)
+DARK = Capture(0.1, 4)
 
 
-def _coarse_pass(weights: Weights, height: int, width: int, seed: int = 0) -> tuple[CoarsePrediction, np.ndarray]:
-    """The coarse prediction at a random scene, and a patch for every patch."""
-    p, s, columns = weights.config.patch, weights.config.factor, weights.config.columns
-    grid, rng = SceneGrid(height, width, p, s), np.random.default_rng(seed)
-    seen = coarse_prediction(weights, rng.uniform(0.1, 0.5, (*grid.coarse_shape, len(NM))), NM, grid)
-    count = grid.patch_shape[0] * grid.patch_shape[1]
-    return seen, rng.normal(0, 1, (count, p, p, columns)).astype(np.float32)
+def _values(height: int, width: int, bands: int = len(NM)) -> np.ndarray:
+    return np.random.default_rng(0).uniform(0.1, 0.5, (height, width, bands)).astype(np.float32)
 
 
-@pytest.mark.parametrize("size", [(37, 53), (1, 1), (16, 16), (17, 1), (1, 40), (48, 15)])
+def _seen(weights: Weights, height: int = 32, width: int = 48) -> tuple[CoarsePrediction, np.ndarray]:
+    """The overview of a scene of noise, and other noise for every patch."""
+    coarse_pass, fine = scene_columns(weights, height, width)
+    return read_coarse_prediction(weights, coarse_pass), fine
+
+
+@pytest.mark.parametrize("size", [(37, 53), (1, 1), (32, 32), (33, 1), (1, 40)])
 @pytest.mark.parametrize("factor", [1, 2, 4])
 def test_maps_have_the_size_of_the_scene(tiny: Maker, size: tuple[int, int], factor: int):
     """Any size works, with no patch, one patch and every patch, down to a single pixel."""
-    weights = tiny(factor=factor)
-    seen, fine = _coarse_pass(weights, *size)
-    for patch_index in (NONE, seen.grid.valid_patches()[-1:], seen.grid.valid_patches()):
+    weights, grid = tiny(), SceneGrid(*size, 8, factor)
+    seen = coarse_prediction(weights, _values(*grid.coarse_shape), NM, grid, factor=factor)
+    fine = noise(1, int(np.prod(grid.patch_shape)), 8, 8, 4).numpy()
+    for patch_index in (NONE, grid.valid_patches()[-1:], grid.valid_patches()):
         drawn = segment(weights, seen, fine[patch_index], patch_index)
         assert drawn.classes.shape == drawn.confidence.shape == size
         assert drawn.classes.dtype == np.uint8
@@ -46,42 +58,209 @@ def test_maps_have_the_size_of_the_scene(tiny: Maker, size: tuple[int, int], fac
         assert 1 / 3 - 1e-6 <= drawn.confidence.min() <= drawn.confidence.max() <= 1
 
 
-def test_patches_lie_at_their_patches(tiny: Maker):
-    """Exchanging the patches of two patches changes the map in both, and a patch's map follows its patch's pixels."""
-    weights = tiny(classes=6)
-    seen, fine = _coarse_pass(weights, 32, 32)
-    drawn = segment(weights, seen, fine[:2], np.array([3, 12]))
-    moved = segment(weights, seen, fine[:2], np.array([12, 3]))
-    changed = np.abs(drawn.confidence - moved.confidence).reshape(4, 8, 4, 8).max(axis=(1, 3))
-    assert sorted(np.argsort(changed, axis=None)[-2:].tolist()) == [3, 12]
+def test_a_map_without_a_patch_is_the_overviews(tiny: Maker):
+    """Confidence and classes are those of its probabilities, on the scene, softened by the weights' temperature."""
+    weights = tiny()
+    seen, fine = _seen(weights, 37, 53)
+    expected = seen.probability[:37, :53]
+    drawn = segment(weights, seen, fine[:0], NONE, every_class=True)
+    assert drawn.confidence == pytest.approx(expected.max(axis=-1), abs=1e-6)
+    assert (drawn.classes == expected.argmax(axis=-1)).all()
+    assert drawn.log_probability is not None
+    assert np.exp(drawn.log_probability) == pytest.approx(expected, abs=1e-6)
+    softer = segment(with_record(weights, calibration={"temperature": 2.0}), seen, fine[:0], NONE)
+    rooted = np.sqrt(expected)
+    assert softer.confidence == pytest.approx((rooted / rooted.sum(axis=-1, keepdims=True)).max(axis=-1), abs=1e-6)
+    assert (softer.classes == drawn.classes).all()
+
+
+def test_a_patch_changes_its_own_pixels_alone(tiny: Maker):
+    """Bit by bit all others are the overview's; of patches exchanged both change, whatever the order they come in."""
+    weights = tiny()
+    seen, fine = _seen(weights)
+    patch_index = np.array([15, 3])
+    without, drawn, moved, again = (
+        segment(weights, seen, fine[which], numbers).confidence
+        for which, numbers in (([], NONE), ([0, 1], patch_index), ([1, 0], patch_index), ([1, 0], patch_index[::-1]))
+    )
+    for one, other in ((without, drawn), (drawn, moved)):
+        changed = (one != other).reshape(4, 8, 6, 8).any(axis=(1, 3))
+        assert np.flatnonzero(changed).tolist() == [3, 15]
+    assert again == pytest.approx(drawn, abs=1e-6)
+
+
+@pytest.mark.parametrize("most", [1, 7])
+def test_chunks_do_not_show(tiny: Maker, most: int, monkeypatch: pytest.MonkeyPatch):
+    """However many patches are read at a time, classes are the same and confidence differs by 1e-6 at most."""
+    weights = tiny()
+    seen, fine = _seen(weights)
+    patch_index = np.random.default_rng(1).permutation(24)[:15]
+    whole = segment(weights, seen, fine[patch_index], patch_index)
+    monkeypatch.setattr(inference, "PATCHES_AT_ONCE", most)
+    monkeypatch.setattr(inference, "ROWS_DRAWN", most)
+    drawn = segment(weights, seen, fine[patch_index], patch_index)
+    assert (drawn.classes == whole.classes).all()
+    assert np.abs(drawn.confidence - whole.confidence).max() <= 1e-6
+
+
+@pytest.mark.parametrize("patch", [8, 32, 64])
+@pytest.mark.parametrize("origin", [(0, 0), (8, 40)])
+def test_a_region_is_drawn_as_training_saw_crops(tiny: Maker, patch: int, origin: tuple[int, int]):
+    """What is drawn is the composite that the loss of training is taken of, at the same places, by both captures."""
+    weights = tiny(patch=patch)
+    coarse_pass, fine = scene_columns(weights, 64, 128)
+    moved, patch_index = replace(coarse_pass, origin=origin, capture=DARK), np.array([1, 0])
+    other = Capture(0.5)
+    drawn = segment(weights, moved, fine[patch_index], patch_index, capture=other)
+    detail = np.zeros((64, 128, 4), np.float32)
+    for (y, x), own in zip(coarse_pass.grid.patch_origin(patch_index), fine[patch_index], strict=True):
+        detail[y : y + patch, x : x + patch] = own
+    images = (
+        torch.from_numpy(with_planes(*one)).permute(2, 0, 1)[None]
+        for one in ((coarse_pass.columns, DARK), (detail, other))
+    )
+    model, numbers = weights.segmenter, torch.from_numpy(patch_index)[None]
+    with torch.inference_mode():
+        places = torch.tensor([origin]).double() * patch / TOKEN_PX
+        logits = model.composite(*model(*images, numbers, places), numbers)
+    assert np.abs(drawn.confidence - logits[0].softmax(dim=0).amax(dim=0).numpy()).max() <= 1e-5
+    here = segment(weights, replace(moved, origin=(0, 0)), fine[patch_index], patch_index, capture=other)
+    assert (drawn.confidence == here.confidence).all() == (origin == (0, 0))
+
+
+def test_a_kept_overview_counts_for_what_it_is_of_only(tiny: Maker, monkeypatch: pytest.MonkeyPatch):
+    """A scene is read again where pixels, place, living tokens, capture or weights are not those of the prediction."""
+    weights, other, again = tiny(0), tiny(1), list[int]()
+    seen, fine = _seen(weights)
+    for network in (weights.segmenter, other.segmenter):
+        read = network.read_overview
+        monkeypatch.setattr(network, "read_overview", lambda *given, read=read: again.append(1) or read(*given))
+    segment(weights, seen, fine[:1], np.array([0]))
+    assert not again
+    changes = {"columns": seen.columns + 1, "origin": (4, 4), "living": np.array([True, False]), "capture": DARK}
+    changed = [(weights, replace(seen, **{name: value})) for name, value in changes.items()]
+    for count, (who, what) in enumerate([*changed, (other, seen)], 1):
+        segment(who, what, fine[:1], np.array([0]))
+        assert len(again) == count
+
+
+@pytest.mark.parametrize(
+    ("numbers", "words"),
+    [
+        ([0, 24], r"patch 24 is none of the 24 patches of the scene, 0\.\.23"),
+        ([-1], "patch -1 is none"),
+        ([4, 1, 4], "patch 4 is given more"),
+    ],
+)
+def test_a_patch_that_cannot_be_is_refused_before_anything_is_read(
+    tiny: Maker, numbers: list[int], words: str, monkeypatch: pytest.MonkeyPatch
+):
+    """One outside the scene is named, and one that is given twice."""
+    weights = tiny()
+    coarse_pass, fine = scene_columns(weights, 32, 48)
+    monkeypatch.setattr(weights.segmenter, "read_overview", lambda *given: pytest.fail("read"))
+    with pytest.raises(ShapeError, match=words):
+        segment(weights, coarse_pass, fine[: len(numbers)], np.array(numbers))
 
 
 @pytest.mark.parametrize("bands", [NM, NM[:3]])
-def test_a_look_in_swaths_is_the_look_at_once(tiny: Maker, bands: np.ndarray):
+@pytest.mark.parametrize("factor", [1, 2])
+def test_a_look_in_swaths_is_the_look_at_once(tiny: Maker, bands: np.ndarray, factor: int):
     """Rows of the mosaic that come some at a time give the very same columns, with bands for all of them or not."""
-    weights, grid = tiny(), SceneGrid(37, 53, 8, 2)
-    coarse = np.random.default_rng(0).uniform(0.1, 0.5, (*grid.coarse_shape, len(bands))).astype(np.float32)
-    whole = coarse_prediction(weights, coarse, bands, grid)
-    parts = read_coarse_pass(weights, np.split(coarse, [1, 9]), bands, grid)
+    weights, grid = tiny(), SceneGrid(37, 53, 8, factor)
+    values = _values(*grid.coarse_shape, len(bands))
+    whole = read_coarse_pass(weights, [values], bands, grid, factor=factor)
+    parts = read_coarse_pass(weights, np.split(values, [1, 9]), bands, grid, factor=factor)
     assert (parts.columns == whole.columns).all()
-    assert (read_coarse_prediction(weights, parts).probability == whole.probability).all()
+    inner = weights.columns(values, bands).repeat(factor, 0).repeat(factor, 1)[:37, :53]
+    assert whole.columns[:37, :53] == pytest.approx(inner, abs=1e-6)  # each coarse pixel stands for several
+    added = len(whole.columns) - 37
+    assert (whole.columns[37:] == whole.columns[35 : 35 - added : -1]).all()  # the pad is a mirror image
 
 
-@pytest.mark.parametrize("origin", [(0, 0), (12, 40)])
-def test_a_region_is_drawn_as_training_saw_crops(tiny: Maker, origin: tuple[int, int]):
-    """Reading in steps and chunks gives the composite that the loss of training is taken of, at the same places."""
+def test_columns_and_patches_of_a_scene_are_read_alike(tiny: Maker):
+    """An image, and its patches row by row, have one overview; read in full everywhere it is the whole map."""
     weights = tiny()
-    seen, fine = _coarse_pass(weights, 32, 48)
-    moved, patch_index = replace(seen, origin=origin), np.array([5, 0, 17, 23, 9])
-    drawn, model = segment(weights, moved, fine[patch_index], patch_index), weights.segmenter
-    with torch.inference_mode():
-        columns = torch.from_numpy(seen.columns).permute(2, 0, 1)[None]
-        numbers, patches = (
-            torch.from_numpy(patch_index)[None],
-            torch.from_numpy(fine[patch_index]).permute(0, 3, 1, 2)[None],
-        )
-        coarse, detail = model(columns, patches, numbers, torch.tensor([origin]))
-        confidence = model.composite(coarse, detail, numbers)[0].softmax(dim=0).max(dim=0).values.numpy()
-    assert np.abs(drawn.confidence - confidence).max() <= 1e-5
-    same = (drawn.confidence == segment(weights, seen, fine[patch_index], patch_index).confidence).all()
-    assert same == (origin == (0, 0))
+    coarse_pass, _ = scene_columns(weights, 32, 48)
+    every = coarse_pass.grid.valid_patches()
+    image, cells = (
+        coarse_prediction_of_columns(weights, coarse_pass.columns, coarse_pass.grid, DARK),
+        coarse_prediction_of_patches(weights, coarse_pass.patches(every), coarse_pass.grid, DARK),
+    )
+    assert (image.probability == cells.probability).all()
+    drawn, log_probability = map_of_columns(weights, coarse_pass.columns, coarse_pass.grid, DARK)
+    own = segment(weights, image, image.patches(every), every)
+    assert (drawn.confidence == own.confidence).all()
+    assert np.exp(log_probability).max(axis=-1) == pytest.approx(own.confidence, abs=1e-6)
+    brighter, _ = map_of_columns(weights, coarse_pass.columns, coarse_pass.grid)
+    assert np.abs(brighter.confidence - drawn.confidence).max() > 1e-4
+
+
+@pytest.mark.parametrize("more", [0, 1])
+def test_a_token_dead_in_most_of_its_pixels_is_left_out(more: int):
+    """With half of its pixels dead a token is read, with one more it is not; holes take the mean of their patch."""
+    weights, grid, values = plain_weights(), SceneGrid(60, 64, 8, 1), _values(60, 64)
+    whole = read_coarse_pass(weights, [values], NM, grid).columns
+    values[:16, :32], values[16, :more], values[41:43, 50:53] = np.nan, np.inf, -np.inf
+    seen = read_coarse_pass(weights, [values], NM, grid)
+    assert seen.living is not None
+    assert seen.living.tolist() == [not more, True, True, True]
+    hole = np.zeros((64, 64), bool)
+    hole[:16, :32], hole[16, :more], hole[41:43, 50:53] = True, True, True
+    assert (seen.columns[~hole] == whole[~hole]).all()
+    assert not seen.columns[:16, :32].any()  # nothing of these patches lives
+    beside = whole[40:48, 48:56][~hole[40:48, 48:56]].mean(axis=0)
+    assert seen.columns[41:43, 50:53] == pytest.approx(np.broadcast_to(beside, (2, 3, 4)), abs=1e-5)
+    assert (np.isnan(seen.seen_columns).all(axis=-1) == hole).all()
+    assert seen.out_of_range is not None
+    assert np.count_nonzero(seen.out_of_range) == more + 6  # captured, and no readings
+
+
+def test_what_is_dead_reaches_nobody():
+    """Holes of any content give one map, in either reading; a scene all dead has one too, and so have its patches."""
+    weights, grid, maps = plain_weights(), SceneGrid(64, 64, 8, 1), []
+    fine = noise(1, 3, 8, 8, 4).numpy()
+    for bad in (np.nan, np.inf, -np.inf, 1e30):
+        values, patches = _values(64, 64), fine.copy()
+        values[:33, :32], values[:, 47], patches[0, 2, 1:4] = bad, bad, bad
+        seen = coarse_prediction(weights, values, NM, grid)
+        maps.append(segment(weights, seen, patches, np.array([1, 9, 63])).confidence)
+    assert np.isfinite(maps[0]).all()
+    assert all((other == maps[0]).all() for other in maps[1:])
+    seen = coarse_prediction(weights, np.full((64, 64, 9), np.nan), NM, grid)
+    assert seen.living is not None
+    assert not seen.living.any()
+    assert np.isfinite(segment(weights, seen, fine, np.array([1, 9, 63])).confidence).all()
+
+
+@pytest.mark.parametrize(("dead", "counts"), [(32, True), (33, False), (64, False)])
+def test_a_patch_dead_in_most_of_its_pixels_counts_as_not_captured(tiny: Maker, dead: int, counts: bool):
+    """The map is that without it, and other patches are drawn at their own places."""
+    weights = tiny()
+    seen, fine = _seen(weights)
+    fine[5].reshape(64, 4)[:dead] = np.nan
+    drawn, without = (segment(weights, seen, fine[which], np.array(which)).confidence for which in ([4, 5, 6], [4, 6]))
+    changed = (drawn != without).reshape(4, 8, 6, 8).any(axis=(1, 3))
+    assert np.flatnonzero(changed).tolist() == [5] * counts
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_logits_that_are_not_finite_give_no_class(value: float):
+    """255 and NaN there, and what is beside is drawn as ever."""
+    logits = noise(0, 3, 70, 5)
+    whole = draw(logits.clone())
+    logits[1, 66, 2] = value
+    drawn = draw(logits)
+    assert (drawn.classes[66, 2], np.isnan(drawn.confidence[66, 2])) == (255, True)
+    beside = np.ones((70, 5), bool)
+    beside[66, 2] = False
+    assert (drawn.classes[beside] == whole.classes[beside]).all()
+    assert (drawn.confidence[beside] == whole.confidence[beside]).all()
+
+
+def test_what_was_never_dead_has_no_mask(tiny: Maker):
+    """Where every pixel lives no token is left out, and nothing is filled."""
+    seen = read_coarse_pass(tiny(), [_values(30, 31)], NM, SceneGrid(30, 31, 8, 1))
+    assert (seen.living, seen.filled, seen.out_of_range) == (None, None, None)
+    assert seen.seen_columns is seen.columns
+    assert CoarsePass(seen.grid, seen.columns).capture == Capture()

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import models.reading.prior_map as prior_map
-from models.network.sizes import TemporalSizes
+from models.network.sizes import CELL_PX, TemporalSizes
 from models.network.temporal_reader import TemporalReader
 from models.reading.prior_map import (
     FAINTEST,
@@ -29,9 +29,10 @@ from models.reading.prior_map import (
     first_probabilities,
     fuse,
     in_classes,
+    pooled,
 )
 
-CLASSES, COLUMNS, FACTOR = 3, 4, 4
+CLASSES, COLUMNS = 3, 4
 SHAPE = (24, 20)
 seeds = st.integers(0, 2**16)
 
@@ -44,7 +45,7 @@ def log_probabilities(rng: np.random.Generator, shape: tuple[int, int] = SHAPE) 
 
 def an_observation(rng: np.random.Generator, shape: tuple[int, int] = SHAPE) -> CurrentVisit:
     """A look in detail at all of a field."""
-    coarse = rng.normal(size=(shape[0] // FACTOR, -(-shape[1] // FACTOR), COLUMNS)).astype(np.float32)
+    coarse = rng.normal(size=(*(-(-side // CELL_PX) for side in shape), COLUMNS)).astype(np.float32)
     return CurrentVisit(log_probabilities(rng, shape), np.ones(shape, np.bool_), coarse, 0.05, 2)
 
 
@@ -54,11 +55,11 @@ def a_prior_map(rng: np.random.Generator, shape: tuple[int, int] = SHAPE, days: 
     return PriorMap(first_probabilities(coarse_pass), coarse_pass.coarse, days)
 
 
-def a_reader(seed: int = 0, factor: int = FACTOR) -> TemporalReader:
+def a_reader(seed: int = 0) -> TemporalReader:
     """A reader as chance made it, in which nothing is idle."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        reader = TemporalReader(TemporalSizes(CLASSES, COLUMNS, factor, width=8, coarse_width=4)).eval()
+        reader = TemporalReader(TemporalSizes(CLASSES, COLUMNS, width=8, coarse_width=4)).eval()
         torch.nn.init.normal_(reader.leave.weight, std=0.3)
     return reader
 
@@ -171,20 +172,23 @@ def test_a_memory_is_worth_nothing_in_the_end() -> None:
     np.testing.assert_allclose(faded(told, np.zeros(SHAPE, np.float32)), np.maximum(told, FAINTEST), atol=1e-5)
 
 
-@pytest.mark.parametrize("factor", [2, 4, 8])
 @pytest.mark.parametrize("shape", [(80, 36), (33, 21), (7, 5)])
-def test_swaths_of_rows_read_the_same_as_the_whole(
-    monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int], factor: int
-) -> None:
+def test_swaths_of_rows_read_the_same_as_the_whole(monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int]) -> None:
     """However few rows are read at a time, and whatever is left of a coarse pixel at the border."""
     rng = np.random.default_rng(7)
-    memory, coarse_pass, reader = a_prior_map(rng, shape), an_observation(rng, shape), a_reader(3, factor)
-    rows = -(-shape[0] // factor)
-    coarse = [rng.normal(size=(rows, -(-shape[1] // factor), COLUMNS)).astype(np.float32) for _ in range(2)]
-    memory, coarse_pass = replace(memory, coarse=coarse[0]), replace(coarse_pass, coarse=coarse[1])
+    memory, coarse_pass, reader = a_prior_map(rng, shape), an_observation(rng, shape), a_reader(3)
     whole = fuse(memory, coarse_pass, reader)
     monkeypatch.setattr(prior_map, "ROWS", 8)
     np.testing.assert_allclose(fuse(memory, coarse_pass, reader).log_probability, whole.log_probability, atol=2e-5)
+
+
+def test_a_reader_sees_means_of_the_pixels_that_are_known() -> None:
+    """Of each 2 x 2, be it of a part at the border; NaN of those of which nothing is known, column by column."""
+    columns = np.arange(30, dtype=np.float32).reshape(3, 5, 2)
+    columns[0, 1], columns[1, 2, 0], columns[:2, 2:4, 1] = np.nan, np.inf, np.nan
+    nan = math.nan
+    expected = [[[22 / 3, 25 / 3], [26 / 3, nan], [13, 14]], [[21, 22], [25, 26], [28, 29]]]
+    np.testing.assert_allclose(pooled(columns), np.array(expected, np.float32), rtol=1e-6)
 
 
 def test_coarse_looks_that_cannot_be_compared_change_nothing() -> None:
@@ -204,7 +208,7 @@ def test_a_fresh_reader_weighs_both_witnesses_by_its_gates() -> None:
     """Untaught: .73 of the memory, .27 of its product to the power .9 with the look to the power .5."""
     rng = np.random.default_rng(2)
     memory, coarse_pass = a_prior_map(rng, days=0.0), an_observation(rng)
-    reader = TemporalReader(TemporalSizes(CLASSES, COLUMNS, FACTOR)).eval()
+    reader = TemporalReader(TemporalSizes(CLASSES, COLUMNS)).eval()
     old, new = (np.exp(one.log_probability.astype(np.float64)) for one in (memory.probabilities, coarse_pass))
     old /= old.sum(axis=-1, keepdims=True)
     product = old ** (1 / (1 + math.exp(-2.2))) * new**0.5
@@ -243,7 +247,7 @@ def test_another_field_is_known_by_its_agreement() -> None:
 def test_a_field_of_one_class_is_no_other_field() -> None:
     """Where everything is one class in memory and look alike chance would agree as well: they agree."""
     told = np.log(np.tile(np.array([0.98, 0.01, 0.01], np.float32), (*SHAPE, 1)))
-    coarse_pass = CurrentVisit(told, np.ones(SHAPE, np.bool_), np.zeros((6, 5, COLUMNS), np.float32), 1.0, 1)
+    coarse_pass = CurrentVisit(told, np.ones(SHAPE, np.bool_), np.zeros((12, 10, COLUMNS), np.float32), 1.0, 1)
     memory = PriorMap(first_probabilities(coarse_pass), None, 1.0)
     assert not compare(memory, coarse_pass, memory.probabilities, np.s_[:, :]).is_of_another_field
 
@@ -252,7 +256,7 @@ def sure_of(classes: NDArray[np.integer], how: float) -> CurrentVisit:
     """A look in detail that gives every pixel of (y, x) its class with the same probability."""
     told = np.full((*classes.shape, CLASSES), (1 - how) / (CLASSES - 1), np.float32)
     np.put_along_axis(told, np.asarray(classes, np.intp)[..., None], how, axis=-1)
-    coarse = np.zeros((classes.shape[0] // FACTOR, classes.shape[1] // FACTOR, COLUMNS), np.float32)
+    coarse = np.zeros((*(side // CELL_PX for side in classes.shape), COLUMNS), np.float32)
     return CurrentVisit(np.log(told), np.ones(classes.shape, np.bool_), coarse, 0.05, 2)
 
 

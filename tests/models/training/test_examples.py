@@ -1,4 +1,4 @@
-"""Training data: labelled scenes in both looks, and random crops of them."""
+"""Training data: labelled scenes as the camera shows them, and random crops of them."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from torch import Tensor
+import torch
 
-from models.network.spectral import SpectralBasis
-from models.training import examples
+from models.network.sizes import PLANES
+from models.network.spectral import Normalisation, SpectralBasis
+from models.training.capture_augmentation import CaptureAugmentation, ColumnNoise
 from models.training.examples import CropSampler, Example, observe
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera, expose, footprint
@@ -32,35 +33,33 @@ def _observed(scene: RasterScene, camera: LineCamera = CAMERA, seed: int = 0) ->
     return observe(scene, camera, SceneGrid(*scene.shape, 8, 2), basis, np.random.default_rng(seed))
 
 
-def test_both_looks_are_the_cameras_own():
-    """Columns of both looks are the spectral columns of the camera's reflectances of the whole padded scene."""
+def test_the_look_is_the_cameras_own():
+    """Columns are the spectral columns of the camera's reflectances of the whole padded scene."""
     bright = replace(CAMERA, electrons_per_dn=1e6, read_noise_e=0.0)  # so much light that noise is below rounding
     scene = _scene((32, 48), bright)
     seen, (matrix, _) = _observed(scene, bright), SpectralBasis.spanning(NM).matrix(NM)
     light, scale = scene.planes * scene.electrons, scene.white_reference / scene.white_reference_electrons
-    for step, columns in ((1, seen.fine), (2, seen.coarse)):
-        expected = (expose(footprint(light, bright), bright, step=step, rng=None) * scale) @ matrix
-        assert columns == pytest.approx(expected, abs=3e-3)
+    expected = (expose(footprint(light, bright), bright, step=1, rng=None) * scale) @ matrix
+    assert seen.columns == pytest.approx(expected, abs=3e-3)
 
 
-def test_the_looks_of_a_padded_scene():
-    """Looks and labels have the padded size; what was added is unlabelled and mirrors the scene."""
+def test_the_look_at_a_padded_scene():
+    """Columns and labels have the padded size; what was added is unlabelled and mirrors the scene."""
     scene = _scene()
     seen = _observed(scene)
-    assert seen.fine.shape == (48, 64, 6)
-    assert seen.coarse.shape == (24, 32, 6)
+    assert seen.columns.shape == (48, 64, 6)
     assert (seen.labels[:40, :50] == scene.labels).all()
     assert (seen.labels[40:] == 255).all()
     assert (seen.labels[:, 50:] == 255).all()
     assert seen.shape == (40, 50)
-    assert np.abs(seen.fine[40:44] - seen.fine[38:34:-1]).mean() < 0.1
+    assert np.abs(seen.columns[40:44] - seen.columns[38:34:-1]).mean() < 0.1
 
 
 def test_exposure_changes_noise_and_not_reflectance():
     """A quarter of the exposure gives the same mean columns with more noise."""
     short = replace(CAMERA, exposure_ms=CAMERA.exposure_ms / 4)
-    usual, other = (_observed(_scene(), seed=seed).fine for seed in (0, 1))
-    brief, again = (_observed(_scene(), short, seed).fine for seed in (0, 1))
+    usual, other = (_observed(_scene(), seed=seed).columns for seed in (0, 1))
+    brief, again = (_observed(_scene(), short, seed).columns for seed in (0, 1))
     assert brief.mean() == pytest.approx(usual.mean(), rel=0.01)
     assert (brief - again).std() > 1.8 * (usual - other).std()
 
@@ -69,52 +68,40 @@ def test_scenes_without_labels_teach_nothing():
     """A scene without labels, and examples without one labelled pixel, are refused."""
     with pytest.raises(SceneError, match="scene s has no labels"):
         _observed(replace(_scene(), raster=SceneRaster.of(_scene().planes)))
-    blank = Example(
-        "e",
-        np.zeros((32, 32, 1), np.float16),
-        np.zeros((16, 16, 1), np.float32),
-        np.full((32, 32), 255, np.uint8),
-        (32, 32),
-    )
+    blank = Example("e", np.zeros((32, 32, 1), np.float16), np.full((32, 32), 255, np.uint8), (32, 32))
     with pytest.raises(SceneError, match="none of 2 scenes has a labelled pixel"):
-        CropSampler([blank, blank], 8, 2, 32)
+        CropSampler([blank, blank], 8, 32)
 
 
-def _example(shape: tuple[int, int], name: str = "e", labelled: float = 1.0) -> Example:
-    """An example whose one column is the label plus 1, at both scales the place's own."""
-    rng = np.random.default_rng(len(name))
-    labels = np.kron(rng.integers(0, 5, (shape[0] // 2, shape[1] // 2)), np.ones((2, 2))).astype(np.uint8)
-    fine, coarse = (labels[..., None] + 1).astype(np.float16), (labels[::2, ::2, None] + 1).astype(np.float32)
-    labels[rng.random(shape) >= labelled] = 255
-    return Example(name, fine, coarse, labels, shape)
+def _example(shape: tuple[int, int], name: str = "e") -> Example:
+    """An example whose one column is the label plus 1."""
+    labels = np.random.default_rng(len(name)).integers(0, 5, shape).astype(np.uint8)
+    return Example(name, (labels[..., None] + 1).astype(np.float16), labels, shape)
 
 
-def _image(patch_index: Tensor) -> np.ndarray:
-    """Patches of square crops back to images."""
-    b, count, _, p, _ = patch_index.shape
-    side = round(count**0.5)
-    return patch_index[:, :, 0].view(b, side, side, p, p).permute(0, 1, 3, 2, 4).reshape(b, side * p, -1).numpy()
-
-
-def test_crops_show_one_place_in_both_looks():
-    """However a crop is turned, its patches, coarse pixels and labels belong together and share one brightness."""
-    sampler = CropSampler([_example((64, 96)), _example((48, 48), "other")], 8, 2, 32)
+def test_crops_show_one_place_to_both_networks():
+    """However a crop is turned, its pixels and labels belong together and share one brightness, at the reference."""
+    sampler = CropSampler([_example((64, 96)), _example((48, 48), "other")], 8, 32)
     batch = sampler.draw(12, np.random.default_rng(3), np.zeros(1, np.float32))
-    fine, coarse, labels = _image(batch.fine), batch.coarse[:, 0].numpy(), batch.labels.numpy()
-    gain = (fine / (labels + 1)).mean(axis=(1, 2), keepdims=True)
-    assert fine == pytest.approx((labels + 1) * gain, rel=1e-5)
-    assert coarse == pytest.approx(fine[:, ::2, ::2], rel=1e-5)
+    columns, labels = batch.image[:, 0].numpy(), batch.labels.numpy()
+    gain = (columns / (labels + 1)).mean(axis=(1, 2), keepdims=True)
+    assert columns == pytest.approx((labels + 1) * gain, rel=1e-5)
     assert gain.std() > 0.01
+    assert torch.equal(batch.image, batch.detail)
+    assert not batch.image[:, 1:].any()  # the planes of the reference
 
 
-@pytest.mark.parametrize(("crop", "size"), [(16, 16), (40, 32), (1, 16), (400, 48)])
-def test_crops_are_whole_cells_within_the_smallest_scene(crop: int, size: int):
-    """The wished size is brought down to whole coarse patches, and never below one."""
-    sampler = CropSampler([_example((64, 96)), _example((48, 80))], 8, 2, crop)
+@pytest.mark.parametrize(
+    ("patch", "smallest", "crop", "size"),
+    [(8, 48, 16, 32), (8, 48, 400, 32), (16, 64, 70, 64), (8, 24, 16, 16), (8, 24, 400, 24), (64, 128, 100, 64)],
+)
+def test_crops_are_whole_cells_within_the_smallest_scene(patch: int, smallest: int, crop: int, size: int):
+    """The wished size is brought down to whole tokens and patches, and never below one; patches of smaller scenes."""
+    sampler = CropSampler([_example((128, 192)), _example((smallest, 160))], patch, crop)
     batch = sampler.draw(2, np.random.default_rng(0), np.zeros(1, np.float32))
     assert batch.labels.shape == (2, size, size)
-    assert batch.coarse.shape == (2, 1, size // 2, size // 2)
-    assert batch.fine.shape == (2, (size // 8) ** 2, 1, 8, 8)
+    assert batch.image.shape == batch.detail.shape == (2, 1 + PLANES, size, size)
+    assert batch.origin.shape == (2, 2)
 
 
 def test_crops_follow_the_labels():
@@ -122,17 +109,18 @@ def test_crops_follow_the_labels():
     dark = replace(_example((64, 64)), labels=np.full((64, 64), 255, np.uint8))
     corner = np.full((64, 64), 255, np.uint8)
     corner[20:40, 20:40] = 4
-    sampler = CropSampler([dark, replace(dark, labels=corner)], 8, 2, 16)
+    sampler = CropSampler([dark, replace(dark, labels=corner)], 8, 16)
     labels = sampler.draw(30, np.random.default_rng(0), np.zeros(1, np.float32)).labels
     assert (labels == 4).flatten(1).any(dim=1).all()
 
 
-def test_a_coarse_pixel_has_the_noise_of_more_light(monkeypatch: pytest.MonkeyPatch):
-    """It gathers ``factor`` times the light of a fine one: its noise is that of the fine look over the root of it."""
-    monkeypatch.setattr(examples, "NOISY", 1.0)
-    sampler = CropSampler([replace(_example((64, 64)), labels=np.zeros((64, 64), np.uint8))], 8, 4, 64, noise=1.0)
-    flat = sampler.examples[0]
-    flat.fine[:], flat.coarse[:] = 0, 0
-    for seed in range(3):
-        batch = sampler.draw(1, np.random.default_rng(seed), np.zeros(1, np.float32))
-        assert batch.fine.std() / batch.coarse.std() == pytest.approx(2, rel=0.1)
+def test_crops_of_scenes_whose_noise_is_known_are_shown_as_captures():
+    """By the augmentation: their planes are those of shorter exposures; of a scene without noise they stay 0."""
+    plain = Normalisation(np.zeros(1, np.float32), np.ones(1, np.float32), np.eye(1, dtype=np.float32))
+    noise = ColumnNoise(np.full(1, 1e-4), np.full((1, 1), 1e-4))
+    for known in (noise, None):
+        sampler = CropSampler(
+            [replace(_example((64, 64)), noise=known)], 8, 32, augmentation=CaptureAugmentation(plain, darkest_ms=10.0)
+        )
+        batch = sampler.draw(4, np.random.default_rng(0), np.zeros(1, np.float32))
+        assert bool((batch.image[:, 1] > 0).any()) == (known is not None)

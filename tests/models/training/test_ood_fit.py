@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from models.network.spectral import Normalisation
+from models.network.spectral import Capture, Normalisation
 from models.training.calibration import JudgedMap, fitted_temperature, judge_confidence
 from models.training.capture_augmentation import ColumnNoise
 from models.training.examples import Example
@@ -23,10 +25,9 @@ def scene(seed: int, side: int = 48) -> Example:
     labels[:, -side // 8 :] = 1
     labels[:2, :2] = 255
     middles = np.array([[1.0, 2.0, 3.0], [3.0, 2.0, 1.0], [50.0, 50.0, 50.0]])
-    fine = middles[np.minimum(labels, 2)] + 0.1 * rng.standard_normal((side, side, COLUMNS))
-    coarse = fine.reshape(side // 4, 4, side // 4, 4, COLUMNS).mean(axis=(1, 3))
+    columns = middles[np.minimum(labels, 2)] + 0.1 * rng.standard_normal((side, side, COLUMNS))
     noise = ColumnNoise(np.full(COLUMNS, 1e-5), 1e-6 * np.eye(COLUMNS))
-    return Example(f"{seed}", fine.astype(np.float16), coarse.astype(np.float32), labels, labels.shape, noise)
+    return Example(f"{seed}", columns.astype(np.float16), labels, labels.shape, noise)
 
 
 def test_known_spectra_are_unknown_at_the_rate_that_is_stated() -> None:
@@ -34,11 +35,23 @@ def test_known_spectra_are_unknown_at_the_rate_that_is_stated() -> None:
     ood_detector = fit_ood(
         [scene(i) for i in range(4)], [scene(i) for i in range(10, 13)], PLAIN, darkest_ms=3.0, bands=9, seed=0
     )
-    fresh = np.concatenate([scene(i).fine[4:].reshape(-1, COLUMNS) for i in range(20, 26)])
-    fraction = ood_detector.unknown(fresh, rate=0.01, light=1.0, step=1, bands=9).mean()
+    fresh = np.concatenate([scene(i).columns[4:].reshape(-1, COLUMNS) for i in range(20, 26)])
+    fraction = ood_detector.unknown(fresh, rate=0.01, capture=Capture(), bands=9).mean()
     assert 0.004 < fraction < 0.02
     out_of_range = np.array([[2.0, 0.0, 2.0], [3.0, 3.0, 3.0], [50.0, 50.0, 50.0], [1.0, 4.0, 3.0]])
-    assert ood_detector.unknown(out_of_range, rate=0.01, light=1.0, step=1, bands=9).all()
+    assert ood_detector.unknown(out_of_range, rate=0.01, capture=Capture(), bands=9).all()
+
+
+def test_every_capture_that_training_shows_has_limits() -> None:
+    """Each spacing and light, down to the darkest; one spacing and light alone of scenes whose noise is not known."""
+    given = [scene(0)], [scene(1, 40)], PLAIN
+    limits = fit_ood(*given, darkest_ms=12.0, bands=9, seed=0).limits
+    assert (limits.steps, limits.light.tolist()) == ((1, 2, 4, 8), [0.12, 0.25, 0.5, 1.0])
+    assert (limits.fine.shape, limits.coarse.shape) == ((4, 4, 7), (4, 7))
+    assert (np.diff(limits.fine, axis=-1) <= 0).all()
+    silent = [[replace(one, noise=None) for one in some] for some in given[:2]]
+    bare = fit_ood(silent[0], silent[1], PLAIN, darkest_ms=12.0, bands=9, seed=0).limits
+    assert (bare.steps, bare.light.tolist(), bare.coarse.shape) == ((1,), [1.0], (1, 7))
 
 
 def test_a_scene_to_measure_the_rate_on_is_needed() -> None:

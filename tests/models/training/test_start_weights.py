@@ -32,13 +32,13 @@ def test_fewer_layers_and_other_widths_take_what_fits(tmp_path: Path, tiny: Make
     """Layers beyond the last have no place, tensors of another shape neither; both are said."""
     weights = tiny(layers=2)
     file = _kept(weights, tmp_path / "w.safetensors")
-    config = replace(weights.config, layers=1, width=12)
+    config = replace(weights.config, layers=1, overview_width=12)
     start = file.begin(config, weights.basis, weights.normalisation, weights.class_names)
     beyond = start.record["skipped"].pop("layers beyond the last")
     assert {name.split(".")[2] for name in beyond} == {"1"}
     assert all("does not fit" in why for why in start.record["skipped"])
     assert any(name.startswith("encoder.blocks.0.") for name in start.state)
-    assert not any(name.startswith("fine_stem.enter") for name in start.state)
+    assert not {"overview_stem.enter.weight", "full_stem.enter.weight"} & start.state.keys()  # both are as wide
 
 
 def test_files_that_are_no_weights_are_refused(tmp_path: Path):
@@ -76,26 +76,28 @@ def test_other_classes_leave_their_heads_fresh(tmp_path: Path, tiny: Maker):
         config = replace(weights.config, classes=len(names))
         start = file.begin(config, weights.basis, weights.normalisation, names)
         fresh = {name.split(".")[0] for name in weights.segmenter.state_dict() if name not in start.state}
-        assert fresh == {"coarse_classes", "fine_classes", "scorer"}
+        assert fresh == {"overview_classes", "full_classes", "spectral", "scorer"}
         assert set(start.record["skipped"]) == {"other classes"}
         assert not any(name.split(".")[0] in fresh for name in start.state)
 
 
 def test_other_columns_are_reached_by_wavelength(tmp_path: Path, tiny: Maker):
-    """First kernels are brought to the new number of columns and are no larger; the report says so."""
+    """First kernels are brought to the new number of columns, no larger; what they read beside stays as it was."""
     weights = tiny(3)
     file = _kept(weights, tmp_path / "w.safetensors")
     new = Normalisation(np.full(7, 0.3, np.float32), np.full(7, 0.1, np.float32), 3 * np.eye(7, dtype=np.float32))
     config = replace(weights.config, columns=7)
     start = file.begin(config, SpectralBasis(450.0, 900.0, 7), new, weights.class_names)
-    assert start.record["resized"] == {
-        f"{stem}_stem.enter.weight": "4 to 7 spectral columns by wavelength" for stem in ("coarse", "fine")
-    }
+    kernels = ("overview_stem.enter.weight", "full_stem.enter.weight", "spectral.weight")
+    assert start.record["resized"] == dict.fromkeys(kernels, "4 to 7 spectral columns by wavelength")
     assert start.state.keys() == weights.segmenter.state_dict().keys()
-    for stem in ("coarse", "fine"):
-        before = weights.segmenter.state_dict()[f"{stem}_stem.enter.weight"].flatten(1).norm(dim=1)
-        after = start.state[f"{stem}_stem.enter.weight"].flatten(1).norm(dim=1)
-        assert (after <= before * (1 + 1e-5)).all()
+    for stem in ("overview", "full"):
+        (before, beside), (after, kept) = (
+            state[f"{stem}_stem.enter.weight"].tensor_split([columns], dim=1)
+            for state, columns in ((weights.segmenter.state_dict(), 4), (start.state, 7))
+        )
+        assert (after.flatten(1).norm(dim=1) <= before.flatten(1).norm(dim=1) * (1 + 1e-5)).all()
+        assert torch.equal(beside, kept)  # planes of the capture, and what the overview found
 
 
 def test_a_change_of_columns_is_exact_for_the_same_wavelengths():
@@ -119,9 +121,9 @@ def test_kernels_for_the_same_data_say_what_they_said(tmp_path: Path, tiny):
     new = replace(old, whitening=(0.1 * np.eye(4) + 0.02).astype(np.float32))
     start = file.begin(weights.config, weights.basis, new, weights.class_names)
     pixels = np.random.default_rng(1).normal(size=(50, 4)).astype(np.float32)
-    kernel = "fine_stem.enter.weight"
+    kernel = "full_stem.enter.weight"
     before, after = (
-        torch.einsum("pc,ocyx->poyx", torch.from_numpy(one.apply(pixels, np.ones(4, np.bool_))), state[kernel])
+        torch.einsum("pc,ocyx->poyx", torch.from_numpy(one.apply(pixels, np.ones(4, np.bool_))), state[kernel][:, :4])
         for one, state in ((old, weights.segmenter.state_dict()), (new, start.state))
     )
     np.testing.assert_allclose(after.numpy(), before.numpy(), rtol=1e-3, atol=1e-4)

@@ -10,15 +10,18 @@ import torch
 from torch import Tensor
 
 from models.network.segmenter import Segmenter
-from models.network.sizes import SegmenterConfig
+from models.network.sizes import PLANES, SegmenterConfig
+from models.network.spectral import Capture
+from models.reading.inference import map_of_columns
 from models.training import objective
 from models.training import train as training
 from models.training.examples import CropSampler
 from models.training.objective import batch_loss, class_weights, draw_patches, map_loss, phase_at, pixel_losses
 from models.training.train import Progress, TrainingSettings, rate_at, train
-from tests.models.conftest import block_example
+from pipeline.geometry.grid import SceneGrid
+from tests.models.conftest import Maker, block_example
 
-CONFIG = SegmenterConfig(classes=3, columns=2, patch=8, factor=2, width=8, dim=16, layers=1, heads=2)
+CONFIG = SegmenterConfig(classes=3, columns=2, patch=8, width=8, dim=16, layers=1, heads=2)
 SETTINGS = TrainingSettings(steps=6, batch=2, crop=16, learning_rate=3e-3)
 SHIFT = np.zeros(2, np.float32)
 
@@ -28,13 +31,23 @@ def test_training_learns():
     losses: list[float] = []
     scene, settings = block_example(64, 16), replace(SETTINGS, steps=40, crop=32, learning_rate=1e-2)
     model, summary = train(CONFIG, [scene], SHIFT, settings, lambda now: losses.append(now.loss))
-    batch = CropSampler([scene], 8, 2, 32).draw(8, np.random.default_rng(0), SHIFT)
+    batch = CropSampler([scene], 8, 32).draw(8, np.random.default_rng(0), SHIFT)
     weight = class_weights([scene.labels], 3, 5.0)
     with torch.no_grad():
         last = batch_loss(model, batch, weight, np.random.default_rng(0), phase_at(0.0), soft_dice=False)
     assert last < losses[0] / 3
     assert (summary["steps"], summary["skipped_steps"]) == (40, 0)
     assert not model.training
+
+
+def test_what_was_trained_at_the_reference_alone_reads_every_capture_alike(tiny: Maker):
+    """Nothing is learned of planes that are 0 in every crop: their kernels stay 0, and the map is the same."""
+    scene = block_example()
+    model, _ = train(CONFIG, [scene], SHIFT, SETTINGS)
+    assert not any(stem.enter.weight[:, 2 : 2 + PLANES].any() for stem in (model.overview_stem, model.full_stem))
+    weights, grid = replace(tiny(columns=2), segmenter=model), SceneGrid(32, 32, 8, 1)
+    usual, dark = (map_of_columns(weights, scene.columns, grid, one)[1] for one in (Capture(), Capture(0.1, 4, 4)))
+    assert (usual == dark).all()
 
 
 def test_equal_seeds_give_equal_weights_and_leave_global_streams_alone():
@@ -51,8 +64,8 @@ def test_equal_seeds_give_equal_weights_and_leave_global_streams_alone():
     assert not first.training
 
 
-@pytest.mark.parametrize(("crop", "last"), [(48, (2, 64)), (64, (4, 64)), (16, (4, 16))])
-def test_batches_are_halved_where_crops_grow(crop: int, last: tuple[int, int]):
+@pytest.mark.parametrize(("crop", "first", "last"), [(48, 32, (2, 64)), (64, 64, (4, 64)), (16, 32, (4, 32))])
+def test_batches_are_halved_where_crops_grow(crop: int, first: int, last: tuple[int, int]):
     """The last phase has larger crops and fewer of them; where scenes have no larger ones, as many as before."""
     trainer = training.Trainer(CONFIG, [block_example(64)], SHIFT, replace(SETTINGS, batch=4, crop=crop))
     sizes = []
@@ -60,7 +73,7 @@ def test_batches_are_halved_where_crops_grow(crop: int, last: tuple[int, int]):
         trainer.step(done)
         assert trainer.batch is not None
         sizes.append((len(trainer.batch.labels), trainer.batch.labels.shape[-1]))
-    assert sizes == [(4, crop), last]
+    assert sizes == [(4, first), last]
 
 
 def test_minutes_end_a_run(monkeypatch: pytest.MonkeyPatch):
@@ -78,10 +91,10 @@ def test_a_gradient_that_is_none_is_no_step():
     model = Segmenter(CONFIG)
     optimiser = torch.optim.AdamW(model.parameters(), 0.1)
     before = torch.nn.utils.parameters_to_vector(model.parameters()).clone()
-    zero = model.scale_code.sum() * 0
+    zero = model.to_token.bias.sum() * 0
     assert not training._step(model, optimiser, zero.abs().sqrt())
     assert torch.equal(torch.nn.utils.parameters_to_vector(model.parameters()), before)
-    assert training._step(model, optimiser, model.scale_code.square().sum() + model.scale_code.sum())
+    assert training._step(model, optimiser, model.to_token.bias.square().sum() + model.to_token.bias.sum())
 
 
 def test_the_rate_warms_up_and_falls():
@@ -102,13 +115,13 @@ def test_rare_classes_weigh_more():
     assert class_weights([labels], 3, 2.0).max() == 2
 
 
-def test_patches_are_drawn_where_the_coarse_prediction_is_unsure_or_anywhere():
+def test_patches_are_drawn_where_the_overview_is_unsure_or_anywhere():
     """Half of the draws go by entropy: its patches come first there, and by chance elsewhere."""
-    coarse_prediction = torch.zeros(1, 3, 32, 32)
-    coarse_prediction[:, 0] = 30.0
-    coarse_prediction[:, :, :4, :4] = 0.0  # unsure in patch 0 alone
+    overview = torch.zeros(1, 3, 64, 64)
+    overview[:, 0] = 30.0
+    overview[:, :, :8, :8] = 0.0  # unsure in patch 0 alone
     phase, nothing = phase_at(0.0), torch.zeros(1, 64)
-    drawn = [draw_patches(coarse_prediction, nothing, CONFIG, np.random.default_rng(seed), phase) for seed in range(60)]
+    drawn = [draw_patches(overview, nothing, CONFIG, np.random.default_rng(seed), phase) for seed in range(60)]
     first = np.mean([row[0, 0] == 0 for row in drawn])
     assert 0.35 < first < 0.7
     assert any(0 not in row for row in drawn)
@@ -121,7 +134,7 @@ def test_late_in_a_run_the_scorer_places_patches_too():
 
     def first(done: float) -> float:
         draws = (
-            draw_patches(torch.zeros(1, 3, 32, 32), score, CONFIG, np.random.default_rng(seed), phase_at(done))
+            draw_patches(torch.zeros(1, 3, 64, 64), score, CONFIG, np.random.default_rng(seed), phase_at(done))
             for seed in range(60)
         )
         return float(np.mean([row[0, 0] == 41 for row in draws]))
@@ -155,12 +168,12 @@ def test_the_scorer_is_told_of_labelled_patches_alone(monkeypatch: pytest.Monkey
         return given[0].sum() * 0
 
     monkeypatch.setattr(objective, "scoring_loss", scoring)
-    monkeypatch.setattr(objective, "draw_patches", lambda *_: torch.arange(4)[None])
-    batch = CropSampler([block_example()], 8, 2, 16).draw(1, np.random.default_rng(0), SHIFT)
+    monkeypatch.setattr(objective, "draw_patches", lambda *_: torch.arange(16)[None])
+    batch = CropSampler([block_example()], 8, 16).draw(1, np.random.default_rng(0), SHIFT)
     batch.labels[:] = 255
     batch.labels[0, 3, 12] = 1
     with torch.no_grad():
         batch_loss(Segmenter(CONFIG), batch, torch.ones(3), np.random.default_rng(0), phase_at(0.0), soft_dice=False)
     score, gain, known = told[0]
     assert score.shape == gain.shape == known.shape
-    assert known.tolist() == [[False, True, False, False]]
+    assert known.tolist() == [[number == 1 for number in range(16)]]

@@ -48,7 +48,7 @@ def with_ood(path: Path) -> None:
 def with_reader(path: Path, **changed: int) -> None:
     """Add a reader of prior maps."""
     config = describe_weights(path).config
-    sizes = {"classes": config.classes, "columns": config.columns, "factor": config.factor, "width": 8}
+    sizes = {"classes": config.classes, "columns": config.columns, "width": 8}
     built = TemporalReader(TemporalSizes(**{**sizes, "coarse_width": 4, **changed}))
     add_reader(path, path, built, {"seed": 1})
 
@@ -112,10 +112,10 @@ def test_every_flipped_bit_is_told(path: Path, add: Callable[[Path], None], load
 
 @pytest.mark.parametrize(
     ("changed", "why"),
-    [({"columns": 5}, "for another network"), ({"factor": 8}, "for another network"), ({"width": 2048}, "4 wide")],
+    [({"columns": 5}, "for another network"), ({"classes": 8}, "for another network"), ({"width": 2048}, "4 wide")],
 )
 def test_a_reader_for_others_is_refused(path: Path, changed: dict[str, int], why: str) -> None:
-    """Other columns or another factor than the weights have; and a width that is damage."""
+    """Other columns or classes than the weights have; and a width that is damage."""
     with_reader(path, **changed)
     with pytest.raises(WeightsError, match=why):
         load_reader(path)

@@ -81,10 +81,11 @@ def test_what_is_no_whole_file_is_not_readable(saved: Path, keep: int | None):
 
 
 def test_another_format_is_named(saved: Path):
-    """A newer format, and tensors without any mark, are told apart."""
-    _rewritten(saved, {**_about(saved), "format": "spectralzoom-weights/9"})
-    with pytest.raises(WeightsError, match=f"holds spectralzoom-weights/9, expected {FORMAT}"):
-        load_weights(saved)
+    """A newer format, that of two scales, and tensors without any mark, are told apart."""
+    for other in ("spectralzoom-weights/9", "spectralzoom-weights/3"):
+        _rewritten(saved, {**_about(saved), "format": other})
+        with pytest.raises(WeightsError, match=f"holds {other}, expected {FORMAT}"):
+            load_weights(saved)
     save_file({"a": torch.zeros(1)}, saved)
     with pytest.raises(WeightsError, match="holds no format mark"):
         load_weights(saved)
@@ -95,13 +96,13 @@ def test_another_format_is_named(saved: Path):
     [
         ({"classes": 1}, "description is damaged.*2 to 255 classes, got 1"),
         ({"depth": 3}, "description is damaged.*depth"),
-        ({"dim": 32}, r"tensor scale_code should be \(2, 32\), the file has \(2, 16\)"),
-        ({"width": 16}, r"tensor fine_stem.enter.weight should be \(16, 4, 1, 1\)"),
+        ({"dim": 32}, r"tensor to_token.weight should be \(32, 24, 4, 4\), the file has \(16, 24, 4, 4\)"),
+        ({"width": 16}, r"tensor full_stem.enter.weight should be \(16, 15, 1, 1\)"),
         ({"columns": 7}, "description is damaged.*a basis of 4 columns from 400 to 1000 nm, expected 7"),
         ({"layers": 10_000_000}, "description is damaged.*layers of a segmenter must be at least 1 and at most 256"),
         ({"dim": 2**40}, "description is damaged.*dim of a segmenter must be at least 1 and at most 16384"),
-        ({"dim": 16384, "layers": 256}, r"tensor scale_code should be \(2, 16384\), the file has \(2, 16\)"),
-        ({"positions": "3d"}, "description is damaged.*positions of a segmenter is one of 2d, got '3d'"),
+        ({"dim": 16384, "layers": 256}, r"tensor to_token.weight should be \(16384, 24, 4, 4\)"),
+        ({"overview_width": 0}, "description is damaged.*overview_width of a segmenter must be at least 1"),
         ({"layers": 1.0}, "description is damaged.*layers of a segmenter must be a whole number, got 1.0"),
     ],
 )
@@ -113,7 +114,7 @@ def test_sizes_that_do_not_fit_are_named(saved: Path, changes: dict[str, Any], w
         load_weights(saved)
 
 
-@pytest.mark.parametrize("name", ["normalisation.centre", "class_colours", "fine_classes.bias"])
+@pytest.mark.parametrize("name", ["normalisation.centre", "class_colours", "full_classes.bias"])
 def test_a_missing_tensor_is_named(saved: Path, name: str):
     """Each tensor is wanted: parameters, normalisation and colours."""
     tensors = load_file(saved)
@@ -176,9 +177,9 @@ def test_numbers_that_are_not_finite_are_refused(tiny: Maker, tmp_path: Path, va
     """A network of NaN would draw a map of nothing; the tensor is named."""
     weights, path = tiny(), tmp_path / "w.safetensors"
     with torch.no_grad():
-        weights.segmenter.fine_classes.bias[1] = value
+        weights.segmenter.full_classes.bias[1] = value
     save_weights(weights, path)
-    with pytest.raises(WeightsError, match=r"1 of 3 numbers of tensor fine_classes.bias are not finite; copy or train"):
+    with pytest.raises(WeightsError, match=r"1 of 3 numbers of tensor full_classes.bias are not finite; copy or train"):
         load_weights(path)
 
 

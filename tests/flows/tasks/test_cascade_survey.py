@@ -1,0 +1,122 @@
+"""Surveys in which the full network reads the patches that promise enough, and the overview the rest."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from flows.archive.plan_command import format_kept, plan_content
+from flows.settings.load import load_settings
+from models.evaluation.cascade import CascadeTable
+from models.weights.files import CASCADE, save_weights
+from tests.conftest import RGB_NM, Survey, random_weights
+from tests.prior_work import without_effects
+
+SCAN: dict[str, Any] = {"budget": None, "scan_step": "1"}
+TABLE = CascadeTable((0.05, 0.15, 0.2), (0.001, 0.003, 0.2), (0.8, 0.4, 0.1))
+
+pytestmark = pytest.mark.usefixtures("no_effects")
+
+
+@pytest.fixture(scope="module")
+def judged(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Tiny weights that know what reading a part loses."""
+    path, tiny = tmp_path_factory.mktemp("weights") / "weights.safetensors", random_weights(RGB_NM)
+    save_weights(replace(tiny, record={**tiny.record, CASCADE: asdict(TABLE)}), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def cascade(judged: Path, survey_png: Survey, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
+    """A survey of these weights that asks for nothing; not to be changed."""
+    out = tmp_path_factory.mktemp("cascade")
+    with without_effects():
+        return out, survey_png(out, **SCAN, weights=str(judged)).receipt
+
+
+def _open(out: Path, receipt: Any, name: str) -> xr.Dataset:
+    return xr.open_zarr(out / receipt["products"][name], consolidated=False)
+
+
+def _classes(out: Path, receipt: Any) -> np.ndarray:
+    return _open(out, receipt, "class_map")["classes"].values
+
+
+def test_the_loss_that_is_allowed_says_what_gain_is_enough(cascade: tuple[Path, Any]) -> None:
+    """By the weights' table, .3 points without a flag; patches of as much are read, ranked by it, and none of less."""
+    out, receipt = cascade
+    attention = _open(out, receipt, "attention")
+    gain, rank = attention["score"].values.ravel(), attention["rank"].values.ravel()
+    asked = {"macs": None, "least_gain": pytest.approx(0.15), "expected_loss": 0.3}
+    assert receipt["kept"]["asked"] == asked
+    np.testing.assert_array_equal(rank >= 0, gain >= 0.15)
+    assert 0 < receipt["kept"]["patches"] == np.count_nonzero(rank >= 0) < receipt["kept"]["of_patches"]
+    assert (np.diff(gain[np.argsort(rank)][rank.size - np.count_nonzero(rank >= 0) :]) <= 0).all()
+
+
+def test_each_patch_has_the_map_of_its_reading(cascade: tuple[Path, Any], survey_png: Survey, tmp_path: Path) -> None:
+    """Read patches are those of a survey that reads everything; elsewhere the two maps may differ."""
+    out, receipt = cascade
+    everything = survey_png(tmp_path, **SCAN, weights=receipt_weights(receipt), expected_loss="0").receipt
+    assert "kept" not in everything
+    ours, whole = _classes(out, receipt), _classes(tmp_path, everything)
+    read = (
+        (_open(out, receipt, "attention")["rank"].values >= 0)
+        .repeat(8, 0)
+        .repeat(8, 1)[: ours.shape[0], : ours.shape[1]]
+    )
+    np.testing.assert_array_equal(ours[read], whole[read])
+    assert (ours[~read] != whole[~read]).any()
+
+
+def receipt_weights(receipt: Any) -> str:
+    """Path of the weights that a receipt names."""
+    return str(receipt["settings"]["weights"])
+
+
+def test_the_overview_is_paid_for_once(cascade: tuple[Path, Any]) -> None:
+    """Its multiply-adds, the scores' and those of the patches read; everything is counted without scores."""
+    _, receipt = cascade
+    costs, patches = receipt["savings"]["multiply_adds"], receipt["savings"]["patches"]
+    assert costs["done"] == costs["overview"] + costs["score"] + costs["detail"]
+    assert costs["detail"] / patches["done"] == pytest.approx((costs["full"] - costs["overview"]) / patches["full"])
+
+
+def test_a_survey_is_told_beside_the_best_uniform_reading(judged: Path, survey_png: Survey, tmp_path: Path) -> None:
+    """With controls, random patches stand beside those chosen, as many of them."""
+    receipt = survey_png(tmp_path, **SCAN, weights=str(judged), controls=True).receipt
+    assert receipt["accuracy"]["controls_fraction"] == receipt["kept"]["patches"] / receipt["kept"]["of_patches"]
+    assert set(receipt["accuracy"]["controls"]) == {"gain", "entropy", "sobel", "random"}
+
+
+@pytest.mark.parametrize(
+    ("flags", "least"),
+    [
+        ({"expected_loss": "0.1"}, 0.05),
+        ({"expected_loss": "0"}, None),
+        ({"expected_loss": "50"}, 0.2),
+        ({"least_gain": "0.1"}, 0.1),
+        ({"macs": "90%"}, None),
+    ],
+)
+def test_what_is_asked_for_comes_first(
+    judged: Path, scene_files: Path, tmp_path: Path, flags: dict[str, str], least: float | None
+) -> None:
+    """A gain or multiply-adds by hand, another loss."""
+    given = {"scene": str(scene_files / "scene.png"), "source": "sim", "weights": str(judged), "out": str(tmp_path)}
+    content = plan_content(load_settings(None, {**given, "scan_step": "1", **flags}))
+    asked = content.get("kept", {"asked": {"least_gain": None}})["asked"]
+    assert asked["least_gain"] == (least if least is None else pytest.approx(least))
+
+
+def test_a_plan_tells_how_much_is_likely_to_be_read(judged: Path, scene_files: Path, tmp_path: Path) -> None:
+    """By the fraction that scenes kept from training had."""
+    given = {"scene": str(scene_files / "scene.png"), "source": "sim", "weights": str(judged), "out": str(tmp_path)}
+    kept = plan_content(load_settings(None, {**given, "scan_step": "1"}))["kept"]
+    assert kept["patches"] == round(0.4 * kept["of_patches"])
+    assert format_kept(kept).startswith(f"full reading: likely {kept['patches']} of {kept['of_patches']} patches")
