@@ -63,7 +63,7 @@ def format_worst_class(accuracy: Mapping[str, Any], *, alone: bool = False) -> s
         return f"Its worst class is {name} with {format_points(worst.this)}."
     full = "" if worst.all is None else f", a full reading {format_points(worst.all)}"
     return (
-        f"Its worst class is {name} with {format_points(worst.this)}: the coarse pass alone "
+        f"Its worst class is {name} with {format_points(worst.this)}: the overview alone "
         f"gives {format_points(worst.none)}{full}."
     )
 
