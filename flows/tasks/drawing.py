@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from flows.tasks.field_prior_map import FieldPriorMap
 from flows.tasks.field_work import FieldWork, WeightsFile, coarse_region, patch_features, seen_patches
-from models.network.spectral import Capture
+from models.network.spectral import LineSpec
 from models.policies.policies import score_patches
 from models.reading.inference import CoarsePass, read_coarse_prediction, segment
 from models.reading.ood import OodDetector
@@ -49,7 +49,7 @@ class Drawing:
     attention: Path  # whose ranks say which patches are read in detail
     out: Path  # of the class map
     probabilities: Path
-    captures: tuple[Capture, Capture]  # of the overview's pixels, and of those read in full
+    captures: tuple[LineSpec, LineSpec]  # of the overview's pixels, and of those read in full
     memory: FieldPriorMap | None = None  # what is remembered of the field
     left_out: Path | None = None  # (y, x) pixels of which zones have no map drawn
     unknown: UnknownRule | None = None  # which pixels are called unknown
@@ -159,7 +159,7 @@ class UnknownRule:
         patches: NDArray[np.float32],
         patch_index: NDArray[np.int64],
         bands: int,
-        full: Capture,
+        full: LineSpec,
     ) -> NDArray[np.bool_]:
         """Unknown pixels of a region's scene, (y, x): by its patches, captured as ``full``, and by the rest."""
         grid, p = seen.grid, seen.grid.patch

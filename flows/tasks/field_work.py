@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from flows.tasks.patch_budget import SHARD
 from models.network.machine import PROCESSOR
-from models.network.spectral import Capture, dead_pixels, patches_of
+from models.network.spectral import LineSpec, dead_pixels, patches_of
 from models.policies.policies import GLANCING_POLICIES, score_patches
 from models.reading.inference import CoarsePass, CoarsePrediction, read_coarse_pass, read_coarse_prediction
 from models.reading.ood import OodDetector
@@ -74,7 +74,7 @@ class Scoring:
     weights: WeightsFile
     mosaic: Path
     policy: str
-    capture: Capture
+    capture: LineSpec
 
     def __call__(self, region: Region) -> NDArray[np.float64]:
         """Scores of the patches that are kept, (patch_y, patch_x)."""
@@ -90,7 +90,7 @@ class Scoring:
         return region.crop_patches(score_patches(self.policy, seen))
 
 
-def coarse_region(weights: Weights, mosaic: Path, region: Region, capture: Capture = Capture()) -> CoarsePass:  # noqa: B008
+def coarse_region(weights: Weights, mosaic: Path, region: Region, capture: LineSpec = LineSpec()) -> CoarsePass:
     """Read the part of a stored mosaic that a region needs, some rows at a time; coarse pixels are repeated."""
     seen = open_mosaic(mosaic)
     part = region.read.over(seen.factor)
@@ -162,7 +162,7 @@ class FieldWork:
     memory: int  # of this process and those that it starts, together [bytes]
 
     def score(
-        self, policy: str, mosaic: Path, capture: Capture, report: Callable[[float], None]
+        self, policy: str, mosaic: Path, capture: LineSpec, report: Callable[[float], None]
     ) -> NDArray[np.float64]:
         """Score every patch of the padded grid by the first mosaic alone, (patch_y, patch_x).
 

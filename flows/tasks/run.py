@@ -44,7 +44,7 @@ from models.evaluation.cascade import CascadeTable
 from models.evaluation.expected_scores import MapScores
 from models.network.machine import PROCESSOR, choose_device
 from models.network.sizes import MultiplyAdds
-from models.network.spectral import Capture
+from models.network.spectral import LineSpec
 from models.reading.regions import plan_regions
 from models.weights.checksummed_files import SEAL
 from models.weights.files import CASCADE, Description, Weights
@@ -267,17 +267,17 @@ class SurveyRun(CaptureRun):
         return self.settings.extent != EXTENT_WHOLE
 
     @property
-    def captures(self) -> tuple[Capture, Capture]:
+    def captures(self) -> tuple[LineSpec, LineSpec]:
         """How the pixels of the overview were captured, and those that are read in full."""
         settings, usual = self.settings, self.camera.exposure_ms
         if self.plan.plain:
-            scan = Capture((settings.scan_exposure_ms or usual) / DEFAULT_EXPOSURE_MS, settings.scan_step or 1)
+            scan = LineSpec((settings.scan_exposure_ms or usual) / DEFAULT_EXPOSURE_MS, settings.scan_step or 1)
             return scan, scan
-        coarse = Capture((settings.coarse_exposure_ms or usual) / DEFAULT_EXPOSURE_MS, self.factor, self.factor)
-        return coarse, Capture(usual / DEFAULT_EXPOSURE_MS)
+        coarse = LineSpec((settings.coarse_exposure_ms or usual) / DEFAULT_EXPOSURE_MS, self.factor, self.factor)
+        return coarse, LineSpec(usual / DEFAULT_EXPOSURE_MS)
 
     @property
-    def capture(self) -> Capture:
+    def capture(self) -> LineSpec:
         """How the pixels of the overview were captured."""
         return self.captures[0]
 

@@ -16,7 +16,7 @@ from flows.tasks.stages.accuracy import columns_of_raster, columns_of_sweeps
 from flows.tasks.survey_model import shipped_weights
 from flows.training.data import scene_of_file
 from models.evaluation.metrics import confusion, mean_iou
-from models.network.spectral import Capture
+from models.network.spectral import LineSpec
 from models.reading.inference import coarse_prediction_of_patches, segment
 from models.weights.files import Weights, describe_weights, load_weights
 from pipeline.errors import SceneError
@@ -129,7 +129,7 @@ def scan_farm(seed: int, shape: tuple[int, int] = FIELD_SHAPE, camera: LineCamer
         columns = columns_of_sweeps(
             [plain], camera, source.wavelength_nm, grid, weights, memory=MEMORY, resampling="catmull-rom"
         )
-        return _miou(weights, columns, grid, labels, Capture(EXPOSURE_MS / DEFAULT_EXPOSURE_MS))
+        return _miou(weights, columns, grid, labels, LineSpec(EXPOSURE_MS / DEFAULT_EXPOSURE_MS))
 
     dark = dark_frame(block, source.choice)
     truth, sigma = _calibrated(light / per_dn + dark, lines), _calibrated(noise_dn + dark, lines)
@@ -193,7 +193,7 @@ def _miou(
     columns: Values,
     grid: SceneGrid,
     labels: NDArray[np.uint8],
-    capture: Capture = Capture(),  # noqa: B008
+    capture: LineSpec = LineSpec(),  # noqa: B008
 ) -> float:
     """Draw the map of all patches and judge it."""
     patch_index = grid.valid_patches()

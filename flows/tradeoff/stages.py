@@ -25,7 +25,7 @@ from flows.tradeoff.store import STORE
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.machine import keep_freed_memory
 from models.network.sizes import multiply_adds
-from models.network.spectral import Capture
+from models.network.spectral import LineSpec
 from models.policies.policies import score_patches
 from models.reading.inference import (
     CoarsePrediction,
@@ -228,7 +228,7 @@ class PlannedPass:
     weights: Weights  # that read it
     seconds: float = 0.0
     bytes_raw: int = 0
-    capture: Capture | None = None  # of the patches, where they were captured otherwise than what the overview reads
+    capture: LineSpec | None = None  # of the patches, where they were captured otherwise than what the overview reads
 
 
 @dataclass(frozen=True)
@@ -266,7 +266,7 @@ class PlannedField:
 
 
 def uniform_pass(
-    weights: Weights, source: SimulatedSource, sweeps: list[Sweep], grid: SceneGrid, cost: CostModel, capture: Capture
+    weights: Weights, source: SimulatedSource, sweeps: list[Sweep], grid: SceneGrid, cost: CostModel, capture: LineSpec
 ) -> PlannedPass:
     """Read a uniform scan whole."""
     columns = columns_of_all_patches(source, sweeps, grid, weights, memory=MEMORY, resampling="catmull-rom")
@@ -326,7 +326,7 @@ def plan_every_way(seed: int, scene: str | None = None, weights: Path | None = N
     scan_passes: dict[Setting, PlannedPass] = {}
     for words, (step, exposure_ms) in (SCANS | ({} if chosen is None else {default: chosen})).items():
         sweeps = uniform_sweeps(grid, camera, along, step=step, exposure_ms=exposure_ms)
-        scan = Capture(exposure_ms / DEFAULT_EXPOSURE_MS, step)
+        scan = LineSpec(exposure_ms / DEFAULT_EXPOSURE_MS, step)
         scan_passes[words] = uniform_pass(read_with, source, sweeps, grid, cost, scan)
     whole = scan_passes[format_scan(*PART_OF)]
     scan_passes |= {words: part_of(whole, bands, fraction) for words, fraction in PARTS.items()}
@@ -334,8 +334,8 @@ def plan_every_way(seed: int, scene: str | None = None, weights: Path | None = N
     coarse_s = cost.seconds(coarse, camera)
     if paid := {words: budget for words, budget in BUDGETS.items() if budget * full_s >= coarse_s}:
         sweeps = uniform_sweeps(grid, camera, along, step=1, exposure_ms=camera.exposure_ms)
-        every = uniform_pass(read_with, source, sweeps, grid, cost, Capture())
-        binned = Capture(1.0, COARSE_FACTOR, COARSE_FACTOR)
+        every = uniform_pass(read_with, source, sweeps, grid, cost, LineSpec())
+        binned = LineSpec(1.0, COARSE_FACTOR, COARSE_FACTOR)
         values, bands_nm = coarse_mosaic(source, coarse, grid), run.scene.wavelength_nm
         seen = coarse_prediction(read_with, values, bands_nm, grid, capture=binned, factor=COARSE_FACTOR)
         scores = score_patches(POLICY, seen)
@@ -343,7 +343,7 @@ def plan_every_way(seed: int, scene: str | None = None, weights: Path | None = N
         plan = plan_fine(grid, camera, cost, along, scores, budget_s=budget * full_s - coarse_s, full=full)
         columns = every.columns[np.searchsorted(every.patch_index, plan.patch_index)]
         size, seconds = raw_bytes([*coarse, *plan.sweeps], camera, bands), coarse_s + plan.seconds
-        scan_passes[words] = PlannedPass(seen, plan.patch_index, columns, read_with, seconds, size, Capture())
+        scan_passes[words] = PlannedPass(seen, plan.patch_index, columns, read_with, seconds, size, LineSpec())
     assert run.labels is not None
     return PlannedField(run.labels, bands, scan_passes, default)
 

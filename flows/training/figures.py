@@ -23,7 +23,7 @@ from models.evaluation.metrics import (
 )
 from models.evaluation.placement import CONTROL_FRACTION, Controls, Counts, run_controls
 from models.network.sizes import PLANES
-from models.network.spectral import Capture, patches_of
+from models.network.spectral import LineSpec, patches_of
 from models.policies.policies import score_patches
 from models.reading.inference import coarse_prediction_of_columns, map_of_columns, segment
 from models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation
@@ -161,7 +161,7 @@ def _scanned(
     grid, _, labels = _parts(weights, example)
     plain, classes = example.columns.astype(np.float32), weights.config.classes
     scan = augmentation.scan(plain, example.noise, light=light, step=step, rng=rng)[..., :-PLANES]
-    drawn, every_class = map_of_columns(weights, scan, grid, Capture(light, step))
+    drawn, every_class = map_of_columns(weights, scan, grid, LineSpec(light, step))
     valid = (labels != UNLABELLED) & np.isfinite(drawn.confidence)
     sure = confidence_counts(drawn.confidence[valid], drawn.classes[valid] == labels[valid])
     expected = expected_counts([every_class[valid]], classes)

@@ -20,7 +20,7 @@ from flows.training.data import Report
 from flows.training.observed_scenes import observe_finely
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.sizes import PLANES
-from models.network.spectral import Capture
+from models.network.spectral import LineSpec
 from models.network.temporal_reader import TemporalReader
 from models.reading.inference import map_of_columns
 from models.reading.prior_map import CurrentVisit, PriorMap, first_probabilities, fuse, pooled
@@ -161,7 +161,7 @@ class _Land:
         """Return what a uniform scan would have shown, read by the weights."""
         light = exposure_ms / REFERENCE_MS
         scan = augmentation.scan(self.columns, self.noise, light=light, step=step, rng=rng)[..., :-PLANES]
-        _, every_class = map_of_columns(weights, scan, self.grid, Capture(light, step))
+        _, every_class = map_of_columns(weights, scan, self.grid, LineSpec(light, step))
         return CurrentVisit(every_class, np.ones(self.labels.shape, np.bool_), pooled(scan), light, step)
 
 

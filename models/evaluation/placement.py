@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from models.evaluation.metrics import agreement, confusion, gap_closed, mean_iou
 from models.network.sizes import MOST_GAIN
-from models.network.spectral import Capture, patches_of
+from models.network.spectral import LineSpec, patches_of
 from models.policies.policies import score_patches
 from models.reading.inference import CoarsePrediction, captured, overview_of, patch_logits, segment
 from models.weights.files import Weights
@@ -119,7 +119,7 @@ def run_controls(
     *,
     fraction: float,
     seed: int,
-    capture: Capture | None = None,
+    capture: LineSpec | None = None,
     policies: tuple[str, ...] = ("gain", "entropy", "sobel"),
     among: NDArray[np.bool_] | None = None,
     report: Callable[[str], None] = lambda row: None,

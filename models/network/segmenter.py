@@ -5,7 +5,7 @@ level: each token stands for ``TOKEN_PX`` pixels a side.
 The full network is a wider U-Net that reads a patch beside what the overview found there, and corrects its logits.
 
 Shapes: B scenes of H x W px, J spectral features, K patches a scene of p x p px. An input image has J + ``PLANES``
-channels; the last ones are those of `models.network.spectral.Capture`.
+channels; the last ones are those of `models.network.spectral.LineSpec`.
 """
 
 from __future__ import annotations

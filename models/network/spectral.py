@@ -198,7 +198,7 @@ class Normalisation:
         return np.asarray((self.centre / self.spread) @ self.whitening, np.float32)
 
 
-class Capture(NamedTuple):
+class LineSpec(NamedTuple):
     """How pixels were captured; without arguments by every line of the reference exposure."""
 
     light: float = 1.0  # exposure as a fraction of the reference
@@ -211,7 +211,7 @@ class Capture(NamedTuple):
         return np.asarray(np.log2(np.maximum([1 / self.light, self.step, self.binned], 1)) / PLANE_SCALES, np.float32)
 
 
-def with_planes(columns: NDArray[np.floating], capture: Capture) -> NDArray[np.float32]:
+def with_planes(columns: NDArray[np.floating], capture: LineSpec) -> NDArray[np.float32]:
     """Spectral features (..., column) with how they were captured behind them, (..., column + 3)."""
     planes = np.broadcast_to(capture.planes, (*columns.shape[:-1], len(PLANE_SCALES)))
     return np.concatenate([columns, planes], axis=-1, dtype=np.float32)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.network.sizes import PATCHES_AT_ONCE, TOKEN_PX
-from models.network.spectral import Capture, all_alive, dead_pixels, fill_dead, patches_of, readable, with_planes
+from models.network.spectral import LineSpec, all_alive, dead_pixels, fill_dead, patches_of, readable, with_planes
 from models.weights.files import Weights
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
@@ -35,7 +35,7 @@ class CoarsePass:
 
     grid: SceneGrid
     columns: NDArray[np.float32]  # (y, x, column) normalised
-    capture: Capture = field(default=Capture(), kw_only=True)
+    capture: LineSpec = field(default=LineSpec(), kw_only=True)
     origin: tuple[int, int] = field(default=(0, 0), kw_only=True)  # row and column of the field's patch it begins at
     living: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (token,) which are read; None: all
     out_of_range: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (y, x) of the scene: seen, and unread
@@ -98,7 +98,7 @@ def coarse_prediction(
     wavelength_nm: NDArray[np.floating],
     grid: SceneGrid,
     *,
-    capture: Capture = Capture(),  # noqa: B008 - a value
+    capture: LineSpec = LineSpec(),  # noqa: B008 - a value
     factor: int = 1,
 ) -> CoarsePrediction:
     """Read an overview of scene values (y, x, band), in pixels of ``factor`` fine ones; NaN where none was captured.
@@ -115,7 +115,7 @@ def read_coarse_pass(
     wavelength_nm: NDArray[np.floating],
     grid: SceneGrid,
     *,
-    capture: Capture = Capture(),  # noqa: B008 - a value
+    capture: LineSpec = LineSpec(),  # noqa: B008 - a value
     factor: int = 1,
     origin: tuple[int, int] = (0, 0),
     components: Components | None = None,
@@ -169,7 +169,7 @@ def coarse_prediction_of_columns(
     weights: Weights,
     columns: NDArray[np.generic],
     grid: SceneGrid,
-    capture: Capture = Capture(),  # noqa: B008 - a value
+    capture: LineSpec = LineSpec(),  # noqa: B008 - a value
 ) -> CoarsePrediction:
     """Read normalised columns of the padded grid, (y, x, column); dead ones count as in a mosaic."""
     given = np.ascontiguousarray(columns, np.float32)
@@ -182,7 +182,7 @@ def coarse_prediction_of_patches(
     weights: Weights,
     patches: NDArray[np.float32],
     grid: SceneGrid,
-    capture: Capture = Capture(),  # noqa: B008 - a value
+    capture: LineSpec = LineSpec(),  # noqa: B008 - a value
 ) -> CoarsePrediction:
     """Read normalised columns of all patches of the padded grid, (patch, p, p, column)."""
     (down, across), (y, x) = grid.patch_shape, grid.padded_shape
@@ -214,7 +214,7 @@ def segment(
     patches: NDArray[np.floating],
     patch_index: NDArray[np.integer],
     *,
-    capture: Capture | None = None,
+    capture: LineSpec | None = None,
     every_class: bool = False,
 ) -> DrawnMap:
     """Draw the class map from the overview and the patches that are read in full, of the scene's own size.
@@ -248,7 +248,7 @@ def patch_logits(
     overview: Overview,
     patches: NDArray[np.floating],
     patch_index: NDArray[np.int64],
-    capture: Capture,
+    capture: LineSpec,
 ) -> Iterator[Tensor]:
     """Logits of patches (patch, p, p, column) read in full, (some, class, p, p) at a time.
 
@@ -267,7 +267,7 @@ def map_of_columns(
     weights: Weights,
     columns: NDArray[np.floating],
     grid: SceneGrid,
-    capture: Capture = Capture(),  # noqa: B008 - a value
+    capture: LineSpec = LineSpec(),  # noqa: B008 - a value
 ) -> tuple[DrawnMap, NDArray[np.float32]]:
     """Read a scene whole, by normalised columns (y, x, column) of the padded grid; its map, and all log-probabilities.
 

@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from models.network.spectral import Capture
+from models.network.spectral import LineSpec
 
 Floats = NDArray[np.float32]
 Exact = NDArray[np.float64]
@@ -68,7 +68,9 @@ class OodDetector:
         parts = np.stack([back @ _whitening(one) for one in spread]) / np.sqrt(columns)
         return LitDetector(*(one.astype(np.float32) for one in (base, self.centres @ base, parts)))
 
-    def unknown(self, columns: NDArray[np.floating], *, rate: float, capture: Capture, bands: int) -> NDArray[np.bool_]:
+    def unknown(
+        self, columns: NDArray[np.floating], *, rate: float, capture: LineSpec, bands: int
+    ) -> NDArray[np.bool_]:
         """Pixels (..., column) that lie farther away than all but a fraction ``rate`` of known ones, (...).
 
         ``bands``: Of the camera. A binned pixel is the mean of as many readings. One without columns is not unknown.

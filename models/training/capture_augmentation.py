@@ -8,7 +8,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from models.network.spectral import Capture, Normalisation, with_planes
+from models.network.spectral import LineSpec, Normalisation, with_planes
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS
 
 REFERENCE_MS = DEFAULT_EXPOSURE_MS  # exposures are told as fractions of this one, at which looks are made
@@ -66,7 +66,7 @@ class ColumnNoise:
 class CaptureAugmentation:
     """Turns crops of the reference exposure into what shorter exposures and wider line spacings would have shown.
 
-    What is given back has the planes of `models.network.spectral.Capture` behind the spectral features.
+    What is given back has the planes of `models.network.spectral.LineSpec` behind the spectral features.
     """
 
     def __init__(self, normalisation: Normalisation, *, darkest_ms: float = 3.0) -> None:
@@ -113,7 +113,7 @@ class CaptureAugmentation:
         scaled = self._noisy(scaled, noise, light, rng, samples=step)
         for _ in range(step.bit_length() - 1):
             scaled = _twice_the_rows(scaled)
-        return with_planes(scaled @ self.normalisation.whitening, Capture(light, step))
+        return with_planes(scaled @ self.normalisation.whitening, LineSpec(light, step))
 
     def coarse_pass(self, columns: Columns, noise: ColumnNoise, *, light: float, rng: np.random.Generator) -> Columns:
         """Show a crop as a pass of lines ``BINNED`` px apart, so many samples binned, each pixel repeated."""
@@ -122,7 +122,7 @@ class CaptureAugmentation:
         means = scaled.reshape(y // BINNED, BINNED, x // BINNED, BINNED, -1).mean(axis=(1, 3))
         means = self._noisy(means, noise, light, rng, samples=BINNED**2, readings=BINNED)
         repeated = np.repeat(np.repeat(means, BINNED, axis=0), BINNED, axis=1)
-        return with_planes(repeated @ self.normalisation.whitening, Capture(light, BINNED, BINNED))
+        return with_planes(repeated @ self.normalisation.whitening, LineSpec(light, BINNED, BINNED))
 
     def _noisy(
         self,

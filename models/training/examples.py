@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from models.network.sizes import TOKEN_PX
-from models.network.spectral import Capture, Normalisation, SpectralBasis, with_planes
+from models.network.spectral import LineSpec, Normalisation, SpectralBasis, with_planes
 from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation, ColumnNoise
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera, expose, footprint
@@ -155,6 +155,6 @@ class CropSampler:
             if rng.random() < NOISY:
                 noise = np.float32(rng.uniform(0, self.noise))
                 columns += noise * rng.standard_normal(columns.shape, np.float32)
-            image = detail = with_planes(columns, Capture())
+            image = detail = with_planes(columns, LineSpec())
         channels = [np.ascontiguousarray(one.transpose(2, 0, 1)) for one in (image, detail)]
         return channels[0], channels[1], np.ascontiguousarray(turn(labels)).astype(np.int64)

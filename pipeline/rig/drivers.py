@@ -95,7 +95,7 @@ class MirrorDriver(Protocol):
 
 
 @dataclass(frozen=True)
-class AcknowledgedCapture:
+class Capture:
     """A capture that the camera acknowledged."""
 
     folder: str
@@ -128,7 +128,7 @@ class CameraDriver(Protocol):
         SettingsError : the camera does not take such times.
         """
 
-    def capture(self, frames: int, *, prefix: str = "") -> AcknowledgedCapture:
+    def capture(self, frames: int, *, prefix: str = "") -> Capture:
         """Begin a capture of ``frames`` frames; return once the camera acknowledged it.
 
         Parameters

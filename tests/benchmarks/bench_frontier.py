@@ -30,7 +30,7 @@ from flows.tradeoff.stages import uniform_pass
 from flows.training.observed_scenes import chosen_effects
 from models.evaluation.expected_scores import MapScores, expected_counts
 from models.evaluation.metrics import confusion, mean_iou
-from models.network.spectral import Capture
+from models.network.spectral import LineSpec
 from models.reading.inference import segment
 from models.weights.files import Weights, describe_weights, load_weights
 from pipeline.geometry.camera import LineCamera
@@ -182,7 +182,7 @@ def map_of(scene: RasterScene, seed: int, step: int, exposure_ms: float, weights
     sweeps = uniform_sweeps(grid, CAMERA, along, step=step, exposure_ms=exposure_ms)
     chosen = chosen_effects(scene, rig, sweeps)
     source = SimulatedSource(scene, rig, seed, chosen, clock=sweep_starts(sweeps, CAMERA, COST))
-    scan = Capture(exposure_ms / CAMERA.exposure_ms, step)
+    scan = LineSpec(exposure_ms / CAMERA.exposure_ms, step)
     scan_pass = uniform_pass(weights, source, sweeps, grid, COST, scan)
     drawn = segment(weights, scan_pass.seen, scan_pass.columns, scan_pass.patch_index, every_class=True)
     judged = _judged(scene, drawn.classes, weights)

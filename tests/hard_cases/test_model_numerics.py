@@ -19,7 +19,7 @@ from torch import Tensor
 from models.evaluation.metrics import average_accuracy, confusion, iou_per_class, kappa, mean_iou, overall_accuracy
 from models.network.layers import Encoder, code_2d, cut
 from models.network.sizes import PLANES, SegmenterConfig
-from models.network.spectral import Capture, Normalisation, with_planes
+from models.network.spectral import LineSpec, Normalisation, with_planes
 from models.policies.policies import pixel_entropy, score_patches
 from models.reading.inference import (
     CoarsePrediction,
@@ -130,7 +130,7 @@ def test_5_no_patch_is_the_overview_bit_by_bit():
     """With K = 0 training's forward, the overview and the survey's map come from one and the same logits."""
     weights, grid = plain_weights(), SceneGrid(48, 64, 8, 1)
     seen = coarse_prediction_of_columns(weights, noise(0, 48, 64, 4).numpy(), grid)
-    image = torch.from_numpy(with_planes(seen.columns, Capture())).permute(2, 0, 1)[None]
+    image = torch.from_numpy(with_planes(seen.columns, LineSpec())).permute(2, 0, 1)[None]
     model = weights.segmenter
     logits, patches = model(image, image, NONE, PLACE)
     whole = model.composite(logits, patches, NONE)

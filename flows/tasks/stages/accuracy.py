@@ -33,7 +33,7 @@ from models.evaluation.metrics import (
     kappa,
 )
 from models.evaluation.placement import CONTROL_FRACTION, run_controls
-from models.network.spectral import Capture
+from models.network.spectral import LineSpec
 from models.reading.inference import read_coarse_prediction, segment
 from models.reading.regions import plan_regions, whole_field
 from models.weights.files import Weights
@@ -66,7 +66,7 @@ def evaluate(
     plan: CapturePlan,
     zones: SurveyZones,
     chooses: bool,
-    captures: tuple[Capture, Capture],
+    captures: tuple[LineSpec, LineSpec],
     simulated: SimulatedSource,
     source_key: Mapping[str, Any],
     labels: NDArray[np.uint8],
@@ -135,7 +135,7 @@ def evaluate(
 
 
 def _confusion_of_overview(
-    weights: Weights, mosaic: Path, grid: SceneGrid, capture: Capture, labels: NDArray[np.uint8]
+    weights: Weights, mosaic: Path, grid: SceneGrid, capture: LineSpec, labels: NDArray[np.uint8]
 ) -> NDArray[np.int64]:
     """Count (class, class) pixels of the map that the overview alone gives, region by region as surveys draw it."""
     empty = np.empty((0, grid.patch, grid.patch, weights.basis.columns), np.float32)

@@ -17,7 +17,7 @@ from flows.tasks.field_work import FieldWork, region_params
 from flows.tasks.patch_budget import PatchBudget
 from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
 from flows.tasks.zones import SurveyZones
-from models.network.spectral import Capture
+from models.network.spectral import LineSpec
 from models.policies.policies import SEEING_POLICIES, score_patches
 from models.reading.inference import CoarsePrediction
 from pipeline.capture.recorded_passes import RecordedPasses
@@ -54,7 +54,7 @@ def score(
     seed: int,
     mask: NDArray[np.generic] | None,
     part: bool,
-    capture: Capture,
+    capture: LineSpec,
     model_key: dict[str, Any],
     report: Report,
 ) -> Wanted:

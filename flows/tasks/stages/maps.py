@@ -16,7 +16,7 @@ from flows.tasks.prior_maps import MEMORY, Prior
 from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
 from flows.tasks.stages.attention import READING
 from flows.tasks.zones import SurveyZones
-from models.network.spectral import Capture
+from models.network.spectral import LineSpec
 from models.reading.prior_map import TemporalAgreement, changed_fractions
 from models.weights.parts import OodPart, ReaderPart
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
@@ -56,7 +56,7 @@ def segment(
     reader: ReaderPart | None,
     ood_detector: OodPart | None,
     unknown: UnknownRule | None,
-    captures: tuple[Capture, Capture],
+    captures: tuple[LineSpec, LineSpec],
     part: bool,
     least_gain: float | None,
     policy: str,

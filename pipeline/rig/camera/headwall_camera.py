@@ -31,7 +31,7 @@ from pipeline.rig.device_settings import (
     check_capture,
     check_times,
 )
-from pipeline.rig.drivers import AcknowledgedCapture, FrameClaim
+from pipeline.rig.drivers import Capture, FrameClaim
 from pipeline.rig.transports import (
     SYSTEM_CLOCK,
     Clock,
@@ -107,7 +107,7 @@ class HeadwallCamera:
             times = {"exposure": exposure_ms, "framePeriod": frame_period_ms}
             self._ask("configure", times, lambda response: check_times_set(response, times))
 
-    def capture(self, frames: int, *, cubes: int = 1, prefix: str = "") -> AcknowledgedCapture:
+    def capture(self, frames: int, *, cubes: int = 1, prefix: str = "") -> Capture:
         """Begin a capture of ``cubes`` files (0: until stopped) of ``frames`` lines (0: the camera's own number).
 
         Sent once. Where no reply comes the camera is asked whether it captures and which folders are new, and that is
@@ -133,7 +133,7 @@ class HeadwallCamera:
                 self.unknown = "a capture was sent and the wait for its reply was interrupted"
                 self._hang_up()
                 raise
-            return AcknowledgedCapture(folder, sent_s, self.clock.now())
+            return Capture(folder, sent_s, self.clock.now())
 
     def is_capturing(self) -> bool:
         """Ask whether a capture runs."""

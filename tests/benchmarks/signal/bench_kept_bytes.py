@@ -20,7 +20,7 @@ from flows.settings.survey_settings import SignalChoice
 from flows.tradeoff import scan_lines
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.machine import one_thread
-from models.network.spectral import Capture
+from models.network.spectral import LineSpec
 from models.reading.inference import DrawnMap, coarse_prediction_of_patches, segment
 from pipeline.geometry.grid import SceneGrid
 from pipeline.rectify.region import read_patches
@@ -72,7 +72,7 @@ def rows() -> list[Row]:
 def _farm(seed: int) -> Farm:
     maps = list[Any]()
 
-    def judge(weights: Any, columns: Any, grid: SceneGrid, labels: NDArray[np.uint8], capture: Capture) -> float:
+    def judge(weights: Any, columns: Any, grid: SceneGrid, labels: NDArray[np.uint8], capture: LineSpec) -> float:
         index = grid.valid_patches()
         seen = coarse_prediction_of_patches(weights, columns, grid, capture)
         drawn = segment(weights, seen, columns[index], index, every_class=True)

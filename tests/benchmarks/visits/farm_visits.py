@@ -13,7 +13,7 @@ from flows.tasks.survey_model import shipped_weights
 from flows.tradeoff.stages import uniform_pass
 from flows.training.observed_scenes import chosen_effects
 from models.evaluation.metrics import confusion, mean_iou
-from models.network.spectral import Capture
+from models.network.spectral import LineSpec
 from models.network.temporal_reader import TemporalReader
 from models.reading.inference import segment
 from models.reading.prior_map import ClassProbabilities, CurrentVisit, PriorMap, first_probabilities, fuse, pooled
@@ -79,7 +79,7 @@ def seen_by(scene: RasterScene, seed: int, how: tuple[int, float]) -> Seen:
     sweeps = uniform_sweeps(grid, CAMERA, along, step=step, exposure_ms=exposure_ms)
     clock = sweep_starts(sweeps, CAMERA, COST)
     source = SimulatedSource(scene, rig, seed, chosen_effects(scene, rig, sweeps), clock=clock)
-    scan_pass = uniform_pass(weights, source, sweeps, grid, COST, Capture(exposure_ms / REFERENCE_MS, step))
+    scan_pass = uniform_pass(weights, source, sweeps, grid, COST, LineSpec(exposure_ms / REFERENCE_MS, step))
     drawn = segment(weights, scan_pass.seen, scan_pass.columns, scan_pass.patch_index, every_class=True)
     assert drawn.log_probability is not None
     seen = np.ones(SHAPE, np.bool_)

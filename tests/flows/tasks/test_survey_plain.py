@@ -20,7 +20,7 @@ from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.tasks.scene import open_scene
-from models.network.spectral import Capture
+from models.network.spectral import LineSpec
 from models.reading.inference import coarse_prediction
 from models.weights.files import load_weights, save_weights
 from pipeline.errors import SceneError
@@ -208,7 +208,7 @@ def test_without_a_fine_patch_the_map_is_the_coarse_prediction(survey_png: Any, 
     mosaic = open_mosaic(tmp_path / done.receipt["products"]["mosaic"])
     drawn = done.open("class_map")["classes"].values
     grid = SceneGrid(*drawn.shape, 8, 4)
-    values, capture = mosaic.values(), Capture(1.0, 4, 4)
+    values, capture = mosaic.values(), LineSpec(1.0, 4, 4)
     seen = coarse_prediction(load_weights(weights), values, mosaic.wavelength_nm, grid, capture=capture, factor=4)
     assert (seen.probability.argmax(axis=-1)[: grid.height, : grid.width] == drawn).mean() > 0.999
     assert done.receipt["accuracy"]["miou"] == done.receipt["accuracy"]["none"]["miou"]

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from models.network.layers import ChannelNorm, cut
 from models.network.machine import choose_device
-from models.network.spectral import Capture
+from models.network.spectral import LineSpec
 from models.reading.inference import overview_of, patch_logits
 from models.training.examples import Batch
 from models.training.objective import PHASES, draw_patches
@@ -68,7 +68,7 @@ def test_what_a_map_is_drawn_from_is_brought_to_the_network(elsewhere: Weights) 
     overview = overview_of(elsewhere, replace(coarse_pass, origin=(2, 3)))
     assert overview.logits.device.type == elsewhere.segmenter.score(overview).device.type == "meta"
     with pytest.raises(NotImplementedError, match="copy out of meta tensor"):
-        next(patch_logits(elsewhere, overview, patches[:2], np.array([0, 3]), Capture()))
+        next(patch_logits(elsewhere, overview, patches[:2], np.array([0, 3]), LineSpec()))
 
 
 def test_what_a_step_learns_from_is_brought_to_the_network(elsewhere: Weights) -> None:

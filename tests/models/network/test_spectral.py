@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.network.spectral import Capture, Normalisation, SpectralBasis, band_widths, project, with_planes
+from models.network.spectral import LineSpec, Normalisation, SpectralBasis, band_widths, project, with_planes
 
 BASIS = SpectralBasis(400.0, 1000.0, 24)
 BANDS = st.lists(st.sampled_from(range(400, 1001, 3)), min_size=1, max_size=40)  # repeats are likely
@@ -118,18 +118,18 @@ def test_unreached_columns_are_what_the_others_let_expect():
 @given(st.floats(0.01, 1), st.floats(1, 16), st.floats(1, 16), st.integers(0, 2))
 def test_planes_are_0_at_the_reference_and_grow_with_what_it_lacks(light: float, step: float, binned: float, at: int):
     """Half the exposure adds a quarter, twice the spacing or the samples a half, each to its own plane alone."""
-    here, factor = Capture(light, step, binned), [1.0, 1.0, 1.0]
+    here, factor = LineSpec(light, step, binned), [1.0, 1.0, 1.0]
     factor[at] = 0.5 if at == 0 else 2.0
-    more = Capture(light * factor[0], step * factor[1], binned * factor[2])
+    more = LineSpec(light * factor[0], step * factor[1], binned * factor[2])
     assert more.planes - here.planes == pytest.approx(np.eye(3)[at] * [0.25, 0.5, 0.5], abs=1e-5)
     assert (here.planes >= 0).all()
-    assert not Capture().planes.any()
-    assert not Capture(light=4.0).planes.any()  # what is better than the reference counts as that
+    assert not LineSpec().planes.any()
+    assert not LineSpec(light=4.0).planes.any()  # what is better than the reference counts as that
 
 
 def test_planes_lie_behind_the_columns():
     """Each pixel has its columns first, as they are, then the capture's planes."""
     columns = np.random.default_rng(0).normal(size=(3, 2, 5)).astype(np.float32)
-    told = with_planes(columns, Capture(0.25, 4, 2))
+    told = with_planes(columns, LineSpec(0.25, 4, 2))
     assert (told[..., :5] == columns).all()
     assert (told[..., 5:] == np.array([0.5, 1.0, 0.5], np.float32)).all()

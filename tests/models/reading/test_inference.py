@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from models.network.sizes import TOKEN_PX
-from models.network.spectral import Capture, with_planes
+from models.network.spectral import LineSpec, with_planes
 from models.reading import inference
 from models.reading.inference import (
     CoarsePass,
@@ -30,7 +30,7 @@ from tests.models.conftest import Maker, noise, plain_weights, scene_columns
 
 NM = np.linspace(400, 1000, 9)
 NONE = np.empty(0, np.int64)
-DARK = Capture(0.1, 4)
+DARK = LineSpec(0.1, 4)
 
 
 def _values(height: int, width: int, bands: int = len(NM)) -> np.ndarray:
@@ -110,7 +110,7 @@ def test_a_region_is_drawn_as_training_saw_crops(tiny: Maker, patch: int, origin
     weights = tiny(patch=patch)
     coarse_pass, fine = scene_columns(weights, 64, 128)
     moved, patch_index = replace(coarse_pass, origin=origin, capture=DARK), np.array([1, 0])
-    other = Capture(0.5)
+    other = LineSpec(0.5)
     drawn = segment(weights, moved, fine[patch_index], patch_index, capture=other)
     detail = np.zeros((64, 128, 4), np.float32)
     for (y, x), own in zip(coarse_pass.grid.patch_origin(patch_index), fine[patch_index], strict=True):
@@ -263,4 +263,4 @@ def test_what_was_never_dead_has_no_mask(tiny: Maker):
     seen = read_coarse_pass(tiny(), [_values(30, 31)], NM, SceneGrid(30, 31, 8, 1))
     assert (seen.living, seen.filled, seen.out_of_range) == (None, None, None)
     assert seen.seen_columns is seen.columns
-    assert CoarsePass(seen.grid, seen.columns).capture == Capture()
+    assert CoarsePass(seen.grid, seen.columns).capture == LineSpec()

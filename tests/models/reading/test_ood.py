@@ -10,7 +10,7 @@ import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.network.spectral import Capture
+from models.network.spectral import LineSpec
 from models.reading.ood import Limits, OodDetector
 
 COLUMNS = 5
@@ -71,7 +71,7 @@ def test_gaussian_spectra_lie_beyond_a_limit_as_often_as_chi_squared_says(light:
     beyond = float(scipy.stats.chi2.ppf(0.99, COLUMNS)) / COLUMNS
     ood_detector = some_ood(limits=some_limits(beyond))
     pixels = spectra_of(ood_detector, 4000, light=light)
-    fraction = ood_detector.unknown(pixels, rate=0.005, capture=Capture(light), bands=10).mean()
+    fraction = ood_detector.unknown(pixels, rate=0.005, capture=LineSpec(light), bands=10).mean()
     assert 0.007 < fraction < 0.013
 
 
@@ -79,7 +79,7 @@ def test_fewer_bands_are_read_as_noisier_ones() -> None:
     """A spectrum beyond the noise of all bands may be within that of some; more than in training help nothing."""
     ood_detector = some_ood(covariance=np.stack([0.01 * np.eye(COLUMNS)] * 3))
     pixel = ood_detector.centres[:1] + 0.7
-    told = [ood_detector.unknown(pixel, rate=0.005, capture=Capture(), bands=bands)[0] for bands in (1, 10, 20)]
+    told = [ood_detector.unknown(pixel, rate=0.005, capture=LineSpec(), bands=bands)[0] for bands in (1, 10, 20)]
     assert told == [False, True, True]
 
 
@@ -87,12 +87,12 @@ def test_a_pixel_without_columns_is_not_unknown() -> None:
     """It was not captured, which is another thing; what was, however far away, is."""
     ood_detector = some_ood()
     pixels = np.array([[np.nan] * COLUMNS, [np.inf] * COLUMNS, [1e6] * COLUMNS])
-    assert ood_detector.unknown(pixels, rate=0.005, capture=Capture(binned=4), bands=10).tolist() == [
+    assert ood_detector.unknown(pixels, rate=0.005, capture=LineSpec(binned=4), bands=10).tolist() == [
         False,
         False,
         True,
     ]
-    assert ood_detector.unknown(pixels[:0], rate=0.005, capture=Capture(), bands=10).shape == (0,)
+    assert ood_detector.unknown(pixels[:0], rate=0.005, capture=LineSpec(), bands=10).shape == (0,)
 
 
 def test_a_capture_is_held_against_its_own_limit() -> None:
@@ -106,7 +106,7 @@ def test_a_capture_is_held_against_its_own_limit() -> None:
         limits=limits,
     )
     pixels = ood_detector.centres[0] + np.sqrt([[0.9], [2.0], [5.0], [7.0]])  # so far away, squared
-    captures = [Capture(), Capture(step=1.5), Capture(step=2), Capture(step=4, binned=4)]
+    captures = [LineSpec(), LineSpec(step=1.5), LineSpec(step=2), LineSpec(step=4, binned=4)]
     told = [ood_detector.unknown(pixels, rate=0.01, capture=one, bands=10).sum() for one in captures]
     assert told == [3, 2, 2, 1]
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.network.spectral import Capture, Normalisation, SpectralBasis
+from models.network.spectral import LineSpec, Normalisation, SpectralBasis
 from models.training import capture_augmentation
 from models.training.capture_augmentation import CaptureAugmentation, ColumnNoise
 from pipeline.geometry.camera import LineCamera, expose
@@ -102,7 +102,7 @@ def test_a_scan_shows_means_as_wide_as_its_lines(step: int) -> None:
     mixed = np.random.default_rng(2).permuted(image.reshape(-1, step, 36), axis=1).reshape(image.shape)
     seen = _silent_scan(augmentation, image, step)
     np.testing.assert_allclose(seen, _silent_scan(augmentation, mixed, step), atol=1e-4)
-    assert (seen[..., 12:] == Capture(1.0, step).planes).all()
+    assert (seen[..., 12:] == LineSpec(1.0, step).planes).all()
     if step == 1:
         np.testing.assert_allclose(seen[..., :12], image, atol=1e-4)
 
@@ -117,7 +117,7 @@ def test_a_scan_is_as_noisy_as_its_light_makes_it(light: float, step: int) -> No
     noise, unwhiten = _noise(), np.linalg.inv(normalisation.whitening.astype(np.float64))
     plain = _flat(normalisation, 0.3, (64, 1000))
     seen = augmentation.scan(plain, noise, light=light, step=step, rng=np.random.default_rng(6))
-    assert (seen[..., 12:] == Capture(light, step).planes).all()
+    assert (seen[..., 12:] == LineSpec(light, step).planes).all()
     one_line = np.zeros((64, 1, 12), np.float32)
     one_line[32 : 32 + step] = 1
     share = np.square(_silent_scan(augmentation, one_line, step)[..., 0]).sum() / step  # mean over rows, of the squares
@@ -134,7 +134,7 @@ def test_a_coarse_pass_repeats_means_that_are_read_four_times() -> None:
     seen = augmentation.coarse_pass(image, SILENT, light=0.5, rng=np.random.default_rng(0))
     means = image.reshape(4, 4, 6, 4, 12).mean(axis=(1, 3))
     np.testing.assert_allclose(seen[..., :12], means.repeat(4, 0).repeat(4, 1), atol=1e-4)
-    assert (seen[..., 12:] == Capture(0.5, 4, 4).planes).all()
+    assert (seen[..., 12:] == LineSpec(0.5, 4, 4).planes).all()
     noise, plain = _noise(), _flat(normalisation, 0.3, (400, 400))
     seen = augmentation.coarse_pass(plain, noise, light=0.1, rng=np.random.default_rng(3))
     pixels = seen.reshape(100, 4, 100, 4, 15)
@@ -154,10 +154,10 @@ def _drawn(kind: int, monkeypatch: pytest.MonkeyPatch) -> list[tuple[np.ndarray,
     return [(image, *augmentation.draw(image, SILENT, rng)) for _ in range(60)]
 
 
-def _captures(planes: np.ndarray) -> list[Capture]:
+def _captures(planes: np.ndarray) -> list[LineSpec]:
     """The captures of an image, by its planes."""
     logarithms = np.unique(planes.reshape(-1, 3), axis=0) * [4, 2, 2]
-    return [Capture(2**-light, round(2**step), round(2**binned)) for light, step, binned in logarithms]
+    return [LineSpec(2**-light, round(2**step), round(2**binned)) for light, step, binned in logarithms]
 
 
 def test_uniform_scans_have_every_spacing_and_light(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -195,7 +195,7 @@ def test_lines_between_others_are_a_second_capture_beside_the_first(monkeypatch:
             fine = min(int(own.step) for own in captures)
             assert wide % fine == 0
             assert fine < wide
-            assert finest == Capture(step=fine).planes[1]
+            assert finest == LineSpec(step=fine).planes[1]
             expected[part] = _silent_scan(augmentation, image[part], fine)[..., :12]
             assert len(captures) == 2
         np.testing.assert_allclose(overview[..., :12], expected, atol=1e-4)

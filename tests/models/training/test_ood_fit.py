@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.network.spectral import Capture, Normalisation
+from models.network.spectral import LineSpec, Normalisation
 from models.training.calibration import JudgedMap, fitted_temperature, judge_confidence
 from models.training.capture_augmentation import ColumnNoise
 from models.training.examples import Example
@@ -36,10 +36,10 @@ def test_known_spectra_are_unknown_at_the_rate_that_is_stated() -> None:
         [scene(i) for i in range(4)], [scene(i) for i in range(10, 13)], PLAIN, darkest_ms=3.0, bands=9, seed=0
     )
     fresh = np.concatenate([scene(i).columns[4:].reshape(-1, COLUMNS) for i in range(20, 26)])
-    fraction = ood_detector.unknown(fresh, rate=0.01, capture=Capture(), bands=9).mean()
+    fraction = ood_detector.unknown(fresh, rate=0.01, capture=LineSpec(), bands=9).mean()
     assert 0.004 < fraction < 0.02
     out_of_range = np.array([[2.0, 0.0, 2.0], [3.0, 3.0, 3.0], [50.0, 50.0, 50.0], [1.0, 4.0, 3.0]])
-    assert ood_detector.unknown(out_of_range, rate=0.01, capture=Capture(), bands=9).all()
+    assert ood_detector.unknown(out_of_range, rate=0.01, capture=LineSpec(), bands=9).all()
 
 
 def test_every_capture_that_training_shows_has_limits() -> None:

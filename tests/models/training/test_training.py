@@ -11,7 +11,7 @@ from torch import Tensor
 
 from models.network.segmenter import Segmenter
 from models.network.sizes import PLANES, SegmenterConfig
-from models.network.spectral import Capture
+from models.network.spectral import LineSpec
 from models.reading.inference import map_of_columns
 from models.training import objective
 from models.training import train as training
@@ -46,7 +46,7 @@ def test_what_was_trained_at_the_reference_alone_reads_every_capture_alike(tiny:
     model, _ = train(CONFIG, [scene], SHIFT, SETTINGS)
     assert not any(stem.enter.weight[:, 2 : 2 + PLANES].any() for stem in (model.overview_stem, model.full_stem))
     weights, grid = replace(tiny(columns=2), segmenter=model), SceneGrid(32, 32, 8, 1)
-    usual, dark = (map_of_columns(weights, scene.columns, grid, one)[1] for one in (Capture(), Capture(0.1, 4, 4)))
+    usual, dark = (map_of_columns(weights, scene.columns, grid, one)[1] for one in (LineSpec(), LineSpec(0.1, 4, 4)))
     assert (usual == dark).all()
 
 
