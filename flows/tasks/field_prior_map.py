@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from flows.tasks.field_work import coarse_region
 from flows.tasks.prior_maps import EarlierRun
 from models.network.sizes import CELL_PX
+from models.network.spectral import LineSpec
 from models.reading.prior_map import ClassProbabilities, PriorMap, in_classes, pooled
 from models.reading.regions import Region
 from models.weights.files import Weights
@@ -48,7 +49,7 @@ class FieldPriorMap:
             values = in_classes(values, self.classes)
         lies = None
         if self.mosaic is not None:
-            coarse = pooled(coarse_region(weights, self.mosaic, region).seen_columns)
+            coarse = pooled(coarse_region(weights, self.mosaic, region, LineSpec()).seen_columns)
             lies = shifted(coarse, _cells(self.shift_px, CELL_PX))
         return PriorMap(ClassProbabilities(values, age, np.nan_to_num(light)), lies, self.days)
 

@@ -90,7 +90,7 @@ class Scoring:
         return region.crop_patches(score_patches(self.policy, seen))
 
 
-def coarse_region(weights: Weights, mosaic: Path, region: Region, capture: LineSpec = LineSpec()) -> CoarsePass:
+def coarse_region(weights: Weights, mosaic: Path, region: Region, capture: LineSpec) -> CoarsePass:
     """Read the part of a stored mosaic that a region needs, some rows at a time; coarse pixels are repeated."""
     seen = open_mosaic(mosaic)
     part = region.read.over(seen.factor)
