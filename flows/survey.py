@@ -17,7 +17,7 @@ from prefect import flow
 from flows.publish.publishing import add_accuracy, clear_raw, publish
 from flows.settings.parameters import SurveySettings
 from flows.tasks.captures import capture_pass, captured_signal, plan_capture
-from flows.tasks.open_survey import JUDGED, OpenSurvey, RunRef
+from flows.tasks.open_survey import OpenSurvey, RunRef
 from flows.tasks.prefect_tasks import as_task
 from flows.tasks.stages.accuracy import evaluate
 from flows.tasks.stages.attention import score
@@ -77,19 +77,18 @@ def _draw_captured(plan: OpenSurvey) -> tuple[StageRef, StageRef]:
     seams = register_coarse(plan, signal) if plan.registers else None
     mosaic = rectify(plan, signal, locate(plan, signal, seams), seams)
     request = score(plan, mosaic)
-    fine = None
-    if not plan.uniform:  # go back for what the plan requests
+    if plan.goes_back(request):  # take the lines between, where they promise most
         signal = captured_signal(plan, "fine", request, effects)
         seams = register_fine(plan, signal, mosaic) if plan.registers else None
-        fine = rectify_fine(plan, request, signal, seams)
-    return mosaic, segment(plan, mosaic, request, fine)
+        mosaic = rectify_fine(plan, signal, seams)
+    return mosaic, segment(plan, mosaic, request)
 
 
 def judge(plan: OpenSurvey, run: RunRef) -> RunRef:
     """Judge a published class map by the labels, where there are any; none of it counts as the survey's cost."""
     if not run.pending:
         return run
-    return as_task(add_accuracy, "add_accuracy")(plan, run, evaluate(plan, *plan.products.there(*JUDGED)))
+    return as_task(add_accuracy, "add_accuracy")(plan, run, evaluate(plan, *plan.products.judged))
 
 
 @flow(name="capture", flow_run_name="capture-{settings.name_of_run}", validate_parameters=True, persist_result=False)

@@ -20,7 +20,7 @@ from flows.publish.findings import field_figures
 from flows.publish.receipt_table import finding_rows
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
-from flows.tasks.open_survey import JUDGED, STAGES, OpenSurvey
+from flows.tasks.open_survey import STAGES, OpenSurvey
 from flows.tasks.run import SurveyRun, open_run
 from flows.tasks.scan_choice import ScanChoice, as_figures
 from flows.tasks.scores import MOST_ERROR, format_prediction
@@ -127,7 +127,7 @@ def forecast(settings: Settings, preview: Path | None = None) -> Forecast:
         planner = Planner(run, catalogue)
         survey_flow.draw_class_map(planner)
         if run.scene.labelled and run.settings.accuracy:
-            evaluate(planner, *planner.products.there(*JUDGED))
+            evaluate(planner, *planner.products.judged)
         fine: FinePlan | None = None
         attention = planner.products["score"]
         if attention is not None and not isinstance(attention, _Awaited):
@@ -175,6 +175,12 @@ class Planner(OpenSurvey):
         self.rows.append(row)
         self.products[stage] = ref
         return ref
+
+    def goes_back(self, request: StageRef) -> bool:
+        """Return whether the survey may ask for more lines, as far as that is known."""
+        with suppress(PipelineError, OSError):
+            return super().goes_back(request)
+        return not self.run.plan.plain
 
     def take_as_found(self, stage: str, ref: StageRef, *inputs: StageRef) -> None:
         """Note a store that is not made again, since what follows was made of it."""

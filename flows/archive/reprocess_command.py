@@ -22,7 +22,7 @@ from flows.publish.run_folder import extend_with_accuracy, load_receipt
 from flows.publish.survey_command import run_survey, show_published
 from flows.settings.survey_settings import Settings
 from flows.tasks.observer import Observer
-from flows.tasks.open_survey import JUDGED, STAGES, TITLES, OpenSurvey, Products, versions
+from flows.tasks.open_survey import STAGES, TITLES, OpenSurvey, Products, versions
 from flows.tasks.run import SurveyRun, open_run
 from flows.tasks.scene import for_rig
 from flows.tasks.scores import score_of
@@ -221,7 +221,7 @@ def run_judge(
             raise ArchiveError(f"{found.uri} is being judged by another process; it adds the accuracy")
         with draft:
             made = survey.products
-            published = extend_with_accuracy(survey, draft, evaluate(survey, *made.there(*JUDGED)))
+            published = extend_with_accuracy(survey, draft, evaluate(survey, *made.judged))
     show_published(published, settings.out, console)
     return published.receipt
 

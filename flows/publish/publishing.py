@@ -20,7 +20,7 @@ from flows.publish.retention import is_outlived
 from flows.publish.run_folder import Published, asked_settings, extend_with_accuracy, publish_run
 from flows.settings.survey_settings import OF_THE_MACHINE
 from flows.settings.values import KEEP_SIGNAL
-from flows.tasks.open_survey import JUDGED, STAGES, OpenSurvey, RunRef
+from flows.tasks.open_survey import STAGES, OpenSurvey, RunRef
 from flows.tasks.prefect_tasks import as_task, inside_flow
 from flows.tasks.stages.accuracy import evaluate
 from flows.tasks.stages.capture import capture_coarse, capture_fine
@@ -55,7 +55,7 @@ def _publish(plan: OpenSurvey, *products: StageRef) -> RunRef:
         return stopped
     judged = plan.run.scene.labelled and plan.run.settings.accuracy
     if judged and _accuracy_is_stored(plan):
-        plan(evaluate.name, *plan.products.there(*JUDGED))
+        plan(evaluate.name, *plan.products.judged)
         judged = False
     published = publish_run(plan)
     if judged:
@@ -123,7 +123,7 @@ def _ref(published: Published, *, pending: bool = False) -> RunRef:
 def _accuracy_is_stored(plan: OpenSurvey) -> bool:
     try:
         one = STAGES[evaluate.name]
-        return one.find(plan.run.archive, one.wants(plan.run, *plan.products.there(*JUDGED))) is not None
+        return one.find(plan.run.archive, one.wants(plan.run, *plan.products.judged)) is not None
     except Exception:  # what is wrong is said when the map is judged: until then it is published
         return False
 

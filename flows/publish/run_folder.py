@@ -32,14 +32,16 @@ from flows.tasks.run import SurveyRun, now
 from flows.tasks.scan_choice import as_figures
 from flows.tasks.scene import seen_in_training
 from flows.tasks.stages.accuracy import load_accuracy
-from flows.tasks.stages.attention import READING, load_plan
+from flows.tasks.stages.attention import READING, load_plan, read_in_full
 from flows.tasks.stages.effects import load_manifest
 from flows.tasks.stages.on_ground import STORE
-from flows.tasks.stages.placement import load_registration, pixels_of_patches, seen_fractions
+from flows.tasks.stages.placement import load_registration
 from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.errors import IncompleteStoreError
+from pipeline.geometry.grid import patch_pixels
 from pipeline.planning.coverage import on_scene
 from pipeline.planning.fine_pass import FinePlan
+from pipeline.planning.interlaced import FIRST_STEP
 from pipeline.planning.prices import SavingEntry, capture_savings
 from pipeline.planning.uniform_scans import format_scan
 from storage.archive.keys import StageRef
@@ -48,7 +50,6 @@ from storage.archive.records import read_run
 from storage.archive.run_folders import RunDraft
 from storage.arrays.class_maps import ProbabilityStore, load_class_map
 from storage.arrays.ground_maps import load_ground_map
-from storage.arrays.layout import SHARD_ROWS
 from storage.arrays.mosaics import load_attention, open_mosaic
 from storage.arrays.quicklooks import choose_bands
 from storage.arrays.signal_cubes import SignalCube, open_signal_cubes
@@ -68,7 +69,7 @@ class Published:
 
 def publish_run(survey: OpenSurvey) -> Published:
     """Write receipt.json, quicklook.png and report.html into a run folder and publish it as a whole."""
-    plan = load_plan(survey.products["score"], survey.products["segment"])
+    plan = load_plan(survey.products["score"])
     with survey.run.archive.new_run(survey.run.name) as draft:
         receipt = make_receipt(survey, plan, f"runs/{draft.id}")
         return _publish(survey, draft, plan, receipt)
@@ -91,7 +92,7 @@ def extend_with_accuracy(survey: OpenSurvey, draft: RunDraft, accuracy: StageRef
         settings={name: asked[name] for name in names},
         judged=now(),
     )
-    return _publish(survey, draft, load_plan(survey.products["score"], survey.products["segment"]), receipt)
+    return _publish(survey, draft, load_plan(survey.products["score"]), receipt)
 
 
 def load_receipt(folder: Path) -> Receipt:
@@ -104,11 +105,7 @@ def load_receipt(folder: Path) -> Receipt:
 
 def _publish(survey: OpenSurvey, draft: RunDraft, plan: FinePlan, receipt: Receipt) -> Published:
     run, products = survey.run, survey.products
-    again = (
-        None
-        if run.plan.plain
-        else float(seen_fractions(run.frame, products.detail, plan.patch_index).sum()) / len(run.grid.valid_patches())
-    )
+    again = None if run.plan.plain else len(plan.patch_index) / len(run.grid.valid_patches())
     shown = quicklook_data(run, products, plan, receipt)
     draw_quicklook(draft.folder / "quicklook.png", shown)
     if "plots" in receipt:
@@ -166,7 +163,7 @@ def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
         versions=versions,
         settings=asked_settings(run),
         stages=[asdict(one) for one in survey.records.values()],
-        savings=_savings(run, plan),
+        savings=_savings(run, plan, read_in_full(products["score"], products["segment"])),
         data_bytes=open_account(run, plan),
         accuracy_is=accuracy_is,
         judged=None if accuracy is None else now(),
@@ -185,10 +182,10 @@ def asked_settings(run: SurveyRun) -> dict[str, object]:
     return {**anchor_paths(run.settings.to_dict(), Path.cwd()), "notes": list(run.notes)}
 
 
-def _savings(run: SurveyRun, plan: FinePlan) -> dict[str, Any]:
+def _savings(run: SurveyRun, plan: FinePlan, read: NDArray[np.intp]) -> dict[str, Any]:
     """Everything done against the full scan; of a raster, of which nothing is captured, what the model reads."""
     if run.raster is not None:
-        return _model_savings(run, plan)
+        return _model_savings(run, read)
     done = [*run.plan.coarse, *plan.sweeps]
     entries = capture_savings(done, run.plan.full, run.camera, run.grid, cost=run.settings.cost)
     reference = run.scans.reference  # the cheapest scan that is nearly as good as any; without a table, every line
@@ -197,15 +194,15 @@ def _savings(run: SurveyRun, plan: FinePlan) -> dict[str, Any]:
     return {
         **{name: entry.as_dict() for name, entry in entries.items()},
         "capture_s": capture if reference is None else capture | {"full_scan": reference.words},
-        **_model_savings(run, plan),
+        **_model_savings(run, read),
     }
 
 
-def _model_savings(run: SurveyRun, plan: FinePlan) -> dict[str, Any]:
+def _model_savings(run: SurveyRun, read: NDArray[np.intp]) -> dict[str, Any]:
     """Patches that are read in full, and multiply-adds, beside those of reading every patch."""
-    did, scan = run.work_done(plan.patch_index), run.costs.of_map(run.grid.valid_patches())
+    did, scan = run.work_done(read), run.costs.of_map(run.grid.valid_patches())
     return {
-        "patches": SavingEntry(len(plan.patch_index), len(run.grid.valid_patches()), "predicted").as_dict(),
+        "patches": SavingEntry(len(read), len(run.grid.valid_patches()), "predicted").as_dict(),
         "multiply_adds": {**SavingEntry(did.total, scan.total, "predicted").as_dict(), **asdict(did)},
     }
 
@@ -215,7 +212,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
     bands, _ = choose_bands(run.scene.wavelength_nm)
     chosen = list(bands)
     mosaic = open_mosaic(products.mosaic.path / "mosaic.zarr")
-    coarse = np.concatenate([mosaic.spectra(strip, chosen) for strip in mosaic.row_blocks(run.factor)])
+    coarse = np.concatenate([mosaic.spectra(strip, chosen) for strip in mosaic.row_blocks()])
     decided = products["segment"].path / READING
     attention = load_attention(decided if decided.exists() else products["score"].path / READING)
     changed = attention.changed
@@ -227,9 +224,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
     if accuracy is not None and accuracy["miou"] is not None:
         where = " on a scene of the training" if "training_scene" in receipt else ""
         notes.append(f"mIoU {100 * accuracy['miou']:.1f} %{where}")
-    sweeps = [
-        cube for ref in products.there("condense_coarse") for cube in open_signal_cubes(ref.path)
-    ]  # of a raster none
+    sweeps = [cube for ref in products.signals for cube in open_signal_cubes(ref.path) if cube.sweep.kind == "coarse"]
     strips = sorted(sweeps, key=lambda cube: cube.sweep.swath_px)  # as they lie there
     return QuicklookData(
         survey=run.name,
@@ -240,7 +235,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
         raster=run.raster is not None,
         raw=(coarse,) if run.raster is not None else tuple(_calibrated(run, cube, chosen) for cube in strips),
         raw_lines=sum(cube.sweep.lines for cube in strips),
-        rectified=_both_scales(run, products, plan, chosen, coarse),
+        rectified=coarse,
         wavelength_nm=run.scene.wavelength_nm[chosen],
         score=attention.score if changed is None else np.where(attention.rank >= 0, changed, np.nan),
         changed=changed is not None,
@@ -263,7 +258,8 @@ def _format_asked(run: SurveyRun) -> str:
         return "raster, taken as it is"
     if run.plan.plain:
         return format_scan(run.settings.scan_step or 1, run.settings.scan_exposure_ms or run.camera.exposure_ms)
-    return f"budget {run.settings.budget:g}   ·   policy {run.settings.policy}"
+    first = format_scan(FIRST_STEP, run.settings.coarse_exposure_ms or run.camera.exposure_ms)
+    return f"first {first}, then the lines between where they promise most"
 
 
 def _calibrated(run: SurveyRun, cube: SignalCube, bands: list[int]) -> NDArray[np.float32]:
@@ -279,23 +275,9 @@ def _calibrated(run: SurveyRun, cube: SignalCube, bands: list[int]) -> NDArray[n
     return values
 
 
-def _both_scales(
-    run: SurveyRun, products: Products, plan: FinePlan, bands: list[int], coarse: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """The coarse mosaic at the scene's size with the patches in detail laid in, (y, x, 3)."""
-    s = run.grid.factor
-    canvas = np.repeat(np.repeat(coarse, s, axis=0), s, axis=1)[: run.grid.height, : run.grid.width].copy()
-    detail, chosen = open_mosaic(products.detail.path / "mosaic.zarr"), pixels_of_patches(run.grid, plan.patch_index)
-    for first in range(0, run.grid.height, SHARD_ROWS):
-        rows = slice(first, min(first + SHARD_ROWS, run.grid.height))
-        if chosen[rows].any():
-            canvas[rows][chosen[rows]] = detail.values(rows, bands=bands)[chosen[rows]]
-    return canvas
-
-
 def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     """``plan``, and what not every survey has: see `flows.publish.receipt.FINDINGS`."""
-    plan = load_plan(products["score"], products["segment"])
+    plan = load_plan(products["score"])
     figures: dict[str, Any] = {
         "kind": plan.kind,
         "reason": plan.reason,
@@ -309,8 +291,8 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     found: dict[str, Any] = {"field": field_figures(run, plan), "plan": figures}
     if run.recorded is not None:
         found["recording"] = _recording(run, run.recorded, plan)
-    if run.plan.plain and run.chooses:
-        found["kept"] = run.reading_figures(plan.patch_index)
+    if run.chooses and (run.plan.plain or run.least_gain is not None):
+        found["kept"] = run.reading_figures(read_in_full(products["score"], products["segment"]))
     if (memory := prior_map_figures(products["segment"].path)) is not None:
         found["memory"] = memory
     if run.settings.extent != EXTENT_WHOLE:
@@ -322,9 +304,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     passes = {"coarse": products.get("register_coarse"), "fine": products.get("register_fine")}
     pointing = {name: _pointing(ref) for name, ref in passes.items() if ref is not None}
     if "fine" in pointing:
-        pointing["fine"]["partly_seen"] = int(
-            np.count_nonzero(seen_fractions(run.frame, products.detail, plan.patch_index) < 1)
-        )
+        pointing["fine"]["partly_seen"] = _partly_seen(run, products.mosaic, plan)
     if pointing:
         found["pointing"] = {"prior_px": run.settings.pointing_px, **pointing}
     class_map = products["segment"]
@@ -339,6 +319,15 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     if troubled:
         found["lines"] = troubled
     return found
+
+
+def _partly_seen(run: SurveyRun, mosaic: StageRef, plan: FinePlan) -> int:
+    """Count the patches that were to be captured again and of which later lines missed a pixel."""
+    kinds = open_mosaic(mosaic.path / "mosaic.zarr").captures()
+    if kinds is None:
+        return 0
+    coarse = np.array([step >= FIRST_STEP for _, step, _ in kinds[0]])[kinds[1]]
+    return int(np.count_nonzero(patch_pixels(run.grid, coarse)[plan.patch_index].any(axis=(1, 2))))
 
 
 def _recording(run: SurveyRun, recorded: RecordedPasses, plan: FinePlan) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from pydantic import Field, PlainValidator, TypeAdapter, ValidationError
 
 from flows.settings import renamed
 from flows.settings.survey_settings import (
+    ALWAYS,
     BUILT_IN_SCENES,
     OF_A_CAMERA,
     OF_A_VIEW,
@@ -133,7 +134,7 @@ TABLES = {
 }
 
 
-OF_THE_PLAN = (*UNIFORM, *OF_TWO_PASSES, *SPARING, "scan_exposure_ms", "extent")
+OF_THE_PLAN = ("zoom", *UNIFORM, *OF_TWO_PASSES, *SPARING, "scan_exposure_ms", "extent")
 OF_THE_RUN = (
     "camera",
     "cost",
@@ -215,9 +216,10 @@ def load_settings(
         if isinstance(inner, Mapping):
             table[name] = {**recorded.pop(name, {}), **inner}
     asked = {**(usual or {}), **recorded, **table}
-    for wrong in (*_camera_of_a_map(asked, origin), *_contradictions(given, origin)):
+    for wrong in (*_camera_of_a_map(asked, origin), *_contradictions(given, origin, zooms=asked.get("zoom") == ALWAYS)):
         raise SettingsError(wrong)
     passes = any(name in given and not _is_usual(table[name], SURVEY[name], origin.get(name)) for name in OF_TWO_PASSES)
+    passes |= asked.get("zoom") == ALWAYS and asked.get("seconds") is None
     if passes and not _is_map(asked) and not any(asked.get(name) is not None for name in (*UNIFORM, "budget")):
         asked["budget"] = USUAL_BUDGET
     return parse_settings(asked, origin)
@@ -339,9 +341,11 @@ def anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:
     return anchored
 
 
-def _contradictions(given: set[str], origin: Mapping[str, str]) -> Iterator[str]:
-    """Settings of a uniform scan beside some of a survey in two passes, or those that choose it beside it itself."""
-    plain = [place_of(key, origin.get(key)) for key in UNIFORM if key in given]
+def _contradictions(given: set[str], origin: Mapping[str, str], *, zooms: bool) -> Iterator[str]:
+    """Yield settings of a uniform scan beside some of a survey that zooms, or those that choose it beside it itself."""
+    plain = [place_of(key, origin.get(key)) for key in UNIFORM if key in given and not (zooms and key == "seconds")]
+    if zooms and plain:
+        yield f"{plain[0]} asks for one uniform scan of the field, and --zoom always for lines between; leave one out"
     chosen = OF_CHOOSING if given & set(SPARING) else ()
     passes = [place_of(key, origin.get(key)) for key in OF_TWO_PASSES if key in given and key not in chosen]
     if plain and passes:

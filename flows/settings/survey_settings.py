@@ -65,12 +65,13 @@ PATHS = (
     *("scene", "labels", "sweeps", "pointing", "dark", "white", "out", "mask", "weights"),
     *("zones.area", "zones.no_go", "zones.plots"),
 )
+ALWAYS: Literal["always"] = "always"  # a first pass, and lines between where they promise most
 AUTO, SIM, RIG, RASTER = "auto", "sim", "rig", "raster"  # where pixels come from
 RECORDED = "recorded"  # likewise, and the uniform scan that takes a recording's own lines
 # of a camera alone: tables, and settings beside them
 OF_A_CAMERA = (
     *("camera", "optics", "mirror", "detector", "air", "sky", "cost", "rig", *UNIFORM, "scan_exposure_ms"),
-    *("coarse_exposure_ms", "budget", "effects", "tol", "resampling", "pointing_px", "extent", *OF_A_PART),
+    *("coarse_exposure_ms", "budget", "zoom", "effects", "tol", "resampling", "pointing_px", "extent", *OF_A_PART),
 )
 OF_A_VIEW = ("camera.pitch_um", "camera.focal_length_mm")  # how large a pixel is seen, which a [pose] asks for
 ALL_OF_IT = "leave it out to read all of the scan in detail"
@@ -232,15 +233,20 @@ class Settings:
     )
     budget: Budget | None = stated(
         None,
-        "Two passes: seconds of coarse and fine capture over those of the full scan, above 0 and at most 1. Without it "
-        "and without a uniform scan the weights' record chooses the cheapest scan nearly as good as any; without a "
-        "record there are two passes in half of the seconds, or every line of a field too small for them",
+        "Zoom within this fraction of the full scan's seconds, in the camera's exposure and by the policy: every 4th "
+        "line first, then lines between where the policy says",
         example=0.5,
+    )
+    zoom: Literal["auto", "always", "never"] = stated(
+        "auto",
+        "Capture every 4th line first, then the lines between where they promise most in the seconds that are left: "
+        "always, never (one uniform scan), or auto: where a field of which every place pays would lose at most 0.3 "
+        "points by it, and the weights have a record of scans",
     )
     seconds: float | None = stated(
         None,
-        "One uniform scan in the place of two passes: of those that end in so many of the camera's seconds, the one "
-        "whose map is likely to score most by the weights' record",
+        "The camera's seconds that the capture may take: one uniform scan, the one whose map is likely to score most "
+        "by the weights' record, or with zoom a first pass and lines between",
         "s",
         0.1,
         1e6,
@@ -287,7 +293,12 @@ class Settings:
         100,
     )
     coarse_exposure_ms: float | None = stated(
-        None, "Exposure of a coarse line; by default the camera's", "ms", 0.5, 10_000, example=25.0
+        None,
+        "Exposure of the first pass; by default the camera's, or as the record says",
+        "ms",
+        0.5,
+        10_000,
+        example=25.0,
     )
     policy: Policy = stated("gain", "Where to capture again")
     mask: str | None = stated(None, "Image of where to capture again, for the policy mask", example="mask.png")
@@ -380,8 +391,14 @@ class Settings:
 
     @property
     def plain(self) -> bool:
-        """Return whether all of the field is there at once, scanned or as a raster, in the place of two passes."""
-        return self.is_map or any(getattr(self, name) is not None for name in UNIFORM)
+        """Return whether a uniform scan is asked for, or a raster: all of the field is there at once."""
+        asked = [name for name in UNIFORM if getattr(self, name) is not None and not (self.zooms and name == "seconds")]
+        return self.is_map or bool(asked)
+
+    @property
+    def zooms(self) -> bool:
+        """Return whether a first pass is asked for, and lines between."""
+        return not self.is_map and (self.budget is not None or self.zoom == ALWAYS)
 
     @property
     def undecided(self) -> bool:

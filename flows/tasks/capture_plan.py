@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from flows.settings.survey_settings import RECORDED, Settings
 from flows.settings.values import EXTENT_WHOLE, parse_extent_runs
 from pipeline.capture.recorded_passes import RecordedPasses
-from pipeline.errors import SettingsError
+from pipeline.errors import BudgetError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, CostModel, Sweep
-from pipeline.planning.coverage import cheapest_full, coarse_sweeps, sweeps_over, uniform_sweeps, with_margin
+from pipeline.planning.coverage import cheapest_full, full_sweeps, sweeps_over, uniform_sweeps, with_margin
+from pipeline.planning.interlaced import FIRST_STEP, every_nth
 from pipeline.planning.partial_scans import sweeps_of_runs
 from pipeline.planning.prices import check_budget
 from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX
@@ -24,7 +25,7 @@ from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX
 class CapturePlan:
     """Plan that every survey of this field has in common: orientation, coarse and full sweeps, and their seconds.
 
-    Of a uniform scan ``coarse`` are the sweeps of that, and there is nothing to go back for.
+    ``coarse`` are the sweeps of the first pass; of a uniform scan they are all that is captured.
     """
 
     along: Axis
@@ -32,10 +33,11 @@ class CapturePlan:
     full: list[Sweep]
     coarse_s: float
     full_s: float
-    fine_s: float  # left by the budget for the fine pass
+    fine_s: float  # left for later passes
     overlap_px: float  # of neighbouring coarse strips, at least
     margin_px: float  # by which sweeps begin earlier and end later
-    plain: bool = False  # one scan of everything, read whole
+    plain: bool = False  # one uniform scan, or a raster
+    by_record: bool = False  # later lines are chosen by the weights' record of scans
 
     @staticmethod
     def of_map() -> CapturePlan:
@@ -51,7 +53,7 @@ class PassLayout:
     camera: LineCamera
     cost: CostModel
     pointing_px: float = 0.0  # by which the mirror may look beside the plan
-    step: int | None = None  # pixels from line to line of a uniform scan; None: two passes
+    step: int | None = None  # pixels from line to line of a uniform scan; None: several passes
     exposure_ms: float | None = None  # of a uniform scan; None: the camera's
     coarse_exposure_ms: float | None = None
     extent: str = EXTENT_WHOLE  # the lines of a uniform scan that are looked at
@@ -86,20 +88,30 @@ class PassLayout:
         """Return the layout of a uniform scan of the whole field."""
         return replace(self, step=step, exposure_ms=exposure_ms, extent=EXTENT_WHOLE, as_taken=False)
 
-    def plan(self, budget: float | None) -> CapturePlan:
-        """Lay out coarse and full sweeps; where the mirror may look beside the plan, with overlaps and margins.
+    def plan(self, budget: float | None, seconds: float | None = None) -> CapturePlan:
+        """Lay out the first pass and the full scan; where the mirror may look beside the plan, overlapping and longer.
 
-        ``budget`` is the fraction of the full scan's seconds that two passes may take, None of a uniform scan. Either
-        pass overlaps by what its own registration needs. Its map lies as the sweep that is held does, which another may
-        lie beside by twice the mirror's error: so much earlier sweeps begin, and later they end. Raises as `sweeps`;
-        BudgetError: the budget does not pay for the coarse pass.
+        All passes may take ``seconds``, or ``budget``, a fraction of the full scan's; without either there is one
+        uniform scan. Raises as `sweeps`; BudgetError: the first pass is not paid for.
         """
         along, coarse, full = self.sweeps()
         full_s, coarse_s = self.cost.seconds(full, self.camera), self.cost.seconds(coarse, self.camera)
-        fine_s = 0.0 if budget is None else check_budget(budget, coarse_s, full_s)
-        overlap = self._overlap(self.step or self.grid.factor)
+        fine_s, by_record = 0.0, budget is None and seconds is not None
+        if budget is not None:
+            fine_s = check_budget(budget, coarse_s, full_s)
+        elif seconds is not None:
+            if seconds < coarse_s:
+                raise BudgetError(
+                    f"--seconds {seconds:g} does not pay for the first pass of every {FIRST_STEP}th line, "
+                    f"{coarse_s:.1f} s; give more, a shorter --coarse-exposure-ms, or --zoom never"
+                )
+            fine_s = seconds - coarse_s
+        overlap = self._overlap(self.step or FIRST_STEP)
         margin = 2 * self.pointing_px
-        return CapturePlan(along, coarse, full, coarse_s, full_s, fine_s, overlap, margin, plain=budget is None)
+        plain = budget is None and seconds is None
+        return CapturePlan(
+            along, coarse, full, coarse_s, full_s, fine_s, overlap, margin, plain=plain, by_record=by_record
+        )
 
     def sweeps(self) -> tuple[Axis, list[Sweep], list[Sweep]]:
         """Give the axis that lines lie along, the coarse sweeps or those of a uniform scan, and those of the full scan.
@@ -121,8 +133,8 @@ class PassLayout:
             step, overlap, exposure_ms = self.step, self._overlap(self.step), self.exposure_ms
             scan_passes = uniform_sweeps(grid, camera, along, step=step, exposure_ms=exposure_ms, overlap_px=overlap)
         else:
-            overlap, exposure_ms = self._overlap(grid.factor), self.coarse_exposure_ms
-            scan_passes = coarse_sweeps(grid, camera, along, overlap_px=overlap, exposure_ms=exposure_ms)
+            overlap, exposure_ms = self._overlap(FIRST_STEP), self.coarse_exposure_ms
+            scan_passes = every_nth(full_sweeps(grid, camera, along, overlap_px=overlap), exposure_ms=exposure_ms)
         scan_passes = cut(scan_passes)
         if self.extent != EXTENT_WHOLE:
             scan_passes = sweeps_of_runs(scan_passes, parse_extent_runs(self.extent))

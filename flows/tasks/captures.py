@@ -112,15 +112,16 @@ def captured_signal(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRe
     Raises as `capture_pass`.
     """
     condense, stage, archive = CONDENSED[sweeps], PASSES[sweeps], plan.run.archive
+    before = plan.products.there("capture_coarse") if sweeps == "fine" else []  # lines that later ones lie between
     found = None
     with suppress(IncompleteStoreError):  # of an input, which the capture itself names
         raw = archive.ref(stage.product.name, stage.key(stage.wants(plan.run, *inputs)))
-        found = condense.find(archive, condense.wants(plan.run, raw))
+        found = condense.find(archive, condense.wants(plan.run, raw, *before))
     if found is None:
-        return condense(plan, capture_pass(plan, sweeps, *inputs))
+        return condense(plan, capture_pass(plan, sweeps, *inputs), *before)
     if archive.is_known(raw):
         plan.take_as_found(stage.name, raw, *inputs)
-    return condense(plan, raw)
+    return condense(plan, raw, *before)
 
 
 def _captured_elsewhere(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.tasks.field_prior_map import FieldPriorMap
-from flows.tasks.field_work import FieldWork, WeightsFile, coarse_region, patch_features, seen_patches
+from flows.tasks.field_work import FieldWork, WeightsFile, coarse_region, seen_patches
 from models.network.spectral import LineSpec
 from models.policies.policies import score_patches
 from models.reading.inference import CoarsePass, read_coarse_prediction, segment
@@ -45,11 +45,10 @@ class Drawing:
 
     weights: WeightsFile
     mosaic: Path
-    detail: Path  # mosaic of the field's own pixels
     attention: Path  # whose ranks say which patches are read in detail
     out: Path  # of the class map
     probabilities: Path
-    captures: tuple[LineSpec, LineSpec]  # of the overview's pixels, and of those read in full
+    capture: LineSpec  # of the mosaic's pixels, where it does not say so itself
     memory: FieldPriorMap | None = None  # what is remembered of the field
     left_out: Path | None = None  # (y, x) pixels of which zones have no map drawn
     unknown: UnknownRule | None = None  # which pixels are called unknown
@@ -60,29 +59,23 @@ class Drawing:
     def __call__(self, region: Region) -> Drawn:
         """Read what was seen of the region coarsely and finely, and store the part of the map that is kept."""
         let_tiles_go()
-        weights, detail = self.weights.load(), open_mosaic(self.detail)
-        overview, full = self.captures
-        seen, chosen = coarse_region(weights, self.mosaic, region, overview), chosen_patches(self.attention)
+        weights, mosaic = self.weights.load(), open_mosaic(self.mosaic)
+        seen, chosen = coarse_region(weights, self.mosaic, region, self.capture), chosen_patches(self.attention)
         if self.least_gain is not None:
             seen = predicted = read_coarse_prediction(weights, seen)
             gain, here = score_patches(self.policy, seen), region.numbers_here(chosen)
             chosen = chosen[(here >= 0) & (gain[here] >= self.least_gain)]
-        if self.mosaic == self.detail:
-            patch_index, columns = seen_patches(chosen, seen, region)
-        else:
-            patch_index, columns = patch_features(weights, detail, chosen, seen, region)
-        drawn = segment(weights, seen, columns, patch_index, capture=full, every_class=True)
-        shown = self._shown(region, detail, patch_index)
+        patch_index, columns = seen_patches(chosen, seen, region)
+        drawn = segment(weights, seen, columns, patch_index, every_class=True)
+        del columns  # a memory takes their room
+        shown = self._shown(region, mosaic, patch_index)
         assert drawn.log_probability is not None
         unknown = None
         if self.unknown is not None:
-            ood_detector, bands = self.weights.load_ood(), len(detail.wavelength_nm)
-            unknown = self.unknown.pixels(ood_detector, seen, columns, patch_index, bands, full) & (
-                drawn.classes != UNLABELLED
-            )
+            unknown = self.unknown.pixels(self.weights.load_ood(), seen, len(mosaic.wavelength_nm))
+            unknown &= drawn.classes != UNLABELLED
             unknown &= shown | (not self.part)
             drawn.log_probability[unknown] = np.nan  # of what these pixels show the classes say nothing
-        del columns  # a memory takes their room
         observation = self._observation(region, drawn.log_probability, shown, seen)
         classes, confidence = drawn.classes, drawn.confidence
         comparison, old = None, None
@@ -125,20 +118,19 @@ class Drawing:
             log_probability = np.where(away[..., None], np.float32(np.nan), log_probability)
         if self.part:
             log_probability = np.where(shown[..., None], log_probability, np.float32(np.nan))
-        light, step, _ = self.captures[1]
+        light, step, _ = seen.capture.usual
         return CurrentVisit(log_probability, shown, pooled(seen.seen_columns), light, int(step))
 
-    def _shown(self, region: Region, detail: Mosaic, patch_index: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def _shown(self, region: Region, mosaic: Mosaic, patch_index: NDArray[np.int64]) -> NDArray[np.bool_]:
         """(y, x) pixels of a region that were looked at in detail.
 
         Of a look at a part only what lines reached, in patches of which they reached enough: what is filled in beside
         the part is no look, and would stand where something better is remembered.
         """
         grid, p = region.grid, region.grid.patch
-        detailed = np.full((int(np.prod(grid.patch_shape)), p, p), self.mosaic == self.detail)
-        detailed[patch_index] = True
+        detailed = np.ones((int(np.prod(grid.patch_shape)), p, p), np.bool_)
         if self.part:
-            reached = patch_pixels(grid, detail.coverage(region.read.rows, region.read.columns) > 0)
+            reached = patch_pixels(grid, mosaic.coverage(region.read.rows, region.read.columns) > 0)
             detailed &= reached & (reached.mean(axis=(1, 2), keepdims=True) >= ENOUGH_SEEN)
         rows, columns = grid.patch_shape
         pixels = detailed.reshape(rows, columns, p, p).swapaxes(1, 2).reshape(rows * p, columns * p)
@@ -152,27 +144,16 @@ class UnknownRule:
     number: int  # of the class, after those of the weights
     rate: float  # of known pixels that may be
 
-    def pixels(
-        self,
-        ood_detector: OodDetector,
-        seen: CoarsePass,
-        patches: NDArray[np.float32],
-        patch_index: NDArray[np.int64],
-        bands: int,
-        full: LineSpec,
-    ) -> NDArray[np.bool_]:
-        """Unknown pixels of a region's scene, (y, x): by its patches, captured as ``full``, and by the rest."""
-        grid, p = seen.grid, seen.grid.patch
-        found = np.zeros(grid.padded_shape, np.bool_)
-        alike = seen.capture == full  # a uniform scan: patches have the columns of the overview
-        if alike or len(patch_index) < len(grid.valid_patches()):
-            found[...] = ood_detector.unknown(seen.columns, rate=self.rate, capture=seen.capture, bands=bands)
-        if alike:
-            return found[: grid.height, : grid.width]
-        fine = ood_detector.unknown(patches, rate=self.rate, capture=full, bands=bands)
-        for patch, (y, x) in zip(fine, grid.patch_origin(patch_index), strict=True):
-            found[y : y + p, x : x + p] = patch
-        return found[: grid.height, : grid.width]
+    def pixels(self, ood_detector: OodDetector, seen: CoarsePass, bands: int) -> NDArray[np.bool_]:
+        """Return the unknown pixels of a region's scene, (y, x), each by how it was captured."""
+        found = np.zeros(seen.grid.padded_shape, np.bool_)
+        for spec in seen.capture.specs:
+            here = seen.capture.where(spec)
+            columns = seen.columns if here is None else seen.columns[here]
+            found[... if here is None else here] = ood_detector.unknown(
+                columns, rate=self.rate, capture=spec, bands=bands
+            )
+        return found[: seen.grid.height, : seen.grid.width]
 
 
 @dataclass(frozen=True)
@@ -198,9 +179,9 @@ def draw_field(field: FieldWork, work: Drawing, report: Callable[[float], None])
 
     Raises SettingsError: not even one region at a time fits the memory.
     """
-    pool = field.pool_for(chosen_patches(work.attention), len(open_mosaic(work.detail).components))
+    pool = field.pool_for(chosen_patches(work.attention), len(open_mosaic(work.mosaic).components))
     prior_map = () if work.memory is None else (work.memory.probabilities, work.memory.mosaic)
-    paths = (work.mosaic, work.detail, work.attention, work.out, work.probabilities, *prior_map)
+    paths = (work.mosaic, work.attention, work.out, work.probabilities, *prior_map)
     parts: list[Drawn] = run_blocks(work, field.regions, pool, report=report, paths=paths)
     compared = [part.comparison for part in parts if part.comparison is not None]
     reading = None

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from flows.tasks.patch_budget import SHARD
 from models.network.machine import PROCESSOR
-from models.network.spectral import LineSpec, dead_pixels, patches_of
+from models.network.spectral import Capture, CaptureMap, LineSpec, patches_of
 from models.policies.policies import GLANCING_POLICIES, score_patches
+from models.reading.expected_errors import PatchExpectedErrors
 from models.reading.inference import CoarsePass, CoarsePrediction, read_coarse_pass, read_coarse_prediction
 from models.reading.ood import OodDetector
 from models.reading.regions import HALO_PX, REGION_PX, Region, most_bytes, plan_regions
@@ -26,7 +27,7 @@ from models.weights.files import Weights, describe_weights, load_ood, load_reade
 from pipeline.errors import WeightsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.rectify.tiles import let_tiles_go
-from storage.arrays.mosaics import Mosaic, open_mosaic, patch_scores
+from storage.arrays.mosaics import open_mosaic
 from storage.parallel.pool import RESERVED_BYTES, WorkerPool, memory_refusal, mib, run_blocks
 
 if TYPE_CHECKING:
@@ -90,47 +91,46 @@ class Scoring:
         return region.crop_patches(score_patches(self.policy, seen))
 
 
+@dataclass(frozen=True)
+class ExpectedErrors:
+    """Finds the errors that the overview expects of itself at a region."""
+
+    weights: WeightsFile
+    mosaic: Path
+    capture: LineSpec
+
+    def __call__(self, region: Region) -> PatchExpectedErrors:
+        """Return the errors of the patches that are kept."""
+        let_tiles_go()
+        weights = self.weights.load()
+        seen = read_coarse_prediction(weights, coarse_region(weights, self.mosaic, region, self.capture))
+        with np.errstate(divide="ignore"):
+            sure = np.log(seen.probability[: region.grid.height, : region.grid.width])
+        ages = np.zeros(sure.shape[:2], np.float32)
+        found = PatchExpectedErrors.of([(sure, ages)], region.grid, len(weights.class_names))
+        pixels = found.pixels.reshape(*region.grid.patch_shape, *found.pixels.shape[1:])
+        (top, left), kept = region.origin, region.kept_patches
+        pixels = pixels[kept.top - top : kept.bottom - top, kept.left - left : kept.right - left]
+        return PatchExpectedErrors(pixels.reshape(-1, *pixels.shape[2:]), found.expected_error, found.age_days[:0])
+
+
 def coarse_region(weights: Weights, mosaic: Path, region: Region, capture: LineSpec) -> CoarsePass:
-    """Read the part of a stored mosaic that a region needs, some rows at a time; coarse pixels are repeated."""
-    seen = open_mosaic(mosaic)
-    part = region.read.over(seen.factor)
+    """Read the part of a stored mosaic that a region needs, some rows at a time.
+
+    ``capture`` says how its pixels were captured, where the mosaic itself does not.
+    """
+    seen, window = open_mosaic(mosaic), (region.read.rows, region.read.columns)
+    mixed = seen.captures(*window)
+    how: Capture = capture if mixed is None else CaptureMap(tuple(LineSpec(*one) for one in mixed[0]), mixed[1])
     return read_coarse_pass(
         weights,
-        seen.row_blocks(None, part.rows, part.columns),
+        seen.row_blocks(None, *window),
         seen.wavelength_nm,
         region.grid,
-        capture=capture,
-        factor=seen.factor,
+        capture=how,
         origin=region.origin,
         components=seen.components,
     )
-
-
-def patch_features(
-    weights: Weights, detail: Mosaic, field_index: NDArray[np.integer], seen: CoarsePass, region: Region
-) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Numbers and normalised spectral columns (patch, p, p, column) of a region's patches, some read at a time.
-
-    ``field_index`` are those of the field that were chosen, ``detail`` the mosaic of its own pixels. A mirror that
-    looks beside the plan leaves pixels of a patch unseen: they take the columns that the overview reads there. A patch
-    of which nothing was seen is left out.
-    """
-    numbers = region.numbers_here(field_index)
-    here = np.flatnonzero(numbers >= 0)
-    p, kept = region.field.patch, 0
-    patch_index = np.empty(len(here), np.int64)
-    columns = np.empty((len(here), p, p, weights.basis.columns), np.float32)
-    for entries, scores in patch_scores(detail, region.field, field_index[here]):
-        given = weights.columns_of_scores(scores, detail.components, detail.wavelength_nm)
-        reached = ~dead_pixels(given)
-        some = np.asarray(reached.any(axis=(1, 2)), np.bool_)
-        part = slice(kept, kept := kept + int(some.sum()))
-        patch_index[part], columns[part] = numbers[here[entries[some]]], given[some]
-        for patch, patch_number, there in zip(columns[part], patch_index[part], reached[some], strict=True):
-            if not there.all():  # where no line reached a pixel of a patch
-                y, x = seen.grid.patch_origin(patch_number)[..., None] + np.arange(p)
-                patch[~there] = seen.columns[np.ix_(y, x)][~there]
-    return patch_index[:kept], columns[:kept]
 
 
 def seen_patches(
@@ -177,6 +177,21 @@ class FieldWork:
         for region, part in zip(self.regions, parts, strict=True):
             scores[region.kept_patches.rows, region.kept_patches.columns] = part
         return scores
+
+    def expected_errors(self, mosaic: Path, capture: LineSpec, report: Callable[[float], None]) -> PatchExpectedErrors:
+        """Return the errors that the overview of a mosaic expects of itself, patch by patch.
+
+        Raises SettingsError: not even one region at a time fits the memory.
+        """
+        pool = self.pool_for(np.empty(0, np.int64), len(open_mosaic(mosaic).components))
+        path, field = mosaic.resolve(), self.regions[0].field
+        parts = run_blocks(ExpectedErrors(self.weights, path, capture), self.regions, pool, report=report, paths=[path])
+        pixels = np.zeros((*field.patch_shape, *parts[0].pixels.shape[1:]), np.float32)
+        for region, part in zip(self.regions, parts, strict=True):
+            kept = region.kept_patches
+            pixels[kept.rows, kept.columns] = part.pixels.reshape(*kept.shape, *part.pixels.shape[1:])
+        nothing_older = np.zeros(int(np.prod(field.patch_shape)))
+        return PatchExpectedErrors(pixels.reshape(-1, *pixels.shape[2:]), parts[0].expected_error, nothing_older)
 
     def pool_for(self, patch_index: NDArray[np.integer], bands: int) -> WorkerPool:
         """Give the worker pool, no larger than memory holds regions with their parts of these patches of the field.

@@ -9,10 +9,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pipeline.geometry.camera import LineCamera
+from pipeline.rectify.interlaced import interlaced_paths
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.placed import PixelGrid, Placed
 from pipeline.rectify.region import Tile, plan_tiles
@@ -39,7 +37,8 @@ class MosaicRecipe:
     camera: LineCamera
     grid: PixelGrid
     kernel: Kernel = "catmull-rom"
-    geolocation: Path | None = None  # tables of the sweeps; None looks lines up directly
+    geolocation: Path | None = None  # tables of the sweeps; None makes them anew
+    interlaced: bool = False  # sweeps of several passes, of which some lie between the lines of others
     registration: Path | None = None  # record of the corrections
 
     @property
@@ -57,6 +56,10 @@ class MosaicRecipe:
 
         Raises IncompleteStoreError: a sweep or the tables are missing or damaged.
         """
+        if self.interlaced:
+            return MosaicWork(
+                interlaced_paths(self.sweeps(), self.camera, self.grid), self.camera, self.grid, self.kernel
+            )
         tables: Tables = {} if self.geolocation is None else open_geolocation(self.geolocation)
         placed = []
         for one in self.sweeps():  # without tables where its lines lie too unevenly for one
@@ -88,20 +91,17 @@ def write_mosaic(
     *,
     memory: int,
     pool: WorkerPool = THREADS,
-    wanted: NDArray[np.bool_] | None = None,
     report: Callable[[float], None] = lambda done: None,
 ) -> TileBudget:
     """Rectify and blend sweeps into a stored mosaic; return how. Any worker's tiles give the same bytes.
 
-    ``wanted`` are (y, x) pixels without which a tile is left out. Fewer tiles are made at a time where ``memory``
+    Fewer tiles are made at a time where ``memory``
     [bytes] of this process and those that it starts, not of workers elsewhere, holds fewer. Raises SettingsError: not
     even one tile fits the memory, or the worker pool cannot work here. WorkerError: processes that made tiles were
     lost.
     """
     work = opened_work(recipe.open)
     tiles = plan_tiles(work.placed, work.camera, work.grid, writer.tile_shape)
-    if wanted is not None:
-        tiles = [tile for tile in tiles if wanted[tile.rows, tile.columns].any()]
     budget = tile_budget(work, tiles, writer.tile_shape, memory=memory, pool=pool)
     maker = TileMaker(recipe.open, budget.cache)
     if pool.shares_memory:

@@ -16,7 +16,7 @@ from flows.tasks.rig_lock import rig_to_oneself
 from flows.tasks.run import SurveyRun, now
 from flows.tasks.stage import Stage
 from flows.tasks.stages.accuracy import evaluate
-from flows.tasks.stages.attention import score
+from flows.tasks.stages.attention import load_plan, score
 from flows.tasks.stages.capture import capture_coarse, capture_fine
 from flows.tasks.stages.condense import condense_coarse, condense_fine
 from flows.tasks.stages.effects import choose_effects
@@ -40,7 +40,6 @@ OF_THE_SURVEY = (
     *(capture_fine, condense_fine, register_fine, rectify_fine, segment, ground, evaluate),
 )
 FIRST = ("rectify", "condense_raster")  # of a capture, of a raster
-JUDGED = (*FIRST, "score", "segment", "choose_effects", "register_coarse")  # whose stores `evaluate` takes
 STAGES: dict[str, Stage] = {one.name: one for one in OF_THE_SURVEY}
 TITLES = {"plan": "scene, weights and plan", **{name: one.title for name, one in STAGES.items()}}
 
@@ -71,13 +70,18 @@ class Products(dict[str, StageRef]):
 
     @property
     def mosaic(self) -> StageRef:
-        """Return the store of the first pass's mosaic, or of the raster's."""
-        return self.there(*FIRST)[0]
+        """Return the store of the mosaic of all passes, or of the raster's."""
+        return self.there("rectify_fine", *FIRST)[0]
 
     @property
-    def detail(self) -> StageRef:
-        """Return the store of the mosaic in the scene's own pixels."""
-        return self.there("rectify_fine", *FIRST)[0]
+    def signals(self) -> list[StageRef]:
+        """Return the store of all condensed lines; none of a raster."""
+        return self.there("condense_fine", "condense_coarse")[:1]
+
+    @property
+    def judged(self) -> list[StageRef]:
+        """Return the stores by which the map is judged."""
+        return [self.mosaic, *self.there("score", "segment", "choose_effects", "register_coarse")]
 
     def there(self, *stages: str) -> list[StageRef]:
         """Return the stores of those of these stages that ran."""
@@ -100,10 +104,9 @@ class OpenSurvey:
         """Return the field's name, by which Prefect's runs are called."""
         return self.run.name
 
-    @property
-    def uniform(self) -> bool:
-        """Return whether one scan of everything is all that is captured."""
-        return self.run.plan.plain
+    def goes_back(self, request: StageRef) -> bool:
+        """Return whether the plan of a first pass asks for more lines."""
+        return not self.run.plan.plain and bool(load_plan(request).sweeps)
 
     @property
     def is_map(self) -> bool:

@@ -29,7 +29,6 @@ class ReadingCosts:
     config: SegmenterConfig
     grid: SceneGrid
     bands: int
-    apart: bool = False  # patches are captured in a pass of their own
 
     @cached_property
     def _regions(self) -> list[Region]:
@@ -39,7 +38,7 @@ class ReadingCosts:
         """Count the map drawn with fine patches at these patches of the field."""
         counts = [int(np.count_nonzero(region.numbers_here(patch_index) >= 0)) for region in self._regions]
         parts = [
-            astuple(multiply_adds(self.config, region.grid, count, self.bands, apart=self.apart))
+            astuple(multiply_adds(self.config, region.grid, count, self.bands))
             for region, count in zip(self._regions, counts, strict=True)
         ]
         return MultiplyAdds(*(sum(part) for part in zip(*parts, strict=True)))

@@ -57,6 +57,8 @@ from pipeline.geometry.scan import Sweep
 from pipeline.ground.field_places import PosedField
 from pipeline.ground.map_grid import GroundGrid
 from pipeline.lazy import Once, deferred
+from pipeline.planning.interlaced import FIRST_STEP
+from pipeline.planning.uniform_scans import ScanPerformance
 from pipeline.rectify.placed import PixelGrid, place
 from pipeline.rectify.region import plan_tiles
 from pipeline.rectify.tiles import MosaicWork
@@ -79,13 +81,12 @@ else:
     rig_field = deferred("flows.tasks.rig_field")
 
 
-COARSE_FACTOR = 4  # pixels a side that the coarse one of two passes stands for
 USUAL_COMPONENTS = 32  # of condensed lines, before they are known
 
 
 def check_memory(source: SimulatedSource, grid: SceneGrid, plan: CapturePlan, memory: int, pool: WorkerPool) -> None:
     """Refuse a memory below one tile of the mosaic before anything is captured (SettingsError, with the least)."""
-    pixels = PixelGrid.of_scene(grid, 1 if plan.plain else grid.factor)
+    pixels = PixelGrid.of_scene(grid, 1)
     placed = [place(_PlannedSweep(source, sweep), source.camera) for sweep in plan.coarse]
     rows, columns = image_spec(("y", "x"), pixels.shape, "<f4").shard or pixels.shape
     tiles = plan_tiles(placed, source.camera, pixels, (rows, columns))
@@ -211,7 +212,7 @@ class SurveyRun(CaptureRun):
         It follows from the loss that the settings allow where they name neither gain nor multiply-adds.
         """
         settings, allowed = self.settings, self.cascade
-        if not self.plan.plain or settings.macs is not None or self.part:
+        if settings.macs is not None or self.part:
             return None
         if settings.least_gain is not None:
             return settings.least_gain
@@ -251,11 +252,6 @@ class SurveyRun(CaptureRun):
         return FieldFrame(self.grid, self.camera.ifov_rad, *bands, scene.missing, scene.geobox)
 
     @property
-    def factor(self) -> int:
-        """Fine px that a coarse pixel has a side."""
-        return self.grid.factor
-
-    @property
     def work(self) -> FieldWork:
         """The model over the field, region by region."""
         file = WeightsFile(weights_path(self.settings).resolve(), self.described.about[SEAL], self.device)
@@ -267,19 +263,24 @@ class SurveyRun(CaptureRun):
         return self.settings.extent != EXTENT_WHOLE
 
     @property
-    def captures(self) -> tuple[LineSpec, LineSpec]:
-        """How the pixels of the overview were captured, and those that are read in full."""
-        settings, usual = self.settings, self.camera.exposure_ms
-        if self.plan.plain:
-            scan = LineSpec((settings.scan_exposure_ms or usual) / DEFAULT_EXPOSURE_MS, settings.scan_step or 1)
-            return scan, scan
-        coarse = LineSpec((settings.coarse_exposure_ms or usual) / DEFAULT_EXPOSURE_MS, self.factor, self.factor)
-        return coarse, LineSpec(usual / DEFAULT_EXPOSURE_MS)
+    def capture(self) -> LineSpec:
+        """Return how the pixels of the first pass, or of the uniform scan, were captured."""
+        settings, light = self.settings, self.light.light
+        exposure_ms, step = settings.scan_exposure_ms, settings.scan_step or 1
+        if not self.plan.plain:
+            exposure_ms, step = settings.coarse_exposure_ms, FIRST_STEP
+        return LineSpec(light * (exposure_ms or self.camera.exposure_ms) / self.camera.exposure_ms, step)
 
     @property
-    def capture(self) -> LineSpec:
-        """How the pixels of the overview were captured."""
-        return self.captures[0]
+    def light(self) -> LineSpec:
+        """Return how every line in the camera's own exposure is captured."""
+        return LineSpec(self.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
+
+    @property
+    def scan_record(self) -> ScanPerformance | None:
+        """Return what the weights record of uniform scans, if anything."""
+        content = self.described.record.get("scans")
+        return None if content is None else ScanPerformance.read(content)
 
     @property
     def unknown(self) -> UnknownRule | None:
@@ -358,7 +359,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     if refused is not None and not planning:
         raise SettingsError(refused)
     pixels, scene, notes, label_notes = _scene_for(model, settings, recorded, planning=planning)
-    grid = SceneGrid(*scene.shape, described.config.patch, 1 if settings.budget is None else COARSE_FACTOR)
+    grid = SceneGrid(*scene.shape, described.config.patch, 1)
     bands = len(scene.wavelength_nm)
     zones = open_zones(settings.zones, place_of_field(settings, scene), grid)
     outside = beyond_training(settings, scene, described, model.trained_on, path)
@@ -376,7 +377,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         planned = _plan_capture(settings, grid, bands, path, described, prior, shown=zones.shown, passes=passes)
     settings, plan = planned.settings, planned.plan
     read = min(bands, SMOOTH)  # the network reads components, as many as smooth directions or fewer
-    costs = ReadingCosts(described.config, grid, read, apart=settings.budget is not None)
+    costs = ReadingCosts(described.config, grid, read)
     spending = settings.policy, settings.macs, settings.least_gain
     shown = None if zones.fractions is None else zones.fractions > 0
     budget = None if settings.macs is None else PatchBudget.asked(costs, shown, *spending)
@@ -453,7 +454,7 @@ def _plan_capture(
         layout, extent, words = choose_extent(layout, prior, described, path, seconds=settings.seconds, **limits)
         extent_notes = (words,)
     scans = choose_uniform_scan(layout, described, path, bands, settings)
-    layout, plan, settings, plan_notes = lay_out_passes(layout, scans.chosen, settings)
+    layout, plan, settings, plan_notes = lay_out_passes(layout, scans, described, settings)
     settings = replace(settings, extent=layout.extent, scan_step=layout.step, scan_exposure_ms=layout.exposure_ms)
     return _PlannedCapture(settings, plan, scans, extent, (*plan_notes, *extent_notes))
 

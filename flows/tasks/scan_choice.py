@@ -8,23 +8,29 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from flows.settings.survey_settings import Settings
+from flows.settings.survey_settings import ALWAYS, AUTO, Settings
 from flows.settings.values import EXTENT_WHOLE, parse_goals
 from flows.tasks.capture_plan import CapturePlan, PassLayout
 from models.weights.files import Description
 from pipeline.errors import BudgetError, NotRecordedError, SettingsError, WeightsError
 from pipeline.geometry.scan import Sweep
+from pipeline.planning.interlaced import FIRST_STEP, every_nth, lines_between, merged_ms
 from pipeline.planning.uniform_scans import (
+    LOSS,
     MIOU,
     ScanLimits,
     ScanPerformance,
     UniformScan,
     choose_scan,
+    exposures_between,
     frontier,
+    longest_exposure,
     priced_scan,
     reference_scan,
     uniform_scans,
 )
+
+ZOOM_LOSS = 0.003  # of mIoU that a first pass may cost where all of the field turns out to pay
 
 
 @dataclass(frozen=True)
@@ -100,27 +106,74 @@ def choose_uniform_scan(
                 f"{record.exposures_ms[0]:g} ms, so that it can choose no scan; take one by hand with --scan-step"
             )
         chosen = choose_scan(scans, replace(limits, goals=goals))
-    elif settings.undecided and scans:
+    elif settings.undecided and scans and not settings.zooms:
         chosen = reference_scan(scans)
     return ScanChoice(tuple(scans), chosen)
 
 
 def lay_out_passes(
-    layout: PassLayout, chosen: UniformScan | None, settings: Settings
+    layout: PassLayout, scans: ScanChoice, weights: Description, settings: Settings
 ) -> tuple[PassLayout, CapturePlan, Settings, tuple[str, ...]]:
-    """Lay out the scan that was chosen, or two passes; the settings that ask for just these, and notes.
+    """Lay out the uniform scan that was chosen, or a first pass; the settings that ask for just these, and notes.
 
-    Where neither settings nor a record decide, every line is captured. Raises what `PassLayout.plan` does.
+    A first pass is taken where it is asked for, or where the record says that it costs next to nothing. Where neither
+    settings nor a record decide, every line is captured. Raises what `PassLayout.plan` does.
     """
+    chosen, content = scans.chosen, weights.record.get("scans")
+    if settings.zooms:
+        zoomed = replace(layout, step=None)
+        if content is not None and settings.seconds is not None and settings.coarse_exposure_ms is None:
+            first = first_exposure(zoomed, ScanPerformance.read(content), settings.seconds)
+            exposure_ms = None if first is None else first[0]
+            zoomed, settings = _exposing_first(zoomed, settings, exposure_ms)
+        return zoomed, zoomed.plan(settings.budget, settings.seconds), settings, ()
+    if chosen is not None and layout.step is None and content is not None and _may_zoom(layout, settings):
+        seconds = settings.seconds or chosen.seconds
+        first = first_exposure(layout, ScanPerformance.read(content), seconds)
+        if first is not None and first[1] >= chosen.expected[MIOU] - ZOOM_LOSS:
+            zoomed, settings = _exposing_first(layout, replace(settings, zoom=ALWAYS, seconds=seconds), first[0])
+            return zoomed, zoomed.plan(None, seconds), settings, ()
     if chosen is not None and layout.step is None:
         layout = replace(layout, step=chosen.step, exposure_ms=chosen.exposure_ms)
     if settings.plain or layout.step is not None:
         return layout, layout.plan(None), settings, ()
-    if settings.budget is not None:
-        return layout, layout.plan(settings.budget), settings, ()
     every = layout.uniform(1)
     note = "every line is captured: the weights have no record of scans by which fewer would be chosen"
     return every, every.plan(None), settings, (note,)
+
+
+def _may_zoom(layout: PassLayout, settings: Settings) -> bool:
+    """Return whether nothing that was asked for needs a uniform scan."""
+    asked = settings.bytes_raw is not None or settings.goal is not None or settings.policy != "gain"
+    return settings.zoom == AUTO and not asked and layout.extent == EXTENT_WHOLE and not layout.as_taken
+
+
+def _exposing_first(layout: PassLayout, settings: Settings, exposure_ms: float | None) -> tuple[PassLayout, Settings]:
+    return replace(layout, coarse_exposure_ms=exposure_ms), replace(settings, coarse_exposure_ms=exposure_ms)
+
+
+def first_exposure(layout: PassLayout, record: ScanPerformance, seconds: float) -> tuple[float, float] | None:
+    """Choose the exposure of a first pass, and tell the mIoU where all lines between follow; None where none ends.
+
+    Any field is served so: one of which every place pays is scanned as a uniform scan, whose lines come in two turns.
+    Of exposures that are nearly as good for that the longest is taken, since some places are not captured again.
+    """
+    camera, cost, full = layout.camera, layout.cost, layout.sweeps()[2]
+    shortest, longest = record.exposures_ms[0], min(camera.exposure_ms, record.exposures_ms[-1])
+    found: list[tuple[float, float]] = []
+    for first_ms in exposures_between(shortest, longest):
+        first = every_nth(full, exposure_ms=first_ms)
+        left_s = seconds - cost.seconds(first, camera)
+        if left_s < 0:
+            break
+        scores = [record.expected(FIRST_STEP, first_ms)[MIOU]] if FIRST_STEP in record.steps else [0.0]
+        for step in (1, 2):
+            rest_ms = longest_exposure(left_s, lines_between(full, first, step=step), camera, cost, shortest, longest)
+            if rest_ms is not None and step in record.steps:
+                scores.append(record.expected(step, merged_ms(first_ms, rest_ms, step / FIRST_STEP))[MIOU])
+        found.append((first_ms, max(scores)))
+    best = max((score for _, score in found), default=0.0)
+    return max((one for one in found if one[1] >= best - LOSS), default=None)
 
 
 def as_figures(scan: UniformScan | None) -> dict[str, Any] | None:

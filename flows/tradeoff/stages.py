@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import RASTER, Settings
 from flows.tasks.patch_budget import PatchBudget, ReadingCosts
-from flows.tasks.run import COARSE_FACTOR, SurveyRun, open_run
+from flows.tasks.run import SurveyRun, open_run
 from flows.tasks.stages.accuracy import columns_of_all_patches, columns_of_raster
 from flows.tasks.survey_model import shipped_weights
 from flows.tradeoff.entries import Setting, Tradeoff
@@ -27,25 +27,17 @@ from models.network.machine import keep_freed_memory
 from models.network.sizes import multiply_adds
 from models.network.spectral import LineSpec
 from models.policies.policies import score_patches
-from models.reading.inference import (
-    CoarsePrediction,
-    DrawnMap,
-    coarse_prediction,
-    coarse_prediction_of_patches,
-    segment,
-)
+from models.reading.inference import CoarsePrediction, DrawnMap, coarse_prediction_of_patches, segment
 from models.weights.files import Weights, load_weights
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.geometry.scan import Axis, CostModel, Sweep
-from pipeline.planning.coverage import cheapest_full, coarse_sweeps, full_sweeps, uniform_sweeps
-from pipeline.planning.fine_pass import plan_fine
+from pipeline.planning.coverage import cheapest_full, full_sweeps, uniform_sweeps
 from pipeline.planning.prices import raw_bytes
 from pipeline.planning.selection import frame_patches
 from pipeline.planning.uniform_scans import format_scan
 from pipeline.rectify.kernels import Kernel
-from pipeline.rectify.region import mosaic_rows
 from pipeline.rectify.resample import resample
 from pipeline.simulator.effects.effect import Effect, SweepBlock
 from pipeline.simulator.effects.probe import noise_electrons
@@ -56,7 +48,7 @@ from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.simulator.selection.choice import Decision, decide
 from pipeline.simulator.selection.survey_probe import probe_scene
-from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_block
+from pipeline.simulator.simulated import SimulatedSource, sweep_block
 from storage.archive.archive import Archive
 
 Values = NDArray[np.float32]
@@ -213,7 +205,6 @@ SIMULATE = Tradeoff(
 
 SURVEY_SHAPE = (384, 512)
 SCANS = {format_scan(step, ms): (step, ms) for step in (1, 2, 4) for ms in (100.0, 50.0, 25.0, 12.0, 6.0)}
-BUDGETS = {f"two passes, budget {budget:g}": budget for budget in (0.8, 0.65, 0.5, 0.4)}
 PART_OF = (1, 25.0)  # step and exposure [ms] of the scan of which parts are read in detail
 PARTS = {f"{format_scan(*PART_OF)}, {fraction} of multiply-adds": fraction for fraction in ("50%", "35%", "25%")}
 
@@ -284,12 +275,6 @@ def part_of(scan_pass: PlannedPass, bands: int, compute: str) -> PlannedPass:
     return replace(scan_pass, patch_index=kept, columns=scan_pass.columns[np.searchsorted(scan_pass.patch_index, kept)])
 
 
-def coarse_mosaic(source: SimulatedSource, coarse: list[Sweep], grid: SceneGrid) -> Values:
-    """Take coarse sweeps and put them together, (y, x, band)."""
-    rows = mosaic_rows([SimulatedSweep(source, sweep) for sweep in coarse], source.camera, grid, rows=64)
-    return np.concatenate([values for _, values, _ in rows])
-
-
 def open_field(seed: int, scene: str | None, weights: Path | None, source: str) -> SurveyRun:
     """Open a field as a survey by its defaults does, or a farm without a ``scene``; nothing is written.
 
@@ -308,20 +293,17 @@ def open_field(seed: int, scene: str | None, weights: Path | None, source: str) 
 def default_plan(run: SurveyRun) -> tuple[str, tuple[int, float] | None]:
     """Return in words what a survey takes that asks for no plan, with step and exposure [ms] where it is one scan."""
     if not run.plan.plain:
-        return f"two passes, budget {run.settings.budget:g}", None
+        return "every 4th line, then lines between", None
     scan = run.settings.scan_step or 1, run.settings.scan_exposure_ms or run.camera.exposure_ms
     return format_scan(*scan), scan
 
 
 def plan_every_way(seed: int, scene: str | None = None, weights: Path | None = None) -> PlannedField:
-    """Take a farm, or one's own scene, by every uniform scan, by parts of one, and in two passes of every budget.
-
-    Budgets that do not pay for the coarse pass are left out.
-    """
+    """Take a farm, or one's own scene, by every uniform scan and by parts of one."""
     run = open_field(seed, scene, weights, "sim")
     camera, cost, source, bands = run.camera, run.settings.cost, run.simulated, len(run.scene.wavelength_nm)
-    grid, read_with = SceneGrid(*run.scene.shape, run.described.config.patch, COARSE_FACTOR), run.weights
-    along, full, full_s = cheapest_full(grid, camera, cost)
+    grid, read_with = SceneGrid(*run.scene.shape, run.described.config.patch, 1), run.weights
+    along, _, _ = cheapest_full(grid, camera, cost)
     default, chosen = default_plan(run)
     scan_passes: dict[Setting, PlannedPass] = {}
     for words, (step, exposure_ms) in (SCANS | ({} if chosen is None else {default: chosen})).items():
@@ -330,20 +312,6 @@ def plan_every_way(seed: int, scene: str | None = None, weights: Path | None = N
         scan_passes[words] = uniform_pass(read_with, source, sweeps, grid, cost, scan)
     whole = scan_passes[format_scan(*PART_OF)]
     scan_passes |= {words: part_of(whole, bands, fraction) for words, fraction in PARTS.items()}
-    coarse = coarse_sweeps(grid, camera, along)
-    coarse_s = cost.seconds(coarse, camera)
-    if paid := {words: budget for words, budget in BUDGETS.items() if budget * full_s >= coarse_s}:
-        sweeps = uniform_sweeps(grid, camera, along, step=1, exposure_ms=camera.exposure_ms)
-        every = uniform_pass(read_with, source, sweeps, grid, cost, LineSpec())
-        binned = LineSpec(1.0, COARSE_FACTOR, COARSE_FACTOR)
-        values, bands_nm = coarse_mosaic(source, coarse, grid), run.scene.wavelength_nm
-        seen = coarse_prediction(read_with, values, bands_nm, grid, capture=binned, factor=COARSE_FACTOR)
-        scores = score_patches(POLICY, seen)
-    for words, budget in paid.items():
-        plan = plan_fine(grid, camera, cost, along, scores, budget_s=budget * full_s - coarse_s, full=full)
-        columns = every.columns[np.searchsorted(every.patch_index, plan.patch_index)]
-        size, seconds = raw_bytes([*coarse, *plan.sweeps], camera, bands), coarse_s + plan.seconds
-        scan_passes[words] = PlannedPass(seen, plan.patch_index, columns, read_with, seconds, size, LineSpec())
     assert run.labels is not None
     return PlannedField(run.labels, bands, scan_passes, default)
 
@@ -353,7 +321,7 @@ SURVEY = Tradeoff(
     knob="plan",
     error="1 - mIoU",
     unit="scene px",
-    reference=f"labels of a farm of {SURVEY_SHAPE[1]} x {SURVEY_SHAPE[0]} px; two passes and parts by expected gain",
+    reference=f"labels of a farm of {SURVEY_SHAPE[1]} x {SURVEY_SHAPE[0]} px; parts by expected gain",
     settings=(),
     settings_of=lambda field: field.plans,
     default=lambda field: field.default,

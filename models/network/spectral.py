@@ -210,8 +210,59 @@ class LineSpec(NamedTuple):
         """What the network reads beside spectral features, (3,): 0 for what is at least the reference."""
         return np.asarray(np.log2(np.maximum([1 / self.light, self.step, self.binned], 1)) / PLANE_SCALES, np.float32)
 
+    @property
+    def specs(self) -> tuple[LineSpec, ...]:
+        """Return the kinds of capture that there are: this one."""
+        return (self,)
 
-def with_planes(columns: NDArray[np.floating], capture: LineSpec) -> NDArray[np.float32]:
+    @property
+    def usual(self) -> LineSpec:
+        """Return the capture that stands for all pixels."""
+        return self
+
+    def of_patches(self, patch_index: NDArray[np.integer], patch: int) -> LineSpec:
+        """Return the capture of some patches: that of all pixels."""
+        return self
+
+    def where(self, spec: LineSpec) -> None:
+        """Return None: every pixel was captured so."""
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureMap:
+    """How each pixel of an image was captured, where that differs from pixel to pixel."""
+
+    specs: tuple[LineSpec, ...]
+    number: NDArray[np.uint8]  # (...) of each pixel's capture among them
+
+    @property
+    def planes(self) -> NDArray[np.float32]:
+        """Return what the network reads beside spectral features, (..., 3)."""
+        return np.stack([spec.planes for spec in self.specs])[self.number]
+
+    @property
+    def usual(self) -> LineSpec:
+        """Return the capture of most pixels."""
+        return self.specs[int(np.bincount(self.number.ravel(), minlength=1).argmax())]
+
+    def padded(self, shape: tuple[int, int]) -> CaptureMap:
+        """Return the map of a padded image, by its border's pixels."""
+        gap = [(0, whole - size) for whole, size in zip(shape, self.number.shape, strict=True)]
+        return CaptureMap(self.specs, np.pad(self.number, gap, mode="edge"))
+
+    def of_patches(self, patch_index: NDArray[np.integer], patch: int) -> CaptureMap:
+        """Return the captures of some patches of an image, (patch, p, p)."""
+        return CaptureMap(self.specs, patches_of(self.number, patch)[patch_index])
+
+    def where(self, spec: LineSpec) -> NDArray[np.bool_]:
+        """Return the pixels (...) that were captured so."""
+        return np.asarray(self.number == self.specs.index(spec), np.bool_)
+
+
+Capture = LineSpec | CaptureMap
+
+
+def with_planes(columns: NDArray[np.floating], capture: Capture) -> NDArray[np.float32]:
     """Spectral features (..., column) with how they were captured behind them, (..., column + 3)."""
     planes = np.broadcast_to(capture.planes, (*columns.shape[:-1], len(PLANE_SCALES)))
     return np.concatenate([columns, planes], axis=-1, dtype=np.float32)

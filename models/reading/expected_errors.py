@@ -77,6 +77,11 @@ class PatchExpectedErrors:
             (self.pixels.sum(axis=(0, 1), dtype=np.float64) @ self.expected_error) / self.pixels.sum(dtype=np.float64)
         )
 
+    def expected_wrong_pixels(self) -> Floats:
+        """Return how many pixels of each patch are expected to be wrong, (patch,)."""
+        found: Floats = self.pixels.sum(axis=1, dtype=np.float64) @ self.expected_error
+        return found
+
     def expected_gain(self, wrong_after: Floats) -> Floats:
         """Give what a look at each patch (patch,) is expected to add to the mean over classes, 0..1.
 

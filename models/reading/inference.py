@@ -11,7 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.network.sizes import PATCHES_AT_ONCE, TOKEN_PX
-from models.network.spectral import LineSpec, all_alive, dead_pixels, fill_dead, patches_of, readable, with_planes
+from models.network.spectral import (
+    Capture,
+    CaptureMap,
+    LineSpec,
+    all_alive,
+    dead_pixels,
+    fill_dead,
+    patches_of,
+    readable,
+    with_planes,
+)
 from models.weights.files import Weights
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
@@ -35,7 +45,7 @@ class CoarsePass:
 
     grid: SceneGrid
     columns: NDArray[np.float32]  # (y, x, column) normalised
-    capture: LineSpec = field(default=LineSpec(), kw_only=True)
+    capture: Capture = field(default=LineSpec(), kw_only=True)
     origin: tuple[int, int] = field(default=(0, 0), kw_only=True)  # row and column of the field's patch it begins at
     living: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (token,) which are read; None: all
     out_of_range: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (y, x) of the scene: seen, and unread
@@ -98,7 +108,7 @@ def coarse_prediction(
     wavelength_nm: NDArray[np.floating],
     grid: SceneGrid,
     *,
-    capture: LineSpec = LineSpec(),  # noqa: B008 - a value
+    capture: Capture = LineSpec(),  # noqa: B008 - a value
     factor: int = 1,
 ) -> CoarsePrediction:
     """Read an overview of scene values (y, x, band), in pixels of ``factor`` fine ones; NaN where none was captured.
@@ -115,7 +125,7 @@ def read_coarse_pass(
     wavelength_nm: NDArray[np.floating],
     grid: SceneGrid,
     *,
-    capture: LineSpec = LineSpec(),  # noqa: B008 - a value
+    capture: Capture = LineSpec(),  # noqa: B008 - a value
     factor: int = 1,
     origin: tuple[int, int] = (0, 0),
     components: Components | None = None,
@@ -144,7 +154,7 @@ def read_coarse_pass(
     return CoarsePass(
         grid,
         columns,
-        capture=capture,
+        capture=capture.padded(grid.padded_shape) if isinstance(capture, CaptureMap) else capture,
         origin=origin,
         living=_mend(columns, grid.patch),
         out_of_range=wild if wild.any() else None,
@@ -169,7 +179,7 @@ def coarse_prediction_of_columns(
     weights: Weights,
     columns: NDArray[np.generic],
     grid: SceneGrid,
-    capture: LineSpec = LineSpec(),  # noqa: B008 - a value
+    capture: Capture = LineSpec(),  # noqa: B008 - a value
 ) -> CoarsePrediction:
     """Read normalised columns of the padded grid, (y, x, column); dead ones count as in a mosaic."""
     given = np.ascontiguousarray(columns, np.float32)
@@ -182,7 +192,7 @@ def coarse_prediction_of_patches(
     weights: Weights,
     patches: NDArray[np.float32],
     grid: SceneGrid,
-    capture: LineSpec = LineSpec(),  # noqa: B008 - a value
+    capture: Capture = LineSpec(),  # noqa: B008 - a value
 ) -> CoarsePrediction:
     """Read normalised columns of all patches of the padded grid, (patch, p, p, column)."""
     (down, across), (y, x) = grid.patch_shape, grid.padded_shape
@@ -214,7 +224,7 @@ def segment(
     patches: NDArray[np.floating],
     patch_index: NDArray[np.integer],
     *,
-    capture: LineSpec | None = None,
+    capture: Capture | None = None,
     every_class: bool = False,
 ) -> DrawnMap:
     """Draw the class map from the overview and the patches that are read in full, of the scene's own size.
@@ -232,11 +242,10 @@ def segment(
     with torch.inference_mode():
         overview = overview_of(weights, seen)
         logits = overview.logits[0].cpu().clone()
+        planes = (seen.capture if capture is None else capture).of_patches(numbers, seen.grid.patch)
         for (y, x), read in zip(
             seen.grid.patch_origin(numbers),
-            itertools.chain.from_iterable(
-                patch_logits(weights, overview, own, numbers, seen.capture if capture is None else capture)
-            ),
+            itertools.chain.from_iterable(patch_logits(weights, overview, own, numbers, planes)),
             strict=True,
         ):
             logits[:, y : y + read.shape[1], x : x + read.shape[2]] = read
@@ -248,17 +257,17 @@ def patch_logits(
     overview: Overview,
     patches: NDArray[np.floating],
     patch_index: NDArray[np.int64],
-    capture: LineSpec,
+    capture: Capture,
 ) -> Iterator[Tensor]:
-    """Logits of patches (patch, p, p, column) read in full, (some, class, p, p) at a time.
+    """Give logits of patches (patch, p, p, column) that are read in full, (some, class, p, p) at a time.
 
     Chunks fit the processor's caches; what is not finite counts as 0, the median.
     """
     network = weights.segmenter
     for first in range(0, len(patches), PATCHES_AT_ONCE):
-        chunk = torch.from_numpy(with_planes(patches[first : first + PATCHES_AT_ONCE], capture)).nan_to_num_(
-            0.0, 0.0, 0.0
-        )
+        some = slice(first, first + PATCHES_AT_ONCE)
+        planes = CaptureMap(capture.specs, capture.number[some]) if isinstance(capture, CaptureMap) else capture
+        chunk = torch.from_numpy(with_planes(patches[some], planes)).nan_to_num_(0.0, 0.0, 0.0)
         index = torch.from_numpy(patch_index[first : first + PATCHES_AT_ONCE])[None].to(network.device)
         yield network.read_patches(overview, chunk.permute(0, 3, 1, 2)[None].to(network.device), index)[0].cpu()
 
@@ -267,7 +276,7 @@ def map_of_columns(
     weights: Weights,
     columns: NDArray[np.floating],
     grid: SceneGrid,
-    capture: LineSpec = LineSpec(),  # noqa: B008 - a value
+    capture: Capture = LineSpec(),  # noqa: B008 - a value
 ) -> tuple[DrawnMap, NDArray[np.float32]]:
     """Read a scene whole, by normalised columns (y, x, column) of the padded grid; its map, and all log-probabilities.
 

@@ -72,13 +72,6 @@ class RecordedPasses:
                 self.source.pick(sweep)  # names the first line that is missing
         return found
 
-    def swaths(self, start_px: float) -> list[Sweep]:
-        """Give the strips of recorded lines at full resolution, from ``start_px`` on and without lines yet."""
-        places = sorted({sweep.swath_px for sweep in self._full_sweeps()})
-        return [
-            Sweep(f"fine-{number:03d}", "fine", self.axes[0], place, start_px, 0) for number, place in enumerate(places)
-        ]
-
     def fine_pass(self, planned: Sequence[Sweep]) -> list[Sweep]:
         """Give the planned sweeps of a fine pass without what was never taken at the field's ends.
 
@@ -115,7 +108,7 @@ class RecordedPasses:
             scan_px = one.tangents[one.valid_line, 1] / self.source.camera.ifov_rad
             low, high = float(np.nanmin(scan_px)), float(np.nanmax(scan_px))
             lines = int((high - low) // like.step) + 1
-            start = low - (like.step - 1) / 2
+            start = low - (like.positions - 1) / 2
             name = f"{like.name.rpartition('-')[0]}-{len(found)}"
             found.append(replace(like, name=name, swath_px=one.sweep.swath_px, start_px=start, lines=lines))
         return found

@@ -34,8 +34,9 @@ Ends = Literal["exclusive", "inclusive"]
 class Sweep:
     """A run of lines, straight in the scene: all line centres lie on one parallel to the scan axis.
 
-    Scene coordinates are in px from the scene's centre, the undeflected direction. The mirror holds ``step``
-    positions, 1 px apart, during each exposure (a staircase from its vector memory): ``step=1`` stares.
+    Scene coordinates are in px from the scene's centre, the undeflected direction. The mirror holds ``positions``
+    positions, 1 px apart, during each exposure: as many as lines are apart (a staircase from its vector memory), or
+    ``held`` of them. ``held=1`` stares at one position a line, so that later lines fit between.
     """
 
     name: str
@@ -47,14 +48,21 @@ class Sweep:
     step: int = 1
     binning: int = 1
     exposure_ms: float | None = None  # of a line; the camera's own where it is None
+    held: int | None = None  # positions that an exposure holds; None: ``step`` of them
+
+    @property
+    def positions(self) -> int:
+        """Return how many positions the mirror holds during each exposure."""
+        return self.held or self.step
 
     def held_px(self) -> NDArray[np.float64]:
-        """Scan coordinate of every held position, (line, step) [px]."""
-        return self.start_px + np.arange(self.lines * self.step, dtype=np.float64).reshape(self.lines, self.step)
+        """Return the scan coordinate of every held position, (line, position) [px]."""
+        starts = np.arange(self.lines, dtype=np.float64) * self.step
+        return self.start_px + (starts[:, None] + np.arange(self.positions))
 
     def line_px(self) -> NDArray[np.float64]:
-        """Scan coordinate at mid exposure of every line, (line,) [px]."""
-        return self.start_px + (self.step - 1) / 2 + np.arange(self.lines, dtype=np.float64) * self.step
+        """Return the scan coordinate at mid exposure of every line, (line,) [px]."""
+        return self.start_px + (self.positions - 1) / 2 + np.arange(self.lines, dtype=np.float64) * self.step
 
 
 def exposing(camera: LineCamera, sweep: Sweep) -> LineCamera:
@@ -163,7 +171,7 @@ def points_of_scan(swath_px: float, camera: LineCamera, scan_px: ArrayLike, slop
 def scene_to_sweep(sweep: Sweep, camera: LineCamera, along_px: ArrayLike, scan_px: ArrayLike) -> Floats:
     """Give continuous (line, sample) of scene points on a sweep as planned, (..., 2) float64; integers are centres."""
     centre, slope = scan_of_points(sweep.swath_px, camera, along_px, scan_px)
-    line = (centre - sweep.start_px - (sweep.step - 1) / 2) / sweep.step
+    line = (centre - sweep.start_px - (sweep.positions - 1) / 2) / sweep.step
     return np.stack([line, camera.sample_at(slope, sweep.binning)], axis=-1)
 
 
@@ -213,14 +221,14 @@ def memory_loads(sweeps: Sequence[Sweep], vector_pairs: int) -> list[Load]:
         _check_line(sweep, vector_pairs)
         line = 0
         while line < sweep.lines:
-            room = (vector_pairs - used) // sweep.step
+            room = (vector_pairs - used) // sweep.positions
             if room == 0:
                 loads.append(Load(tuple(parts)))
                 parts, used = [], 0
                 continue
             taken = min(room, sweep.lines - line)
-            parts.append(MemoryPart(number, (line, line + taken), (used, used + taken * sweep.step)))
-            line, used = line + taken, used + taken * sweep.step
+            parts.append(MemoryPart(number, (line, line + taken), (used, used + taken * sweep.positions)))
+            line, used = line + taken, used + taken * sweep.positions
     return [*loads, Load(tuple(parts))] if parts else loads
 
 
@@ -229,21 +237,21 @@ def count_loads(sweeps: Sequence[Sweep], vector_pairs: int) -> int:
     loads, used = 0, vector_pairs
     for sweep in sweeps:
         _check_line(sweep, vector_pairs)
-        rest = sweep.lines - min((vector_pairs - used) // sweep.step, sweep.lines)
+        rest = sweep.lines - min((vector_pairs - used) // sweep.positions, sweep.lines)
         if rest == 0:
-            used += sweep.lines * sweep.step
+            used += sweep.lines * sweep.positions
             continue
-        most = vector_pairs // sweep.step
+        most = vector_pairs // sweep.positions
         more = -(-rest // most)
-        loads, used = loads + more, (rest - (more - 1) * most) * sweep.step
+        loads, used = loads + more, (rest - (more - 1) * most) * sweep.positions
     return loads
 
 
 def _check_line(sweep: Sweep, vector_pairs: int) -> None:
-    if sweep.step > vector_pairs:
+    if sweep.positions > vector_pairs:
         raise SettingsError(
-            f"sweep {sweep.name} holds {sweep.step} positions in each line, the mirror's vector memory {vector_pairs} "
-            f"pairs; take a smaller coarse factor"
+            f"sweep {sweep.name} holds {sweep.positions} positions in each line, the mirror's vector memory "
+            f"{vector_pairs} pairs; take a smaller coarse factor"
         )
 
 

@@ -39,28 +39,6 @@ def full_sweeps(grid: SceneGrid, camera: LineCamera, along: Axis, *, overlap_px:
     return _cover(grid, camera, along, step=1, overlap_px=overlap_px)
 
 
-def coarse_sweeps(
-    grid: SceneGrid, camera: LineCamera, along: Axis, *, overlap_px: float = 0, exposure_ms: float | None = None
-) -> list[Sweep]:
-    """Cover the whole scene with lines of ``grid.factor`` held positions and as many samples summed.
-
-    ``overlap_px`` is that of :func:`full_sweeps`, in px of the full resolution; ``exposure_ms`` the camera's own where
-    it is None.
-
-    Raises SettingsError: the sum of ``grid.factor`` samples does not fit 16 bits, or a line has fewer samples; or the
-        overlap is negative or leaves nothing of a line.
-    Raises PoseError: the field is beyond the mirror's range.
-    """
-    most = min(camera.most_binning, camera.samples)
-    if grid.factor > most:
-        raise SettingsError(
-            f"the coarse factor must be at most {most} for {camera.bits}-bit lines of {camera.samples} samples "
-            f"(samples are summed in 16 bits), got {grid.factor}; take one uniform scan, or weights of a smaller factor"
-        )
-    covering = _cover(grid, camera, along, step=grid.factor, overlap_px=overlap_px)
-    return [replace(sweep, exposure_ms=exposure_ms) for sweep in covering]
-
-
 def uniform_sweeps(
     grid: SceneGrid,
     camera: LineCamera,

@@ -127,7 +127,8 @@ def uniform_scans(
         if exposures_ms is not None:
             tried = [exposure_ms for exposure_ms in exposures_ms if record.knows(exposure_ms)]
         elif seconds is not None and tried:
-            tried += _longest_within(seconds, sweeps[step], camera, cost, shortest, longest)
+            last = longest_exposure(seconds, sweeps[step], camera, cost, shortest, longest)
+            tried += [] if last is None else [last]
         found += [priced_scan(record, sweeps[step], camera, cost, bands, exposure_ms) for exposure_ms in tried]
     return found
 
@@ -155,20 +156,20 @@ def exposures_between(shortest: float, longest: float) -> list[float]:
     return [round(float(one), _DIGITS) for one in np.geomspace(shortest, longest, count + 1)]
 
 
-def _longest_within(
+def longest_exposure(
     seconds: float, sweeps: Sequence[Sweep], camera: LineCamera, cost: CostModel, shortest: float, longest: float
-) -> list[float]:
-    """The longest exposure of such sweeps that ends in time, if there is one: their price is linear in it."""
+) -> float | None:
+    """Return the longest exposure of such sweeps that ends in time, to .1 ms; None where none does."""
     ends = [cost.seconds([replace(sweep, exposure_ms=one) for sweep in sweeps], camera) for one in (shortest, longest)]
     if not ends[0] <= seconds:
-        return []
-    scale = 10**_DIGITS
+        return None
+    scale = 10.0**_DIGITS
     low, high = math.ceil(shortest * scale), math.floor(longest * scale)
-    while low < high:  # in steps of a tenth of a millisecond; the camera's highest rate bends the line
+    while low < high:  # the camera's highest rate bends the line
         middle = (low + high + 1) // 2
         taken_s = cost.seconds([replace(sweep, exposure_ms=middle / scale) for sweep in sweeps], camera)
         low, high = (middle, high) if taken_s <= seconds else (low, middle - 1)
-    return [low / scale]
+    return low / scale
 
 
 def choose_scan(scans: Sequence[UniformScan], limits: ScanLimits) -> UniformScan:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 
 import numpy as np
@@ -31,6 +31,7 @@ class MosaicPart:
     values: NDArray[np.float32]
     weight: NDArray[np.float32]
     edge_px: NDArray[np.float64]
+    step: int = 1  # distance of its lines [px]
 
 
 def edge_distance(coordinates: NDArray[np.float64], lines: int, samples: int) -> NDArray[np.float64]:
@@ -46,10 +47,12 @@ def mosaic(parts: Sequence[MosaicPart]) -> tuple[NDArray[np.float32], NDArray[np
 
     The weights are the same for all bands, so every spectrum is a convex mixture of captured ones; only a band that a
     sweep has no value in is the others' alone. One sweep alone comes back unchanged, bit by bit (it may be the very
-    array that went in). What a part holds where its weight is 0 does not matter.
+    array that went in). What a part holds where its weight is 0 does not matter. Where lines of several distances
+    reach a point, the closest count alone.
 
     (n, band) float32, NaN where no sweep reached, and (n,) how many sweeps did.
     """
+    parts = _closest(parts)
     reached = [part.weight > 0 for part in parts]
     coverage: NDArray[np.intp] = np.sum(reached, axis=0, dtype=np.intp)
     for part, here in zip(parts, reached, strict=True):
@@ -62,6 +65,17 @@ def mosaic(parts: Sequence[MosaicPart]) -> tuple[NDArray[np.float32], NDArray[np
         blended[alone] = part.values[alone]
     _blend_shared(blended, parts, np.flatnonzero(coverage > 1))
     return blended, coverage
+
+
+def _closest(parts: Sequence[MosaicPart]) -> Sequence[MosaicPart]:
+    """Take the weight of parts away where another has closer lines."""
+    if len({part.step for part in parts}) == 1:
+        return parts
+    steps = np.stack([np.where(part.weight > 0, part.step, np.inf) for part in parts])
+    closest = steps.min(axis=0)
+    return [
+        replace(part, weight=np.where(step > closest, 0, part.weight)) for part, step in zip(parts, steps, strict=True)
+    ]
 
 
 def _blend_shared(blended: NDArray[np.float32], parts: Sequence[MosaicPart], points: NDArray[np.intp]) -> None:
@@ -130,7 +144,8 @@ def read_part(
     if len(starts) < len(members):
         values, valid = merge_lines(values, valid, starts)
     values_at, weight = resample(values, valid, coordinates - np.array([knots.start, samples.start]), kernel)
-    return MosaicPart(values_at, weight, edge_distance(coordinates, len(scan_path), count))
+    edge_px = edge_distance(coordinates, len(scan_path), count)
+    return MosaicPart(values_at, weight, edge_px, located.placed.lines.sweep.step)
 
 
 def cut_runs(located: Sequence[NDArray[np.float64]], bands: int) -> list[slice]:

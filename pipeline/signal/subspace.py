@@ -119,6 +119,30 @@ class SignalStatistics:
         whole, usable = seen == bands, 2 * seen >= bands
         return spectra, np.asarray(whole if 2 * whole.sum() >= usable.sum() else usable)
 
+    def merged(self, other: SignalStatistics) -> SignalStatistics:
+        """Return the statistics of both, as if all lines had come together; sums are moved to this one's origin."""
+        if self.origin is None or other.origin is None:
+            return other if self.origin is None else self
+        found = replace(
+            self,
+            expected=self.expected + other.expected,
+            count=self.count + other.count,
+            means=self.means + other.means,
+            origin=np.where(self.lit, self.origin, other.origin).astype(np.float32),
+        )
+        apart = np.where(self.lit & other.lit, other.origin.astype(np.float64) - self.origin, 0.0)
+        found.lit = self.lit | other.lit
+        for products, sums, count in (("single", "total", other.count), ("block", "block_total", other.means)):
+            total = getattr(other, sums)
+            cross = np.outer(apart, total)
+            moved = getattr(other, products) + cross + cross.T + count * np.outer(apart, apart)
+            setattr(found, products, getattr(self, products) + moved)
+            setattr(found, sums, getattr(self, sums) + total + count * apart)
+        found.largest = np.maximum(self.largest, other.largest + np.abs(apart))
+        found.rough = [*self.rough, *other.rough]
+        found.kept = [*self.kept, *((some + apart).astype(np.float32) for some in other.kept)]
+        return found
+
     @property
     def spectra(self) -> Values:
         """(n, band) some spectra of all over the field, scene values."""

@@ -124,7 +124,7 @@ def held_positions(block: SweepBlock, choice: Choice) -> Floats:
     position = smeared_positions(block, choice.variant("smear"))
     for aim, variant in choice.doing("aim"):
         shift = aim.aim(block, variant)
-        if shift.shape[1] not in (1, position.shape[1]) and block.sweep.step > 1:  # the mirror's course is not followed
+        if shift.shape[1] not in (1, position.shape[1]) and block.sweep.positions > 1:  # its course is not followed
             shift = shift.mean(axis=1, keepdims=True)
         position = shifted_position(position, shift, block.rig.camera)
     return position
@@ -179,7 +179,7 @@ def tails_apart(
     Where their blurs or held positions differ, other kernels are fitted to the same patterns; where these have tails,
     so has what the kernels are wrong by.
     """
-    held, found = block.sweep.step, []
+    held, found = block.sweep.positions, []
     for choice in map(Choice.of, (one, other)):
         found.append(
             replace(_footprint(block, choice, folded_positions(block.sweep, choice.variant("smear"))), held=held)

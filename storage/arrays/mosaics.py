@@ -13,7 +13,7 @@ import zarr
 from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
-from pipeline.geometry.grid import SceneGrid, block_means
+from pipeline.geometry.grid import block_means
 from pipeline.signal.components import Components, broad_weights
 from storage.arrays.georeference import create_placed_group
 from storage.arrays.layout import (
@@ -43,6 +43,7 @@ from storage.arrays.signal_cubes import (
 )
 from storage.parallel.pool import WorkerPool, run_blocks
 
+CAPTURES = "capture"  # array of a mosaic whose pixels were captured in several ways
 HALF = 0.5  # of a pixel's finer ones: of fewer seen it has no value
 
 
@@ -136,6 +137,11 @@ class MosaicWriter:
             for left in range(0, scores.shape[1], wide):
                 part = np.s_[top : top + deep, left : left + wide]
                 self.write_tile(first + top, left, scores[part], seen[part])
+
+    def write_captures(self, specs: Sequence[Sequence[float]], number: NDArray[np.uint8]) -> None:
+        """Store how each pixel was captured: ``number`` (y, x) counts the ``specs``, numbers of the network's input."""
+        about = {"long_name": "kind of capture", "units": "1", "kinds": [list(one) for one in specs]}
+        write_image(self.group, CAPTURES, ("y", "x"), number, about)
 
     def write_quicklook(self, image: NDArray[np.uint8]) -> None:
         """Store a small colour picture, (y, x, 3) uint8, beside the mosaic."""
@@ -232,6 +238,18 @@ class Mosaic:
         """Count the sweeps that saw some pixels, (y, x)."""
         return read_array(self.group, "coverage", (rows, columns))
 
+    def captures(
+        self, rows: slice = slice(None), columns: slice = slice(None)
+    ) -> tuple[list[tuple[float, ...]], NDArray[np.uint8]] | None:
+        """Return the kinds of capture and each pixel's number among them, (y, x); None where all were captured alike.
+
+        Raises IncompleteStoreError: a checksum says that the bytes have changed.
+        """
+        if CAPTURES not in self.group:
+            return None
+        kinds: Any = self.group[CAPTURES].attrs["kinds"]
+        return [tuple(one) for one in kinds], read_array(self.group, CAPTURES, (rows, columns))
+
     def values(
         self, rows: slice = slice(None), columns: slice = slice(None), bands: Sequence[int] | None = None
     ) -> NDArray[np.float32]:
@@ -297,41 +315,6 @@ def open_mosaic(path: Path) -> Mosaic:
     with damage_named(str(path)):
         step = float(group["scores"].attrs["scale_factor"])  # type: ignore[arg-type]
     return Mosaic(group, read_components(group), step, wavelength, fwhm, grid_of(dict(group.attrs)))
-
-
-def patch_scores(
-    mosaic: Mosaic, grid: SceneGrid, patch_index: NDArray[np.integer]
-) -> Iterator[tuple[NDArray[np.intp], NDArray[np.float32]]]:
-    """Cut patches out of a mosaic of the fine grid, the patches of some rows at a time.
-
-    Yields entries of ``patch_index`` and their scores (n, p, p, component), NaN where nothing was seen. Beyond the
-    scene's border a patch repeats its pixels by reflection.
-    """
-    p, (_, across) = grid.patch, grid.patch_shape
-    row, column = np.divmod(np.asarray(patch_index, np.intp), across)
-    deep = max(SHARD_ROWS // p, 1)
-    for group in np.unique(row // deep):
-        entries = np.flatnonzero(row // deep == group)
-        first, left, right = int(row[entries].min()), int(column[entries].min()), int(column[entries].max()) + 1
-        last = int(row[entries].max()) + 1
-        window = mosaic.scores(
-            slice(first * p, min(last * p, grid.height)), slice(left * p, min(right * p, grid.width))
-        )
-        whole = _reflected(_reflected(window, p, (last - first) * p, 0), p, (right - left) * p, 1)
-        cut = whole.reshape(last - first, p, right - left, p, -1).swapaxes(1, 2)
-        yield entries, cut[row[entries] - first, column[entries] - left]
-
-
-def _reflected(window: NDArray[np.float32], patch: int, size: int, axis: int) -> NDArray[np.float32]:
-    """Fill an axis up to ``size``, a multiple of a patch, within the last patch by reflection, else by the border."""
-    have = window.shape[axis]
-    if have == size:
-        return window
-    place = np.arange(size)
-    mirrored = 2 * (have - 1) - place
-    return np.take(
-        window, np.where(place < have, place, np.where(mirrored >= size - patch, mirrored, have - 1)), axis=axis
-    )
 
 
 @dataclass(frozen=True)

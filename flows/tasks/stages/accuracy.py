@@ -7,7 +7,6 @@ come with simulated fields alone, which memory holds as well. Controls read the 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -19,8 +18,7 @@ from flows.tasks.capture_plan import CapturePlan
 from flows.tasks.field_work import coarse_region
 from flows.tasks.patch_budget import SHARD
 from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
-from flows.tasks.stages.attention import load_plan
-from flows.tasks.stages.effects import source_with
+from flows.tasks.stages.attention import read_in_full
 from flows.tasks.stages.placement import load_registration
 from flows.tasks.zones import SurveyZones
 from models.evaluation.metrics import (
@@ -43,7 +41,7 @@ from pipeline.geometry.scan import Axis, Sweep
 from pipeline.lazy import Once
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.region import read_patches
-from pipeline.simulator.effects.pointing import CommonOffset, PointingErrors
+from pipeline.simulator.effects.pointing import PointingErrors
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from pipeline.source import SweepLines
 from storage.archive.keys import StageRef, array_digest
@@ -53,7 +51,7 @@ from storage.arrays.class_maps import load_class_map
 from storage.readers.raster_fields import RasterPixels, patches_of
 
 RECORD = "accuracy.json"
-ACCURACY = Product("evaluate", version=11, files=(RECORD,), by_weights=True)
+ACCURACY = Product("evaluate", version=12, files=(RECORD,), by_weights=True)
 
 
 @stage("evaluate", "accuracy (not part of the survey)", ACCURACY)
@@ -66,15 +64,13 @@ def evaluate(
     plan: CapturePlan,
     zones: SurveyZones,
     chooses: bool,
-    captures: tuple[LineSpec, LineSpec],
+    capture: LineSpec,
     simulated: SimulatedSource,
     source_key: Mapping[str, Any],
     labels: NDArray[np.uint8],
     load: Once[Weights],
     model_key: Mapping[str, Any],
     controls: bool,
-    resampling: Kernel,
-    memory: int,
     seed: int,
     report: Report,
 ) -> Wanted:
@@ -93,21 +89,15 @@ def evaluate(
         counts = confusion(judged, classes, len(drawn.names))  # with the class unknown, which no label has
         result: dict[str, Any] = map_figures(names, counts) | {"confusion": counts.tolist()}
         image = mosaic.path / "mosaic.zarr"
-        result["none"] = map_figures(names, _confusion_of_overview(weights, image, grid, captures[0], judged))
+        result["none"] = map_figures(names, _confusion_of_overview(weights, image, grid, capture, judged))
         result |= {"all": {"miou": None, "per_class_iou": {}}, "gap_closed": None, "controls": {}}
         if controls:
-            seen = coarse_region(weights, image, whole_field(grid), captures[0])
-            if plan.plain:
-                columns = seen.patches(np.arange(int(np.prod(grid.patch_shape))))
-            else:
-                source = source_with(sure_source(simulated, off), sources[0])
-                columns = columns_of_all_patches(
-                    source, plan.full, grid, weights, memory=memory, resampling=resampling, report=first_part
-                )
+            seen = coarse_region(weights, image, whole_field(grid), capture)
+            columns = seen.patches(np.arange(int(np.prod(grid.patch_shape))))
             fraction, valid = CONTROL_FRACTION, grid.valid_fraction().ravel() > 0
             among = valid if zones.fractions is None else valid & (zones.fractions > 0)
-            if chooses and plan.plain:  # as many as were read of a uniform scan
-                read = len(load_plan(attention, class_map).patch_index)
+            if chooses:  # as many as were read
+                read = len(read_in_full(attention, class_map))
                 fraction = read / max(int(among.sum()), 1)
             rows = count(1)
             found = run_controls(
@@ -115,11 +105,10 @@ def evaluate(
                 read_coarse_prediction(weights, seen),
                 columns,
                 judged,
-                capture=captures[1],
                 fraction=fraction,
                 seed=seed,
                 among=among,
-                report=lambda row: report(0.6 + 0.035 * next(rows)),
+                report=lambda row: report(0.09 * next(rows)),
             )
             figures = map_figures(names, found.every)
             gap = gap_closed(result["miou"], result["none"]["miou"], figures["miou"])
@@ -127,10 +116,7 @@ def evaluate(
             result |= {"all": figures, "gap_closed": gap, **shown}
         (path / RECORD).write_text(to_json(result), encoding="utf-8")  # no NaN, which JSON does not know
 
-    def first_part(done: float) -> None:
-        report(0.6 * done)
-
-    params = {**model_key, "labels": array_digest(labels), "controls": controls, "resampling": resampling, **source_key}
+    params = {**model_key, "labels": array_digest(labels), "controls": controls, **source_key}
     return Wanted(build, params, [mosaic, attention, class_map, *sources])
 
 
@@ -165,13 +151,6 @@ def moved_labels(labels: NDArray[np.uint8], off: NDArray[np.float64], along: Axi
     inside = ((rows >= 0) & (rows < labels.shape[0]))[:, None] & ((columns >= 0) & (columns < labels.shape[1]))
     moved = labels[np.clip(rows, 0, labels.shape[0] - 1)[:, None], np.clip(columns, 0, labels.shape[1] - 1)]
     return np.where(inside, moved, np.uint8(UNLABELLED))
-
-
-def sure_source(simulated: SimulatedSource, off: NDArray[np.float64]) -> SimulatedSource:
-    """Return a mirror that looks as far beside the scene as the map lies: controls share the map's pixels."""
-    if simulated.pointing is None:
-        return simulated
-    return replace(simulated, pointing=CommonOffset((float(off[0]), float(off[1]))))
 
 
 def map_figures(names: Sequence[str], counts: NDArray[np.int64]) -> dict[str, Any]:

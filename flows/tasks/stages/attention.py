@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from flows.settings.survey_settings import SPARING
 from flows.tasks.capture_plan import CapturePlan
 from flows.tasks.field_work import FieldWork, region_params
+from flows.tasks.later_passes import LaterPasses
 from flows.tasks.patch_budget import PatchBudget
 from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
 from flows.tasks.zones import SurveyZones
@@ -24,16 +24,16 @@ from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid, patch_pixels
 from pipeline.geometry.scan import CostModel, Sweep, exposing
-from pipeline.planning.coverage import field_px, patches_shown
-from pipeline.planning.fine_pass import FinePlan, plan_fine
-from pipeline.planning.uniform_scans import format_scan
+from pipeline.planning.coverage import patches_shown
+from pipeline.planning.fine_pass import FinePlan
+from pipeline.planning.uniform_scans import ScanPerformance, format_scan
 from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table, write_table
 from storage.arrays.mosaics import Attention, chosen_patches, open_mosaic, write_attention
 from storage.readers.raster_fields import RasterPixels
 
 READING = "attention.zarr"  # beside a map, where patches were chosen while it was drawn
-ATTENTION = Product("score", version=9, files=("attention.zarr", "plan.json"), by_weights=True)
+ATTENTION = Product("score", version=10, files=("attention.zarr", "plan.json"), by_weights=True)
 Scores = NDArray[np.float64]
 
 
@@ -55,6 +55,8 @@ def score(
     mask: NDArray[np.generic] | None,
     part: bool,
     capture: LineSpec,
+    scan_record: ScanPerformance | None,
+    least_gain: float | None,
     model_key: dict[str, Any],
     report: Report,
 ) -> Wanted:
@@ -62,22 +64,31 @@ def score(
     grid, fractions = frame.grid, zones.fractions
 
     def expected_gain() -> Scores:
-        """Return the (patch,) worth of a fine look at each patch, by the fraction of it that zones leave."""
+        """Return the (patch,) gain that the policy expects of each patch."""
         if policy in SEEING_POLICIES:
             scores = work.score(policy, mosaic.path / "mosaic.zarr", capture, lambda done: report(0.5 * done)).ravel()
         else:
             nothing = np.empty((0, 0, 0), np.float32)
             scores = score_patches(policy, CoarsePrediction(grid, nothing, nothing), seed=seed, mask=mask)
-        if frame.missing is not None:  # a patch without any pixel of the scene is worth no look
+        return worth(scores)
+
+    def worth(scores: Scores) -> Scores:
+        """Return scores by the fraction of each patch that zones leave; a patch beside the scene is worth nothing."""
+        if frame.missing is not None:
             void = patch_pixels(grid, frame.missing).mean(axis=(1, 2)) >= grid.valid_fraction().ravel()
             scores = np.where(void, 0.0, scores)
         return scores if fractions is None else np.where(fractions > 0, scores, 0.0) * fractions
 
     def planned() -> tuple[Scores, FinePlan]:
-        """Return the scores where patches are chosen, and what is seen of the field in detail."""
+        """Return the scores where patches are chosen, and the lines that are captured later."""
         if not plan.plain:
-            scores = expected_gain()
-            return scores, plan_detail(grid, plan, camera, cost, scores, recorded)
+            later = LaterPasses(grid, camera, cost, plan, recorded)
+            if scan_record is None or policy != "gain" or not plan.by_record:
+                scores = expected_gain()
+                return scores, later.within(scores)
+            errors = work.expected_errors(mosaic.path / "mosaic.zarr", capture, lambda done: report(0.5 * done))
+            found = later.best(errors, scan_record, work.weights.load().class_names, worth)
+            return errors.expected_wrong_pixels(), found
         seen = all_seen(grid, () if raster is not None else plan.coarse, camera, part=part)
         if budget is None:
             return np.zeros(int(np.prod(grid.patch_shape))), seen
@@ -89,16 +100,16 @@ def score(
         scores, found = planned()
         if fractions is not None:  # patches of which zones leave something
             found = replace(found, patch_index=found.patch_index[fractions[found.patch_index] > 0])
-        work.pool_for(
-            found.patch_index, len(open_mosaic(mosaic.path / "mosaic.zarr").components)
-        )  # refuses what does not fit before the rig goes back
+        read = found.patch_index
+        if not plan.plain and (least_gain is not None or found.kind == "full" or not found.sweeps):
+            read = grid.valid_patches()  # of which the reading chooses
+            read = read if fractions is None else read[fractions[read] > 0]
+        work.pool_for(read, len(open_mosaic(mosaic.path / "mosaic.zarr").components))  # before the rig goes back
         rank = np.full(scores.shape, -1, np.int32)
-        rank[found.patch_index[np.argsort(-scores[found.patch_index], kind="stable")]] = np.arange(
-            len(found.patch_index)
-        )
+        rank[read[np.argsort(-scores[read], kind="stable")]] = np.arange(len(read))
         shape = grid.patch_shape
         write_attention(path / "attention.zarr", Attention(scores.reshape(shape), rank.reshape(shape), policy))
-        content = asdict(found) | {"patch_index": found.patch_index.tolist()}
+        content = asdict(found) | {"patch_index": found.patch_index.tolist(), "read": read.tolist()}
         write_table(path / "plan.json", content)
 
     captures = {
@@ -117,44 +128,11 @@ def score(
         "mask": None if mask is None else array_digest(mask),
         **(captures if raster is None else {}),
         **(region_params(grid) | {"capture": list(capture)} if policy in SEEING_POLICIES else {}),
-        **({"plain": True} if plan.plain else {}),
+        **({"plain": True} if plan.plain else {"by_record": plan.by_record, "least_gain": least_gain}),
         **({} if budget is None else {"patches": {name: getattr(budget, name) for name in SPARING}}),
         **zones.key,
     }
     return Wanted(build, params, [mosaic])
-
-
-def plan_detail(
-    grid: SceneGrid,
-    plan: CapturePlan,
-    camera: LineCamera,
-    cost: CostModel,
-    scores: Scores,
-    recorded: RecordedPasses | None,
-) -> FinePlan:
-    """Plan the runs of lines that show most of the (patch,) scores in the time left.
-
-    Of a recording it is the plan of free strips where that has its lines, else the one on the strips that it has.
-    """
-    plan_on = partial(
-        plan_fine,
-        grid,
-        camera,
-        cost,
-        plan.along,
-        scores,
-        budget_s=plan.fine_s,
-        margin_px=plan.margin_px,
-        full=plan.full,
-    )
-    found = plan_on()
-    if recorded is None:
-        return found
-    taken = recorded.served(found.sweeps)
-    if taken is None and (swaths := recorded.swaths(-(field_px(grid, plan.along)[1] - 1) / 2)):
-        found = plan_on(swaths=swaths)
-    sweeps = recorded.fine_pass(found.sweeps) if taken is None else taken
-    return replace(found, sweeps=sweeps, seconds=cost.seconds(sweeps, camera))
 
 
 def all_seen(grid: SceneGrid, sweeps: Sequence[Sweep], camera: LineCamera, *, part: bool) -> FinePlan:
@@ -178,15 +156,15 @@ def kept_within(budget: PatchBudget, scores: Scores, seen: FinePlan) -> FinePlan
     return replace(seen, patch_index=np.sort(bought), reason=reason, expected_gain=expected_gain, wanted_gain=wanted)
 
 
-def load_plan(attention: StageRef, class_map: StageRef | None = None) -> FinePlan:
-    """Read the plan of an attention store, with the patches that were chosen while ``class_map`` was drawn, if any."""
+def load_plan(attention: StageRef) -> FinePlan:
+    """Read the plan of an attention store: the lines captured later, and the patches that they show."""
     plan = read_table(attention.path / "plan.json")
-    if class_map is not None and (store := class_map.path / READING).exists():
-        chosen, everything = chosen_patches(store), len(plan["patch_index"])
-        words = f"{plan['reason']}; {len(chosen)} of {everything} patches are read in full"
-        plan |= {"patch_index": chosen, "reason": words}
-    kept = {
-        "sweeps": [Sweep(**sweep) for sweep in plan["sweeps"]],
-        "patch_index": np.array(plan["patch_index"], np.intp),
-    }
-    return FinePlan(**(plan | kept))
+    plan.pop("read", None)
+    sweeps = [Sweep(**sweep) for sweep in plan.pop("sweeps")]
+    return FinePlan(sweeps, np.array(plan.pop("patch_index"), np.intp), **plan)
+
+
+def read_in_full(attention: StageRef, class_map: StageRef) -> NDArray[np.intp]:
+    """Return the patches (patch,) that were read in full, as they were chosen before or while a map was drawn."""
+    store = class_map.path / READING
+    return chosen_patches(store if store.exists() else attention.path / "attention.zarr")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from storage.arrays.spool import line_values
 from storage.arrays.statistics import read_statistics
 
 SIGNAL = Product("condense", version=1)
-SIGNAL_FINE = Product("condense_fine", version=1)
+SIGNAL_FINE = Product("condense_fine", version=2)
 RECORD = "signal.json"
 SHARED_FRACTION = 2e-3  # of all spectra: of more rare ones, a component is cheaper than their residuals
 COARSER = (1.5, 2.0, 3.0, 4.0, 6.0)  # steps that a limit of bytes may ask for [noise's deviations]
@@ -52,13 +53,23 @@ def condense_coarse(
 ) -> Wanted:
     """Condense the sweeps of the first pass, or of a uniform scan, with its mosaic in at most ``kept_bytes``."""
     limit = None if kept_bytes is None else KeptBytes(kept_bytes, frame.grid.height * frame.grid.width)
-    return _condensed(raw, camera, signal, report, limit)
+    return _condensed([raw], camera, signal, report, limit)
 
 
-@stage("condense_fine", "signal of the fine sweeps", SIGNAL_FINE, named="signal_fine")
-def condense_fine(raw: StageRef, *, camera: LineCamera, signal: SignalChoice, report: Report) -> Wanted:
-    """Condense the sweeps of the second pass."""
-    return _condensed(raw, camera, signal, report)
+@stage("condense_fine", "signal of all passes", SIGNAL_FINE, named="signal_fine")
+def condense_fine(
+    raw: StageRef,
+    raw_first: StageRef,
+    *,
+    camera: LineCamera,
+    signal: SignalChoice,
+    kept_bytes: int | None,
+    frame: FieldFrame,
+    report: Report,
+) -> Wanted:
+    """Condense the sweeps of the later passes and those of the first by common components, so that lines merge."""
+    limit = None if kept_bytes is None else KeptBytes(kept_bytes, frame.grid.height * frame.grid.width)
+    return _condensed([raw, raw_first], camera, signal, report, limit)
 
 
 @dataclass(frozen=True)
@@ -99,28 +110,39 @@ class KeptBytes:
 
 
 def _condensed(
-    raw: StageRef, camera: LineCamera, choice: SignalChoice, report: Report, limit: KeptBytes | None = None
+    passes: Sequence[StageRef], camera: LineCamera, choice: SignalChoice, report: Report, limit: KeptBytes | None
 ) -> Wanted:
-    """Want the condensed sweeps of a capture."""
+    """Want the condensed sweeps of some captures."""
 
     def build(path: Path) -> None:
-        """Find the components of the pass, and write every sweep's scores; once more where rare spectra share some."""
-        cubes = open_raw_cubes(raw.path)
-        found = read_statistics(raw.path)
+        """Find the components of all lines, and write every sweep's scores; once more where rare spectra share some."""
+        captured = [(open_raw_cubes(raw.path), read_statistics(raw.path)) for raw in passes]
+        cubes = [cube for of_pass, _ in captured for cube in of_pass]
+        found = reduce(SignalStatistics.merged, (statistics for _, statistics in captured))
         components = components_of(found, cubes, choice)
         step = choice.step if limit is None else limit.step(cubes, components, camera, choice.step)
         law = ResidualLaw.learned(found.spectra, components)
         condenser = Condenser(components, law, camera, choice.rare_spectra, step)
-        done = _write_sweeps(path, cubes, condenser, found, report)
+
+        def written(condenser: Condenser) -> list[CondensedSweep]:
+            """Write every sweep, by the noise of its own pass: exposures differ."""
+            of_passes = []
+            for of_pass, statistics in captured:
+                law = condenser.law if len(passes) == 1 else ResidualLaw.learned(statistics.spectra, components)
+                of_passes += [(cube, replace(condenser, law=law)) for cube in of_pass]
+            return _write_sweeps(path, of_passes, found, report)
+
+        done = written(condenser)
         better = with_shared_directions(condenser, done, found, choice.false_alarm)
         if better is not None:
-            condenser, done = better, _write_sweeps(path, cubes, better, found, report)
+            condenser, components, done = better, better.components, written(better)
         write_table(path / RECORD, _record(condenser, done))
-        if (raw.path / RIG_RECORD).is_file():  # raw lines may go
-            shutil.copyfile(raw.path / RIG_RECORD, path / RIG_RECORD)
+        for raw in passes[:1]:
+            if (raw.path / RIG_RECORD).is_file():  # raw lines may go
+                shutil.copyfile(raw.path / RIG_RECORD, path / RIG_RECORD)
 
     key = {"camera": {"bits": camera.bits}, **asdict(choice)}  # of a camera scores depend on where it saturates
-    return Wanted(build, key if limit is None else {**key, "kept": asdict(limit)}, [raw])
+    return Wanted(build, key if limit is None else {**key, "kept": asdict(limit)}, list(passes))
 
 
 def with_shared_directions(
@@ -152,22 +174,23 @@ def components_of(found: SignalStatistics, cubes: Sequence[RawCube], choice: Sig
 
 
 def _write_sweeps(
-    path: Path, cubes: Sequence[RawCube], condenser: Condenser, found: SignalStatistics, report: Report
+    path: Path, sweeps: Sequence[tuple[RawCube, Condenser]], found: SignalStatistics, report: Report
 ) -> list[CondensedSweep]:
     """Store the scores of every sweep, and what components do not hold."""
     origin = np.zeros(found.bands) if found.origin is None else found.origin
-    largest = condenser.components.largest(found.largest + np.abs(origin - np.nan_to_num(condenser.components.mean)))
     done = []
-    for number, cube in enumerate(cubes):
-        out = path / f"{cube.sweep.name}.zarr"
+    for number, (cube, condenser) in enumerate(sweeps):
+        mean = np.nan_to_num(condenser.components.mean)
+        largest = condenser.components.largest(found.largest + np.abs(origin - mean))
+        out, first = path / f"{cube.sweep.name}.zarr", sweeps[0][0]
         shutil.rmtree(out, ignore_errors=True)
-        shared = cubes[0].sweep.name if number and cube.references.same_as(cubes[0].references) else None
+        shared = first.sweep.name if number and cube.references.same_as(first.references) else None
         writer = SignalCubeWriter(
             out, header_of(cube), condenser.components, step=condenser.step, largest=largest, frames_of=shared
         )
 
         def part(fraction: float, number: int = number) -> None:
-            report((number + fraction) / len(cubes))
+            report((number + fraction) / len(sweeps))
 
         done.append(condenser.sweep(cube, writer.write, part))
         x, y = cube.position.T
@@ -211,11 +234,13 @@ def _lines_differ(raw: StageRef, signal: StageRef, camera: LineCamera) -> str | 
         fraction = 100 * record["rare"] / record["spectra"]
         return f"{fraction:.1f} % of the spectra have more than noise beside {record['components']} components"
     cubes, condensed = open_raw_cubes(raw.path), open_signal_cubes(signal.path)
-    if [cube.sweep for cube in cubes] != [stored.sweep for stored in condensed]:
+    of_sweep = {stored.sweep: stored for stored in condensed}
+    if any(cube.sweep not in of_sweep for cube in cubes):
         return "the sweeps of the signal are not those of the raw lines"
     found = read_statistics(raw.path)
     few = components_of(found, cubes, SignalChoice()) if found.bands <= FEW_BANDS else None
-    for cube, stored in zip(cubes, condensed, strict=True):
+    for cube in cubes:
+        stored = of_sweep[cube.sweep]
         wrong = differing_lines(cube, stored, camera, few)
         if wrong:
             return f"sweep {cube.sweep.name}: {line_values(wrong)} of the signal are not those of the raw lines"

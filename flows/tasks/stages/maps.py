@@ -47,7 +47,6 @@ MOST_TURN_PX = 12.0  # that a field's corners may lie off by, as it is turned, s
 def segment(
     mosaic: StageRef,
     attention: StageRef,
-    fine: StageRef | None = None,
     *,
     frame: FieldFrame,
     work: FieldWork,
@@ -56,7 +55,7 @@ def segment(
     reader: ReaderPart | None,
     ood_detector: OodPart | None,
     unknown: UnknownRule | None,
-    captures: tuple[LineSpec, LineSpec],
+    capture: LineSpec,
     part: bool,
     least_gain: float | None,
     policy: str,
@@ -65,11 +64,10 @@ def segment(
 ) -> Wanted:
     """Draw the class map region by region, in detail where patches were chosen; no class where the scene has no value.
 
-    ``fine`` is the mosaic of the second pass, where there is one: else the first shows the field's own pixels.
-    ``captures`` say how the pixels of the overview were captured, and those that are read in full. With ``least_gain``
-    patches are chosen region by region, by what the policy expects of them.
+    ``capture`` says how the mosaic's pixels were captured, where it does not say so itself. With ``least_gain`` patches
+    are chosen region by region, by what the policy expects of them.
     """
-    grid, left_out, inputs = frame.grid, zones.left_out, [mosaic, attention, *([] if fine is None else [fine])]
+    grid, left_out, inputs = frame.grid, zones.left_out, [mosaic, attention]
 
     def build(path: Path) -> None:
         """Draw the map and what is believed; once more without the memory, where that is put aside."""
@@ -82,17 +80,16 @@ def segment(
         legend, shape = ClassNames(weights.class_names, weights.class_colours), (grid.height, grid.width)
         create_class_map(out, shape, legend if unknown is None else with_unknown(legend), grid=frame.angular_grid())
         create_probabilities(probabilities, shape, legend, grid=frame.angular_grid(), goes_on=memory is not None)
-        seen, detail = ((ref.path / "mosaic.zarr").resolve() for ref in (mosaic, fine or mosaic))
+        seen = (mosaic.path / "mosaic.zarr").resolve()
         chosen = (attention.path / "attention.zarr").resolve()
         away = None if left_out is None else (path / LEFT_OUT).resolve()
         drawing = Drawing(
             work.weights,
             seen,
-            detail,
             chosen,
             out.resolve(),
             probabilities.resolve(),
-            captures,
+            capture,
             memory,
             away,
             unknown,
@@ -126,7 +123,7 @@ def segment(
         (path / LEFT_OUT).unlink(missing_ok=True)
 
     params = {**model_key, "grid": asdict(grid), **region_params(grid), **frame.key, **zones.key}
-    params["captures"] = [list(one) for one in captures]
+    params["capture"] = list(capture)
     if ood_detector is not None and unknown is not None:
         params["unknown"] = {"familiar": ood_detector.key, **asdict(unknown)}
     if part:

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.tasks.capture_plan import CapturePlan
 from flows.tasks.mosaic_work import MosaicRecipe, open_sweeps, write_mosaic
 from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
-from flows.tasks.stages.attention import load_plan
+from models.network.spectral import LineSpec
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid, patch_pixels
+from pipeline.geometry.scan import Sweep, exposing
+from pipeline.rectify.interlaced import capture_numbers
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.placed import PixelGrid, Placed, TieTable
 from pipeline.rectify.registration.alignment import SweepShift
@@ -27,20 +27,19 @@ from pipeline.signal.components import BROAD_BANDS, Components
 from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table, write_table
 from storage.arrays.geolocation import path_digest, write_geolocation
-from storage.arrays.layout import blank_coarse, blank_pixels
+from storage.arrays.layout import blank_pixels
 from storage.arrays.mosaics import MosaicWriter, nothing_seen, open_mosaic
 from storage.arrays.quicklooks import choose_bands, stretched
 from storage.arrays.signal_cubes import open_signal_cubes
 from storage.parallel.pool import WorkerPool
 
-Valid = NDArray[np.bool_]
 RECORD = "registration.json"
 POINTING = Product("register", version=2, files=(RECORD,))
 
 
 GEOLOCATION = Product("locate", version=3, files=("geolocation.zarr",))
 MOSAIC = Product("rectify", version=5, files=("mosaic.zarr",))
-DETAIL = Product("rectify_fine", version=1, files=("mosaic.zarr",))
+DETAIL = Product("rectify_fine", version=2, files=("mosaic.zarr",))
 QUICKLOOK_PX = 512
 MOSAIC_STEP = 0.5  # of resampled scores, over that of the sweeps: what is read between samples is less noisy
 KERNEL_GAIN = 2.0  # by which kernels overshoot, at most
@@ -145,16 +144,10 @@ def load_registration(registration: StageRef) -> dict[str, Any]:
 
 @stage("locate", "lookup", GEOLOCATION)
 def locate(
-    signal: StageRef,
-    registration: StageRef | None = None,
-    *,
-    camera: LineCamera,
-    frame: FieldFrame,
-    plan: CapturePlan,
-    report: Report,
+    signal: StageRef, registration: StageRef | None = None, *, camera: LineCamera, frame: FieldFrame, report: Report
 ) -> Wanted:
-    """Look up where each coarse pixel was seen: a table that every survey along the same path shares."""
-    grid = PixelGrid.of_scene(frame.grid, 1 if plan.plain else frame.grid.factor)
+    """Look up where each pixel was seen: a table that every survey along the same path shares."""
+    grid = PixelGrid.of_scene(frame.grid, 1)
     sweeps = open_sweeps(signal.path, record_of(registration), camera)
     params = {
         "camera": {name: getattr(camera, name) for name in ("samples", "pitch_um", "focal_length_mm")},
@@ -190,112 +183,96 @@ def rectify(
     *,
     camera: LineCamera,
     frame: FieldFrame,
-    plan: CapturePlan,
     resampling: Kernel,
     memory: int,
     pool: WorkerPool,
     report: Report,
 ) -> Wanted:
-    """Bring the sweeps of the first pass onto the scene grid and blend them into one mosaic, tile by tile.
-
-    Its pixels are the scene's own of a uniform scan, else the coarse ones.
-    """
+    """Bring the sweeps of the first pass onto the scene grid and blend them into one mosaic, tile by tile."""
 
     def build(path: Path) -> None:
         """Write mosaic and quicklook, and what became of each sweep's lines."""
-        factor = 1 if plan.plain else frame.grid.factor
         recipe = MosaicRecipe(
             signal.path,
             camera,
-            PixelGrid.of_scene(frame.grid, factor),
+            PixelGrid.of_scene(frame.grid, 1),
             resampling,
             geolocation=geolocation.path / "geolocation.zarr",
             registration=record_of(registration),
         )
-        writer = mosaic_of_sweeps(path, signal, frame, factor)
+        writer = mosaic_of_sweeps(path, signal, frame)
         write_mosaic(recipe, writer, memory=memory, pool=pool, report=report)
-        finish_mosaic(writer, frame, factor)
+        finish_mosaic(writer, frame)
         write_table(path / "lines.json", {one.lines.sweep.name: one.facts() for one in recipe.sweeps()})
 
     params = {"grid": asdict(frame.grid), "resampling": resampling, **frame.key}
     return Wanted(build, params, [signal, geolocation, *_there(registration)])
 
 
-@stage("rectify_fine", "mosaic of the fine sweeps", DETAIL, named="detail")
+@stage("rectify_fine", "mosaic of all passes", DETAIL, named="detail")
 def rectify_fine(
-    attention: StageRef,
     signal: StageRef,
     registration: StageRef | None = None,
     *,
     camera: LineCamera,
     frame: FieldFrame,
+    light: LineSpec,
     resampling: Kernel,
     memory: int,
     pool: WorkerPool,
     report: Report,
 ) -> Wanted:
-    """Bring the fine sweeps onto the scene's own pixels, in the tiles in which patches were chosen."""
+    """Bring the lines of all passes onto the scene grid, merged by position; each pixel is of the closest lines."""
 
     def build(path: Path) -> None:
-        """Write the tiles that hold chosen patches."""
+        """Write mosaic, quicklook, how each pixel was captured, and what became of each sweep's lines."""
+        grid = PixelGrid.of_scene(frame.grid, 1)
         recipe = MosaicRecipe(
-            signal.path, camera, PixelGrid.of_scene(frame.grid, 1), resampling, registration=record_of(registration)
+            signal.path, camera, grid, resampling, registration=record_of(registration), interlaced=True
         )
-        writer, chosen = mosaic_of_sweeps(path, signal, frame, 1), load_plan(attention).patch_index
-        if len(chosen):
-            there = pixels_of_patches(frame.grid, chosen)
-            write_mosaic(recipe, writer, memory=memory, pool=pool, wanted=there, report=report)
-        finish_mosaic(writer, frame, 1)
+        writer = mosaic_of_sweeps(path, signal, frame)
+        write_mosaic(recipe, writer, memory=memory, pool=pool, report=report)
+        placed = recipe.open().placed
+        number = np.maximum(capture_numbers(placed, camera, grid), 0).astype(np.uint8)
+        sweeps = [one.lines.sweep for one in placed]
+        writer.write_captures([spec_of(sweep, camera, light) for sweep in sweeps], number)
+        finish_mosaic(writer, frame)
+        write_table(path / "lines.json", {one.lines.sweep.name: one.facts() for one in recipe.sweeps()})
 
-    params = {"grid": asdict(frame.grid), "resampling": resampling, **frame.key}
-    return Wanted(build, params, [attention, signal, *_there(registration)])
-
-
-def pixels_of_patches(grid: SceneGrid, patch_index: NDArray[np.integer]) -> Valid:
-    """(y, x) pixels of the scene that lie in some patches."""
-    chosen = np.zeros(int(np.prod(grid.patch_shape)), np.bool_)
-    chosen[patch_index] = True
-    pixels = np.kron(chosen.reshape(grid.patch_shape), np.ones((grid.patch, grid.patch), np.bool_))
-    return np.asarray(pixels[: grid.height, : grid.width], np.bool_)
+    params = {"grid": asdict(frame.grid), "resampling": resampling, "light": light.light, **frame.key}
+    return Wanted(build, params, [signal, *_there(registration)])
 
 
-def mosaic_of_sweeps(path: Path, signal: StageRef, frame: FieldFrame, factor: int) -> MosaicWriter:
-    """Begin the mosaic of condensed sweeps, in pixels of ``factor`` fine ones."""
+def spec_of(sweep: Sweep, camera: LineCamera, light: LineSpec) -> LineSpec:
+    """Return how a sweep's lines were captured; ``light`` is the capture of every line in the camera's exposure."""
+    exposed = exposing(camera, sweep).exposure_ms / camera.exposure_ms
+    return LineSpec(light.light * exposed, sweep.step)
+
+
+def mosaic_of_sweeps(path: Path, signal: StageRef, frame: FieldFrame) -> MosaicWriter:
+    """Begin the mosaic of condensed sweeps, in the scene's own pixels."""
     sweeps = open_signal_cubes(signal.path)
     components = sweeps[0].components if sweeps else Components.empty(len(frame.wavelength_nm))
     return MosaicWriter(
         path / "mosaic.zarr",
-        frame.grid.coarse_shape if factor > 1 else (frame.grid.height, frame.grid.width),
+        (frame.grid.height, frame.grid.width),
         components,
         frame.wavelength_nm,
         step=MOSAIC_STEP * sweeps[0].step if sweeps else 1.0,
         largest=max((sweep.largest for sweep in sweeps), default=0.0) * KERNEL_GAIN,
         fwhm_nm=frame.fwhm_nm,
-        grid=frame.angular_grid(factor),
+        grid=frame.angular_grid(),
         simulation=sweeps[0].simulation if sweeps else None,
     )
 
 
-def finish_mosaic(writer: MosaicWriter, frame: FieldFrame, factor: int) -> None:
+def finish_mosaic(writer: MosaicWriter, frame: FieldFrame) -> None:
     """Take out what is no scene, and store a picture of the rest."""
     if frame.missing is not None:
-        gaps = frame.missing if factor == 1 else blank_coarse(frame.missing, factor)
-        blank_pixels(writer.path, gaps, nothing_seen(writer.path))
+        blank_pixels(writer.path, frame.missing, nothing_seen(writer.path))
     mosaic = open_mosaic(writer.path)
     step, bands = -(-max(mosaic.shape) // QUICKLOOK_PX), choose_bands(frame.wavelength_nm)[0]
     writer.write_quicklook(stretched(mosaic.thinned(step, bands)).image)
-
-
-def seen_fractions(frame: FieldFrame, detail: StageRef, patch_index: NDArray[np.integer]) -> NDArray[np.float64]:
-    """Return the seen part of each patch, (patch,) 0..1 of its pixels on the scene; 1 where it has none there."""
-    grid = frame.grid
-    covered = patch_pixels(grid, open_mosaic(detail.path / "mosaic.zarr").coverage() > 0)[patch_index]
-    seen: NDArray[np.float64] = covered.mean(axis=(1, 2))
-    there = grid.valid_fraction().ravel()[patch_index]
-    if frame.missing is not None:
-        there = there - patch_pixels(grid, frame.missing)[patch_index].mean(axis=(1, 2))
-    fractions: NDArray[np.float64] = np.divide(seen, there, out=np.ones_like(seen), where=there > 0)
-    return fractions
 
 
 def _there(registration: StageRef | None) -> list[StageRef]:

@@ -64,7 +64,7 @@ def condense_raster(
             seen = score_lines(values, valid, components)
             writer.write_rows(first, seen.scores, seen.quality != UNUSABLE)
             report(0.5 + 0.5 * (first + len(values)) / frame.grid.height)
-        finish_mosaic(writer, frame, 1)
+        finish_mosaic(writer, frame)
 
     params = {"source": RASTER, "scene": scene_key, "grid": asdict(frame.grid), **asdict(signal), **frame.key}
     return Wanted(build, params | {"bands": raster.bands})

@@ -202,7 +202,7 @@ REFERENCES = "references"  # prefix of a capture that is made for the dark and w
 _DIGITS = "0123456789abcdefghijklmnopqrstuv"
 _LONGEST = 14  # b and 64 bits
 _NUMBER = r"(-?\d+(?:p\d+)?|b[0-9a-v]{13})"
-_FORM = re.compile(rf"(.+)_([cf])([xy]){_NUMBER}_{_NUMBER}_(\d+)x(\d+)x(\d+)_(\d+)", re.DOTALL)
+_FORM = re.compile(rf"(.+)_([cf])([xy]){_NUMBER}_{_NUMBER}_(\d+)x(\d+)x(\d+)(?:x(\d+))?_(\d+)", re.DOTALL)
 _KINDS: dict[str, Literal["coarse", "fine"]] = {"c": "coarse", "f": "fine"}
 
 
@@ -219,7 +219,7 @@ def capture_prefix(sweep: Sweep, first: int = 0) -> str:
 
     SettingsError where the sweep's name holds what a folder's name must not, or is too long.
     """
-    sizes = f"{sweep.lines}x{sweep.step}x{sweep.binning}"
+    sizes = f"{sweep.lines}x{sweep.step}x{sweep.binning}" + ("" if sweep.held is None else f"x{sweep.held}")
     place = f"{sweep.kind[0]}{sweep.along}{_written(sweep.swath_px)}_{_written(sweep.start_px)}"
     prefix = f"{sweep.name}_{place}_{sizes}_{first}"
     check_capture(0, 0, prefix)
@@ -231,12 +231,14 @@ def announced(prefix: str) -> Announced | None:
     found = _FORM.fullmatch(prefix)
     if found is None:
         return None
-    name, kind, along, strip, start, *sizes = found.groups()
+    name, kind, along, strip, start, lines, step, binning, held, first = found.groups()
     axis: Axis = "x" if along == "x" else "y"
-    lines, step, binning, first = map(int, sizes)
-    if lines < 1 or step < 1 or binning < 1 or first >= lines:
+    sizes = int(lines), int(step), int(binning)
+    if min(sizes) < 1 or int(first) >= sizes[0] or held == "0":
         return None
-    return Announced(Sweep(name, _KINDS[kind], axis, _number(strip), _number(start), lines, step, binning), first)
+    of_exposure = None if held is None else int(held)
+    sweep = Sweep(name, _KINDS[kind], axis, _number(strip), _number(start), *sizes, held=of_exposure)
+    return Announced(sweep, int(first))
 
 
 def _written(value: float) -> str:
@@ -278,7 +280,7 @@ class CapturePath:
 
     def frames_at(self, index: int) -> int | None:
         """Frames that edges were counted of, where the cell ``index`` was played last; None within a line."""
-        frames, rest = divmod(index + 1 - LEAD, self.sweep.step)
+        frames, rest = divmod(index + 1 - LEAD, self.sweep.positions)
         return None if rest else frames
 
 
@@ -301,12 +303,13 @@ def path_of(sweep: Sweep, lines: tuple[int, int], camera: LineCamera, *, trigger
     cells, middle = (
         wire_positions(some) for some in (np.concatenate([lead, held]), line_positions(sweep, camera)[slice(*lines)])
     )
-    return CapturePath(sweep, *lines, cells, middle, sweep.step * 1000 / exposing(camera, sweep).frame_ms, triggered)
+    rate_hz = sweep.positions * 1000 / exposing(camera, sweep).frame_ms
+    return CapturePath(sweep, *lines, cells, middle, rate_hz, triggered)
 
 
 def can_trigger(pulses: Pulses, sweep: Sweep) -> bool:
     """Return whether the pulses at the mirror's input step through this sweep: one a position is needed."""
-    return pulses == "position" or (pulses == "frame" and sweep.step == 1)
+    return pulses == "position" or (pulses == "frame" and sweep.positions == 1)
 
 
 @dataclass(frozen=True)
@@ -399,7 +402,7 @@ def _tied(
         if taken.index_at_end is not None and counted != taken_in_all:
             raise RigError(
                 f"the mirror stands at cell {taken.index_at_end} of its path, after {taken_in_all} frames cell "
-                f"{taken_in_all * path.sweep.step} was expected: edges were lost, or are not one a position (see "
+                f"{taken_in_all * path.sweep.positions} was expected: edges were lost, or are not one a position (see "
                 f"pulses in [rig])"
             )
         last = None if counted is None else int(frames.number.max())

@@ -125,7 +125,7 @@ class SceneView:
     def numbers(self, sweep: Sweep, seen: Floats) -> Ints:
         """Give the line (line,) of the sweep that each exposure (line, step, 2) is nearest to."""
         scan = self._place(seen)[..., 1].mean(axis=1)
-        number = np.rint((scan - sweep.start_px - (sweep.step - 1) / 2) / sweep.step)
+        number = np.rint((scan - sweep.start_px - (sweep.positions - 1) / 2) / sweep.step)
         lines: Ints = np.clip(number, 0, sweep.lines - 1).astype(np.int64)
         return lines
 
@@ -206,7 +206,7 @@ class SceneCamera(CameraDevice):
             return found[0]
         for capture in self.captures[-2:]:  # one may just have ended
             told = announced(_prefix(capture)) if self.wired == "position" else None
-            steps = 1 if told is None else told.sweep.step
+            steps = 1 if told is None else told.sweep.positions
             begins = capture.exposures(from_s - capture.exposure_s, to_s)[:, :1]
             rises = (begins + np.arange(steps) * (capture.exposure_s / steps)).ravel()
             rises = rises[(rises >= from_s) & (rises < to_s)]
@@ -257,7 +257,7 @@ class SceneCamera(CameraDevice):
             names = [f"{capture.folder}-{one}" for one in number]
             viewed = zip(names, positions, strict=True)
             return np.concatenate([self.view.alone(name, place, times_ms, capture.began_s) for name, place in viewed])
-        step = told.sweep.step  # positions during each exposure
+        step = told.sweep.positions  # positions during each exposure
         moments = (np.arange(step) + 0.5) * (capture.exposure_s / step)
         held = self.mirror.sent(middle_s[:, None] - capture.exposure_s / 2 + moments)
         whole_began_s = capture.began_s - told.first * capture.period_s  # had the sweep been taken at once

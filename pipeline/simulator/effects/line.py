@@ -147,7 +147,7 @@ class Smear(Effect):
 
         They vary as the mirror runs: without them its course within an exposure is left out as well.
         """
-        most = max((sweep.step for sweep in probe.sweeps), default=1)
+        most = max((sweep.positions for sweep in probe.sweeps), default=1)
         variance = (most**2 - 1) / 12  # of positions 1 px apart
         if variance == 0:
             return Bound(0.0, "the mirror stands still while a line is exposed")
@@ -173,27 +173,27 @@ class Smear(Effect):
 
 def _courses(sweeps: tuple[Sweep, ...], rig: Rig) -> Iterator[Floats]:
     """Ways of held positions beside their plan, (line, step), of each kind of sweep that has several. [px]"""
-    for sweep in {(one.lines, one.step): one for one in sweeps if one.lines and one.step > 1}.values():
+    for sweep in {(one.lines, one.step): one for one in sweeps if one.lines and one.positions > 1}.values():
         numbers = np.arange(sweep.lines)
         yield transient(rig, sweep, numbers) + beside_plan(rig.mirror.positions_per_line, sweep.step, numbers)
 
 
 def smeared_positions(block: SweepBlock, variant: str) -> Floats:
     """Give the mirror positions (line, step, 2) at which a footprint stands in an exposure."""
-    if variant == POSITIONS and block.sweep.step > 1:
+    if variant == POSITIONS and block.sweep.positions > 1:
         return block.positions
     return block.middle[:, None]
 
 
 def folded_positions(sweep: Sweep, variant: str) -> int:
     """Give how many held positions the footprint itself holds, 1 px apart along the scan."""
-    return sweep.step if variant == FOLDED else 1
+    return sweep.positions if variant == FOLDED else 1
 
 
 def _beside(sweeps: tuple[Sweep, ...], rig: Rig) -> tuple[float, float]:
     found = np.zeros(2)
     for sweep in sweeps:
-        if sweep.lines and sweep.step > 1:
+        if sweep.lines and sweep.positions > 1:
             moved = end_gains(sweep, rig.camera)[..., 1] - [0.0, 1.0]
             found = np.maximum(found, np.abs(moved).max(axis=(0, 1)))
     return float(found[0]), float(found[1])

@@ -303,8 +303,8 @@ class Staircase(Aim):
     cost_ns = MappingProxyType({EXACT: 27.0, CENTRES: 0.01})  # exact: five positions a line instead of one
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
-        positions = block.rig.mirror.positions_per_line
-        scan = beside_plan(positions, block.sweep.step, block.numbers, _parts(positions, block.sweep.step, variant))
+        positions, held = block.rig.mirror.positions_per_line, block.sweep.positions
+        scan = beside_plan(positions, held, block.numbers, _parts(positions, held, variant))
         return np.stack([np.zeros_like(scan), scan], axis=-1)
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
@@ -347,8 +347,8 @@ def _parts(positions: float, step: int, variant: str) -> int:
 
 def _moments(positions: float, sweeps: tuple[Sweep, ...], variant: str) -> tuple[float, float, float]:
     worst = np.zeros(3)
-    for step in {sweep.step for sweep in sweeps}:
-        numbers = np.arange(max(sweep.lines for sweep in sweeps if sweep.step == step))
+    for step in {sweep.positions for sweep in sweeps}:
+        numbers = np.arange(max(sweep.lines for sweep in sweeps if sweep.positions == step))
         ways = beside_plan(positions, step, numbers, _parts(positions, step, EXACT))
         if variant == CENTRES:
             ways = ways - (ways.mean(axis=1, keepdims=True) if step == 1 else ways)
@@ -387,7 +387,7 @@ class Lag(Aim):
 def greatest_lag_px(rig: Rig, sweeps: Iterable[Sweep]) -> float:
     """Give the greatest shift along the scan of any line. [px]"""
     worst = 0.0
-    for sweep in {(one.lines, one.step): one for one in sweeps if one.lines}.values():
+    for sweep in {(one.lines, one.step, one.positions): one for one in sweeps if one.lines}.values():
         numbers = np.arange(sweep.lines)
         off = transient(rig, sweep, numbers)
         worst = max(worst, float(np.abs(off).mean(axis=1).max()))
@@ -398,9 +398,9 @@ def transient(rig: Rig, sweep: Sweep, numbers: NDArray[np.int64]) -> Floats:
     """Give the mean shift along the scan over each held position of some lines, (line, step). [px]"""
     camera, mirror = rig.camera, rig.mirror
     pace = 2 * math.pi * mirror.natural_hz * 1e-3  # [1/ms]
-    period, held = pace * camera.frame_ms, pace * camera.exposure_ms / sweep.step
+    period, held = pace * camera.frame_ms, pace * camera.exposure_ms / sweep.positions
     start = _at_start(mirror, sweep, period, held)
-    time = numbers[:, None] * period + np.arange(sweep.step) * held
+    time = numbers[:, None] * period + np.arange(sweep.positions) * held
     impulse, rise = responses(time, mirror.damping)
     place: Floats = start[0] * (1 - rise) + start[1] * impulse
     rate = -start[0] * impulse + start[1] * (1 - rise - 2 * mirror.damping * impulse)
@@ -466,11 +466,11 @@ def _steps(mirror: MirrorMotion, sweep: Sweep, period: float, held: float) -> tu
 
     A pattern is a line with its number of positions, rounded, or one position that is held for several lines.
     """
-    wanted = mirror.positions_per_line * sweep.step
+    wanted = mirror.positions_per_line * sweep.positions
     if wanted < 1:
         return np.array([period / wanted]), sweep.step / wanted, period / wanted
     count = min(max(round(wanted), 1), _RAMP)
-    exposed = held * sweep.step
+    exposed = held * sweep.positions
     return period - np.arange(count) * exposed / count, sweep.step / count, period
 
 
