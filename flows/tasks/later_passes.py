@@ -93,12 +93,10 @@ class LaterPasses:
         Exposures are tried first, then every second line, then free swaths.
         """
         first = exposing(self.camera, self.plan.coarse[0])
-        longest = min(self.camera.exposure_ms, record.exposures_ms[-1])
-        tried = np.geomspace(record.exposures_ms[0], longest, EXPOSURES).round(1).tolist()
+        shortest, longest = record.offered_ms(self.camera)
+        tried = np.geomspace(shortest, longest, EXPOSURES).round(1).tolist()
         between = lines_between(self.plan.full, self.plan.coarse if self.interlaces else [])
-        everything_ms = longest_exposure(
-            self.plan.fine_s, between, self.camera, self.cost, record.exposures_ms[0], longest
-        )
+        everything_ms = longest_exposure(self.plan.fine_s, between, self.camera, self.cost, shortest, longest)
         tried = sorted({*tried, *([] if everything_ms is None else [everything_ms])})
         known: dict[tuple[int, float, bool], FinePlan] = {}
 
@@ -106,7 +104,7 @@ class LaterPasses:
             if (key := (step, exposure_ms, own_swaths)) not in known:
                 again = step / self.plan.coarse[0].step if own_swaths and self.interlaces else 0.0
                 mean_ms = merged_ms(first.exposure_ms, exposure_ms, again)  # of the lines that a run then has
-                expected = record.expected(step, float(np.clip(mean_ms, record.exposures_ms[0], longest)))
+                expected = record.expected(step, float(np.clip(mean_ms, shortest, longest)))
                 iou = np.array([expected.get(name, expected[MIOU]) for name in class_names])
                 gain = worth(errors.expected_gain((1 - iou) / (1 + iou)))
                 known[key] = self.within(gain, step=step, exposure_ms=exposure_ms, own_swaths=own_swaths)

@@ -274,13 +274,13 @@ class SurveyRun(CaptureRun):
     @property
     def light(self) -> LineSpec:
         """Return how every line in the camera's own exposure is captured."""
-        return LineSpec(self.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
+        return LineSpec(self.camera.exposure_ms * self.scene.light_fraction / DEFAULT_EXPOSURE_MS)
 
     @property
     def scan_record(self) -> ScanPerformance | None:
         """Return what the weights record of uniform scans, if anything."""
         content = self.described.record.get("scans")
-        return None if content is None else ScanPerformance.read(content)
+        return None if content is None else ScanPerformance.read(content, self.scene.light_fraction)
 
     @property
     def unknown(self) -> UnknownRule | None:
@@ -451,7 +451,8 @@ def _plan_capture(
     if is_part and prior is not None:
         assert settings.seconds is not None  # checked with the settings
         limits = {"max_age": settings.max_age, "skip_below_error": settings.skip_below_error}
-        layout, extent, words = choose_extent(layout, prior, described, path, seconds=settings.seconds, **limits)
+        light = settings.sky.fraction_of_clear
+        layout, extent, words = choose_extent(layout, prior, described, path, light, seconds=settings.seconds, **limits)
         extent_notes = (words,)
     scans = choose_uniform_scan(layout, described, path, bands, settings)
     layout, plan, settings, plan_notes = lay_out_passes(layout, scans, described, settings)
@@ -469,6 +470,7 @@ def _scene_for(
     pixels = None
     if recorded is not None:
         scene, notes = recorded.scene()
+        scene = scene.in_light(settings.sky.fraction_of_clear)
     elif settings.is_map:
         pixels, scene, notes = open_map(settings, model.described.class_names)
     else:

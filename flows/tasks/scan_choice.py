@@ -81,7 +81,7 @@ def choose_uniform_scan(
                 "kept for validation"
             )
         return ScanChoice()
-    record = ScanPerformance.read(content)
+    record = ScanPerformance.read(content, settings.sky.fraction_of_clear)
     goals = {} if settings.goal is None else parse_goals(settings.goal)
     for name in goals:
         if name not in record.scores:
@@ -120,16 +120,17 @@ def lay_out_passes(
     settings nor a record decide, every line is captured. Raises what `PassLayout.plan` does.
     """
     chosen, content = scans.chosen, weights.record.get("scans")
+    record = None if content is None else ScanPerformance.read(content, settings.sky.fraction_of_clear)
     if settings.zooms:
         zoomed = replace(layout, step=None)
-        if content is not None and settings.seconds is not None and settings.coarse_exposure_ms is None:
-            first = first_exposure(zoomed, ScanPerformance.read(content), settings.seconds)
+        if record is not None and settings.seconds is not None and settings.coarse_exposure_ms is None:
+            first = first_exposure(zoomed, record, settings.seconds)
             exposure_ms = None if first is None else first[0]
             zoomed, settings = _exposing_first(zoomed, settings, exposure_ms)
         return zoomed, zoomed.plan(settings.budget, settings.seconds), settings, ()
-    if chosen is not None and layout.step is None and content is not None and _may_zoom(layout, settings):
+    if chosen is not None and layout.step is None and record is not None and _may_zoom(layout, settings):
         seconds = settings.seconds or chosen.seconds
-        first = first_exposure(layout, ScanPerformance.read(content), seconds)
+        first = first_exposure(replace(layout, step=None), record, seconds)
         if first is not None and first[1] >= chosen.expected[MIOU] - ZOOM_LOSS:
             zoomed, settings = _exposing_first(layout, replace(settings, zoom=ALWAYS, seconds=seconds), first[0])
             return zoomed, zoomed.plan(None, seconds), settings, ()
@@ -159,7 +160,7 @@ def first_exposure(layout: PassLayout, record: ScanPerformance, seconds: float) 
     Of exposures that are nearly as good for that the longest is taken, since some places are not captured again.
     """
     camera, cost, full = layout.camera, layout.cost, layout.sweeps()[2]
-    shortest, longest = record.exposures_ms[0], min(camera.exposure_ms, record.exposures_ms[-1])
+    shortest, longest = record.offered_ms(camera)
     found: list[tuple[float, float]] = []
     for first_ms in exposures_between(shortest, longest):
         first = every_nth(full, exposure_ms=first_ms)
