@@ -215,6 +215,7 @@ def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
     if (
         run.map_scores is None
         or step is None
+        or not run.plan.plain
         or settings.extent != EXTENT_WHOLE
         or run.settings.macs is not None
         or remembers

@@ -41,7 +41,6 @@ from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.grid import patch_pixels
 from pipeline.planning.coverage import on_scene
 from pipeline.planning.fine_pass import FinePlan
-from pipeline.planning.interlaced import FIRST_STEP
 from pipeline.planning.prices import SavingEntry, capture_savings
 from pipeline.planning.uniform_scans import format_scan
 from storage.archive.keys import StageRef
@@ -258,7 +257,7 @@ def _format_asked(run: SurveyRun) -> str:
         return "raster, taken as it is"
     if run.plan.plain:
         return format_scan(run.settings.scan_step or 1, run.settings.scan_exposure_ms or run.camera.exposure_ms)
-    first = format_scan(FIRST_STEP, run.settings.coarse_exposure_ms or run.camera.exposure_ms)
+    first = format_scan(run.plan.coarse[0].step, run.settings.coarse_exposure_ms or run.camera.exposure_ms)
     return f"first {first}, then the lines between where they promise most"
 
 
@@ -326,7 +325,7 @@ def _partly_seen(run: SurveyRun, mosaic: StageRef, plan: FinePlan) -> int:
     kinds = open_mosaic(mosaic.path / "mosaic.zarr").captures()
     if kinds is None:
         return 0
-    coarse = np.array([step >= FIRST_STEP for _, step, _ in kinds[0]])[kinds[1]]
+    coarse = np.array([step >= run.plan.coarse[0].step for _, step, _ in kinds[0]])[kinds[1]]
     return int(np.count_nonzero(patch_pixels(run.grid, coarse)[plan.patch_index].any(axis=(1, 2))))
 
 

@@ -149,6 +149,7 @@ OF_THE_RUN = (
     "weights",
     "unknown",
 )
+OF_ZOOM = ("seconds", "scan_step")  # settings of a uniform scan that a first pass has too
 BUILT_IN_WEIGHTS = "farm"
 FLAGS = {"sky.light": "sky"}  # of settings in tables whose flag has another name
 
@@ -345,7 +346,7 @@ def anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:
 
 def _contradictions(given: set[str], origin: Mapping[str, str], *, zooms: bool) -> Iterator[str]:
     """Yield settings of a uniform scan beside some of a survey that zooms, or those that choose it beside it itself."""
-    plain = [place_of(key, origin.get(key)) for key in UNIFORM if key in given and not (zooms and key == "seconds")]
+    plain = [place_of(key, origin.get(key)) for key in UNIFORM if key in given and not (zooms and key in OF_ZOOM)]
     if zooms and plain:
         yield f"{plain[0]} asks for one uniform scan of the field, and --zoom always for lines between; leave one out"
     chosen = OF_CHOOSING if given & set(SPARING) else ()
@@ -356,7 +357,7 @@ def _contradictions(given: set[str], origin: Mapping[str, str], *, zooms: bool) 
             "again; leave one of them out"
         )
     by_hand = [place_of(key, origin.get(key)) for key in ("scan_step", "scan_exposure_ms", "scan") if key in given]
-    if by_hand and given & {"seconds", "bytes_raw", "goal"}:
+    if by_hand and not zooms and given & {"seconds", "bytes_raw", "goal"}:
         yield f"{plain[0]} leaves the choice of the scan to the weights' record, {by_hand[0]} makes it: leave one out"
     if "scan_exposure_ms" in given and "scan_step" not in given:
         yield f"{by_hand[0]} is for a uniform scan: give --scan-step too (1 for every line), or --coarse-exposure-ms"

@@ -263,7 +263,13 @@ class Settings:
         why=INSTEAD,
     )
     scan_step: int | None = stated(
-        None, "One uniform scan with lines so far apart, chosen by hand", "px", 1, MOST_STEP, example=2, why=INSTEAD
+        None,
+        "One uniform scan with lines so far apart, chosen by hand; with zoom the lines of the first pass",
+        "px",
+        1,
+        MOST_STEP,
+        example=2,
+        why=INSTEAD,
     )
     scan_exposure_ms: float | None = stated(
         None, "Exposure of that scan's lines; by default the camera's", "ms", 0.5, 10_000, example=25.0, why=INSTEAD
@@ -412,8 +418,7 @@ class Settings:
     @property
     def plain(self) -> bool:
         """Return whether a uniform scan is asked for, or a raster: all of the field is there at once."""
-        asked = [name for name in UNIFORM if getattr(self, name) is not None and not (self.zooms and name == "seconds")]
-        return self.is_map or bool(asked)
+        return self.is_map or (not self.zooms and any(getattr(self, name) is not None for name in UNIFORM))
 
     @property
     def zooms(self) -> bool:

@@ -57,6 +57,7 @@ class PassLayout:
     exposure_ms: float | None = None  # of a uniform scan; None: the camera's
     coarse_exposure_ms: float | None = None
     extent: str = EXTENT_WHOLE  # the lines of a uniform scan that are looked at
+    first_step: int = FIRST_STEP  # pixels from line to line of the first of several passes
     as_taken: bool = False  # the uniform scan that a recording is
     shown: NDArray[np.bool_] | None = None  # (patch,) that lines show; None: all
     recorded: RecordedPasses | None = None  # whose lines the passes take
@@ -75,10 +76,11 @@ class PassLayout:
             settings.camera,
             settings.cost,
             settings.pointing_px,
-            settings.scan_step,
+            None if settings.zooms else settings.scan_step,
             settings.scan_exposure_ms,
             settings.coarse_exposure_ms,
             settings.extent,
+            FIRST_STEP if settings.scan_step is None else settings.scan_step,
             settings.scan == RECORDED,
             shown,
             recorded,
@@ -102,11 +104,11 @@ class PassLayout:
         elif seconds is not None:
             if seconds < coarse_s:
                 raise BudgetError(
-                    f"--seconds {seconds:g} does not pay for the first pass of every {FIRST_STEP}th line, "
+                    f"--seconds {seconds:g} does not pay for the first pass of every {self.first_step}th line, "
                     f"{coarse_s:.1f} s; give more, a shorter --coarse-exposure-ms, or --zoom never"
                 )
             fine_s = seconds - coarse_s
-        overlap = self._overlap(self.step or FIRST_STEP)
+        overlap = self._overlap(self.step or self.first_step)
         margin = 2 * self.pointing_px
         plain = budget is None and seconds is None
         return CapturePlan(
@@ -133,8 +135,8 @@ class PassLayout:
             step, overlap, exposure_ms = self.step, self._overlap(self.step), self.exposure_ms
             scan_passes = uniform_sweeps(grid, camera, along, step=step, exposure_ms=exposure_ms, overlap_px=overlap)
         else:
-            overlap, exposure_ms = self._overlap(FIRST_STEP), self.coarse_exposure_ms
-            scan_passes = every_nth(full_sweeps(grid, camera, along, overlap_px=overlap), exposure_ms=exposure_ms)
+            overlap, exposure_ms = self._overlap(self.first_step), self.coarse_exposure_ms
+            scan_passes = every_nth(full_sweeps(grid, camera, along, overlap_px=overlap), self.first_step, exposure_ms)
         scan_passes = cut(scan_passes)
         if self.extent != EXTENT_WHOLE:
             scan_passes = sweeps_of_runs(scan_passes, parse_extent_runs(self.extent))

@@ -90,7 +90,6 @@ class LaterPasses:
         """Return the plan that is expected to add most to the mIoU, by the record of uniform scans.
 
         ``errors`` are those of the first pass's map; ``worth`` leaves of (patch,) gains what the survey is after.
-        Exposures are tried first, then every second line, then free swaths.
         """
         first = exposing(self.camera, self.plan.coarse[0])
         shortest, longest = record.offered_ms(self.camera)
@@ -110,14 +109,19 @@ class LaterPasses:
                 known[key] = self.within(gain, step=step, exposure_ms=exposure_ms, own_swaths=own_swaths)
             return known[key]
 
-        low, high = 0, len(tried) - 1
-        while low < high:  # the gain rises with the exposure, and falls again where too few lines are paid for
-            middle = (low + high) // 2
-            now, longer = (plan_for(1, tried[one], True).expected_gain for one in (middle, middle + 1))
-            low, high = (low, middle) if now >= longer else (middle + 1, high)
-        for step, own in ((2, True), (1, False)):
-            if step in record.steps and self.interlaces and self.recorded is None:
-                plan_for(step, tried[low], own)
+        def longest_that_pays(step: int) -> float:
+            """Return the best exposure: the gain rises with it, and falls again where too few lines are paid for."""
+            low, high = 0, len(tried) - 1
+            while low < high:
+                middle = (low + high) // 2
+                now, longer = (plan_for(step, tried[one], True).expected_gain for one in (middle, middle + 1))
+                low, high = (low, middle) if now >= longer else (middle + 1, high)
+            return float(tried[low])
+
+        for step in (step for step in record.steps if step < self.plan.coarse[0].step):
+            exposure_ms = longest_that_pays(step)
+            if step == 1 and self.interlaces and self.recorded is None:
+                plan_for(step, exposure_ms, False)
         (step, exposure_ms, _), plan = max(known.items(), key=lambda one: (one[1].expected_gain, -one[1].seconds))
         if plan.expected_gain < LEAST_GAIN:
             nothing = f"later lines are expected to add {100 * plan.expected_gain:.2f} points; none are captured"

@@ -57,7 +57,6 @@ from pipeline.geometry.scan import Sweep
 from pipeline.ground.field_places import PosedField
 from pipeline.ground.map_grid import GroundGrid
 from pipeline.lazy import Once, deferred
-from pipeline.planning.interlaced import FIRST_STEP
 from pipeline.planning.uniform_scans import ScanPerformance
 from pipeline.rectify.placed import PixelGrid, place
 from pipeline.rectify.region import plan_tiles
@@ -268,7 +267,7 @@ class SurveyRun(CaptureRun):
         settings, light = self.settings, self.light.light
         exposure_ms, step = settings.scan_exposure_ms, settings.scan_step or 1
         if not self.plan.plain:
-            exposure_ms, step = settings.coarse_exposure_ms, FIRST_STEP
+            exposure_ms, step = settings.coarse_exposure_ms, self.plan.coarse[0].step
         return LineSpec(light * (exposure_ms or self.camera.exposure_ms) / self.camera.exposure_ms, step)
 
     @property
@@ -456,7 +455,7 @@ def _plan_capture(
         extent_notes = (words,)
     scans = choose_uniform_scan(layout, described, path, bands, settings)
     layout, plan, settings, plan_notes = lay_out_passes(layout, scans, described, settings)
-    settings = replace(settings, extent=layout.extent, scan_step=layout.step, scan_exposure_ms=layout.exposure_ms)
+    settings = replace(settings, extent=layout.extent)
     return _PlannedCapture(settings, plan, scans, extent, (*plan_notes, *extent_notes))
 
 

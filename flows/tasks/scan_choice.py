@@ -14,7 +14,7 @@ from flows.tasks.capture_plan import CapturePlan, PassLayout
 from models.weights.files import Description
 from pipeline.errors import BudgetError, NotRecordedError, SettingsError, WeightsError
 from pipeline.geometry.scan import Sweep
-from pipeline.planning.interlaced import FIRST_STEP, every_nth, lines_between, merged_ms
+from pipeline.planning.interlaced import FIRST_STEP, FIRST_STEPS, every_nth, lines_between, merged_ms
 from pipeline.planning.uniform_scans import (
     LOSS,
     MIOU,
@@ -121,60 +121,73 @@ def lay_out_passes(
     """
     chosen, content = scans.chosen, weights.record.get("scans")
     record = None if content is None else ScanPerformance.read(content, settings.sky.fraction_of_clear)
+    first, seconds = None, settings.seconds
     if settings.zooms:
-        zoomed = replace(layout, step=None)
-        if record is not None and settings.seconds is not None and settings.coarse_exposure_ms is None:
-            first = first_exposure(zoomed, record, settings.seconds)
-            exposure_ms = None if first is None else first[0]
-            zoomed, settings = _exposing_first(zoomed, settings, exposure_ms)
-        return zoomed, zoomed.plan(settings.budget, settings.seconds), settings, ()
-    if chosen is not None and layout.step is None and record is not None and _may_zoom(layout, settings):
-        seconds = settings.seconds or chosen.seconds
-        first = first_exposure(replace(layout, step=None), record, seconds)
-        if first is not None and first[1] >= chosen.expected[MIOU] - ZOOM_LOSS:
-            zoomed, settings = _exposing_first(layout, replace(settings, zoom=ALWAYS, seconds=seconds), first[0])
-            return zoomed, zoomed.plan(None, seconds), settings, ()
+        layout = replace(layout, first_step=settings.scan_step or FIRST_STEP, step=None)
+        if record is not None and seconds is not None and settings.coarse_exposure_ms is None:
+            first = choose_first_pass(layout, record, seconds)
+    elif chosen is not None and record is not None and _may_zoom(layout, settings):
+        seconds = seconds or chosen.seconds
+        first = choose_first_pass(layout, record, seconds)
+        if first is not None and first.expected < chosen.expected[MIOU] - ZOOM_LOSS:
+            first = None
+    if first is not None:
+        settings = replace(settings, zoom=ALWAYS, seconds=seconds, coarse_exposure_ms=first.exposure_ms)
+        layout = replace(layout, step=None, first_step=first.step, coarse_exposure_ms=first.exposure_ms)
+    if settings.zooms:
+        settings = replace(settings, scan_step=None if settings.budget is not None else layout.first_step)
+        return layout, layout.plan(settings.budget, seconds), settings, ()
     if chosen is not None and layout.step is None:
         layout = replace(layout, step=chosen.step, exposure_ms=chosen.exposure_ms)
-    if settings.plain or layout.step is not None:
+    settings = replace(settings, scan_step=layout.step, scan_exposure_ms=layout.exposure_ms)
+    if layout.step is not None or settings.plain:
         return layout, layout.plan(None), settings, ()
     every = layout.uniform(1)
     note = "every line is captured: the weights have no record of scans by which fewer would be chosen"
-    return every, every.plan(None), settings, (note,)
+    return every, every.plan(None), replace(settings, scan_step=1), (note,)
 
 
 def _may_zoom(layout: PassLayout, settings: Settings) -> bool:
     """Return whether nothing that was asked for needs a uniform scan."""
     asked = settings.bytes_raw is not None or settings.goal is not None or settings.policy != "gain"
-    return settings.zoom == AUTO and not asked and layout.extent == EXTENT_WHOLE and not layout.as_taken
+    whole = layout.extent == EXTENT_WHOLE and layout.step is None
+    return settings.zoom == AUTO and whole and not asked and not layout.as_taken
 
 
-def _exposing_first(layout: PassLayout, settings: Settings, exposure_ms: float | None) -> tuple[PassLayout, Settings]:
-    return replace(layout, coarse_exposure_ms=exposure_ms), replace(settings, coarse_exposure_ms=exposure_ms)
+@dataclass(frozen=True)
+class FirstPass:
+    """Lines of a first pass, and the mIoU of a field of which every place is captured again."""
+
+    step: int
+    exposure_ms: float
+    expected: float
 
 
-def first_exposure(layout: PassLayout, record: ScanPerformance, seconds: float) -> tuple[float, float] | None:
-    """Choose the exposure of a first pass, and tell the mIoU where all lines between follow; None where none ends.
+def choose_first_pass(layout: PassLayout, record: ScanPerformance, seconds: float) -> FirstPass | None:
+    """Choose the lines of a first pass that ends in time; None where none does.
 
     Any field is served so: one of which every place pays is scanned as a uniform scan, whose lines come in two turns.
-    Of exposures that are nearly as good for that the longest is taken, since some places are not captured again.
+    Of those that are nearly as good for that the closest lines are taken, and of these the longest exposure.
     """
     camera, cost, full = layout.camera, layout.cost, layout.sweeps()[2]
     shortest, longest = record.offered_ms(camera)
-    found: list[tuple[float, float]] = []
-    for first_ms in exposures_between(shortest, longest):
-        first = every_nth(full, exposure_ms=first_ms)
-        left_s = seconds - cost.seconds(first, camera)
-        if left_s < 0:
-            break
-        scores = [record.expected(FIRST_STEP, first_ms)[MIOU]] if FIRST_STEP in record.steps else [0.0]
-        for step in (1, 2):
-            rest_ms = longest_exposure(left_s, lines_between(full, first, step=step), camera, cost, shortest, longest)
-            if rest_ms is not None and step in record.steps:
-                scores.append(record.expected(step, merged_ms(first_ms, rest_ms, step / FIRST_STEP))[MIOU])
-        found.append((first_ms, max(scores)))
-    best = max((score for _, score in found), default=0.0)
-    return max((one for one in found if one[1] >= best - LOSS), default=None)
+    found: list[FirstPass] = []
+    for first_step in (step for step in FIRST_STEPS if step in record.steps):
+        for first_ms in exposures_between(shortest, longest):
+            first = every_nth(full, first_step, first_ms)
+            left_s = seconds - cost.seconds(first, camera)
+            if left_s < 0:
+                break
+            scores = [0.0]
+            for step in (step for step in record.steps if step < first_step):
+                rest = lines_between(full, first, step=step)
+                rest_ms = longest_exposure(left_s, rest, camera, cost, shortest, longest)
+                if rest_ms is not None:
+                    scores.append(record.expected(step, merged_ms(first_ms, rest_ms, step / first_step))[MIOU])
+            found.append(FirstPass(first_step, first_ms, max(scores)))
+    best = max((one.expected for one in found), default=0.0)
+    good = [one for one in found if one.expected >= best - LOSS]
+    return max(good, key=lambda one: (-one.step, one.exposure_ms), default=None)
 
 
 def as_figures(scan: UniformScan | None) -> dict[str, Any] | None:

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pipeline.geometry.scan import Sweep
 
 FIRST_STEP = 4  # full scan's positions from line to line of the first pass
+FIRST_STEPS = (4, 8)  # that may be chosen
 
 
 def merged_ms(first_ms: float, later_ms: float, first_fraction: float) -> float:
