@@ -17,10 +17,12 @@ from pipeline.geometry.scan import CostModel, Sweep, exposing
 from pipeline.planning.coverage import field_px
 from pipeline.planning.fine_pass import FinePlan, plan_fine
 from pipeline.planning.interlaced import lines_between, merged_ms
+from pipeline.planning.prices import prices_of
 from pipeline.planning.uniform_scans import MIOU, ScanPerformance, format_scan, longest_exposure
 
 LEAST_GAIN = 1e-3  # of mIoU that later lines are expected to add; for less none are captured
 EXPOSURES = 7  # that are tried, evenly by their logarithm
+PLANNED = 2  # of the kinds of lines that could gain most
 TRIES = 5  # to fit runs into the seconds that are left
 Scores = NDArray[np.float64]
 
@@ -39,6 +41,32 @@ class LaterPasses:
     def interlaces(self) -> bool:
         """Return whether lines can lie between others: not where the mirror may look beside the plan."""
         return not self.plan.margin_px
+
+    @property
+    def _apart(self) -> int:
+        """Return the distance of the first pass's lines [px]."""
+        return self.plan.coarse[0].step
+
+    def _exposures(self, record: ScanPerformance, step: int) -> list[float]:
+        """Return the exposures to try, that which takes all of the field in time among them [ms]."""
+        shortest, longest = record.offered_ms(self.camera)
+        tried = np.geomspace(shortest, longest, EXPOSURES).round(1).tolist()
+        between = lines_between(self.plan.full, self.plan.coarse if self.interlaces else [], step=step)
+        last = longest_exposure(self.plan.fine_s, between, self.camera, self.cost, shortest, longest)
+        return sorted({*tried, *([] if last is None else [last])})
+
+    def _most_gain(self, gain: Scores, step: int, exposure_ms: float) -> float:
+        """Return what rows of patches along the lines could gain at most in the seconds left, were runs free."""
+        grid, along_x = self.grid, self.plan.along == "x"
+        lines = grid.patch * (1 / step - (1 / self._apart if self.interlaces else 0.0))
+        price = lines * prices_of(replace(self.camera, exposure_ms=exposure_ms), self.cost).even_line_s
+        centres = np.array(sorted({sweep.swath_px for sweep in self.plan.coarse}))
+        row, column = np.divmod(np.arange(len(gain)), grid.patch_shape[1])
+        across, down = (column, row) if along_x else (row, column)
+        middle = (across + 0.5) * grid.patch - field_px(grid, self.plan.along)[0] / 2
+        swath = np.abs(middle[:, None] - centres).argmin(axis=1)
+        rows = np.bincount(swath * (int(down.max()) + 1) + down, np.maximum(gain, 0.0))
+        return float(np.sort(rows)[::-1][: int(self.plan.fine_s / price)].sum())
 
     def within(
         self, gain: Scores, *, step: int = 1, exposure_ms: float | None = None, own_swaths: bool = True
@@ -91,38 +119,23 @@ class LaterPasses:
 
         ``errors`` are those of the first pass's map; ``worth`` leaves of (patch,) gains what the survey is after.
         """
-        first = exposing(self.camera, self.plan.coarse[0])
-        shortest, longest = record.offered_ms(self.camera)
-        tried = np.geomspace(shortest, longest, EXPOSURES).round(1).tolist()
-        between = lines_between(self.plan.full, self.plan.coarse if self.interlaces else [])
-        everything_ms = longest_exposure(self.plan.fine_s, between, self.camera, self.cost, shortest, longest)
-        tried = sorted({*tried, *([] if everything_ms is None else [everything_ms])})
-        known: dict[tuple[int, float, bool], FinePlan] = {}
-
-        def plan_for(step: int, exposure_ms: float, own_swaths: bool) -> FinePlan:
-            if (key := (step, exposure_ms, own_swaths)) not in known:
-                again = step / self.plan.coarse[0].step if own_swaths and self.interlaces else 0.0
+        first, steps = exposing(self.camera, self.plan.coarse[0]), [one for one in record.steps if one < self._apart]
+        gains: dict[tuple[int, float], Scores] = {}
+        for step in steps:
+            for exposure_ms in self._exposures(record, step):
+                again = step / self._apart if self.interlaces else 0.0
                 mean_ms = merged_ms(first.exposure_ms, exposure_ms, again)  # of the lines that a run then has
-                expected = record.expected(step, float(np.clip(mean_ms, shortest, longest)))
+                expected = record.expected(step, float(np.clip(mean_ms, *record.offered_ms(self.camera))))
                 iou = np.array([expected.get(name, expected[MIOU]) for name in class_names])
-                gain = worth(errors.expected_gain((1 - iou) / (1 + iou)))
-                known[key] = self.within(gain, step=step, exposure_ms=exposure_ms, own_swaths=own_swaths)
-            return known[key]
-
-        def longest_that_pays(step: int) -> float:
-            """Return the best exposure: the gain rises with it, and falls again where too few lines are paid for."""
-            low, high = 0, len(tried) - 1
-            while low < high:
-                middle = (low + high) // 2
-                now, longer = (plan_for(step, tried[one], True).expected_gain for one in (middle, middle + 1))
-                low, high = (low, middle) if now >= longer else (middle + 1, high)
-            return float(tried[low])
-
-        for step in (step for step in record.steps if step < self.plan.coarse[0].step):
-            exposure_ms = longest_that_pays(step)
-            if step == 1 and self.interlaces and self.recorded is None:
-                plan_for(step, exposure_ms, False)
-        (step, exposure_ms, _), plan = max(known.items(), key=lambda one: (one[1].expected_gain, -one[1].seconds))
+                gains[step, exposure_ms] = worth(errors.expected_gain((1 - iou) / (1 + iou)))
+        ranked = sorted(gains, key=lambda one: -self._most_gain(gains[one], *one))
+        plans: list[tuple[tuple[int, float], FinePlan]] = []
+        for one in ranked[:PLANNED]:
+            plans.append((one, self.within(gains[one], step=one[0], exposure_ms=one[1])))
+        if self.recorded is None and ranked and plans[0][1].kind != "full":
+            one = max(plans, key=lambda made: made[1].expected_gain)[0]
+            plans.append((one, self.within(gains[one], step=one[0], exposure_ms=one[1], own_swaths=False)))
+        (step, exposure_ms), plan = max(plans, key=lambda made: (made[1].expected_gain, -made[1].seconds))
         if plan.expected_gain < LEAST_GAIN:
             nothing = f"later lines are expected to add {100 * plan.expected_gain:.2f} points; none are captured"
             return replace(plan, sweeps=[], patch_index=np.empty(0, np.intp), seconds=0.0, reason=nothing)
