@@ -223,7 +223,7 @@ def _visit(archive: Archive, run: Run, row: Row, shown: ClassMap) -> dict[str, s
 
 
 def _format_row(receipt: Mapping[str, Any]) -> str:
-    """Seconds spent, and what became of the prior map."""
+    """Return a row of the table: the seconds spent, and the use of the prior map."""
     capture, memory = (receipt.get("savings") or {}).get("capture_s") or {}, receipt.get("memory")
     seconds = known_number(capture.get("done"))
     parts = [] if seconds is None else [f"{format_seconds(seconds)} at the camera"]

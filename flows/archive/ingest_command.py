@@ -108,7 +108,7 @@ def run_ingest(
 
 
 def hash_files(source: CubeSource, report: Report = lambda done: None) -> list[SourceFile]:
-    """Size and SHA-256 of every file that a cube comes from; names are without folders, but those within a store."""
+    """Return the size and SHA-256 of every file of a cube; names have no folders, except within a store."""
     files: list[SourceFile] = []
     for number, path in enumerate(source.files):
         root = source.root
@@ -119,7 +119,7 @@ def hash_files(source: CubeSource, report: Report = lambda done: None) -> list[S
 
 
 def _next(record: Mapping[str, Any], source: str) -> str:
-    """The command that surveys what was stored: a camera's own numbers as a recording, anything else as a scene."""
+    """Return the command that surveys the stored cube: a camera's numbers as a recording, all others as a scene."""
     words = ["spectralzoom", "survey"]
     if record["source_dtype"].lstrip("<>=|") in ("u1", "u2", "i2"):
         path = Path(source)

@@ -67,12 +67,12 @@ class FieldScale:
         return None if self.area_m2 is None else self.area_m2 / M2_PER_HECTARE
 
     def hectares_per_hour(self, seconds: float) -> float | None:
-        """Ground in an hour of the camera where this field takes so many seconds; None without seconds or metres."""
+        """Return the hectares per hour of the camera for a field of so many seconds; None without seconds or metres."""
         return None if self.hectares is None or seconds <= 0 else self.hectares / seconds * SECONDS_PER_HOUR
 
 
 def field_of_view_deg(shape: tuple[int, int], ifov_rad: float) -> tuple[float, float]:
-    """Angles between the outer edges of a field of (y, x) px around the undeflected direction [deg]."""
+    """Return the angles between the outer edges of a field of (y, x) px around the undeflected direction [deg]."""
     down, across = (2 * np.arctan(size / 2 * ifov_rad) for size in shape)
     return float(np.rad2deg(down)), float(np.rad2deg(across))
 
@@ -115,7 +115,7 @@ def footprint_of(view: GroundView, shape: tuple[int, int]) -> GroundFootprint:
 
 
 def areas_by_number(place: FieldPlace, numbers: NDArray[np.integer], count: int) -> Floats | None:
-    """Sum the ground under a field's pixels by their (y, x) numbers, (count,) [m2]; None where it is unknown.
+    """Return the ground area of a field's numbers in (y, x), (count,) [m2]; None where it is unknown.
 
     Pixels with a number below 0 or from ``count`` on are left out, and those that show no ground.
     """
@@ -148,7 +148,9 @@ class NoPlace:
         return shape
 
     def pixel_areas_m2(self, rows: slice, columns: slice) -> Floats | None:
-        """The ground under some pixels (row, column) [m2], NaN where they show none; None where it is unknown."""
+        """Return the ground under some pixels (row, column) [m2], NaN where they show none; None where it is
+        unknown.
+        """
         size = rows.stop - rows.start, columns.stop - columns.start
         return None if self.pixel_m is None else np.full(size, self.pixel_m**2)
 
@@ -216,7 +218,7 @@ class PosedField:
         return shapely.transform(seen, lambda points: frame.ground_to_map(self.view.scene_to_ground(points[:, ::-1])))
 
     def _seen(self, border_px: float) -> BaseGeometry:
-        """The part of the field that the map reaches, (x, y) from its centre [px]."""
+        """Return the part of the field that the map reaches, (x, y) from its centre [px]."""
         rows, columns = self.shape
         size = rows + 2 * round(border_px), columns + 2 * round(border_px)
         return shapely.Polygon(self.view.outline_px(size, self.grid.least_sink)[:, ::-1])

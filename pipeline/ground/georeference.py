@@ -30,7 +30,7 @@ SAME_SIZE = 1e-6  # by which pixels of one size may differ
 
 
 def zoomed_out(geobox: GeoBox, factor: int, shape: tuple[int, int]) -> GeoBox:
-    """The grid of (y, x) ``shape`` whose pixels are ``factor`` of the given one's a side, from the same corner.
+    """Return the grid of (y, x) ``shape`` from the same corner, with pixels ``factor`` times as long.
 
     The last row and column may reach beyond the given grid: a scene is padded to whole coarse pixels.
     """
@@ -70,14 +70,16 @@ def crs_name(geobox: GeoBox) -> str:
 
 
 def pixel_side_m(geobox: GeoBox) -> float:
-    """Side of the square on the ground that is as large as the middle pixel [m]."""
+    """Return the side of the square that has the area of the middle pixel [m]."""
     rows, columns = geobox.shape
     middle = _m2_of_units(geobox, np.array([columns / 2]), np.array([rows / 2]))
     return float(np.sqrt(abs(float(geobox.affine.determinant)) * middle[0]))
 
 
 def pixel_rows_m2(geobox: GeoBox) -> Iterator[Floats]:
-    """Ground under the pixels of each row, (x,) [m2], from the first row down: of the ellipsoid, at any scale of a map.
+    """Yield the ground area of the pixels of each row, (x,) [m2], from the first row down.
+
+    It is measured on the ellipsoid, at any scale of the map.
 
     A projection's scale is asked for at `TIE_POINTS` places along each side, and linear between: off by 2e-5 in a UTM
     zone.
@@ -93,7 +95,7 @@ def pixel_rows_m2(geobox: GeoBox) -> Iterator[Floats]:
 
 
 def _m2_of_units(geobox: GeoBox, column: Floats, row: Floats) -> Floats:
-    """Square metres of the ellipsoid in one square of the map's unit, at places counted in pixels."""
+    """Return the square metres of the ellipsoid in one square of the map's unit, at places counted in pixels."""
     assert geobox.crs is not None
     crs = pyproj.CRS.from_wkt(geobox.crs.to_wkt())
     degrees, ellipsoid = crs.geodetic_crs, crs.get_geod()
@@ -115,7 +117,7 @@ def _m2_of_units(geobox: GeoBox, column: Floats, row: Floats) -> Floats:
 
 
 def crs_wkt(geobox: GeoBox) -> str:
-    """A grid's CRS as WKT."""
+    """Return a grid's CRS as WKT."""
     assert geobox.crs is not None
     return geobox.crs.to_wkt()
 
@@ -127,7 +129,7 @@ def to_degrees(geobox: GeoBox) -> Places:
 
 
 def degree_m(geobox: GeoBox) -> tuple[float, float]:
-    """Metres of a degree to the north and of one to the east, in the middle of a map."""
+    """Return the metres of a degree to the north and of one to the east, in the middle of a map."""
     middle = geobox.affine * (geobox.shape[1] / 2, geobox.shape[0] / 2)
     lat, lon = to_degrees(geobox)(*np.array(middle)[:, None])[0].tolist()
     geod = pyproj.Geod(ellps="WGS84")

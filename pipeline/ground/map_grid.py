@@ -119,7 +119,7 @@ class MapFrame:
         return point + rise[..., None] * up
 
     def _vertical(self, lon_deg: Floats, lat_deg: Floats) -> Floats:
-        """(..., 3) normals of the ellipsoid at other places, in east, north, up of the foot."""
+        """Return (..., 3) normals of the ellipsoid at other places, in east, north, up of the foot."""
         away = np.deg2rad(lon_deg - self.view.pose.lon_deg)
         lat, foot = np.deg2rad(lat_deg), np.deg2rad(self.view.pose.lat_deg)
         north = np.sin(lat) * np.cos(foot) - np.cos(lat) * np.sin(foot) * np.cos(away)
@@ -141,7 +141,7 @@ class MapFrame:
 
 
 def _stacked(parts: tuple[ArrayLike, ...]) -> Floats:
-    """Coordinates on the last axis; PROJ marks what it cannot do as infinite."""
+    """Return the coordinates on the last axis; PROJ gives infinite ones where it fails."""
     whole = np.stack([np.asarray(part, np.float64) for part in parts], axis=-1)
     return np.where(np.isfinite(whole), whole, np.nan)
 
@@ -185,7 +185,7 @@ class GroundGrid:
         return _between(_between(exact, columns, 1), rows, 0)
 
     def counts(self) -> dict[str, int]:
-        """Scene pixels that the map shows, that meet the ground beyond its reach, and that meet none."""
+        """Return how many scene pixels the map shows, meet the ground beyond its reach, and meet none."""
         view, total = self.frame.view, self.scene_shape[0] * self.scene_shape[1]
         near, ground = (view.count_ground(self.scene_shape, sink) for sink in (self.least_sink, LEAST_SINK))
         return {"mapped_px": near, "beyond_reach_px": ground - near, "no_ground_px": total - ground}
@@ -248,19 +248,22 @@ def median_sink(view: GroundView, scene_shape: tuple[int, int]) -> float:
 
 
 def median_footprint_m(view: GroundView, scene_shape: tuple[int, int]) -> float:
-    """Side of the square that is as large as the median pixel's footprint, of the pixels that meet the ground."""
+    """Return the side of the square with the area of the median footprint of pixels that meet the ground [m]."""
     return float(view.height_m * view.ifov_rad * median_sink(view, scene_shape) ** -1.5)
 
 
 def round_step(step_m: float) -> float:
-    """The nearest of 1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8 times a power of ten, by ratio."""
+    """Return the nearest of 1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8 times a power of ten, by ratio."""
     power = int(np.floor(np.log10(step_m)))
     ratios = np.abs(np.log(np.array(ROUND_STEPS) * 10.0**power / step_m))
     return float(f"{ROUND_STEPS[int(np.argmin(ratios))]:g}e{power}")
 
 
 def _bounds(frame: MapFrame, outline: Floats) -> tuple[float, float, float, float]:
-    """Box on the map around part of a scene, given by its corners [px]; lines of the scene are lines on the ground."""
+    """Return the box on the map around part of a scene, given by its corners [px].
+
+    Lines of the scene are lines on the ground.
+    """
     fraction = np.linspace(0, 1, EDGE_POINTS)[:, None, None]
     sides = outline + fraction * (np.roll(outline, -1, axis=0) - outline)
     places = frame.ground_to_map(frame.view.scene_to_ground(sides.reshape(-1, 2)))

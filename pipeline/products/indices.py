@@ -131,7 +131,7 @@ def find_index(name: str) -> SpectralIndex:
 
 
 def _listed(name: str) -> SpectralIndex:
-    """An index of spyndex's list, its constants filled in."""
+    """Return an index of spyndex's list with its constants."""
     about, bands, constants = spyndex.indices[name], [], {}
     for symbol in about.bands:
         if symbol in spyndex.bands:
@@ -192,7 +192,7 @@ def _spread(wavelength_nm: NDArray[np.float64]) -> str:
 def index_values(
     index: SpectralIndex, values: NDArray[np.floating], wavelength_nm: Sequence[float], *, white: float = 1.0
 ) -> Floats:
-    """Work an index out of the values (..., band) of the bands that `pick_bands` gave, and their wavelengths [nm].
+    """Return an index from the values (..., band) of the bands that `pick_bands` gave, and their wavelengths [nm].
 
     NaN where a band has no value, where the bands are darker than 1 % of ``white`` on the mean, and where the formula
     has no finite value, as by a division by zero.

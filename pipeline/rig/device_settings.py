@@ -57,7 +57,7 @@ class FileServer:
         return f"the camera's file server {self.host}:{self.port}"
 
     def most_s(self, size: int) -> float:
-        """Seconds that a file of ``size`` bytes may take with all its tries."""
+        """Return the seconds that a file of ``size`` bytes may take with all its tries."""
         return 2 * size / (1e3 * self.least_kb_s) + 3 * self.tries * (self.stall_s + self.pause_s)
 
 

@@ -105,7 +105,7 @@ class Archive:
     # --- stages -------------------------------------------------------------------------------------------------------
 
     def ref(self, stage: str, key: str) -> StageRef:
-        """Address of a store, whether it is there or not."""
+        """Return the address of a store, whether it is there or not."""
         return store_at(self.root, stage, key)
 
     def locate(self, address: str) -> Path:
@@ -125,10 +125,10 @@ class Archive:
         return self.root / address
 
     def find(self, stage: str, key: str) -> StageRef | None:
-        """The published store, or None, also where its files were cleared away.
+        """Return the published store; None where there is none or its files were cleared away.
 
-        Sizes are compared with the manifest, content only by `verify`. Raises IncompleteStoreError: it is there,
-        but its manifest or a file is missing, or has another size.
+        Sizes are compared with the manifest, content only by `verify`. Raises IncompleteStoreError: it is there, but
+        its manifest or a file is missing, or has another size.
         """
         ref = store_at(self.root, stage, key)
         if not os.path.lexists(ref.path):
@@ -209,20 +209,26 @@ class Archive:
         return read_manifest(self.root / ref.uri)
 
     def stored_bytes(self, ref: StageRef) -> int:
-        """Size of a store's files by its manifest, as they were made: also of those that were cleared away."""
+        """Return the size of a store's files by its manifest, as they were made.
+
+        Files that were cleared away count too.
+        """
         return made_bytes(self.manifest(ref))
 
     def manifest_hash(self, ref: StageRef) -> str:
-        """SHA-256 of a store's manifest.json, and so of every byte of the store."""
+        """Return the SHA-256 of a store's manifest.json, and so of every byte of the store."""
         return manifest_sha256(self.root / ref.uri)
 
     def manifest_hashes(self, refs: Iterable[StageRef]) -> dict[str, str]:
-        """`manifest_hash` by address, of stores and of all they rest on, for ``RunDraft.publish(rests_on=...)``."""
+        """Return the `manifest_hash` of stores and of all they rest on, by address.
+
+        See ``RunDraft.publish(rests_on=...)``.
+        """
         plain = [store_at(self.root, ref.stage, ref.key) for ref in refs]
         return {ref.uri: manifest_sha256(ref.path) for ref in rests_on(self.root, plain)}
 
     def refs(self, stage: str | None = None) -> list[StageRef]:
-        """Every published store (of one stage), by stage and key."""
+        """Return every published store (of one stage), by stage and key."""
         return published_stores(self.root, stage)
 
     def discard(self, ref: StageRef, *, wait: bool = True, unnamed: bool = False) -> bool:
@@ -285,15 +291,15 @@ class Archive:
         return removed
 
     def now(self) -> datetime:
-        """Time by the clock that tells how old stores are."""
+        """Return the time by the clock that the age of stores is counted by."""
         return datetime.now(UTC)
 
     def size_of(self, uri: str) -> int:
-        """Bytes of all files of a store or run, manifest included, as they are there now."""
+        """Return the bytes of all files of a store or run, manifest included, as they are there now."""
         return bytes_below(self.root / uri)
 
     def sizes(self, uris: Iterable[str]) -> dict[str, int]:
-        """`size_of` stores and runs, by address."""
+        """Return the sizes of stores and runs, as `size_of` counts them, by address."""
         return {uri: self.size_of(uri) for uri in uris}
 
     def kept_bytes(self, run: Run, catalogue: Catalogue) -> int:
@@ -309,11 +315,11 @@ class Archive:
         return self.sizes(sorted({*catalogue.stores, *below, *(uri for uris in below.values() for uri in uris)}))
 
     def take_moved(self) -> int:
-        """Bytes that went to and from a bucket since this was asked last, or the archive was opened."""
+        """Return the bytes that went to and from a bucket since the last call, or since the archive was opened."""
         return 0
 
     def lost_runs(self) -> list[str]:
-        """Addresses of runs whose manifest is gone, so that nothing tells what they name."""
+        """Return the addresses of runs that have lost their manifest, so that their stores are unknown."""
         return [
             f"runs/{path.name}" for path in without_manifest(self.root) if path.parent.name == "runs" and path.is_dir()
         ]
@@ -382,11 +388,11 @@ class Archive:
         return RunDraft(run_id, folder, self.root, release, extends=extends)
 
     def runs(self) -> list[Path]:
-        """Folders of the published runs, oldest first."""
+        """Return the folders of the published runs, oldest first."""
         return published_runs(self.root)
 
     def spool_folder(self, key: str) -> Path:
-        """Folder for the lines of a capture under way; it outlives the process, unlike a staged store."""
+        """Return the folder for the lines of a capture under way; it outlives the process, unlike a staged store."""
         check_name(key)
         folder = self.root / "spool" / key
         with refusals(self.root, "write to the archive"):
@@ -401,7 +407,7 @@ class Archive:
             remove_tree(self.root / "spool" / key)
 
     def take_spooled(self) -> int:
-        """Bytes of the spools that were removed since this was asked last, or the archive was opened."""
+        """Return the bytes of the spools that were removed since the last call, or since the archive was opened."""
         taken, self._spooled = self._spooled, 0
         return taken
 

@@ -56,7 +56,7 @@ def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """Content of a published folder's manifest.
+    """Return the content of a published folder's manifest.
 
     Raises IncompleteStoreError: there is none, it cannot be read, its own seal says that it has changed, or it lists
     what cannot be a file of this folder.
@@ -68,7 +68,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def try_manifest(folder: Path) -> tuple[dict[str, Any], str | None]:
-    """Content of a published folder's manifest and None, or nothing and what is wrong with it."""
+    """Return the content of a published folder's manifest and None, or nothing and its fault."""
     if folder.is_symlink():
         return {}, f"{folder.name} is a link, which is not followed: put there what it leads to"
     try:
@@ -80,7 +80,7 @@ def try_manifest(folder: Path) -> tuple[dict[str, Any], str | None]:
 
 
 def parse_manifest(written: bytes) -> tuple[dict[str, Any], str | None]:
-    """Content of a manifest as it was written and None, or nothing and what is wrong with it."""
+    """Return the content of a manifest's text and None, or nothing and its fault."""
     try:
         text = written.decode()
         content = json.loads(text)
@@ -104,7 +104,7 @@ def parse_manifest(written: bytes) -> tuple[dict[str, Any], str | None]:
 
 
 def manifest_sha256(folder: Path) -> str:
-    """SHA-256 of a published folder's manifest.json: what a run records of each store that it rests on.
+    """Return the SHA-256 of a published folder's manifest.json, which runs record of each store they rest on.
 
     Raises IncompleteStoreError: there is none.
     """
@@ -115,18 +115,18 @@ def manifest_sha256(folder: Path) -> str:
 
 
 def listed_bytes(manifest: Mapping[str, Any]) -> int:
-    """Size of all files that a manifest lists."""
+    """Return the size of all files that a manifest lists."""
     return sum(entry["size"] for entry in manifest["files"].values())
 
 
 def made_bytes(manifest: Mapping[str, Any]) -> int:
-    """Size of all files as they were made, also where they were cleared away since."""
+    """Return the size of all files as they were made, those cleared away since included."""
     size = _table(manifest.get(CLEARED)).get("bytes_before")
     return size if isinstance(size, int) else listed_bytes(manifest)
 
 
 def cleared_facts(before: Mapping[str, Any], sha256: str) -> dict[str, Any]:
-    """Facts for the manifest of a store whose files are cleared away: those of before, and what there was.
+    """Return the facts for the manifest of a store whose files are cleared away: earlier ones, and what was removed.
 
     ``before`` and ``sha256`` are the manifest that it has until then, and the SHA-256 of its file.
     """
@@ -152,7 +152,7 @@ def _table(value: object) -> Mapping[str, Any]:
 
 
 def extended_facts(before: Mapping[str, Any], sha256: str) -> dict[str, Any]:
-    """Facts for the manifest of a run that something is added to; it stays a run of the time at which it was published.
+    """Return the facts for the manifest of a run that is extended; its time of publication stays.
 
     ``before`` and ``sha256`` are the manifest that it has until then, and the SHA-256 of its file.
     """
@@ -219,7 +219,7 @@ def _seal(content: Mapping[str, Any]) -> str:
 
 @cache
 def library_versions() -> Mapping[str, str]:
-    """Versions of the libraries that a stored result may depend on, as installed when they were asked for first."""
+    """Return the installed versions of the libraries that a stored result may depend on."""
     found: dict[str, str] = {}
     for name in _DISTRIBUTIONS:
         with suppress(importlib.metadata.PackageNotFoundError):
@@ -228,7 +228,7 @@ def library_versions() -> Mapping[str, str]:
 
 
 def read_table(path: Path) -> dict[str, Any]:
-    """Content of a file directly in a published store's folder.
+    """Return the content of a file directly in a published store's folder.
 
     Raises IncompleteStoreError: the store's manifest does not list the file, or not one of these bytes.
     """

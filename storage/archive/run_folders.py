@@ -46,7 +46,7 @@ _UNSUPPORTED = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP)
 
 
 def date_of_store(root: Path, uri: str) -> str:
-    """When a store is made: now, or just after the last run that knows one of this address, if the clock was set back.
+    """Return the date of a new store: now, or after the last run that knows its address where the clock was set back.
 
     By its date `verify` tells a store that was made anew from one whose manifest was written later.
     """
@@ -125,7 +125,9 @@ class RunDraft:
         return final
 
     def bytes_published(self, *, rests_on: Mapping[str, str] | None = None, **facts: Any) -> int:
-        """Bytes of the folder, manifest included, were it published now with these facts; see `publish`."""
+        """Return the bytes of the folder, manifest included, if it were published now with these facts; see
+        `publish`.
+        """
         with refusals(self._root, "write to the archive"):
             self._write_manifest(rests_on, facts)
             return bytes_below(self.folder)
@@ -186,7 +188,7 @@ def try_exchange(one: Path, other: Path) -> bool:
 
 
 def unfinished_extensions(root: Path) -> Iterator[Path]:
-    """Whole folders that were about to take the place of a run, whose own name leads to nothing any more."""
+    """Yield whole folders that were about to replace a run and whose run is gone."""
     for part in sorted((root / "runs").glob(f"*{PART_SUFFIX}")):
         facts, problem = try_manifest(part)
         named = part.name.removesuffix(PART_SUFFIX)

@@ -73,7 +73,7 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def to_json(content: Mapping[str, object]) -> str:
-    """JSON text, two spaces a level, in the content's own order; numbers that are not finite become null.
+    """Return JSON text, two spaces a level, in the content's own order; numbers that are not finite become null.
 
     What would steer a terminal or turn words round stands as escapes, as JSON has them.
     """
@@ -82,7 +82,7 @@ def to_json(content: Mapping[str, object]) -> str:
 
 
 def _plain(value: object) -> object:
-    """Plain lists, dictionaries and numbers; numpy's scalars by their ``item``."""
+    """Return plain lists, dictionaries and numbers; numpy's scalars by their ``item``."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

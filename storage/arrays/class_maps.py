@@ -71,7 +71,7 @@ UNKNOWN, UNKNOWN_COLOUR = "unknown", (200, 0, 200)
 
 
 def with_unknown(legend: ClassNames) -> ClassNames:
-    """The classes with one more behind them, for pixels that are unlike all that the weights were trained on."""
+    """Return the classes and one more, for pixels unlike all that the weights were trained on."""
     name = UNKNOWN if UNKNOWN not in legend.names else f"{UNKNOWN}_spectrum"
     return ClassNames((*legend.names, name), np.vstack([legend.colours, np.array([UNKNOWN_COLOUR], np.uint8)]))
 
@@ -139,7 +139,7 @@ def check_named(classes: NDArray[np.integer], count: int) -> None:
 
 
 def class_flags(names: Sequence[str], colours: NDArray[np.uint8]) -> dict[str, Any]:
-    """CF's flag attributes of an image of class indices."""
+    """Return CF's flag attributes of an image of class indices."""
     return {
         "long_name": "class",
         "nodata": UNLABELLED,  # no _FillValue: xarray would make fractions of the numbers
@@ -150,7 +150,7 @@ def class_flags(names: Sequence[str], colours: NDArray[np.uint8]) -> dict[str, A
 
 
 def legend_of(group: zarr.Group) -> ClassNames:
-    """The classes that a group's attributes name."""
+    """Return the classes that a group's attributes name."""
     attributes: dict[str, Any] = dict(group.attrs)
     colours = np.array(attributes.get("class_colours", ()), np.uint8).reshape(-1, 3)
     return ClassNames(tuple(attributes.get("class_names", ())), colours)
@@ -192,7 +192,7 @@ def create_probabilities(
 
 
 def old_class_flags(legend: ClassNames) -> dict[str, Any]:
-    """CF's flag attributes of an image of the classes that pixels had before."""
+    """Return CF's flag attributes of an image of the classes that pixels had before."""
     words = f"class remembered, where the map is sure of another one; {UNLABELLED} everywhere else"
     return {**class_flags(legend.names, legend.colours), "long_name": words}
 
@@ -256,7 +256,7 @@ def write_changes(path: Path, changed: Floats, patch_px: int) -> None:
 
 
 def unpacked_days(packed: NDArray[np.uint16]) -> Floats:
-    """Days of stored ages; NaN where nothing is known."""
+    """Return stored ages in days; NaN where nothing is known."""
     return np.where(packed == NEVER, np.float32(np.nan), packed * np.float32(DAY_STEP)).astype(np.float32)
 
 
@@ -274,9 +274,10 @@ class ProbabilityStore:
         return legend_of(self._group)
 
     def read(self, rows: slice = slice(None), columns: slice = slice(None)) -> tuple[Floats, Floats, Floats]:
-        """Log-probabilities (y, x, class) that sum to 1 once taken to powers, ages in days and light (y, x).
+        """Return log-probabilities (y, x, class), ages in days (y, x) and light (y, x).
 
-        NaN where nothing is known, no light where there was none.
+        The exponentials of the log-probabilities sum to 1. NaN stands where nothing is known; light is NaN where there
+        was none.
         """
         packed = read_array(self._group, "log_probability", np.s_[rows, columns])
         values = (packed * np.float32(STEP) + np.float32(FAINTEST)).astype(np.float32)
@@ -288,11 +289,11 @@ class ProbabilityStore:
         return values, days, np.where(packed_light == DARK, 0, light).astype(np.float32)
 
     def age(self, rows: slice = slice(None), columns: slice = slice(None)) -> Floats:
-        """(y, x) days since a pixel was looked at; NaN where nothing is known."""
+        """Return (y, x) days since each pixel was captured; NaN where nothing is known."""
         return unpacked_days(read_array(self._group, "age", np.s_[rows, columns]))
 
     def old_class(self) -> NDArray[np.uint8] | None:
-        """(y, x) class that a pixel had where it has another now, else 255; None of a first look."""
+        """Return (y, x) earlier classes of pixels that changed, else 255; None for a first visit."""
         return read_array(self._group, OLD_CLASS) if OLD_CLASS in self._group else None
 
     @property
@@ -301,5 +302,5 @@ class ProbabilityStore:
         return int(self._group["changed"].attrs["patch_px"])  # type: ignore[arg-type]
 
     def changed(self) -> Floats | None:
-        """Shares of pixels that changed, by patch; None of a first look."""
+        """Return the fraction of changed pixels of each patch; None for a first visit."""
         return read_array(self._group, "changed") if "changed" in self._group else None

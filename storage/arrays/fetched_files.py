@@ -62,7 +62,7 @@ class FetchedFiles:
         self._sums: dict[str, _Sums] = {}
 
     def size(self, name: str) -> int:
-        """Bytes held of a file; 0 of one that is not there.
+        """Return the number of bytes held of a file; 0 of one that is not there.
 
         Raises NotKept: the disk does not give them, here or in other calls.
         """
@@ -76,7 +76,7 @@ class FetchedFiles:
             raise _unread(path, error) from error
 
     def read(self, name: str, start: int, stop: int) -> bytes:
-        """Some of the bytes held."""
+        """Return some of the bytes held."""
         path = self._path(name)
         try:
             self._compare(name, path)
@@ -168,9 +168,9 @@ class FetchedFiles:
 
 
 def first_unlike(path: Path) -> int | None:
-    """From which byte on a fetched file is not as its sums say; None where all of it is. What is torn is no change.
+    """Return the number of the first byte of a fetched file that its sums contradict; None where all fits.
 
-    Raises OSError: one of both cannot be read.
+    A torn end is no change. Raises OSError: the file or its sums cannot be read.
     """
     found, changed = _agreeing(path)
     return found.reached if changed else None

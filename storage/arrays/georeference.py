@@ -77,7 +77,7 @@ def create_placed_group(
 
 
 def map_attributes(geobox: GeoBox) -> dict[str, Any]:
-    """GeoZarr ``proj:`` and ``spatial:`` attributes of a map; the transform maps pixel corners.
+    """Return the GeoZarr ``proj:`` and ``spatial:`` attributes of a map; the transform maps pixel corners.
 
     Raises PoseError: the grid has no CRS.
     """
@@ -117,7 +117,7 @@ def write_grid_mapping(group: zarr.Group, geobox: GeoBox) -> None:
 
 
 def _axis(crs: CRS, name: str) -> dict[str, str]:
-    """CF's words for one axis of a map."""
+    """Return CF's attributes of one axis of a map."""
     if crs.geographic:
         standard, unit = _DEGREES[name]
         return {"standard_name": standard, "long_name": f"{standard} of the pixel's centre", "units": unit}
@@ -180,7 +180,7 @@ def find_geobox(
 
 
 def _mapping(attributes: Mapping[str, Any], arrays: Mapping[str, zarr.Array[Any]]) -> dict[str, Any]:
-    """Attributes of the grid mapping: the one that the image names, else the only array that could be one."""
+    """Return the attributes of the grid mapping that the image names, else of the only array that could be one."""
     named = str(attributes.get("grid_mapping", "")).split(":")[0].split(" ")[0]
     if named in arrays:
         return dict(arrays[named].attrs)

@@ -68,7 +68,7 @@ class StoredImage:
         return geobox_of_group(self.group)
 
     def rows(self) -> Iterator[tuple[int, NDArray[Any]]]:
-        """Rows with the number of the first, as many at a time as a shard has.
+        """Yield the number of the first row and the rows, as many at a time as a shard has.
 
         Raises IncompleteStoreError: a checksum says that the bytes have changed.
         """
@@ -87,7 +87,10 @@ def open_image(path: Path, name: str) -> StoredImage:
 
 
 def load_bands(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-    """Wavelengths and widths [nm] of the store at ``path``. Raises IncompleteStoreError where they are damaged."""
+    """Return the wavelengths and widths [nm] of the store at ``path``.
+
+    Raises IncompleteStoreError where they are damaged.
+    """
     return read_bands(open_group(path))
 
 

@@ -60,7 +60,9 @@ class AngularGrid:
     geobox: GeoBox | None = None  # of the fine grid, where the scene's file says it
 
     def attributes(self, shape: tuple[int, int]) -> dict[str, Any]:
-        """GeoZarr ``spatial:`` attributes of an image of (y, x) ``shape``; the transform maps pixel corners."""
+        """Return the GeoZarr ``spatial:`` attributes of an image of (y, x) ``shape``; the transform maps pixel
+        corners.
+        """
         step = self.ifov_rad * self.factor
         top, left = (-size / 2 * self.ifov_rad for size in self.scene_shape)
         return {
@@ -79,7 +81,7 @@ class AngularGrid:
 
 
 def grid_of(attributes: Mapping[str, Any]) -> AngularGrid | None:
-    """The grid of angles that a group's attributes record, or None."""
+    """Return the grid of angles that a group's attributes record, or None."""
     record = attributes.get("angular_grid")
     if not isinstance(record, dict):
         return None
@@ -106,7 +108,8 @@ class ArraySpec:
 
 
 def image_spec(dims: Sequence[str], shape: Sequence[int], dtype: str, *, whole: bool = False) -> ArraySpec:
-    """Rows and columns first, all bands in one chunk; a shard is 64 rows of at most 640 columns.
+    """Return the layout of an image: rows and columns first, all bands in one chunk, shards of 64 rows of up to 640
+    columns.
 
     It is one chunk where it is to be read ``whole``, and in images without bands: chunks of few bytes cost more calls
     than unpacking.
@@ -243,7 +246,7 @@ def read_array(group: zarr.Group, name: str, selection: Any = ...) -> NDArray[An
 
 
 def read_bands(group: zarr.Group) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-    """Wavelengths and widths [nm] of a store."""
+    """Return the wavelengths and widths [nm] of a store."""
     return read_array(group, "wavelength"), read_array(group, "fwhm") if "fwhm" in group else None
 
 
@@ -292,7 +295,7 @@ def blank_pixels(path: Path, where: NDArray[np.bool_], images: Mapping[str, floa
 
 
 def blank_coarse(missing: NDArray[np.bool_], factor: int) -> NDArray[np.bool_]:
-    """(y, x) coarse pixels of ``factor`` px a side of which the scene has less than half."""
+    """Return (y, x) which coarse pixels of ``factor`` px a side lie less than half on the scene."""
     starts = [np.arange(0, side, factor) for side in missing.shape]
     gaps = np.add.reduceat(np.add.reduceat(missing.astype(np.int32), starts[0], axis=0), starts[1], axis=1)
     down, across = (np.minimum(factor, side - first) for first, side in zip(starts, missing.shape, strict=True))

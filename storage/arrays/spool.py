@@ -238,7 +238,7 @@ def spool_problems(path: Path) -> Iterator[str]:
 
 
 def line_values(numbers: Sequence[int]) -> str:
-    """Numbers of lines for a message: the first few, and how many more."""
+    """Return the numbers of lines for a message: the first few, and how many follow."""
     named = ", ".join(str(number) for number in numbers[:MOST_NAMED])
     more = f" and {len(numbers) - MOST_NAMED} more" if len(numbers) > MOST_NAMED else ""
     return f"line{'s' if len(numbers) > 1 else ''} {named}{more}"
@@ -255,7 +255,7 @@ def _header(head: bytes) -> dict[str, Any] | None:
 
 
 def _difference(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
-    """First thing in which two headers differ, in words."""
+    """Return the first difference between two headers, in words."""
     have, want = ({**head, **head["header"]} for head in (found, wanted))
     for name in sorted((set(have) | set(want)) - {"header"}):
         if have.get(name) != want.get(name):

@@ -98,7 +98,7 @@ def _refusals_of_gdal(path: Path) -> Iterator[None]:
 
 
 def _write_plain(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> None:
-    """An uncompressed TIFF in strips, block by block, from which GDAL makes the other."""
+    """Write an uncompressed TIFF in strips, block by block, from which GDAL makes the other."""
     (y, x), crs = image.geobox.shape, image.geobox.crs
     profile = {
         "driver": "GTiff",
@@ -149,7 +149,7 @@ def _tag_wavelengths(file: Any, image: CogImage) -> None:
 
 
 def value_span(path: Path, bands: Sequence[int]) -> tuple[float, float]:
-    """Values of some bands, counted from 1, that 2 % of a file's pixels are below and above; 0 and 1 without any.
+    """Return the 2nd and 98th percentile of a file's pixels in some bands, counted from 1; 0 and 1 without any value.
 
     Of at most 512 x 512 pixels of the file.
     """

@@ -80,7 +80,7 @@ _OPTIONS: Mapping[str, Mapping[str, Any]] = {
 
 @contextmanager
 def _writing(path: Path, names: Sequence[str], when: str | None) -> Iterator[Path]:
-    """A folder to write into; GDAL's date of now is ``when``, what it refuses an ArchiveError."""
+    """Yield a folder to write into; GDAL's date of now is ``when``, and its refusals become ArchiveError."""
     pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": when})
     try:
         with written_aside(path.parent, names) as aside:
@@ -149,7 +149,7 @@ def write_task_data(folder: Path, grid: TaskGrid, words: TaskText) -> tuple[Path
 
 
 def _task_file(grid: TaskGrid, words: TaskText, length: int) -> ElementTree.Element:
-    """One planned task of one field with two treatment zones, one of them the grid's."""
+    """Return one planned task of one field with two treatment zones, one of them the grid's."""
     root = ElementTree.Element(
         "ISO11783_TaskData",
         VersionMajor="4",
@@ -188,7 +188,7 @@ def _task_file(grid: TaskGrid, words: TaskText, length: int) -> ElementTree.Elem
 
 
 def ramp_colour(fraction: float, ramp: Sequence[Colour]) -> Colour:
-    """The colour at a fraction, 0 to 1, of a ramp of colours evenly apart."""
+    """Return the colour at a fraction, 0 to 1, of a ramp of colours evenly apart."""
     place = min(max(fraction, 0.0), 1.0) * (len(ramp) - 1)
     low = min(int(place), len(ramp) - 2)
     return tuple(round(a + (place - low) * (b - a)) for a, b in zip(ramp[low], ramp[low + 1], strict=True))

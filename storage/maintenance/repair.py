@@ -108,7 +108,7 @@ def repair(
 
 
 def _hopeless(catalogue: Catalogue, uri: str, versions: Mapping[str, int | str] | None) -> str:
-    """Why a store cannot be made again; empty where it can."""
+    """Return why a store cannot be made again; empty where it can."""
     store, stage = catalogue.stores.get(uri), uri.split("/")[1]
     if catalogue.is_only_copy(uri):
         return "raw lines that cannot be had again: restore them from a copy; lines not named can still be read"
@@ -125,6 +125,6 @@ def _hopeless(catalogue: Catalogue, uri: str, versions: Mapping[str, int | str] 
 
 
 def _settings_text(run: Run) -> str:
-    """Settings in one text, without the archive's place and the notes, which ask for nothing."""
+    """Return the settings as one text, without the archive's place and the notes, which change nothing."""
     asked = {name: value for name, value in run.settings.items() if name not in ("notes", "out")}
     return canonical_json(asked) if asked else ""

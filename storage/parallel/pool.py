@@ -346,7 +346,7 @@ class Cluster(Executor):
         self.client.close()
 
     def count(self) -> int:
-        """Blocks that can be made at a time (WorkerError: there are no workers)."""
+        """Return how many blocks can be made at a time. Raises WorkerError: there are no workers."""
         try:
             self.client.wait_for_workers(1, timeout=ANSWER_S)
         except TimeoutError:

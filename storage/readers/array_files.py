@@ -110,7 +110,7 @@ def open_hdf_cube(path: Path, variable: str | None = None, *, labels: bool = Fal
 
 
 def _bad_bands(arrays: Mapping[str, Any], count: int) -> tuple[int, ...]:
-    """Bands, from 0, that a list of the file marks by 0, as EMIT's of good wavelengths does."""
+    """Return the bands, from 0, that a list of the file marks by 0, as EMIT's of good wavelengths does."""
     for name, array in arrays.items():
         if name.rpartition("/")[2].lower() in GOOD_BANDS and array.shape == (count,):
             return tuple(int(band) for band in np.flatnonzero(array[...] == 0))
@@ -148,7 +148,7 @@ def _other_place(
 
 
 def _prisma_cube(path: Path, level: str, arrays: Mapping[str, FileArray], about: Mapping[str, Any]) -> CubeSource:
-    """Both cubes of a PRISMA product of level 2 as one, its used bands by ascending wavelength.
+    """Return both cubes of a PRISMA product of level 2 as one, its used bands by ascending wavelength.
 
     Their axes are y, band and x. Pixels that are 0 in every band lie outside the swath.
     """
@@ -201,7 +201,7 @@ def _prisma_cube(path: Path, level: str, arrays: Mapping[str, FileArray], about:
 
 
 def _prisma_place(about: Mapping[str, Any], shape: tuple[int, int]) -> tuple[GeoBox | None, tuple[str, ...]]:
-    """The grid between the centres of the upper left and the lower right pixel."""
+    """Return the grid between the centres of the upper left and the lower right pixel."""
     try:
         (west, north), (east, south) = (
             [float(about[f"Product_{corner}corner_{axis}"]) for axis in ("easting", "northing")]
@@ -215,7 +215,7 @@ def _prisma_place(about: Mapping[str, Any], shape: tuple[int, int]) -> tuple[Geo
 
 
 def _in_scope(arrays: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """All arrays by their paths; those of the array's group and of groups above by their names alone, too."""
+    """Return all arrays by their paths; those of the array's group and of groups above by their names alone, too."""
     groups = name.split("/")[:-1]
     found: dict[str, Any] = {}
     for depth in range(len(groups) + 1):
@@ -239,7 +239,7 @@ def _check_array(path: Path, name: str, array: FileArray, *, lines: tuple[int, i
 
 
 def _classic_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
-    """Arrays and attributes of a NetCDF file of version 3, which is no HDF5.
+    """Return the arrays and attributes of a NetCDF file of version 3, which is no HDF5.
 
     The file is read whole: asked for more bytes than it has, it would take the memory for them first.
     """
@@ -259,7 +259,7 @@ def _classic_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
 
 
 def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
-    """Arrays of an HDF5 file by their paths, and the attributes of its root.
+    """Return the arrays of an HDF5 file by their paths, and the attributes of its root.
 
     Only what is kept in this very file: links and virtual arrays may lead anywhere on the disk.
     """
@@ -301,7 +301,9 @@ def _words(about: Mapping[str, Any], item: Any) -> dict[str, Any]:
 
 
 def _plain(attributes: Any) -> dict[str, Any]:
-    """Attributes as Python's own texts and numbers, lists as arrays; those that cannot be read are left out."""
+    """Return the attributes as Python's own texts and numbers, lists as arrays; those that cannot be read are left
+    out.
+    """
     found = {}
     for name in attributes:
         try:

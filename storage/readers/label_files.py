@@ -50,7 +50,7 @@ class MatchedFiles:
 
 
 def scene_entries(folder: Path) -> list[Path]:
-    """Files and Zarr stores that may be scenes or labels, by name; hidden ones are left out."""
+    """Return the files and Zarr stores that may be scenes or labels, by name; hidden ones are left out."""
     return sorted(
         entry
         for entry in folder.iterdir()
@@ -94,7 +94,9 @@ def match_folder(folder: Path) -> MatchedFiles:
 
 
 def find_label(scene: Path) -> Path | None:
-    """The label file of one scene by its name; None where there is none (SceneError: there are several)."""
+    """Return the label file of one scene by its name; None where there is none. Raises SceneError: there are
+    several.
+    """
     if not scene.parent.is_dir() or (scene.is_dir() and not is_store(scene)):
         return None
     try:
@@ -119,7 +121,7 @@ def folders_within(folder: Path) -> str:
 
 
 def listed_names(paths: Iterable[Path]) -> str:
-    """The first names, and how many more there are."""
+    """Return the first names, and how many follow."""
     names = [path.name for path in paths]
     more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
     return ", ".join(names[:SHOWN]) + more
@@ -131,7 +133,9 @@ def is_store(entry: Path) -> bool:
 
 
 def _in_label_folders(folder: Path) -> list[Path]:
-    """All pictures that may be labels in folders of labels: in this one, or beside it where it is one of images."""
+    """Return all pictures that may be labels in folders of labels: in this one, or beside it where it is one of
+    images.
+    """
     return [entry for inner in _label_folders(folder) for entry in scene_entries(inner)]
 
 
@@ -142,7 +146,10 @@ def _label_folders(folder: Path) -> list[Path]:
 
 
 def _polygons_about(folder: Path) -> list[Path]:
-    """Files of polygons that may be labels: in a folder, in one of labels, or beside it where it is one of images."""
+    """Return the files of polygons that may be labels.
+
+    They lie in a folder, in one of labels, or beside it where it is one of images.
+    """
     places = [folder, *([folder.parent] if is_image_folder(folder) else []), *_label_folders(folder)]
     return [
         entry
@@ -153,7 +160,7 @@ def _polygons_about(folder: Path) -> list[Path]:
 
 
 def _label_of(image: Path, candidates: Sequence[Path]) -> Path | None:
-    """The one that has the image's name; without one, that differs by a word for images, too."""
+    """Return the file that has the image's name, else the one that differs by a word for images."""
     stem = image.stem.lower()
     for alike in (lambda name: name, lambda name: _IMAGE_WORD.sub("", name)):
         wanted = alike(stem)
@@ -202,6 +209,6 @@ def filled(pattern: str, scene: Path) -> str:
 
 
 def scene_number(path: Path) -> str | None:
-    """``059_image.png`` -> ``059``: the first digits of the file's name."""
+    """Return the first digits of the file's name: ``059_image.png`` -> ``059``."""
     digits = re.search(r"\d+", path.stem)
     return None if digits is None else digits.group()

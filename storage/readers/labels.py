@@ -228,9 +228,9 @@ def colour_of(code: int) -> Colour:
 
 
 def found_codes(codes: NDArray[np.int64], none: int | None, is_colour: bool, where: str) -> dict[str, ClassValue]:
-    """One class for each value in the file, ascending: ``class_N`` after a number, ``colour_RRGGBB`` after a colour.
+    """Return one class for each value in the file, ascending.
 
-    A name follows from the value alone: a file without some of the classes names the others alike.
+    Classes are called ``class_N`` after a number, ``colour_RRGGBB`` after a colour.
     """
     found = [int(code) for code in np.unique(codes) if code != none and code >= 0]
     if len(found) > MOST_FOUND_CLASSES:
@@ -285,7 +285,7 @@ def class_colours(classes: Mapping[str, ClassValue], stated: Mapping[str, Colour
 
 
 def default_colour(index: int) -> Colour:
-    """Colour of class ``index`` where the file says none: eight safe ones, then hues a golden angle apart."""
+    """Return the colour of class ``index`` where the file has none: eight safe ones, then hues a golden angle apart."""
     if index < len(_EIGHT_COLOURS):
         return _EIGHT_COLOURS[index]
     turn = index * 0.618033988749895 % 1.0

@@ -56,10 +56,7 @@ _BEGINNINGS = {  # of files, and the endings that go with them
 
 
 def split_variable(address: str | Path) -> tuple[Path, str | None]:
-    """``scene.mat:cube`` -> path and variable, with the step of time in ``cube:3``; None where none is named.
-
-    The variable of a NetCDF or HDF5 file may begin with its groups: ``scene.h5:SERC/Reflectance/Reflectance_Data``.
-    """
+    """Return path and variable of ``scene.mat:cube``, with the step of time in ``cube:3``; None where none is named."""
     found = _WITH_VARIABLE.match(str(address))
     if found is None:
         return Path(address), None

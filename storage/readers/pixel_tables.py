@@ -28,7 +28,7 @@ ORDERS: Mapping[Literal["C", "F"], str] = {
 
 
 def check_picture(shape: tuple[int, ...], where: object) -> None:
-    """Question a table of numbers that is given for a scene of one band, and say how it becomes a cube (SceneError)."""
+    """Raise SceneError where a scene of one band is a table of spectra; the message shows how it becomes a cube."""
     if max(shape) < max(MOST_UNEVEN * min(shape), 1000):
         return
     bands, turned = min(shape), ".T" if shape[0] < shape[1] else ""

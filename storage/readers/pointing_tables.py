@@ -133,7 +133,7 @@ class PointingTable:
         return LinePointing(self.kind, self._positions(rows, valid, mounting), valid, time_s, exposure_ms, part)
 
     def _positions(self, rows: NDArray[np.intp], valid: NDArray[np.bool_], mounting: Mounting) -> Floats:
-        """(line, 2) positions of the model, or (line, 1) places; made up between valid lines for those that are not."""
+        """Return (line, 2) positions of the model, or (line, 1) places; values of invalid lines are interpolated."""
         values = np.stack([self.columns[name][rows] for name in KINDS[self.kind]], axis=-1)
         values = np.stack([_filled(column, valid) for column in values.T], axis=-1)
         if self.kind in WITHOUT_MIRROR:
@@ -168,7 +168,7 @@ class PointingTable:
 
 
 def _filled(values: Floats, valid: NDArray[np.bool_]) -> Floats:
-    """The values, with those of lines that are not valid and not known interpolated between valid ones."""
+    """Return the values; unknown ones of invalid lines are interpolated between valid lines."""
     known = valid | np.isfinite(values)
     at = np.arange(len(values))
     return values if known.all() else np.interp(at, at[known], values[known])
@@ -211,7 +211,7 @@ def load_pointing_table(path: Path) -> PointingTable:
 
 
 def _numbers(path: Path, name: str, cells: Sequence[object], first_row: int) -> Floats:
-    """The cells of a column as numbers; empty ones and None are NaN, True is 1."""
+    """Return the cells of a column as numbers; empty ones and None are NaN, True is 1."""
     values = np.empty(len(cells))
     for number, cell in enumerate(cells):
         text = str(cell).strip().lower()
@@ -226,7 +226,7 @@ def _numbers(path: Path, name: str, cells: Sequence[object], first_row: int) -> 
 
 
 def _csv_cells(path: Path) -> tuple[list[str], list[list[str]]]:
-    """Names of the columns and the cells of all rows; the delimiter is the one that the header has."""
+    """Return the names of the columns and the cells of all rows; the header's delimiter holds."""
     text = _text(path)
     lines = text.splitlines()
     header = lines[0] if lines else ""
@@ -330,6 +330,6 @@ def follow_vector(vector: PlayedVector, middle_s: Floats, where: str) -> LinePoi
 
 
 def find_pointing(folder: Path, stem: str) -> Path | None:
-    """The pointing file of a cube in a folder, by its name: ``STEM.pointing.csv``, ``.parquet`` or ``.toml``."""
+    """Return the pointing file of a cube in a folder, by its name: ``STEM.pointing.csv``, ``.parquet`` or ``.toml``."""
     names = [f"{stem}.pointing{ending}" for ending in ENDINGS]
     return next((folder / name for name in names if (folder / name).is_file()), None)

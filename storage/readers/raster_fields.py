@@ -216,7 +216,10 @@ def _placed(opened: Sequence[SceneFile]) -> tuple[list[_Tile], GeoBox]:
 
 
 def _origin(first: SceneFile, other: SceneFile, grid: GeoBox, own: GeoBox) -> tuple[int, int]:
-    """Row and column of a tile on the grid of the first (SceneError: other pixels, or pixels that lie between)."""
+    """Return the row and column of a tile on the grid of the first.
+
+    Raises SceneError: its pixels have another size, or lie between those of the first.
+    """
     shift = shift_px(grid, own)
     if shift is None:
         sizes = [f"{abs(one.affine.a):g} x {abs(one.affine.e):g}" for one in (grid, own)]

@@ -77,7 +77,7 @@ class SceneFile:
         )
 
     def with_labels(self, labels: NDArray[np.uint8], note: str) -> SceneFile:
-        """The same scene with other labels; its provenance says so."""
+        """Return the same scene with other labels; its provenance has the note."""
         return replace(self, labels=labels, provenance=(*self.provenance, note))
 
 
@@ -243,7 +243,7 @@ def _content_hash(file: Path, files: tuple[Path, ...]) -> str:
 def _chosen_bands(
     bands: Sequence[int] | None, settings: SceneSettings, count: int, path: Path, bad: Sequence[int]
 ) -> tuple[list[int], tuple[str, ...]]:
-    """Bands to use, and a note: without a word of the user's, those that the file itself does not call bad."""
+    """Return the bands to use, and a note; without a choice by the user, all that the file does not call bad."""
     where = "--bands" if bands is not None else f"bands in {settings.path}"
     chosen = bands if bands is not None else settings.bands
     if chosen is None:
@@ -310,7 +310,7 @@ def load_field_labels(address: str | Path, shape: tuple[int, int]) -> tuple[Labe
 
 
 def _one_class_note(found: Labels) -> tuple[str, ...]:
-    """Question labels that are all alike: the one value may mean unlabelled."""
+    """Return a question on labels that are all alike: the one value may mean unlabelled. Empty otherwise."""
     there = np.unique(found.index[found.index != UNLABELLED])
     if len(there) != 1:
         return ()
@@ -498,7 +498,7 @@ class ValueCount:
 
 
 def bands_text(bands: Sequence[int]) -> str:
-    """Band numbers as ``--bands`` takes them: ``0-3,7``."""
+    """Return the band numbers as ``--bands`` takes them: ``0-3,7``."""
     runs: list[list[int]] = []
     for band in bands:
         if runs and band == runs[-1][1] + 1:

@@ -208,7 +208,10 @@ def write_ingested_cube(
 
 
 def stored_dtype(source: CubeSource, report: Report = lambda done: None) -> np.dtype[Any]:
-    """Type of the store: uint8 and uint16 stay, other whole numbers become uint16 where all fit, the rest float32."""
+    """Return the type of the store.
+
+    uint8 and uint16 stay, other whole numbers become uint16 where all fit, the rest float32.
+    """
     if source.dtype.kind == "b" or source.dtype == np.uint8:
         return np.dtype(np.uint8)
     if source.dtype == np.uint16:

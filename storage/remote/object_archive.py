@@ -75,11 +75,13 @@ class ObjectArchive(Archive):
     # --- stores -------------------------------------------------------------------------------------------------------
 
     def ref(self, stage: str, key: str) -> StageRef:
-        """Address of a store, whether it is there or not; its path fetches it."""
+        """Return the address of a store, whether it is there or not; its path fetches it."""
         return RemoteRef(stage, key, store_at(self.root, stage, key).path, self._fetch)
 
     def find(self, stage: str, key: str) -> StageRef | None:
-        """The published store, or None, also where its files were cleared away; what waits here is uploaded.
+        """Return the published store; None where there is none or its files were cleared away.
+
+        A store that waits here is uploaded.
 
         Raises IncompleteStoreError: its manifest in the bucket is damaged.
         """
@@ -100,7 +102,7 @@ class ObjectArchive(Archive):
         return super().is_known(ref) or self._find(ref.uri)
 
     def manifest_hashes(self, refs: Iterable[StageRef]) -> dict[str, str]:
-        """`manifest_hash` by address, of stores and of all they rest on, each of which is in the bucket then."""
+        """Return the `manifest_hash` of stores and of all they rest on, by address, once each is in the bucket."""
         given = list(refs)
         self._ensure(super().manifest_hashes(given))
         return super().manifest_hashes(given)
@@ -222,7 +224,7 @@ class ObjectArchive(Archive):
                 self._fetch_files(uri, [RECEIPT])
 
     def now(self) -> datetime:
-        """Time by the clock that dates the objects, rounded up: it tells whole seconds."""
+        """Return the time by the clock that dates the objects, rounded up to whole seconds."""
         if not self.writes:
             return super().now()
         self.objects.write(".now", b"")
@@ -230,25 +232,25 @@ class ObjectArchive(Archive):
         return super().now() if dated is None else dated[1] + timedelta(seconds=1)
 
     def size_of(self, uri: str) -> int:
-        """Bytes of all objects of a store or run."""
+        """Return the bytes of all objects of a store or run."""
         return sum(one.size for one in self.objects.listing(uri).values())
 
     def sizes(self, uris: Iterable[str]) -> dict[str, int]:
-        """`size_of` stores and runs, by address."""
+        """Return the sizes of stores and runs, as `size_of` counts them, by address."""
         names = list(uris)
         return dict(zip(names, some_at_a_time(self.size_of, names), strict=True))
 
     def take_moved(self) -> int:
-        """Bytes of objects sent and brought since this was asked last, or the archive was opened."""
+        """Return the bytes of objects sent and received since the last call, or since the archive was opened."""
         return self.objects.take_moved()
 
     def lost_runs(self) -> list[str]:
-        """Addresses of runs in the bucket of which there are files, but no manifest, neither there nor here."""
+        """Return the addresses of runs in the bucket that have files, but no manifest there or here."""
         here = {f"runs/{folder.name}" for folder in self.runs()}
         return [uri for uri in _lost_runs(self.objects.listing("runs")) if uri not in here]
 
     def leftovers(self, keep_days: float) -> dict[str, int]:
-        """Files in the bucket that no manifest publishes, older than ``keep_days``: folder and bytes."""
+        """Return folders and bytes of files in the bucket that no manifest publishes, older than ``keep_days``."""
         there = self.objects.listing()
         latest = max((one.changed for one in there.values()), default=None)
         uploads: dict[str, list[Listed]] = {}
@@ -444,7 +446,7 @@ def _is_address(uri: str) -> bool:
 
 
 def _files_at(uri: str, manifest: bytes) -> str:
-    """Address of the files that a manifest lists."""
+    """Return the address of the files that a manifest lists."""
     return f"{uri}/{hashlib.sha256(manifest).hexdigest()[:16]}"
 
 
@@ -460,7 +462,7 @@ def _manifests(there: Mapping[str, Listed]) -> dict[str, Listed]:
 
 
 def _lost_runs(there: Mapping[str, Listed]) -> list[str]:
-    """Runs of which there are files, but no manifest, and that are not about to be uploaded."""
+    """Return the runs that have files, but no manifest, and that are not about to be uploaded."""
     files = {path: found[1] for path in there if path.startswith("runs/") and (found := ATTEMPT.fullmatch(path))}
     latest = max((one.changed for one in there.values()), default=None)
     old = {uri for path, uri in files.items() if latest and (latest - there[path].changed).total_seconds() >= UPLOAD_S}

@@ -314,7 +314,7 @@ def as_references(
 
 
 def _strays(lines: NDArray[np.integer]) -> tuple[NDArray[np.bool_], tuple[int, ...]]:
-    """Elements (sample, band) that jump, and frames that show something else; none where too few frames tell."""
+    """Return outlier elements (sample, band) and outlier frames; none where there are too few frames."""
     count, samples, bands = lines.shape
     jumping, scatter = np.zeros((samples, bands), np.bool_), np.zeros(count)
     if count < FRAMES_FOR_JUMPS:

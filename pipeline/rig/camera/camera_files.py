@@ -48,7 +48,10 @@ class FileSession(ftplib.FTP):
         self._together = False
 
     def size_of(self, name: str) -> int | None:
-        """Bytes of a file; None where the server does not say, DamagedTransfer where its answer is no size."""
+        """Return the bytes of a file; None where the server does not say.
+
+        Raises DamagedTransfer: its answer is no size.
+        """
         said = self.sendcmd(f"SIZE {name}")
         if not said.startswith("213"):
             return None
@@ -141,7 +144,7 @@ class FileSession(ftplib.FTP):
 
 @contextmanager
 def open_session(server: FileServer) -> Iterator[FileSession]:
-    """A session that is logged in; its errors are raised as RigError.
+    """Yield a session that is logged in; its errors are raised as RigError.
 
     DeviceRefused where the server says no, DamagedTransfer where it speaks no FTP, DeadlinePassed or DeviceGone where
     it is not there.
@@ -211,10 +214,10 @@ class Kept(Protocol):
     """Store of fetched bytes: files named as on the camera, of which a part may be there already."""
 
     def size(self, name: str) -> int:
-        """Bytes held of a file; 0 of one that is not there."""
+        """Return the number of bytes held of a file; 0 of one that is not there."""
 
     def read(self, name: str, start: int, stop: int) -> bytes:
-        """Some of the bytes held."""
+        """Return some of the bytes held."""
 
     def append(self, name: str, data: bytes) -> None:
         """Add bytes at the end."""
@@ -393,7 +396,7 @@ class _Fetch:
         self.sure = self.earlier = 0
 
     def _whole_size(self, session: FileSession) -> int:
-        """Size by the server; the listing must agree, or the file still grows."""
+        """Return the size by the server; where the listing differs, the file still grows."""
         listed, most = self.file.size, self.file.most
         told = session.size_of(self.file.name)
         size = listed if told is None else told

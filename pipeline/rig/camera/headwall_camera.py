@@ -88,7 +88,7 @@ class HeadwallCamera:
 
     @classmethod
     def at(cls, address: CameraAddress, server: FileServer, *, clock: Clock = SYSTEM_CLOCK, **given: Any) -> Self:
-        """A camera on the network."""
+        """Return a camera on the network."""
 
         def connect() -> SocketTransport:
             return SocketTransport(address.host, address.port, clock, connect_s=address.connect_s)
@@ -168,7 +168,10 @@ class HeadwallCamera:
         return read_capture([file.name for file in files], _reader(kept))
 
     def references(self, folder: str, kept: Kept, *, claim: FrameClaim | None = None) -> dict[str, MeanFrame]:
-        """Mean frames of the reference cubes in a capture's folder, by ``dark`` and ``white``; empty without any."""
+        """Return the mean frames of the reference cubes in a capture's folder, by ``dark`` and ``white``.
+
+        Empty without any.
+        """
         files = [file for file in self._finished(folder, claim) if file.base.lower().startswith(("dark", "white"))]
         fetch_files(self.server, files, kept, clock=self.clock)
         cubes = read_references([file.name for file in files], _reader(kept))
@@ -279,7 +282,7 @@ class HeadwallCamera:
             )
 
     def _folders(self) -> set[str] | None:
-        """Folders of the capture root; None where the camera does not list it."""
+        """Return the folders of the capture root; None where the camera does not list it."""
         try:
             return {entry.name for entry in self.list_files(CAPTURE_ROOT)}
         except DeviceRefused as error:
@@ -302,7 +305,9 @@ class HeadwallCamera:
         )
 
     def _finished(self, folder: str, claim: FrameClaim | None) -> list[RemoteFile]:
-        """Files of a folder, as two listings in a row have them: one that lost an entry on its way looks whole."""
+        """Return the files of a folder once two listings in a row agree: one that lost an entry on its way looks
+        whole.
+        """
         if self.is_capturing():
             raise RigError(f"a capture still runs, so files of {folder} may grow; wait for its end, or stop it")
         listed = self.list_files(folder)

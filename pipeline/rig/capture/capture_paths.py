@@ -79,7 +79,7 @@ def mend_times(frames: FrameTimes) -> tuple[Ints, Ints, list[str]]:
 
 
 def whole_numbers(number: Ints) -> tuple[Ints, list[str]]:
-    """Frame numbers, gaps filled where the lines around them leave no doubt, and what was found."""
+    """Return the frame numbers and findings; gaps are filled where the lines around them leave no doubt."""
     filled, notes = number.copy(), []
     known = np.flatnonzero(number >= 0)
     for left, right in pairwise(known.tolist()):
@@ -94,7 +94,7 @@ def whole_numbers(number: Ints) -> tuple[Ints, list[str]]:
 
 
 def _strayed(late: Floats, period_us: float) -> Bools:
-    """Stamps off the median of their neighbours by half a period."""
+    """Return which stamps differ from the median of their neighbours by half a period."""
     if len(late) < 3:
         return np.zeros(len(late), np.bool_)
     window = min(_WINDOW, len(late) - 1 + len(late) % 2)  # odd
@@ -185,12 +185,12 @@ def lines_by_time(
 
 
 def _at(scan_path: MirrorScanPath, time_s: Floats) -> Floats:
-    """Logged positions between samples, (time, 2)."""
+    """Return the logged positions between samples, (time, 2)."""
     return np.stack([np.interp(time_s, scan_path.time_s, scan_path.position[:, axis]) for axis in (0, 1)], axis=-1)
 
 
 def _apart_px(scan_path: MirrorScanPath, camera: LineCamera, times: tuple[Floats, Floats]) -> float:
-    """Root mean square of how far the view moves between two times of each line. [px]"""
+    """Return the root mean square distance that the view moves between two times of each line. [px]"""
     if not len(times[0]):
         return 0.0
     one, other = (direction_to_scene(position_to_direction(_at(scan_path, time_s))) for time_s in times)
@@ -277,7 +277,9 @@ class CapturePath:
         return self.stop - self.first
 
     def frames_at(self, index: int) -> int | None:
-        """Frames that edges were counted of, where the cell ``index`` was played last; None within a line."""
+        """Return how many frames had their edges counted, where the cell ``index`` was played last; None within a
+        line.
+        """
         frames, rest = divmod(index + 1 - LEAD, self.sweep.step)
         return None if rest else frames
 
@@ -392,7 +394,7 @@ def _tied(
     *,
     total: int,
 ) -> LinePositions:
-    """Positions by the edges that stepped the mirror, else by its log, else by the commands' times."""
+    """Return the positions by the edges that stepped the mirror, else by its log, else by the commands' times."""
     if taken.triggered:
         counted = None if taken.index_at_end is None else path.frames_at(taken.index_at_end)
         taken_in_all = max(total, int(frames.number.max()) + 1)

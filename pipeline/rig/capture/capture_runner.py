@@ -69,7 +69,7 @@ class CaptureJournal:
         self._read()
 
     def holding(self, sweep: Sweep, line: int) -> CaptureRecord | None:
-        """The latest capture that has a line of the sweep and is not spent."""
+        """Return the latest capture that has a line of the sweep and is not spent."""
         fits = [one for one in self._taken.values() if one.sweep == sweep and one.first <= line < one.stop]
         return next((one for one in reversed(fits) if not one.spent), None)
 

@@ -211,9 +211,9 @@ class RigSource:
         return Line(number, nothing, float(x), float(y), time_s, exposing(self.camera, sweep).exposure_ms, valid=False)
 
     def references(self, sweep: Sweep) -> References:
-        """Dark and white frames with the sweep's binning, captured and fetched once for all sweeps of its exposure.
+        """Return the dark and white frames with the sweep's binning.
 
-        RigError where the camera has none beside its captures, they do not fit, or a device failed.
+        They are captured and fetched once for all sweeps of an exposure.
         """
         exposure_ms, folders = sweep.exposure_ms, self._journal.references
         if folders.get(exposure_ms, "") not in self._whole:
@@ -229,7 +229,10 @@ class RigSource:
         return References(dark, white, whole.white_reference, bad, by_mirror=self.rig.white_at_rest)
 
     def _known_references(self, runner: CaptureRunner, folder: str) -> tuple[References, tuple[str, ...]] | None:
-        """The frames of an earlier session; None where the camera no longer has them: it was emptied, or is another."""
+        """Return the frames of an earlier session.
+
+        None: the camera no longer has them, because it was emptied or replaced.
+        """
         try:
             return self._whole_references(runner, folder)
         except RigError as error:
@@ -239,7 +242,7 @@ class RigSource:
             return None
 
     def _whole_references(self, runner: CaptureRunner, folder: str) -> tuple[References, tuple[str, ...]]:
-        """Dark and white frames of all samples, and what was found of them."""
+        """Return the dark and white frames of all samples, and findings on them."""
         frames = runner.devices.camera.references(folder, self._kept, claim=self._claim(1))
         missing = [kind for kind in ("dark", "white") if kind not in frames]
         if missing:

@@ -130,7 +130,10 @@ class SceneView:
         return lines
 
     def references(self, times_ms: tuple[float, float], frames: int) -> dict[str, Raw]:
-        """Dark and white frames (frame, sample, band) whose means are the source's, to half of 1 / ``frames`` DN."""
+        """Return dark and white frames (frame, sample, band) whose means are the source's.
+
+        The means agree to half of 1 / ``frames`` DN.
+        """
         taken = replace(self.source, rig=self._rig(times_ms)).references(AT_REST)
         dither = ((np.arange(frames) + 0.5) / frames)[:, None, None]
         return {
@@ -139,11 +142,11 @@ class SceneView:
         }
 
     def _place(self, position: Floats) -> Floats:
-        """Along the line and the scan, (..., 2). [px]"""
+        """Return the position along the line and the scan, (..., 2). [px]"""
         return direction_to_scene(position_to_direction(position)) / self.source.camera.ifov_rad
 
     def _rig(self, times_ms: tuple[float, float]) -> Rig:
-        """The source's rig, or one whose camera was told other times."""
+        """Return the source's rig, with the times that the camera was set to."""
         camera = self.source.camera
         if np.allclose(times_ms, (camera.exposure_ms, camera.frame_ms), rtol=1e-9):
             return self.source.rig
@@ -160,7 +163,7 @@ class SceneView:
 
 
 def _runs(number: Ints, alike: NDArray[np.bool_]) -> Iterator[slice]:
-    """Exposures in a row whose lines follow each other and that are all as planned, or all not."""
+    """Yield consecutive exposures whose lines follow each other and that are all as planned, or all not."""
     edges = np.flatnonzero((np.diff(number) != 1) | (np.diff(alike.astype(np.int8)) != 0)) + 1
     for start, stop in zip([0, *edges], [*edges, len(number)], strict=True):
         yield slice(int(start), int(stop))
@@ -246,7 +249,7 @@ class SceneCamera(CameraDevice):
         return capture
 
     def _seen(self, positions: Floats, middle_s: Floats) -> Raw:
-        """Raw lines (line, sample, band) of exposures by the middle of each."""
+        """Return the raw lines (line, sample, band) of exposures by their mid times."""
         capture = next((one for one in reversed(self.captures) if one.began_s <= middle_s[0]), None)
         if capture is None:
             return self.view.alone("no capture", positions[0], (self.exposure_ms, self.period_ms), 0.0)
@@ -378,7 +381,7 @@ class _Line:
                 return
 
     def _patience(self) -> float | None:
-        """Real time until something is due; None where nothing is."""
+        """Return the real time until the next event; None without one."""
         waiting = [queue[0][0] for queue in (self._in, self._out) if queue]
         if not waiting:
             return None

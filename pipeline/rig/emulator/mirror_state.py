@@ -123,7 +123,9 @@ class AxisMotion:
 
 @lru_cache(maxsize=4096)
 def _response(angle: float, damping: float) -> tuple[float, float]:
-    """Responses to a unit impulse and a unit step at one time; a vector is played with few different times."""
+    """Return the responses to a unit impulse and a unit step at one time; a vector is played with few different
+    times.
+    """
     impulse, rise = responses(np.array([angle]), damping)
     return float(impulse[0]), float(rise[0])
 

@@ -142,7 +142,10 @@ def check_play(first: int, stop: int, rate_hz: float, cycles: int, loaded: int) 
 
 
 def hold_values(x: float, y: float) -> dict[int, Value]:
-    """Registers that send both channels to a position, hold it and end any path, in one frame, which they fill."""
+    """Return the registers that send both channels to a position, hold it and end any path.
+
+    They fill one frame.
+    """
     follow = {**X.followed(X.static_system), **Y.followed(Y.static_system)}
     halt = {X.vector(VectorRegister.RUN): 0, Y.vector(VectorRegister.RUN): 0}
     return {X.static_xy: float(x), Y.static_xy: float(y), **follow, **halt}
@@ -216,12 +219,15 @@ class MirrorController(Closing):
         return self._modes.found_in_pro
 
     def status(self) -> Status:
-        """Status bits, now."""
+        """Return the present status bits."""
         self._check_connected()
         return Status(self._link.ask(ask_status(), "the status", cell_int))
 
     def temperature(self) -> float:
-        """Temperature, read in simple mode; RigError where a path plays, as modes are not changed under it. [deg C]"""
+        """Return the temperature, read in simple mode.
+
+        Raises RigError: a path plays, and modes are not changed under it.
+        """
         self._check_idle("ask for its temperature")
         with self._modes.simple() as lines:
             return lines.temperature()
@@ -313,7 +319,7 @@ class MirrorController(Closing):
         return any(map(cell_int, self._link.ask(get_values(registers), "whether a path plays", read_values)))
 
     def index(self) -> int:
-        """Position of the loaded path that plays now: the cell of X."""
+        """Return the position of the loaded path that plays now: the cell of X."""
         self._check_connected()
         return self._link.ask(get_value(X.vector(VectorRegister.INDEX)), "the place in the path", cell_int)
 

@@ -288,7 +288,7 @@ class Modes:
 
     @contextmanager
     def simple(self) -> Iterator[SimpleLink]:
-        """Simple mode for as long as the block lasts; where a mode is not reached, connect again.
+        """Keep simple mode while the block runs; connect again where a mode is not reached.
 
         Raises DeadlinePassed, DeviceRefused or DeviceGone.
         """

@@ -405,11 +405,11 @@ class ChannelRegisters:
         self.control = 0x4002 + 5 * self.channel  # which system controls the channel
 
     def vector(self, register: VectorRegister) -> int:
-        """Id of a register of the vector unit."""
+        """Return the id of a register of the vector unit."""
         return self.vector_system << 8 | register
 
     def followed(self, system: int) -> dict[int, int]:
-        """Values that make the channel follow an input, controlled by position."""
+        """Return the values that make the channel follow an input, controlled by position."""
         return {self.control: self.xy_system, self.input: system}
 
 
@@ -433,5 +433,5 @@ X, Y = ChannelRegisters(0), ChannelRegisters(1)
 
 
 def log_slot(slot: int) -> int:
-    """Id of the register that says what a slot of the logger takes down, and of the vector that it takes down."""
+    """Return the id of the register that assigns a slot of the logger, which is also that of the vector it records."""
     return 0x2400 | slot

@@ -231,7 +231,7 @@ def closeness(air: Air, row: Floats) -> Floats:
 
 
 def greatest_fraction(air: Air) -> float:
-    """Greatest displacement per px of way from the line's centre."""
+    """Return the greatest displacement per px of distance from the line's centre."""
     if air.distance_m is None:
         return 0.0
     ends = closeness(air, np.array([-1.0, 1.0])) - 1 / air.distance_m
@@ -463,7 +463,7 @@ def rayleigh_per_m(wavelength_nm: Floats) -> Floats:
 
 
 def _contrast(probe: Probe, rig: Rig) -> Floats:
-    """Greatest difference of a signal and the light of endless air, over the signal's unit, (band,).
+    """Return the greatest difference of a signal from the light of endless air, over the signal's unit, (band,).
 
     Daylight multiplies both; clouds and the angle of view change the signal alone: H counts over their greatest factor,
     and the darkest signal after their least.
@@ -484,7 +484,9 @@ def _contrast(probe: Probe, rig: Rig) -> Floats:
 
 
 def _between(near: Floats, far: Floats) -> Floats:
-    """Fraction of the light lost between two optical depths, exp(-near) - exp(-far), however near they lie."""
+    """Return the fraction of light lost between two optical depths, exp(-near) - exp(-far), accurate for close
+    depths.
+    """
     return -np.exp(-near) * np.expm1(near - far)
 
 

@@ -97,7 +97,7 @@ def airy_gaussians() -> tuple[Floats, Floats]:
 
 
 def _waves(rig: Rig, wavelength_nm: Floats, normal: Floats | None) -> Floats:
-    """lambda over the pupil's widths along line and scan, (2, band). [px]"""
+    """Return lambda over the pupil's widths along line and scan, (2, band). [px]"""
     angle = np.asarray(wavelength_nm, np.float64) * 1e-9 / (rig.optics.aperture_mm * 1e-3)
     return angle / rig.camera.ifov_rad * np.sqrt(spread_of_waves(normal))[:, None]
 

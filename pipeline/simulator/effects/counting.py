@@ -118,7 +118,7 @@ def chip_variation(read_noise_e: float) -> float:
 
 
 def separable(sd: float, other: float) -> float:
-    """Twice the total variation between two normal distributions of one mean: the deviations that noise counts.
+    """Return twice the total variation distance of two normal distributions of one mean and these deviations.
 
     0 where both are alike, 2 where one has no spread. Their densities cross at x^2 = 2 ln(a / b) / (1 / b^2 - 1 / a^2).
     """
@@ -133,14 +133,14 @@ def separable(sd: float, other: float) -> float:
 
 
 def _series_quantile(mean: Floats, z: Floats) -> Floats:
-    """Poisson quantile at Phi(z) for means from `SERIES_FROM_E` on.
+    """Return the Poisson quantile at Phi(z) for means from `SERIES_FROM_E` on.
 
     C(x) = Gamma(x, mean) / Gamma(x) runs smoothly through the distribution, F(k) = C(k + 1): where C(x) = Phi(z), the
     quantile is floor(x). x is expanded in 1 / sqrt(mean) [1]; where it comes as near to a whole number as the expansion
     may err, the distribution itself is asked.
 
-    [1] Giles, "Algorithm 955: approximation of the inverse Poisson cumulative distribution function", ACM Trans.
-           Math. Softw. 42, 2016. doi:10.1145/2699466
+    [1] Giles, "Algorithm 955: approximation of the inverse Poisson cumulative distribution function", ACM Trans. Math.
+    Softw. 42, 2016. doi:10.1145/2699466
     """
     root, square = np.sqrt(mean), z * z
     x = mean + root * z
@@ -157,7 +157,7 @@ def _series_quantile(mean: Floats, z: Floats) -> Floats:
 
 
 def _summed_quantile(mean: Floats, z: Floats) -> Floats:
-    """Poisson quantile at Phi(z) for small means: how many of the sums of probabilities lie below."""
+    """Return the Poisson quantile at Phi(z) for small means: the number of cumulative probabilities below it."""
     counts = np.zeros_like(mean)
     asked = scipy.special.ndtr(z)
     chance = np.exp(-mean)
@@ -217,7 +217,7 @@ def warmth(temperature_deg_c: float) -> float:
 
 
 def band_gap_ev(kelvin: float) -> float:
-    """Silicon's band gap by Varshni's formula with the constants of [1]. [eV]"""
+    """Return silicon's band gap by Varshni's formula with the constants of [1]. [eV]"""
     return 1.1557 - 7.021e-4 * kelvin**2 / (1108 + kelvin)
 
 

@@ -167,7 +167,7 @@ def _angles(sweep: Sweep, camera: LineCamera, scan_px: Floats, slopes: Floats) -
 
 
 def _extremes(sweeps: tuple[Sweep, ...], camera: LineCamera) -> tuple[float, float]:
-    """Greatest angle from the undeflected direction and least phase within the sweeps [rad]."""
+    """Return the greatest angle from the undeflected direction and least phase within the sweeps [rad]."""
     greatest, least = 0.0, np.inf
     for sweep in (sweep for sweep in sweeps if sweep.lines):
         ends = [np.linspace(0, count - 1, _PROBES).round().astype(int) for count in (sweep.lines, camera.samples)]

@@ -172,7 +172,9 @@ class Smear(Effect):
 
 
 def _courses(sweeps: tuple[Sweep, ...], rig: Rig) -> Iterator[Floats]:
-    """Ways of held positions beside their plan, (line, step), of each kind of sweep that has several. [px]"""
+    """Yield the paths of held positions beside their plan, (line, step), for each kind of sweep that has several.
+    [px]
+    """
     for sweep in {(one.lines, one.step): one for one in sweeps if one.lines and one.step > 1}.values():
         numbers = np.arange(sweep.lines)
         yield transient(rig, sweep, numbers) + beside_plan(rig.mirror.positions_per_line, sweep.step, numbers)

@@ -141,7 +141,7 @@ class Polarisation(Gain):
 
 
 def _incidence(view_directions: Floats) -> Floats:
-    """Angle between chief ray and mirror normal where the mirror looks along unit directions of this o_z. [rad]"""
+    """Return the angle between chief ray and mirror normal for unit look directions with this o_z. [rad]"""
     return np.arccos(np.sqrt((1 - view_directions) / 2))
 
 

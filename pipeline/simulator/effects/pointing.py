@@ -338,7 +338,7 @@ def beside_plan(positions: float, step: int, numbers: NDArray[np.int64], parts: 
 
 
 def _parts(positions: float, step: int, variant: str) -> int:
-    """Equal parts of an exposure; positions a / b change at multiples of 1 / a of it."""
+    """Return how many equal parts an exposure has; positions a / b change at multiples of 1 / a of it."""
     if variant == CENTRES or step > 1:
         return 1
     ratio = Fraction(positions).limit_denominator(1000)
@@ -433,7 +433,7 @@ def responses(time: Floats, damping: float) -> tuple[Floats, Floats]:
 
 
 def _early_rise(time: Floats, damping: float) -> Floats:
-    """The step response by its Taylor series, from h'' + 2 zeta h' + h = 1: where 1 - rest would cancel."""
+    """Return the step response by its Taylor series, from h'' + 2 zeta h' + h = 1, where 1 - rest would cancel."""
     before, term = np.zeros_like(time), time**2 / 2
     total = term.copy()
     for order in range(3, _TERMS):
@@ -462,7 +462,7 @@ def _at_start(mirror: MirrorMotion, sweep: Sweep, period: float, held: float) ->
 
 
 def _steps(mirror: MirrorMotion, sweep: Sweep, period: float, held: float) -> tuple[Floats, float, float]:
-    """Times from the steps of one pattern before the sweep to its start, the steps' height, the pattern's length.
+    """Return times from a pattern's steps before the sweep to its start, the steps' heights, and the pattern's length.
 
     A pattern is a line with its number of positions, rounded, or one position that is held for several lines.
     """

@@ -159,7 +159,7 @@ class Probe:
 
 
 def _times(steep: Floats, way: Floats | float) -> Floats:
-    """Their product; 0 where there is no way, however steep it is."""
+    """Return the product; 0 where ``way`` is 0, however steep."""
     return np.multiply(steep, way, out=np.zeros(np.shape(steep)), where=np.not_equal(way, 0))
 
 
@@ -245,7 +245,7 @@ class GainRange:
 
     @staticmethod
     def between(least: float, greatest: float, bands: int, *, uneven: float = 0.0) -> GainRange:
-        """The same in all bands."""
+        """Return the range from ``least`` to ``greatest``, the same in all bands."""
         no = np.zeros(bands)
         return GainRange(np.full(bands, least), np.full(bands, greatest), uneven, no, no, no, no, no)
 
@@ -278,7 +278,7 @@ def rising_gaps(wavelength_nm: Floats) -> Floats:
 
 
 def difference_rates(wavelength_nm: Floats) -> Floats:
-    """Weights of the second difference D, (2, band): of the steps down and up to the neighbours. [1/nm^2]
+    """Return the weights of the second difference D, (2, band): of the steps down and up to the neighbours. [1/nm^2]
 
     D I = up (I_next - I) + down (I_last - I) is the second derivative of any parabola. 0 at both ends of a run.
     """
@@ -310,7 +310,7 @@ def steepest_difference(spectra: NDArray[Real], wavelength_nm: Floats) -> NDArra
 
 
 def spectral_differences_between(ends_e: Floats, wavelength_nm: Floats) -> Floats:
-    """Greatest divided differences, (2, band), of any spectra between two, (2, band): light of what is not looked at.
+    """Return the greatest divided differences, (2, band), of any spectra between two, (2, band): for unprobed light.
 
     Second differences are greatest where bands are at one end and their neighbours at the other.
     """

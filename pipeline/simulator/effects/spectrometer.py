@@ -117,7 +117,7 @@ def _band_groups(wavelength_nm: tuple[float, ...], variance: tuple[float, ...]) 
 
 
 def _heat_kernel(wavelength_nm: Floats, variance: Floats) -> Floats:
-    """Rows of exp(v/2 D), (band, band), each with its own variance v.
+    """Return the rows of exp(v/2 D), (band, band), each with its own variance v.
 
     D leaves straight lines and both ends as they are. So a spectrum is parted into the line through its ends, which
     stays, and a rest that is 0 there; on the rest D is a symmetric matrix after scaling by the root of the gaps.
@@ -219,7 +219,9 @@ def _tap_weights(wavelength_nm: tuple[float, ...], smile_nm: float, samples: int
 
 
 def _run_taps(wavelength: Floats, shift: Floats) -> list[tuple[NDArray[np.int64], Floats]]:
-    """Taps of one run of rising wavelengths: which band beside its own, and how much of it, (sample, band) each."""
+    """Return the taps of one run of rising wavelengths, (sample, band) each: offsets to other bands, and their
+    weights.
+    """
     wanted = np.clip(wavelength + shift[:, None], wavelength[0], wavelength[-1])
     gap = np.clip(np.searchsorted(wavelength, wanted, side="right") - 1, 0, len(wavelength) - 2)
     width = np.diff(wavelength)[gap]
@@ -370,7 +372,7 @@ def _most_halo(probe: Probe, rig: Rig, spread: float) -> float:
 
 @lru_cache(maxsize=16)
 def _uneven_fraction(counts: tuple[int, ...], sd_px: float) -> float:
-    """Greatest fraction of a sample's halo that comes from elsewhere than if it were even: 1 narrow, 0 endless."""
+    """Return the greatest fraction of a sample's halo that differs from an even one: 1 narrow, 0 endless."""
     even = 1.0
     for count in counts:
         waves, passed = _cosines(count, sd_px)
@@ -381,7 +383,9 @@ def _uneven_fraction(counts: tuple[int, ...], sd_px: float) -> float:
 
 @lru_cache(maxsize=16)
 def _cosines(count: int, sd_px: float) -> tuple[Radiance, NDArray[np.float64]]:
-    """Orthonormal cosines (mode, count) that a Gaussian reflected at both ends passes, and the fraction it passes."""
+    """Return orthonormal cosines (mode, count), passed by a Gaussian reflected at both ends, and the fractions
+    passed.
+    """
     passed = np.exp(-((np.pi * sd_px / count * np.arange(count)) ** 2) / 2)
     modes = np.arange(count)[passed > LEAST_MODE]
     waves = np.cos(np.pi / count * np.outer(modes, np.arange(count) + 0.5))

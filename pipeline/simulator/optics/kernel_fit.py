@@ -53,7 +53,7 @@ def disc_points(axes: Axes) -> tuple[Floats, Floats]:
 
 
 def _rings(diameter: float) -> tuple[float, ...]:
-    """Radii over the disc's: each ring in the middle of as much of the disc's area as it has points, or nearly."""
+    """Return the radii over the disc's, one ring in the middle of each equal part of its area, or nearly."""
     for most, radii in _FITTED:
         if diameter <= most:
             return radii
@@ -108,7 +108,7 @@ class Kernels:
 def _fit(
     told: bytes, bands: int, box: tuple[float, float], held: int, disc: Axes
 ) -> tuple[Kernels, Floats, Floats, float]:
-    """Kernels, shares and their error for bands (6, band), no two alike: shift, variance and waves."""
+    """Return kernels, fractions and their error for bands (6, band), no two alike: shift, variance and waves."""
     moments = np.frombuffer(told).reshape(6, bands)
     if bands <= _OWN and not moments[4:].any():
         return Kernels(moments[:2], moments[2:4], np.ones(bands, np.intp)), np.eye(bands), np.eye(bands), 0.0
@@ -184,7 +184,7 @@ def _candidates(moments: Floats, place: Floats) -> Iterator[Kernels]:
 
 
 def _ladder(widest: Floats, core: float, ratio: float) -> list[tuple[float, int]]:
-    """Sizes [px, the smaller of along and scan] and the levels at which they are looked through."""
+    """Return the sizes [px, the smaller of along and scan] and the pyramid levels used for them."""
     wave = float(widest.min())
     least = min(_SHARPEST * wave, core)
     afar = 2 * _size_at(2)
@@ -209,7 +209,7 @@ def _size_at(level: int) -> float:
 
 
 def _nodes(moments: Floats, place: Floats, count: int) -> Floats:
-    """Moments (4, count) at even steps along the bands' curve, both ends among them; the middle alone."""
+    """Return the moments (4, count) at even steps along the bands' curve, with both ends; one node is its middle."""
     order = np.argsort(place)
     if count >= len(place):
         return moments[:, order]
@@ -249,7 +249,9 @@ def _wanted(moments: Floats, own: Floats) -> Transfer:
 
 
 def _fractions(passed: Transfer, wanted: Transfer) -> Floats:
-    """Shares (kernel, band) by least squares, none below 0 and of sum 1, by what kernels and bands pass of waves."""
+    """Return the fractions (kernel, band), none negative and of sum 1, fitted to the waves that kernels and bands
+    pass.
+    """
     count, bands = passed.shape[1], wanted.shape[1]
     system = np.concatenate([passed.real, passed.imag, np.full((1, count), _SUM)])
     right = np.concatenate([wanted.real, wanted.imag, np.full((1, bands), _SUM)])
@@ -468,7 +470,7 @@ class TapTable(NamedTuple):
 
 
 def _rows(place: Floats, taps: int, reach: float, kernels: tuple[Floats, Floats]) -> Floats:
-    """Weights (kernel, tap, place), scaled to sum 1 at every place."""
+    """Return the weights (kernel, tap, place), scaled to sum 1 at every place."""
     distance, weight = kernels
     apart = place[None, :] - np.arange(taps)[:, None]
     rows: Floats = np.stack([np.interp(apart, distance, one, left=0.0, right=0.0) for one in weight])
@@ -487,6 +489,6 @@ def _reach(distance: Floats, weight: Floats, tail: float) -> float:
 
 
 def _integral(t: Floats) -> Floats:
-    """Integral of the kernel of linear interpolation from 0 to t."""
+    """Return the integral of the kernel of linear interpolation from 0 to t."""
     a = np.minimum(np.abs(t), 1.0)
     return np.sign(t) * a * (1 - a / 2)

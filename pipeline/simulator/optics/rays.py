@@ -37,17 +37,17 @@ class RayViews:
     scan_turn: Floats
 
     def __getitem__(self, which: slice | NDArray[np.intp]) -> RayViews:
-        """Some of the samples."""
+        """Return some of the samples."""
         return RayViews(*(getattr(self, one.name)[which] for one in fields(self)))
 
     def thinned(self, level: int, before: int) -> RayViews:
-        """The same places in px of a scene of which every ``level``-th pixel is left, after ``before`` others."""
+        """Return the same places in px of a scene thinned to every ``level``-th pixel after ``before`` others."""
         if level == 1:
             return self
         return replace(self, along=self.along / level + before, scan=self.scan / level + before)
 
     def table(self) -> Floats:
-        """All of them as rows, (6, n), in the order in which they stand here."""
+        """Return all values as rows, (6, n), in the order of the fields."""
         return np.stack([np.asarray(getattr(self, one.name), np.float64) for one in fields(self)])
 
     def flat(self) -> RayViews:

@@ -44,7 +44,7 @@ class _Mixing:
 
     @staticmethod
     def of(fractions: Radiance, between: Floats, spectra: Radiance) -> _Mixing:
-        """That of spectra (component, band): bands between the same nodes are made at once."""
+        """Return the mixing of spectra (component, band): bands between the same nodes are made at once."""
         bands, cuts = spectra.shape[1], [0]
         for cut in (np.flatnonzero(np.diff((between > 0).argmax(axis=0))) + 1).tolist():
             if min(cut - cuts[-1], bands - cut) >= LEAST_BANDS:
@@ -72,7 +72,7 @@ class Looker:
     """Looks at scenes through one footprint, from views whose shape is within a range."""
 
     def __init__(self, footprint: Footprint, extremes: RayViews) -> None:
-        """``extremes`` are views all over what will be looked at; their places do not matter."""
+        """Take ``extremes``: views spread over all that will be sampled; their places do not matter."""
         self.footprint = footprint
         self._extremes = extremes
 

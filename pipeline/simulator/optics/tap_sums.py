@@ -45,7 +45,7 @@ class Gatherer:
     """Gathers a scene's components through a footprint at views whose shape is within a range."""
 
     def __init__(self, footprint: Footprint, views: RayViews) -> None:
-        """``views`` are some that hold the extremes of all that will be gathered."""
+        """Take ``views`` that include the extremes of all that will be gathered."""
         self.footprint = footprint
         width, (across, along) = footprint.box, footprint.parts
         variance = footprint.variance + disc_points(footprint.disc)[1][:, None]
@@ -137,7 +137,7 @@ def misplaced(parts: Parts, box: tuple[float, float], shape: tuple[float, ...]) 
 
 
 def _weights(parts: Parts, box: tuple[float, float], shape: tuple[float, ...]) -> Floats:
-    """Weights (phase, along, scan) of the pixels around a sample, in closed form."""
+    """Return the weights (phase, along, scan) of the pixels around a sample, in closed form."""
     none, views = np.zeros((2, 1)), RayViews(*(np.array([one]) for one in (0.0, 0.0, *shape)))
     footprint: Footprint = fold(box, parts, 1, Moments(none, none))
     scale, places = place_parts(footprint, views)

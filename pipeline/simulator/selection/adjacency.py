@@ -85,7 +85,7 @@ def reached_cells(shape: tuple[int, int], camera: LineCamera, sweeps: Sequence[S
 def _edge_cells(
     sweep: Sweep, camera: LineCamera, shape: tuple[int, int], cell: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Cells at the scene's edge that a sweep sees repeated outside of it."""
+    """Return the cells at the scene's edge that a sweep sees repeated outside of it."""
     count = max(_PROBES, 2 * max(shape) // cell)
     lines = sweep.start_px + np.linspace(0, sweep.lines - 1, count)
     slopes = np.linspace(-0.5, 0.5, count) * camera.samples * camera.ifov_rad
@@ -143,7 +143,7 @@ def seen_widely(scene: RasterScene, exposure_ms: float) -> WideLight:
 
 
 def _spectral_differences(parts: Radiance, spectra: Radiance, wavelength_nm: Floats) -> Radiance:
-    """Greatest first and second divided differences over wavelength of light, (2, band) [e-/nm, e-/nm^2]."""
+    """Return the greatest first and second divided differences over wavelength of light, (2, band) [e-/nm, e-/nm^2]."""
     if spectra.ndim == 1:
         light = to_bands(parts, spectra)
         steep, bent = steepest_difference(light, wavelength_nm), second_difference(light, wavelength_nm)
@@ -156,12 +156,12 @@ def _spectral_differences(parts: Radiance, spectra: Radiance, wavelength_nm: Flo
 
 
 def _largest(values: Radiance) -> Radiance:
-    """Greatest size of each band, (band,)."""
+    """Return the largest magnitude in each band, (band,)."""
     return np.asarray(np.maximum(values.max(axis=(0, 1), initial=0.0), -values.min(axis=(0, 1), initial=0.0)))
 
 
 def _means(scene: RasterScene) -> Iterator[Radiance]:
-    """Components of windows of two by two blocks, a block apart, in overlapping parts of the scene."""
+    """Yield the components of windows of two by two blocks, a block apart, in overlapping parts of the scene."""
     planes = scene.planes
     short = [-size % BLOCK_PX for size in scene.shape]
     if any(short):
@@ -213,7 +213,7 @@ def _blended(probe: Probe, reach_px: float, way_px: float, parts: Sequence[tuple
 
 
 def _seen_through(probe: Probe, beside_px: float, sd_px: float) -> Detail:
-    """The least of what bounds derivatives and span of an image that a Gaussian has blurred, up to so far beside."""
+    """Return the least bound of derivatives and span of an image blurred by a Gaussian, up to this distance away."""
     assert probe.anywhere is not None
     last = max((one.reach_px for one in probe.beside), default=0.0)
     found = []
@@ -247,7 +247,7 @@ def greatest_way_px(probe: Probe, rig: Rig, effects: Sequence[Effect]) -> float:
 
 
 def _blur_parts(probe: Probe, rig: Rig, blurs: Sequence[Any]) -> list[tuple[float, float]]:
-    """Shares and sizes (sd) of the Gaussians that a rig's blurs are the sum of, as wide as in any band. [px]"""
+    """Return the fractions and sizes (sd) of the Gaussians that make up a rig's blurs, as wide as in any band. [px]"""
     nm = np.asarray(probe.wavelength_nm, np.float64)
     sizes, waves = [0.0], [0.0]
     for normal in normals_met(probe.sweeps, rig.camera):

@@ -82,7 +82,7 @@ class Decision:
         return cost_of((one.menu for one in self.taken), {one.name: one.option for one in self.taken})
 
     def cost_of(self, one: Treatment) -> float:
-        """Per px and band, of one effect beside the others as they are taken [ns]."""
+        """Return the cost per px and band of one effect beside the other effects as chosen [ns]."""
         return one.menu.cost_beside(one.option, {other.name: other.option for other in self.taken})
 
     @property

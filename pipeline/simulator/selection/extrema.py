@@ -55,7 +55,7 @@ class PixelOptics:
         return noise
 
     def worths(self, light: Radiance) -> Iterator[Radiance]:
-        """Measures of light without its halo, (row, column, band) each: the higher, the more worth a look.
+        """Yield measures of light without its halo, (row, column, band) each: higher ones are probed first.
 
         Where samples are summed, sizes are averaged along the line, as the probe does.
         """
@@ -77,7 +77,7 @@ class PixelOptics:
             yield np.divide(self._summed(mixed, line)[inner], noise)
 
     def _summed(self, values: Radiance, axis: int) -> Radiance:
-        """Mean over the samples of a stored number about each pixel, along an axis."""
+        """Return the mean over the samples of a stored number about each pixel, along an axis."""
         if self.binning == 1:
             return values
         steps = np.arange(self.binning) - self.binning // 2
@@ -130,7 +130,7 @@ class Ranking:
 
 
 def _worst_first(places: Floats, most: int) -> Floats:
-    """The first places, (row, place) of worth and where they lie, by worth and then by where."""
+    """Return the first places by measure and then by location, (row, place): measure, and where they lie."""
     if places.shape[1] > most:
         places = places[:, places[0] >= np.partition(places[0], -most)[-most]]
     return places[:, np.lexsort(places[::-1])[::-1][:most]]
@@ -216,7 +216,9 @@ class BandTiles:
                 ranking.offer((tier, sort, number), *(one[group == number] for one in offered))
 
     def _window(self, row: int, column: int, band: int) -> Radiance:
-        """Light about a tile in a band and its neighbours, (row, column, 3); the scene's edge is repeated."""
+        """Return the light about a tile in a band and its neighbours, (row, column, 3); the scene's edge is
+        repeated.
+        """
         halo, (rows, columns) = self._optics.halo, self._scene.shape
         down = np.arange(row - halo, row + self._tile + halo).clip(0, rows - 1)
         right = np.arange(column - halo, column + self._tile + halo).clip(0, columns - 1)
@@ -233,7 +235,7 @@ class BandTiles:
         return np.arange(0, columns, self._tile)
 
     def _measures(self, light: Radiance) -> list[Radiance]:
-        """Worth of every tile of a strip for every measure, (tile, band) each; the strip has a pixel beside it."""
+        """Return every measure of every tile of a strip, (tile, band) each; the strip has one pixel of margin."""
         inner = light[1:-1, 1:-1]
         starts = self._starts(inner.shape[1])
 
@@ -262,7 +264,7 @@ class BandTiles:
     def _wide_steps(
         self, light: Radiance, starts: NDArray[np.intp], greatest: Callable[[Radiance], Radiance], noise: Radiance
     ) -> list[Radiance]:
-        """Between means of half tiles, and between any two pixels: what a slit shows that is wider than a pixel."""
+        """Return the steps between means of half tiles, and between any two pixels, for slits wider than a pixel."""
         high, low = light.max(axis=0)[1:-1], light.min(axis=0)[1:-1]
         span: Radiance = greatest(high[None]) + greatest(-low[None])
         rows, columns = (_halves(size, self._tile) for size in light.shape[:2])
@@ -277,7 +279,7 @@ class BandTiles:
 
 
 def _halves(size: int, tile: int) -> NDArray[np.intp]:
-    """Firsts of half tiles, of a row with a pixel on either side."""
+    """Return the first pixels of half tiles, for a row with a pixel of margin on either side."""
     firsts = np.arange(1, size - 1, tile)
     both = np.unique(np.concatenate([firsts, firsts + tile // 2]))
     found: NDArray[np.intp] = both[both < size - 1]

@@ -178,7 +178,7 @@ def _is_present(effect: Effect, probe: Probe, rig: Rig) -> bool:
 
 
 def _even_probe(probe: Probe, derivatives: float) -> Probe:
-    """The probe of a scene of level 1 and the same derivatives in every band."""
+    """Return the probe of a scene of level 1 and the same derivatives in every band."""
     ones, both = np.ones(len(probe.wavelength_nm)), np.full((2, len(probe.wavelength_nm)), derivatives)
     alone = replace(probe, beside=(), afar=None, anywhere=None, own_e=None, ends_e=None)
     seen = replace(alone, level=ones, spread=ones, span=ones, slope=both, curvature=both)
@@ -304,7 +304,7 @@ def light_through(probe: Probe, rig: Rig, blurs: Iterable[Any]) -> Probe:
 
 
 def _differences(probe: Probe, rig: Rig, blurs: list[Any], normal: Floats) -> tuple[Floats, Floats]:
-    """Greatest first and second differences over wavelength, (2, band) each for either axis of the image."""
+    """Return the greatest first and second differences over wavelength, (2, band) each for either axis of the image."""
     nm = np.asarray(probe.wavelength_nm, np.float64)
     blurred = Moments.together([blur.moments(rig, nm, blur.variants[0], normal) for blur in blurs], len(nm))
     steep, bend = np.zeros((2, *probe.slope.shape))
@@ -320,7 +320,7 @@ def _differences(probe: Probe, rig: Rig, blurs: list[Any], normal: Floats) -> tu
 
 
 def _by_gaussian(probe: Probe, nm: Floats, shift: Floats, variance: Floats, width: Floats) -> tuple[Floats, Floats]:
-    """Greatest differences through Gaussians of a shift and variance in each band, (2, band) each.
+    """Return the greatest differences through Gaussians of a shift and variance in each band, (2, band) each.
 
     ``width`` (2, band) is the part of it that grows in proportion to the wavelength.
     """

@@ -66,7 +66,10 @@ def light_seen(
     footprint: Footprint,
     shifts: Sequence[tuple[Way, Way]] = (((0.0, 0.0), (0.0, 0.0)),),
 ) -> Radiance:
-    """Light (shift, view, band) through a footprint, with rays turned and points moved (along, scan) by shifts [px]."""
+    """Return light (shift, view, band) through a footprint.
+
+    Rays are turned and points moved (along, scan) by shifts [px].
+    """
     exposures, ifov = camera.exposure_ms / DEFAULT_EXPOSURE_MS, camera.ifov_rad
     light = np.empty((len(shifts), len(views.slope), len(scene.wavelength_nm)), np.float32)
     for along_y in (False, True):
@@ -98,7 +101,7 @@ def line_sums(camera: LineCamera, binning: int) -> int:
 
 
 def views_of_lines(sweeps: tuple[Sweep, ...], camera: LineCamera, room: int) -> SampleViews:
-    """Lines spread over all sweeps, the most oblique among them, of samples evenly from end to end.
+    """Return lines spread over all sweeps, the most oblique included, with samples evenly from end to end.
 
     All sweeps sum as many samples to a number.
     """
@@ -127,7 +130,7 @@ def views_of_lines(sweeps: tuple[Sweep, ...], camera: LineCamera, room: int) -> 
 def views_of_places(
     places: Floats, scene: RasterScene, camera: LineCamera, sweeps: tuple[Sweep, ...], beside_px: float | None = None
 ) -> SampleViews:
-    """Patches around places, each as the finest and the most oblique sweep of each orientation see it.
+    """Return patches around places, in the view of the finest and the most oblique sweep of each orientation.
 
     ``beside_px``: patches lie where their places are, up to so far beside what a sweep sees, as if its lines and their
     samples went on; None: a sweep's own samples, the nearest ones. All sweeps sum as many samples to a number.
@@ -185,7 +188,9 @@ def _held(sweep: Sweep) -> Sweep:
 
 
 def sample_offsets(binning: int) -> Floats:
-    """Steps of a patch around a place: stored numbers along the line and lines along the scan, (number, 2)."""
+    """Return the steps of a patch around a place: stored numbers along the line and lines along the scan, (number,
+    2).
+    """
     beside = _BESIDE if binning == 1 else 1
     return np.stack(np.meshgrid(np.arange(-beside, beside + 1.0), np.arange(-1.0, 2.0)), axis=-1).reshape(-1, 2)
 
@@ -246,5 +251,5 @@ def line_means(
 
 
 def _course(sweep: Sweep) -> tuple[bool, float, tuple[float, float]]:
-    """Orientation, strip, and the first held position and the one after the last: what tells paths apart."""
+    """Return what identifies a path: orientation, strip, the first held position and the one after the last."""
     return sweep.along == "y", sweep.swath_px, (sweep.start_px, sweep.start_px + sweep.lines * sweep.step)

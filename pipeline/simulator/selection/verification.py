@@ -271,7 +271,7 @@ def contrast_about(block: SweepBlock, render: Render, reach_px: int = REACH_PX) 
 
 
 def _beyond(sweep: Sweep, rig: Rig, reach_px: int) -> Sweep:
-    """All positions that a sweep holds, one by one, and those beyond its ends; none that the mirror does not reach."""
+    """Return a sweep of every held position, extended beyond its ends where the mirror reaches that far."""
     held = replace(sweep, step=1, lines=sweep.lines * sweep.step)
     wide = replace(held, start_px=held.start_px - reach_px - 1, lines=held.lines + 2 * (reach_px + 1))
     try:
