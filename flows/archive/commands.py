@@ -299,8 +299,9 @@ def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
 
 
 def command(settings: Mapping[str, Any], out: str) -> str:
-    """Return the command for these settings into the archive ``out``, which may have moved, as far as flags can say
-    it.
+    """Return the command for these settings into the archive ``out``, as far as flags can say it.
+
+    The archive may have moved since.
     """
     if not settings:
         return ""

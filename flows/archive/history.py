@@ -180,8 +180,8 @@ def read_moment(value: object) -> datetime | None:
 def time_of_visit(run: Run) -> datetime | None:
     """Return the moment that a run's visit is called by, else the day that its farm was drawn on.
 
-    Of others when they began, or were published. The day is of the year in which the run was published. None where
-    nothing of that can be read.
+    Other runs have the time when they began, or were published. The day is of the year in which the run was published.
+    None where nothing of that can be read.
     """
     named = read_moment(run.settings.get("visit"))
     if named is not None:

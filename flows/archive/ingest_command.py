@@ -76,10 +76,10 @@ def run_ingest(
 ) -> dict[str, Any]:
     """Store a source in an archive, with progress on ``console``; give the record that --json prints.
 
-    What the files hold and the flags say is the store's key: the same content is stored once, whatever it is called and
-    wherever it lies. Killed anywhere it leaves nothing under that key. Raises SceneError, WavelengthError: the source
-    cannot be used, or changed while it was read; ArchiveError: the name cannot be one in an archive, or the archive
-    cannot be written to.
+    The key of the store comes from the files' content and the flags. The same content is stored once, whatever its name
+    and place. Killed anywhere it leaves nothing under that key. Raises SceneError, WavelengthError: the source cannot
+    be used, or changed while it was read; ArchiveError: the name cannot be one in an archive, or the archive cannot be
+    written to.
     """
     if name is not None:
         check_name(name)

@@ -78,8 +78,8 @@ def _recorded_run(catalogue: Catalogue, run: Run) -> Run:
 def from_raw_cubes(catalogue: Catalogue, run: Run, settings: Settings) -> Settings:
     """Return the settings of a survey of a run's own raw cubes as a recording, where its light is not found otherwise.
 
-    That is so where another version of the captures is wanted than a rig or a recording left, or where the files of a
-    recording or of a simulated scene are gone. Else, and where the raw cubes are gone too, the settings stay. Raises
+    That is so where the captures have another version than a rig or a recording left. It is so, too, where the files of
+    a recording or of a simulated scene are gone. Else, and where the raw cubes are gone too, the settings stay. Raises
     SettingsError, BudgetError: as `asked_again`.
     """
     raw = set(stores_of_lines(run.products, lambda uri: uri in catalogue.stores and not catalogue.stores[uri].cleared))

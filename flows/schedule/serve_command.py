@@ -317,7 +317,8 @@ def _pause(fields: Sequence[str]) -> None:
 def _prepare(fields: Sequence[str]) -> None:
     """Have one rig in Prefect's limits, and end what an earlier serve left.
 
-    What was due while nothing was served is cancelled, since its time is over; what ran then has crashed.
+    Surveys that were due while serve was stopped are cancelled, since their time is over; those that ran then have
+    crashed.
     """
     filters, kind = cast(Any, prefect_filters), prefect_objects.StateType
     named = filters.DeploymentFilter(name=filters.DeploymentFilterName(any_=list(fields)))

@@ -148,8 +148,9 @@ class NoPlace:
         return shape
 
     def pixel_areas_m2(self, rows: slice, columns: slice) -> Floats | None:
-        """Return the ground under some pixels (row, column) [m2], NaN where they show none; None where it is
-        unknown.
+        """Return the ground under some pixels (row, column) [m2]; None where it is unknown.
+
+        Pixels that show none are NaN.
         """
         size = rows.stop - rows.start, columns.stop - columns.start
         return None if self.pixel_m is None else np.full(size, self.pixel_m**2)
@@ -177,10 +178,8 @@ class PlacedPicture:
     @property
     def outline(self) -> BaseGeometry:
         corners = shapely.box(0, 0, self.shape[1], self.shape[0])
-        return self._on_map(shapely.segmentize(corners, max(self.shape) / EDGE_PARTS))
-
-    def _on_map(self, pixels: BaseGeometry) -> BaseGeometry:
-        return shapely.affinity.affine_transform(pixels, self.geobox.affine.to_shapely())
+        edges = shapely.segmentize(corners, max(self.shape) / EDGE_PARTS)
+        return shapely.affinity.affine_transform(edges, self.geobox.affine.to_shapely())
 
     def to_pixels(self, shape: BaseGeometry) -> BaseGeometry:
         return shapely.affinity.affine_transform(shape, (~self.geobox.affine).to_shapely())

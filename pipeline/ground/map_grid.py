@@ -1,7 +1,8 @@
 """The map's pixels: metres around the rig's foot in a projected CRS and back, and a grid there of what a scene shows.
 
-The metres are of the plane that touches the ellipsoid's normal at the foot (east, north, up); they go to longitude and
-latitude through Cartesian coordinates of the earth, so that nothing is taken for flat. By PROJ, without a network.
+The metres are of the plane that touches the ellipsoid's normal at the foot (east, north, up). They go to longitude and
+latitude through Cartesian coordinates of the earth, so that nothing is taken for flat. PROJ computes it, without a
+network.
 """
 
 from __future__ import annotations
@@ -196,8 +197,8 @@ def ground_grid(
 ) -> GroundGrid:
     """Lay a map's grid over the footprint of a field of (y, x) px. Its pixels start at multiples of their side.
 
-    ``epsg`` is the code of a projected CRS in metres, None for the rig's UTM zone; ``resolution_m`` the side of the
-    map's pixels, None for the median side of a scene pixel's footprint, rounded, or more where a long and narrow
+    ``epsg`` is the code of a projected CRS in metres, None for the rig's UTM zone; ``resolution_m`` is the side of the
+    map's pixels. None takes the median side of a scene pixel's footprint, rounded, or more where a long and narrow
     footprint would need a far larger map than the scene.
 
     Raises PoseError: no ray of the field meets the ground, the CRS does not suit the place, or the grid would have far

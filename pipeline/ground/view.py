@@ -82,7 +82,7 @@ class GroundView:
     """A posed rig with its pixel's angle: every scene point's ray and where it meets the ground.
 
     A ray v + x r + y d (tangents x and y, r right, d down) sinks by w = -n . ray per unit of depth, n being the
-    ground's normal with n_up = 1; it meets the ground at the depth height / w. All of this class follows from w being
+    ground's normal with n_up = 1. It meets the ground at the depth height / w. All of this class follows from w being
     linear in the scene.
     """
 

@@ -41,7 +41,9 @@ def on_field(shape: BaseGeometry, crs: pyproj.CRS | None, place: FieldPlace) -> 
         return shapely.intersection(shape, _grown(shapely.box(*place.outline.bounds), BORDER_PX))
     to_place = pyproj.Transformer.from_crs(crs, place.crs, always_xy=True)
     middle = _middle_deg(place) if crs.is_geographic else None
-    there, given = (_told_from(one, middle) for one in (_there(place, crs), shape))
+    back = pyproj.Transformer.from_crs(place.crs, crs, always_xy=True)
+    outline = shapely.transform(place.outline, lambda at: np.stack(back.transform(at[:, 0], at[:, 1]), axis=-1))
+    there, given = (_told_from(one, middle) for one in (outline, shape))
     around = _grown(there, ROUND_THE_FIELD * max(np.ptp(np.reshape(there.bounds, (2, 2)), axis=0)))
     near = shapely.intersection(given, around)
     if near.is_empty:
@@ -57,12 +59,6 @@ def extent_deg(shape: BaseGeometry, crs: pyproj.CRS) -> tuple[float, float, floa
     places = shapely.get_coordinates(shape)
     lon, lat = to_globe.transform(places[:, 0], places[:, 1])
     return float(np.min(lon)), float(np.min(lat)), float(np.max(lon)), float(np.max(lat))
-
-
-def _there(place: FieldPlace, crs: pyproj.CRS) -> BaseGeometry:
-    """Return the outline of a field in the coordinates of polygons."""
-    back = pyproj.Transformer.from_crs(place.crs, crs, always_xy=True)
-    return shapely.transform(place.outline, lambda at: np.stack(back.transform(at[:, 0], at[:, 1]), axis=-1))
 
 
 def _middle_deg(place: FieldPlace) -> float | None:

@@ -194,8 +194,8 @@ def index_values(
 ) -> Floats:
     """Return an index from the values (..., band) of the bands that `pick_bands` gave, and their wavelengths [nm].
 
-    NaN where a band has no value, where the bands are darker than 1 % of ``white`` on the mean, and where the formula
-    has no finite value, as by a division by zero.
+    It is NaN where a band has no value, and where the bands are darker than 1 % of ``white`` on the mean. So it is
+    where the formula has no finite value, as by a division by zero.
     """
     usable: NDArray[np.bool_] = np.isfinite(values).all(axis=-1)
     usable &= np.where(usable, values.mean(axis=-1), -np.inf) >= DARK_FRACTION * white

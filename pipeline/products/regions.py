@@ -1,10 +1,10 @@
 """Regions of a class map: small ones given to a neighbour, classes grown, and their outlines as polygons without gaps.
 
-A region is a set of pixels of one class that hang together by their sides. What has no class (255) is no region: it
-is never given to a class, nor takes anything from one, unless a class is grown over it on request.
+A region is a set of pixels of one class that hang together by their sides. Pixels without a class (255) are no region:
+they are never given to a class, nor take from one, unless a class is grown over them on request.
 
-Outlines go along the sides of pixels. Wherever three regions meet, all three have a vertex there: that is what makes
-the outlines a coverage in the words of shapely, whose simplification draws a border once for both its regions.
+Outlines go along the sides of pixels. Wherever three regions meet, all three have a vertex there. That makes the
+outlines a coverage in the words of shapely, whose simplification draws a border once for both its regions.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class RegionGraph:
     def grouped(self, group: NDArray[np.integer]) -> RegionGraph:
         """Return the graph of groups of regions, (region,) numbers of groups from 0.
 
-        A group has its largest region's class. Of equally large ones the first gives the class.
+        A group has its largest region's class. The first of equally large ones gives the class.
         """
         count = int(group.max(initial=-1)) + 1
         sizes = np.bincount(group, self.sizes, count).astype(np.int64)
@@ -150,8 +150,8 @@ def merge_small(classes: Classes, least_px: float) -> Classes:
     """Give every region of less than ``least_px`` pixels to the neighbour that it shares the longest border with.
 
     Neighbours that are small as well stay together, as the class of the largest, until the whole is large enough.
-    What has no neighbour with a class stays, however small. Of borders equally long the neighbour numbered first (from
-    the upper left) is taken.
+    Regions without a neighbour of a class stay, however small. Among borders equally long the neighbour numbered first
+    (from the upper left) is taken.
     """
     if least_px <= 1:
         return classes.copy()
@@ -168,8 +168,9 @@ def merge_small(classes: Classes, least_px: float) -> Classes:
 
 
 def _links_of_small(graph: RegionGraph, least_px: float) -> NDArray[np.int64]:
-    """Return (link, 2): each small region with its neighbour of the longest border; none for those without a
-    neighbour.
+    """Return (link, 2): each small region with its neighbour of the longest border.
+
+    Regions without a neighbour have no link.
     """
     known = (graph.classes[graph.pairs] != UNLABELLED).all(axis=1)
     pairs, sides = graph.pairs[known], np.tile(graph.sides[known], 2)

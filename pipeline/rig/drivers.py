@@ -23,7 +23,7 @@ from pipeline.rig.mirror.pro_mode import Trigger
 class MirrorDriver(Protocol):
     """A two-axis mirror that holds a position, or plays a list of them.
 
-    Positions are X and Y on the unit disk, 1 at the rim, of a mirror mounted straight; a driver turns them into the
+    Positions are X and Y on the unit disk, 1 at the rim, of a mirror mounted straight. A driver turns them into the
     device's own by ``rig.mounting``. `load_path` gets at most ``cost.vector_pairs`` of them.
     """
 

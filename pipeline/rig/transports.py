@@ -307,8 +307,8 @@ class SocketTransport:
 class Wire:
     """One device behind a transport. Only one transaction runs at a time, and each begins with an empty line.
 
-    A read is asked again, within the deadline of the first; a write never is; a motion never is, and one that is not
-    acknowledged freezes all motions: where the mirror is is for a person to see, who connects anew then.
+    A read is asked again, within the deadline of the first. A write or a motion never is, and a motion that is not
+    acknowledged freezes all motions. A person has to look where the mirror stands, and connects anew then.
     """
 
     def __init__(self, transport: Transport, clock: Clock, patience: Patience) -> None:
@@ -389,7 +389,7 @@ class Wire:
         )
 
     def _empty_line(self, when: str, latest: float = math.inf, *, level: int = logging.WARNING) -> None:
-        """Drop what is on the line. Where an answer is still owed, wait for silence: it would pass for the next one."""
+        """Drop what is on the line. If an answer is still owed, wait for silence: it would pass for the next one."""
         stale = self.transport.drain()
         now = self.clock.now()
         latest = min(latest, now + 5 * self.patience.quiet_s)  # some devices never stop

@@ -111,8 +111,8 @@ class Archive:
     def locate(self, address: str) -> Path:
         """Return where on this machine a product lies by its address relative to the archive, as a receipt gives it.
 
-        Raises IncompleteStoreError: its store is not there, its files were cleared away, or one of them is missing, cut
-        short, a link or no file at all.
+        Raises IncompleteStoreError: the store is not there, or its files were cleared away. So does a file that is
+        missing, cut short, a link or no plain file.
         """
         uri = in_text(address)
         if uri is not None:
@@ -265,7 +265,7 @@ class Archive:
     def in_use(self, *, alone: bool = False) -> Iterator[bool]:
         """Keep others from clearing stores away while the block runs; many may do so at a time.
 
-        With ``alone`` ask to be the only one: gives False, at once, where another process uses the archive.
+        ``alone`` asks to be the only one, and gives False at once where another process uses the archive.
         """
         with refusals(self.root, "write to the archive"):
             release = take_lock(self._lock_path("use"), wait=not alone, shared=not alone)

@@ -1,7 +1,6 @@
 """Manifests: the facts of a published folder, the hash and size of every file, and a seal over the manifest itself.
 
-The seal is the SHA-256 of the manifest's text without it, so that a bit that flips in the manifest is found by the
-manifest alone.
+The seal is the SHA-256 of the manifest's text without it. A flipped bit in the manifest is found by the manifest alone.
 """
 
 from __future__ import annotations
@@ -58,8 +57,8 @@ def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
 def read_manifest(folder: Path) -> dict[str, Any]:
     """Return the content of a published folder's manifest.
 
-    Raises IncompleteStoreError: there is none, it cannot be read, its own seal says that it has changed, or it lists
-    what cannot be a file of this folder.
+    Raises IncompleteStoreError: there is none, it cannot be read, or its own seal contradicts it. So does a listed file
+    that cannot lie in this folder.
     """
     content, problem = try_manifest(folder)
     if problem is not None:

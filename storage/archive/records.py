@@ -23,7 +23,10 @@ RESTS_ON = "rests_on"  # in a run's manifest: address of a store -> SHA-256 of i
 
 @dataclass(frozen=True)
 class StageRecord:
-    """One stage of a run, as its receipt has it. What was not measured (a stage read from the archive) is None."""
+    """One stage of a run, as its receipt has it.
+
+    Figures that were not measured (a stage read from the archive) are None.
+    """
 
     name: str
     key: str

@@ -1,9 +1,9 @@
 """Maps of classes on the grid of a mosaic, and class probabilities of each pixel; those of the ground: `ground_maps`.
 
-Names of classes are CF flags. Of a pixel log-probabilities of its classes, how long ago it was looked at and by what
-light are kept, packed by CF's rules (scale_factor, add_offset), so that any reader of netCDF or Zarr gets numbers: a
-twentieth of a nat in a byte, an eighth of a day in two, a sixteenth of an octave of light in one. Classes less likely
-than one in 1100 are all stored as equally unlikely, and confidence as floats in steps of 1/256.
+Names of classes are CF flags. Each pixel has log-probabilities of its classes, and age and light of its last capture.
+They are packed by CF's rules (scale_factor, add_offset), so that any reader of netCDF or Zarr gets numbers. A byte
+counts twentieths of a nat for probabilities and sixteenths of an octave for light; two bytes count eighths of a day.
+Classes less likely than one in 1100 are all stored as equally unlikely, and confidence as floats in steps of 1/256.
 """
 
 from __future__ import annotations
@@ -168,7 +168,7 @@ def create_probabilities(
 ) -> None:
     """Begin a store for a field of (y, x) ``shape`` of which nothing is known yet.
 
-    Where it ``goes_on`` from an earlier one there is also what its pixels were, where they changed: `OLD_CLASS`.
+    A store that ``goes_on`` from an earlier one also has the earlier classes of changed pixels: `OLD_CLASS`.
     """
     names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
     group, place = create_placed_group(path, "class_probabilities", grid, shape, names)

@@ -2,16 +2,16 @@
 
 A file of the camera is named by its whole path there, notes about the files by a name alone. Bytes are written at the
 end and nowhere else; a file that came damaged goes as a whole. Notes are on the disk when ``append`` returns; of files
-so is all but the last ``SYNC_BYTES``, since the camera still has them. What is held is compared when a transfer goes
-on.
+so is all but the last ``SYNC_BYTES``, since the camera still has them. Held bytes are compared when a transfer
+continues.
 
 ::
 
     <name>          the bytes of a file of the camera, or of notes, which have checksums of their own
     <name>%sums     records of how far the file reached, the CRC-32 of its bytes up to there, and that of the record
 
-What an earlier process left of a file is compared with its sums once, and cut off from where they do not fit: the
-camera is asked for it again.
+Files left by an earlier process are compared with their sums once, and cut off where they differ. The camera is asked
+for the rest again.
 """
 
 from __future__ import annotations
@@ -130,7 +130,10 @@ class FetchedFiles:
             ) from error
 
     def _sum_up(self, name: str, path: Path, data: bytes) -> None:
-        """Take down how far a file reaches now. What the disk takes half of is cut off when the file is compared."""
+        """Take down how far a file reaches now.
+
+        A part that the disk took only half of is cut off when the file is compared.
+        """
         known = self._sums[name]
         reached, crc32 = known.reached + len(data), zlib.crc32(data, known.crc32)
         text, sums = _record(reached, crc32), _sums_of(path)

@@ -1,8 +1,8 @@
 """Georeference of stored images: GeoBox or the camera's angles as attributes and coordinates, written and read.
 
-A GeoBox is said by CF's grid mapping with coordinates of pixel centres, and by GeoZarr's attributes ``proj:`` and
-``spatial:``, so that plain xarray, rioxarray and odc-geo find the same. A grid that is turned has no centres along its
-axes: as odc-geo has it, its coordinates count pixels, and the grid mapping's GeoTransform says the rest.
+A GeoBox is written as CF's grid mapping with coordinates of pixel centres, and as GeoZarr's attributes ``proj:`` and
+``spatial:``. Plain xarray, rioxarray and odc-geo find the same. A turned grid has no centres along its axes. As in
+odc-geo its coordinates count pixels, and the grid mapping's GeoTransform has the rest.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The common layout of stored arrays: Zarr v3 codecs and chunks, bands, CF and GeoZarr attributes, rounding.
 
-Chunks of 32 x 32 px with all bands, in shards of 64 rows, each chunk with its own crc32c: one patch is one range read,
-and a flipped bit is an error instead of a wrong number. Images without bands are one chunk a shard. Codecs to choose
-from are tried in memory in the same layout.
+Chunks are 32 x 32 px with all bands, in shards of 64 rows, each with its own crc32c. One patch is one range read, and a
+flipped bit is an error instead of a wrong number. Images without bands are one chunk a shard. Codecs to choose from are
+tried in memory in the same layout.
 
 Pixels of which a scene knows nothing are taken out of stored images: no class, no value, no memory.
 """
@@ -60,8 +60,9 @@ class AngularGrid:
     geobox: GeoBox | None = None  # of the fine grid, where the scene's file says it
 
     def attributes(self, shape: tuple[int, int]) -> dict[str, Any]:
-        """Return the GeoZarr ``spatial:`` attributes of an image of (y, x) ``shape``; the transform maps pixel
-        corners.
+        """Return the GeoZarr ``spatial:`` attributes of an image of (y, x) ``shape``.
+
+        The transform maps pixel corners.
         """
         step = self.ifov_rad * self.factor
         top, left = (-size / 2 * self.ifov_rad for size in self.scene_shape)
@@ -108,8 +109,9 @@ class ArraySpec:
 
 
 def image_spec(dims: Sequence[str], shape: Sequence[int], dtype: str, *, whole: bool = False) -> ArraySpec:
-    """Return the layout of an image: rows and columns first, all bands in one chunk, shards of 64 rows of up to 640
-    columns.
+    """Return the layout of an image: rows and columns first, all bands in one chunk.
+
+    A shard has 64 rows and at most 640 columns.
 
     It is one chunk where it is to be read ``whole``, and in images without bands: chunks of few bytes cost more calls
     than unpacking.
@@ -146,8 +148,8 @@ def create_array(
 ) -> zarr.Array[Any]:
     """Add an empty array: NaN where floating; ``_FillValue``, ``nodata`` or 0 where not; checksums come last.
 
-    ``packing`` is blosc's codec and its level. Of a ``flat`` image most pixels are like those beside them, as of a
-    map: bytes are packed whole, channel after channel, and files lie in one folder.
+    ``packing`` is blosc's codec and its level. Most pixels of a ``flat`` image, such as a map, are like their
+    neighbours. Its bytes are packed whole, channel after channel, and its files lie in one folder.
     """
     kind, (codec, level) = np.dtype(spec.dtype), packing
     shuffle = BloscShuffle.shuffle if flat else BloscShuffle.bitshuffle

@@ -268,7 +268,7 @@ class Mosaic:
     def brightness(self, factor: int | None = None, bands: int | None = None) -> NDArray[np.float32]:
         """Return the mean over the bands, (y, x) in pixels of ``factor`` fine ones.
 
-        With a number of bands, so many of them are taken, spread over all.
+        ``bands`` limits the mean to so many bands, spread over all.
         """
         weights, offset = broad_weights(self.components, bands or self.components.bands)
         return np.concatenate([block @ weights + offset for block in self.row_blocks(factor)])
@@ -278,8 +278,8 @@ class Mosaic:
     ) -> Iterator[NDArray[np.float32]]:
         """Yield the scores of a window from the top down, (y, x, component), that end where shards do.
 
-        ``factor`` are the fine pixels to a side of those wanted, a multiple of its own: means of what was seen, NaN
-        where that is less than half; rows and columns count such pixels. None: its own pixels.
+        ``factor`` is the side of the wanted pixels in fine ones, a multiple of the store's own. Such pixels are means
+        of the captured ones, NaN where fewer than half are. Rows and columns count such pixels. None: its own pixels.
         """
         times = 1 if factor is None else factor // self.factor
         (first, last, _), (left, right, _) = (

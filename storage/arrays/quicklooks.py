@@ -4,8 +4,8 @@
 
     <cube>.zarr/quicklook     (y, x, 3) uint8: every 4th line and sample, three bands, 2-98 % of each; 0 where missing
 
-It is gathered while lines are written, from three bands of those lines alone. Attributes say which bands they are, the
-step between its pixels, and the values that 0 and 255 stand for: one scale for all three where frames make scene values
+It is gathered while lines are written, from three bands of those lines alone. Attributes name the bands, the step
+between pixels, and the values that 0 and 255 stand for. All three bands have one scale where frames make scene values
 of them and they are near red, green and blue, else one each.
 """
 
@@ -91,7 +91,7 @@ def stretched(
 ) -> Quicklook:
     """Return the 2nd to 98th percentile of each band as 0..255, (y, x, band) in and out.
 
-    Values that are not finite become 0. With ``together`` all bands have one scale, from the least to the greatest of
+    Values that are not finite become 0. ``together`` gives all bands one scale, from the least to the greatest of
     these: colours stay true.
     """
     ends = np.array([_ends(image[..., band]) for band in range(image.shape[-1])])

@@ -308,7 +308,7 @@ def open_signal_cubes(folder: Path) -> list[SignalCube]:
 class RestoredCube(RawCube):
     """Raw lines as their components give them back: their signal, rounded to whole numbers; the noise is gone.
 
-    What was unusable comes back as the largest number, which counts as saturated.
+    Unusable numbers come back as the largest number, which counts as saturated.
     """
 
     signal: SignalCube

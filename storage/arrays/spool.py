@@ -1,12 +1,12 @@
-"""The line spool: what a capture writes while it runs, so that a crash loses at most the lines since the last sync.
+"""The line spool: records of a capture while it runs, so that a crash loses at most the lines since the last sync.
 
-``<name>.lines`` begins with one JSON object on a line: what the lines belong to, with a checksum of its own. Records
-of one size follow, one a line: number, mirror X and Y, time, exposure, valid, a CRC-32, and the raw numbers (sample,
-band) uint16. The CRC continues that of the header, so that a record belongs to one sweep alone.
+``<name>.lines`` begins with one JSON object on a line: the sweep of the lines, with a checksum of its own. Records of
+one size follow, one a line: number, mirror X and Y, time, exposure, valid, a CRC-32, and the raw numbers (sample, band)
+uint16. The CRC continues that of the header, so that a record belongs to one sweep alone.
 
-A line counts when its record has its CRC. Records that do not count lie either behind the last that does, and are cut
-off: the capture continues there; or before it: these lines are lost, and are put back in their places when the source
-gives them again.
+A line counts when its record has its CRC. Other records behind the last that counts are cut off, and the capture
+continues there. Lines of other records before it are lost, until the source gives them again and they are put back in
+their places.
 """
 
 from __future__ import annotations

@@ -151,7 +151,7 @@ def _tag_wavelengths(file: Any, image: CogImage) -> None:
 def value_span(path: Path, bands: Sequence[int]) -> tuple[float, float]:
     """Return the 2nd and 98th percentile of a file's pixels in some bands, counted from 1; 0 and 1 without any value.
 
-    Of at most 512 x 512 pixels of the file.
+    At most 512 x 512 pixels of the file are read.
     """
     with importlib.import_module("rasterio").open(path) as file:
         y, x = (min(size, TILE) for size in file.shape)
@@ -267,9 +267,8 @@ def write_recorded_files(cube: RawCube, folder: Path) -> Path:
         NAME.white.*                 white frame; its header has the value of the white reference per band
         NAME.bad.*  NAME.flat.*      bad elements (1), and the relative response where there is one
 
-    Numbers stand in text with as many digits as give the same float64 again.
-    What is there under these names is replaced. Raises ArchiveError: the disk refuses; IncompleteStoreError: the cube
-    is damaged.
+    Numbers stand in text with as many digits as give the same float64 again. Files of these names are replaced. Raises
+    ArchiveError: the disk refuses; IncompleteStoreError: the cube is damaged.
     """
     make_folder(folder)
     name = cube.sweep.name

@@ -1,8 +1,8 @@
 """Files for map programs and machines: polygons (by GDAL), QGIS styles beside them and rasters, and ISOXML task data.
 
 Polygons are GeoPackage, GeoJSON and shapefile; styles (.qml) are classes with names and colours, ramps, bands as
-colours. Task data (ISO 11783-10, version 4) is TASKDATA.XML and the numbers of its grid, of type 2: rows from the
-south-west corner, each cell the dose as a 32 bit whole number in steps of the dictionary's entity for it.
+colours. Task data (ISO 11783-10, version 4) is TASKDATA.XML and the numbers of its grid, of type 2. Rows begin at the
+south-west corner; each cell has the dose as a 32 bit whole number in steps of the dictionary's entity for it.
 """
 
 from __future__ import annotations
@@ -195,7 +195,7 @@ def ramp_colour(fraction: float, ramp: Sequence[Colour]) -> Colour:
 
 
 def write_class_style(path: Path, classes: Sequence[Entry]) -> None:
-    """Style a raster of class numbers."""
+    """Write the style of a raster of class numbers."""
     root, renderer = _raster({"type": "paletted", "band": "1", "opacity": "1", "alphaBand": "-1"})
     palette = SubElement(renderer, "colorPalette")
     for number, name, colour in classes:
@@ -204,7 +204,7 @@ def write_class_style(path: Path, classes: Sequence[Entry]) -> None:
 
 
 def write_ramp_style(path: Path, low: float, high: float, ramp: Sequence[Colour]) -> None:
-    """Style a raster of one band by a ramp of colours from ``low`` to ``high``."""
+    """Write the style of a raster of one band: a ramp of colours from ``low`` to ``high``."""
     span = {"classificationMin": f"{low:g}", "classificationMax": f"{high:g}"}
     root, renderer = _raster({"type": "singlebandpseudocolor", "band": "1", "opacity": "1", "alphaBand": "-1", **span})
     kind = {"colorRampType": "INTERPOLATED", "classificationMode": "2", "clip": "0"}
@@ -217,7 +217,10 @@ def write_ramp_style(path: Path, low: float, high: float, ramp: Sequence[Colour]
 
 
 def write_colour_style(path: Path, bands: Sequence[int], low: float, high: float) -> None:
-    """Style a raster by three of its bands, counted from 1, as red, green and blue, each from ``low`` to ``high``."""
+    """Write the style of a raster that shows three of its bands, counted from 1, as red, green and blue.
+
+    Each goes from ``low`` to ``high``.
+    """
     named = dict(zip(("redBand", "greenBand", "blueBand"), map(str, bands), strict=True))
     root, renderer = _raster({"type": "multibandcolor", "opacity": "1", "alphaBand": "-1", **named})
     for colour in ("red", "green", "blue"):
@@ -232,7 +235,7 @@ def write_colour_style(path: Path, bands: Sequence[int], low: float, high: float
 
 
 def write_polygon_style(path: Path, column: str, entries: Sequence[Entry]) -> None:
-    """Style polygons by the values of one column."""
+    """Write the style of polygons by the values of one column."""
     root = Element("qgis", version=QGIS_VERSION, styleCategories="Symbology")
     about = {"type": "categorizedSymbol", "attr": column, "symbollevels": "0", "enableorderby": "0"}
     renderer = SubElement(root, "renderer-v2", about)

@@ -64,8 +64,9 @@ def footprint(geobox: GeoBox, seen: Iterable[tuple[int, NDArray[np.bool_]]]) -> 
 
 
 def projection(geobox: GeoBox) -> dict[str, Any]:
-    """Return the fields of the projection extension of an image on a map, by its Zarr store. Raises PoseError: no
-    CRS.
+    """Return the fields of the projection extension of an image on a map, by its Zarr store.
+
+    Raises PoseError: the map has no CRS.
     """
     place = map_attributes(geobox)
     code = place.get("proj:code")

@@ -151,8 +151,9 @@ def _age_days(store: Store, now: datetime) -> float:
 
 
 def _obstacle(archive: Archive, catalogue: Catalogue, staying: set[str]) -> str | None:
-    """Return why no store may be removed: a receipt or manifest that names stores is damaged or gone. None without
-    one.
+    """Return why no store may be removed; None where stores may be.
+
+    A damaged or missing receipt or manifest is an obstacle where it would name stores to keep.
     """
     for uri in archive.lost_runs():
         return f"no store is removed: {uri} has lost its {MANIFEST_NAME} and does not tell what it names"

@@ -1,7 +1,7 @@
 """Making an archive whole again: what is broken is named, taken away, and made anew by the surveys that name it.
 
-The raw lines of a rig, and stores of a version of a stage that is not made any more, cannot be made anew: they stay as
-they are. In a bucket what this machine's working copy has whole is uploaded again.
+Raw lines of a rig cannot be made anew, nor can stores of a former version of a stage: they stay as they are. Stores in
+a bucket that this machine's working copy has whole are uploaded again.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Reading a whole archive again: every byte against its manifest, every manifest against its seal and its runs.
 
-A link or a pipe in the place of a file is reported and never opened. Of a broken file of an array it
-says which part it holds.
+A link or a pipe in the place of a file is reported and never opened. A finding on a broken file of an array names the
+part that it holds.
 """
 
 from __future__ import annotations

@@ -173,11 +173,11 @@ def run_blocks(
     They are begun in order, none more than a few before the oldest unfinished one: neighbours share what they read.
     The first error is raised once no block is being made any more: none writes after that.
 
-    On threads ``make`` is anything that may be called from several at once. Otherwise it and the items are pickled:
-    they hold absolute paths, never arrays or open files, and writing a block twice must give the same bytes.
-    ``report`` is called with the share done after each. Workers elsewhere are asked if they see the same in ``paths``,
-    the folders that the work reads or writes; from those in a staged store (``*.part``) goes what a killed worker left
-    of a file that another wrote again. Gives the results in the order of the items. Raises SettingsError: no scheduler
+    On threads ``make`` is anything that may be called from several at once. Otherwise it and the items are pickled.
+    They hold absolute paths, never arrays or open files, and writing a block twice must give the same bytes. ``report``
+    is called with the share done after each. Workers elsewhere are asked if they see the same in ``paths``, the folders
+    that the work reads or writes. Those in a staged store (``*.part``) are cleared of partial files that a killed
+    worker left and another wrote again. Gives the results in the order of the items. Raises SettingsError: no scheduler
     answers, or its workers see other files or run other versions. WorkerError: workers died, more often than a block is
     tried again.
     """
@@ -254,7 +254,7 @@ def _send(
 ) -> None:
     """Send blocks in order, none ``window`` or more behind the oldest unfinished one; ``ended`` takes each result.
 
-    What is on its way is waited for before an error is raised.
+    Running blocks are waited for before an error is raised.
     """
     running: dict[Future[Any], int] = {}
     sent = 0

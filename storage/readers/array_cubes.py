@@ -82,7 +82,7 @@ class ArrayCube:
 def find_cube(arrays: Arrays, variable: str | None, path: Path, *, labels: bool = False) -> ArrayCube:
     """Find the array that is a cube: the one named, the only one with three axes, or the only one with wavelengths.
 
-    Of ``labels`` the only one with two axes comes first. ``variable`` may end in a step of time (``values:3``), or be
+    For ``labels`` the only one with two axes comes first. ``variable`` may end in a step of time (``values:3``), or be
     one. Nothing but names, shapes and attributes is read. Raises SceneError: there is no such array, there are several,
     or its axes are not y, x and band.
     """

@@ -301,8 +301,9 @@ def _words(about: Mapping[str, Any], item: Any) -> dict[str, Any]:
 
 
 def _plain(attributes: Any) -> dict[str, Any]:
-    """Return the attributes as Python's own texts and numbers, lists as arrays; those that cannot be read are left
-    out.
+    """Return the attributes as Python's own texts and numbers, lists as arrays.
+
+    Attributes that cannot be read are left out.
     """
     found = {}
     for name in attributes:
@@ -323,8 +324,8 @@ def _plain(attributes: Any) -> dict[str, Any]:
 def open_array_file(path: Path, variable: str | None = None, *, labels: bool = False) -> CubeSource:
     """Open the array named, or the only one with three axes; one of a .npy file is never read as a whole.
 
-    Of ``labels`` the only one with two axes. Raises SceneError: there is no such array, or several; it is no table of
-    numbers; or it claims more than the file or the machine can hold.
+    For ``labels`` it is the only one with two axes. Raises SceneError: there is no such array, or several, or it is no
+    table of numbers. So does an array that claims more than the file or the machine can hold.
     """
     guard = partial(reading_array, path)
     with guard():

@@ -1,8 +1,8 @@
 """Label files that belong to scenes by their names.
 
 Labels are pictures, or polygons where there is no picture. They lie beside their images (``001_mask.png``,
-``field_a_labels.png``, ``field_a.gpkg``) or in a folder of labels there, or beside a folder of images
-(``labels/001.png``, ``annotations/001_annotation.png``); names are equal, or but for a word such as ``_mask``. Upper
+``field_a_labels.png``, ``field_a.gpkg``) or in a folder of labels. That folder lies there, or beside a folder of images
+(``labels/001.png``, ``annotations/001_annotation.png``). Names are equal, or differ by a word such as ``_mask``. Upper
 and lower case are alike.
 """
 
@@ -94,8 +94,9 @@ def match_folder(folder: Path) -> MatchedFiles:
 
 
 def find_label(scene: Path) -> Path | None:
-    """Return the label file of one scene by its name; None where there is none. Raises SceneError: there are
-    several.
+    """Return the label file of one scene by its name; None where there is none.
+
+    Raises SceneError: there are several.
     """
     if not scene.parent.is_dir() or (scene.is_dir() and not is_store(scene)):
         return None
@@ -133,8 +134,9 @@ def is_store(entry: Path) -> bool:
 
 
 def _in_label_folders(folder: Path) -> list[Path]:
-    """Return all pictures that may be labels in folders of labels: in this one, or beside it where it is one of
-    images.
+    """Return all pictures that may be labels in folders of labels.
+
+    Such a folder lies in this one, or beside it where it is one of images.
     """
     return [entry for inner in _label_folders(folder) for entry in scene_entries(inner)]
 

@@ -103,8 +103,8 @@ def load_labels(
     """Read a label file of numbers or exact colours; without ``classes`` every value found becomes one.
 
     ``geobox`` is the grid of the scene: labels with a place of their own are brought to it. Raises SceneError: the file
-    cannot be read, lies beside the scene, has another size and no place, a value that is no class (named with its
-    count), or more than 64 values where no classes are stated.
+    cannot be read, lies beside the scene, or has another size and no place. So does a value that is no class (named
+    with its count), and more than 64 values where no classes are stated.
     """
     by_colour = any(isinstance(value, tuple) for value in (*classes.values(), unlabelled))
     read = load_codes(address, geobox, by_number=bool(classes) and not by_colour, classes=classes.values())

@@ -89,9 +89,9 @@ def open_cube(
     """Open whatever holds a cube; nothing of its numbers is read yet but pictures, .mat and .npz, which are whole.
 
     ``address`` may name an array and a step of time: ``STORE:ARRAY:3``. ``dark`` and ``white`` are ENVI or .npy files
-    of reference frames, averaged over their lines; they win over those in a Headwall folder. Of ``labels`` numbers are
-    those that stand in the file: no scale is applied, and of several arrays that with two axes is meant. Raises
-    SceneError: there is no such thing, it is damaged, or not of a kind or shape that can be used.
+    of reference frames, averaged over their lines; they win over those in a Headwall folder. Numbers of ``labels`` are
+    those in the file, without any scale; of several arrays that with two axes is meant. Raises SceneError: there is no
+    such thing, it is damaged, or not of a kind or shape that can be used.
     """
     path, variable = split_variable(address)
     frames: list[tuple[str, str | Path | None]] = [("dark", dark), ("white", white)]

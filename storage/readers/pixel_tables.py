@@ -58,8 +58,8 @@ class SpectraTable:
     def folded(self, values: NDArray[Any], usual: Literal["C", "F"]) -> tuple[NDArray[Any], str]:
         """Return (y, x, band) values, and a note of the order that the pixels were taken in.
 
-        Of the ``usual`` order of the file's kind (F: down the columns) and the other one the other is taken where its
-        picture is clearly smoother.
+        The ``usual`` order of the file's kind (F: down the columns) is taken, unless the other one gives the clearly
+        smoother picture.
         """
         spectra = np.moveaxis(values, self.pixel_axis, 0).reshape(self.rows * self.columns, -1)
         few = spectra[:, :: max(1, spectra.shape[1] // SMOOTHED_BANDS)]

@@ -86,9 +86,9 @@ class PointingTable:
     def of_cube(self, name: str, lines: int, mounting: Mounting = STRAIGHT, *, alone: bool = False) -> LinePointing:
         """Give the pointing of a cube's ``lines`` lines: rows whose ``sweep`` is its name, or all without that column.
 
-        Where the cube is ``alone``, and no row has its name, the column cuts it into sweeps. ``mounting`` leads from
-        the device's positions to the model's. Raises SceneError: the table has no row or another number of rows for the
-        cube, a value that is no number, out of range or beyond the mirror, times that do not rise, or no valid row.
+        If the cube is ``alone`` and no row has its name, the column cuts it into sweeps. ``mounting`` leads from the
+        device's positions to the model's. Raises SceneError: the cube has no row or another number of rows, or no valid
+        one. So does a value that is no number, out of range or beyond the mirror, and times that do not rise.
         """
         rows, sweeps = np.arange(len(self.columns[KINDS[self.kind][0]])), tuple(dict.fromkeys(self.sweep or ()))
         cut = self.sweep is not None and alone and name not in sweeps
@@ -177,8 +177,8 @@ def _filled(values: Floats, valid: NDArray[np.bool_]) -> Floats:
 def load_pointing_table(path: Path) -> PointingTable:
     """Read a table with a row a line.
 
-    Raises SceneError: it cannot be read, has no row, a column that is not known, a cell that is no number, or not
-    exactly one kind of pointing.
+    Raises SceneError: it cannot be read, has no row, an unknown column, or a cell that is no number. So does a table
+    that has not exactly one kind of pointing.
     """
     header: list[str]
     cells: Sequence[Sequence[object]]

@@ -1,8 +1,8 @@
 """Polygons out of GeoJSON, GeoPackage and shapefile: zones with names, and labels burnt onto the pixels of a scene.
 
-A pixel has the class of the polygon that its centre lies in, of the later one in the file where several do, and none
-outside. On a scene with a place polygons lie where their CRS says; on one without, they are in pixels, x to the right
-and y down from the upper left corner.
+A pixel has the class of the polygon around its centre: of the last one in the file where several hold it, and none
+outside. On a scene with a place polygons lie where their CRS says. On a scene without one they are in pixels, x to the
+right and y down from the upper left corner.
 """
 
 from __future__ import annotations
@@ -178,8 +178,8 @@ def load_polygon_labels(
     """Burn the polygons of ``FILE`` or ``FILE.gpkg:LAYER`` onto the (y, x) pixels of a scene; and notes.
 
     Classes are those of the settings, by name or by number, else every value of the attribute that says them. Raises
-    SceneError: there is no such file, layer or attribute, no polygon, none on the scene, no CRS where one is needed
-    or one where none is known, or a class that the settings lack.
+    SceneError: the file, layer or attribute is missing, there is no polygon, or none on the scene. So does a missing
+    CRS where one is needed, one where none is known, or a class that the settings lack.
     """
     layer = _labels_in(address)
     attribute, said = _classes_said(layer, address, settings)

@@ -8,11 +8,11 @@
     a folder with raw_<frame> files       a Headwall camera's capture
     NAME.zarr                             a cube of anyone's
 
-Beside a cube ``NAME`` of files are found, where no flag names them: ``NAME.pointing.csv`` (.parquet, .toml),
-``NAME.dark.hdr``, ``NAME.white.hdr``, ``NAME.bad.hdr``, ``NAME.flat.hdr``, or ``dark*.hdr`` and ``white*.hdr`` for all
-cubes of the folder. The header of an ENVI cube may say ``line axis = y``: lines lie along y of the field, and the scan
-goes along x. The header of a white frame may say ``white_reference = {...}``, the value of the white reference per
-band, and ``mirror at rest = 1`` where it was taken so.
+Files beside a cube ``NAME`` are found where no flag names them: ``NAME.pointing.csv`` (.parquet, .toml),
+``NAME.dark.hdr``, ``NAME.white.hdr``, ``NAME.bad.hdr`` and ``NAME.flat.hdr``. Frames for all cubes of the folder are
+``dark*.hdr`` and ``white*.hdr``. The header of an ENVI cube may say ``line axis = y``: lines lie along y of the field,
+and the scan goes along x. The header of a white frame may hold ``white_reference = {...}``, the value of the white
+reference per band. ``mirror at rest = 1`` says that it was taken so.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ def stores_of_lines(products: Mapping[str, str], is_there: Callable[[str], bool]
 class Recording:
     """A recording, opened; no line has been read.
 
-    ``camera`` is the one given, with the samples, bits, exposure and period that the recording has; of a scan without a
-    mirror its lens is so long that lines are parallel.
+    ``camera`` is the one given, with the samples, bits, exposure and period that the recording has. A scan without a
+    mirror has so long a lens that lines are parallel.
     """
 
     name: str
@@ -352,8 +352,9 @@ def _line_reader(source: CubeSource, own: NDArray[np.intp]) -> Callable[[NDArray
 
 
 def _middle_s(source: CubeSource, stated_s: Floats | None, camera: LineCamera, notes: list[str]) -> Floats:
-    """Return (line,) times of mid exposure since the first exposure began [s]: as stated, by the files' stamps, or
-    even.
+    """Return (line,) times of mid exposure since the first exposure began [s].
+
+    They are as stated, by the files' stamps, or even.
     """
     at = np.arange(source.shape[0])
     if stated_s is None and source.lines.time_s is not None:

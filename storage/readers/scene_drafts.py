@@ -73,9 +73,9 @@ class SceneDraft:
 def draft_scene(address: str | Path, report: Report = lambda done, name: None) -> SceneDraft:
     """Look at the images and labels of a folder, or at one file and its labels.
 
-    Of images the first is read, of the others the sizes; of label files all are read. Raises SceneError: there is
-    nothing to look at, the first image cannot be read, labels may belong to several images, or have no classes because
-    their values are mixed.
+    The first image is read, of the others only the sizes; label files are all read. Raises SceneError: there is no file
+    to read, or the first image cannot be read. So do labels that may belong to several images, or that have no classes
+    because their values are mixed.
     """
     path, _ = split_variable(address)
     alone = not path.is_dir() or is_store(path)

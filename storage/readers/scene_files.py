@@ -92,14 +92,14 @@ def load_scene_file(
 ) -> SceneFile:
     """Read a scene from an image, .npy, .npz, .mat, ENVI, Zarr, NetCDF, HDF5 or a Headwall folder.
 
-    ``path`` may be ``FILE.mat:ARRAY`` or ``STORE.zarr:ARRAY``, and end in a step of time, ``FILE.npy:STEP``. Axes
-    are y, x, band; two axes are one band. What comes in lines with dark and white frames is taken over the white
-    reference. What is given here wins over the ``scene.toml`` beside the file, and that over what the file says: a file
-    of class numbers or colours on the same pixels, or of polygons (others are found by their names), bands to use,
-    counted from 0, and wavelengths [nm], one for each band used or for each of the file. ``classes`` are those of a
-    scene.toml that states none. Labels found by their names that cannot be used are left out with a note where no
-    ``labels_needed``. Raises SceneError: a file is missing, damaged, of a kind or shape that cannot be used, or the
-    labels do not fit. WavelengthError: wavelengths are missing, or their number, unit or range is wrong.
+    ``path`` may be ``FILE.mat:ARRAY`` or ``STORE.zarr:ARRAY``, and end in a step of time, ``FILE.npy:STEP``. Axes are
+    y, x, band; two axes are one band. Lines with dark and white frames are taken over the white reference. Arguments
+    win over the ``scene.toml`` beside the file, and that over the file itself. ``labels`` is a file of class numbers or
+    colours on the same pixels, or of polygons; others are found by their names. ``bands`` count from 0; ``wavelengths``
+    [nm] are one for each band used or for each of the file. ``classes`` are those of a scene.toml that states none.
+    Labels found by their names that cannot be used are left out with a note where no ``labels_needed``. Raises
+    SceneError: a file is missing, damaged, of a kind or shape that cannot be used, or the labels do not fit.
+    WavelengthError: wavelengths are missing, or their number, unit or range is wrong.
     """
     return _open(path, labels, bands, wavelengths, classes or {}, labels_needed, keep=True)
 

@@ -1,12 +1,12 @@
 """An archive in a bucket: the same stores, keys and runs, worked on in a folder of this machine.
 
-A store's or run's manifest has the same address in the bucket; its files lie below ``<address>/<attempt>/``, the
-attempt being the beginning of the SHA-256 of the manifest that lists them: two writers never mix theirs. A store is
-published in the working copy first, then uploaded; a conditional put of its manifest, last, publishes it for everybody:
-the first one wins, for ever, and others take what stands. Files are fetched when their path is asked for.
+A store's or run's manifest has the same address in the bucket. Its files lie below ``<address>/<attempt>/``. The
+attempt is the beginning of the SHA-256 of the manifest that lists them, so that two writers never mix theirs. A store
+is published in the working copy first, then uploaded. A conditional put of its manifest, last, publishes it: the first
+writer wins, for ever, and others take what stands. Files are fetched when their path is asked for.
 
-What was made is kept in the working copy where the bucket stops answering, and the same command uploads it. All of the
-working copy that is in the bucket may be deleted at any time while no process works on it.
+Results stay in the working copy where the bucket stops answering, and the same command uploads them. All of the working
+copy that is in the bucket may be deleted at any time while no process works on it.
 """
 
 from __future__ import annotations
@@ -115,8 +115,8 @@ class ObjectArchive(Archive):
     def discard(self, ref: StageRef, *, wait: bool = True, unnamed: bool = False) -> bool:
         """Take one store away for good, here and in the bucket; see `Archive.discard`.
 
-        Its manifest goes first. With ``unnamed`` it comes back where a run that names it has been published since this
-        archive was opened; publishing a run looks for its stores after that.
+        Its manifest goes first. An ``unnamed`` store comes back where a run that names it has been published since this
+        archive was opened. Publishing a run looks for its stores after that.
         """
         manifest = f"{ref.uri}/{MANIFEST_NAME}"
         standing = self.objects.read(manifest)

@@ -1,6 +1,6 @@
 """An archive's place in a bucket, and its objects: read, written, listed and removed, each of them as a whole.
 
-How the bucket is reached stands in the environment, as for any S3 client: AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY,
+The environment says how the bucket is reached, as for any S3 client: AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY,
 AWS_REGION, AWS_ENDPOINT_URL. SPECTRALZOOM_WORK names the folder of working copies.
 """
 
@@ -194,8 +194,9 @@ class Objects:
         self._moved, self._counting = 0, Lock()
 
     def take_moved(self) -> int:
-        """Return the bytes of objects written and read since the last call. Names, listings and headers do not
-        count.
+        """Return the bytes of objects written and read since the last call.
+
+        Names, listings and headers do not count.
         """
         with self._counting:
             taken, self._moved = self._moved, 0
@@ -210,8 +211,9 @@ class Objects:
         return None if (found := self.read_dated(name)) is None else found[0]
 
     def read_dated(self, name: str) -> tuple[bytes, datetime] | None:
-        """Return the content of a small object and its time of writing, by the store's clock; None where there is
-        none.
+        """Return the content of a small object and its time of writing; None where there is none.
+
+        The time is by the store's clock.
         """
         with answers_of(self.place):
             try:

@@ -1,7 +1,7 @@
 """Bytes of a capture's files to lines with their frames' numbers and times, and of its references to mean frames.
 
-What the camera itself writes is read strictly here, for the loop that waits for it; folders from anywhere are read by
-``storage.readers.envi_files``.
+The camera's own files are read strictly here, for the loop that waits for them; ``storage.readers.envi_files`` reads
+folders from anywhere.
 """
 
 from __future__ import annotations
@@ -239,10 +239,10 @@ class MeanFrame:
 def mean_frame(lines: NDArray[np.integer]) -> MeanFrame:
     """Average frames (line, sample, band); exact sums, so that the order of frames does not matter.
 
-    All frames look at the same thing, so an element scatters about its median by its noise alone: by 12 sigma it
-    jumps. Sigma is 1.4826 / sqrt(2) of the median step from frame to frame, which one change amid the frames does not
-    widen, and at least that of most elements, and 1 DN. A frame whose scatter about the medians, each at most those
-    12 sigma, is 3 times that of most frames shows something else. ShapeError where there is no frame.
+    All frames look at the same thing, so an element scatters about its median by its noise alone: by 12 sigma it jumps.
+    Sigma is 1.4826 / sqrt(2) of the median step from frame to frame, which one change amid the frames does not widen.
+    It is at least that of most elements, and 1 DN. A frame whose scatter about the medians, each at most those 12
+    sigma, is 3 times that of most frames shows something else. ShapeError where there is no frame.
     """
     if lines.ndim != 3 or not lines.size:
         raise ShapeError(f"expected at least one frame (line, sample, band), got {lines.shape}; capture the reference")

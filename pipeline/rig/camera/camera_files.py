@@ -1,8 +1,8 @@
 """Files of the camera over FTP: fetched in order, continued where an earlier try ended, and every byte read twice.
 
-FTP says nothing of what is in a file, so one that came with bytes lost, doubled or put in between can have the right
-size. What is held is therefore read again and compared before it counts, and dropped whole where it differs from two
-readings. What the camera itself gives alike twice cannot be doubted here.
+FTP has no checksums: a file with bytes lost, doubled or inserted can have the right size. Held bytes are therefore read
+again and compared before they count, and dropped whole where two readings differ from them. Bytes that the camera
+itself gives alike twice cannot be doubted here.
 """
 
 from __future__ import annotations
@@ -255,8 +255,8 @@ def fetch_files(
 ) -> None:
     """Fetch files one after the other until ``kept`` holds them whole.
 
-    What is held from an earlier call is compared before anything is added to it. A transfer that breaks off is taken
-    up again; what has come stays in ``kept`` however this ends, unless it is damaged, and a later call continues there.
+    Bytes held from an earlier call are compared before any are added. A transfer that breaks off is taken up again.
+    Fetched bytes stay in ``kept`` however this ends, unless they are damaged, and a later call continues there.
 
     Raises RigError where a file is not the one of which a part is held, is larger than it can be, or comes damaged each
     time; DeviceRefused where the server does not give it, or takes another password; DeadlinePassed or DeviceGone where
@@ -278,7 +278,7 @@ def log_in(server: FileServer) -> str:
 
 @dataclass
 class _Fetch:
-    """One file on its way. Of the bytes that are held the first ``sure`` ones came alike twice."""
+    """One file on its way. The first ``sure`` bytes of those held came alike twice."""
 
     server: FileServer
     file: RemoteFile

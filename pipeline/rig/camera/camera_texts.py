@@ -6,7 +6,7 @@ files from anywhere (``storage.readers.envi_files``), or a camera's own (``camer
 
 ``frameIndex_<n>.txt`` lies beside ``raw_<n>``: a heading, then a line a frame with its number and its time in
 microseconds. Versions of the camera's program differ in what stands between the two (a tab or spaces) and in the line
-ends; frames may be missing or listed twice. Tested on small indices made in these layouts.
+ends. Frames may be missing or listed twice. Tested on small indices made in these layouts.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ _MS = {"us": 1e-3, "µs": 1e-3, "μs": 1e-3, "microseconds": 1e-3, "s": 1e3, "se
 def split_header(text: str, where: str, notes: list[str]) -> tuple[dict[str, str], dict[str, str]]:
     """Return the fields, and settings in comments: as written, keys in lower case, without the outer braces.
 
-    What was made of strange forms is added to ``notes``; messages call the header ``where``. SceneError where it does
-    not begin with ENVI (ArcGIS headers do not), or a brace is never closed.
+    ``notes`` tell how strange forms were read; messages call the header ``where``. SceneError where it does not begin
+    with ENVI (ArcGIS headers do not), or a brace is never closed.
     """
     lines = text.lstrip("\ufeff").splitlines()
     first = next((number for number, line in enumerate(lines) if line.strip()), None)
@@ -212,9 +212,9 @@ def parse_frame_index(lines: Iterable[str], name: str = "the frame index", where
 def times_of_lines(index: FrameIndex, first_frame: int, lines: int, lost: int = 0) -> LineTimes:
     """Give each of a file's ``lines`` its frame and time.
 
-    Lines are frames in order, the first of them ``first_frame`` (the number in the file's name). Where as many frames
-    are listed as there are lines, they are its lines whatever their numbers: the camera dropped those missing. So they
-    are where as many are listed as there were lines before the file lost its last ``lost`` ones. An index whose numbers
+    Lines are frames in order, the first of them ``first_frame`` (the number in the file's name). If as many frames are
+    listed as there are lines, they are its lines whatever their numbers: the camera dropped those missing. So they are
+    where as many are listed as there were lines before the file lost its last ``lost`` ones. An index whose numbers
     begin at 0 in a later file counts from that file's start.
     """
     if len(index.frame) in (lines, lines + lost):

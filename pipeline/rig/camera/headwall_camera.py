@@ -62,9 +62,9 @@ class CaptureUnknown(StateUnknown):
 class HeadwallCamera:
     """A line camera for surveys: its commands and its files. Nothing is connected before the first command.
 
-    After a reply that was late or damaged the connection is given up and made anew, so that what comes late is never
-    taken for the next command's reply. ``connect`` makes a connection. Commands raise DeviceRefused, DeadlinePassed or
-    DeviceGone besides what they say themselves.
+    After a late or damaged reply the connection is closed and opened again. So a late answer is never taken for the
+    next command's reply. ``connect`` makes a connection. Commands raise DeviceRefused, DeadlinePassed or DeviceGone
+    besides what they say themselves.
     """
 
     def __init__(
@@ -110,9 +110,9 @@ class HeadwallCamera:
     def capture(self, frames: int, *, cubes: int = 1, prefix: str = "") -> Capture:
         """Begin a capture of ``cubes`` files (0: until stopped) of ``frames`` lines (0: the camera's own number).
 
-        Sent once. Where no reply comes the camera is asked whether it captures and which folders are new, and that is
-        said in the error; captures and settings are refused from then on: a person looks, and connects anew.
-        Raises CaptureUnknown then, and SettingsError where a number or the prefix cannot be used.
+        Sent once. If no reply comes, the camera is asked whether it captures and which folders are new, and the error
+        says so. Captures and settings are refused from then on: a person looks, and connects anew. Raises
+        CaptureUnknown then, and SettingsError where a number or the prefix cannot be used.
         """
         check_capture(frames, cubes, prefix)
         with self._lock:
@@ -305,8 +305,9 @@ class HeadwallCamera:
         )
 
     def _finished(self, folder: str, claim: FrameClaim | None) -> list[RemoteFile]:
-        """Return the files of a folder once two listings in a row agree: one that lost an entry on its way looks
-        whole.
+        """Return the files of a folder once two listings in a row agree.
+
+        A listing that lost an entry on its way looks whole.
         """
         if self.is_capturing():
             raise RigError(f"a capture still runs, so files of {folder} may grow; wait for its end, or stop it")

@@ -1,11 +1,11 @@
 """Captures of a sweep: what each is called, what the vector memory holds during it, and where its lines lie then.
 
-Which of them it was, and how far it may be off, is recorded with the positions. Times of lines are the mirror's; the
+The records of the positions name the way that was used, and its possible error. Times of lines are the mirror's; the
 camera stamps its frames in whole microseconds of its own clock.
 
 A capture's prefix says which lines of which sweep it takes, so that a folder tells what it holds.
-``coarse-0_cy-31p5_0p5_96x16x16_0`` is the sweep ``coarse-0``, a coarse one whose lines lie along y, on strip -31.5 px,
-from scan coordinate 0.5 px on, of 96 lines of 16 held positions, binned by 16; the capture begins at its line 0. ``p``
+``coarse-0_cy-31p5_0p5_96x16x16_0`` is the coarse sweep ``coarse-0``, whose lines lie along y. It is on strip -31.5 px,
+from scan coordinate 0.5 px on, of 96 lines of 16 held positions, binned by 16. The capture begins at its line 0. ``p``
 is the decimal point; a number that takes more room than its bits is ``b`` and those, to base 32.
 """
 
@@ -49,9 +49,9 @@ class FrameTimes:
 def mend_times(frames: FrameTimes) -> tuple[Ints, Ints, list[str]]:
     """Give every line a stamp and a number, and say what was done.
 
-    Frames come at a steady rate or later, never sooner: a stamp off its neighbours' by half a period strayed, and
-    where all after one are early the clock was set back. Both follow their neighbours then; so do lines without a
-    stamp. A later stamp counts, since a frame may have been dropped.
+    Frames come at a steady rate or later, never sooner. A stamp off its neighbours' by half a period strayed; where all
+    after one are early the clock was set back. Both follow their neighbours then; so do lines without a stamp. A later
+    stamp counts, since a frame may have been dropped.
     """
     number, notes = whole_numbers(frames.number)
     if (number < 0).all():
@@ -166,9 +166,9 @@ def lines_by_time(
 ) -> LinePositions:
     """Take the track's position at mid exposure of each line, counted from the commands' times.
 
-    ``began_s`` is when the log or the path began, ``capture_s`` when the capture did, by one clock. What passes between
-    a command and the first frame is not known, so a constant offset of the lines stays, for registration
-    that go both ways. A stamp that goes back or is missing is made up from its neighbours.
+    ``began_s`` is when the log or the path began, ``capture_s`` when the capture did, by one clock. The time between a
+    command and the first frame is unknown. A constant offset of the lines stays, for registration of sweeps that go
+    both ways. A stamp that goes back or is missing is made up from its neighbours.
     """
     stamp, number, notes = mend_times(frames)
     first_s = float(np.mean(capture_s) - np.mean(began_s)) + float(scan_path.time_s[0])
@@ -277,8 +277,9 @@ class CapturePath:
         return self.stop - self.first
 
     def frames_at(self, index: int) -> int | None:
-        """Return how many frames had their edges counted, where the cell ``index`` was played last; None within a
-        line.
+        """Return how many frames had their edges counted, where the cell ``index`` was played last.
+
+        None within a line.
         """
         frames, rest = divmod(index + 1 - LEAD, self.sweep.step)
         return None if rest else frames

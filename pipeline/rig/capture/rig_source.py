@@ -1,16 +1,16 @@
 """The rig as a source of lines: a sweep's positions go to the mirror, captures to the camera, and lines come back.
 
-A sweep is taken in captures, each of as many lines as the mirror's vector memory holds positions for. Of each the
-camera's files are fetched, its lines tied to the mirror, summed over neighbours as the sweep wants, and given in order.
-Where pulses step the mirror a line's position is the one sent to it at mid exposure, as the wire has it (float32);
-without them it is the one that the mirror's log measured. Time is by the camera's own stamps, to a microsecond.
+A sweep is taken in captures, each of as many lines as the mirror's vector memory holds positions for. Each capture's
+files are fetched, and its lines tied to the mirror, summed over neighbours as the sweep wants, and given in order.
+Where pulses step the mirror a line's position is the one sent to it at mid exposure, as the wire has it (float32).
+Without them it is the one that the mirror's log measured. Time is by the camera's own stamps, to a microsecond.
 
-Over an emulated rig lines are those of the simulated source it looks with, bit for bit, in however many captures: their
-noise is keyed by the sweep's name and the line's number, which captures are called by. Times differ where a load falls
-in the midst of a sweep: the simulated one continues without a break, a rig has to stop for it.
+Over an emulated rig lines are those of its simulated source, bit for bit, in however many captures. Their noise is
+keyed by the sweep's name and the line's number, which name the captures, too. Times differ where a load falls in the
+midst of a sweep: the simulated one continues without a break, a rig has to stop for it.
 
-Whatever the rig has acknowledged is in a journal beside the fetched files, so a later call with the same ``kept`` takes
-up a transfer where it broke off, and captures only what the camera does not have.
+A journal beside the fetched files records all that the rig has acknowledged. A later call with the same ``kept``
+continues a transfer where it broke off, and captures only what the camera does not have.
 """
 
 from __future__ import annotations
@@ -122,8 +122,8 @@ class RigSource:
     def session(self) -> Iterator[CaptureRunner]:
         """Hold on to the devices over several calls; inner sessions share them.
 
-        Raises DeviceGone, DeadlinePassed or RigError where a device is not there, or another one is, and StateUnknown
-        where what an earlier session sent was not acknowledged; nothing is sent again by this process.
+        Raises DeviceGone, DeadlinePassed or RigError where a device is missing or another one is there. Raises
+        StateUnknown where the last order of an earlier session was not acknowledged; this process repeats no order.
         """
         if self._runner is not None:
             yield self._runner

@@ -2,21 +2,21 @@
 
 Noise and drifts of the simulator are keyed by a sweep's name and a line's number, so the camera has to know both. The
 name, with the sweep's geometry, is in the capture's prefix (:func:`pipeline.rig.capture.capture_paths.announced`). The
-number is that of the line whose planned position is nearest to the one the mirror holds at mid exposure: what the
-vector index says where the path is the planned one, and still right where it was loaded in parts, begins with a
-lead-in, or lost an edge.
+number is that of the line whose planned position is nearest to the mirror's at mid exposure. Where the path is the
+planned one this is the vector index. It also holds for a path that was loaded in parts, begins with a lead-in, or lost
+an edge.
 
 Where the mirror holds what was planned, to the last bit of the wire's float32, a line is that of the simulated source,
 bit for bit. Elsewhere it is looked at from where the mirror is. A capture that announces nothing has streams of its
 own, by its folder and frame.
 
 Pulses, as the cable has it: one for each held position of the sweep that a capture announces, evenly over the exposure
-(a pulse generator between camera and mirror would give them; cameras have none); one as each exposure begins; or none.
+(a pulse generator between camera and mirror would give them; cameras have none). One as each exposure begins; or none.
 
 A planned sweep that is announced (by a capture's prefix, :func:`pipeline.rig.capture.capture_paths.capture_prefix`),
 loaded and played gives the simulated source's lines, bit for bit; see :mod:`pipeline.rig.emulator.emulated_rig`. A path
-that is played by trigger begins with a lead-in cell: the mirror takes the first as it is run, and one more at each
-rising edge. Without trigger it is run at (positions of a line) / (frame period), and is the planned one where it begins
+that is played by trigger begins with a lead-in cell. The mirror takes the first cell as it is run, and one more at each
+rising edge. Without trigger it is run at (positions of a line) / (frame period). It is the planned one where it begins
 within half a held position of the first exposure. A capture with the prefix ``references`` has dark and white cubes.
 
 The mirror's controller hangs on a pty, which is opened as a real port is.
@@ -182,8 +182,7 @@ class SceneCamera(CameraDevice):
     kept
         So many finished captures keep their files, and references always; 0 is all.
 
-    With ``aside`` frames are looked at by calls of :meth:`keep_looking` alone, from a thread; until then it is
-    capturing.
+    ``aside`` leaves frames to calls of :meth:`keep_looking` from a thread; until then it is capturing.
     """
 
     def __init__(
@@ -351,15 +350,13 @@ class _Line:
             if stop in ready:
                 return
             if self._master in ready:
-                self._take(os.read(self._master, _MOST_READ))
+                data = os.read(self._master, _MOST_READ)
+                self._in_free_s = max(self._device.clock.now(), self._in_free_s) + len(data) * self._byte_s
+                heapq.heappush(self._in, (self._in_free_s, next(self._order), data))
             while self._in and self._in[0][0] <= self._device.clock.now():
                 due, _, data = heapq.heappop(self._in)
                 self._schedule(self._device.receive(data), due)  # not from now: waking late is not the device's doing
             self._deliver()
-
-    def _take(self, data: bytes) -> None:
-        self._in_free_s = max(self._device.clock.now(), self._in_free_s) + len(data) * self._byte_s
-        heapq.heappush(self._in, (self._in_free_s, next(self._order), data))
 
     def _schedule(self, chunks: list[Chunk], since_s: float) -> None:
         for delay_s, data in chunks:

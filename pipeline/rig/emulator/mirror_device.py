@@ -1,11 +1,11 @@
 """The emulated mirror controller: bytes in, bytes out, and its registers; time only by the clock that it is given.
 
-What drivers ask for in both modes of the documented protocol. Assumed, as the documents leave it open: an empty line
-has no answer; NO answers a line that is not known, ERROR one that is too long; what comes while the controller boots is
-lost; in pro mode bytes that are no frame are answered by error 0001 at the next boundary, requests are checked by their
-CRC after GOPROCRC alone, and replies always carry it. Two other firmwares are emulated, too: one that checks the CRC of
-requests after GOPRO as well (``crc="required"``), and one that knows no GOPROCRC and sends 00 00 in the CRC's place
-(``crc="absent"``).
+It has what drivers ask for in both modes of the documented protocol. Assumed, as the documents leave it open: an empty
+line has no answer; NO answers a line that is not known, ERROR one that is too long. What comes while the controller
+boots is lost. Bytes in pro mode that are no frame are answered by error 0001 at the next boundary. Requests are checked
+by their CRC after GOPROCRC alone, and replies always carry it. Two other firmwares are emulated, too: one that checks
+the CRC of requests after GOPRO as well (``crc="required"``), and one that knows no GOPROCRC and sends 00 00 in the
+CRC's place (``crc="absent"``).
 """
 
 from __future__ import annotations
@@ -163,8 +163,8 @@ class RegisterFile:
     def put(self, cells: Mapping[int, bytes]) -> None:
         """Write registers at one moment; held positions go out together.
 
-        RefusedError where a register is missing, read only or out of range, and then none is written; or one does not
-        take its value as things stand, and then those before it are.
+        Raises RefusedError: a register is missing, read only or out of range, and none is written. It is raised, too,
+        where one does not take its value in the present state; those before it are written then.
         """
         values = {number: self._find(number).check(cell) for number, cell in cells.items()}
         self._state.advance()

@@ -1,9 +1,9 @@
 """The emulated mirror controller: its motion in closed form, vector units, targets, status and log. No protocol.
 
 Nothing runs by itself: everything is worked out up to the clock's moment when it is asked for, so time may run at any
-speed. Assumed of a vector unit, as no document says it: the first cell is taken at the run command, with an external
-trigger too, whose edges then take one cell each; a unit that is done keeps its last cell and reports that it no longer
-runs.
+speed. Assumptions on the vector unit, which no document describes: the run command takes the first cell, with an
+external trigger too. Each edge of the trigger then takes one cell. A unit that is done keeps its last cell and reports
+that it no longer runs.
 """
 
 from __future__ import annotations
@@ -123,8 +123,9 @@ class AxisMotion:
 
 @lru_cache(maxsize=4096)
 def _response(angle: float, damping: float) -> tuple[float, float]:
-    """Return the responses to a unit impulse and a unit step at one time; a vector is played with few different
-    times.
+    """Return the responses to a unit impulse and a unit step at one time.
+
+    They are cached: a vector is played with few different times.
     """
     impulse, rise = responses(np.array([angle]), damping)
     return float(impulse[0]), float(rise[0])

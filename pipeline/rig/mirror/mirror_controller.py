@@ -59,8 +59,8 @@ def wire_positions(positions: ArrayLike, mounting: Mounting = STRAIGHT) -> NDArr
 
     They are those of the device that is mounted so, for what a straight one gets by the wire.
 
-    Raises ShapeError where they are not of that shape, or none, and PoseError where one is not finite or beyond the
-    rim; the message names the first.
+    Raises ShapeError: they have another shape, or there is none. Raises PoseError: one is not finite or beyond the rim;
+    the message names the first.
     """
     given = np.asarray(positions)
     if given.ndim != 2 or given.shape[1:] != (2,) or not len(given):
@@ -155,9 +155,9 @@ def hold_values(x: float, y: float) -> dict[int, Value]:
 class MotionLog:
     """Positions that the controller measured at a steady rate.
 
-    ``started_s`` is when the start was acknowledged, by the driver's clock, and ``start_error_s`` how much earlier it
-    may have been: the time of the request itself. Offset and drift against frame times are found where lines
-    get their positions.
+    ``started_s`` is when the start was acknowledged, by the driver's clock. ``start_error_s`` is how much earlier it
+    may have been: the time of the request itself. Offset and drift against frame times are found where lines get their
+    positions.
     """
 
     position: NDArray[np.float32]  # (sample, 2) X and Y
@@ -192,8 +192,8 @@ class MirrorController(Closing):
     def connect(self, *, known: bool = False) -> Identity:
         """Find the controller in whichever mode it is, and bring it to pro mode. Nothing moves.
 
-        With ``known`` only the models that the documents are of are taken, or the one that the settings expect. Raises
-        DeadlinePassed or DeviceGone where nothing answers, RigError where another device does.
+        ``known`` restricts the models to documented ones, or to the one that the settings expect. Raises DeadlinePassed
+        or DeviceGone where nothing answers, RigError where another device does.
         """
         self._pairs, self._identity = 0, None
         found, expected = self._modes.connect(), self.settings.expected_id
@@ -244,8 +244,8 @@ class MirrorController(Closing):
     def goto(self, x: float, y: float) -> None:
         """Send the mirror to a position and hold it there; comes back once that is acknowledged, not at rest.
 
-        Raises PoseError outside the disk, before anything is sent, RigError where the status forbids motion, and
-        StateUnknown where it was not acknowledged, or motions are frozen.
+        Raises PoseError: the position is outside the disk; no byte is sent. Raises RigError: the status forbids motion.
+        Raises StateUnknown: it was not acknowledged, or motions are frozen.
         """
         target = wire_positions([(x, y)], self.settings.mounting)[0]
         self._move(hold_values(*target), f"going to {target[0]:.6g}; {target[1]:.6g}")
@@ -337,8 +337,8 @@ class MirrorController(Closing):
     def read_log(self, samples: int | None = None) -> MotionLog:
         """End the log and fetch ``samples`` of it, or as many as the time since the start has.
 
-        Never more than the logger holds. Where it holds fewer than expected, the device says so and the log ends there.
-        RigError where no log was started.
+        Never more than the logger holds. A log with fewer values than expected ends where the device says so. RigError
+        where no log was started.
         """
         if self._logging is None:
             raise RigError(f"no log was started on {self.wire.port}; start one before the path runs")

@@ -254,7 +254,7 @@ class Modes:
         """Find the controller in either mode, ask what it is, and leave it in pro mode. Nothing moves.
 
         Raises DeadlinePassed where nothing answers in either mode, RigError where something else does, or DeviceGone.
-        Where frames are not answered as the settings send them, the error says whether they are the other way.
+        If frames are not answered in the form of the settings, the error says whether they are in the other form.
         """
         with self.pro.wire.lock:
             self.found_in_pro = False

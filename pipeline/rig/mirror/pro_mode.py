@@ -2,7 +2,7 @@
 
 A frame is ``7E | address 00 | command | size | payload | CRC, low byte first | 7E``; 7D and 7E between the boundaries
 are sent as 7D and the byte with bit 5 turned. The CRC is CRC-16/ARC over address to payload. It fits the one documented
-frame (``00 11 04 00 00 00 00 | F2 81``) and is not confirmed on hardware, so a reader only says whether it fits. That
+frame (``00 11 04 00 00 00 00 | F2 81``) and is not confirmed on hardware. So a reader only says whether it fits. That
 it begins at 0 leaves open whether the address counts; as the address is 0, either way gives the same CRC.
 
 Numbers in payloads are big-endian. A register's id takes two bytes, its cell four: a float32, or an integer. Several

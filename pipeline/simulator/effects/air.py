@@ -84,9 +84,9 @@ def turbulence_px(rig: Rig) -> float:
     """Give the deviation of the angle of arrival per axis, sqrt(1.09 Cn2 d D^(-1/3)), from the farthest part. [px]
 
     Spherical waves: air near the point tilts them less than air near the aperture, by (z / d)^(5/3) a length of way, so
-    that 3/8 of a plane wave's 2.91 are left [1]. D is the aperture as seen at rest, 10.6 mm of 15. Valid for
-    Kolmogorov's spectrum with one Cn2 all along the way, for D between inner and outer scale, sqrt(lambda d) not much
-    wider than D, and weak turbulence, `rytov_variance` up to 1. 0 without a distance; no way is longer than
+    that 3/8 of a plane wave's 2.91 are left [1]. D is the aperture as seen at rest, 10.6 mm of 15. It is valid for
+    Kolmogorov's spectrum with one Cn2 all along the way, and D between inner and outer scale. sqrt(lambda d) must not
+    be much wider than D, and turbulence weak: `rytov_variance` up to 1. 0 without a distance; no way is longer than
     `FARTHEST_M`.
     """
     metres = _way_m(rig)
@@ -109,7 +109,7 @@ def _way_m(rig: Rig) -> float:
 class Wind(Displacement):
     """Crop motion: the scene sways by a travelling wave along the wind, its phase and direction drawn for a survey.
 
-    All of the scene sways, as one that stands at mid exposure; where f t_frame is above one half, a fast sway shows as
+    All of the scene sways, as one that stands at mid exposure. Where f t_frame is above one half, a fast sway shows as
     a slow one. The smear within an exposure is neither modelled nor counted: up to 2 pi f t_exp of the amplitude, 2 %
     of it at 1 Hz in 3 ms and 62 % in 100 ms. ``why`` tells how many px that are.
     """
@@ -179,9 +179,9 @@ class Parallax(Displacement):
     """Displacement of what is not at the scene's distance, for which scale and geometry are right.
 
     The virtual pinhole lies a lever L behind the pivot on the chief ray. A ray meets a surface at distance d, taken
-    along the chief ray, L (1/d - 1/d0) times its way from the line's centre beside the point of distance d0, where
-    depth is read. Occlusion is left out: within a displacement of a step a sample may see the other depth, within the
-    bound.
+    along the chief ray, beside the point of distance d0, where depth is read. It is off by L (1/d - 1/d0) times its way
+    from the line's centre. Occlusion is left out: within a displacement of a step a sample may see the other depth,
+    within the bound.
     """
 
     name = "parallax"
@@ -370,7 +370,7 @@ def transmission(metres: Floats, rig: Rig, wavelength_nm: Floats) -> Floats:
 class PathRadiance(LightChange):
     """Light L at a distance d arrives as L exp(-beta d) + H (1 - exp(-beta d)), beta of ``extinction_per_m``.
 
-    H, the light of endless air, is ``air.airlight_fraction`` of the white reference's and follows the daylight; none is
+    H, the light of endless air, is ``air.airlight_fraction`` of the white reference's and follows the daylight. None is
     added where the white reference's light is not known. ``range`` takes each sample's own distance, ``uniform`` the
     middle.
     """
@@ -446,7 +446,7 @@ class PathRadiance(LightChange):
 def extinction_per_m(air: Air, wavelength_nm: Floats) -> Floats:
     """Give the extinction of aerosol and molecules near the ground, (band,) [1/m]: 0.17 /km in all at 23 km, 550 nm.
 
-    At 550 nm it is Koschmieder's for the visibility [3], no less than the molecules'; what these do not explain is
+    At 550 nm it is Koschmieder's for the visibility [3], no less than the molecules'. What these do not explain is
     aerosol, which falls by Angstrom's exponent: 1.14 [4], below 7.4 km Kruse's 0.585 V^(1/3) [5]. Above 336 km no
     aerosol is left. Valid from 400 to 1000 nm beside the lines of gases, and down to some 0.5 km of visibility.
     """
@@ -465,8 +465,8 @@ def rayleigh_per_m(wavelength_nm: Floats) -> Floats:
 def _contrast(probe: Probe, rig: Rig) -> Floats:
     """Return the greatest difference of a signal from the light of endless air, over the signal's unit, (band,).
 
-    Daylight multiplies both; clouds and the angle of view change the signal alone: H counts over their greatest factor,
-    and the darkest signal after their least.
+    Daylight multiplies both; clouds and the angle of view change the signal alone. So H counts over their greatest
+    factor, and the darkest signal after their least.
     """
     if probe.white_e is None:
         return probe.level
@@ -484,8 +484,9 @@ def _contrast(probe: Probe, rig: Rig) -> Floats:
 
 
 def _between(near: Floats, far: Floats) -> Floats:
-    """Return the fraction of light lost between two optical depths, exp(-near) - exp(-far), accurate for close
-    depths.
+    """Return the fraction of light lost between two optical depths, exp(-near) - exp(-far).
+
+    It is accurate however close they are.
     """
     return -np.exp(-near) * np.expm1(near - far)
 

@@ -85,7 +85,8 @@ class Diffraction(Blur):
 def airy_gaussians() -> tuple[Floats, Floats]:
     """Give shares, none below 0, of sum 1, and widths (sd) [lambda / D] of Gaussians whose sum is an Airy pattern.
 
-    By least squares on what the pupil passes: within 0.004 of it up to 0.6 of its cut-off. For bounds, not for light.
+    The least squares fit to the pupil's transfer is within 0.004 of it up to 0.6 of its cut-off. For bounds, not for
+    light.
     """
     size, u = np.geomspace(0.1, 160.0, 24), np.concatenate([np.geomspace(1e-3, 0.02, 30), np.linspace(0.03, 1.5, 150)])
     weight = 1 / (1 + (u / 0.5) ** 4)
@@ -150,7 +151,7 @@ class Defocus(Blur):
 def defocus_px(rig: Rig, distance_m: float | None, normal: Floats | None = None) -> Floats:
     """Give the axes of the blur's disc, (2,) along line and scan: pupil |1/d - 1/d_f| / IFOV; 0 without a distance.
 
-    In px; the variance of such an even disc is a sixteenth of its diameter squared.
+    It is in px; the variance of such an even disc is a sixteenth of its diameter squared.
     """
     if distance_m is None or distance_m == rig.optics.focus_m:
         return np.zeros(2)
@@ -163,7 +164,8 @@ class Keystone(Blur):
     """Shift along the line, of its own in each band: a line is imaged longer at one wavelength than at another.
 
     At the last wavelength a sample sees the scene ``keystone_px / 2`` further along the line (towards higher samples)
-    than the mirror model says, at the first as much less far; linear from 400 to 1000 nm, and held beyond.
+    than the mirror model says. At the first wavelength it sees it as much less far. The shift is linear from 400 to
+    1000 nm, and held beyond.
     """
 
     name = "keystone"

@@ -1,7 +1,7 @@
 """The readout: draws of shot and read noise, and the effects dark current, defects, saturation and quantisation.
 
-Every element takes one deviate, whatever its light. The count of photons grows with both: two images of nearly the same
-light have nearly the same noise, and their difference is that of the light.
+Every element takes one deviate, whatever its light. The count of photons grows with both. So two images of nearly the
+same light have nearly the same noise, and their difference is that of the light.
 """
 
 from __future__ import annotations
@@ -103,8 +103,8 @@ def divergence(expected: Floats, read_noise_e: float) -> Floats:
 def least_expected(read_noise_e: float) -> float:
     """Give from how many expected electrons on cheap draws may stand for exact ones; 0 is at any light.
 
-    From there on, a patch of `CHIP_SAMPLES` cheap numbers and one of exact ones have a total variation of at most
-    sqrt(N divergence) / 2 <= `MOST_VARIATION`.
+    From there on, a patch of `CHIP_SAMPLES` cheap numbers and one of exact ones are close: their total variation is at
+    most sqrt(N divergence) / 2 <= `MOST_VARIATION`.
     """
     levels = np.geomspace(1e-3, 1e6, 4096)
     too_far = divergence(levels, read_noise_e) * CHIP_SAMPLES > (2 * MOST_VARIATION) ** 2
@@ -136,7 +136,7 @@ def _series_quantile(mean: Floats, z: Floats) -> Floats:
     """Return the Poisson quantile at Phi(z) for means from `SERIES_FROM_E` on.
 
     C(x) = Gamma(x, mean) / Gamma(x) runs smoothly through the distribution, F(k) = C(k + 1): where C(x) = Phi(z), the
-    quantile is floor(x). x is expanded in 1 / sqrt(mean) [1]; where it comes as near to a whole number as the expansion
+    quantile is floor(x). x is expanded in 1 / sqrt(mean) [1]. If it comes as near to a whole number as the expansion
     may err, the distribution itself is asked.
 
     [1] Giles, "Algorithm 955: approximation of the inverse Poisson cumulative distribution function", ACM Trans. Math.
@@ -376,7 +376,7 @@ def in_unit(deviations: float, sd_e: float, probe: Probe, rig: Rig) -> float:
 
 @dataclass(frozen=True)
 class ReadNoise(Effect):
-    """Normal, with the camera's standard deviation. In one draw with the shot noise where that is not exact.
+    """Normal, with the camera's standard deviation. It is one draw with the shot noise where that is not exact.
 
     Noise counts twice the total variation between the distributions of a sample with and without: see `separable`.
     """

@@ -27,8 +27,8 @@ _PROBES = 65  # lines of a sweep, and samples of a line, at which angles are tak
 class Drift(Gain):
     """Light at a line's mid exposure over the light at the survey's start, to which the scene is stated.
 
-    It is SPECTRL2 under a clear sky. A survey that starts in the night is relative to the light of a sun 1 deg high;
-    with the sun at the horizon or below the light is 0. Without a time of day there is none.
+    It is SPECTRL2 under a clear sky. A survey that starts in the night is relative to the light of a sun 1 deg high.
+    With the sun at the horizon or below the light is 0. Without a time of day there is none.
     """
 
     name = "drift"

@@ -95,8 +95,8 @@ class SlitBox(Effect):
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by half as much again as the probe measured; where it has not, by the box's variance and the span.
 
-        How a variant errs depends on what lies within the footprint, which no derivative of the image tells. What is
-        rounded in tables, and what lines turn more where the mirror looks beside its plan, add a little.
+        The error of a variant depends on the light within the footprint, which no derivative of the image gives.
+        Rounding in tables adds a little, and so do lines that turn more where the mirror looks beside its plan.
         """
         width, bands = rig.camera.slit_px, len(probe.wavelength_nm)
         why = f"{_words(variant)} in place of a footprint {width:.2g} px wide and 1 px long"
@@ -172,8 +172,9 @@ class Smear(Effect):
 
 
 def _courses(sweeps: tuple[Sweep, ...], rig: Rig) -> Iterator[Floats]:
-    """Yield the paths of held positions beside their plan, (line, step), for each kind of sweep that has several.
-    [px]
+    """Yield the paths of held positions beside their plan, (line, step) [px].
+
+    There is one for each kind of sweep that holds several positions a line.
     """
     for sweep in {(one.lines, one.step): one for one in sweeps if one.lines and one.step > 1}.values():
         numbers = np.arange(sweep.lines)

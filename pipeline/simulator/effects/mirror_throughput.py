@@ -157,7 +157,7 @@ def _factors_between(incidence_rad: Floats, rig: Rig, wavelength_nm: Floats) -> 
 def reflectance(coating: Coating, wavelength_nm: Floats, incidence_rad: Floats) -> Floats:
     """Return the fraction of unpolarised light that a coating reflects, (incidence, band): both polarisations' mean.
 
-    Valid from 311 to 1937 nm, and for films that no light passes (50 nm or more); beyond, the index of the nearest end
+    Valid from 311 to 1937 nm, and for films that no light passes (50 nm or more). Beyond, the index of the nearest end
     is held.
     """
     if coating == "ideal":

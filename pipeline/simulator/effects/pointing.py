@@ -64,7 +64,7 @@ class Jitter(Aim):
     """A normal deviate of the tilt about either axis, anew for every line.
 
     At rest the view moves by 2 sigma in the plane of incidence, which is the scan's axis, and by sqrt(2) sigma across
-    it, along the line; elsewhere by the derivatives of the exact reflection.
+    it, along the line. Elsewhere the derivatives of the exact reflection say how far.
     """
 
     name = "jitter"
@@ -105,9 +105,9 @@ class Jitter(Aim):
 def tilt_to_scene(normals: Floats) -> Floats:
     """Give the derivatives of scene tangents with respect to tilts of the mirror, (..., 2, 2).
 
-    ``normals``: (..., 3) unit normals.
-    Returns rows are along the line and along the scan; columns a tilt about the axis most nearly in the plane of
-    incidence, which moves the view across that plane, and one about y, which moves it within. At rest diag(sqrt(2), 2).
+    ``normals``: (..., 3) unit normals. Returns rows are along the line and along the scan. Columns are a tilt about the
+    axis most nearly in the plane of incidence, and one about y. The first moves the view across that plane, the second
+    within it. At rest diag(sqrt(2), 2).
     """
     within = np.stack([normals[..., 2], np.zeros_like(normals[..., 0]), -normals[..., 0]], axis=-1)  # y x n
     within /= np.hypot(normals[..., 2], normals[..., 0])[..., None]
@@ -229,9 +229,9 @@ class Pointing(Aim, ABC):
 class PointingErrors(Pointing):
     """Errors of the mirror's reported places, in px of the scene along the line and the scan.
 
-    Every sweep has an offset drawn evenly from ``-offset_px`` to ``offset_px`` in either axis, and every line a
-    normal deviate of ``jitter_px`` rms in either. Each is drawn from a stream of its own, keyed (seed, sweep name) and
-    (seed, sweep name, line number): no line's error depends on which others were asked for.
+    Every sweep has an offset drawn evenly from ``-offset_px`` to ``offset_px`` in either axis, and every line a normal
+    deviate of ``jitter_px`` rms in either. Each is drawn from a stream of its own, keyed (seed, sweep name) and (seed,
+    sweep name, line number). So no line's error depends on which others are computed.
     """
 
     offset_px: float = ACCURACY_PX
@@ -324,7 +324,7 @@ def beside_plan(positions: float, step: int, numbers: NDArray[np.int64], parts: 
     """Give the mean position less the planned one in each part of each held px of path, (line, step * parts). [px]
 
     Held positions are ``1 / positions`` px apart. Within a time t, counted in px of path, the mirror lags the ramp by
-    frac(positions * t) / positions; what that has of its mean is the result.
+    frac(positions * t) / positions. The result is the difference of that from its mean.
     """
     edges = np.arange(step * parts + 1) / parts
     place = positions * (numbers[:, None] * float(step) + edges)
@@ -364,7 +364,7 @@ class Lag(Aim):
     """Mirror lag and overshoot: what is left of the start of a sweep, as the mean shift over each held position.
 
     The mirror follows its commands as a second-order system, x'' + 2 zeta x' + x = 0 in units of 1 / natural frequency.
-    Calibration takes away the way that one in steady motion lies behind; what is left is the free oscillation between
+    Calibration takes away the way that one in steady motion lies behind. The remainder is the free oscillation between
     it and a mirror that starts from rest. Before a sweep it has flown back by the sweep's length, has had ``settled_s``
     to come to rest one held position ahead, and takes the first step as line 0 begins.
     """
@@ -415,7 +415,8 @@ def responses(time: Floats, damping: float) -> tuple[Floats, Floats]:
     """Give the responses to a unit impulse and to a unit step, of a system with natural frequency 1 rad/s.
 
     ``time`` (...) is times that frequency, from 0 on [rad]. With g the first and h the second, the matrix exponential
-    of the free system is [[1 - h, g], [-g, 1 - h - 2 zeta g]]; by expm1 and sinc right below, at and above damping 1.
+    of the free system is [[1 - h, g], [-g, 1 - h - 2 zeta g]]. Computed by expm1 and sinc, it is accurate below, at and
+    above damping 1.
     """
     with np.errstate(under="ignore"):
         if damping <= 1:

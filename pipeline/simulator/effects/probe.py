@@ -49,9 +49,9 @@ class Probe:
     """Maxima over the samples of a few lines, band by band, as the footprint of slit and pixel alone shows the scene.
 
     All but the electrons are over the unit of the tolerance: one standard deviation of the noise of the number that is
-    stored, or one DN of it. Where that sums ``binning`` samples, a maximum is of the mean of their sizes over the noise
-    of their mean: a change of whatever sign at each of them is bounded, and only as far as needed where they differ.
-    Axis 0 of ``slope`` and ``curvature`` is (along the line, along the scan).
+    stored, or one DN of it. If that sums ``binning`` samples, a maximum is of the mean of their sizes over the noise of
+    their mean. So a change of any sign at each of them is bounded, and only as far as needed where they differ. Axis 0
+    of ``slope`` and ``curvature`` is (along the line, along the scan).
     """
 
     unit: Unit
@@ -114,9 +114,9 @@ class Probe:
     def change_blurred(self, variance_px2: Floats, mean_way: float = 1.0) -> Floats:
         """Bound what it changes in each band, (band,): C s^2 / 2, or G E|x| where that is less, or the span.
 
-        E|x| is ``mean_way`` times s, at most 1; the smaller bound takes over where the image is a step or a point. What
-        lies beside the sweeps counts as far as the kernel reaches, and beyond by the fraction of it that does; a wide
-        Gaussian is a narrow one, and one of the rest of its variance that sees means of several pixels.
+        E|x| is ``mean_way`` times s, at most 1; the smaller bound takes over where the image is a step or a point.
+        Light beside the sweeps counts as far as the kernel reaches, and beyond by the fraction of it that does. A wide
+        Gaussian is taken as a narrow one, followed by one of the remaining variance over means of several pixels.
         """
         widest = float(np.sqrt(np.max(variance_px2, initial=0.0)))
         if self.anywhere is None or widest == 0:

@@ -120,7 +120,7 @@ def _heat_kernel(wavelength_nm: Floats, variance: Floats) -> Floats:
     """Return the rows of exp(v/2 D), (band, band), each with its own variance v.
 
     D leaves straight lines and both ends as they are. So a spectrum is parted into the line through its ends, which
-    stays, and a rest that is 0 there; on the rest D is a symmetric matrix after scaling by the root of the gaps.
+    stays, and a rest that is 0 there. On the rest D is a symmetric matrix after scaling by the root of the gaps.
     """
     bands = len(wavelength_nm)
     if bands < 3:
@@ -219,9 +219,7 @@ def _tap_weights(wavelength_nm: tuple[float, ...], smile_nm: float, samples: int
 
 
 def _run_taps(wavelength: Floats, shift: Floats) -> list[tuple[NDArray[np.int64], Floats]]:
-    """Return the taps of one run of rising wavelengths, (sample, band) each: offsets to other bands, and their
-    weights.
-    """
+    """Return the taps of one run of rising wavelengths, (sample, band) each: band offsets and their weights."""
     wanted = np.clip(wavelength + shift[:, None], wavelength[0], wavelength[-1])
     gap = np.clip(np.searchsorted(wavelength, wanted, side="right") - 1, 0, len(wavelength) - 2)
     width = np.diff(wavelength)[gap]
@@ -320,8 +318,8 @@ def _gains(unit: int, kind: str, samples: int, bands: int, *, fraction: float) -
 class StrayLight(LightChange):
     """A fraction of all the light in a line is scattered over its detector: (1 - f) S + f K S. A band is a row.
 
-    Of it ``stray_even`` falls evenly, the rest as a Gaussian ``stray_halo_px`` wide (sd), reflected at the detector's
-    edges. K has no weight below 0 and keeps all light.
+    A fraction ``stray_even`` of it falls evenly, the rest as a Gaussian ``stray_halo_px`` wide (sd), reflected at the
+    detector's edges. K has no weight below 0 and keeps all light.
 
     The Gaussian passes only the slowest cosines of a frame, so it is a product with few of them.
     """
@@ -383,9 +381,7 @@ def _uneven_fraction(counts: tuple[int, ...], sd_px: float) -> float:
 
 @lru_cache(maxsize=16)
 def _cosines(count: int, sd_px: float) -> tuple[Radiance, NDArray[np.float64]]:
-    """Return orthonormal cosines (mode, count), passed by a Gaussian reflected at both ends, and the fractions
-    passed.
-    """
+    """Return orthonormal cosines (mode, count), passed by a Gaussian reflected at both ends, and fractions passed."""
     passed = np.exp(-((np.pi * sd_px / count * np.arange(count)) ** 2) / 2)
     modes = np.arange(count)[passed > LEAST_MODE]
     waves = np.cos(np.pi / count * np.outer(modes, np.arange(count) + 0.5))

@@ -1,8 +1,8 @@
 """Footprints: slit, pixel and every blur folded to few kernels that all bands share; tables of their weights.
 
 A kernel is a box (the slit across the line, the pixel along it) convolved with a Gaussian of a shift and a variance of
-its own. Gaussians of a ladder of sizes, at a few of the bands' shifts, stand for all bands; what a sum passes of a wave
-is compared with the optical transfer function behind the footprint of slit, pixel and scene. Wide ones look at every
+its own. Gaussians of a ladder of sizes, at a few of the bands' shifts, stand for all bands. The waves that a sum passes
+are compared with the optical transfer function behind the footprint of slit, pixel and scene. Wide ones look at every
 second, fourth, ... pixel of the scene, blurred before: see `SceneRaster.thinned`.
 """
 
@@ -40,8 +40,8 @@ def disc_contrast(along: Floats, scan: Floats, axes: Axes) -> Floats:
 def disc_points(axes: Axes) -> tuple[Floats, Floats]:
     """Give points (2, point) along line and scan [px], and the variance (2,) of a Gaussian about each [px^2].
 
-    All count alike. With the Gaussians they have the disc's mean and variance, a sixteenth of its diameters squared.
-    Small discs are one Gaussian; of very wide ones the edge is blurred.
+    All count alike. Together with the Gaussians they have the disc's mean and variance, a sixteenth of its diameters
+    squared. Small discs are one Gaussian; of very wide ones the edge is blurred.
     """
     radii = _rings(max(axes))
     counts = [1, *(6 * (ring + 1) for ring in range(len(radii)))]
@@ -249,8 +249,9 @@ def _wanted(moments: Floats, own: Floats) -> Transfer:
 
 
 def _fractions(passed: Transfer, wanted: Transfer) -> Floats:
-    """Return the fractions (kernel, band), none negative and of sum 1, fitted to the waves that kernels and bands
-    pass.
+    """Return the fractions (kernel, band), none negative and of sum 1.
+
+    They are a least squares fit of what kernels and bands pass of waves.
     """
     count, bands = passed.shape[1], wanted.shape[1]
     system = np.concatenate([passed.real, passed.imag, np.full((1, count), _SUM)])
@@ -357,7 +358,7 @@ class Footprint:
     def part(self, level: int, which: NDArray[np.intp]) -> Footprint:
         """Give some kernels of a level, in its px. Beyond level 1 boxes lie upright: they are small beside Gaussians.
 
-        What blurs a scene before pixels are left out is taken off the Gaussians.
+        Blur of the scene from leaving out pixels is taken off the Gaussians.
         """
         some = replace(self, fractions=self.fractions[which], level=self.level[which])
         shift, variance = self.shift[:, which], self.variance[:, which]
@@ -375,7 +376,7 @@ def fold(box: tuple[float, float], parts: tuple[int, int], held: int, blurs: Mom
 
     ``box``: widths of slit and pixel, across and along, 0 for none [px]. ``held``: positions 1 px apart along the scan.
     Returns the fewest kernels that change no wave of any band by more than `NEGLIGIBLE` of its amplitude, or the best
-    that were tried; no share is below 0, and they sum to 1.
+    that were tried. No share is below 0, and they sum to 1.
     """
     waves = blurs.waves if blurs.waves is not None and blurs.waves.any() else np.zeros_like(blurs.shift)
     told, band = np.unique(np.concatenate([blurs.shift, blurs.variance, waves]), axis=1, return_inverse=True)

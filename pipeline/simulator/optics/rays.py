@@ -1,8 +1,8 @@
 """Rays of the camera over the mirror: where they meet the scene plane, how they spread there, and the pupil they pass.
 
 The aperture is the mirror's disc, foreshortened in the plane of incidence and only there. At rest that plane holds the
-scan, so the pupil is an ellipse: the whole diameter along the line, and |n_z| of it, 0.71, along the scan. Diffraction
-is then wider along the scan, defocus wider along the line.
+scan. The pupil is then an ellipse: the whole diameter along the line, and |n_z| of it, 0.71, along the scan.
+Diffraction is then wider along the scan, defocus wider along the line.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ REST_NORMAL: Floats = np.array([np.sqrt(0.5), 0.0, -np.sqrt(0.5)])
 class RayViews:
     """Directions of samples, and how far the scene point moves per px of the camera, along and across; (n,) each.
 
-    ``along`` and ``scan`` are tangents or px; the others are px of the scene over px of the camera: ``along_run`` and
-    ``scan_run`` for a ray moved along the line, ``along_turn`` and ``scan_turn`` for one moved across it.
+    ``along`` and ``scan`` are tangents or px. The others are px of the scene over px of the camera. ``along_run`` and
+    ``scan_run`` are for a ray moved along the line, ``along_turn`` and ``scan_turn`` for one moved across it.
     """
 
     along: Floats
@@ -78,7 +78,7 @@ def exact_views(normal: Floats, across: Floats | float, slopes: Floats) -> RayVi
 def spread_of_waves(normal: Floats | None = None) -> Floats:
     """Give the variance that diffraction has along (line, scan), over that of a round pupil of the mirror's diameter.
 
-    A pupil |n_z| wide along (n_x, n_y) and 1 across spreads waves by 1 / n_z^2 and 1; on the camera's own axes that is
+    A pupil |n_z| wide along (n_x, n_y) and 1 across spreads waves by 1 / n_z^2 and 1. On the camera's own axes that is
     1 + n_y^2 / n_z^2 and 1 + n_x^2 / n_z^2. The covariance n_x n_y / n_z^2 is left out: it is 0 at rest.
 
     ``normal``: (..., 3) mirror normals in the camera frame; None is the mirror at rest. Returns (..., 2).

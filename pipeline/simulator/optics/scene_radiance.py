@@ -89,7 +89,8 @@ class Looker:
         """
         spectra = scene.electrons * np.float32(exposures)
         levels = np.unique(self.footprint.level).tolist()
-        pixels = {level: _pixels(scene, along_y, level) for level in levels}
+        rasters = {level: np.ascontiguousarray(scene.raster.thinned(level), np.float32) for level in levels}
+        pixels = {level: ScenePixels(raster, along_y) for level, raster in rasters.items()}
         sums = np.ones(self.footprint.kernels)
         for _, some, gatherer in self.gatherers:
             sums[some] = gatherer.parts
@@ -125,7 +126,3 @@ class Looker:
             for level, some, gatherer in self.gatherers:
                 seen = views.thinned(level, THINNED_MARGIN)
                 gatherer.gather(pixels[level], seen, out, numbers[some], gains[some])
-
-
-def _pixels(scene: RasterScene, along_y: bool, level: int) -> ScenePixels:
-    return ScenePixels(np.ascontiguousarray(scene.raster.thinned(level), np.float32), along_y)

@@ -1,8 +1,8 @@
 """Light through a footprint: for every sample one window of pixels, and for every kernel a weight for each of them.
 
-A footprint that lies turned in the scene is parted across the slit: each part is a box that does not lie turned, in its
-right place. The parts are moved beside their places, and widened, by so much that all together have the second moments
-of the turned footprint. There are as few as misplace little of its light.
+A footprint that lies turned in the scene is parted across the slit. Each part is a box parallel to the scene's axes, in
+its right place. The parts are moved beside their places, and widened, by so much that all together have the second
+moments of the turned footprint. There are as few as misplace little of its light.
 """
 
 from __future__ import annotations

@@ -183,7 +183,7 @@ _ENDLESS = 1e9  # span and curvature of an image whose shifts show as they are
 def blended_surroundings(probe: Probe, rig: Rig, moving: Sequence[Effect]) -> Probe:
     """Give the probe of an image that all blurs and shifts of a rig have passed, with what they bring from beside.
 
-    Shifts bring what lies within their way; each part of a blur has the greatest derivatives of what it reaches, and
+    Shifts bring what lies within their way. Each part of a blur has the greatest derivatives of what it reaches, and
     the image has the mean of its parts'. The same probe where nothing lies beside the sweeps.
     """
     if probe.anywhere is None:

@@ -1,10 +1,10 @@
 """The decision: which effects to compute, and how, so that what is left out stays within one tolerance; its manifest.
 
-The tolerance is of the numbers that are stored, sums of samples where a sweep bins them: an effect counts by what it
-does at the binning where it does most.
+The tolerance applies to stored numbers, sums of samples where a sweep bins them. An effect counts by its change at the
+binning where that is greatest.
 
-Greedy: start with everything exact; of all cheaper options that still fit, take the one that saves most per error that
-it adds; until none fits. Because one long step may be shut out by a short one, the same is tried after each single
+The search is greedy, and starts with everything exact. The cheaper option that still fits and saves most per added
+error is taken, until none fits. One long step may be shut out by a short one. So the same is tried after each single
 step, and the cheapest end counts: it saves at least half of what can be saved. A larger tolerance never costs more, but
 may switch a cheap effect on again in exchange for a dear one.
 """

@@ -1,8 +1,8 @@
 """Extrema of a scene: where it is steepest, most curved, brightest and darkest, in and beside the sweeps.
 
-Works on the scene's own pixels, strip by strip, with the slit's box along the scan; it is fast and right to a pixel,
-and leaves the exact numbers to closer looks. Of components a few bands stand for all; where bands have planes
-of their own, each is looked at, tile by tile: see `BandTiles`.
+It works on the scene's own pixels, strip by strip, with the slit's box along the scan. It is fast and right to a pixel,
+and leaves the exact numbers to closer looks. A few bands stand for all where planes are components; where bands have
+planes of their own, each is searched, tile by tile: see `BandTiles`.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class PixelOptics:
     def worths(self, light: Radiance) -> Iterator[Radiance]:
         """Yield measures of light without its halo, (row, column, band) each: higher ones are probed first.
 
-        Where samples are summed, sizes are averaged along the line, as the probe does.
+        Summed samples count by the average of sizes along the line, as in the probe.
         """
         inner = (slice(self.halo, -self.halo), slice(self.halo, -self.halo))
         for along_y in self.turned:
@@ -216,8 +216,9 @@ class BandTiles:
                 ranking.offer((tier, sort, number), *(one[group == number] for one in offered))
 
     def _window(self, row: int, column: int, band: int) -> Radiance:
-        """Return the light about a tile in a band and its neighbours, (row, column, 3); the scene's edge is
-        repeated.
+        """Return the light about a tile in a band and its neighbours, (row, column, 3).
+
+        The scene's edge is repeated.
         """
         halo, (rows, columns) = self._optics.halo, self._scene.shape
         down = np.arange(row - halo, row + self._tile + halo).clip(0, rows - 1)
@@ -386,7 +387,7 @@ def _offer(
 def chosen_bands(spectra: Radiance) -> NDArray[np.intp]:
     """Choose the brightest band and those least like the ones chosen, at most ``CHOSEN_BANDS``.
 
-    Of bands with planes of their own, which do not tell of each other: as many, evenly.
+    Bands with planes of their own are chosen evenly, and as many: they do not predict each other.
     """
     if spectra.ndim == 1:
         return np.unique(np.linspace(0, len(spectra) - 1, CHOSEN_BANDS).round().astype(np.intp))

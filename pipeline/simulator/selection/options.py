@@ -1,14 +1,14 @@
 """Options of the decision: for every effect, off and each variant with its error and cost.
 
-A bound is the change of a stored number in units of its noise (or in DN), at the worst binning of the survey. Where a
-drawn displacement or gain moves the light (jitter, turbulence, wind), it is on the change with the same draws. Where
-the draw is the noise itself (shot, read, dark) what matters is the total variation between the distributions of a
-number with and without: noise that changes it by ``t`` counts ``2 t`` deviations, as much as a change that could be
-told apart as often. Total variation is a metric and no later stage increases it: so all bounds may be summed.
+A bound is the change of a stored number in units of its noise (or in DN), at the worst binning of the survey. If a
+drawn displacement or gain moves the light (jitter, turbulence, wind), it is on the change with the same draws. If the
+draw is the noise itself (shot, read, dark), the total variation between the distributions of a number with and without
+it counts. Noise that changes it by ``t`` counts ``2 t`` deviations, as much as a change that could be detected as
+often. Total variation is a metric and no later stage increases it: so all bounds may be summed.
 
 Kernels that are not negative and sum to 1 have gain 1 at most, readout none. Gains of light (vignetting, drift, ...)
 multiply the errors of all other effects in the light, each by its own greatest factor, and change the unit: with
-sigma(S)^2 = S + n, g sigma(S) / sigma(g S) grows with g; so the greatest gains count for errors made elsewhere, and the
+sigma(S)^2 = S + n, g sigma(S) / sigma(g S) grows with g. So the greatest gains count for errors made elsewhere, and the
 least of its own for a gain that is left out. Blurs and shifts of each band's own colour edges: light then changes over
 wavelength where the scene's does not.
 """
@@ -94,7 +94,7 @@ def acts_on_light(effect: Effect) -> bool:
 def list_options(probes: Probe | Sequence[Probe], rig: Rig, effects: Sequence[Effect]) -> tuple[Menu, ...]:
     """Ask every effect for the bounds of its options; errors are in the unit of the probes.
 
-    Of several probes, one for each binning and exposure of a survey, every option has the error of the worst.
+    Every option has the error of the worst probe; a survey has one for each binning and exposure.
 
     Raises SettingsError: two effects have one name, or a bound is negative or not a number; names it.
     """
@@ -244,8 +244,8 @@ class Growth:
 def light_after(probe: Probe, ranges: Iterable[GainRange], rig: Rig) -> Probe:
     """Give the probe of light after some gains, their greatest factors taken off: those are for `Growth`.
 
-    By Leibniz' rule for differences, (g I)' <= g I' + g' I and (g I)'' <= g I'' + 2 g' I' + g'' I; where light is
-    added, its own. What does not shrink with the light counts by the unit of the darkest.
+    Leibniz' rule for differences gives (g I)' <= g I' + g' I and (g I)'' <= g I'' + 2 g' I' + g'' I. Added light has
+    its own differences. Light that the factor does not reduce counts by the unit of the darkest.
     """
     passed = list(ranges)
     if not passed:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -188,8 +189,9 @@ def _held(sweep: Sweep) -> Sweep:
 
 
 def sample_offsets(binning: int) -> Floats:
-    """Return the steps of a patch around a place: stored numbers along the line and lines along the scan, (number,
-    2).
+    """Return the steps of a patch around a place, (number, 2).
+
+    They are stored numbers along the line and lines along the scan.
     """
     beside = _BESIDE if binning == 1 else 1
     return np.stack(np.meshgrid(np.arange(-beside, beside + 1.0), np.arange(-1.0, 2.0)), axis=-1).reshape(-1, 2)
@@ -228,28 +230,24 @@ def line_means(
 ) -> Radiance:
     """Give the mean over samples and bands of every position that any sweep holds, (position,) [e-].
 
-    Of the pixels that middle rays meet: a slit, and positions that one line holds, give means between these. Positions
-    continue beyond a sweep's ends as far as its slit reaches, and as far as ``beside_px``, by which lines also lie
-    beside their strip.
+    Means are those of the pixels that middle rays meet. A slit, and positions that one line holds, give means between
+    these. Positions continue beyond a sweep's ends as far as its slit reaches, and as far as ``beside_px``, by which
+    lines also lie beside their strip.
     """
     spectra = scene.electrons * np.float32(camera.exposure_ms / DEFAULT_EXPOSURE_MS)
     mean = spectra / spectra.shape[0] if spectra.ndim == 1 else spectra.mean(axis=1)
     grey = (scene.planes.reshape(-1, scene.planes.shape[2]) @ mean.astype(np.float32)).reshape(scene.shape)
     beyond, found = np.ceil(camera.slit_px / 2 + 1) + max(beside_px), []
-    courses = sorted({_course(sweep) for sweep in sweeps if sweep.lines})
-    for along_y, swath, lines in ((one[0], one[1] + beside, one[2]) for one in courses for beside in beside_px):
+    held_by = ((one, one.start_px, one.start_px + one.lines * one.step) for one in sweeps if one.lines)
+    courses = sorted({(one.along == "y", one.swath_px, start, stop) for one, start, stop in held_by})
+    for (along_y, swath, start, stop), beside in itertools.product(courses, beside_px):
         pixels, middle = (grey.T if along_y else grey), (np.array(scene.shape) - 1) / 2
         down, right = middle[::-1] if along_y else middle
-        held = np.arange(lines[0] - beyond, lines[1] + beyond)
+        held = np.arange(start - beyond, stop + beyond)
         for first in range(0, len(held), _LINES_AT_ONCE):
             some = held[first : first + _LINES_AT_ONCE]
-            along, scan = points_of_scan(swath, camera, some[:, None], camera.pixel_slopes())
+            along, scan = points_of_scan(swath + beside, camera, some[:, None], camera.pixel_slopes())
             row = np.rint(scan + down).clip(0, pixels.shape[0] - 1).astype(np.intp)
             column = np.rint(along + right).clip(0, pixels.shape[1] - 1).astype(np.intp)
             found.append(pixels[row, column].mean(axis=1))
     return np.concatenate(found)
-
-
-def _course(sweep: Sweep) -> tuple[bool, float, tuple[float, float]]:
-    """Return what identifies a path: orientation, strip, the first held position and the one after the last."""
-    return sweep.along == "y", sweep.swath_px, (sweep.start_px, sweep.start_px + sweep.lines * sweep.step)

@@ -204,7 +204,7 @@ def worst_of_groups(probe: Probe) -> Probe:
 def _derivatives(seen: Radiance, scale: Radiance, binning: int) -> tuple[Floats, Floats]:
     """Return the greatest first and second derivatives, (2, band) each over the unit, by differences within half a px.
 
-    Of a stored number the mean size over its samples: they may be moved one way or the other.
+    A stored number has the mean size over its samples: they may be moved one way or the other.
     """
     level, high = seen[0], np.abs(seen[0]).max(axis=0)
 
@@ -282,9 +282,9 @@ def probe_survey(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Un
 def probe_scene(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "sigma") -> Probe:
     """Look at the scene through the footprint alone where it is steepest, brightest and darkest, and along some lines.
 
-    Where to look is found on the scene's own pixels, so that the maxima hold for the whole image. Raises SceneError:
-    the scene holds a number that is not finite; SettingsError: no line to take, or sweeps of several binnings or
-    exposures; PoseError: a sweep is out of the mirror's reach.
+    The places to look are found on the scene's own pixels, so that the maxima hold for the whole image. Raises
+    SceneError: the scene holds a number that is not finite; SettingsError: no line to take, or sweeps of several
+    binnings or exposures; PoseError: a sweep is out of the mirror's reach.
     """
     taken = _taken(sweeps)
     binnings = {sweep.binning for sweep in taken}
@@ -340,8 +340,9 @@ def _taken(sweeps: Sequence[Sweep]) -> tuple[Sweep, ...]:
 def _slit_errors(
     scene: RasterScene, rig: Rig, views: SampleViews, sweeps: tuple[Sweep, ...], unit: Unit
 ) -> dict[str, float]:
-    """Return the greatest change by every variant of the slit, over the unit: off, or against the finest, with all
-    blurs.
+    """Return the greatest change by every variant of the slit, over the unit.
+
+    A variant is off, or compared with the finest, with all of the rig's blurs.
 
     Each sweep is seen through the boxes that a variant takes for it.
     """
@@ -405,7 +406,9 @@ def _blurs(rig: Rig, wavelength_nm: Floats, sweeps: Sequence[Sweep]) -> list[Mom
     One where both agree. The slit's variants stand beside all other effects: what leaving out a blur changes is bounded
     for any slit.
     """
-    found = [_moments(rig, wavelength_nm, middle_normal(sweep, rig.camera)) for sweep in sweeps]
+    normals = [middle_normal(sweep, rig.camera) for sweep in sweeps]
+    all_blurs = [[blur.moments(rig, wavelength_nm, blur.variants[0], one) for blur in _OPTICS] for one in normals]
+    found = [Moments.together(blurs, len(wavelength_nm)) for blurs in all_blurs]
     found.sort(key=lambda one: float(_size(one).sum()))
     least, most = found[0], found[-1]
     return [least] if np.allclose(_size(least), _size(most), rtol=_ALIKE) else [least, most]
@@ -413,11 +416,6 @@ def _blurs(rig: Rig, wavelength_nm: Floats, sweeps: Sequence[Sweep]) -> list[Mom
 
 def _size(blurs: Moments) -> Floats:
     return blurs.spread if blurs.waves is None else blurs.spread + blurs.waves**2
-
-
-def _moments(rig: Rig, wavelength_nm: Floats, normal: Floats) -> Moments:
-    found = [blur.moments(rig, wavelength_nm, blur.variants[0], normal) for blur in _OPTICS]
-    return Moments.together(found, len(wavelength_nm))
 
 
 def _stored(values: Radiance, views: SampleViews) -> Radiance:

@@ -54,9 +54,9 @@ def worst_blocks(
 ) -> dict[str, SweepBlock]:
     """Choose where bounds are hardest to keep: the steepest, brightest, darkest and most oblique of some blocks.
 
-    Of numbers as they are stored, of each binning its own. ``render`` gives expected electrons (line, sample, band),
-    ``units`` one unit of the tolerance at each [e-], from electrons and their binning. Returns them by name; one block
-    may have several. Raises ShapeError: there is nothing to choose from.
+    They are blocks of stored numbers, separate for each binning. ``render`` gives expected electrons (line, sample,
+    band), ``units`` one unit of the tolerance at each [e-], from electrons and their binning. Returns them by name; one
+    block may have several. Raises ShapeError: there is nothing to choose from.
     """
     best: dict[str, tuple[float, SweepBlock]] = {}
     least = min((block.sweep.binning for block in candidates), default=1)
@@ -134,9 +134,9 @@ def verify(decision: Decision, render: Render, blocks: Mapping[str, SweepBlock],
 
     Draws are paired: the difference is the effect's alone. Effects of the readout change distributions, not expected
     light, and are not measured. ``render`` gives expected electrons (line, sample, band) of a block with some effects
-    on, ``units`` one unit of the tolerance at each [e-]. Returns the greatest change of a stored number in units: by
-    the name of each effect that is not exact and bounded by more than `HARDLY`, and of `TOTAL`; where ``none`` was
-    asked for, of that alone.
+    on, ``units`` one unit of the tolerance at each [e-]. Returns the greatest change of a stored number in units, by
+    name. The names are `TOTAL` and each effect that is not exact and bounded by more than `HARDLY`. A request for
+    ``none`` returns that alone.
 
     Raises BoundError: a change exceeds the bound that the decision counted on; names effect, bound, change and place.
     """
@@ -212,8 +212,8 @@ def misplaced_electrons(light: NDArray[np.floating], contrast: NDArray[np.floati
 def misplaced_fraction(block: SweepBlock, exact: Mapping[Effect, str], chosen: Mapping[Effect, str]) -> float:
     """Give the fraction of the contrast about a sample by which two ways to compute its light may differ at most.
 
-    Tables of weights misplace up to `TABULATED` of the light along either axis, in either image; where blurs or held
-    positions differ, so do the kernels that stand for those of all bands, each right to `NEGLIGIBLE` unless its
+    Tables of weights misplace up to `TABULATED` of the light along either axis, in either image. Where blurs or held
+    positions differ, so do the kernels that stand for those of all bands. Each is right to `NEGLIGIBLE` unless its
     footprint says otherwise. Half counts.
     """
     if _folded(exact) == _folded(chosen):
@@ -264,7 +264,8 @@ def contrast_about(block: SweepBlock, render: Render, reach_px: int = REACH_PX) 
     wide = replace(block, sweep=held, lines=range(max(ends[0], 0), min(ends[1], held.lines)))
     if not wide.lines:
         return np.zeros((1, block.rig.camera.samples, len(block.wavelength_nm)))
-    probes = (render(replace(wide, sweep=_beside(held, *way)), MIDDLE_RAYS) for way in _HALVES)
+    moved = (replace(held, swath_px=held.swath_px + along, start_px=held.start_px + scan) for along, scan in _HALVES)
+    probes = (render(replace(wide, sweep=one), MIDDLE_RAYS) for one in moved)
     ends_e = np.max([(seen.max(axis=0), -seen.min(axis=0)) for seen in probes], axis=0)
     most, least = (scipy.ndimage.maximum_filter1d(one, 2 * reach_px + 1, axis=0, mode="nearest") for one in ends_e)
     return np.asarray((most + least).astype(np.float64)[None])
@@ -279,7 +280,3 @@ def _beyond(sweep: Sweep, rig: Rig, reach_px: int) -> Sweep:
     except PoseError:
         return held
     return wide
-
-
-def _beside(sweep: Sweep, along_px: float, scan_px: float) -> Sweep:
-    return replace(sweep, swath_px=sweep.swath_px + along_px, start_px=sweep.start_px + scan_px)
