@@ -78,13 +78,13 @@ def field_of_view_deg(shape: tuple[int, int], ifov_rad: float) -> tuple[float, f
 
 
 def scale_of_pixels(shape: tuple[int, int], ifov_rad: float, pixel_m: float | None) -> FieldScale:
-    """Tell the scale of a field whose pixels are all squares of one side [m]; without metres where that is None."""
+    """Return the scale of a field whose pixels are all squares of one side [m]; without metres where that is None."""
     area = None if pixel_m is None else shape[0] * shape[1] * pixel_m**2
     return FieldScale(shape, field_of_view_deg(shape, ifov_rad), pixel_m, area)
 
 
 def scale_of_view(view: GroundView, shape: tuple[int, int]) -> FieldScale:
-    """Tell the scale of a field of (y, x) px before a rig of which the place is known.
+    """Return the scale of a field of (y, x) px before a rig of which the place is known.
 
     Raises PoseError: no ray of the field meets the ground.
     """

@@ -46,7 +46,7 @@ EDGE_POINTS = 33  # on each side of the footprint: straight on the ground, bent 
 
 
 def default_epsg(pose: RigPose) -> int:
-    """Give the EPSG code of the rig's UTM zone (WGS 84), of polar stereographic beyond 84 N and 80 S."""
+    """Return the EPSG code of the rig's UTM zone (WGS 84), of polar stereographic beyond 84 N and 80 S."""
     south, north = UTM_LATITUDES
     if not south <= pose.lat_deg <= north:
         return POLAR[pose.lat_deg > 0]
@@ -55,7 +55,7 @@ def default_epsg(pose: RigPose) -> int:
 
 
 def map_crs(pose: RigPose, epsg: int | None = None) -> pyproj.CRS:
-    """Give the projected CRS of a map around the rig: the one asked for, or that of ``default_epsg``.
+    """Return the projected CRS of a map around the rig: the one asked for, or that of ``default_epsg``.
 
     Raises PoseError: no such code, not a projected CRS in metres, or the rig stands outside the area it is made for.
     """
@@ -96,18 +96,22 @@ class MapFrame:
     crs: CRS
 
     def ground_to_geodetic(self, ground_m: ArrayLike) -> Floats:
-        """Give (..., 3) longitude, latitude [deg] and height above the ellipsoid [m] of east, north, up of the foot."""
+        """Return (..., 3) longitude, latitude [deg] and height above the ellipsoid [m] of east, north, up of the
+        foot.
+        """
         ground = np.asarray(ground_m, np.float64)
         east, north, up = np.moveaxis(ground, -1, 0)
         return _stacked(self._around_foot.transform(east, north, up, direction="INVERSE"))
 
     def ground_to_map(self, ground_m: ArrayLike) -> Floats:
-        """Give map coordinates (..., 2) of points (..., 3) east, north, up of the foot [m]; NaN for NaN."""
+        """Return map coordinates (..., 2) of points (..., 3) east, north, up of the foot [m]; NaN for NaN."""
         place = self.ground_to_geodetic(ground_m)
         return _stacked(self._on_map.transform(place[..., 0], place[..., 1]))
 
     def map_to_ground(self, map_m: ArrayLike) -> Floats:
-        """Give the point of the ground's plane over map coordinates (..., 2), as (..., 3) east, north, up of the foot.
+        """Return the point of the ground's plane over map coordinates (..., 2).
+
+        It is (..., 3) east, north, up of the foot.
 
         The map gives longitude and latitude; the height follows from where their vertical meets the plane.
         """
@@ -163,7 +167,7 @@ class GroundGrid:
         return int(rows), int(columns)
 
     def scene_pixels(self, rows: slice, columns: slice) -> Floats:
-        """Give where map pixels lie in the scene's image, (row, column, 2); integers are centres of its pixels.
+        """Return where map pixels lie in the scene's image, (row, column, 2); integers are centres of its pixels.
 
         NaN where the field does not show the ground, or shows it beyond the map's reach.
         """
@@ -174,7 +178,7 @@ class GroundGrid:
         return np.where(inside[..., None], points + (size - 1) / 2, np.nan)
 
     def ground_m(self, rows: slice, columns: slice) -> Floats:
-        """Give the ground under the centres of map pixels, (row, column, 3) east, north and up of the foot [m].
+        """Return the ground under the centres of map pixels, (row, column, 3) east, north and up of the foot [m].
 
         Exact every ``TIE`` pixels and linear between. A map bends against the ground's plane by about the earth's
         radius, so that this is off by TIE^2 resolution / 8 R of a pixel: 1e-6 at 5 cm, 2e-5 at 1 m (tested).
@@ -227,20 +231,20 @@ def ground_grid(
 
 
 def least_mapped_sink(view: GroundView, scene_shape: tuple[int, int]) -> float:
-    """Give the sink below which a field's rays meet the ground too far away to be mapped."""
+    """Return the sink below which a field's rays meet the ground too far away to be mapped."""
     farther: float = FAR_PIXELS ** (2 / 3)  # a footprint's area goes as w^-3
     return max(median_sink(view, scene_shape) / farther, LEAST_SINK)
 
 
 def grid_of_map(view: GroundView, scene_shape: tuple[int, int], geobox: GeoBox) -> GroundGrid:
-    """Give the grid of a map that is there already, as ``ground_grid`` made it for the view and scene."""
+    """Return the grid of a map that is there already, as ``ground_grid`` made it for the view and scene."""
     assert geobox.crs is not None
     frame = MapFrame(view, pyproj.CRS.from_wkt(geobox.crs.to_wkt()))
     return GroundGrid(frame, scene_shape, geobox, least_mapped_sink(view, scene_shape))
 
 
 def median_sink(view: GroundView, scene_shape: tuple[int, int]) -> float:
-    """Give the median by which the rays of a field that meet the ground sink; NaN if none does."""
+    """Return the median by which the rays of a field that meet the ground sink; NaN if none does."""
     y, x = (np.linspace(places[0], places[-1], min(len(places), SAMPLES)) for places in pixel_places(scene_shape))
     sink = view.sink(np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1))
     # w is linear, so that one of the corners, which are among the samples, sinks the most

@@ -89,7 +89,7 @@ def _grown(shape: BaseGeometry, by: float) -> BaseGeometry:
 def pixels_inside(
     shapes: Sequence[BaseGeometry], size: tuple[int, int], *, origin: tuple[int, int] = (0, 0), touched: bool = False
 ) -> Mask:
-    """Tell which of (y, x) ``size`` pixels from row and column ``origin`` on lie in polygons given in pixels.
+    """Return which of (y, x) ``size`` pixels from row and column ``origin`` on lie in polygons given in pixels.
 
     A pixel belongs where its centre lies; with ``touched`` every pixel that a polygon touches does.
     """

@@ -40,12 +40,12 @@ class Heading:
         return float(np.sin(np.deg2rad(self.degrees))), float(np.cos(np.deg2rad(self.degrees)))
 
     def to_axes(self, x: Floats, y: Floats) -> Floats:
-        """Give (..., 2) along and across of places x east, y north, in the map's unit."""
+        """Return (..., 2) along and across of places x east, y north, in the map's unit."""
         sine, cosine = self._turn
         return np.stack([x * sine + y * cosine, x * cosine - y * sine], axis=-1)
 
     def from_axes(self, along: Floats, across: Floats) -> Floats:
-        """Give (..., 2) x and y; the inverse of ``to_axes``."""
+        """Return (..., 2) x and y; the inverse of ``to_axes``."""
         sine, cosine = self._turn
         return np.stack([along * sine + across * cosine, along * cosine - across * sine], axis=-1)
 

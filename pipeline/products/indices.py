@@ -112,7 +112,7 @@ NARROW = (
 
 
 def find_index(name: str) -> SpectralIndex:
-    """Give an index by its name, in capitals or not.
+    """Return an index by its name, in capitals or not.
 
     Raises SettingsError: there is none of that name, or it needs what no camera gives; the message lists similar names.
     """

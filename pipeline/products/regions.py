@@ -147,7 +147,7 @@ def find_regions(classes: Classes) -> tuple[NDArray[np.int32], RegionGraph]:
 
 
 def merge_small(classes: Classes, least_px: float) -> Classes:
-    """Give every region of less than ``least_px`` pixels to the neighbour that it shares the longest border with.
+    """Return every region of less than ``least_px`` pixels to the neighbour that it shares the longest border with.
 
     Neighbours that are small as well stay together, as the class of the largest, until the whole is large enough.
     Regions without a neighbour of a class stay, however small. Among borders equally long the neighbour numbered first
@@ -190,7 +190,9 @@ def _joined(links: NDArray[np.int64], count: int) -> NDArray[np.int32]:
 
 
 def grow_class(classes: Classes, number: int, radius_px: float) -> Classes:
-    """Give a class all pixels whose centres lie within ``radius_px`` of one of its own; what has no class stays so."""
+    """Return a class all pixels whose centres lie within ``radius_px`` of one of its own; what has no class stays
+    so.
+    """
     grown = classes.copy()
     if radius_px > 0 and (classes == number).any():
         away = ndimage.distance_transform_edt(classes != number)

@@ -218,7 +218,7 @@ class SurveyRig(MirrorLink):
     provenance: str = stated("assumed", "Who confirmed the assumed values")
 
     def mirror(self, vector_pairs: int) -> MirrorSettings:
-        """Give the settings of the mirror's driver; SettingsError where they are out of range."""
+        """Return the settings of the mirror's driver; SettingsError where they are out of range."""
         link = {item.name: getattr(self, item.name) for item in fields(MirrorLink)}
         return MirrorSettings(**link, vector_pairs=vector_pairs, provenance=self.provenance, mounting=self.mounting)
 

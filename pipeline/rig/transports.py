@@ -25,10 +25,10 @@ class Clock(Protocol):
     """A clock that never goes back. Deadlines are moments of it."""
 
     def now(self) -> float:
-        """Give the moment, counted from anywhere. [s]"""
+        """Return the moment, counted from anywhere. [s]"""
 
     def sleep(self, seconds: float) -> None:
-        """Let time pass; nothing for a time that is not above 0. [s]"""
+        """Wait for a time [s]; return at once where it is not above 0."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Closing(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Let go of what is held."""
+        """Release all that is held."""
 
 
 class DeviceGone(RigError):  # noqa: N818 - the name says what is the case
@@ -124,10 +124,10 @@ class Transport(Protocol):
         """Wait for bytes and give those that are there; none where the deadline passes first."""
 
     def drain(self) -> bytes:
-        """Give what is there already, without waiting."""
+        """Return what is there already, without waiting."""
 
     def close(self) -> None:
-        """Let go of the port."""
+        """Close the port."""
 
 
 class SerialTransport:
@@ -185,7 +185,7 @@ class SerialTransport:
             raise self._gone(error) from error
 
     def drain(self) -> bytes:
-        """Give what is there already, without waiting, and at most some buffers: a port may never fall silent."""
+        """Return what is there already, without waiting, and at most some buffers: a port may never fall silent."""
         drained = b""
         try:
             while len(drained) < _MOST_DRAINED and (there := self._serial.in_waiting):
@@ -277,7 +277,7 @@ class SocketTransport:
         return data
 
     def drain(self) -> bytes:
-        """Give what is there already, without waiting, and at most some buffers: a sender may never fall silent.
+        """Return what is there already, without waiting, and at most some buffers: a sender may never fall silent.
 
         DeviceGone: the connection is lost, or the other end closed it.
         """

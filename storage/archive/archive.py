@@ -155,7 +155,7 @@ class Archive:
         params: Mapping[str, Any] | None = None,
         inputs: Sequence[str] = (),
     ) -> Iterator[StagedStore]:
-        """Give a folder to write into, and publish it when the block ends well.
+        """Yield a folder to write into, and publish it when the block ends well.
 
         One process at a time makes a key; the others wait and then find ``done``. When the block fails, the folder is
         removed and the archive is unchanged. Raises ArchiveError: the disk refuses; the message names the path and what
@@ -343,7 +343,7 @@ class Archive:
     # --- runs and spools ----------------------------------------------------------------------------------------------
 
     def new_run(self, name: str) -> RunDraft:
-        """Begin the folder of one run; nothing of it is seen under ``runs`` before :meth:`RunDraft.publish`."""
+        """Create the folder of one run; it is not seen under ``runs`` before :meth:`RunDraft.publish`."""
         stem = f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{run_stem(name)}"
         run_id, number = stem, 1
         with refusals(self.root, "write to the archive"):
@@ -357,7 +357,7 @@ class Archive:
         return self._draft(run_id, wait=False, extends=False)
 
     def extend_run(self, run_id: str, *, wait: bool = True) -> RunDraft | None:
-        """Begin to add to a published run; it stays as it is until :meth:`RunDraft.publish` of what is given.
+        """Open a published run to add to it; it stays as it is until :meth:`RunDraft.publish` of the draft returned.
 
         One process at a time does so; None where another does and ``wait`` is false. Raises ArchiveError: there is no
         run of this name.

@@ -170,7 +170,7 @@ def check_files(folder: Path, *, hashes: bool) -> None:
 
 
 def broken_files(folder: Path, manifest: Mapping[str, Any], *, hashes: bool) -> Iterator[tuple[str, str]]:
-    """Give name and problem of every file that is not as the manifest lists it; with ``hashes`` also extra ones."""
+    """Yield name and problem of every file that is not as the manifest lists it; with ``hashes`` also extra ones."""
     listed = manifest["files"]
     inner = {parent for name in listed for parent in PurePosixPath(name).parents}
     links = sorted(one for one in inner if (folder / one).is_symlink())  # the outer ones first

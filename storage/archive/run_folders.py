@@ -169,7 +169,7 @@ def take_its_place(part: Path, final: Path) -> None:
 
 
 def try_exchange(one: Path, other: Path) -> bool:
-    """Give two folders of one file system each other's name in one step, and have the disk know it.
+    """Return two folders of one file system each other's name in one step, and have the disk know it.
 
     Linux does that (renameat2) on its local file systems. Elsewhere, as on most network file systems, nothing is
     changed and the answer is False.

@@ -60,7 +60,7 @@ def plain_size(path: Path) -> int:
 
 
 def open_plain(path: Path, flags: int = os.O_RDONLY) -> int:
-    """Give a descriptor of a file, which the caller closes.
+    """Return a descriptor of a file, which the caller closes.
 
     Raises NotPlainError: it is a link, a pipe, or whatever else is no file. FileNotFoundError, OSError.
     """
@@ -216,7 +216,7 @@ def retire(path: Path) -> None:
 
 
 def sync_path(path: Path) -> None:
-    """Ask the disk to have a file's content, or a folder's names, before going on."""
+    """Write a file's content, or a folder's names, through to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

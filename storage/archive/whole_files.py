@@ -18,7 +18,7 @@ PROBE_BYTES = 1 << 20  # a disk without room for so much is full
 
 @contextmanager
 def written_aside(folder: Path, names: Sequence[str]) -> Iterator[Path]:
-    """Give an empty folder to write ``names`` into; when the block ends well they replace those in ``folder``.
+    """Yield an empty folder to write ``names`` into; when the block ends well they replace those in ``folder``.
 
     Old and new files are never mixed. Old files of all names but the first are removed before the first is replaced;
     the last one to appear vouches for the others. When the block fails, ``folder`` is unchanged. Raises ArchiveError:

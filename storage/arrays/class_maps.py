@@ -79,7 +79,7 @@ def with_unknown(legend: ClassNames) -> ClassNames:
 def create_class_map(
     path: Path, shape: tuple[int, ...], legend: ClassNames, *, grid: AngularGrid | None = None
 ) -> None:
-    """Begin a class map of (y, x) ``shape`` in which no pixel has a class yet.
+    """Create a class map of (y, x) ``shape`` in which no pixel has a class yet.
 
     Raises ShapeError: there are not as many colours as names.
     """
@@ -166,7 +166,7 @@ def load_class_map(path: Path) -> ClassMap:
 def create_probabilities(
     path: Path, shape: tuple[int, int], legend: ClassNames, *, grid: AngularGrid | None = None, goes_on: bool = False
 ) -> None:
-    """Begin a store for a field of (y, x) ``shape`` of which nothing is known yet.
+    """Create a store for a field of (y, x) ``shape`` whose pixels are all unknown.
 
     A store that ``goes_on`` from an earlier one also has the earlier classes of changed pixels: `OLD_CLASS`.
     """

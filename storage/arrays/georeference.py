@@ -54,7 +54,7 @@ _EVEN = 1e-3  # of a step, by which coordinates may differ from an even grid's
 def create_placed_group(
     path: Path, title: str, grid: AngularGrid | None, shape: tuple[int, ...], attributes: Mapping[str, Any]
 ) -> tuple[zarr.Group, dict[str, Any]]:
-    """Begin a store of images of (y, x) ``shape`` on a scene's grid, with the coordinates y and x.
+    """Create a store of images of (y, x) ``shape`` on a scene's grid, with the coordinates y and x.
 
     Gives the store, and the attributes that say of each of its images where it lies.
     """

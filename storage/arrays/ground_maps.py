@@ -115,7 +115,7 @@ class GroundMapWriter:
     def __init__(
         self, path: Path, geobox: GeoBox, legend: ClassNames, *, about: Mapping[str, Any], goes_on: bool = False
     ) -> None:
-        """Begin a map; one of a survey that ``goes_on`` from an earlier one has images of what changed as well."""
+        """Create a map; one of a survey that ``goes_on`` from an earlier one has images of the changes as well."""
         place = map_attributes(geobox)
         names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
         self._group = create_group(path, "class map on the ground", {**place, **names, **about})

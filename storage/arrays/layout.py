@@ -91,7 +91,7 @@ def grid_of(attributes: Mapping[str, Any]) -> AngularGrid | None:
 
 
 def create_group(path: StorePlace, title: str, attributes: Mapping[str, Any]) -> zarr.Group:
-    """Begin a Zarr v3 store at ``path``, which must not exist."""
+    """Create a Zarr v3 store at ``path``, which must not exist."""
     if isinstance(path, Path):
         path.parent.mkdir(parents=True, exist_ok=True)
     return zarr.create_group(path, zarr_format=3, attributes={"Conventions": "CF-1.12", "title": title, **attributes})

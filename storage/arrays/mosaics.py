@@ -62,7 +62,7 @@ class MosaicWriter:
         grid: AngularGrid | None = None,
         simulation: Mapping[str, Any] | None = None,
     ) -> None:
-        """Begin a mosaic of (y, x) ``shape``; ``largest`` is the size that no score exceeds."""
+        """Create a mosaic of (y, x) ``shape``; ``largest`` is the greatest size of a score."""
         simulated = {} if simulation is None else {"simulation": dict(simulation)}
         self.path = path
         self.group, place = create_placed_group(path, "mosaic", grid, shape, simulated)

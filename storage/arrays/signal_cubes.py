@@ -136,7 +136,7 @@ class SignalCubeWriter:
         largest: float,
         frames_of: str | None = None,
     ) -> None:
-        """Begin a sweep; ``largest`` is the size that no score exceeds, ``frames_of`` a sweep with the same frames."""
+        """Create a sweep; ``largest`` is the greatest size of a score, ``frames_of`` a sweep with the same frames."""
         lines, samples, _ = header.shape
         self._header, self._step = header, step
         facts: dict[str, Any] = {"sweep": asdict(header.sweep), "source": header.source}

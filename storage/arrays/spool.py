@@ -155,7 +155,7 @@ class Spool:
         return self.count
 
     def read(self, first: int = 0, last: int | None = None) -> Iterator[Line | None]:
-        """Give the lines from ``first`` on, before ``last``; None for each that is not as it was captured."""
+        """Yield the lines from ``first`` on, before ``last``; None for each that is not as it was captured."""
         with plain_reader(self.path) as file:
             file.seek(self._place(first))
             for number in count(first) if last is None else range(first, last):
@@ -165,7 +165,7 @@ class Spool:
                 yield self._line(number, record)
 
     def blocks(self, size: int = SYNC_LINES) -> Iterator[list[Line]]:
-        """Give the lines in blocks of ``size``; the last may be shorter.
+        """Yield the lines in blocks of ``size``; the last may be shorter.
 
         Raises RigError: a line has changed since it was written, or is lost and not mended; names it.
         """

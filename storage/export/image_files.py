@@ -135,7 +135,9 @@ def _write_plain(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> 
 
 
 def _tag_wavelengths(file: Any, image: CogImage) -> None:
-    """Say each band's wavelength and width: in GDAL's own domain IMAGERY [um], and as its driver of ENVI does [nm]."""
+    """Write each band's wavelength and width: in GDAL's own domain IMAGERY [um], and as its driver of ENVI does
+    [nm].
+    """
     if image.wavelength_nm is None:
         return
     widths = [None] * len(image.bands) if image.fwhm_nm is None else image.fwhm_nm
@@ -208,7 +210,7 @@ def write_envi(header: Path, file: EnviFile, blocks: Blocks) -> Path:
 
 
 def _header_fields(file: EnviFile, kind: np.dtype[Any]) -> Iterator[tuple[str, str]]:
-    """Give sizes, type, byte order, bands, and the map where there is one."""
+    """Yield sizes, type, byte order, bands, and the map where there is one."""
     lines, samples, bands = file.shape
     if file.description:
         yield "description", _listed([file.description.replace("{", "(").replace("}", ")")])

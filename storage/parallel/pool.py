@@ -147,7 +147,7 @@ class _Open:
     team: Executor | None = None
 
     def dismiss(self) -> None:
-        """Let workers go at once: the next use starts others."""
+        """Dismiss the workers at once: the next use starts others."""
         team, self.team = self.team, None
         if isinstance(team, ProcessPoolExecutor):
             for process in list((team._processes or {}).values()):
@@ -211,7 +211,7 @@ def _send_away(
     paths: Sequence[Path],
     ended: Callable[[int, Any], None],
 ) -> None:
-    """Have blocks made by processes; those whose worker died are made again by others."""
+    """Make blocks in processes; blocks whose worker died are made again by others."""
     left, held, deaths = dict.fromkeys(range(len(items))), _open[pool], 0
 
     def tick(number: int, result: Any) -> None:
@@ -303,7 +303,7 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _inherited() -> Iterator[None]:
-    """Let processes and threads that begin meanwhile have the environment of workers, and never see Ctrl-C."""
+    """Give new processes and threads the environment of workers while the block runs, and keep Ctrl-C from them."""
     before = {name: os.environ.get(name) for name in _ENVIRONMENT}
     resource_tracker.ensure_running()  # where it starts later it lets signals through again
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -342,7 +342,7 @@ class Cluster(Executor):
         return sent
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Let go of the workers, which keep running."""
+        """Disconnect from the workers, which keep running."""
         self.client.close()
 
     def count(self) -> int:
@@ -357,7 +357,7 @@ class Cluster(Executor):
         return max(1, sum(int(threads) for threads in self.client.nthreads().values()))
 
     def check(self, paths: Sequence[Path]) -> int:
-        """Ask every worker for its versions and threads, and what it sees in some folders; gives `count`.
+        """Ask every worker for its versions and threads, and what it sees in some folders; return `count`.
 
         Raises SettingsError: one differs from this process; names it, both values and what to do. WorkerError: there is
         none, or one was lost meanwhile.

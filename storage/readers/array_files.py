@@ -175,7 +175,7 @@ def _prisma_cube(path: Path, level: str, arrays: Mapping[str, FileArray], about:
     order = bands[np.argsort(np.array(centres)[bands], kind="stable")]
 
     def read(start: int, stop: int) -> NDArray[Any]:
-        """Give some lines (line, sample, band)."""
+        """Return some lines (line, sample, band)."""
         with reading(path, KIND):
             raw = [np.moveaxis(array[start:stop], 1, 2) for array, _, _ in parts]
         void = np.logical_and.reduce([(block == 0).all(axis=2) for block in raw])
@@ -391,7 +391,7 @@ def _member(path: Path, member: zipfile.ZipInfo, claimed: int) -> NDArray[Any]:
 
 
 def _is_hdf(path: Path) -> bool:
-    """Tell whether a .mat file is of version 7.3, which is HDF5 behind 512 bytes of MATLAB's own."""
+    """Return whether a .mat file is of version 7.3, which is HDF5 behind 512 bytes of MATLAB's own."""
     with path.open("rb") as file:
         head = file.read(520)
     return b"\x89HDF\r\n\x1a\n" in (head[:8], head[512:])

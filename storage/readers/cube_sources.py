@@ -187,7 +187,7 @@ def read_by_chunks(read: ReadLines, lines: int, chunk_lines: int) -> ReadLines:
         return kept[number]
 
     def read_lines(start: int, stop: int) -> NDArray[Any]:
-        """Give some lines (line, sample, band)."""
+        """Return some lines (line, sample, band)."""
         with lock:
             numbers = range(start // chunk_lines, -(-stop // chunk_lines))
             parts = [

@@ -239,7 +239,7 @@ def _refuse_layouts(fields: Mapping[str, str], kind: str, where: str) -> None:
 
 
 def is_headwall_folder(folder: Path) -> bool:
-    """Tell whether a folder holds parts of a cube as a Headwall camera names them."""
+    """Return whether a folder holds parts of a cube as a Headwall camera names them."""
     return any(_PART.fullmatch(entry.name) is not None for entry in folder.iterdir())
 
 
@@ -337,7 +337,7 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
         bands = Bands(header.wavelength_nm, header.fwhm_nm, units, origin)
 
     def read(start: int, stop: int) -> NDArray[Any]:
-        """Give some lines (line, sample, band)."""
+        """Return some lines (line, sample, band)."""
         block = np.zeros((stop - start, samples, count), native)
         for begin, part in parts.items():
             low, high = max(start, begin), min(stop, begin + len(part.values))

@@ -155,7 +155,7 @@ def _reader(
     whole = cache(lambda: read_window(0, shape[0]))
 
     def read(first: int, last: int) -> NDArray[Any]:
-        """Give some rows, (y, x, band) (SceneError: they are damaged)."""
+        """Return some rows, (y, x, band) (SceneError: they are damaged)."""
         numbers = whole()[first:last] if picture else read_window(first, last)
         return numbers if colours is None else colours[numbers[..., 0]]
 
@@ -217,7 +217,7 @@ def _check_size(path: Path, driver: str, shape: tuple[int, int, int], item: int,
 
 
 def _is_mask(file: Any, channel: int) -> bool:
-    """Tell whether nearly all values of a channel are 0 or its greatest, in the middle of the image.
+    """Return whether nearly all values of a channel are 0 or its greatest, in the middle of the image.
 
     Programs call the fourth band of a file alpha where nothing says what it is.
     """

@@ -189,7 +189,7 @@ def _whole_numbers(values: NDArray[Any], address: str | Path, *, by_number: bool
 
 
 def _grid_difference(own: GeoBox, scene: GeoBox) -> str:
-    """Say how the grid of labels differs from a scene's; nothing where the pixels are the same."""
+    """Return how the grid of labels differs from a scene's; empty where the pixels are the same."""
     if own.crs != scene.crs:
         return f"are in {crs_name(own)}, the scene in {crs_name(scene)}"
     shift = shift_px(scene, own)

@@ -64,7 +64,7 @@ def split_variable(address: str | Path) -> tuple[Path, str | None]:
 
 
 def reader_of(address: str | Path) -> Reader:
-    """Tell which reader takes an address; none where there is no such file, or one of a kind that is not read.
+    """Return the reader that takes an address; none where there is no such file, or it is of a kind that is not read.
 
     A folder is a Zarr store or a Headwall camera's, an ENVI cube is named by its header or its data file.
     """

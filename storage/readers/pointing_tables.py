@@ -84,7 +84,9 @@ class PointingTable:
     first_row: int  # number of the first row in the file, as an editor counts them
 
     def of_cube(self, name: str, lines: int, mounting: Mounting = STRAIGHT, *, alone: bool = False) -> LinePointing:
-        """Give the pointing of a cube's ``lines`` lines: rows whose ``sweep`` is its name, or all without that column.
+        """Return the pointing of a cube's ``lines`` lines.
+
+        Its rows are those whose ``sweep`` is its name, or all without that column.
 
         If the cube is ``alone`` and no row has its name, the column cuts it into sweeps. ``mounting`` leads from the
         device's positions to the model's. Raises SceneError: the cube has no row or another number of rows, or no valid
@@ -308,7 +310,7 @@ def load_played_vector(path: Path, mounting: Mounting = STRAIGHT) -> PlayedVecto
 
 
 def follow_vector(vector: PlayedVector, middle_s: Floats, where: str) -> LinePointing:
-    """Give the pointing of lines by a played vector and the times of their mid exposures (line,) [s].
+    """Return the pointing of lines by a played vector and the times of their mid exposures (line,) [s].
 
     Times count from when the first line's exposure began; lines without a time, or outside of the path's time, are not
     valid. Raises SceneError: no line lies within the path's time.

@@ -87,7 +87,9 @@ class Recording:
     light: tuple[str, ...]  # what the numbers are known by without reading them: a manifest's hash, or file stamps
 
     def key(self) -> dict[str, Any]:
-        """Give what captures from the recording depend on: lines, references, bands and light, but no place or name."""
+        """Return what captures from the recording depend on: lines, references, bands and light, but no place or
+        name.
+        """
         arrays = [
             array
             for one in self.sweeps

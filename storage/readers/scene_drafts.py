@@ -134,7 +134,7 @@ def _named_step(address: str | Path) -> tuple[str | Path, tuple[str, ...]]:
 
 
 def _shared_labels(found: MatchedFiles, shape: tuple[int, ...]) -> MatchedFiles:
-    """Give all images the only label file, where it is called by a word for labels alone and has their size."""
+    """Return all images the only label file, where it is called by a word for labels alone and has their size."""
     if found.labels or len(found.alone) != 1 or found.alone[0].stem.lower() not in LABEL_WORDS:
         return found
     with suppress(PipelineError):

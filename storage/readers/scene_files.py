@@ -199,7 +199,7 @@ def with_stated_values(source: CubeSource, address: str | Path) -> CubeSource:
     nodata, plain = USUAL_NODATA if nodata is None and source.dtype.kind in "if" else nodata, source.read
 
     def read(start: int, stop: int) -> NDArray[np.float32]:
-        """Give some lines (line, sample, band), NaN where the file has no value."""
+        """Return some lines (line, sample, band), NaN where the file has no value."""
         return unpacked(plain(start, stop), settings.scale, settings.offset, nodata)
 
     return replace(source, read=read, dtype=np.dtype(np.float32), nodata=None, notes=(*source.notes, note))
@@ -483,7 +483,7 @@ class ValueCount:
         return (*notes, *self._dark_note())
 
     def _dark_note(self) -> tuple[str, ...]:
-        """Say where the bright end is so far above all else that hardly any light is left for it."""
+        """Return a note where the bright end is so far above all else that hardly any light is left for it."""
         lit = np.concatenate(self._lit) if self._lit else np.empty(0, np.float32)
         if not lit.size:
             return ()

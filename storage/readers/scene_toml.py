@@ -87,7 +87,7 @@ def find_scene_settings(scene: Path) -> SceneSettings:
 
 
 def is_image_folder(folder: Path) -> bool:
-    """Tell whether a folder's name says that images lie in it, and what belongs to them beside it."""
+    """Return whether a folder's name says that images lie in it, and what belongs to them beside it."""
     return folder.name.lower() in IMAGE_FOLDERS
 
 
@@ -119,7 +119,7 @@ MICROMETRES = (0.2, 5.0)
 
 
 def check_wavelengths(wavelengths: Sequence[float] | NDArray[np.float64], where: str) -> NDArray[np.float64]:
-    """Give the wavelengths as float64 [nm], any order.
+    """Return the wavelengths as float64 [nm], any order.
 
     Raises WavelengthError: they are not finite, look like micrometres, or lie outside 200-3000 nm.
     """

@@ -155,7 +155,7 @@ def _read_json(path: Path) -> Mapping[str, Any]:
 
 
 def _codecs(content: object) -> Iterator[str]:
-    """Give names of all codecs in an array's metadata, those within others too."""
+    """Yield names of all codecs in an array's metadata, those within others too."""
     if isinstance(content, dict):
         for key in ("codecs", "index_codecs", "filters", "compressor", "compressors"):
             listed = content.get(key) or []

@@ -95,9 +95,11 @@ class ObjectArchive(Archive):
         return None if is_cleared(read_manifest(self.root / ref.uri)) else ref
 
     def is_known(self, ref: StageRef) -> bool:
-        """Tell whether a store was published, also where its files were cleared away since; its manifest is here then.
+        """Return whether a store was published, also where its files were cleared away since.
 
-        Raises IncompleteStoreError: its manifest in the bucket is damaged.
+        Its manifest is here then.
+
+        Its manifest is here then. Raises IncompleteStoreError: its manifest in the bucket is damaged.
         """
         return super().is_known(ref) or self._find(ref.uri)
 
@@ -172,11 +174,11 @@ class ObjectArchive(Archive):
         return self._sending(super()._begin_run(f"{run_id}-{secrets.token_hex(3)}"))  # which no other machine takes
 
     def extend_run(self, run_id: str, *, wait: bool = True) -> RunDraft | None:
-        """Begin to add to a run that is published here or in the bucket; see `Archive.extend_run`."""
+        """Open a run that is published here or in the bucket to add to it; see `Archive.extend_run`."""
         return self._sending(super().extend_run(run_id, wait=wait))
 
     def _sending(self, draft: RunDraft | None) -> RunDraft | None:
-        """Have a run uploaded once it is published in the working copy, and then look for its stores once more."""
+        """Upload a run once it is published in the working copy, and then look for its stores once more."""
 
         def send(uri: str) -> None:
             self._upload(uri, first=draft is not None and not draft.extends)
@@ -329,7 +331,7 @@ class ObjectArchive(Archive):
         return True
 
     def _lay(self, uri: str, manifest: bytes, changed: datetime) -> None:
-        """Have a manifest here, with the date of its object; files that it lists otherwise than before go."""
+        """Write a manifest here, with the date of its object; files that it lists otherwise are removed."""
         folder = self.root / uri
         with self._locked(f"copy-{uri.replace('/', '-')}"), self._aside() as aside:
             before, problem = try_manifest(folder)
@@ -349,7 +351,7 @@ class ObjectArchive(Archive):
 
     @contextmanager
     def _aside(self) -> Iterator[Path]:
-        """Give a folder of the working copy for what is not whole yet; a disk that refuses says so in words."""
+        """Yield a folder of the working copy for what is not whole yet; a disk that refuses says so in words."""
         with (
             refusals(self.root, "write to the working copy"),
             TemporaryDirectory(prefix=ASIDE, dir=self.root, ignore_cleanup_errors=True) as named,
@@ -357,7 +359,7 @@ class ObjectArchive(Archive):
             yield Path(named)
 
     def _fetch(self, uri: str) -> None:
-        """Have a store or run here whole; of one of which nothing is known, a reader says what it finds.
+        """Fetch a whole store or run; an unknown one is left to the reader, who reports its absence.
 
         Raises IncompleteStoreError: an object of it is missing or has changed, or all of it was removed since.
         """
@@ -421,7 +423,7 @@ class ObjectArchive(Archive):
             self._lay(uri, *dated)  # by its date it is known as what stands
 
     def _ensure(self, uris: Iterable[str]) -> None:
-        """See that stores stand in the bucket as they are known here; those that do not are uploaded.
+        """Upload the stores that are not in the bucket as they are known here.
 
         Raises IncompleteStoreError: one is neither in the bucket nor whole here.
         """
@@ -531,7 +533,7 @@ def open_object_archive(text: str | Path, *, create: bool = True, write: bool = 
 
 
 def _find_mark(objects: Objects, *, create: bool) -> None:
-    """See that a prefix has the mark that makes it an archive; where ``create``, write it if need be.
+    """Check that a prefix has the mark that makes it an archive; ``create`` writes it where it is missing.
 
     A store that anyone may overwrite is refused.
     """

@@ -100,7 +100,7 @@ def parse_cube_header(text: str, where: str) -> CubeHeader:
 
 
 def cube_lines(header: CubeHeader, data: bytes) -> CubeLines:
-    """Give the lines that are whole in ``data``, (line, sample, band)."""
+    """Return the lines that are whole in ``data``, (line, sample, band)."""
     held = min(max(len(data) - header.offset, 0) // header.line_bytes, header.lines)
     shape = (held, header.bands, header.samples)
     values = np.ndarray(shape, header.dtype, data, header.offset if held else 0).transpose(0, 2, 1)
@@ -150,7 +150,7 @@ def read_capture(names: Iterable[str], read: Read) -> CapturedLines:
 
 
 def read_references(names: Iterable[str], read: Read) -> dict[str, CubeLines]:
-    """Give the reference cubes of a folder by ``dark`` and ``white``, where there are such.
+    """Return the reference cubes of a folder by ``dark`` and ``white``, where there are such.
 
     RigError where one has no header, a wrong one, or frames less or more, or there are two of a kind.
     """

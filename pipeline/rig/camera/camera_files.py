@@ -64,7 +64,7 @@ class FileSession(ftplib.FTP):
         return int(found[1])
 
     def pieces(self, name: str, start: int, size: int) -> Generator[bytes]:
-        """Give the bytes of a file from ``start`` on, to its end.
+        """Return the bytes of a file from ``start`` on, to its end.
 
         DamagedTransfer where the file continues after ``size`` bytes, or ends before them; DeadlinePassed where less
         than ``least_kb_s`` came.

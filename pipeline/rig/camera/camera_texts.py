@@ -210,7 +210,7 @@ def parse_frame_index(lines: Iterable[str], name: str = "the frame index", where
 
 
 def times_of_lines(index: FrameIndex, first_frame: int, lines: int, lost: int = 0) -> LineTimes:
-    """Give each of a file's ``lines`` its frame and time.
+    """Return each of a file's ``lines`` its frame and time.
 
     Lines are frames in order, the first of them ``first_frame`` (the number in the file's name). If as many frames are
     listed as there are lines, they are its lines whatever their numbers: the camera dropped those missing. So they are

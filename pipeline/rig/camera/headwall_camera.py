@@ -205,7 +205,7 @@ class HeadwallCamera:
             raise AssertionError("unreachable")
 
     def _open(self) -> None:
-        """Have a connection that stands at its prompt, with nothing left over from before."""
+        """Open a connection that stands at its prompt, with no earlier input left over."""
         if self._line is not None:
             try:
                 if stale := self._reader.held + self._line.drain():
@@ -329,7 +329,7 @@ def _reader(kept: Kept) -> Read:
 
 
 def bounded(files: Sequence[RemoteFile], claim: FrameClaim) -> list[RemoteFile]:
-    """Give the files with the most that each can have: cubes what was asked for, references and texts a fixed number.
+    """Return the files with the most that each can have: cubes what was asked for, references and texts a fixed number.
 
     RigError where one claims more, or all cubes together do, or there are too many files.
     """

@@ -47,7 +47,7 @@ class FrameTimes:
 
 
 def mend_times(frames: FrameTimes) -> tuple[Ints, Ints, list[str]]:
-    """Give every line a stamp and a number, and say what was done.
+    """Return every line a stamp and a number, and say what was done.
 
     Frames come at a steady rate or later, never sooner. A stamp off its neighbours' by half a period strayed; where all
     after one are early the clock was set back. Both follow their neighbours then; so do lines without a stamp. A later
@@ -215,7 +215,7 @@ class Announced:
 
 
 def capture_prefix(sweep: Sweep, first: int = 0) -> str:
-    """Give the prefix of a capture of a sweep's lines from ``first`` on.
+    """Return the prefix of a capture of a sweep's lines from ``first`` on.
 
     SettingsError where the sweep's name holds what a folder's name must not, or is too long.
     """
@@ -286,7 +286,7 @@ class CapturePath:
 
 
 def next_path(sweep: Sweep, first: int, camera: LineCamera, *, vector_pairs: int, triggered: bool) -> CapturePath:
-    """Give the path of the sweep's lines from ``first`` on, as many as the vector memory takes.
+    """Return the path of the sweep's lines from ``first`` on, as many as the vector memory takes.
 
     SettingsError where the positions of one line do not fit the memory, PoseError where one is beyond the disk.
     """
@@ -298,7 +298,7 @@ def next_path(sweep: Sweep, first: int, camera: LineCamera, *, vector_pairs: int
 
 
 def path_of(sweep: Sweep, lines: tuple[int, int], camera: LineCamera, *, triggered: bool) -> CapturePath:
-    """Give the path of some of the sweep's lines; PoseError where a position is beyond the mirror's disk."""
+    """Return the path of some of the sweep's lines; PoseError where a position is beyond the mirror's disk."""
     held: NDArray[Any] = sweep_positions(sweep, camera)[slice(*lines)].reshape(-1, 2)
     lead = held[:LEAD] if triggered else held[:0]
     cells, middle = (
@@ -364,7 +364,7 @@ def place_lines(
     camera: LineCamera,
     scan_path: MirrorScanPath | None,
 ) -> PlacedLines:
-    """Give each line of the path its row of the capture, up to the last one that is there whole.
+    """Return each line of the path its row of the capture, up to the last one that is there whole.
 
     UntiedError where nothing, or what contradicts itself, ties frames to the mirror.
     """

@@ -180,7 +180,7 @@ class RigDevices:
     clock: Clock
 
     def close(self) -> None:
-        """Let go of both, whatever either says."""
+        """Close both devices, whatever either raises."""
         for device in (self.steering, self.camera):
             try:
                 device.close()

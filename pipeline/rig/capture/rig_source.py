@@ -107,13 +107,13 @@ class RigSource:
         return {"rig": told, "references": list(notes), "captures": self._journal.captures, **damage}
 
     def keeping(self, kept: Kept) -> RigSource:
-        """Give the same source with its files elsewhere."""
+        """Return the same source with its files elsewhere."""
         other = self.saying(self._say)
         other._kept, other._journal, other._whole = kept, CaptureJournal(kept), {}
         return other
 
     def saying(self, say: Say) -> RigSource:
-        """Give the same source with a report of what the rig is at."""
+        """Return the same source with a report of what the rig is at."""
         other = copy(self)
         other._say, other._runner = say, None
         return other
@@ -142,7 +142,7 @@ class RigSource:
             devices.close()
 
     def lines(self, sweep: Sweep, first: int = 0) -> Iterator[Line]:
-        """Give the sweep's lines one by one, from line ``first`` on.
+        """Yield the sweep's lines one by one, from line ``first`` on.
 
         Raises ShapeError where sums of ``sweep.binning`` samples at full scale do not fit uint16; PoseError where a
         position of the sweep is out of the mirror's reach; StateUnknown where a motion or a capture was sent and not
@@ -176,7 +176,7 @@ class RigSource:
                     self._give_up(taken, line, why, last=barren >= BARREN)
 
     def lines_again(self, sweep: Sweep, numbers: Sequence[int]) -> Iterator[Line]:
-        """Give single lines of those given before, in order, from the files of the captures that hold them.
+        """Yield single lines of those given before, in order, from the files of the captures that hold them.
 
         Nothing is captured for them. A line that no capture gives any more comes as one that the camera dropped: there,
         and not valid. RigError where a device failed, or the password is not taken.
@@ -295,7 +295,7 @@ class RigSource:
         return exposed.mid_exposure_s(float(number))
 
     def _give_up(self, taken: CaptureRecord, line: int, why: str, *, last: bool) -> None:
-        """Give a capture up: what it lacks is captured again, unless that has been tried already."""
+        """Abandon a capture: lines that it lacks are captured again, unless that has been tried already."""
         self._journal.spend(taken, why)
         if last:
             raise RigError(

@@ -65,7 +65,7 @@ class EmulatedCapture:
         return max(whole if self.most_frames is None else min(whole, self.most_frames), 0)
 
     def exposures(self, from_s: float, to_s: float) -> Floats:
-        """Begin and end (exposure, 2) of exposures that begin at ``from_s`` or later and before ``to_s``."""
+        """Return begin and end (exposure, 2) of exposures that begin at ``from_s`` or later and before ``to_s``."""
         bounds = np.ceil((np.array([from_s, to_s]) - self.began_s) / self.period_s - 1e-9).astype(np.int64)
         first, stop = np.clip(bounds, 0, self.most_frames)
         begins = self.began_s + np.arange(first, stop) * self.period_s
@@ -94,7 +94,7 @@ class EmulatedCapture:
         self._taken += len(lines)
 
     def drop(self) -> None:
-        """Have the files no longer; the capture is over."""
+        """Discard the files; the capture is over."""
         self._lines, self._whole = [], {}
 
     def files(self) -> dict[str, bytes]:
@@ -189,7 +189,9 @@ class CameraDevice:
         return bool(self.captures) and self.captures[-1].running(self.clock.now())
 
     def exposures(self, from_s: float, to_s: float) -> NDArray[np.float64]:
-        """Give begin and end (exposure, 2) of exposures that begin in a span of time: pulses for a mirror's trigger."""
+        """Return begin and end (exposure, 2) of exposures that begin in a span of time: pulses for a mirror's
+        trigger.
+        """
         with self._lock:
             spans = [capture.exposures(from_s, to_s) for capture in self.captures]
             return np.concatenate([np.zeros((0, 2)), *spans])
@@ -395,7 +397,7 @@ class CameraServer(Closing):
                 connection.sendall(chunk.data)
 
     def _wait(self, seconds: float) -> None:
-        """Let the device's time pass, unless the server closes."""
+        """Wait while the device's time passes, unless the server closes."""
         clock = self.device.clock
         until = clock.now() + seconds
         while not self._ended.is_set() and (left := until - clock.now()) > 0:

@@ -78,7 +78,7 @@ class OffPlanAim(Aim):
     cost_ns = MappingProxyType({"exact": 0.2})
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
-        """Give the shifts of a block's lines, along the line and the scan. [px]"""
+        """Return the shifts of a block's lines, along the line and the scan. [px]"""
         return self.shift_px[block.numbers - self.first]
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
@@ -94,7 +94,7 @@ class SceneView:
     mounting: Mounting = STRAIGHT
 
     def lines(self, told: Announced, held: Floats, times_ms: tuple[float, float], started_s: float) -> Raw:
-        """Give raw lines (line, sample, band) of a sweep, not binned.
+        """Return raw lines (line, sample, band) of a sweep, not binned.
 
         ``held`` are (line, step, 2) positions of the device during each exposure, ``times_ms`` exposure and frame
         period; ``started_s`` is when the sweep began, for what drifts, unless the source's own clock knows.
@@ -117,13 +117,13 @@ class SceneView:
         return np.concatenate(raw)
 
     def alone(self, name: str, held: Floats, times_ms: tuple[float, float], started_s: float) -> Raw:
-        """Give one raw line (1, sample, band) along x of a position (2,) of the device that belongs to no sweep."""
+        """Return one raw line (1, sample, band) along x of a position (2,) of the device that belongs to no sweep."""
         place = self._place(self.mounting.to_model(held))
         sweep = Sweep(name, "fine", "x", float(place[0]), float(place[1]), 1)
         return self._render(self._rig(times_ms), self.source.choice, sweep, range(1), started_s)
 
     def numbers(self, sweep: Sweep, seen: Floats) -> Ints:
-        """Give the line (line,) of the sweep that each exposure (line, step, 2) is nearest to."""
+        """Return the line (line,) of the sweep that each exposure (line, step, 2) is nearest to."""
         scan = self._place(seen)[..., 1].mean(axis=1)
         number = np.rint((scan - sweep.start_px - (sweep.step - 1) / 2) / sweep.step)
         lines: Ints = np.clip(number, 0, sweep.lines - 1).astype(np.int64)
@@ -202,7 +202,7 @@ class SceneCamera(CameraDevice):
         self.aside = False
 
     def pulses(self, from_s: float, to_s: float) -> Floats:
-        """Give rises and falls (pulse, 2) of the trigger pulses that rise from ``from_s`` on and before ``to_s``."""
+        """Return rises and falls (pulse, 2) of the trigger pulses that rise from ``from_s`` on and before ``to_s``."""
         found = [np.zeros((0, 2))]
         if self.wired == "none":
             return found[0]
@@ -477,7 +477,7 @@ class ServedRig(Closing):
         self._thread.start()
 
     def close(self) -> None:
-        """Let go of the pty and the sockets; clients see the devices go."""
+        """Close the pty and the sockets; clients see the devices go."""
         self._ended.set()
         self._thread.join()
         self._server.close()

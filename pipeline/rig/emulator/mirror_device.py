@@ -154,7 +154,7 @@ class RegisterFile:
         return Frame(command)
 
     def get(self, number: int) -> bytes:
-        """Give a register's cell; RefusedError where there is no such register."""
+        """Return a register's cell; RefusedError where there is no such register."""
         self._state.advance()
         register = self._find(number)
         value = register.read()
@@ -175,7 +175,9 @@ class RegisterFile:
         self._state.aim()
 
     def get_cells(self, number: int, offset: int, length: int) -> bytes:
-        """Give whole cells of the vector memory or of a log's slot (else RefusedError); offset and length in bytes."""
+        """Return whole cells of the vector memory or of a log's slot (else RefusedError); offset and length in
+        bytes.
+        """
         start, stop = _cells(offset, length)
         if number == VECTOR_MEMORY:
             _within(stop, self._state.memory.size)
@@ -377,13 +379,13 @@ class MirrorDevice:
                     self.state.trigger(pulses[:, 0], pulses[:, 1])
 
     def positions(self, times_s: ArrayLike) -> Floats:
-        """Give where the mirror truly was, (..., 2) device X and Y, at times of the clock up to now (...)."""
+        """Return where the mirror truly was, (..., 2) device X and Y, at times of the clock up to now (...)."""
         self.take_pulses()
         with self._lock:
             return self.state.positions(times_s)
 
     def sent(self, times_s: ArrayLike) -> Floats:
-        """Give where the mirror was sent, (..., 2), at times of the clock up to now (...)."""
+        """Return where the mirror was sent, (..., 2), at times of the clock up to now (...)."""
         self.take_pulses()
         with self._lock:
             self.state.advance()

@@ -76,11 +76,11 @@ class AxisMotion:
                 del column[:-KEPT_STEPS]
 
     def rest(self, time_s: float) -> None:
-        """Be at rest at 0 at once, as after a loss of power; the past is forgotten."""
+        """Reset to rest at 0 at once, as after a loss of power; the past is forgotten."""
         self._time, self._place, self._rate, self._command = [time_s], [0.0], [0.0], [0.0]
 
     def places(self, times_s: ArrayLike) -> Floats:
-        """Give where the axis was at times (...), in the unit of its commands.
+        """Return where the axis was at times (...), in the unit of its commands.
 
         Times before the oldest command that is remembered are given the place then.
         """
@@ -95,18 +95,20 @@ class AxisMotion:
         return np.where(still, np.asarray(self._command)[at], places)
 
     def commands(self, times_s: ArrayLike) -> Floats:
-        """Give where the axis was sent to at times (...); times before the oldest that is remembered get the oldest."""
+        """Return where the axis was sent to at times (...); times before the oldest that is remembered get the
+        oldest.
+        """
         at = np.searchsorted(np.asarray(self._time), np.asarray(times_s, np.float64), side="right") - 1
         return np.asarray(self._command)[np.clip(at, 0, None)]
 
     def place(self, time_s: float) -> float:
-        """Give where the axis was at one time, which is faster for the time after the last command."""
+        """Return where the axis was at one time, which is faster for the time after the last command."""
         if time_s < self._time[-1]:
             return float(self.places(time_s))
         return self._moved(time_s - self._time[-1])[0]
 
     def unsettled(self, time_s: float) -> float:
-        """Give a bound on how far the axis may still be off its command from a time on, oscillation included."""
+        """Return a bound on how far the axis may still be off its command from a time on, oscillation included."""
         place, rate = self._moved(max(time_s - self._time[-1], 0.0))
         return math.hypot(place - self._command[-1], rate)
 
@@ -158,7 +160,7 @@ class VectorPlayer:
         return self.start + max(self._played - 1, 0) % self.length if self.length > 0 else self.start
 
     def run(self, time_s: float) -> None:
-        """Begin with the first cell."""
+        """Start with the first cell."""
         self.running, self._began_s, self._played = True, time_s, 0
         self._edges.clear()
 
@@ -174,7 +176,7 @@ class VectorPlayer:
             self._edges.extend((rises_s if self.external is Trigger.RISING_EDGE else both).tolist())
 
     def due(self, now_s: float) -> Iterator[tuple[float, int]]:
-        """Give the steps (time, cell) since the last call up to now, and stop where the run is over."""
+        """Yield the steps (time, cell) since the last call up to now, and stop where the run is over."""
         if not self.running or self.length < 1:
             return
         total = math.inf if self.cycles < 0 else self.cycles * self.length
@@ -234,7 +236,7 @@ class MirrorState:
         self.restart(clock.now())
 
     def restart(self, now_s: float) -> None:
-        """Be as after power came: at rest in the middle, memory and registers empty."""
+        """Reset to the state after power came: at rest in the middle, memory and registers empty."""
         self.players = [VectorPlayer(self.unit.ends) for _ in range(CHANNELS)]
         self.memory = np.zeros(2 * self.unit.vector_pairs, np.float32)
         self.static = [dict.fromkeys(Unit, 0.0) for _ in range(CHANNELS)]
@@ -269,7 +271,7 @@ class MirrorState:
         self.advance()
 
     def positions(self, times_s: ArrayLike) -> NDArray[np.float64]:
-        """Give where the mirror was, (..., 2), at times up to now (...)."""
+        """Return where the mirror was, (..., 2), at times up to now (...)."""
         self.advance()
         return np.stack([axis.places(times_s) for axis in self.axes], axis=-1)
 
@@ -329,14 +331,14 @@ class PositionLogger:
         return min(int((until - self._began_s) * self.rate_hz + 1e-9) + 1, self._state.unit.log_rows)
 
     def run(self, on: bool) -> None:
-        """Begin anew, or stop; a logger that is stopped keeps its rows."""
+        """Start anew, or stop; a logger that is stopped keeps its rows."""
         if on:
             self._began_s, self._stopped_s = self._state.clock.now(), None
         elif self.running:
             self._stopped_s = self._state.clock.now()
 
     def cells(self, slot: int, start: int, stop: int) -> bytes:
-        """Give the cells of some rows of a slot; of registers that are no feedback, 0."""
+        """Return the cells of some rows of a slot; of registers that are no feedback, 0."""
         times = (self._began_s or 0.0) + np.arange(start, stop) / self.rate_hz
         channel = self.slots[slot] - FEEDBACK_X
         if channel not in range(CHANNELS):

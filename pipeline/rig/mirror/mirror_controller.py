@@ -55,7 +55,7 @@ Progress = Callable[[int, int], None]  # cells done, cells in all
 
 
 def wire_positions(positions: ArrayLike, mounting: Mounting = STRAIGHT) -> NDArray[np.float32]:
-    """Give positions (position, 2) at the precision of the wire, float32, where rounding carries none beyond the rim.
+    """Return positions (position, 2) at the precision of the wire, float32, where rounding carries none beyond the rim.
 
     They are those of the device that is mounted so, for what a straight one gets by the wire.
 
@@ -109,7 +109,7 @@ def upload(link: ProLink, cells: bytes, read_back: ReadBack, progress: Progress 
 
 
 def frames_to_check(frames: int, read_back: ReadBack) -> list[int]:
-    """Give the numbers of the frames that are read back."""
+    """Return the numbers of the frames that are read back."""
     if read_back == "none":
         return []
     if read_back == "all":
@@ -324,7 +324,7 @@ class MirrorController(Closing):
         return self._link.ask(get_value(X.vector(VectorRegister.INDEX)), "the place in the path", cell_int)
 
     def start_log(self, rate_hz: float) -> None:
-        """Begin to log measured positions ``rate_hz`` times a second: X in slot 0, Y in slot 1."""
+        """Start to log measured positions ``rate_hz`` times a second: X in slot 0, Y in slot 1."""
         self._check_connected()
         self._logging = None
         self._link.tell(set_values({LOG_RUN: 0}), "stopping the log")
@@ -354,7 +354,7 @@ class MirrorController(Closing):
         return MotionLog(position, rate_hz, after, after - before)
 
     def close(self) -> None:
-        """Let go of the port; the mirror stays where it is."""
+        """Close the port; the mirror stays where it is."""
         self._identity = None
         self.wire.transport.close()
 

@@ -60,7 +60,7 @@ _WORDS = {
 
 
 def to_line(request: str) -> bytes:
-    """Give the bytes of a request; ShapeError where it is not ASCII, empty, too long, or has an end of its own."""
+    """Return the bytes of a request; ShapeError where it is not ASCII, empty, too long, or has an end of its own."""
     if not request.isascii() or not request or any(character in request for character in "\r\n"):
         raise ShapeError(f"expected one line of ASCII, got {request!r}")
     line = request.encode("ascii") + END

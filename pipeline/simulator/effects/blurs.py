@@ -50,7 +50,7 @@ def blurred_bound(
 
 
 def even(variance: Floats, bands: int) -> Moments:
-    """Give the moments of a blur that is the same in all bands: no shift, and (2,) variance along line and scan."""
+    """Return the moments of a blur that is the same in all bands: no shift, and (2,) variance along line and scan."""
     return Moments(np.zeros((2, bands)), np.repeat(np.asarray(variance, np.float64)[:, None], bands, axis=1))
 
 
@@ -83,7 +83,7 @@ class Diffraction(Blur):
 
 @cache  # not at import: SciPy takes its time
 def airy_gaussians() -> tuple[Floats, Floats]:
-    """Give shares, none below 0, of sum 1, and widths (sd) [lambda / D] of Gaussians whose sum is an Airy pattern.
+    """Return shares, none below 0, of sum 1, and widths (sd) [lambda / D] of Gaussians whose sum is an Airy pattern.
 
     The least squares fit to the pupil's transfer is within 0.004 of it up to 0.6 of its cut-off. For bounds, not for
     light.
@@ -129,7 +129,7 @@ class Defocus(Blur):
     cost_ns = MappingProxyType({"disc": 5.7})  # of seven points
 
     def cost_at(self, probe: Probe, rig: Rig) -> Mapping[str, float]:
-        """Give the cost of as many points as stand for the disc; one is a Gaussian, which costs nothing."""
+        """Return the cost of as many points as stand for the disc; one is a Gaussian, which costs nothing."""
         along, scan = defocus_px(rig, rig.air.distance_m).tolist()
         points = disc_points((along, scan))[0].shape[1]
         return {"disc": _POINT_NS * points if points > 1 else 0.0}
@@ -149,7 +149,7 @@ class Defocus(Blur):
 
 
 def defocus_px(rig: Rig, distance_m: float | None, normal: Floats | None = None) -> Floats:
-    """Give the axes of the blur's disc, (2,) along line and scan: pupil |1/d - 1/d_f| / IFOV; 0 without a distance.
+    """Return the axes of the blur's disc, (2,) along line and scan: pupil |1/d - 1/d_f| / IFOV; 0 without a distance.
 
     It is in px; the variance of such an even disc is a sixteenth of its diameter squared.
     """
@@ -172,7 +172,7 @@ class Keystone(Blur):
     cost_ns = MappingProxyType({"linear": 3.9})
 
     def merged(self, rig: Rig) -> Merged:
-        """Give what it costs beside diffraction, whose several widths have to be shifted each."""
+        """Return what it costs beside diffraction, whose several widths have to be shifted each."""
         return Merged(DIFFRACTION.name, AIRY, 6.5)
 
     def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
@@ -196,7 +196,7 @@ class Keystone(Blur):
 
 
 def keystone_shift(rig: Rig, wavelength_nm: Floats) -> Floats:
-    """Give how far along the line each band sees beside the mirror model's place, (band,) from -k/2 to k/2. [px]"""
+    """Return how far along the line each band sees beside the mirror model's place, (band,) from -k/2 to k/2. [px]"""
     fraction = (np.asarray(wavelength_nm, np.float64) - FIRST_NM) / (LAST_NM - FIRST_NM)
     return rig.optics.keystone_px * (np.clip(fraction, 0.0, 1.0) - 0.5)
 

@@ -50,11 +50,10 @@ def normal_deviates(rng: np.random.Generator, count: int) -> Radiance:
 
 
 def photon_counts(expected: Radiance, deviate: Radiance) -> Radiance:
-    """Give exact Poisson counts: the quantile of each deviate's probability; 0 where 0 or less is expected.
+    """Return exact Poisson counts: the quantile of each deviate's probability; 0 where 0 or less is expected.
 
-    ``expected``: Electrons, any shape, finite. [e-]
-    ``deviate``: Standard normal, the same shape.
-    Returns the same shape, whole numbers (above 2^24 as near as float32 comes). [e-]
+    ``expected``: Electrons, any shape, finite. [e-] ``deviate``: Standard normal, the same shape. Returns the same
+    shape, whole numbers (above 2^24 as near as float32 comes). [e-]
     """
     counts = np.zeros(expected.size, np.float32)
     mean, normal = expected.reshape(-1), deviate.reshape(-1)
@@ -72,7 +71,7 @@ def photon_counts(expected: Radiance, deviate: Radiance) -> Radiance:
 
 
 def rounded_counts(expected: Radiance, deviate: Radiance) -> Radiance:
-    """Give nearly Poisson counts: mean, variance and third cumulant are right; for `least_expected` on.
+    """Return nearly Poisson counts: mean, variance and third cumulant are right; for `least_expected` on.
 
     The first terms of the quantile's expansion, as `photon_counts` has it. Rounding and the square add 5/36 to the
     variance, which is taken off before.
@@ -101,7 +100,7 @@ def divergence(expected: Floats, read_noise_e: float) -> Floats:
 
 @lru_cache
 def least_expected(read_noise_e: float) -> float:
-    """Give from how many expected electrons on cheap draws may stand for exact ones; 0 is at any light.
+    """Return from how many expected electrons on cheap draws may stand for exact ones; 0 is at any light.
 
     From there on, a patch of `CHIP_SAMPLES` cheap numbers and one of exact ones are close: their total variation is at
     most sqrt(N divergence) / 2 <= `MOST_VARIATION`.
@@ -112,7 +111,9 @@ def least_expected(read_noise_e: float) -> float:
 
 
 def chip_variation(read_noise_e: float) -> float:
-    """Give the greatest total variation between a patch of cheap numbers and one of exact ones, where cheap is used."""
+    """Return the greatest total variation between a patch of cheap numbers and one of exact ones, where cheap is
+    used.
+    """
     levels = np.geomspace(max(least_expected(read_noise_e), 1e-3), 1e6, 4096)
     return float(np.sqrt(CHIP_SAMPLES * divergence(levels, read_noise_e).max()) / 2)
 
@@ -227,7 +228,7 @@ def _log_generation(temperature_deg_c: float) -> float:
 
 
 def dark_electrons(rig: Rig) -> float:
-    """Give the expected dark electrons of one exposure in a sound element; 0 in an ideal sensor. [e-]"""
+    """Return the expected dark electrons of one exposure in a sound element; 0 in an ideal sensor. [e-]"""
     if rig.detector.noiseless:
         return 0.0
     seconds = rig.camera.exposure_ms * 1e-3
@@ -256,19 +257,19 @@ class Defects(Effect):
 
 
 def dead_elements(rig: Rig, bands: int) -> Mask:
-    """Give the elements without response, (sample, band) of the whole camera."""
+    """Return the elements without response, (sample, band) of the whole camera."""
     return _mask(rig.detector.unit, "dead", rig.camera.samples, bands, fraction=rig.detector.dead_fraction)
 
 
 def hot_electrons(rig: Rig, bands: int) -> Radiance:
-    """Give what hot elements add in one exposure, (sample, band) of the whole camera. [e-]"""
+    """Return what hot elements add in one exposure, (sample, band) of the whole camera. [e-]"""
     detector = rig.detector
     mask = _mask(detector.unit, "hot", rig.camera.samples, bands, fraction=detector.hot_fraction)
     return mask * np.float32(most_hot_electrons(rig))
 
 
 def most_hot_electrons(rig: Rig) -> float:
-    """Give what a hot element adds in one exposure; 0 where the sensor has none, or is ideal. [e-]"""
+    """Return what a hot element adds in one exposure; 0 where the sensor has none, or is ideal. [e-]"""
     detector = rig.detector
     if detector.noiseless or not detector.hot_fraction:
         return 0.0
@@ -331,7 +332,7 @@ class Shot(Effect):
     cost_ns = MappingProxyType({EXACT: 10.0, GAUSSIAN: 3.9})  # of light above `SERIES_FROM_E`
 
     def cost_at(self, probe: Probe, rig: Rig) -> Mapping[str, float]:
-        """Give the cost at the light along the probe's lines: few electrons are counted one by one.
+        """Return the cost at the light along the probe's lines: few electrons are counted one by one.
 
         Cheap draws pay for the exact ones that stand in for them where too few electrons are expected.
         """
@@ -368,7 +369,7 @@ class Shot(Effect):
 
 
 def in_unit(deviations: float, sd_e: float, probe: Probe, rig: Rig) -> float:
-    """Give deviations of a noise of ``sd_e`` in each sample [e-] in the unit of the probe."""
+    """Return deviations of a noise of ``sd_e`` in each sample [e-] in the unit of the probe."""
     if probe.unit == "sigma":
         return deviations
     return deviations * sd_e * float(np.sqrt(probe.binning)) / rig.camera.electrons_per_dn
@@ -385,7 +386,7 @@ class ReadNoise(Effect):
     cost_ns = MappingProxyType({"exact": 3.2})
 
     def merged(self, rig: Rig) -> Merged | None:
-        """Give what it costs in the shot noise's draw: nothing, where no well comes between them."""
+        """Return what it costs in the shot noise's draw: nothing, where no well comes between them."""
         if rig.camera.read_noise_e < LEAST_MERGED_READ_E or well_reached(rig, rig.camera.read_noise_e):
             return None
         return Merged(SHOT.name, GAUSSIAN, 0.0)

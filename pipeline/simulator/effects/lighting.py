@@ -93,7 +93,9 @@ class Cloud(Gain):
         return GainRange.between(1 - fraction, 1.0, len(probe.wavelength_nm), uneven=fraction)
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
-        """Give 1 less what the shadow takes at each sample's place and time, (line, sample, 1); (1, 1, 1) if clear."""
+        """Return 1 less what the shadow takes at each sample's place and time, (line, sample, 1); (1, 1, 1) if
+        clear.
+        """
         sky = block.rig.sky
         if sky.cloud_fraction == 0:
             return np.ones((1, 1, 1), np.float32)
@@ -107,7 +109,7 @@ class Cloud(Gain):
 
 
 def shadow(way_px: Floats, size_px: float) -> Floats:
-    """Give how much of a cloud lies between the sun and points so far along its way, 0 to 1; the period is 2 sizes.
+    """Return how much of a cloud lies between the sun and points so far along its way, 0 to 1; the period is 2 sizes.
 
     It is 1 about every even multiple of the size, 0 about the odd ones, 1/2 in the middle of an edge.
     """
@@ -149,7 +151,9 @@ class Brdf(Gain):
         return GainRange.between(least, greatest, bands, uneven=greatest - least)
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
-        """Give 1 + b a + h exp(-phase / 2 deg) of each sample's direction, (line, sample, 1), 0 where that is below."""
+        """Return 1 + b a + h exp(-phase / 2 deg) of each sample's direction, (line, sample, 1), 0 where that is
+        below.
+        """
         sky = block.rig.sky
         if sky.brdf_per_rad == 0 and sky.hot_spot == 0:
             return np.ones((1, 1, 1), np.float32)

@@ -32,7 +32,7 @@ POSITIONS, FOLDED = "positions", "folded"
 
 
 def beside_plan_px(probe: Probe, rig: Rig) -> tuple[float, float]:
-    """Give how far beside its plan the rig may look by drift, hysteresis, jitter, turbulence and lag. [px]
+    """Return how far beside its plan the rig may look by drift, hysteresis, jitter, turbulence and lag. [px]
 
     Along the line and the scan. Lines lie turned by where the mirror looks: the farther from the middle, the more.
     """
@@ -113,14 +113,14 @@ class SlitBox(Effect):
 
 
 def box_parts(variant: str, rig: Rig, views: RayViews) -> Parts:
-    """Give into how many boxes a variant parts the footprint, across and along, for views all over a sweep."""
+    """Return into how many boxes a variant parts the footprint, across and along, for views all over a sweep."""
     if variant in _STATED:
         return fewest_parts(_STATED[variant], box_of(variant, rig), views)
     return _COUNTED.get(variant, (1, 1))
 
 
 def box_of(variant: str, rig: Rig) -> tuple[float, float]:
-    """Give the widths of slit and pixel; 0 where the footprint is off. [px]"""
+    """Return the widths of slit and pixel; 0 where the footprint is off. [px]"""
     return (0.0, 0.0) if variant == OFF else (rig.camera.slit_px, 1.0)
 
 
@@ -182,14 +182,14 @@ def _courses(sweeps: tuple[Sweep, ...], rig: Rig) -> Iterator[Floats]:
 
 
 def smeared_positions(block: SweepBlock, variant: str) -> Floats:
-    """Give the mirror positions (line, step, 2) at which a footprint stands in an exposure."""
+    """Return the mirror positions (line, step, 2) at which a footprint stands in an exposure."""
     if variant == POSITIONS and block.sweep.step > 1:
         return block.positions
     return block.middle[:, None]
 
 
 def folded_positions(sweep: Sweep, variant: str) -> int:
-    """Give how many held positions the footprint itself holds, 1 px apart along the scan."""
+    """Return how many held positions the footprint itself holds, 1 px apart along the scan."""
     return sweep.step if variant == FOLDED else 1
 
 

@@ -85,14 +85,14 @@ class Vignetting(Gain):
 
 
 def sweep_ends(probe: Probe, camera: LineCamera) -> Floats:
-    """Give o_z at the first and the last position of every sweep, (2 sweep,); it never turns round in between."""
+    """Return o_z at the first and the last position of every sweep, (2 sweep,); it never turns round in between."""
     ends = [sweep.held_px().ravel()[[0, -1]] for sweep in probe.sweeps]
     found = [ahead(sweep.swath_px, px, camera) for sweep, px in zip(probe.sweeps, ends, strict=True)]
     return np.concatenate(found) if found else np.zeros(0)
 
 
 def ahead(along_px: float, scan_px: Floats, camera: LineCamera) -> Floats:
-    """Give o_z, the part along the camera's axis, of the unit directions to points of the scene."""
+    """Return o_z, the part along the camera's axis, of the unit directions to points of the scene."""
     xi, eta = along_px * camera.ifov_rad, scan_px * camera.ifov_rad
     return eta / np.sqrt(1 + xi**2 + eta**2)
 
@@ -169,7 +169,7 @@ def reflectance(coating: Coating, wavelength_nm: Floats, incidence_rad: Floats) 
 
 
 def fresnel(index: Indices, incidence_rad: Floats) -> tuple[Floats, Floats]:
-    """Give what a surface in air reflects of light polarised across (s) and within (p) the plane of incidence [1]."""
+    """Return what a surface in air reflects of light polarised across (s) and within (p) the plane of incidence [1]."""
     cosine, square = np.cos(incidence_rad), index**2
     beyond = np.sqrt(square - np.sin(incidence_rad) ** 2)  # index times the cosine behind the surface
     across = np.abs((cosine - beyond) / (cosine + beyond)) ** 2

@@ -34,10 +34,10 @@ _MOST_DEVIATES = 6.0  # beyond, one line in 5e8 lies
 
 
 def end_gains(sweep: Sweep, camera: LineCamera) -> Floats:
-    """Give the derivatives of a line's points (along, scan) by those of its centre, (line, point, 2, 2).
+    """Return the derivatives of a line's points (along, scan) by those of its centre, (line, point, 2, 2).
 
-    The points are the line's two ends and its centre, where the derivatives are 1 and 0. At the end of 320 px a
-    centre that moves by 1 px along the line moves the point by .034 px along the scan.
+    The points are the line's two ends and its centre, where the derivatives are 1 and 0. At the end of 320 px a centre
+    that moves by 1 px along the line moves the point by .034 px along the scan.
     """
     slopes = np.array([-0.5, 0.0, 0.5]) * camera.samples * camera.ifov_rad
     centre = sweep.line_px()[:, None]
@@ -103,7 +103,7 @@ class Jitter(Aim):
 
 
 def tilt_to_scene(normals: Floats) -> Floats:
-    """Give the derivatives of scene tangents with respect to tilts of the mirror, (..., 2, 2).
+    """Return the derivatives of scene tangents with respect to tilts of the mirror, (..., 2, 2).
 
     ``normals``: (..., 3) unit normals. Returns rows are along the line and along the scan. Columns are a tilt about the
     axis most nearly in the plane of incidence, and one about y. The first moves the view across that plane, the second
@@ -171,7 +171,7 @@ class ThermalDrift(Aim):
 
 
 def pointing_field(unit: int, position: Floats) -> Floats:
-    """Give a smooth field over the disk, (..., 2) for positions (..., 2); between -1 and 1 on it. [-]
+    """Return a smooth field over the disk, (..., 2) for positions (..., 2); between -1 and 1 on it. [-]
 
     A sum of the six Zernike polynomials up to degree 2 in the disk's own coordinates, each at most 1 in size, with
     normal deviates for weights whose sizes sum to 1.
@@ -188,7 +188,7 @@ def _course(rig: Rig, sweep: Sweep, position: Floats) -> Floats:
 
 
 def scan_sign(sweep: Sweep) -> float:
-    """Give 1 for a scan towards greater coordinates (or one that stands still), -1 for one that comes back."""
+    """Return 1 for a scan towards greater coordinates (or one that stands still), -1 for one that comes back."""
     held = sweep.held_px().ravel()
     return -1.0 if len(held) > 1 and held[-1] < held[0] else 1.0
 
@@ -211,7 +211,7 @@ class Pointing(Aim, ABC):
 
     @abstractmethod
     def of_lines(self, sweep_name: str, lines: range) -> Floats:
-        """Give the error of some lines of a sweep, (line, 2) along the line and the scan [px]."""
+        """Return the error of some lines of a sweep, (line, 2) along the line and the scan [px]."""
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
         return self.of_lines(block.sweep.name, block.lines)[:, None]
@@ -251,11 +251,11 @@ class PointingErrors(Pointing):
         return most, most
 
     def offset(self, sweep_name: str) -> Floats:
-        """Give the systematic error of a sweep, (2,) along the line and the scan [px]."""
+        """Return the systematic error of a sweep, (2,) along the line and the scan [px]."""
         return self._stream(sweep_name).uniform(-self.offset_px, self.offset_px, 2)
 
     def of_lines(self, sweep_name: str, lines: range) -> Floats:
-        """Give the whole error of some lines of a sweep, (line, 2) along the line and the scan [px]."""
+        """Return the whole error of some lines of a sweep, (line, 2) along the line and the scan [px]."""
         jitter = np.array([self._stream(sweep_name, number).standard_normal(2) for number in lines]).reshape(-1, 2)
         return self.offset(sweep_name) + self.jitter_px * jitter
 
@@ -276,7 +276,7 @@ class CommonOffset(Pointing):
         return abs(self.offset_px[0]), abs(self.offset_px[1])
 
     def of_lines(self, sweep_name: str, lines: range) -> Floats:
-        """Give the error of some lines, (line, 2) along the line and the scan [px]."""
+        """Return the error of some lines, (line, 2) along the line and the scan [px]."""
         return np.tile(np.array(self.offset_px, np.float64), (len(lines), 1))
 
 
@@ -321,7 +321,7 @@ class Staircase(Aim):
 
 
 def beside_plan(positions: float, step: int, numbers: NDArray[np.int64], parts: int = 1) -> Floats:
-    """Give the mean position less the planned one in each part of each held px of path, (line, step * parts). [px]
+    """Return the mean position less the planned one in each part of each held px of path, (line, step * parts). [px]
 
     Held positions are ``1 / positions`` px apart. Within a time t, counted in px of path, the mirror lags the ramp by
     frac(positions * t) / positions. The result is the difference of that from its mean.
@@ -385,7 +385,7 @@ class Lag(Aim):
 
 
 def greatest_lag_px(rig: Rig, sweeps: Iterable[Sweep]) -> float:
-    """Give the greatest shift along the scan of any line. [px]"""
+    """Return the greatest shift along the scan of any line. [px]"""
     worst = 0.0
     for sweep in {(one.lines, one.step): one for one in sweeps if one.lines}.values():
         numbers = np.arange(sweep.lines)
@@ -395,7 +395,7 @@ def greatest_lag_px(rig: Rig, sweeps: Iterable[Sweep]) -> float:
 
 
 def transient(rig: Rig, sweep: Sweep, numbers: NDArray[np.int64]) -> Floats:
-    """Give the mean shift along the scan over each held position of some lines, (line, step). [px]"""
+    """Return the mean shift along the scan over each held position of some lines, (line, step). [px]"""
     camera, mirror = rig.camera, rig.mirror
     pace = 2 * math.pi * mirror.natural_hz * 1e-3  # [1/ms]
     period, held = pace * camera.frame_ms, pace * camera.exposure_ms / sweep.step
@@ -412,7 +412,7 @@ def transient(rig: Rig, sweep: Sweep, numbers: NDArray[np.int64]) -> Floats:
 
 
 def responses(time: Floats, damping: float) -> tuple[Floats, Floats]:
-    """Give the responses to a unit impulse and to a unit step, of a system with natural frequency 1 rad/s.
+    """Return the responses to a unit impulse and to a unit step, of a system with natural frequency 1 rad/s.
 
     ``time`` (...) is times that frequency, from 0 on [rad]. With g the first and h the second, the matrix exponential
     of the free system is [[1 - h, g], [-g, 1 - h - 2 zeta g]]. Computed by expm1 and sinc, it is accurate below, at and

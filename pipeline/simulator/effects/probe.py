@@ -83,7 +83,8 @@ class Probe:
     ends_e: Floats | None = None  # (2, band) least and greatest light of all the scene, None as `anywhere` [e-]
 
     def within(self, reach_px: float) -> Probe:
-        """Give the probe of what lies no farther from the samples: it has the greatest slope, curvature and span there.
+        """Return the probe of the light no farther from the samples: it has the greatest slope, curvature and span
+        there.
 
         Farther than has been looked, light changes by at most the greatest difference in a px.
         """
@@ -97,7 +98,7 @@ class Probe:
         return found if spectral is None else replace(found, spectral_slope=spectral[0], spectral_curvature=spectral[1])
 
     def blurred_by(self, sd_px: float) -> Probe:
-        """Give the probe of what a Gaussian of this size sees of the scene, its derivatives among it."""
+        """Return the probe of what a Gaussian of this size sees of the scene, its derivatives among it."""
         wide = self.afar is not None and sd_px > WIDE_PX
         return self.with_detail(self.afar) if wide and self.afar else self.within(_FAR_SDS * sd_px)
 
@@ -134,7 +135,7 @@ class Probe:
         return np.asarray(np.minimum(self.change_blurred(narrow, mean_way) + wide, self.anywhere))
 
     def with_detail(self, detail: Detail) -> Probe:
-        """Give the same probe with the steepest and the most curved light of another place."""
+        """Return the same probe with the steepest and the most curved light of another place."""
         return replace(
             self,
             span=detail.span,
@@ -164,7 +165,7 @@ def _times(steep: Floats, way: Floats | float) -> Floats:
 
 
 def stored_mean(light: NDArray[np.floating], binning: int) -> NDArray[np.floating]:
-    """Give the mean of each ``binning`` neighbours, (..., sample, band) -> (..., sample // binning, band).
+    """Return the mean of each ``binning`` neighbours, (..., sample, band) -> (..., sample // binning, band).
 
     A remainder is dropped, as in the raw lines.
     """
@@ -176,7 +177,7 @@ def stored_mean(light: NDArray[np.floating], binning: int) -> NDArray[np.floatin
 
 
 def noise_electrons(signal: NDArray[np.floating], rig: Rig, binning: int = 1) -> Radiance:
-    """Give one standard deviation of shot noise, read noise and quantisation at each signal; never 0. [e-]
+    """Return one standard deviation of shot noise, read noise and quantisation at each signal; never 0. [e-]
 
     ``signal`` is the mean of ``binning`` samples, each with noise of its own, and the noise is that of the mean.
     """
@@ -188,30 +189,30 @@ def noise_electrons(signal: NDArray[np.floating], rig: Rig, binning: int = 1) ->
 
 
 def unit_at(signal: NDArray[np.floating], rig: Rig, unit: Unit, binning: int = 1) -> Radiance:
-    """Give what a unit of the tolerance, of a number that sums ``binning`` samples, is of their mean signal. [e-]"""
+    """Return what a unit of the tolerance, of a number that sums ``binning`` samples, is of their mean signal. [e-]"""
     if unit == "sigma":
         return noise_electrons(signal, rig, binning)
     return np.full_like(signal, rig.camera.electrons_per_dn / binning)
 
 
 def fixed_variance(rig: Rig) -> float:
-    """Give the variance of read noise and quantisation, which light does not change. [e-^2]"""
+    """Return the variance of read noise and quantisation, which light does not change. [e-^2]"""
     camera = rig.camera
     return camera.read_noise_e**2 + camera.electrons_per_dn**2 / 12
 
 
 def unit_electrons(light_e: Floats, probe: Probe, rig: Rig) -> Floats:
-    """Give the unit of the probe at some light [e-]; what does not follow the light is the smallest unit met."""
+    """Return the unit of the probe at some light [e-]; what does not follow the light is the smallest unit met."""
     if probe.unit == "sigma" and not rig.detector.noiseless:
         return np.sqrt((np.maximum(light_e, 0.0) + fixed_variance(rig)) / probe.binning)
     return np.full_like(light_e, probe.unit_least_dn * rig.camera.electrons_per_dn)
 
 
 def lights_within(probe: Probe, rig: Rig) -> tuple[Floats, Floats]:
-    """Give least and greatest light of every band, (band,) each [e-]: where level and span have their units from.
+    """Return least and greatest light of every band, (band,) each [e-]: where level and span have their units from.
 
-    Where the probe does not hold them: with U(S)^2 = (S + n) / m for means of m samples, the greatest S has level
-    S / U(S), and the least a difference of span U to it, or a smaller.
+    Where the probe does not hold them: with U(S)^2 = (S + n) / m for means of m samples, the greatest S has level S /
+    U(S), and the least a difference of span U to it, or a smaller.
     """
     if probe.own_e is not None:
         return probe.own_e[0], probe.own_e[1]
@@ -265,14 +266,14 @@ def _differences(factors: Floats, wavelength_nm: Floats) -> tuple[Floats, Floats
 
 
 def rising_runs(wavelength_nm: Floats) -> list[slice]:
-    """Give the runs of bands whose wavelengths rise: where they fall back or stay, another detector begins."""
+    """Return the runs of bands whose wavelengths rise: where they fall back or stay, another detector begins."""
     breaks = np.flatnonzero(~(np.diff(wavelength_nm) > 0)) + 1
     ends = [0, *breaks.tolist(), len(wavelength_nm)]
     return [slice(start, stop) for start, stop in pairwise(ends)]
 
 
 def rising_gaps(wavelength_nm: Floats) -> Floats:
-    """Give the distances of neighbouring bands within runs. [nm]"""
+    """Return the distances of neighbouring bands within runs. [nm]"""
     gaps = np.diff(wavelength_nm)
     return gaps[gaps > 0]
 
@@ -291,7 +292,7 @@ def difference_rates(wavelength_nm: Floats) -> Floats:
 
 
 def second_difference(spectra: NDArray[Real], wavelength_nm: Floats) -> NDArray[Real]:
-    """Give D I of spectra (..., band), as :func:`difference_rates` defines it. [1/nm^2]"""
+    """Return D I of spectra (..., band), as :func:`difference_rates` defines it. [1/nm^2]"""
     down, up = difference_rates(wavelength_nm).astype(spectra.dtype)
     steps, out = np.diff(spectra, axis=-1), np.zeros_like(spectra)
     out[..., :-1] = up[:-1] * steps
@@ -300,7 +301,7 @@ def second_difference(spectra: NDArray[Real], wavelength_nm: Floats) -> NDArray[
 
 
 def steepest_difference(spectra: NDArray[Real], wavelength_nm: Floats) -> NDArray[Real]:
-    """Give |I'| of spectra (..., band) towards the steeper neighbour of each band; 0 for a run of one band. [1/nm]"""
+    """Return |I'| of spectra (..., band) towards the steeper neighbour of each band; 0 for a run of one band. [1/nm]"""
     gaps = np.diff(wavelength_nm)
     rate = np.divide(1, gaps, out=np.zeros_like(gaps), where=gaps > 0).astype(spectra.dtype)
     steep, out = np.abs(np.diff(spectra, axis=-1)) * rate, np.zeros_like(spectra)

@@ -76,13 +76,13 @@ class Response(LightChange):
 
 
 def widen_bands(spectra: Radiance, wavelength_nm: Floats, fwhm_nm: Floats | None, wanted_nm: float) -> Radiance:
-    """Give spectra as bands of width ``wanted_nm`` see them; any linear measure of light, (..., band).
+    """Return spectra as bands of width ``wanted_nm`` see them; any linear measure of light, (..., band).
 
     Factors of light serve as well as light: (component, band) electrons.
 
     ``wavelength_nm``, ``fwhm_nm``: (band,) centres, and widths of the spectra's own bands; None or NaN where not known,
-    and then nothing is done.
-    Returns array of the same shape and type; ``spectra`` itself where its bands are all as wide already.
+    and then nothing is done. Returns array of the same shape and type; ``spectra`` itself where its bands are all as
+    wide already.
     """
     variance = missing_variance(wanted_nm, fwhm_nm, spectra.shape[-1])
     if not variance.any():
@@ -94,7 +94,7 @@ def widen_bands(spectra: Radiance, wavelength_nm: Floats, fwhm_nm: Floats | None
 
 
 def missing_variance(wanted_nm: float, fwhm_nm: Floats | None, bands: int) -> Floats:
-    """Give the variance that Gaussian bands lack to be ``wanted_nm`` wide, (band,); 0 where not known. [nm^2]"""
+    """Return the variance that Gaussian bands lack to be ``wanted_nm`` wide, (band,); 0 where not known. [nm^2]"""
     if fwhm_nm is None:
         return np.zeros(bands)
     widths = np.nan_to_num(np.asarray(fwhm_nm, np.float64), nan=np.inf, posinf=np.inf)
@@ -176,7 +176,7 @@ class Smile(LightChange):
         return Bound(steep * shift + min(bent, steep * shift * 2 * part * (1 - part)), why)
 
     def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
-        """Give light (line, sample, band) [e-] at the wavelengths that each sample sees; as it is without a smile."""
+        """Return light (line, sample, band) [e-] at the wavelengths that each sample sees; as it is without a smile."""
         camera, smile = block.rig.camera, block.rig.optics.smile_nm
         if smile == 0 or light.shape[-1] < 2:
             return light
@@ -188,7 +188,7 @@ class Smile(LightChange):
 
 
 def wavelength_shift(samples: int, smile_nm: float) -> Floats:
-    """Give by how much longer the wavelength of each sample is than its band's, (sample,). [nm]"""
+    """Return by how much longer the wavelength of each sample is than its band's, (sample,). [nm]"""
     half = (samples - 1) / 2
     if half == 0:
         return np.zeros(samples)
@@ -197,7 +197,7 @@ def wavelength_shift(samples: int, smile_nm: float) -> Floats:
 
 @lru_cache(maxsize=4)
 def _tap_weights(wavelength_nm: tuple[float, ...], smile_nm: float, samples: int) -> tuple[int, NDArray[np.float32]]:
-    """Give the offset of the first tap and the weights of all, (tap, sample, band)."""
+    """Return the offset of the first tap and the weights of all, (tap, sample, band)."""
     wavelength, shift = np.array(wavelength_nm), wavelength_shift(samples, smile_nm)
     taps: list[tuple[slice, NDArray[np.int64], Floats]] = []
     for run in rising_runs(wavelength):
@@ -291,12 +291,12 @@ class Striping(Gain):
 
 
 def response_gain(rig: Rig, bands: int) -> Radiance:
-    """Give the gains of the sensor's elements, (sample, band) of the whole camera."""
+    """Return the gains of the sensor's elements, (sample, band) of the whole camera."""
     return _gains(rig.detector.unit, "prnu", rig.camera.samples, bands, fraction=rig.detector.prnu_std)
 
 
 def stripe_gain(rig: Rig) -> Radiance:
-    """Give the gains of the sensor's columns, (sample, 1) of the whole camera."""
+    """Return the gains of the sensor's columns, (sample, 1) of the whole camera."""
     return _gains(rig.detector.unit, "striping", rig.camera.samples, 1, fraction=rig.detector.striping_std)
 
 
@@ -338,7 +338,7 @@ class StrayLight(LightChange):
         return Bound(optics.stray_fraction * spread + halo, why)
 
     def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
-        """Give the light after scattering; works in place."""
+        """Return the light after scattering; works in place."""
         optics = block.rig.optics
         if optics.stray_fraction == 0:
             return light

@@ -31,14 +31,14 @@ _SMOOTH = 0.6  # sd of the Gaussian about each point over the distance of rings,
 
 
 def disc_contrast(along: Floats, scan: Floats, axes: Axes) -> Floats:
-    """Give what an even elliptic disc of diameters ``axes`` [px] passes of waves [1/px]: 2 J1(v) / v."""
+    """Return what an even elliptic disc of diameters ``axes`` [px] passes of waves [1/px]: 2 J1(v) / v."""
     v = np.pi * np.hypot(axes[0] * along, axes[1] * scan)
     return np.asarray(np.where(v > 1e-6, 2 * scipy.special.j1(v) / np.maximum(v, 1e-6), 1.0))
 
 
 @lru_cache(maxsize=64)
 def disc_points(axes: Axes) -> tuple[Floats, Floats]:
-    """Give points (2, point) along line and scan [px], and the variance (2,) of a Gaussian about each [px^2].
+    """Return points (2, point) along line and scan [px], and the variance (2,) of a Gaussian about each [px^2].
 
     All count alike. Together with the Gaussians they have the disc's mean and variance, a sixteenth of its diameters
     squared. Small discs are one Gaussian; of very wide ones the edge is blurred.
@@ -322,7 +322,7 @@ class Footprint:
         return self.fractions @ self.between
 
     def afar(self, along: Floats, scan: Floats) -> Floats:
-        """Give the light at places (place,) some px beyond slit and pixel, (place, band). [1/px^2]
+        """Return the light at places (place,) some px beyond slit and pixel, (place, band). [1/px^2]
 
         Box, disc, held positions and pixels count by their variance: there they are small beside the Gaussians that
         reach.
@@ -335,7 +335,7 @@ class Footprint:
         return light @ self.mixing
 
     def windows(self) -> list[tuple[int, NDArray[np.intp]]]:
-        """Give the levels, and numbers of kernels that look at pixels of that level through one window."""
+        """Return the levels, and numbers of kernels that look at pixels of that level through one window."""
         found = []
         for level in np.unique(self.level):
             there = np.flatnonzero(self.level == level)
@@ -347,7 +347,7 @@ class Footprint:
         return found
 
     def by_parts(self) -> tuple[Footprint, Footprint | None]:
-        """Give the kernels whose box is parted, and those of pixels left out, which lie upright; None without any."""
+        """Return the kernels whose box is parted, and those of pixels left out, which lie upright; None without any."""
         fine = self.level == 1
         return self._some(fine), None if fine.all() else self._some(~fine)
 
@@ -356,7 +356,7 @@ class Footprint:
         return replace(self, shift=shift, variance=variance, fractions=fractions, level=self.level[which])
 
     def part(self, level: int, which: NDArray[np.intp]) -> Footprint:
-        """Give some kernels of a level, in its px. Beyond level 1 boxes lie upright: they are small beside Gaussians.
+        """Return some kernels of a level, in its px. Beyond level 1 boxes lie upright: they are small beside Gaussians.
 
         Blur of the scene from leaving out pixels is taken off the Gaussians.
         """
@@ -400,7 +400,7 @@ _SDS = 6.5  # of a Gaussian: nothing beyond
 
 
 def box_weight(distance: Floats, width: float, held: int = 1) -> Floats:
-    """Give the linear kernel averaged over a box and over ``held`` positions 1 px apart, at distances [px]."""
+    """Return the linear kernel averaged over a box and over ``held`` positions 1 px apart, at distances [px]."""
     places = np.arange(held) - (held - 1) / 2
     total = np.zeros(np.shape(distance))
     for place in places:
@@ -413,7 +413,9 @@ def box_weight(distance: Floats, width: float, held: int = 1) -> Floats:
 
 
 def blurred_weight(width: float, variance: Floats, held: int = 1) -> tuple[Floats, Floats]:
-    """Give distances (place,) from -reach to reach and weights (kernel, place) with Gaussians of variance (kernel,)."""
+    """Return distances (place,) from -reach to reach and weights (kernel, place) with Gaussians of variance
+    (kernel,).
+    """
     reach = math.ceil(1 + width / 2 + (held - 1) / 2 + _SDS * math.sqrt(variance.max(initial=0.0))) + 1
     distance = np.arange(-reach * PER_PX, reach * PER_PX + 1) / PER_PX
     sharp = box_weight(distance, width, held)

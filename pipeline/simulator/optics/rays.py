@@ -55,7 +55,7 @@ class RayViews:
 
 
 def exact_views(normal: Floats, across: Floats | float, slopes: Floats) -> RayViews:
-    """Give where camera rays (across, slope, 1) meet the scene after the mirror, as tangents.
+    """Return where camera rays (across, slope, 1) meet the scene after the mirror, as tangents.
 
     ``normal`` is (..., 3), of arrays that broadcast. The reflection is written out for the two tangents; the ray's
     length cancels. Their derivatives follow by the rule for quotients.
@@ -76,7 +76,7 @@ def exact_views(normal: Floats, across: Floats | float, slopes: Floats) -> RayVi
 
 
 def spread_of_waves(normal: Floats | None = None) -> Floats:
-    """Give the variance that diffraction has along (line, scan), over that of a round pupil of the mirror's diameter.
+    """Return the variance that diffraction has along (line, scan), over that of a round pupil of the mirror's diameter.
 
     A pupil |n_z| wide along (n_x, n_y) and 1 across spreads waves by 1 / n_z^2 and 1. On the camera's own axes that is
     1 + n_y^2 / n_z^2 and 1 + n_x^2 / n_z^2. The covariance n_x n_y / n_z^2 is left out: it is 0 at rest.
@@ -88,7 +88,7 @@ def spread_of_waves(normal: Floats | None = None) -> Floats:
 
 
 def spread_of_rays(normal: Floats | None = None) -> Floats:
-    """Give the variance of the pupil along (line, scan), over that of a round one: 1 - n_y^2 and 1 - n_x^2, (..., 2).
+    """Return the variance of the pupil along (line, scan), over that of a round one: 1 - n_y^2 and 1 - n_x^2, (..., 2).
 
     The covariance -n_x n_y is left out: it is 0 at rest.
     """
@@ -97,7 +97,7 @@ def spread_of_rays(normal: Floats | None = None) -> Floats:
 
 
 def pupil_contrast(u: Floats) -> Floats:
-    """Give what a round pupil passes of a wave of u cycles per lambda / D: its autocorrelation, 0 from u = 1 on.
+    """Return what a round pupil passes of a wave of u cycles per lambda / D: its autocorrelation, 0 from u = 1 on.
 
     2 / pi (acos u - u sqrt(1 - u^2)) (Goodman, Introduction to Fourier Optics, section 6.3). An elliptic pupil passes a
     wave as a round one does when u is counted along its own axes. The 6 nm of a band are too little to tell: they
@@ -108,7 +108,7 @@ def pupil_contrast(u: Floats) -> Floats:
 
 
 def normals_met(sweeps: Iterable[Sweep], camera: LineCamera) -> Floats:
-    """Give the mirror's normals at rest and at both ends of every sweep, (n, 3).
+    """Return the mirror's normals at rest and at both ends of every sweep, (n, 3).
 
     Both spreads are monotonic along a sweep (n_x / n_z = 1 / (eta - sqrt(1 + xi^2 + eta^2)) in scene tangents), so the
     ends hold the extremes.
@@ -120,7 +120,7 @@ def normals_met(sweeps: Iterable[Sweep], camera: LineCamera) -> Floats:
 
 
 def middle_normal(sweep: Sweep, camera: LineCamera) -> Floats:
-    """Give the mirror's normal in the middle of a sweep, (3,): one kernel for all its lines, whatever the block."""
+    """Return the mirror's normal in the middle of a sweep, (3,): one kernel for all its lines, whatever the block."""
     middle = sweep.start_px + (sweep.lines * sweep.step - 1) / 2
     tangents = np.array([sweep.swath_px, middle]) * camera.ifov_rad
     return direction_to_normal(scene_to_direction(tangents))

@@ -83,7 +83,7 @@ class Looker:
         return [(level, some, Gatherer(whole.part(level, some), self._extremes)) for level, some in windows]
 
     def scan_pass(self, scene: RasterScene, steps: Sequence[RayViews], *, along_y: bool, exposures: float) -> Radiance:
-        """Give the light (n, band) of samples that look so at each of the held positions. [e-]
+        """Return the light (n, band) of samples that look so at each of the held positions. [e-]
 
         A sample's light does not depend on the others.
         """

@@ -53,7 +53,7 @@ class ReachedCells:
         return not self.apart_px.any()
 
     def rows_within(self, first: int, last: int, nearest_px: float, farthest_px: float) -> Mask:
-        """Give which pixels of rows lie farther than the one and no farther than the other, (row, column)."""
+        """Return which pixels of rows lie farther than the one and no farther than the other, (row, column)."""
         rows = np.arange(first, min(last, self.shape[0])) // self.cell_px
         apart = self.apart_px[rows]
         within: Mask = np.repeat((apart > nearest_px) & (apart <= farthest_px), self.cell_px, axis=1)
@@ -61,7 +61,7 @@ class ReachedCells:
 
 
 def reached_cells(shape: tuple[int, int], camera: LineCamera, sweeps: Sequence[Sweep]) -> ReachedCells:
-    """Ask for every cell of a scene whether any sweep sees some of it; what lies outside shows the scene's edge."""
+    """Return which cells of a scene any sweep sees in part; outside, the scene's edge is repeated."""
     cell = max(2, math.ceil(math.sqrt(shape[0] * shape[1] / _CELLS)))
     y, x = (np.arange(0, size, cell) + (cell - size) / 2 for size in shape)
     reached = np.zeros((len(y), len(x)), np.bool_)
@@ -119,7 +119,7 @@ class WideLight:
 
 
 def seen_widely(scene: RasterScene, exposure_ms: float) -> WideLight:
-    """Give what is `WIDE_PX` wide and wider sees of all the scene: means of 2 x 2 blocks of `BLOCK_PX`.
+    """Return what is `WIDE_PX` wide and wider sees of all the scene: means of 2 x 2 blocks of `BLOCK_PX`.
 
     Derivatives are the greatest along either axis.
     """
@@ -181,7 +181,7 @@ _ENDLESS = 1e9  # span and curvature of an image whose shifts show as they are
 
 
 def blended_surroundings(probe: Probe, rig: Rig, moving: Sequence[Effect]) -> Probe:
-    """Give the probe of an image that all blurs and shifts of a rig have passed, with what they bring from beside.
+    """Return the probe of an image that all blurs and shifts of a rig have passed, with what they bring from beside.
 
     Shifts bring what lies within their way. Each part of a blur has the greatest derivatives of what it reaches, and
     the image has the mean of its parts'. The same probe where nothing lies beside the sweeps.
@@ -262,7 +262,7 @@ def _blur_parts(probe: Probe, rig: Rig, blurs: Sequence[Any]) -> list[tuple[floa
 
 
 def light_brought(probe: Probe, rig: Rig, moving: Iterable[Effect]) -> Probe:
-    """Give the probe of light to which blurs and shifts have brought some from beside what the sweeps see.
+    """Return the probe of light to which blurs and shifts have brought some from beside what the sweeps see.
 
     They change no signal by more than their bounds, and none to what is nowhere in the scene. The same probe where
     nothing lies beside.

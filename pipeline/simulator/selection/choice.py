@@ -122,7 +122,7 @@ def decide(
 
 
 def named_effects(asked: str, known: Sequence[str]) -> frozenset[str] | None:
-    """Give the effects that ``asked`` demands; None where the tolerance decides.
+    """Return the effects that ``asked`` demands; None where the tolerance decides.
 
     Raises SettingsError: a name is not known (names the nearest that is), or there is none.
     """
@@ -210,7 +210,7 @@ def _reason(menu: Menu, option: Option, tolerance: float, named: frozenset[str] 
 
 
 def list_effects(decision: Decision, measured: Mapping[str, float] | None = None) -> list[dict[str, Any]]:
-    """Give one plain row for every effect, in the order of the chain; ``measured`` is what `verify` found, by name.
+    """Return one plain row for every effect, in the order of the chain; ``measured`` is what `verify` found, by name.
 
     ``bound`` is on the change of any stored number, at the worst binning, with the factor of safety, in ``unit`` (0
     where exact or absent, None where there is none); ``cost_s`` are estimated CPU seconds of all sweeps; ``why`` is a
@@ -257,7 +257,7 @@ def sum_up(decision: Decision, measured: Mapping[str, float] | None = None) -> d
 
 
 def explain(one: Treatment, decision: Decision) -> str:
-    """Say why an effect is on or off, with the magnitude that its own bound states."""
+    """Return why an effect is on or off, with the magnitude that its own bound states."""
     unit, tolerance = UNIT_NAMES[decision.unit], _number(decision.tolerance)
     left_out = f"left out it could change a stored number by {_number(one.menu.off.error)} {unit}"
     asked = one.name in [word.strip() for word in decision.asked.split(",")]

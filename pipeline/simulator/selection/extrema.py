@@ -50,7 +50,7 @@ class PixelOptics:
         return len(self.slit) // 2 + len(self.pixel) // 2 + 1 + self.binning // 2
 
     def noise(self, light: Radiance) -> Radiance:
-        """Give one standard deviation at each light [e-]."""
+        """Return one standard deviation at each light [e-]."""
         noise: Radiance = np.sqrt(np.maximum(light, 0) + np.float32(self.fixed_noise))
         return noise
 
@@ -121,7 +121,7 @@ class Ranking:
         self._offers.setdefault(kind, []).append(offers[:, offers[0] > -np.inf])
 
     def best(self, tier: int, most: int) -> Floats:
-        """Give the best of each kind in turns, none twice, (place, 2) rows and columns."""
+        """Return the best of each kind in turns, none twice, (place, 2) rows and columns."""
         offers = [np.concatenate(some, axis=1) for kind, some in self._offers.items() if kind[0] == tier]
         best = [_worst_first(places, most) for places in offers]
         ranked = [list(zip(*places[1:].astype(int).tolist(), strict=True)) for places in best]
@@ -137,7 +137,7 @@ def _worst_first(places: Floats, most: int) -> Floats:
 
 
 def band_groups(bands: int) -> list[slice]:
-    """Give the groups of neighbouring bands whose worst stands for each of them."""
+    """Return the groups of neighbouring bands whose worst stands for each of them."""
     edges = np.linspace(0, bands, min(bands, BAND_GROUPS) + 1).round().astype(int).tolist()
     return [slice(first, last) for first, last in pairwise(edges)]
 

@@ -79,7 +79,7 @@ class Menu:
         return self.variants[0]
 
     def cost_beside(self, option: Option, others: Mapping[str, Option]) -> float:
-        """Give what an option costs beside those taken for other effects, by name [ns]: draws may be shared."""
+        """Return what an option costs beside those taken for other effects, by name [ns]: draws may be shared."""
         one = self.merged
         if one is None or option.variant == OFF or one.other not in others or others[one.other].variant != one.variant:
             return option.cost_ns
@@ -206,7 +206,7 @@ def _gain_beside(effect: Effect, ranges: Sequence[GainRange | None], place: int,
 
 
 def cost_of(menus: Iterable[Menu], options: Mapping[str, Option]) -> float:
-    """Give what options, one for each menu by its name, cost together per px and band [ns]."""
+    """Return what options, one for each menu by its name, cost together per px and band [ns]."""
     return math.fsum(menu.cost_beside(options[menu.name], options) for menu in menus)
 
 
@@ -218,11 +218,11 @@ class Growth:
     rig: Rig
 
     def of_errors(self, gain: float) -> float:
-        """Give the most that gains up to ``gain``, 1 or more, multiply an error made elsewhere."""
+        """Return the most that gains up to ``gain``, 1 or more, multiply an error made elsewhere."""
         return gain * self.unit_ratio(gain)
 
     def of_gain(self, own: GainRange | None, others: float) -> float:
-        """Give the most that the other gains, and its own light, multiply the error of a gain that is left out."""
+        """Return the most that the other gains, and its own light, multiply the error of a gain that is left out."""
         if own is None:
             return self.of_errors(others)
         low, high = float(own.least.min(initial=1.0)), float(own.greatest.max(initial=1.0))
@@ -233,7 +233,7 @@ class Growth:
         return others * max(ends)
 
     def unit_ratio(self, gain: float) -> float:
-        """Give the most that a unit is over the one that light multiplied by ``gain`` has."""
+        """Return the most that a unit is over the one that light multiplied by ``gain`` has."""
         if self.probe.unit == "dn" or self.rig.detector.noiseless:
             return 1.0
         fixed = fixed_variance(self.rig)
@@ -242,7 +242,7 @@ class Growth:
 
 
 def light_after(probe: Probe, ranges: Iterable[GainRange], rig: Rig) -> Probe:
-    """Give the probe of light after some gains, their greatest factors taken off: those are for `Growth`.
+    """Return the probe of light after some gains, their greatest factors taken off: those are for `Growth`.
 
     Leibniz' rule for differences gives (g I)' <= g I' + g' I and (g I)'' <= g I'' + 2 g' I' + g'' I. Added light has
     its own differences. Light that the factor does not reduce counts by the unit of the darkest.
@@ -282,7 +282,7 @@ def light_after(probe: Probe, ranges: Iterable[GainRange], rig: Rig) -> Probe:
 
 
 def light_through(probe: Probe, rig: Rig, blurs: Iterable[Any]) -> Probe:
-    """Give the probe of light that has passed blurs (their exact variants), with the spectral differences they make.
+    """Return the probe of light that has passed blurs (their exact variants), with the spectral differences they make.
 
     A kernel of shift s and variance v makes I(x + s) blurred, whose derivative over wavelength is s' I_x + v' I_xx / 2
     beside the scene's own, and its second one s'' I_x + v'' I_xx / 2 + (s' + v' d/dx / 2)^2 I_xx. At a step v' I_xx / 2

@@ -89,7 +89,7 @@ def light_seen(
 
 
 def rays_of(views: SampleViews, camera: LineCamera, turned: Way = (0.0, 0.0)) -> RayViews:
-    """Give the middle rays of samples, moved by (along, across) px of the camera, in tangents."""
+    """Return the middle rays of samples, moved by (along, across) px of the camera, in tangents."""
     ifov = camera.ifov_rad
     tangents = np.stack([views.swath_px, views.scan_px], axis=-1) * ifov
     normal = direction_to_normal(scene_to_direction(tangents))
@@ -97,7 +97,7 @@ def rays_of(views: SampleViews, camera: LineCamera, turned: Way = (0.0, 0.0)) ->
 
 
 def line_sums(camera: LineCamera, binning: int) -> int:
-    """Give how many stored numbers of a line stand for all of it."""
+    """Return how many stored numbers of a line stand for all of it."""
     return min(camera.samples // binning, max(LINE_SAMPLES // binning, _LEAST_SUMS))
 
 
@@ -158,7 +158,7 @@ def views_of_places(
 def places_beyond(
     places: Floats, scene: RasterScene, camera: LineCamera, sweeps: tuple[Sweep, ...]
 ) -> NDArray[np.bool_]:
-    """Give which places no sweep sees itself, (place,): its nearest samples look beside them."""
+    """Return which places no sweep sees itself, (place,): its nearest samples look beside them."""
     centred = places - (np.array(scene.shape) - 1) / 2
     found = np.ones(len(places), np.bool_)
     for along_y in {sweep.along == "y" for sweep in sweeps}:
@@ -228,7 +228,7 @@ _LINES_AT_ONCE = 256
 def line_means(
     scene: RasterScene, camera: LineCamera, sweeps: Sequence[Sweep], beside_px: Sequence[float] = (0.0,)
 ) -> Radiance:
-    """Give the mean over samples and bands of every position that any sweep holds, (position,) [e-].
+    """Return the mean over samples and bands of every position that any sweep holds, (position,) [e-].
 
     Means are those of the pixels that middle rays meet. A slit, and positions that one line holds, give means between
     these. Positions continue beyond a sweep's ends as far as its slit reaches, and as far as ``beside_px``, by which

@@ -38,7 +38,7 @@ MIDDLE_RAYS: Mapping[Effect, str] = {ROTATION: ROTATION.variants[0]}  # the scen
 
 
 def candidate_blocks(whole: Sequence[SweepBlock], places: Floats, *, lines: int = VERIFIED_LINES) -> list[SweepBlock]:
-    """Give blocks of few lines about places of the scene and about the first, middle and last line of every sweep.
+    """Return blocks of few lines about places of the scene and about the first, middle and last line of every sweep.
 
     ``whole``: every sweep as one block of all its lines; ``places``: (place, 2) rows and columns that are steep, bright
     or dark [px]. Returns at most `MOST_CANDIDATES`, evenly out of all, none twice.
@@ -210,7 +210,7 @@ def misplaced_electrons(light: NDArray[np.floating], contrast: NDArray[np.floati
 
 
 def misplaced_fraction(block: SweepBlock, exact: Mapping[Effect, str], chosen: Mapping[Effect, str]) -> float:
-    """Give the fraction of the contrast about a sample by which two ways to compute its light may differ at most.
+    """Return the fraction of the contrast about a sample by which two ways to compute its light may differ at most.
 
     Tables of weights misplace up to `TABULATED` of the light along either axis, in either image. Where blurs or held
     positions differ, so do the kernels that stand for those of all bands. Each is right to `NEGLIGIBLE` unless its
@@ -236,7 +236,9 @@ def misplaced_in_tails(
 
 
 def tails_fraction(block: SweepBlock, exact: Mapping[Effect, str], chosen: Mapping[Effect, str]) -> Floats:
-    """Give the fraction of light, by size, that two ways put elsewhere beyond `REACH_PX` by other kernels, (band,)."""
+    """Return the fraction of light, by size, that two ways put elsewhere beyond `REACH_PX` by other kernels,
+    (band,).
+    """
     positions = (folded_positions(block.sweep, _way(ways, SMEAR)) for ways in (exact, chosen))
     same = len(set(positions)) == 1 and _folded(exact) == _folded(chosen)
     if same or _way(exact, DIFFRACTION) != _way(chosen, DIFFRACTION):
@@ -254,7 +256,7 @@ def _folded(ways: Mapping[Effect, str]) -> dict[str, str]:
 
 
 def contrast_about(block: SweepBlock, render: Render, reach_px: int = REACH_PX) -> Floats:
-    """Give the range of the scene's light within a reach of each sample, (1, sample, band). [e-]
+    """Return the range of the scene's light within a reach of each sample, (1, sample, band). [e-]
 
     The scene is looked at by middle rays, a px and half a px apart: pixels may lie between those of one look.
     """
