@@ -278,7 +278,7 @@ def _tree(catalogue: Catalogue, uri: str, shown: set[str], path: tuple[str, ...]
 
 
 def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
-    """Return what verification found, and for what is broken what a repair would do."""
+    """Return the summary of a verification, with the repair of what is broken."""
     bad = [finding for finding in findings if finding.problem is not None]
     places = {finding.uri for finding in findings if finding.kind in ("whole", "broken")}
     broken = {finding.uri for finding in bad if finding.kind == "broken"}

@@ -114,7 +114,7 @@ def _is_same_field(old: Run, new: Run) -> bool:
 
 
 def _field_key(run: Run) -> str:
-    """Return what names the land: not the bands, nor the day and hour at which a farm was looked at."""
+    """Return a key of the land, which has neither the bands nor the day and hour at which a farm was captured."""
     key = str(run.receipt.get("scene", run.uri)).split("/bands=")[0].split("/only=")[0]
     if not is_farm_key(key):
         return key

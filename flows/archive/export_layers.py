@@ -68,7 +68,7 @@ class ExportedRun:
         return ref
 
     def path(self, product: str) -> Path:
-        """Return where a product lies that every finished run has (IncompleteStoreError: this one has not)."""
+        """Return the path of a product that every finished run has. Raises IncompleteStoreError: this one has not."""
         if self.store(product) is None:
             raise IncompleteStoreError(f"the run {self.id} has no {product}: it did not finish; export another run")
         return self.archive.locate(self.receipt["products"][product])
@@ -79,7 +79,7 @@ class ExportedRun:
 
     @cached_property
     def geobox(self) -> GeoBox | None:
-        """Return where the run's map lies on the earth, by its pose or its scene's file; None where neither says it."""
+        """Return the grid of the run's map on the earth, by its pose or its scene's file; None where neither has it."""
         return load_geobox(self.path(self.map_product))
 
     @property
@@ -145,7 +145,7 @@ def map_layers(run: ExportedRun) -> list[Layer]:
 
 
 def layer_tags(run: ExportedRun, product: str, geobox: GeoBox) -> dict[str, str]:
-    """Return what every image says of its run."""
+    """Return the tags of the run, which every image has."""
     return {
         "TIFFTAG_SOFTWARE": f"spectralzoom {run.receipt['versions'].get('spectralzoom', 'of unknown version')}",
         "run": run.id,

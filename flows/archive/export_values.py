@@ -123,7 +123,7 @@ class MosaicView:
 
     @property
     def words(self) -> str:
-        """Return how large its pixels are."""
+        """Return the size of its pixels, in words."""
         return "Pixels of the field" if self.factor == 1 else f"Pixels of {self.factor} x {self.factor} px"
 
     @cached_property

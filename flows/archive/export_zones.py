@@ -105,7 +105,7 @@ def check_zones(run: ExportedRun, choice: ProductChoice) -> None:
 
 
 def zone_notes(run: ExportedRun, choice: ProductChoice) -> list[str]:
-    """Return what a prescription's reader has to know of it: cells that are finer than the map's pixels."""
+    """Return notes for readers of a prescription: cells that are finer than the map's pixels."""
     if not choice.doses or run.geobox is None or choice.flags.cell is None:
         return []
     cell_m, pixel_m = choice.flags.cell, plane_pixel_m(run.geobox)

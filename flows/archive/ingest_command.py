@@ -136,7 +136,7 @@ def _stamps(source: CubeSource) -> list[tuple[int, int]]:
 
 
 def _key(name: str | None, source: CubeSource, files: Sequence[SourceFile]) -> dict[str, Any]:
-    """Return what the store depends on: content, the flags, and wavelengths that come from elsewhere than the files."""
+    """Return the parameters of the store: content, flags, and wavelengths from elsewhere than the files."""
     named = source.root is not None  # in a Zarr store names say where a chunk lies
     centres, widths = source.bands.wavelength_nm, source.bands.fwhm_nm
     return {

@@ -132,7 +132,7 @@ def reprocess_fields(
 def _asked(
     catalogue: Catalogue, run: Run, archive: str, weights: Path | None, pool: WorkerPool, renewed: Mapping[str, str]
 ) -> Settings | None:
-    """Return what to survey a field by again; None where its newest run is already as it would become.
+    """Return the settings of a field's new survey; None where its newest run is already as it would become.
 
     ``renewed`` names the newest run of each visit that may be another's prior map.
     """

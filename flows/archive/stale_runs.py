@@ -160,7 +160,7 @@ def is_current(catalogue: Catalogue, run: Run, settings: Settings) -> bool:
 
 
 def weights_key(settings: Settings) -> str | None:
-    """Return what the weights are called by what they hold, as stages know it; None where they cannot be read."""
+    """Return the key of the weights by their content, as stages know it; None where they cannot be read."""
     try:
         path = weights_path(settings)
         return _file_key(path, path.stat().st_mtime_ns, path.stat().st_size)

@@ -140,7 +140,7 @@ class NoPlace:
 
     @property
     def outline(self) -> BaseGeometry:
-        """Return what the field shows, in the coordinates that polygons are given in."""
+        """Return the outline of the field, in the coordinates that polygons are given in."""
         return shapely.box(0, 0, self.shape[1], self.shape[0])
 
     def to_pixels(self, shape: BaseGeometry) -> BaseGeometry:

@@ -51,20 +51,20 @@ def shift_px(grid: GeoBox, other: GeoBox) -> tuple[float, float] | None:
 
 
 def georeference_record(geobox: GeoBox | None) -> dict[str, Any]:
-    """Return what says a place in the keys of stores: nothing for a scene that has none, so that its keys stay."""
+    """Return the place in the keys of stores; empty for a scene without one, so that its keys stay."""
     if geobox is None:
         return {}
     return {"georeference": {"crs": crs_key(geobox), "transform": [float(number) for number in geobox.affine[:6]]}}
 
 
 def crs_key(geobox: GeoBox) -> str:
-    """Return what says a grid's CRS in one word: its EPSG code, or all of it as WKT where it has none."""
+    """Return a grid's CRS as one word: its EPSG code, or all of it as WKT where it has none."""
     assert geobox.crs is not None
     return geobox.crs.to_wkt() if geobox.crs.epsg is None else f"EPSG:{geobox.crs.epsg}"
 
 
 def crs_name(geobox: GeoBox) -> str:
-    """Return what people call a grid's CRS: its EPSG code, or its name where it has none."""
+    """Return the usual name of a grid's CRS: its EPSG code, or its name where it has none."""
     assert geobox.crs is not None
     return str(geobox.crs.proj.name) if geobox.crs.epsg is None else crs_key(geobox)
 
@@ -123,7 +123,7 @@ def crs_wkt(geobox: GeoBox) -> str:
 
 
 def to_degrees(geobox: GeoBox) -> Places:
-    """Return what gives (..., 2) latitude and longitude [deg] of a map's x and y."""
+    """Return a function from a map's x and y to (..., 2) latitude and longitude [deg]."""
     transformer = pyproj.Transformer.from_crs(crs_wkt(geobox), WGS84, always_xy=True)
     return lambda x, y: np.stack(transformer.transform(x, y)[::-1], axis=-1)
 
@@ -141,7 +141,7 @@ def degree_m(geobox: GeoBox) -> tuple[float, float]:
 
 
 def to_plane(geobox: GeoBox) -> tuple[Places, str]:
-    """Return what gives (..., 2) metres east and north of a map's x and y, and the CRS (WKT) that they are in.
+    """Return a function from a map's x and y to (..., 2) metres east and north, and the CRS (WKT) of these.
 
     The map's own where it is projected in metres, else the UTM zone of its middle.
     """

@@ -96,9 +96,7 @@ class MapFrame:
     crs: CRS
 
     def ground_to_geodetic(self, ground_m: ArrayLike) -> Floats:
-        """Return (..., 3) longitude, latitude [deg] and height above the ellipsoid [m] of east, north, up of the
-        foot.
-        """
+        """Return (..., 3) longitude, latitude [deg] and ellipsoidal height [m] of east, north, up of the foot."""
         ground = np.asarray(ground_m, np.float64)
         east, north, up = np.moveaxis(ground, -1, 0)
         return _stacked(self._around_foot.transform(east, north, up, direction="INVERSE"))
@@ -167,7 +165,7 @@ class GroundGrid:
         return int(rows), int(columns)
 
     def scene_pixels(self, rows: slice, columns: slice) -> Floats:
-        """Return where map pixels lie in the scene's image, (row, column, 2); integers are centres of its pixels.
+        """Return the places of map pixels in the scene's image, (row, column, 2); integers are centres of its pixels.
 
         NaN where the field does not show the ground, or shows it beyond the map's reach.
         """
@@ -181,7 +179,7 @@ class GroundGrid:
         """Return the ground under the centres of map pixels, (row, column, 3) east, north and up of the foot [m].
 
         Exact every ``TIE`` pixels and linear between. A map bends against the ground's plane by about the earth's
-        radius, so that this is off by TIE^2 resolution / 8 R of a pixel: 1e-6 at 5 cm, 2e-5 at 1 m (tested).
+        radius. So this is off by TIE^2 resolution / 8 R of a pixel: 1e-6 at 5 cm, 2e-5 at 1 m (tested).
         """
         affine, cuts = self.geobox.affine, (-(-(part.stop - part.start) // TIE) + 1 for part in (rows, columns))
         row, column = (np.linspace(part.start, part.stop, cut) for part, cut in zip((rows, columns), cuts, strict=True))

@@ -135,7 +135,7 @@ class GroundView:
         return w
 
     def scene_to_ground(self, points_px: ArrayLike) -> Floats:
-        """Return where the rays of scene points (..., 2), y and x [px], meet the ground: (..., 3) of the foot [m].
+        """Return where rays of scene points (..., 2), y and x [px], meet the ground: (..., 3) from the foot [m].
 
         NaN where the ray is at or above the horizon.
         """
@@ -161,7 +161,7 @@ class GroundView:
     def area_m2(self, points_px: ArrayLike) -> Floats:
         """Return the ground under a pixel as a map shows it (of a slope its level share), (...) [m2]; NaN off it.
 
-        The cross product of the two sides of the footprint is -n (height ifov)^2 / w^3: its level part has no other
+        The cross product of the two sides of the footprint is -n (height ifov)^2 / w^3. Its level part has no other
         dependence on the direction.
         """
         w = self.sink(points_px)

@@ -116,7 +116,7 @@ class FieldZones:
     def patch_fractions(self, grid: SceneGrid) -> Floats:
         """Return the fraction of each patch's pixels that are kept, (patch,) 0..1.
 
-        0 of every patch that a no-go zone touches.
+        It is 0 for every patch that a no-go zone touches.
         """
         fractions = _patch_means(self.kept, grid)
         return fractions if self.no_go is None else np.where(_patch_means(self.no_go, grid) > 0, 0.0, fractions)

@@ -111,7 +111,7 @@ def covered_fractions(grid: CellGrid, mask: NDArray[np.bool_], transform: Affine
     """Return the fraction of each cell, (row, column), that the pixels of a mask (y, x) cover.
 
     Exact for pixels with straight sides. Each side of the outline, cut at the cells' borders, is a trapezoid to the far
-    end of its row of cells. With their signs these add up to the covered area (Green's theorem).
+    end of its row of cells. Added with their signs, these give the covered area (Green's theorem).
     """
     beside, beyond = np.zeros(grid.shape[0] * grid.shape[1]), np.zeros(grid.shape[0] * grid.shape[1])
     for sides in pixel_sides(mask, transform, to_axes):

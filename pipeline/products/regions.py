@@ -1,7 +1,7 @@
 """Regions of a class map: small ones given to a neighbour, classes grown, and their outlines as polygons without gaps.
 
-A region is a set of pixels of one class that hang together by their sides. Pixels without a class (255) are no region:
-they are never given to a class, nor take from one, unless a class is grown over them on request.
+A region is a set of pixels of one class that hang together by their sides. Pixels without a class (255) are no region.
+They are never given to a class, nor take from one, unless a class is grown over them on request.
 
 Outlines go along the sides of pixels. Wherever three regions meet, all three have a vertex there. That makes the
 outlines a coverage in the words of shapely, whose simplification draws a border once for both its regions.
@@ -67,8 +67,9 @@ class Coverage:
 def class_polygons(classes: Classes, tolerance_px: float = 1.0) -> Coverage:
     """Return the outlines of the regions of a class map (y, x), simplified by about ``tolerance_px``.
 
-    A region of a few pixels keeps its outline, as its area would be lost with its corners: those below 32 squares of
-    the tolerance where a class's area would else be off by more than 1 %, or below 128, 512, 2048, or at last all.
+    A region of a few pixels keeps its outline, as its area would be lost with its corners. These are regions below 32
+    squares of the tolerance where a class's area would else be off by more than 1 %. The limit rises to 128, 512 and
+    2048, and at last to all regions, while it is.
     """
     framed = np.pad(classes, 1, constant_values=UNLABELLED)  # what has no class is simplified with its neighbours
     found = outline_regions(framed)
@@ -190,8 +191,9 @@ def _joined(links: NDArray[np.int64], count: int) -> NDArray[np.int32]:
 
 
 def grow_class(classes: Classes, number: int, radius_px: float) -> Classes:
-    """Return a class all pixels whose centres lie within ``radius_px`` of one of its own; what has no class stays
-    so.
+    """Return the map with a class grown over pixels whose centres lie within ``radius_px`` of its own.
+
+    Pixels without a class stay so.
     """
     grown = classes.copy()
     if radius_px > 0 and (classes == number).any():

@@ -155,7 +155,7 @@ class MirrorSettings(MirrorLink):
 
     @property
     def patience(self) -> Patience:
-        """Return how long transactions may take."""
+        """Return deadline, retries and quiet time of transactions."""
         return Patience(self.deadline_s, self.retries, self.quiet_s)
 
 
@@ -224,16 +224,16 @@ class SurveyRig(MirrorLink):
 
     @property
     def mounting(self) -> Mounting:
-        """Return how the mirror is mounted."""
+        """Return the mounting of the mirror."""
         return Mounting(self.mirror_axes, self.mirror_clocking_deg, self.mirror_offset_x, self.mirror_offset_y)
 
     @property
     def camera(self) -> CameraAddress:
-        """Return where the camera's control socket is."""
+        """Return the address of the camera's control socket."""
         return CameraAddress(self.host, self.control_port, self.connect_s)
 
     @property
     def files(self) -> FileServer:
-        """Return where the camera's files are."""
+        """Return the address of the camera's files."""
         own = {name: getattr(self, name) for name in ("user", "password", "stall_s", "least_kb_s", "read_twice")}
         return FileServer(self.host, self.file_port, **own)

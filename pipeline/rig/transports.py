@@ -124,7 +124,7 @@ class Transport(Protocol):
         """Wait for bytes and give those that are there; none where the deadline passes first."""
 
     def drain(self) -> bytes:
-        """Return what is there already, without waiting."""
+        """Return the bytes that are there already, without waiting."""
 
     def close(self) -> None:
         """Close the port."""

@@ -94,7 +94,7 @@ class Archive:
 
     @property
     def name(self) -> str:
-        """Return what a person gives to open it again."""
+        """Return the address by which a person opens it again."""
         return str(self.root)
 
     @property
@@ -109,7 +109,7 @@ class Archive:
         return store_at(self.root, stage, key)
 
     def locate(self, address: str) -> Path:
-        """Return where on this machine a product lies by its address relative to the archive, as a receipt gives it.
+        """Return the path on this machine of a product, by its address relative to the archive, as a receipt gives it.
 
         Raises IncompleteStoreError: the store is not there, or its files were cleared away. So does a file that is
         missing, cut short, a link or no plain file.
@@ -205,7 +205,7 @@ class Archive:
         return staged.ref, not staged.done
 
     def manifest(self, ref: StageRef) -> dict[str, Any]:
-        """Return what is known of a store: stage, key, version, params, inputs, created, libraries, files."""
+        """Return the facts of a store: stage, key, version, params, inputs, created, libraries, files."""
         return read_manifest(self.root / ref.uri)
 
     def stored_bytes(self, ref: StageRef) -> int:
@@ -325,7 +325,10 @@ class Archive:
         ]
 
     def leftovers(self, keep_days: float) -> dict[str, int]:
-        """Return what broken-off uploads left in a bucket for ``keep_days``: address and bytes; nothing in a folder."""
+        """Return address and bytes of files that broken-off uploads left in a bucket for ``keep_days``.
+
+        None in a folder.
+        """
         return {}
 
     def drop_leftover(self, uri: str) -> None:

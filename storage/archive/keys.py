@@ -131,7 +131,7 @@ def _is_published(folder: Path) -> bool:
 
 
 def without_manifest(root: Path) -> list[Path]:
-    """Return what lies among stores and runs and is neither: folders without a manifest, and other people's files."""
+    """Return folders without a manifest, and foreign files, that lie among stores and runs."""
     inside = [*root.glob("stages/*/*"), *root.glob("runs/*")]
     loose = [path for path in root.glob("stages/*") if not path.is_dir()]
     return sorted(path for path in (*inside, *loose) if not path.name.endswith(PART_SUFFIX) and not _is_published(path))

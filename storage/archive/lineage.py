@@ -66,11 +66,11 @@ class Catalogue:
         return found
 
     def ancestors(self, uris: Iterable[str]) -> set[str]:
-        """Return what these stores rest on, themselves not counted; with keys that are nowhere."""
+        """Return the stores that these rest on, themselves not counted; with keys that are nowhere."""
         return reach(uris, self.inputs_of)
 
     def dependents(self, uris: Iterable[str]) -> set[str]:
-        """Return what rests on these stores, themselves not counted."""
+        """Return the stores and runs that rest on these stores, themselves not counted."""
         return reach(uris, lambda uri: self._made_of_it.get(uri, []))
 
     def inputs_first(self, uris: Iterable[str]) -> list[str]:
@@ -131,7 +131,7 @@ class Catalogue:
         }
 
     def roles(self, uri: str) -> set[str]:
-        """Return what runs call the stage that made a store, such as capture_fine."""
+        """Return the names that runs give the stage of a store, such as capture_fine."""
         return self._roles.get(uri.rpartition("/")[2], set())
 
     @cached_property
@@ -283,7 +283,7 @@ def version_before(catalogue: Catalogue, uri: str) -> Store | None:
 
 
 def changes_between(catalogue: Catalogue, old: Store, new: Store) -> list[Change]:
-    """Return what differs, and for inputs that differ what differs in them, down to where it began."""
+    """Return the differences of two stores and, for inputs that differ, those within them, down to their origin."""
     found: list[Change] = []
     seen, waiting = set[tuple[str, str]](), [(old, new)]
     while waiting:

@@ -192,7 +192,7 @@ def broken_files(folder: Path, manifest: Mapping[str, Any], *, hashes: bool) -> 
 
 
 def file_problem(path: Path, entry: Mapping[str, Any], *, hashes: bool) -> str | None:
-    """Return what differs from the manifest's ``entry`` of a file, to follow its name; None where it is whole."""
+    """Return a file's difference from its ``entry`` in the manifest, to follow its name; None where it is whole."""
     try:
         size = plain_size(path)
         if size != entry["size"]:

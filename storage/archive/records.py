@@ -109,7 +109,7 @@ class Run:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Return what the survey was asked for; from its manifest where that says so."""
+        """Return the settings of the survey; from the run's manifest where that has them."""
         return _table(self.facts.get("settings")) or _table(self.receipt.get("settings"))
 
     @property

@@ -80,7 +80,7 @@ class RunDraft:
 
     @property
     def published(self) -> Path:
-        """Return where the run lies once it is published."""
+        """Return the run's folder once it is published."""
         return self.folder.with_name(self.id)
 
     def __enter__(self) -> RunDraft:

@@ -181,7 +181,7 @@ def refusals(path: Path, doing: str) -> Iterator[None]:
 
 
 def disk_advice(error: OSError) -> str | None:
-    """Return what a refusal of the disk means and what to do about it; None where the error is another."""
+    """Return the meaning of a refusal of the disk, and the remedy; None where the error is another."""
     return _ADVICE.get(error.errno or 0)
 
 

@@ -188,7 +188,7 @@ def _sums_of(path: Path) -> Path:
 
 
 def _agreeing(path: Path) -> tuple[_Sums, bool]:
-    """Return how far bytes and sums of a file agree, and whether anything of either has changed since.
+    """Return up to where bytes and sums of a file agree, and whether any byte of either has changed since.
 
     Each sum is of all bytes before it, so one that is lost is passed over.
     """

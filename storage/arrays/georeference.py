@@ -1,8 +1,8 @@
 """Georeference of stored images: GeoBox or the camera's angles as attributes and coordinates, written and read.
 
 A GeoBox is written as CF's grid mapping with coordinates of pixel centres, and as GeoZarr's attributes ``proj:`` and
-``spatial:``. Plain xarray, rioxarray and odc-geo find the same. A turned grid has no centres along its axes. As in
-odc-geo its coordinates count pixels, and the grid mapping's GeoTransform has the rest.
+``spatial:``. Plain xarray, rioxarray and odc-geo find the same. A turned grid has no centres along its axes. Its
+coordinates count pixels, as in odc-geo, and the grid mapping's GeoTransform has the rest.
 """
 
 from __future__ import annotations
@@ -159,7 +159,7 @@ def geobox_of_group(group: zarr.Group) -> GeoBox | None:
 def find_geobox(
     attributes: Mapping[str, Any], arrays: Mapping[str, zarr.Array[Any]], shape: tuple[int, int], dims: tuple[str, str]
 ) -> GeoBox | None:
-    """Return where an image of (y, x) ``shape`` lies, as its store says; None where it does not say CRS and grid.
+    """Return the grid on the earth of an image of (y, x) ``shape``, by its store; None without CRS and grid.
 
     ``attributes`` are the image's and its group's, ``arrays`` what else lies in the group, ``dims`` the names of the
     image's axes. Asked are GeoZarr's ``proj:`` and ``spatial:transform``, the grid mapping with its GeoTransform, and

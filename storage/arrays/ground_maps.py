@@ -64,7 +64,7 @@ class StoredImage:
 
     @property
     def geobox(self) -> GeoBox | None:
-        """Return where on the earth it lies; None where its store does not say."""
+        """Return the image's grid on the earth; None where its store has none."""
         return geobox_of_group(self.group)
 
     def rows(self) -> Iterator[tuple[int, NDArray[Any]]]:

@@ -77,7 +77,7 @@ class AngularGrid:
         }
 
     def record(self) -> dict[str, Any]:
-        """Return what `grid_of` needs to make this grid of angles again."""
+        """Return the values from which `grid_of` makes this grid of angles again."""
         return {"ifov_rad": self.ifov_rad, "scene_shape": list(self.scene_shape), "factor": self.factor}
 
 
@@ -272,7 +272,7 @@ def numbers_in_memory(values: NDArray[Any]) -> tuple[int, zarr.Array[Any]]:
 
 
 def bytes_held(held: Mapping[str, Any], *names: str) -> int:
-    """Return what some arrays of a store in memory take, without their metadata."""
+    """Return the bytes that some arrays of a store take in memory, without their metadata."""
     return sum(len(part) for key, part in held.items() if key.split("/")[0] in names and not key.endswith("zarr.json"))
 
 

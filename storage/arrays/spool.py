@@ -245,7 +245,7 @@ def line_values(numbers: Sequence[int]) -> str:
 
 
 def _header(head: bytes) -> dict[str, Any] | None:
-    """Return what a file's first line says its lines belong to; None where it is damaged."""
+    """Return the header on a file's first line, which names the sweep of its lines; None where it is damaged."""
     found = next(read_checked(head), None)
     if found is None or found.state != "whole" or found.content is None or found.text + b"\n" != head:
         return None

@@ -135,8 +135,9 @@ def _write_plain(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> 
 
 
 def _tag_wavelengths(file: Any, image: CogImage) -> None:
-    """Write each band's wavelength and width: in GDAL's own domain IMAGERY [um], and as its driver of ENVI does
-    [nm].
+    """Write each band's wavelength and width.
+
+    They are in GDAL's own domain IMAGERY [um], and as its driver of ENVI has them [nm].
     """
     if image.wavelength_nm is None:
         return

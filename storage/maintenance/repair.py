@@ -48,7 +48,7 @@ class Repaired:
 def plan_repair(
     archive: Archive, findings: Iterable[Finding], *, versions: Mapping[str, int | str] | None = None
 ) -> RepairPlan:
-    """Return what a repair would do with these findings; ``versions`` are those that the stages have now."""
+    """Return the repairs for these findings; ``versions`` are those that the stages have now."""
     catalogue = Catalogue.read(archive.root)
     bad = [one.uri for one in findings if one.kind in ("broken", "missing")]
     stores = [uri for uri in bad if uri.startswith("stages/") and uri.count("/") == 2]

@@ -384,7 +384,7 @@ class Cluster(Executor):
 
 
 def about_here(folders: Sequence[str]) -> dict[str, str]:
-    """Return what this process runs, on how many threads, and what it sees in some folders, by name."""
+    """Return the versions and threads of this process, and its view of some folders, by name."""
     threads = {THREADS_OF: os.environ.get(THREADS_OF, "not set")}
     return versions_here() | threads | {folder: _seen(folder) for folder in folders}
 

@@ -54,7 +54,7 @@ class DataSet:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Return what was left out: scenes without labels, and labels without a scene."""
+        """Return notes on what was left out: scenes without labels, and labels without a scene."""
         bare = [Path(self.files[name]) for name in self.unlabelled]
         told = [f"of {len(self.files)} scenes {len(bare)} without labels left out: {listed_names(bare)}"]
         lone = [f"label files without a scene, {len(self.alone)}: {listed_names(self.alone)}"]

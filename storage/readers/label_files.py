@@ -60,7 +60,7 @@ def scene_entries(folder: Path) -> list[Path]:
 
 
 def image_folder(folder: Path) -> Path:
-    """Return where the images of a folder lie: in a folder ``images`` in it, where there is one, or in itself."""
+    """Return the folder of images: the folder ``images`` in this one, where there is one, or this one."""
     inner = sorted(entry for entry in folder.iterdir() if is_image_folder(entry) and entry.is_dir())
     return next((entry for entry in inner if entry.name == "images"), inner[0] if inner else folder)
 

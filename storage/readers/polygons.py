@@ -143,7 +143,7 @@ def _layer_of(path: Path, layer: str | None) -> str | None:
 
 
 def _names(content: PolygonLayer, named_by: str | None, source: str) -> list[str]:
-    """Return what each polygon is called."""
+    """Return the name of each polygon."""
     numbers = [str(row + 1) for row in content.rows]
     by_word = {name.lower(): name for name in reversed(content.fields)}
     if named_by is not None and named_by not in content.fields:

@@ -57,9 +57,9 @@ def open_raster(
 ) -> SceneFile:
     """Open a file, or the tiles of a folder or a glob as one field, to be read some rows at a time.
 
-    Where tiles overlap, the first by name wins if it has a value; pixels without any tile are missing. ``labels`` are
-    on the pixels of the whole field. Raises SceneError, WavelengthError: as `open_scene_file`, or the tiles do not lie
-    on one grid, do not say where they lie, or have other bands.
+    The first tile by name that has a value wins where several overlap; pixels without any tile are missing. ``labels``
+    are on the pixels of the whole field. Raises SceneError, WavelengthError: as `open_scene_file`, or the tiles do not
+    lie on one grid, do not say where they lie, or have other bands.
     """
     files = tiles_of(address)
     if len(files) == 1:

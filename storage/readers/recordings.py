@@ -87,8 +87,9 @@ class Recording:
     light: tuple[str, ...]  # what the numbers are known by without reading them: a manifest's hash, or file stamps
 
     def key(self) -> dict[str, Any]:
-        """Return what captures from the recording depend on: lines, references, bands and light, but no place or
-        name.
+        """Return all that captures from the recording depend on: lines, references, bands and light.
+
+        Its place and name are not among them.
         """
         arrays = [
             array

@@ -173,7 +173,7 @@ def _open(
 
 
 def _stated_scaling(scale: float, offset: float) -> str:
-    """Return what scene.toml does to the numbers, for hashes; empty where it does nothing."""
+    """Return scene.toml's scaling of the numbers, for hashes; empty where there is none."""
     return "" if (scale, offset) == (1.0, 0.0) else f"{SETTINGS_NAME} scale {scale!r} offset {offset!r}"
 
 
@@ -352,7 +352,7 @@ class FileValues:
 
     @property
     def scaling(self) -> str:
-        """Return what scene.toml does to the numbers, for hashes."""
+        """Return scene.toml's scaling of the numbers, for hashes."""
         return _stated_scaling(self.scale, self.offset)
 
     def notes(self, settings: Path | None) -> tuple[tuple[str, ...], tuple[str, ...]]:

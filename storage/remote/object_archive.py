@@ -110,7 +110,7 @@ class ObjectArchive(Archive):
         return super().manifest_hashes(given)
 
     def locate(self, address: str) -> Path:
-        """Return where on this machine a product lies by its address relative to the archive; fetched if need be."""
+        """Return the path on this machine of a product, by its address relative to the archive; fetched if need be."""
         self._fetch(in_text(address) or "/".join(address.split("/")[:2]))
         return super().locate(address)
 
@@ -453,7 +453,7 @@ def _files_at(uri: str, manifest: bytes) -> str:
 
 
 def _manifests(there: Mapping[str, Listed]) -> dict[str, Listed]:
-    """Return what is published, by address."""
+    """Return the published stores and runs, by address."""
     depths = {"stages": 4, "runs": 3}
     named = {
         path.removesuffix(f"/{MANIFEST_NAME}"): one

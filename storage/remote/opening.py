@@ -34,7 +34,7 @@ def is_archive(address: str | Path) -> bool:
 def verify_archive(archive: Archive, progress: Progress | None = None) -> list[Finding]:
     """Check every store and every run; each file and shard that is broken has a finding of its own.
 
-    For an archive in a bucket every object is read again, and all that grows in the working copy; findings are named as
+    Every object of an archive in a bucket is read again, and all that grows in the working copy. Findings are named as
     in a folder.
     """
     if isinstance(archive, ObjectArchive):

@@ -201,7 +201,7 @@ def _placed(parts: list[tuple[int, CubeLines]], notes: list[str]) -> list[tuple[
 
 
 def _times(by_name: Mapping[str, str], first: int, cube: CubeLines, read: Read, notes: list[str]) -> LineTimes | None:
-    """Return what the part's index says of its lines; None where there is none that can be read."""
+    """Return the times of a part's lines by its index; None where there is none that can be read."""
     name = next((name for name in by_name if (match := FRAME_INDEX.fullmatch(name)) and int(match[1]) == first), None)
     if name is None:
         notes.append(f"there is no frame index for raw_{first}")

@@ -129,7 +129,7 @@ class FileSession(ftplib.FTP):
 
     @property
     def heard(self) -> str:
-        """Return what came of the reply that was waited for last."""
+        """Return in words how much came of the reply that was waited for last."""
         return f"{MOST_REPLY - self._most} bytes of a reply came" if self._most < MOST_REPLY else "nothing came"
 
     def _too_slow(self, name: str, gained: int) -> str:

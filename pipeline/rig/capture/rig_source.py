@@ -1,13 +1,13 @@
 """The rig as a source of lines: a sweep's positions go to the mirror, captures to the camera, and lines come back.
 
 A sweep is taken in captures, each of as many lines as the mirror's vector memory holds positions for. Each capture's
-files are fetched, and its lines tied to the mirror, summed over neighbours as the sweep wants, and given in order.
-Where pulses step the mirror a line's position is the one sent to it at mid exposure, as the wire has it (float32).
+files are fetched, and its lines tied to the mirror, summed over neighbours as the sweep wants, and given in order. A
+line's position is the one sent to the mirror at mid exposure where pulses step it, as the wire has it (float32).
 Without them it is the one that the mirror's log measured. Time is by the camera's own stamps, to a microsecond.
 
 Over an emulated rig lines are those of its simulated source, bit for bit, in however many captures. Their noise is
-keyed by the sweep's name and the line's number, which name the captures, too. Times differ where a load falls in the
-midst of a sweep: the simulated one continues without a break, a rig has to stop for it.
+keyed by the sweep's name and the line's number, which name the captures, too. Times differ where a load falls amid a
+sweep: the simulated one continues, a rig has to stop for it.
 
 A journal beside the fetched files records all that the rig has acknowledged. A later call with the same ``kept``
 continues a transfer where it broke off, and captures only what the camera does not have.

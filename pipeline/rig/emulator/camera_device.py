@@ -169,7 +169,7 @@ class CameraDevice:
         self._lock = threading.RLock()
 
     def greet(self) -> list[Chunk]:
-        """Return what a new connection is sent."""
+        """Return the greeting for a new connection."""
         return [Chunk(0.0, b"Hyperspec control" + PROMPT)]
 
     def command(self, line: str) -> list[Chunk] | None:
@@ -189,9 +189,7 @@ class CameraDevice:
         return bool(self.captures) and self.captures[-1].running(self.clock.now())
 
     def exposures(self, from_s: float, to_s: float) -> NDArray[np.float64]:
-        """Return begin and end (exposure, 2) of exposures that begin in a span of time: pulses for a mirror's
-        trigger.
-        """
+        """Return begin and end (exposure, 2) of exposures that begin in a span of time, for a mirror's trigger."""
         with self._lock:
             spans = [capture.exposures(from_s, to_s) for capture in self.captures]
             return np.concatenate([np.zeros((0, 2)), *spans])

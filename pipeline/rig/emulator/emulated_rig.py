@@ -2,16 +2,16 @@
 
 Noise and drifts of the simulator are keyed by a sweep's name and a line's number, so the camera has to know both. The
 name, with the sweep's geometry, is in the capture's prefix (:func:`pipeline.rig.capture.capture_paths.announced`). The
-number is that of the line whose planned position is nearest to the mirror's at mid exposure. Where the path is the
-planned one this is the vector index. It also holds for a path that was loaded in parts, begins with a lead-in, or lost
-an edge.
+number is that of the line whose planned position is nearest to the mirror's at mid exposure. It is the vector index
+where the path is the planned one. It also holds for a path that was loaded in parts, begins with a lead-in, or lost an
+edge.
 
-Where the mirror holds what was planned, to the last bit of the wire's float32, a line is that of the simulated source,
-bit for bit. Elsewhere it is looked at from where the mirror is. A capture that announces nothing has streams of its
+A line is that of the simulated source, bit for bit, where the mirror holds the planned position to the last bit of the
+wire's float32. Elsewhere it is looked at from where the mirror is. A capture that announces nothing has streams of its
 own, by its folder and frame.
 
-Pulses, as the cable has it: one for each held position of the sweep that a capture announces, evenly over the exposure
-(a pulse generator between camera and mirror would give them; cameras have none). One as each exposure begins; or none.
+The cable has one pulse for each held position of the sweep that a capture announces, evenly over the exposure. A pulse
+generator between camera and mirror would give them; cameras have none. Or it has one as each exposure begins, or none.
 
 A planned sweep that is announced (by a capture's prefix, :func:`pipeline.rig.capture.capture_paths.capture_prefix`),
 loaded and played gives the simulated source's lines, bit for bit; see :mod:`pipeline.rig.emulator.emulated_rig`. A path
@@ -267,7 +267,7 @@ class SceneCamera(CameraDevice):
 
 
 def _prefix(capture: EmulatedCapture) -> str:
-    """Return what a capture's folder is called, without its number."""
+    """Return the name of a capture's folder, without its number."""
     return capture.folder.rsplit("/", 1)[-1].rpartition("_")[0]
 
 
@@ -442,7 +442,7 @@ class EmulatedRig:
 
     @property
     def state(self) -> str:
-        """Return what both devices do now, in words."""
+        """Return the state of both devices, in words."""
         x, y = self.mirror.positions(self.clock.now())
         last = f", last: {self.mirror.acts[-1].request.words}" if self.mirror.acts else ""
         camera = "capturing" if self.camera.is_capturing() else "idle"

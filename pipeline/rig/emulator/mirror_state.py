@@ -58,7 +58,7 @@ class AxisMotion:
 
     @property
     def commanded(self) -> float:
-        """Return what the axis goes to."""
+        """Return the position that the axis goes to."""
         return self._command[-1]
 
     def command(self, time_s: float, place: float) -> None:
@@ -80,7 +80,7 @@ class AxisMotion:
         self._time, self._place, self._rate, self._command = [time_s], [0.0], [0.0], [0.0]
 
     def places(self, times_s: ArrayLike) -> Floats:
-        """Return where the axis was at times (...), in the unit of its commands.
+        """Return the positions of the axis at times (...), in the unit of its commands.
 
         Times before the oldest command that is remembered are given the place then.
         """
@@ -95,8 +95,9 @@ class AxisMotion:
         return np.where(still, np.asarray(self._command)[at], places)
 
     def commands(self, times_s: ArrayLike) -> Floats:
-        """Return where the axis was sent to at times (...); times before the oldest that is remembered get the
-        oldest.
+        """Return the positions that the axis was sent to at times (...).
+
+        Times before the oldest that is remembered get the oldest.
         """
         at = np.searchsorted(np.asarray(self._time), np.asarray(times_s, np.float64), side="right") - 1
         return np.asarray(self._command)[np.clip(at, 0, None)]
@@ -271,7 +272,7 @@ class MirrorState:
         self.advance()
 
     def positions(self, times_s: ArrayLike) -> NDArray[np.float64]:
-        """Return where the mirror was, (..., 2), at times up to now (...)."""
+        """Return the mirror's positions, (..., 2), at times up to now (...)."""
         self.advance()
         return np.stack([axis.places(times_s) for axis in self.axes], axis=-1)
 

@@ -208,7 +208,10 @@ class MirrorController(Closing):
         return found
 
     def identity(self) -> Identity:
-        """Return what the controller said it is when it was connected; RigError where it is not connected."""
+        """Return the controller's answers on its identity from when it was connected.
+
+        Raises RigError: it is not connected.
+        """
         self._check_connected()
         assert self._identity is not None
         return self._identity

@@ -83,8 +83,8 @@ class Turbulence(Aim):
 def turbulence_px(rig: Rig) -> float:
     """Return the deviation of the angle of arrival per axis, sqrt(1.09 Cn2 d D^(-1/3)), from the farthest part. [px]
 
-    Spherical waves: air near the point tilts them less than air near the aperture, by (z / d)^(5/3) a length of way, so
-    that 3/8 of a plane wave's 2.91 are left [1]. D is the aperture as seen at rest, 10.6 mm of 15. It is valid for
+    In spherical waves air near the point tilts them less than air near the aperture, by (z / d)^(5/3) a length of way.
+    So 3/8 of a plane wave's 2.91 are left [1]. D is the aperture as seen at rest, 10.6 mm of 15. It is valid for
     Kolmogorov's spectrum with one Cn2 all along the way, and D between inner and outer scale. sqrt(lambda d) must not
     be much wider than D, and turbulence weak: `rytov_variance` up to 1. 0 without a distance; no way is longer than
     `FARTHEST_M`.
@@ -96,9 +96,7 @@ def turbulence_px(rig: Rig) -> float:
 
 
 def rytov_variance(rig: Rig, wavelength_nm: float) -> float:
-    """Return how strong the turbulence is: of the light's logarithm in spherical waves, 0.5 Cn2 k^(7/6) d^(11/6)
-    [1].
-    """
+    """Return the variance of the light's logarithm in spherical waves by turbulence, 0.5 Cn2 k^(7/6) d^(11/6) [1]."""
     waves_per_m = 2 * math.pi / (wavelength_nm * 1e-9)
     return float(0.5 * rig.air.turbulence_cn2 * waves_per_m ** (7 / 6) * _way_m(rig) ** (11 / 6))
 
@@ -111,9 +109,9 @@ def _way_m(rig: Rig) -> float:
 class Wind(Displacement):
     """Crop motion: the scene sways by a travelling wave along the wind, its phase and direction drawn for a survey.
 
-    All of the scene sways, as one that stands at mid exposure. Where f t_frame is above one half, a fast sway shows as
-    a slow one. The smear within an exposure is neither modelled nor counted: up to 2 pi f t_exp of the amplitude, 2 %
-    of it at 1 Hz in 3 ms and 62 % in 100 ms. ``why`` tells how many px that are.
+    All of the scene sways, as one that stands at mid exposure. A fast sway shows as a slow one if f t_frame is above
+    one half. The smear within an exposure is neither modelled nor counted. It is up to 2 pi f t_exp of the amplitude: 2
+    % of it at 1 Hz in 3 ms and 62 % in 100 ms. ``why`` tells how many px that are.
     """
 
     name = "wind"
@@ -256,9 +254,7 @@ def has_relief(rig: Rig) -> bool:
 
 
 def sample_distances(block: SweepBlock) -> Floats:
-    """Return the distance where each sample looks by the plan, (line, sample) [m]; (1, 1) where all of it is the
-    same.
-    """
+    """Return the distance at which each sample looks by the plan, (line, sample) [m]; (1, 1) if all are alike."""
     ends = reach_m(block.rig)
     if ends is None or ends[0] == ends[1]:
         return np.full((1, 1), FARTHEST_M if ends is None else ends[0])
@@ -301,8 +297,9 @@ KRUSE = 0.585  # of the root of 1 km [5]
 class Absorption(Gain):
     """Fraction of the light that gases leave over a distance, averaged over the width of a band.
 
-    Water vapour about 720, 820 and 940 nm, oxygen at 690 and 760 nm: the band model of [4] for whole atmospheres, taken
-    to paths of metres (assumed). ``range`` takes each sample's own distance, ``uniform`` the middle.
+    It has water vapour about 720, 820 and 940 nm, and oxygen at 690 and 760 nm. The band model of [4] for whole
+    atmospheres is taken to paths of metres (assumed). ``range`` takes each sample's own distance, ``uniform`` the
+    middle.
     """
 
     name = "absorption"
@@ -450,9 +447,9 @@ class PathRadiance(LightChange):
 def extinction_per_m(air: Air, wavelength_nm: Floats) -> Floats:
     """Return the extinction of aerosol and molecules near the ground, (band,) [1/m]: 0.17 /km in all at 23 km, 550 nm.
 
-    At 550 nm it is Koschmieder's for the visibility [3], no less than the molecules'. What these do not explain is
-    aerosol, which falls by Angstrom's exponent: 1.14 [4], below 7.4 km Kruse's 0.585 V^(1/3) [5]. Above 336 km no
-    aerosol is left. Valid from 400 to 1000 nm beside the lines of gases, and down to some 0.5 km of visibility.
+    At 550 nm it is Koschmieder's for the visibility [3], no less than the molecules'. The rest is aerosol, which falls
+    by Angstrom's exponent: 1.14 [4], below 7.4 km Kruse's 0.585 V^(1/3) [5]. Above 336 km no aerosol is left. Valid
+    from 400 to 1000 nm beside the lines of gases, and down to some 0.5 km of visibility.
     """
     molecules = rayleigh_per_m(np.array([VISIBLE_NM]))[0]
     aerosol = max(KOSCHMIEDER / air.visibility_km * 1e-3 - molecules, 0.0)
@@ -461,7 +458,10 @@ def extinction_per_m(air: Air, wavelength_nm: Floats) -> Floats:
 
 
 def rayleigh_per_m(wavelength_nm: Floats) -> Floats:
-    """Return what molecules scatter at sea level, (band,) [1/m]: the optical depth of [4], Eq. 2-4, over 8434 m."""
+    """Return the scattering by molecules at sea level, (band,) [1/m].
+
+    It is the optical depth of [4], Eq. 2-4, over 8434 m.
+    """
     micron = wavelength_nm * 1e-3
     return 1 / (micron**4 * (115.6406 - 1.3366 / micron**2)) / AIR_MASS_M
 

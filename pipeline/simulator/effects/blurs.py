@@ -196,7 +196,7 @@ class Keystone(Blur):
 
 
 def keystone_shift(rig: Rig, wavelength_nm: Floats) -> Floats:
-    """Return how far along the line each band sees beside the mirror model's place, (band,) from -k/2 to k/2. [px]"""
+    """Return the shift of each band along the line from the mirror model's place, (band,) from -k/2 to k/2 [px]."""
     fraction = (np.asarray(wavelength_nm, np.float64) - FIRST_NM) / (LAST_NM - FIRST_NM)
     return rig.optics.keystone_px * (np.clip(fraction, 0.0, 1.0) - 0.5)
 

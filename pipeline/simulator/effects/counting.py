@@ -88,8 +88,8 @@ def rounded_counts(expected: Radiance, deviate: Radiance) -> Radiance:
 def divergence(expected: Floats, read_noise_e: float) -> Floats:
     """Bound how far one cheap draw's distribution is from the exact one's (chi-square divergence).
 
-    The leading terms of its Gram-Charlier expansion: c2^2 / 2 + c4^2 / 24 of the differences of variance and fourth
-    cumulant, in units of the standard deviation. Without read noise that is 1 / (216 expected^2).
+    These are the leading terms of its Gram-Charlier expansion: c2^2 / 2 + c4^2 / 24. c2 and c4 are the differences of
+    variance and fourth cumulant, in units of the standard deviation. Without read noise that is 1 / (216 expected^2).
     """
     variance = np.maximum(expected + read_noise_e**2, np.finfo(float).tiny)
     fraction = expected / variance
@@ -111,9 +111,7 @@ def least_expected(read_noise_e: float) -> float:
 
 
 def chip_variation(read_noise_e: float) -> float:
-    """Return the greatest total variation between a patch of cheap numbers and one of exact ones, where cheap is
-    used.
-    """
+    """Return the greatest total variation between a patch of cheap numbers, where these are used, and an exact one."""
     levels = np.geomspace(max(least_expected(read_noise_e), 1e-3), 1e6, 4096)
     return float(np.sqrt(CHIP_SAMPLES * divergence(levels, read_noise_e).max()) / 2)
 
@@ -262,14 +260,14 @@ def dead_elements(rig: Rig, bands: int) -> Mask:
 
 
 def hot_electrons(rig: Rig, bands: int) -> Radiance:
-    """Return what hot elements add in one exposure, (sample, band) of the whole camera. [e-]"""
+    """Return the electrons that hot elements add in one exposure, (sample, band) of the whole camera [e-]."""
     detector = rig.detector
     mask = _mask(detector.unit, "hot", rig.camera.samples, bands, fraction=detector.hot_fraction)
     return mask * np.float32(most_hot_electrons(rig))
 
 
 def most_hot_electrons(rig: Rig) -> float:
-    """Return what a hot element adds in one exposure; 0 where the sensor has none, or is ideal. [e-]"""
+    """Return the electrons that a hot element adds in one exposure [e-]; 0 where the sensor has none, or is ideal."""
     detector = rig.detector
     if detector.noiseless or not detector.hot_fraction:
         return 0.0

@@ -1,8 +1,8 @@
 """Effects in general: a name, variants from exact to cheap, a bound on the error of each, a cost, and an action.
 
-It works at one of six places of the chain, in this order: the mirror looks elsewhere (``Aim``), rays meet the scene
-elsewhere (``Displacement``), the footprint is blurred or shifted band by band (``Blur``), light is multiplied
-(``Gain``) or changed (``LightChange``), electrons are read out. All before the readout are linear in the light.
+It works at one of six places of the chain, in this order. The mirror looks elsewhere (``Aim``); rays meet the scene
+elsewhere (``Displacement``). The footprint is blurred or shifted band by band (``Blur``); light is multiplied
+(``Gain``) or changed (``LightChange``); electrons are read out. All before the readout are linear in the light.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Effect(Protocol):
 
     @property
     def name(self) -> str:
-        """Return what flags, manifest and streams call it."""
+        """Return the effect's name in flags, manifest and streams."""
 
     @property
     def cost_ns(self) -> Mapping[str, float]:
@@ -78,14 +78,14 @@ class Aim(Effect, Protocol):
     """The mirror looks beside its plan."""
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
-        """Return how far, (line, step, 2) along the line and the scan at every held position; step may be 1. [px]"""
+        """Return the displacement, (line, step, 2) along line and scan at every held position [px]; step may be 1."""
 
 
 class Displacement(Effect, Protocol):
     """Rays meet the scene elsewhere than at its plane's own place."""
 
     def displaced(self, block: SweepBlock, along_px: Floats, scan_px: Floats, variant: str) -> tuple[Floats, Floats]:
-        """Return what to add to scene points (line, sample): along the line and the scan. [px]"""
+        """Return the displacement to add to scene points (line, sample): along the line and the scan [px]."""
 
 
 class Blur(Effect, Protocol):

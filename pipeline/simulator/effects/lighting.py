@@ -28,7 +28,7 @@ class Drift(Gain):
     """Light at a line's mid exposure over the light at the survey's start, to which the scene is stated.
 
     It is SPECTRL2 under a clear sky. A survey that starts in the night is relative to the light of a sun 1 deg high.
-    With the sun at the horizon or below the light is 0. Without a time of day there is none.
+    The light is 0 with the sun at the horizon or below. Without a time of day there is none.
     """
 
     name = "drift"
@@ -93,9 +93,7 @@ class Cloud(Gain):
         return GainRange.between(1 - fraction, 1.0, len(probe.wavelength_nm), uneven=fraction)
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
-        """Return 1 less what the shadow takes at each sample's place and time, (line, sample, 1); (1, 1, 1) if
-        clear.
-        """
+        """Return 1 less the cloud's shadow at each sample's place and time, (line, sample, 1); (1, 1, 1) if clear."""
         sky = block.rig.sky
         if sky.cloud_fraction == 0:
             return np.ones((1, 1, 1), np.float32)
@@ -109,7 +107,7 @@ class Cloud(Gain):
 
 
 def shadow(way_px: Floats, size_px: float) -> Floats:
-    """Return how much of a cloud lies between the sun and points so far along its way, 0 to 1; the period is 2 sizes.
+    """Return the fraction of a cloud between the sun and points so far along its way, 0 to 1; the period is 2 sizes.
 
     It is 1 about every even multiple of the size, 0 about the odd ones, 1/2 in the middle of an edge.
     """
@@ -151,9 +149,7 @@ class Brdf(Gain):
         return GainRange.between(least, greatest, bands, uneven=greatest - least)
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
-        """Return 1 + b a + h exp(-phase / 2 deg) of each sample's direction, (line, sample, 1), 0 where that is
-        below.
-        """
+        """Return 1 + b a + h exp(-phase / 2 deg) of each sample's direction, (line, sample, 1), at least 0."""
         sky = block.rig.sky
         if sky.brdf_per_rad == 0 and sky.hot_spot == 0:
             return np.ones((1, 1, 1), np.float32)

@@ -189,7 +189,7 @@ def smeared_positions(block: SweepBlock, variant: str) -> Floats:
 
 
 def folded_positions(sweep: Sweep, variant: str) -> int:
-    """Return how many held positions the footprint itself holds, 1 px apart along the scan."""
+    """Return the number of held positions that the footprint itself holds, 1 px apart along the scan."""
     return sweep.step if variant == FOLDED else 1
 
 

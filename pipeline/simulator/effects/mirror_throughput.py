@@ -101,9 +101,9 @@ def ahead(along_px: float, scan_px: Floats, camera: LineCamera) -> Floats:
 class Polarisation(Gain):
     """Light goes with the coating's reflectance at the chief ray's incidence over that at rest, 45 deg.
 
-    By Fresnel for bare metal: from 20 to 70 deg aluminium goes from +0.5 to -3.7 % (mean of 400 to 1000 nm; -5.4 % at
-    820 nm), gold in the blue from -1.8 to +18 %. Valid for unpolarised light and a spectrograph that takes both
-    polarisations alike. One factor for each line and band, at mid exposure.
+    Fresnel's equations for bare metal give it. From 20 to 70 deg aluminium goes from +0.5 to -3.7 % (mean of 400 to
+    1000 nm; -5.4 % at 820 nm). Gold goes from -1.8 to +18 % in the blue. Valid for unpolarised light and a spectrograph
+    that takes both polarisations alike. One factor for each line and band, at mid exposure.
     """
 
     name = "polarisation"

@@ -63,8 +63,8 @@ def at_line_ends(sweeps: Iterable[Sweep], camera: LineCamera, along: float, scan
 class Jitter(Aim):
     """A normal deviate of the tilt about either axis, anew for every line.
 
-    At rest the view moves by 2 sigma in the plane of incidence, which is the scan's axis, and by sqrt(2) sigma across
-    it, along the line. Elsewhere the derivatives of the exact reflection say how far.
+    At rest the view moves by 2 sigma in the plane of incidence, which is the scan's axis. Across it, along the line, it
+    moves by sqrt(2) sigma. Elsewhere the derivatives of the exact reflection say how far.
     """
 
     name = "jitter"
@@ -79,8 +79,8 @@ class Jitter(Aim):
         """Bound what the worst of all lines' deviates changes; with a probability of 1e-3 a survey goes beyond.
 
         A line changes by at most its slope's share in the two tilts times the length of the two deviates. That length
-        exceeds m with probability exp(-m^2 / 2), so any of n lines' does with at most n exp(-m^2 / 2): m is
-        sqrt(2 ln(n / 1e-3)), 5.4 for 2560 lines.
+        exceeds m with probability exp(-m^2 / 2), so any of n lines' does with at most n exp(-m^2 / 2). m is sqrt(2 ln(n
+        / 1e-3)), 5.4 for 2560 lines.
         """
         sigma, lines = _sigma_px(rig), probe.lines
         if sigma == 0 or lines == 0:
@@ -173,8 +173,8 @@ class ThermalDrift(Aim):
 def pointing_field(unit: int, position: Floats) -> Floats:
     """Return a smooth field over the disk, (..., 2) for positions (..., 2); between -1 and 1 on it. [-]
 
-    A sum of the six Zernike polynomials up to degree 2 in the disk's own coordinates, each at most 1 in size, with
-    normal deviates for weights whose sizes sum to 1.
+    It is a sum of the six Zernike polynomials up to degree 2 in the disk's own coordinates, each at most 1 in size.
+    Their weights are normal deviates, scaled so that their sizes sum to 1.
     """
     x, y = position[..., 0], position[..., 1]
     modes = np.stack([np.ones_like(x), x, y, 2 * (x * x + y * y) - 1, x * x - y * y, 2 * x * y], axis=-1)
@@ -207,7 +207,7 @@ class Pointing(Aim, ABC):
     @property
     @abstractmethod
     def reach_px(self) -> tuple[float, float]:
-        """Return how far it looks beside at most, along the line and the scan [px]."""
+        """Return the greatest displacement, along the line and the scan [px]."""
 
     @abstractmethod
     def of_lines(self, sweep_name: str, lines: range) -> Floats:
@@ -365,8 +365,8 @@ class Lag(Aim):
 
     The mirror follows its commands as a second-order system, x'' + 2 zeta x' + x = 0 in units of 1 / natural frequency.
     Calibration takes away the way that one in steady motion lies behind. The remainder is the free oscillation between
-    it and a mirror that starts from rest. Before a sweep it has flown back by the sweep's length, has had ``settled_s``
-    to come to rest one held position ahead, and takes the first step as line 0 begins.
+    it and a mirror that starts from rest. Before a sweep it has flown back by the sweep's length, and has had
+    ``settled_s`` to come to rest one held position ahead. It takes the first step as line 0 begins.
     """
 
     name = "lag"
@@ -446,8 +446,8 @@ def _early_rise(time: Floats, damping: float) -> Floats:
 def _at_start(mirror: MirrorMotion, sweep: Sweep, period: float, held: float) -> Floats:
     """State (place [px], rate) as line 0 begins: at rest, less steady motion; and what is left of the way back.
 
-    A mirror in steady motion has the errors of all steps before: a geometric series over lines, I - exp(A period) its
-    denominator, whose determinant h^2 + 2 zeta h g + g^2 is a sum.
+    A mirror in steady motion has the errors of all steps before, a geometric series over lines. Its denominator is I -
+    exp(A period), whose determinant h^2 + 2 zeta h g + g^2 is a sum.
     """
     damping = mirror.damping
     times, height, every = _steps(mirror, sweep, period, held)

@@ -48,8 +48,8 @@ class Detail:
 class Probe:
     """Maxima over the samples of a few lines, band by band, as the footprint of slit and pixel alone shows the scene.
 
-    All but the electrons are over the unit of the tolerance: one standard deviation of the noise of the number that is
-    stored, or one DN of it. If that sums ``binning`` samples, a maximum is of the mean of their sizes over the noise of
+    All but the electrons are over the unit of the tolerance. That is one standard deviation of the noise of the stored
+    number, or one DN of it. If that sums ``binning`` samples, a maximum is of the mean of their sizes over the noise of
     their mean. So a change of any sign at each of them is bounded, and only as far as needed where they differ. Axis 0
     of ``slope`` and ``curvature`` is (along the line, along the scan).
     """
@@ -83,8 +83,7 @@ class Probe:
     ends_e: Floats | None = None  # (2, band) least and greatest light of all the scene, None as `anywhere` [e-]
 
     def within(self, reach_px: float) -> Probe:
-        """Return the probe of the light no farther from the samples: it has the greatest slope, curvature and span
-        there.
+        """Return the probe of the light no farther from the samples, with the greatest slope, curvature and span there.
 
         Farther than has been looked, light changes by at most the greatest difference in a px.
         """

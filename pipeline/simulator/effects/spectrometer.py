@@ -44,9 +44,9 @@ class BandGroup(NamedTuple):
 class Response(LightChange):
     """Each band is averaged over its neighbours so that variances add up to the rig's: fwhm_rig^2 - fwhm_scene^2.
 
-    ``exact`` is the heat kernel exp(v/2 D) of the bands' second divided difference D: no weight below 0, sum 1, mean 0
-    and variance v exactly, on bands at any distance. The first and the last band keep their light: what lies beyond
-    is not known.
+    ``exact`` is the heat kernel exp(v/2 D) of the bands' second divided difference D. It has no weight below 0, sum 1,
+    mean 0 and variance v exactly, on bands at any distance. The first and the last band keep their light: what lies
+    beyond is not known.
     """
 
     name = "response"
@@ -55,7 +55,7 @@ class Response(LightChange):
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it by I'' v / 2, or by I' sqrt(v) where that is less; 0 where the scene's bands are as wide.
 
-        The kernel solves a heat equation: the change is the mean of D I over the time v / 2, so the bound holds on any
+        The kernel solves a heat equation. The change is the mean of D I over the time v / 2, so the bound holds on any
         spectrum.
         """
         wavelength = np.asarray(probe.wavelength_nm, np.float64)
@@ -188,7 +188,7 @@ class Smile(LightChange):
 
 
 def wavelength_shift(samples: int, smile_nm: float) -> Floats:
-    """Return by how much longer the wavelength of each sample is than its band's, (sample,). [nm]"""
+    """Return the excess of each sample's wavelength over its band's, (sample,) [nm]."""
     half = (samples - 1) / 2
     if half == 0:
         return np.zeros(samples)
@@ -357,8 +357,8 @@ class StrayLight(LightChange):
 def _most_halo(probe: Probe, rig: Rig, spread: float) -> float:
     """Bound |H - mean| over the unit at any sample, H the halo's own light.
 
-    It is at most the light that the kernel takes elsewhere than an even one would, times the range of signals: the
-    brightest less the darkest, and never more than twice the greatest way from the mean. That is ``spread`` units,
+    It is at most the light that the kernel takes elsewhere than an even one would, times the range of signals, the
+    brightest less the darkest. It is never more than twice the greatest way from the mean. That is ``spread`` units,
     each at most the unit at the brightest sample.
     """
     elsewhere = _uneven_fraction((rig.camera.samples, len(probe.wavelength_nm)), rig.optics.stray_halo_px)

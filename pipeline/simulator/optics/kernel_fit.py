@@ -31,7 +31,7 @@ _SMOOTH = 0.6  # sd of the Gaussian about each point over the distance of rings,
 
 
 def disc_contrast(along: Floats, scan: Floats, axes: Axes) -> Floats:
-    """Return what an even elliptic disc of diameters ``axes`` [px] passes of waves [1/px]: 2 J1(v) / v."""
+    """Return the transmission of waves [1/px] by an even elliptic disc of diameters ``axes`` [px]: 2 J1(v) / v."""
     v = np.pi * np.hypot(axes[0] * along, axes[1] * scan)
     return np.asarray(np.where(v > 1e-6, 2 * scipy.special.j1(v) / np.maximum(v, 1e-6), 1.0))
 
@@ -198,7 +198,7 @@ def _ladder(widest: Floats, core: float, ratio: float) -> list[tuple[float, int]
 
 
 def _steps(shift: Floats) -> Floats:
-    """Return how far neighbouring nodes lie apart, (2, 1): what is between two of them is wider than either."""
+    """Return the distance of neighbouring nodes, (2, 1): light between two of them is wider than either."""
     if shift.shape[1] == 1:
         return np.zeros((2, 1))
     return np.asarray(np.abs(np.diff(shift, axis=1)).max(axis=1, keepdims=True))
@@ -219,7 +219,7 @@ def _nodes(moments: Floats, place: Floats, count: int) -> Floats:
 
 
 def _seen_at(level: int) -> Floats:
-    """Return what the pixels of a level, linear between each other, pass of the waves, (wave,)."""
+    """Return the transmission of waves by the pixels of a level, linear between each other, (wave,)."""
     passed: Floats = (np.sinc(level * _ALONG) * np.sinc(level * _SCAN)) ** 2
     while level > 1:
         level //= 2
@@ -228,14 +228,14 @@ def _seen_at(level: int) -> Floats:
 
 
 def _gaussian(shift: Floats, variance: Floats) -> Transfer:
-    """Return what Gaussians pass of the waves, (wave, kernel), with their phases."""
+    """Return the transmission of waves by Gaussians, (wave, kernel), with their phases."""
     turned = np.outer(_ALONG, shift[0]) + np.outer(_SCAN, shift[1])
     spread = np.outer(_ALONG**2, variance[0]) + np.outer(_SCAN**2, variance[1])
     return np.exp(-2j * np.pi * turned - 2 * np.pi**2 * spread)
 
 
 def _passed(kernels: Kernels, own: Floats) -> Transfer:
-    """Return what kernels pass of the waves behind slit and pixel, (wave, kernel)."""
+    """Return the transmission of waves by kernels behind slit and pixel, (wave, kernel)."""
     left = kernels.variance - THINNED * (kernels.level**2 - 1)
     seen = {level: _seen_at(level) for level in set(kernels.level.tolist())}
     through = own[:, None] * np.stack([seen[level] for level in kernels.level.tolist()], axis=1)
@@ -243,7 +243,7 @@ def _passed(kernels: Kernels, own: Floats) -> Transfer:
 
 
 def _wanted(moments: Floats, own: Floats) -> Transfer:
-    """Return what bands pass of the waves, (wave, band), for moments (6, band)."""
+    """Return the transmission of waves by bands, (wave, band), for moments (6, band)."""
     across = np.hypot(np.outer(_ALONG, moments[4]), np.outer(_SCAN, moments[5]))
     return (own * _seen_at(1))[:, None] * _gaussian(moments[:2], moments[2:4]) * pupil_contrast(across)
 
@@ -318,7 +318,7 @@ class Footprint:
 
     @property
     def mixing(self) -> Floats:
-        """Return how much each kernel counts in each band, (kernel, band); of sum 1 in each."""
+        """Return the weight of each kernel in each band, (kernel, band); of sum 1 in each."""
         return self.fractions @ self.between
 
     def afar(self, along: Floats, scan: Floats) -> Floats:
@@ -413,9 +413,7 @@ def box_weight(distance: Floats, width: float, held: int = 1) -> Floats:
 
 
 def blurred_weight(width: float, variance: Floats, held: int = 1) -> tuple[Floats, Floats]:
-    """Return distances (place,) from -reach to reach and weights (kernel, place) with Gaussians of variance
-    (kernel,).
-    """
+    """Return distances (place,) from -reach to reach and Gaussian weights (kernel, place) of variance (kernel,)."""
     reach = math.ceil(1 + width / 2 + (held - 1) / 2 + _SDS * math.sqrt(variance.max(initial=0.0))) + 1
     distance = np.arange(-reach * PER_PX, reach * PER_PX + 1) / PER_PX
     sharp = box_weight(distance, width, held)
@@ -445,7 +443,7 @@ class TapTable(NamedTuple):
 
     @property
     def taps(self) -> int:
-        """Return how many pixels along the axis a position reads."""
+        """Return the number of pixels along the axis that a position reads."""
         return int(self.weight.shape[1])
 
     @staticmethod

@@ -55,7 +55,7 @@ class RayViews:
 
 
 def exact_views(normal: Floats, across: Floats | float, slopes: Floats) -> RayViews:
-    """Return where camera rays (across, slope, 1) meet the scene after the mirror, as tangents.
+    """Return the points of the scene that camera rays (across, slope, 1) meet after the mirror, as tangents.
 
     ``normal`` is (..., 3), of arrays that broadcast. The reflection is written out for the two tangents; the ray's
     length cancels. Their derivatives follow by the rule for quotients.
@@ -97,11 +97,11 @@ def spread_of_rays(normal: Floats | None = None) -> Floats:
 
 
 def pupil_contrast(u: Floats) -> Floats:
-    """Return what a round pupil passes of a wave of u cycles per lambda / D: its autocorrelation, 0 from u = 1 on.
+    """Return the transmission of u cycles per lambda / D by a round pupil: its autocorrelation, 0 from u = 1 on.
 
     2 / pi (acos u - u sqrt(1 - u^2)) (Goodman, Introduction to Fourier Optics, section 6.3). An elliptic pupil passes a
-    wave as a round one does when u is counted along its own axes. The 6 nm of a band are too little to tell: they
-    change u by 1 %, evenly to both sides, and no contrast by more than 1e-5.
+    wave as a round one does when u is counted along its own axes. The 6 nm of a band are too few to matter. They change
+    u by 1 %, evenly to both sides, and no contrast by more than 1e-5.
     """
     inside = np.minimum(np.abs(u), 1.0)
     return np.asarray(2 / np.pi * (np.arccos(inside) - inside * np.sqrt(1 - inside * inside)))

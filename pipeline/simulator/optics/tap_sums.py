@@ -59,7 +59,7 @@ class Gatherer:
 
     @property
     def parts(self) -> int:
-        """Return how many boxes each kernel is summed over."""
+        """Return the number of boxes that each kernel is summed over."""
         return int(self._kernels.place.shape[1])
 
     def gather(
@@ -90,7 +90,7 @@ def kernels_of(footprint: Footprint) -> window_sums.PartedKernels:
 
 
 def place_parts(footprint: Footprint, views: RayViews) -> tuple[Floats, Radiance]:
-    """Return how the parts of kernels lie for samples in the middle of a pixel, along and scan.
+    """Return the places of the parts of kernels for samples in the middle of a pixel, along and scan.
 
     Returns scales of one part (kernel, 2, n), and how far beside the pixel parts lie, (kernel, 2, part, n) [px].
     """

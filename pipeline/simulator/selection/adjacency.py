@@ -229,7 +229,7 @@ def _seen_through(probe: Probe, beside_px: float, sd_px: float) -> Detail:
 
 
 def greatest_way_px(probe: Probe, rig: Rig, effects: Sequence[Effect]) -> float:
-    """Return how far all effects move the image together at most, by their bounds on one that rises evenly. [px]"""
+    """Return the greatest displacement by all effects together, by their bounds on an image that rises evenly [px]."""
     moving = [one for one in effects if any(hasattr(one, act) for act in ("aim", "displaced"))]
     bands = len(probe.wavelength_nm)
     rising = replace(

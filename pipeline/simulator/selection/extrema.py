@@ -46,7 +46,7 @@ class PixelOptics:
 
     @property
     def halo(self) -> int:
-        """Return how far kernels, differences and sums reach. [px]"""
+        """Return the reach of kernels, differences and sums [px]."""
         return len(self.slit) // 2 + len(self.pixel) // 2 + 1 + self.binning // 2
 
     def noise(self, light: Radiance) -> Radiance:
@@ -327,8 +327,8 @@ def find_extrema(
     """Find the places where light changes most over its noise, and where there is most and least of it.
 
     ``sweeps`` are of one binning, ``cells`` say how far they see, ``reaches`` how far beside them to look as well [px];
-    ``most`` places at most are found where they see, within each reach, and beyond, each in a tile of its own for one
-    measure and band. Raises SceneError: the scene holds a number that is not finite.
+    At most ``most`` places are found where sweeps see, within each reach, and beyond. Each is in a tile of its own for
+    one measure and band. Raises SceneError: the scene holds a number that is not finite.
     """
     spectra = scene.electrons * np.float32(camera.exposure_ms / DEFAULT_EXPOSURE_MS)
     optics = PixelOptics.of(camera, sweeps[0].binning, tuple(sorted({sweep.along == "y" for sweep in sweeps})))

@@ -79,7 +79,7 @@ class Menu:
         return self.variants[0]
 
     def cost_beside(self, option: Option, others: Mapping[str, Option]) -> float:
-        """Return what an option costs beside those taken for other effects, by name [ns]: draws may be shared."""
+        """Return the cost of an option beside those taken for other effects, by name [ns]: draws may be shared."""
         one = self.merged
         if one is None or option.variant == OFF or one.other not in others or others[one.other].variant != one.variant:
             return option.cost_ns
@@ -206,7 +206,7 @@ def _gain_beside(effect: Effect, ranges: Sequence[GainRange | None], place: int,
 
 
 def cost_of(menus: Iterable[Menu], options: Mapping[str, Option]) -> float:
-    """Return what options, one for each menu by its name, cost together per px and band [ns]."""
+    """Return the cost of options together, one for each menu by its name, per px and band [ns]."""
     return math.fsum(menu.cost_beside(options[menu.name], options) for menu in menus)
 
 
@@ -287,7 +287,7 @@ def light_through(probe: Probe, rig: Rig, blurs: Iterable[Any]) -> Probe:
     A kernel of shift s and variance v makes I(x + s) blurred, whose derivative over wavelength is s' I_x + v' I_xx / 2
     beside the scene's own, and its second one s'' I_x + v'' I_xx / 2 + (s' + v' d/dx / 2)^2 I_xx. At a step v' I_xx / 2
     is at most I_x times the change of the width. Diffraction is a sum of Gaussians whose widths grow with the
-    wavelength: of a wide one the derivatives over the width's logarithm are at most certain parts of the span.
+    wavelength. The derivatives of a wide one over the width's logarithm are at most certain parts of the span.
     """
     passed = list(blurs)
     if not passed or len(probe.wavelength_nm) < 2:

@@ -97,7 +97,7 @@ def rays_of(views: SampleViews, camera: LineCamera, turned: Way = (0.0, 0.0)) ->
 
 
 def line_sums(camera: LineCamera, binning: int) -> int:
-    """Return how many stored numbers of a line stand for all of it."""
+    """Return the number of stored numbers that stand for all of a line."""
     return min(camera.samples // binning, max(LINE_SAMPLES // binning, _LEAST_SUMS))
 
 

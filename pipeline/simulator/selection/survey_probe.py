@@ -95,9 +95,7 @@ class ProbedLines:
         return _greatest(stored_mean(_above(off, np.maximum(np.abs(low), np.abs(high))), self.binning) / self.scale)
 
     def beside(self, scene: RasterScene, covered: bool) -> dict[str, Any]:
-        """Return what the probe knows of what lies beside the sweeps; ``covered``: they see all, but for a px or
-        two.
-        """
+        """Return the probe's values beside the sweeps; ``covered``: sweeps see all of the scene but a px or two."""
         least_unit = self.scale.min(axis=0)[None]
         low, high = self.own.min(axis=(0, 1)), self.own.max(axis=(0, 1))
         own_unit = unit_at(np.minimum(low, high)[None], self.rig, self.unit, self.binning)
@@ -167,8 +165,8 @@ def sum_up_probes(probes: ProbedLines, scene: RasterScene, sweeps: tuple[Sweep, 
 def worst_of_groups(probe: Probe) -> Probe:
     """Return the probe with the worst of each group of neighbouring bands in all of them: one was looked at for each.
 
-    Lights of the groups are the least and the greatest of any of their bands: a level that is one band's, and the span
-    of another, do not tell the least light of a third.
+    Lights of the groups are the least and the greatest of any of their bands. A level of one band and the span of
+    another do not give the least light of a third.
     """
     groups = band_groups(len(probe.wavelength_nm))
 

@@ -212,9 +212,9 @@ def misplaced_electrons(light: NDArray[np.floating], contrast: NDArray[np.floati
 def misplaced_fraction(block: SweepBlock, exact: Mapping[Effect, str], chosen: Mapping[Effect, str]) -> float:
     """Return the fraction of the contrast about a sample by which two ways to compute its light may differ at most.
 
-    Tables of weights misplace up to `TABULATED` of the light along either axis, in either image. Where blurs or held
-    positions differ, so do the kernels that stand for those of all bands. Each is right to `NEGLIGIBLE` unless its
-    footprint says otherwise. Half counts.
+    Tables of weights misplace up to `TABULATED` of the light along either axis, in either image. Kernels that stand for
+    those of all bands differ, too, where blurs or held positions do. Each is right to `NEGLIGIBLE` unless its footprint
+    says otherwise. Half counts.
     """
     if _folded(exact) == _folded(chosen):
         return 2 * TABULATED
@@ -236,9 +236,7 @@ def misplaced_in_tails(
 
 
 def tails_fraction(block: SweepBlock, exact: Mapping[Effect, str], chosen: Mapping[Effect, str]) -> Floats:
-    """Return the fraction of light, by size, that two ways put elsewhere beyond `REACH_PX` by other kernels,
-    (band,).
-    """
+    """Return the fraction of light that two renderings place differently beyond `REACH_PX`, by kernels, (band,)."""
     positions = (folded_positions(block.sweep, _way(ways, SMEAR)) for ways in (exact, chosen))
     same = len(set(positions)) == 1 and _folded(exact) == _folded(chosen)
     if same or _way(exact, DIFFRACTION) != _way(chosen, DIFFRACTION):
