@@ -26,7 +26,7 @@ from flows.publish.quicklook import QuicklookData
 from flows.tasks.stages import effects as effect_choice
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.planning.coverage import coarse_sweeps
+from pipeline.planning.coverage import uniform_sweeps
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import raster_from_values
 
@@ -126,5 +126,5 @@ def _any_probes(unit: Any) -> Any:
     """What a look at the smallest scene finds, for decisions that no test reads."""
     camera = LineCamera()
     scene = raster_from_values(np.full((32, 32, 3), 0.5), camera, name="t", wavelength_nm=np.linspace(460, 640, 3))
-    sweeps = coarse_sweeps(SceneGrid(32, 32, 8, 4), camera, "x")
+    sweeps = uniform_sweeps(SceneGrid(32, 32, 8, 1), camera, "x", step=4)
     return REMEMBERING["probe_survey"][1](scene, Rig(camera), sweeps, unit)

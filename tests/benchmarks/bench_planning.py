@@ -12,8 +12,9 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, CostModel
 from pipeline.planning.budget_search import cheapest_cover, spend
-from pipeline.planning.coverage import cheapest_full, coarse_sweeps, full_sweeps
+from pipeline.planning.coverage import cheapest_full, full_sweeps
 from pipeline.planning.fine_pass import plan_fine, runs_showing
+from pipeline.planning.interlaced import every_nth
 from pipeline.planning.prices import ScanPrices, check_budget, count_lines, prices_of
 from pipeline.planning.scan_runs import Field
 from pipeline.planning.swaths import Views, edges_from, swaths_at_patches
@@ -56,7 +57,7 @@ def _fixed(field: Field) -> Field:
 def _patches() -> list[Row]:
     grid = SceneGrid(10_240, 10_240, 320, 4)
     full = sum(sweep.lines for sweep in full_sweeps(grid, CAMERA, "x"))
-    coarse = sum(sweep.lines for sweep in coarse_sweeps(grid, CAMERA, "x"))
+    coarse = sum(sweep.lines for sweep in every_nth(full_sweeps(grid, CAMERA, "x")))
     patch_index = np.random.default_rng(0).choice(1024, 100, replace=False)
     began = time.process_time()
     lines = count_lines(runs_showing(grid, CAMERA, COST, "x", patch_index))
@@ -108,7 +109,7 @@ def _farm() -> list[Row]:
     """Budget 0.5 on 1280 x 1024 px: worth of free offsets over that of fixed strips."""
     grid = SceneGrid(1024, 1280, 16, 4)
     along, _, full_s = cheapest_full(grid, CAMERA, COST)
-    left = check_budget(0.5, COST.seconds(coarse_sweeps(grid, CAMERA, along), CAMERA), full_s)
+    left = check_budget(0.5, COST.seconds(every_nth(full_sweeps(grid, CAMERA, along)), CAMERA), full_s)
     gains, fractions = [], []
     for seed in range(6):
         scores = _smooth(grid.patch_shape, seed=seed, sigma=(1.5, 3.0)[seed % 2]).ravel()

@@ -68,11 +68,9 @@ def _draw(work: FieldWork, run: SurveyRun, stages: Path, out: Path) -> dict[str,
     create_probabilities(
         out.with_suffix(".class_probabilities"), run.scene.shape, legend, grid=run.frame.angular_grid()
     )
-    mosaic, detail = _mosaics(stages)
+    mosaic = _mosaics(stages)[1]
     attention = _store(stages, "score/*/attention.zarr")
-    drawing = Drawing(
-        work.weights, mosaic, detail, attention, out, out.with_suffix(".class_probabilities"), run.captures
-    )
+    drawing = Drawing(work.weights, mosaic, attention, out, out.with_suffix(".class_probabilities"), run.capture)
     draw_field(work, drawing, lambda done: None)
     consolidate_stores(out.parent)  # as a store is published
     return _contents(out)

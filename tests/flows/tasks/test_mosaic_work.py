@@ -23,7 +23,7 @@ from pipeline.rectify.region import plan_tiles
 from pipeline.rectify.tiles import MosaicWork, TileMaker, let_tiles_go, opened_tiles
 from pipeline.source import References
 from storage.arrays.cubes import SweepHeader
-from storage.arrays.mosaics import MosaicWriter, open_mosaic
+from storage.arrays.mosaics import MosaicWriter
 from storage.arrays.signal_cubes import SignalCube, open_signal_cubes
 from storage.parallel.pool import WorkerPool
 from tests.storage.plain_mosaic import plain_writer, write_plain_sweep
@@ -111,19 +111,6 @@ def test_progress_is_told(tmp_path: Path, cubes: list[SignalCube]) -> None:
     assert len(fractions) == 6
     assert fractions == sorted(fractions)
     assert fractions[-1] == 1
-
-
-def test_only_tiles_that_are_wanted_are_made(tmp_path: Path, cubes: list[SignalCube]) -> None:
-    """A tile without a wanted pixel has no file; the others are those of the whole mosaic."""
-    wanted = np.zeros(GRID.shape, np.bool_)
-    wanted[70, 700] = True
-    for name, pixels in (("all", None), ("some", wanted)):
-        write_mosaic(recipe_of(cubes), mosaic_at(tmp_path / name), memory=PLENTY, pool=ONE, wanted=pixels)
-    whole, some = (open_mosaic(tmp_path / name).scores() for name in ("all", "some"))
-    tile = np.s_[64:128, 640:]
-    np.testing.assert_array_equal(some[tile], whole[tile])
-    some[tile] = np.nan
-    assert np.isnan(some).all()
 
 
 def test_memory_says_how_many_tiles_at_a_time(tmp_path: Path, cubes: list[SignalCube]) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,19 +15,15 @@ from flows.publish.receipt_table import finding_rows
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings, parse_settings
 from flows.tasks.capture_plan import PassLayout
-from flows.tasks.field_work import patch_features
-from models.network.spectral import SpectralBasis
-from models.reading.inference import CoarsePrediction
-from models.reading.regions import whole_field
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import SceneGrid, patch_pixels
 from pipeline.geometry.scan import Sweep
-from pipeline.planning.coverage import coarse_sweeps, full_sweeps, reach_px
+from pipeline.planning.coverage import full_sweeps, reach_px
+from pipeline.planning.interlaced import every_nth
 from pipeline.simulator.effects.pointing import PointingErrors
 from storage.arrays.mosaics import chosen_patches, open_mosaic
 from tests.flows.conftest import FEW_BANDS
 from tests.prior_work import without_effects
-from tests.storage.plain_mosaic import write_values
 
 OFF_PX, SEED = 6.0, 0
 
@@ -75,35 +70,14 @@ def test_what_the_mirror_missed_is_told_and_detail_still_helps(surveyed: tuple[d
     """Patches seen in part are counted, either pass has its row, and with patches the map is better than without."""
     receipt, archive = surveyed
     detail = open_mosaic(archive / receipt["products"]["detail"])
-    grid = SceneGrid(*detail.shape, 16, 4)
-    unseen = patch_pixels(grid, detail.coverage() == 0)[chosen_patches(archive / receipt["products"]["attention"])]
+    kinds, number = detail.captures() or ([], np.zeros(detail.shape))
+    unseen = patch_pixels(SceneGrid(*detail.shape, 16), np.array([step == 4 for _, step, _ in kinds])[number])
+    unseen = unseen[chosen_patches(archive / receipt["products"]["attention"])]
     assert receipt["pointing"]["fine"]["partly_seen"] == np.count_nonzero(unseen.any(axis=(1, 2)))
     rows = dict(finding_rows(surveyed[0]))
     assert all("put right by up to" in rows[f"pointing, {name}"] for name in ("coarse", "fine"))
     accuracy = surveyed[0]["accuracy"]
     assert accuracy["miou"] > accuracy["none"]["miou"]
-
-
-def test_unseen_pixels_take_the_coarse_look(tmp_path: Path) -> None:
-    """What no line reached of a patch has the columns that the overview reads there; a patch never seen is left out."""
-    grid = SceneGrid(12, 16, 4, 1)
-    weights = SimpleNamespace(basis=SpectralBasis(500, 700, 2), columns_of_scores=lambda scores, law, nm: scores)
-    patch_index = np.array([1, 6, 7])
-    values = np.random.default_rng(0).normal(size=(3, 4, 4, 2)).astype(np.float16)
-    values[0, :3, 1:], values[1] = np.nan, np.nan
-    coarse = np.random.default_rng(1).normal(size=(*grid.padded_shape, 2)).astype(np.float32)
-    image = np.full((12, 16, 2), np.nan)
-    for patch, (y, x) in zip(values, grid.patch_origin(patch_index), strict=True):
-        image[y : y + 4, x : x + 4] = patch
-    write_values(tmp_path / "m.zarr", image, np.array([500.0, 700.0]))
-    seen = CoarsePrediction(grid, coarse, np.empty(0, np.float32))
-    detail = open_mosaic(tmp_path / "m.zarr")
-    told, columns = patch_features(weights, detail, patch_index, seen, whole_field(grid))  # type: ignore[arg-type]
-    assert told.tolist() == [1, 7]
-    np.testing.assert_allclose(columns[1], values[2], atol=1e-3)
-    np.testing.assert_allclose(columns[0][:, 0], values[0][:, 0], atol=1e-3)
-    np.testing.assert_allclose(columns[0][3], values[0][3], atol=1e-3)
-    np.testing.assert_array_equal(columns[0][:3, 1:], coarse[:3, 5:8])  # patch 1 begins at row 0, column 4
 
 
 def found_of(**told: Any) -> dict[str, Any]:
@@ -173,7 +147,7 @@ def test_a_mirror_that_is_believed_costs_nothing() -> None:
     plan = PassLayout.of(settings, GRID).plan(None if settings.plain else settings.budget)
     assert plan.overlap_px == 0
     assert plan.full == full_sweeps(GRID, settings.camera, plan.along)
-    assert plan.coarse == coarse_sweeps(GRID, settings.camera, plan.along)
+    assert plan.coarse == every_nth(full_sweeps(GRID, settings.camera, plan.along))
     with pytest.raises(SettingsError, match=r"^--pointing-px 192: .* overlap by 640 px .* give less than 192$"):
         PassLayout.of(parse_settings({"pointing_px": 192.0}), GRID).plan(1.0)
     assert finding_rows(found_of(held="the mosaic", sweeps={})) == []

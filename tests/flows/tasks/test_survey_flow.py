@@ -20,7 +20,7 @@ from flows.settings.parameters import SurveySettings
 from flows.survey import draw_class_map
 from flows.tasks import prefect_tasks
 from flows.tasks.local_server import ServerUnavailable
-from flows.tasks.open_survey import STAGES
+from flows.tasks.open_survey import STAGES, Products
 from flows.tasks.stages import accuracy as evaluation
 from pipeline.errors import IncompleteStoreError, RigError, SettingsError
 from storage.archive.archive import Archive
@@ -51,11 +51,17 @@ class Noted:
         self.uniform = self.registers = self.on_the_ground = self.is_map = False
         self.__dict__ |= facts
         self.steps: dict[str, list[str]] = {}
+        self.products = Products()
+
+    def goes_back(self, request: StageRef) -> bool:
+        """Return whether the plan asks for more lines."""
+        return not self.uniform
 
     def __call__(self, stage: str, *inputs: StageRef) -> StageRef:
         """Note the names of the stages that left the inputs."""
         self.steps[stage] = [ref.stage for ref in inputs]
-        return UnmadeRef(stage, "", Path())
+        self.products[stage] = UnmadeRef(stage, "", Path())
+        return self.products[stage]
 
 
 def steps(**facts: bool) -> dict[str, list[str]]:
@@ -65,17 +71,17 @@ def steps(**facts: bool) -> dict[str, list[str]]:
     return dict(noted.steps)
 
 
-def test_a_survey_in_two_passes_captures_again() -> None:
-    """The fine sweeps follow from the plan, and the map is drawn of both mosaics; each pass is condensed first."""
+def test_a_survey_that_zooms_captures_again() -> None:
+    """Later lines follow from the plan, are condensed with the first ones, and the map is drawn of all of them."""
     found = steps()
     assert list(found) == [
         *("choose_effects", "capture_coarse", "condense_coarse", "locate", "rectify", "score"),
         *("capture_fine", "condense_fine", "rectify_fine", "segment"),
     ]
     assert found["capture_fine"] == ["score", "choose_effects"]
-    assert found["condense_fine"] == ["capture_fine"]
-    assert found["rectify_fine"] == ["score", "condense_fine"]
-    assert found["segment"] == ["rectify", "score", "rectify_fine"]
+    assert found["condense_fine"] == ["capture_fine", "capture_coarse"]
+    assert found["rectify_fine"] == ["condense_fine"]
+    assert found["segment"] == ["rectify_fine", "score"]
 
 
 def test_a_uniform_scan_has_no_second_pass() -> None:
@@ -92,12 +98,12 @@ def test_a_mosaic_is_placed_by_the_registration_of_its_own_pass(uniform: bool, p
     assert [name for name in found if name.startswith("register")] == [f"register_{one}" for one in passes]
     assert found["locate"] == ["condense_coarse", "register_coarse"]
     assert found["rectify"] == ["condense_coarse", "locate", "register_coarse"]
-    assert found.get("rectify_fine") == (None if uniform else ["score", "condense_fine", "register_fine"])
+    assert found.get("rectify_fine") == (None if uniform else ["condense_fine", "register_fine"])
 
 
 def test_a_posed_survey_is_drawn_on_the_ground() -> None:
     """The map on the ground is made of the class map and the mosaic."""
-    assert steps(on_the_ground=True)["ground"] == ["segment", "rectify"]
+    assert steps(on_the_ground=True)["ground"] == ["segment", "rectify_fine"]
 
 
 def test_a_raster_is_neither_captured_nor_rectified() -> None:

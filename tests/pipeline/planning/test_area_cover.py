@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis
-from pipeline.planning.coverage import coarse_sweeps, full_sweeps, sweep_outline, sweeps_over
+from pipeline.planning.coverage import full_sweeps, sweep_outline, sweeps_over, uniform_sweeps
 from pipeline.planning.swaths import covered_patches
 
 GRID, CAMERA = SceneGrid(320, 416, 16, 4), LineCamera(samples=160)
@@ -39,7 +39,7 @@ def test_every_patch_that_was_shown_still_is(shown: np.ndarray, along: Axis) -> 
 @given(blocks)
 def test_lines_stay_where_they_lie(shown: np.ndarray) -> None:
     """A coarse sweep that is cut holds positions that the whole one does, and no others."""
-    whole = {sweep.name: sweep for sweep in coarse_sweeps(GRID, CAMERA, "x")}
+    whole = {sweep.name: sweep for sweep in uniform_sweeps(GRID, CAMERA, "x", step=4)}
     for sweep in sweeps_over(list(whole.values()), GRID, CAMERA, shown):
         assert np.isin(sweep.held_px(), whole[sweep.name].held_px()).all()
 

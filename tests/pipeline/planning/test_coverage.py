@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -10,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import PoseError, SettingsError
+from pipeline.errors import PoseError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import CostModel, Sweep, line_positions, scene_to_sweep
-from pipeline.planning.coverage import cheapest_full, coarse_sweeps, full_sweeps, on_scene, reach_px, with_margin
+from pipeline.planning.coverage import cheapest_full, full_sweeps, on_scene, reach_px, uniform_sweeps, with_margin
 from pipeline.planning.swaths import covered_patches, edges_from, patch_lines, patches_near, swaths_at_patches
 
 CAMERA, COST = LineCamera(), CostModel()
@@ -42,7 +43,7 @@ def test_every_pixel_is_seen(height: int, width: int, along: str, factor: int):
     """Both passes hold every pixel of their grid, with resampling taps, for any size and factor."""
     grid = SceneGrid(height, width, 16, factor)
     assert unseen(full_sweeps(grid, CAMERA, along), grid) == 0
-    assert unseen(coarse_sweeps(grid, CAMERA, along), grid) == 0
+    assert unseen(uniform_sweeps(grid, CAMERA, along, step=factor), grid) == 0
 
 
 @pytest.mark.parametrize(("size", "swaths"), [(1, 1), (640, 1), (641, 2), (1280, 2), (1281, 3), (1920, 3)])
@@ -59,7 +60,7 @@ def test_swaths_on_the_axis_scan_the_scene_and_its_taps_only():
     (sweep,) = full_sweeps(SceneGrid(480, 600, 16, 4), CAMERA, "x")
     assert sweep.lines == 483
     assert sweep.start_px == -479 / 2 - 1
-    (coarse,) = coarse_sweeps(SceneGrid(480, 600, 16, 4), CAMERA, "x")
+    (coarse,) = uniform_sweeps(SceneGrid(480, 600, 16, 4), CAMERA, "x", step=4)
     assert coarse.lines == 123
 
 
@@ -67,7 +68,7 @@ def test_the_known_fields_have_their_known_lines():
     """1280 x 1024 takes 2098 lines in full and 528 coarse; 1296 x 966 is cheaper with lines along its short side."""
     along, sweeps, seconds = cheapest_full(SceneGrid(1024, 1280, 16, 4), CAMERA, COST)
     assert (along, sum(s.lines for s in sweeps), round(seconds, 1)) == ("x", 2098, 213.9)
-    assert sum(s.lines for s in coarse_sweeps(SceneGrid(1024, 1280, 16, 4), CAMERA, "x")) == 528
+    assert sum(s.lines for s in uniform_sweeps(SceneGrid(1024, 1280, 16, 4), CAMERA, "x", step=4)) == 528
     along, sweeps, _ = cheapest_full(SceneGrid(966, 1296, 32, 4), CAMERA, COST)
     assert (along, len(sweeps)) == ("y", 2)
 
@@ -79,13 +80,6 @@ def test_fields_beyond_the_mirror_are_refused():
         full_sweeps(grid, CAMERA, "x")
     with pytest.raises(PoseError, match="beyond the mirror's range"):
         cheapest_full(SceneGrid(24_000, 24_000, 32, 4), CAMERA, COST)
-
-
-@pytest.mark.parametrize("factor", [17, 641])
-def test_factors_that_overflow_the_sum_are_refused(factor: int):
-    """Sums of more than 16 samples of 12 bits do not fit 16 bits."""
-    with pytest.raises(SettingsError, match=f"at most 16 .* got {factor}"):
-        coarse_sweeps(SceneGrid(100, 100, 16, factor), CAMERA, "x")
 
 
 @pytest.mark.parametrize("along", ["x", "y"])
@@ -107,7 +101,7 @@ def test_mask_follows_the_rays(along: str, binning: int):
 def test_swaths_overlap_by_what_is_asked(overlap_px: float):
     """Neighbours share at least the overlap, with no strip more than it takes, and 0 changes nothing."""
     grid = SceneGrid(300, 1100, 16, 4)
-    for cover in (full_sweeps, coarse_sweeps):
+    for cover in (full_sweeps, partial(uniform_sweeps, step=4)):
         sweeps = cover(grid, CAMERA, "x", overlap_px=overlap_px)
         reach = [sweep.swath_px + reach_px(sweep.swath_px, grid.height, CAMERA, sweep.binning) for sweep in sweeps]
         assert all(left[1] - right[0] >= overlap_px - 1e-3 for left, right in pairwise(reach))
@@ -118,7 +112,7 @@ def test_swaths_overlap_by_what_is_asked(overlap_px: float):
 @pytest.mark.parametrize(("margin_px", "lines"), [(0.0, 0), (0.5, 1), (8.0, 2), (9.0, 3)])
 def test_margins_are_whole_lines_at_both_ends(margin_px: float, lines: int):
     """Every sweep begins and ends at least so much further out, by no line too many, and keeps its own lines."""
-    sweeps = coarse_sweeps(SceneGrid(300, 700, 16, 4), CAMERA, "x")
+    sweeps = uniform_sweeps(SceneGrid(300, 700, 16, 4), CAMERA, "x", step=4)
     for sweep, grown in zip(sweeps, with_margin(sweeps, CAMERA, margin_px), strict=True):
         assert grown == replace(sweep, start_px=sweep.start_px - 4 * lines, lines=sweep.lines + 2 * lines)
         assert sweep.held_px()[0, 0] - grown.held_px()[0, 0] >= margin_px

@@ -14,8 +14,9 @@ from pipeline.errors import BudgetError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel
-from pipeline.planning.coverage import cheapest_full, coarse_sweeps, full_sweeps
+from pipeline.planning.coverage import cheapest_full, full_sweeps
 from pipeline.planning.fine_pass import plan_fine, runs_showing
+from pipeline.planning.interlaced import every_nth
 from pipeline.planning.prices import check_budget, count_lines
 from pipeline.planning.swaths import covered_patches
 
@@ -100,7 +101,7 @@ def test_planning_a_farm_pays():
     rows, columns = np.divmod(np.arange(np.prod(grid.patch_shape)), grid.patch_shape[1])
     scores = sum(np.exp(-((rows - r) ** 2 + (columns - c) ** 2) / 60) for r, c in ((8, 12), (30, 60), (55, 20)))
     _, _, full = cheapest_full(grid, CAMERA, COST)
-    left = check_budget(0.5, COST.seconds(coarse_sweeps(grid, CAMERA, "x"), CAMERA), full)
+    left = check_budget(0.5, COST.seconds(every_nth(full_sweeps(grid, CAMERA, "x")), CAMERA), full)
     plan = plan_fine(grid, CAMERA, COST, "x", scores, budget_s=left)
     assert plan.seconds > left - 3
     assert plan.expected_gain > 2 * plan.seconds / full * scores.sum()

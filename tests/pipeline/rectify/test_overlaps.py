@@ -15,7 +15,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, Sweep, line_positions, points_of_scan, sweep_to_scene
 from pipeline.lazy import Once
-from pipeline.planning.coverage import coarse_sweeps, full_sweeps
+from pipeline.planning.coverage import full_sweeps, uniform_sweeps
 from pipeline.rectify.registration.alignment import no_shifts
 from pipeline.rectify.registration.overlaps import BroadSweep, PlacedImage, overlap_windows, places_seen
 from pipeline.rectify.registration.seams import Registration, place_images, register_sweeps
@@ -80,7 +80,8 @@ def test_narrow_overlaps_are_reported():
 def test_coarse_pass_is_registered_in_scene_pixels():
     """Lines 2 px apart of binned samples give corrections in px of the scene, as fine ones do."""
     pointing = PointingErrors(offset_px=6, jitter_px=0, seed=5)
-    sweeps = coarse_sweeps(replace(GRID, factor=2), CAMERA, "x", overlap_px=84)
+    scan = uniform_sweeps(GRID, CAMERA, "x", step=2, overlap_px=84)
+    sweeps = [replace(sweep, binning=2) for sweep in scan]
     source = source_of(pointing)
     broad = [BroadSweep.read(SimulatedSweep(source, sweep), CAMERA) for sweep in sweeps]
     found = register_sweeps(broad, CAMERA, prior_px=8, window_px=300)

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError
-from pipeline.geometry.grid import SceneGrid
 from storage.arrays.layout import AngularGrid
-from storage.arrays.mosaics import MosaicWriter, open_mosaic, patch_scores
+from storage.arrays.mosaics import MosaicWriter, open_mosaic
 from tests.storage.plain_mosaic import plain_writer, write_values
 
 SHAPE = (100, 1300)
@@ -119,22 +118,3 @@ def test_brightness_is_the_mean_over_bands(stored: tuple[Path, NDArray[np.float3
     np.testing.assert_allclose(open_mosaic(stored[0]).brightness(), stored[1].mean(axis=-1), atol=1e-5)
     with pytest.raises(IncompleteStoreError, match="no readable Zarr store"):
         open_mosaic(stored[0] / "none.zarr")
-
-
-@pytest.mark.parametrize("chosen", [[], [0], [3, 4, 5], [59, 2, 31, 30], list(range(60))])
-def test_patches_are_cut_from_the_mosaic(stored: tuple[Path, NDArray[np.float32]], chosen: list[int]) -> None:
-    """In any order; beyond the scene's border a patch repeats its own pixels by reflection."""
-    grid = SceneGrid(150, 90, 16, 2)
-    patches = np.array(chosen, np.intp)
-    padded = np.full((*grid.padded_shape, len(NM)), np.nan, np.float32)
-    padded[:150, :90] = stored[1]
-    padded[150:160] = padded[[148, 147, 146, 145, 144, 149, 149, 149, 149, 149]]  # the last patch begins at 144
-    padded[:, 90:96] = padded[:, 89 - np.arange(1, 7)]
-    found = {}
-    for entries, scores in patch_scores(open_mosaic(stored[0]), grid, patches):
-        found |= dict(zip(patches[entries].tolist(), scores, strict=True))
-    assert sorted(found) == sorted(chosen)
-    for number, patch in found.items():
-        y, x = grid.patch_origin(np.array(number))
-        if y < 150 and x < 90:
-            np.testing.assert_array_equal(patch, padded[y : y + 16, x : x + 16])
