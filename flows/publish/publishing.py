@@ -24,7 +24,7 @@ from flows.tasks.open_survey import STAGES, OpenSurvey, RunRef
 from flows.tasks.prefect_tasks import as_task, inside_flow
 from flows.tasks.stages.accuracy import evaluate
 from flows.tasks.stages.capture import capture_coarse, capture_fine
-from flows.tasks.stages.condense import condense_coarse, condense_fine, raw_differs
+from flows.tasks.stages.condense import raw_differs
 from flows.terminal.figures import format_percent
 from pipeline.lazy import deferred
 from storage.archive.keys import StageRef, canonical_json
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 else:
     prefect_artifacts = deferred("prefect.artifacts")
 
-PASSES_OF_SIGNAL = {capture_coarse.name: condense_coarse.name, capture_fine.name: condense_fine.name}
+PASSES = (capture_fine.name, capture_coarse.name)  # in the order in which they are condensed
 NOT_ASKED = ("notes", "out", "engine", *OF_THE_MACHINE)  # of a receipt's settings: no byte depends on them
 MOST_BYTES = 100 * 1024  # of the picture, as it stands in the text
 WIDTHS_PX = (1200, 1000, 800, 600, 400, 200)
@@ -79,25 +79,23 @@ def clear_raw(plan: OpenSurvey, run: RunRef) -> RunRef:
 
     The run is published again with the bytes that stay.
     """
-    if plan.run.settings.keep != KEEP_SIGNAL or not plan.products.there(*PASSES_OF_SIGNAL):
+    if plan.run.settings.keep != KEEP_SIGNAL or not plan.products.there(*PASSES):
         return run
     return as_task(_clear_raw, "clear_raw")(plan, run)
 
 
 def _clear_raw(plan: OpenSurvey, run: RunRef) -> RunRef:
-    cleared = False
-    for captured, condensed in PASSES_OF_SIGNAL.items():
-        if captured not in plan.products or condensed not in plan.products:
-            continue
-        raw, signal = plan.products[captured], plan.products[condensed]
-        if plan.run.archive.find(raw.stage, raw.key) is None:  # cleared before
-            continue
-        why = _kept_by_others(plan, captured, raw) or raw_differs(raw, signal, plan.run.camera)
-        if why is None:
-            cleared |= plan.run.archive.clear(raw, wait=False)
-        else:
-            plan.observer.note(f"raw lines stay: {why}")
-    return recount(plan, run) if cleared else run
+    archive, there = plan.run.archive, [name for name in PASSES if name in plan.products]
+    passes = [plan.products[name] for name in there]
+    if not plan.products.signals or any(archive.find(raw.stage, raw.key) is None for raw in passes):
+        return run  # cleared before
+    others = (_kept_by_others(plan, name, raw) for name, raw in zip(there, passes, strict=True))
+    why = next(filter(None, others), None) or raw_differs(passes, plan.products.signals[0], plan.run.camera)
+    if why is not None:
+        plan.observer.note(f"raw lines stay: {why}")
+        return run
+    cleared = [archive.clear(raw, wait=False) for raw in passes]
+    return recount(plan, run) if any(cleared) else run
 
 
 def _kept_by_others(plan: OpenSurvey, stage: str, raw: StageRef) -> str | None:

@@ -61,7 +61,9 @@ def clear_raw_lines(
             if progress is not None:
                 progress(one.raw.ref.uri, number / len(found))
             raw, signal = (archive.ref(store.ref.stage, store.ref.key) for store in (one.raw, one.signal))
-            why = raw_differs(raw, signal, camera_of(one.signal.params))
+            others = (archive.find(raw.stage, key) for key in one.signal.inputs if key != raw.key)
+            passes = [raw, *(other for other in others if other is not None)]
+            why = raw_differs(passes, signal, camera_of(one.signal.params))
             if why is not None:
                 done.kept[raw.uri] = why
             elif archive.clear(raw, wait=False):
@@ -74,7 +76,7 @@ def outlived_lines(catalogue: Catalogue, now: datetime) -> Iterator[OutlivedLine
     """Yield the raw lines of published runs that no run keeps any longer, and that were condensed."""
     found = set[str]()
     for run in catalogue.runs:
-        for names in LINE_PRODUCTS.items():
+        for names in reversed(LINE_PRODUCTS.items()):  # later passes first: their comparison asks for the first's
             raw, signal = (_whole(catalogue, run, name) for name in names)
             if raw is None or signal is None or raw.ref.uri in found:
                 continue

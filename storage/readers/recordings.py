@@ -64,10 +64,12 @@ LINE_PRODUCTS = {"raw_coarse": "signal_coarse", "raw_fine": "signal_fine"}  # of
 def stores_of_lines(products: Mapping[str, str], is_there: Callable[[str], bool]) -> list[str]:
     """Return the addresses of the stores that hold a run's lines.
 
-    These are the raw ones, or the condensed ones where the raw ones were cleared away.
+    These are the raw ones, or the condensed ones where raw ones were cleared away: later passes are condensed together
+    with the first.
     """
-    pairs = [(products[raw], products.get(signal)) for raw, signal in LINE_PRODUCTS.items() if raw in products]
-    return [raw if signal is None or is_there(raw) else signal for raw, signal in pairs]
+    raw = [products[name] for name in LINE_PRODUCTS if name in products]
+    condensed = [products[name] for name in reversed(LINE_PRODUCTS.values()) if name in products]
+    return raw if all(map(is_there, raw)) else condensed[:1] or raw
 
 
 @dataclass(frozen=True)

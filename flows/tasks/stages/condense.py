@@ -216,29 +216,32 @@ def _record(condenser: Condenser, done: Sequence[CondensedSweep]) -> dict[str, A
     }
 
 
-def raw_differs(raw: StageRef, signal: StageRef, camera: LineCamera) -> str | None:
+def raw_differs(passes: Sequence[StageRef], signal: StageRef, camera: LineCamera) -> str | None:
     """Compare every raw line with what was condensed from it; say why raw lines are to stay, None where they may go.
+
+    ``passes`` are the captures in the order in which they were condensed.
 
     Every byte of the condensed store is read again before, so that rare spectra and components are as published.
     """
     try:
         check_files(signal.path, hashes=True)
-        return _lines_differ(raw, signal, camera)
+        return _lines_differ(passes, signal, camera)
     except IncompleteStoreError as error:
         return f"{error}"
 
 
-def _lines_differ(raw: StageRef, signal: StageRef, camera: LineCamera) -> str | None:
+def _lines_differ(passes: Sequence[StageRef], signal: StageRef, camera: LineCamera) -> str | None:
     record = read_table(signal.path / RECORD)
     if record["rare"] > MOST_RARE * max(record["spectra"], 1):
         fraction = 100 * record["rare"] / record["spectra"]
         return f"{fraction:.1f} % of the spectra have more than noise beside {record['components']} components"
-    cubes, condensed = open_raw_cubes(raw.path), open_signal_cubes(signal.path)
-    of_sweep = {stored.sweep: stored for stored in condensed}
+    cubes = [cube for raw in passes for cube in open_raw_cubes(raw.path)]
+    of_sweep = {stored.sweep: stored for stored in open_signal_cubes(signal.path)}
     if any(cube.sweep not in of_sweep for cube in cubes):
         return "the sweeps of the signal are not those of the raw lines"
-    found = read_statistics(raw.path)
-    few = components_of(found, cubes, SignalChoice()) if found.bands <= FEW_BANDS else None
+    found = reduce(SignalStatistics.merged, (read_statistics(raw.path) for raw in passes))
+    whole = len(cubes) == len(of_sweep)  # else the stored components are all that is known
+    few = components_of(found, cubes, SignalChoice()) if found.bands <= FEW_BANDS and whole else None
     for cube in cubes:
         stored = of_sweep[cube.sweep]
         wrong = differing_lines(cube, stored, camera, few)

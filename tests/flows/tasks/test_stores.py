@@ -91,7 +91,7 @@ def test_raw_is_stored_once_and_as_uint16(surveyed: tuple[Path, Published]) -> N
         assert all(array.shape[0] < by_line[0][1].shape[2] for array in scores), kind
     lines, signal = (
         sum(array.nbytes for path, array in arrays if path.match(f"stages/{kind}/*/*.zarr/{name}"))
-        for kind, name in (("capture", "dn"), ("condense*", "scores"))
+        for kind, name in (("capture", "dn"), ("condense_fine", "scores"))
     )
     assert signal < lines
 

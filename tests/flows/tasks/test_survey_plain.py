@@ -71,7 +71,7 @@ class Done:
 
     def sweeps(self) -> list[tuple[xr.Dataset, Path]]:
         """Every condensed sweep with its folder."""
-        folders = [self.archive / self.receipt["products"][name] for name in ("signal_coarse", "signal_fine")]
+        folders = [self.archive / self.receipt["products"][name] for name in ("signal_fine",)]
         found = [path for folder in folders for path in sorted(folder.glob("*.zarr"))]
         return [(xr.open_zarr(path, consolidated=False), path) for path in found]
 
@@ -177,7 +177,7 @@ def test_products_open_with_plain_xarray(farm: Done) -> None:
     """Named axes, wavelengths in nm and GeoZarr's place; the patches chosen; CF flags; facts of lines."""
     mosaic, attention, detail, found = (farm.open(name) for name in ("mosaic", "attention", "detail", "class_map"))
     assert mosaic["scores"].dims == ("component", "y", "x")
-    assert (mosaic.sizes["y"], mosaic.sizes["x"]) == (FARM[0] // 4, FARM[1] // 4)
+    assert (mosaic.sizes["y"], mosaic.sizes["x"]) == FARM
     assert np.isfinite(mosaic["scores"].values).all()
     assert (mosaic["wavelength"].dims, mosaic["wavelength"].attrs["units"]) == (("band",), "nm")
     assert mosaic.attrs["spatial:dimensions"] == ["y", "x"]
@@ -202,14 +202,14 @@ def test_products_open_with_plain_xarray(farm: Done) -> None:
 
 @pytest.mark.usefixtures("no_effects")
 def test_without_a_fine_patch_the_map_is_the_coarse_prediction(survey_png: Any, weights: Path, tmp_path: Path) -> None:
-    """A budget that pays for the coarse pass alone gives the classes of the overview of its repeated pixels."""
+    """A budget that pays for the first pass alone gives the classes of the overview of its pixels."""
     done = Done(survey_png(tmp_path, budget="0.45"), tmp_path)
     assert done.published.captured_again == 0
     mosaic = open_mosaic(tmp_path / done.receipt["products"]["mosaic"])
     drawn = done.open("class_map")["classes"].values
-    grid = SceneGrid(*drawn.shape, 8, 4)
-    values, capture = mosaic.values(), LineSpec(1.0, 4, 4)
-    seen = coarse_prediction(load_weights(weights), values, mosaic.wavelength_nm, grid, capture=capture, factor=4)
+    grid = SceneGrid(*drawn.shape, 8, 1)
+    values, capture = mosaic.values(), LineSpec(1.0, 4)
+    seen = coarse_prediction(load_weights(weights), values, mosaic.wavelength_nm, grid, capture=capture)
     assert (seen.probability.argmax(axis=-1)[: grid.height, : grid.width] == drawn).mean() > 0.999
     assert done.receipt["accuracy"]["miou"] == done.receipt["accuracy"]["none"]["miou"]
 
