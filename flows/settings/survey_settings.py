@@ -238,11 +238,10 @@ class Settings:
         "line first, then lines between where the policy says",
         example=0.5,
     )
-    zoom: Literal["auto", "always", "never"] = stated(
-        "auto",
-        "Capture every 4th line first, then the lines between where they promise most in the seconds that are left: "
-        "always, never (one uniform scan), or auto: where a field of which every place pays would lose at most 0.3 "
-        "points by it, and the weights have a record of scans",
+    zoom: Literal["never", "always"] = stated(
+        "never",
+        "Capture every 4th or 8th line first, then the lines between where they promise most in the seconds that are "
+        "left: always, or never (one uniform scan, which scored more in the same seconds where both were measured)",
     )
     seconds: float | None = stated(
         None,

@@ -16,8 +16,7 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel, Sweep, exposing
 from pipeline.planning.coverage import field_px
 from pipeline.planning.fine_pass import FinePlan, plan_fine
-from pipeline.planning.interlaced import lines_between, merged_ms
-from pipeline.planning.prices import prices_of
+from pipeline.planning.interlaced import lines_between, merged_ms, most_within
 from pipeline.planning.uniform_scans import MIOU, ScanPerformance, format_scan, longest_exposure
 
 LEAST_GAIN = 1e-3  # of mIoU that later lines are expected to add; for less none are captured
@@ -56,17 +55,11 @@ class LaterPasses:
         return sorted({*tried, *([] if last is None else [last])})
 
     def _most_gain(self, gain: Scores, step: int, exposure_ms: float) -> float:
-        """Return what rows of patches along the lines could gain at most in the seconds left, were runs free."""
-        grid, along_x = self.grid, self.plan.along == "x"
-        lines = grid.patch * (1 / step - (1 / self._apart if self.interlaces else 0.0))
-        price = lines * prices_of(replace(self.camera, exposure_ms=exposure_ms), self.cost).even_line_s
-        centres = np.array(sorted({sweep.swath_px for sweep in self.plan.coarse}))
-        row, column = np.divmod(np.arange(len(gain)), grid.patch_shape[1])
-        across, down = (column, row) if along_x else (row, column)
-        middle = (across + 0.5) * grid.patch - field_px(grid, self.plan.along)[0] / 2
-        swath = np.abs(middle[:, None] - centres).argmin(axis=1)
-        rows = np.bincount(swath * (int(down.max()) + 1) + down, np.maximum(gain, 0.0))
-        return float(np.sort(rows)[::-1][: int(self.plan.fine_s / price)].sum())
+        """Return what lines of a distance and an exposure could gain at most in the seconds left."""
+        field = self.grid, self.plan.coarse, self.camera, self.cost
+        return most_within(
+            self.plan.fine_s, gain, *field, step=step, exposure_ms=exposure_ms, interlaced=self.interlaces
+        )
 
     def within(
         self, gain: Scores, *, step: int = 1, exposure_ms: float | None = None, own_swaths: bool = True

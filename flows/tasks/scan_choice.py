@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from flows.settings.survey_settings import ALWAYS, AUTO, Settings
+from flows.settings.survey_settings import Settings
 from flows.settings.values import EXTENT_WHOLE, parse_goals
 from flows.tasks.capture_plan import CapturePlan, PassLayout
 from models.weights.files import Description
@@ -29,8 +29,6 @@ from pipeline.planning.uniform_scans import (
     reference_scan,
     uniform_scans,
 )
-
-ZOOM_LOSS = 0.003  # of mIoU that a first pass may cost where all of the field turns out to pay
 
 
 @dataclass(frozen=True)
@@ -116,27 +114,19 @@ def lay_out_passes(
 ) -> tuple[PassLayout, CapturePlan, Settings, tuple[str, ...]]:
     """Lay out the uniform scan that was chosen, or a first pass; the settings that ask for just these, and notes.
 
-    A first pass is taken where it is asked for, or where the record says that it costs next to nothing. Where neither
-    settings nor a record decide, every line is captured. Raises what `PassLayout.plan` does.
+    Where neither settings nor a record decide, every line is captured. Raises what `PassLayout.plan` does.
     """
     chosen, content = scans.chosen, weights.record.get("scans")
-    record = None if content is None else ScanPerformance.read(content, settings.sky.fraction_of_clear)
-    first, seconds = None, settings.seconds
     if settings.zooms:
         layout = replace(layout, first_step=settings.scan_step or FIRST_STEP, step=None)
-        if record is not None and seconds is not None and settings.coarse_exposure_ms is None:
-            first = choose_first_pass(layout, record, seconds)
-    elif chosen is not None and record is not None and _may_zoom(layout, settings):
-        seconds = seconds or chosen.seconds
-        first = choose_first_pass(layout, record, seconds)
-        if first is not None and first.expected < chosen.expected[MIOU] - ZOOM_LOSS:
-            first = None
-    if first is not None:
-        settings = replace(settings, zoom=ALWAYS, seconds=seconds, coarse_exposure_ms=first.exposure_ms)
-        layout = replace(layout, step=None, first_step=first.step, coarse_exposure_ms=first.exposure_ms)
-    if settings.zooms:
+        if content is not None and settings.seconds is not None and settings.coarse_exposure_ms is None:
+            record = ScanPerformance.read(content, settings.sky.fraction_of_clear)
+            first = choose_first_pass(layout, record, settings.seconds)
+            if first is not None:
+                layout = replace(layout, first_step=first.step, coarse_exposure_ms=first.exposure_ms)
+                settings = replace(settings, coarse_exposure_ms=first.exposure_ms)
         settings = replace(settings, scan_step=None if settings.budget is not None else layout.first_step)
-        return layout, layout.plan(settings.budget, seconds), settings, ()
+        return layout, layout.plan(settings.budget, settings.seconds), settings, ()
     if chosen is not None and layout.step is None:
         layout = replace(layout, step=chosen.step, exposure_ms=chosen.exposure_ms)
     settings = replace(settings, scan_step=layout.step, scan_exposure_ms=layout.exposure_ms)
@@ -145,13 +135,6 @@ def lay_out_passes(
     every = layout.uniform(1)
     note = "every line is captured: the weights have no record of scans by which fewer would be chosen"
     return every, every.plan(None), replace(settings, scan_step=1), (note,)
-
-
-def _may_zoom(layout: PassLayout, settings: Settings) -> bool:
-    """Return whether nothing that was asked for needs a uniform scan."""
-    asked = settings.bytes_raw is not None or settings.goal is not None or settings.policy != "gain"
-    whole = layout.extent == EXTENT_WHOLE and layout.step is None
-    return settings.zoom == AUTO and whole and not asked and not layout.as_taken
 
 
 @dataclass(frozen=True)
@@ -166,7 +149,7 @@ class FirstPass:
 def choose_first_pass(layout: PassLayout, record: ScanPerformance, seconds: float) -> FirstPass | None:
     """Choose the lines of a first pass that ends in time; None where none does.
 
-    Any field is served so: one of which every place pays is scanned as a uniform scan, whose lines come in two turns.
+    Any field is served so: one of which every place pays is scanned as by a uniform scan, whose lines come in turns.
     Of those that are nearly as good for that the closest lines are taken, and of these the longest exposure.
     """
     camera, cost, full = layout.camera, layout.cost, layout.sweeps()[2]

@@ -8,7 +8,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-from pipeline.geometry.scan import Sweep
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import CostModel, Sweep
+from pipeline.planning.coverage import field_px
+from pipeline.planning.prices import prices_of
 
 FIRST_STEP = 4  # full scan's positions from line to line of the first pass
 FIRST_STEPS = (4, 8)  # that may be chosen
@@ -66,3 +73,31 @@ def _filling(run: Sweep, coarse: Sweep, step: int, exposure_ms: float | None) ->
         name = f"{run.name}-{apart // 2}"
         yield replace(run, name=name, start_px=start, lines=spaces, step=apart, held=1, exposure_ms=exposure_ms)
         apart, spaces = apart // 2, 2 * spaces
+
+
+def most_within(
+    seconds: float,
+    values: NDArray[np.floating],
+    grid: SceneGrid,
+    first_pass: Sequence[Sweep],
+    camera: LineCamera,
+    cost: CostModel,
+    *,
+    step: int,
+    exposure_ms: float,
+    interlaced: bool = True,
+) -> float:
+    """Return how much of (patch,) values rows of patches along the lines show at most, were runs of lines free.
+
+    The rows are filled up to lines ``step`` px apart in so many ``seconds``; set-ups are left out.
+    """
+    along, apart = first_pass[0].along, first_pass[0].step
+    lines = grid.patch * (1 / step - (1 / apart if interlaced else 0.0))
+    price = lines * prices_of(replace(camera, exposure_ms=exposure_ms), cost).even_line_s
+    row, column = np.divmod(np.arange(len(values)), grid.patch_shape[1])
+    across, down = (column, row) if along == "x" else (row, column)
+    middle = (across + 0.5) * grid.patch - field_px(grid, along)[0] / 2
+    centres = np.array(sorted({sweep.swath_px for sweep in first_pass}))
+    swath = np.abs(middle[:, None] - centres).argmin(axis=1)
+    rows = np.bincount(swath * (int(down.max()) + 1) + down, np.maximum(values, 0.0))
+    return float(np.sort(rows)[::-1][: int(seconds / price)].sum())

@@ -105,11 +105,17 @@ def interlaced_paths(paths: Sequence[SweepPath], camera: LineCamera, grid: Pixel
     """
     placed, swaths = list[Placed](), dict[tuple[str, float], list[SweepPath]]()
     for one in paths:
-        sweep = one.lines.sweep
-        if sweep.held == 1:
-            swaths.setdefault((sweep.along, sweep.swath_px), []).append(one)
-        if sweep.held != 1 or sweep.kind == "coarse":
+        if one.lines.sweep.kind == "coarse":
             placed.append(one.placed(camera, grid))
+            if one.lines.sweep.held == 1:
+                swaths[one.lines.sweep.along, one.lines.sweep.swath_px] = [one]
+    for one in paths:
+        if one.lines.sweep.kind != "coarse":
+            same = swaths.get((one.lines.sweep.along, one.lines.sweep.swath_px))
+            if same is None:  # a swath of its own
+                placed.append(one.placed(camera, grid))
+            else:
+                same.append(one)
     for same in swaths.values():
         placed += _runs(same, camera, grid)
     return placed
