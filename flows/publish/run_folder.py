@@ -223,7 +223,8 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
     if accuracy is not None and accuracy["miou"] is not None:
         where = " on a scene of the training" if "training_scene" in receipt else ""
         notes.append(f"mIoU {100 * accuracy['miou']:.1f} %{where}")
-    sweeps = [cube for ref in products.signals for cube in open_signal_cubes(ref.path) if cube.sweep.kind == "coarse"]
+    cubes = [cube for ref in products.signals for cube in open_signal_cubes(ref.path)]  # of a raster none
+    sweeps = [cube for cube in cubes if run.plan.plain or cube.sweep.kind == "coarse"]  # of a first pass alone
     strips = sorted(sweeps, key=lambda cube: cube.sweep.swath_px)  # as they lie there
     return QuicklookData(
         survey=run.name,

@@ -92,10 +92,11 @@ class LaterPasses:
                 swaths=swaths or None,
             )
             sweeps = lines_between(found.sweeps, first_pass, step=step, exposure_ms=exposure_ms)
-            if self.recorded is not None:
-                sweeps = self.recorded.fine_pass(sweeps)
             seconds = self.cost.seconds(sweeps, self.camera)
             if seconds <= plan.fine_s:
+                if self.recorded is not None:  # of its lines, those that there are
+                    sweeps = self.recorded.fine_pass(sweeps)
+                    seconds = self.cost.seconds(sweeps, self.camera)
                 return replace(found, sweeps=sweeps, seconds=seconds)
             budget_s *= 0.98 * plan.fine_s / seconds
         assert found is not None

@@ -366,7 +366,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     name, found = settings.name or Path(scene.name).stem, None
     if planning:  # what a look would be, were there one
         settings = replace(settings, skip_below_error=None)
-    if settings.extent == EXTENT_PART or settings.zoom == "auto":  # it says where to look
+    if settings.extent == EXTENT_PART:  # what is remembered says where to look: nothing else is asked for so early
         archive = open_archive(settings.out) if archive is None and is_archive(settings.out) else archive
         found = (None, ()) if archive is None else find_prior(archive, settings, name, grid, described.class_names)
     passes = None if recorded is None else recorded.passes

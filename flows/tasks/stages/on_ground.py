@@ -25,18 +25,9 @@ GROUND = Product("ground", version=4, files=(STORE,))
 
 @stage("ground", "map on the ground", GROUND)
 def ground(
-    class_map: StageRef,
-    mosaic: StageRef,
-    *,
-    ground_grid: GroundGrid,
-    map_choice: MapChoice,
-    factor: int,
-    report: Report,
+    class_map: StageRef, mosaic: StageRef, *, ground_grid: GroundGrid, map_choice: MapChoice, report: Report
 ) -> Wanted:
-    """Draw the class map, its memory and the coarse picture on the ground, by the settings' pose.
-
-    ``factor`` is how many fine px a pixel of the mosaic has a side.
-    """
+    """Draw the class map, its memory and the coarse picture on the ground, by the settings' pose."""
     grid = ground_grid
 
     def build(path: Path) -> None:
@@ -44,7 +35,7 @@ def ground(
         found = load_class_map(class_map.path / "class_map.zarr")
         probabilities, colours = (
             ProbabilityStore(class_map.path / "class_probabilities.zarr"),
-            coarse_colours(mosaic, factor),
+            coarse_colours(mosaic, None),
         )
         unsure, age_days = np.isnan(found.confidence), probabilities.age()
         fractions, old_class = probabilities.changed(), probabilities.old_class()  # none of a first look
@@ -56,7 +47,7 @@ def ground(
             """
             confidence = image_at(found.confidence[..., None], pixels)[..., 0]
             confidence[nearest_at(unsure, pixels, False)] = np.nan  # of the class unknown, whatever lies beside it
-            picture = np.nan_to_num(np.rint(image_at(colours, pixels, factor=factor))).astype(np.uint8)
+            picture = np.nan_to_num(np.rint(image_at(colours, pixels, factor=1))).astype(np.uint8)
             images: dict[str, NDArray[np.generic]] = {
                 "classes": nearest_at(found.classes, pixels, UNLABELLED),
                 "confidence": confidence,
@@ -83,7 +74,6 @@ def ground(
         "map": asdict(map_choice),
         "ifov_rad": grid.frame.view.ifov_rad,
         "scene_shape": grid.scene_shape,
-        "factor": factor,
     }
     return Wanted(build, params, [class_map, mosaic])
 

@@ -148,7 +148,7 @@ def test_a_flipped_bit_is_named_and_written_again(bucket: str, survey_png: Surve
     ended = command_line("verify", bucket, "--json")
     (problem,) = json.loads(ended.out)["problems"]
     assert ended.code == 1
-    assert problem["problem"].endswith("(its SHA-256 differs) (mosaic.zarr/scores: all of it)")
+    assert "(its SHA-256 differs) (mosaic.zarr/scores: " in problem["problem"]
     repaired = command_line("verify", bucket, "--repair", "--json")
     assert repaired.code == 0
     assert json.loads(repaired.out)["repair"]["remade"] == [problem["uri"]]

@@ -21,7 +21,7 @@ from pipeline.geometry.scan import Sweep
 from pipeline.planning.coverage import full_sweeps, reach_px
 from pipeline.planning.interlaced import every_nth
 from pipeline.simulator.effects.pointing import PointingErrors
-from storage.arrays.mosaics import chosen_patches, open_mosaic
+from storage.arrays.mosaics import open_mosaic
 from tests.flows.conftest import FEW_BANDS
 from tests.prior_work import without_effects
 
@@ -72,7 +72,7 @@ def test_what_the_mirror_missed_is_told_and_detail_still_helps(surveyed: tuple[d
     detail = open_mosaic(archive / receipt["products"]["detail"])
     kinds, number = detail.captures() or ([], np.zeros(detail.shape))
     unseen = patch_pixels(SceneGrid(*detail.shape, 16, 1), np.array([step == 4 for _, step, _ in kinds])[number])
-    unseen = unseen[chosen_patches(archive / receipt["products"]["attention"])]
+    unseen = unseen[json.loads((archive / receipt["products"]["plan"]).read_text())["patch_index"]]
     assert receipt["pointing"]["fine"]["partly_seen"] == np.count_nonzero(unseen.any(axis=(1, 2)))
     rows = dict(finding_rows(surveyed[0]))
     assert all("put right by up to" in rows[f"pointing, {name}"] for name in ("coarse", "fine"))

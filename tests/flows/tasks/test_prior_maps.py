@@ -231,15 +231,6 @@ def test_a_reader_in_the_weights_is_used(visited: Path, survey_png: Survey, weig
         survey_png(visited, **flags)
 
 
-def test_a_survey_in_two_passes_remembers_where_it_did_not_look(survey_png: Survey, tmp_path: Path) -> None:
-    """Patches without fine lines keep their memory, and grow older."""
-    out, two = tmp_path / "archive", {**UNIFORM, "scan_step": None, "budget": "0.75", "prior": "latest"}
-    survey_png(out, **two, visit=FIRST)
-    later = survey_png(out, **two, visit=LATER)
-    probabilities = xr.open_zarr(out / later.receipt["products"]["class_probabilities"], consolidated=False)
-    assert set(np.unique(probabilities.age.values).tolist()) == {0.0, 3.0}
-
-
 def moved(folder: Path) -> list[dict[str, Any]]:
     """Flags of one field twice, the second time 12 px lower and 20 px further left."""
     values, _ = patchy_scene((160, 192), 3, seed=5)

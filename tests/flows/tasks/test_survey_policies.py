@@ -51,7 +51,7 @@ def test_every_policy_scores_the_field(archive: Path, policy: str) -> None:
     attention = load_attention(ref.path / "attention.zarr")
     assert attention.policy == policy
     assert np.isfinite(attention.score).all()
-    assert 0 < (attention.rank >= 0).sum() < attention.rank.size
+    assert 0 < (attention.rank >= 0).sum() <= attention.rank.size
     runs = [replace(run, settings=replace(run.settings, seed=seed)) for seed in (1, 2)]
     keys = {score.key(score.wants(one, mosaic)) for one in runs}
     assert len(keys) == (2 if policy == "random" else 1)
