@@ -79,11 +79,11 @@ REFUSED = {
         r"class 'class_0', .* table \[classes\] of the scene.toml beside the scene's file: soil = 0$",
     ),
     "budget -1": (2, "--budget -1", "above 0 and at most 1, got '-1'"),
-    "budget below the coarse pass": (2, "--budget 0.1", "the coarse pass alone takes.* least possible is 0.39"),
+    "budget below the coarse pass": (2, "--budget 0.1", "the coarse pass alone takes.* least possible is 0.3892"),
     "scene smaller than a patch": (
         2,
         "--scene tiny.png --budget 0.5",
-        "the coarse pass alone takes.* least possible is 0.92",
+        "the coarse pass alone takes.* least possible is 0.8246",
     ),
     "weights corrupt": (1, "--weights corrupt.safetensors", "corrupt.safetensors is not a readable safetensors file"),
     "weights missing": (1, "--weights none.safetensors", "no weights at none.safetensors; train some"),
@@ -216,7 +216,7 @@ def test_interrupted_survey_says_how_to_go_on(
 
 
 TRAINING = {
-    "scenes of files": (2, "scene.png -o new.safetensors --scenes 3", "--scenes is for the built-in farm"),
+    "scenes of files": (2, "scene.png -o new.safetensors --scenes 3", "--scenes is for built-in scenes"),
     "-o is a folder": (2, "scene.png -o archive --labels labels.png", "archive is a folder, expected a file"),
     "no patch": (2, "scene.png -o new.safetensors --patch 0", "--patch must be above 0, got 0"),
     "sizes do not fit": (
