@@ -28,7 +28,7 @@ from flows.terminal.progress import put_out, table
 from pipeline.errors import ArchiveError, SceneError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import deferred
-from pipeline.simulator.scenes.farm.farm_scene import is_farm_key
+from pipeline.simulator.scenes.built_in import is_built_in_key
 from storage.archive.archive import Archive
 from storage.archive.keys import in_text
 from storage.archive.lineage import ABSENT, Catalogue, find_product, flatten
@@ -112,8 +112,8 @@ def _is_same_field(old: Run, new: Run) -> bool:
 
 def _field_key(run: Run) -> str:
     """Return what names the land: not the bands, nor the day and hour at which a farm was looked at."""
-    key = str(run.receipt.get("scene", run.uri)).split("/bands=")[0].split("/only=")[0]
-    if not is_farm_key(key):
+    key = str(run.receipt.get("scene", run.uri)).split("/light=")[0].split("/bands=")[0].split("/only=")[0]
+    if not is_built_in_key(key):
         return key
     return "/".join(part for part in key.split("/") if not part.startswith(("day=", "hour=")))
 

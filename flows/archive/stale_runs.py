@@ -15,7 +15,8 @@ from flows.tasks.open_survey import STAGES, versions
 from flows.tasks.survey_model import weights_path
 from models.weights.files import describe_weights
 from pipeline.errors import PipelineError, SettingsError, WeightsError
-from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, USUAL_DAY, USUAL_HOUR
+from pipeline.simulator.scenes.built_in import LAWS
+from pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
 from storage.archive.keys import canonical_json
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run, Store
@@ -26,7 +27,7 @@ OF_THE_SURVEY = ("labels", "weights", "memory", "accuracy", "prior")  # settings
 # what the light of a field depends on; surveys that agree in these are generations of one
 OF_THE_LIGHT = (
     *("scene", "bands", "wavelengths", "source", "seed", "effects", "size"),
-    *("day", "hour", "camera", "pointing_px", "pose", "visit", "sweeps", "pointing", "dark", "white"),
+    *("day", "hour", "interest", "camera", "pointing_px", "pose", "visit", "sweeps", "pointing", "dark", "white"),
 )
 
 
@@ -108,11 +109,13 @@ def _is_there(settings: Settings) -> bool:
 
 
 def _light_of(run: Run) -> dict[str, Any]:
-    """Return the settings that the light of a run depends on, with the farm by one name and its usual moment."""
+    """Return the settings that the light of a run depends on, a built-in scene by one name and its usual moment."""
     light = {key: run.settings.get(key) for key in OF_THE_LIGHT}
+    sky = run.settings.get("sky")
+    light["sky"] = [sky.get("light", "clear"), sky.get("light_fraction")] if isinstance(sky, dict) else ["clear", None]
     if light["scene"] in BUILT_IN_SCENES:
         usual = {"day": USUAL_DAY, "hour": USUAL_HOUR}
-        light |= {"scene": FARM_LAW} | {key: value for key, value in usual.items() if light[key] is None}
+        light |= {"scene": LAWS[light["scene"]]} | {key: value for key, value in usual.items() if light[key] is None}
     return light
 
 

@@ -93,7 +93,7 @@ def train(
     mask_classes: str | None = None,
     as_json: AsJson = False,
 ) -> int:
-    """Train weights on DATASET: `farm` (`farm@2`), a folder of labelled scenes, or one scene file.
+    """Train weights on DATASET: `farm`, `scouting`, a folder of labelled scenes, or one scene file.
 
     The state of the run is kept beside the weights, in OUT.checkpoint: the same command goes on where it was stopped.
     `spectralzoom evaluate` then says how good the weights are on scenes that they were not trained on.
@@ -101,13 +101,14 @@ def train(
     Parameters
     ----------
     dataset
-        `farm` (`farm@2`), a folder of images with their labels (`init` writes a scene.toml for it), or a file.
+        `farm` (`farm@2`), `scouting` (`scouting@1`), both with a comma between them, a folder of images with their
+        labels (`init` writes a scene.toml for it), or a file.
     out
         File of weights to write (.safetensors).
     hold_out
         Names of scenes never to be trained on, with commas: 059,060. The split is kept in the weights.
     validation
-        How many scenes to keep from training, for the figures at its end; by default 3 of the farm, one in eight of a
+        How many scenes to keep from training, for the figures at its end; by default 3 of a built-in scene, one in eight of a
         folder, 4 at most.
     seed
         Of all that is drawn by chance: first weights, crops, noise.
@@ -116,7 +117,7 @@ def train(
     minutes
         The longest that the steps may take; looking at the scenes before and validating after come on top.
     scenes
-        How many scenes of the built-in farm, on days from April to October; 48 by default.
+        How many built-in scenes, on days from April to October (`scouting`: May to July); 48 by default.
     patch
         Size of a patch [px]; by default 16 for the farm, 8 to 32 for files, by their size.
     width
@@ -238,7 +239,7 @@ def evaluate(
     Parameters
     ----------
     dataset
-        `farm` (`farm@2`), a folder of labelled scenes, or one scene file; with RUN, an archive.
+        `farm`, `scouting`, a folder of labelled scenes, or one scene file; with RUN, an archive.
     run
         A run of the archive: its name, `latest` or `previous`. `evaluate archive/runs/NAME` is the same.
     weights
@@ -255,7 +256,7 @@ def evaluate(
     frames
         Names of the frames to judge on, with commas; all by default.
     scenes
-        How many scenes of the built-in farm; 4 by default.
+        How many built-in scenes; 4 by default.
     seed
         Of noise, random placements and the bootstrap.
     draws

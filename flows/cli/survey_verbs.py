@@ -28,8 +28,10 @@ else:
 
 OF_ZONES = ("area", "no_go", "plots", "plots_name")
 # flags of what a settings file has in a table
-IN_TABLES = {"exposure_ms": "camera.exposure_ms", **{name: f"zones.{name}" for name in OF_ZONES}}
-_DECLARED = SURVEY | {name: TABLES[place.partition(".")[0]][name] for name, place in IN_TABLES.items()}
+IN_TABLES = {"exposure_ms": "camera.exposure_ms", "sky": "sky.light", "light_fraction": "sky.light_fraction"}
+IN_TABLES |= {name: f"zones.{name}" for name in OF_ZONES}
+_IN_TABLES = {name: place.partition(".") for name, place in IN_TABLES.items()}
+_DECLARED = SURVEY | {name: TABLES[table][key] for name, (table, _, key) in _IN_TABLES.items()}
 
 
 def _flags(names: Iterable[str]) -> Any:
@@ -43,8 +45,8 @@ def _flags(names: Iterable[str]) -> Any:
     return make_dataclass("Flags", given, frozen=True, kw_only=True)
 
 
-_RENDERING = ("effects", "seed", "day", "hour", "bands", "wavelengths")
-_Every: Any = _flags(name for name in _DECLARED if name not in TABLES)
+_RENDERING = ("effects", "seed", "day", "hour", "interest", "sky", "light_fraction", "bands", "wavelengths")
+_Every: Any = _flags(name for name in _DECLARED if name not in TABLES or name in IN_TABLES)
 _OfRendering: Any = _flags(_RENDERING)
 _OfSimulation: Any = _flags((*_RENDERING, "tol", "size", "exposure_ms", "workers"))
 
@@ -111,8 +113,8 @@ def simulate(
     Parameters
     ----------
     scene
-        `farm` (built in; `farm@2`), or an image or cube file: PNG, JPEG, BMP, GeoTIFF, .npy, .npz, .mat,
-        ENVI, Zarr.
+        `farm` or `scouting` (built in; `farm@2`, `scouting@1`), or an image or cube file: PNG, JPEG, BMP, GeoTIFF,
+        .npy, .npz, .mat, ENVI, Zarr.
     out
         Archive for the raw cubes: a folder, or s3://bucket/prefix.
     coarse

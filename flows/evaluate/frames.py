@@ -28,7 +28,7 @@ from models.weights.files import Description, Weights, describe_weights
 from pipeline.errors import EmptySceneError, PipelineError, SceneError, SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
-from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
+from pipeline.simulator.scenes.built_in import built_in_laws
 from pipeline.simulator.scenes.scene import RasterScene
 
 FRACTIONS = (0.05, 0.10, 0.15, 0.20, 0.35)
@@ -166,13 +166,13 @@ def open_frames(
     dataset: str, frames: tuple[str, ...], scenes: int | None, camera: LineCamera, choices: dict[str, Any]
 ) -> TrainingData:
     """Name the frames to judge on, in ``train``. SettingsError: choices of other data, SceneError: no such frame."""
-    built_in = dataset in FARM_NAMES
+    built_in = bool(built_in_laws(dataset))
     data = open_training_data(dataset, 0, 1 if built_in else scenes, camera, **choices)
     if built_in:
         count = FARM_TEST_SCENES if scenes is None else scenes
         if count < 1:
             raise SettingsError(f"--scenes must be at least 1, got {count}")
-        data = farm_test_data(count, camera)
+        data = farm_test_data(count, camera, dataset)
     unknown = [name for name in frames if name not in data.train]
     if unknown:
         raise SceneError(f"{dataset} has no frame {', '.join(unknown)}; it has {', '.join(data.train)}")

@@ -225,7 +225,8 @@ def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
     rows = range(0, store.shape[0], STRIP_ROWS)
     strips = (store.read(slice(top, min(top + STRIP_ROWS, store.shape[0])))[0] for top in rows)
     counts = expected_counts(strips, len(names))
-    score = run.map_scores.expected(counts, step, settings.scan_exposure_ms or run.camera.exposure_ms)
+    exposure_ms = (settings.scan_exposure_ms or run.camera.exposure_ms) * run.scene.light_fraction
+    score = run.map_scores.expected(counts, step, exposure_ms)
     if score is None or not np.isfinite(score.miou):
         return None
     if score.error > MOST_ERROR:

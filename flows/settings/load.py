@@ -40,7 +40,7 @@ from flows.settings.values import EXTENT_PART, EXTENT_WHOLE, parse_moment, parse
 from pipeline.errors import BudgetError, PoseError, SettingsError
 from pipeline.rig.device_settings import MOST_PAIRS
 from pipeline.setting_fields import format_number, span_of
-from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW
+from pipeline.simulator.scenes.farm.scouting import SCOUTING_NAMES
 from storage.archive.staging import read_toml
 from storage.readers.recordings import find_recorded_run
 
@@ -144,10 +144,12 @@ OF_THE_RUN = (
     "resampling",
     "pointing_px",
     "seed",
+    "sky",
     "weights",
     "unknown",
 )
 BUILT_IN_WEIGHTS = "farm"
+FLAGS = {"sky.light": "sky"}  # of settings in tables whose flag has another name
 
 
 def usual_of_recording(table: Mapping[str, object]) -> dict[str, Any]:
@@ -380,9 +382,12 @@ def _scene_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str
     for name, value in {"day": settings.day, "hour": settings.hour}.items():
         if value is not None and scene not in BUILT_IN_SCENES:
             yield (
-                f"{place_of(name, origin.get(name))} = {value:g} is for the scene {FARM_LAW}, whose fields grow; "
-                f"{scene} is as it is: leave it out"
+                f"{place_of(name, origin.get(name))} = {value:g} is for built-in scenes, whose crops grow; {scene}"
+                " is as it is: leave it out"
             )
+    if settings.interest is not None and scene not in SCOUTING_NAMES:
+        place = place_of("interest", origin.get("interest"))
+        yield f"{place} = {settings.interest:g} is for the scene scouting, and the scene is {scene}: leave it out"
     if settings.zones.plots_name is not None and settings.zones.plots is None:
         place = place_of("zones.plots_name", origin.get("zones.plots_name"))
         yield f"{place} = {settings.zones.plots_name!r} names plots, and there are none: give --plots FILE too"
@@ -478,5 +483,5 @@ def _sparing_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[s
 def place_of(key: str, origin: str | None) -> str:
     """Return how a message names a setting: as a flag (without the table that holds it), or in its file."""
     if origin == "flag":
-        return "--" + key.rpartition(".")[2].replace("_", "-")
+        return "--" + FLAGS.get(key, key.rpartition(".")[2]).replace("_", "-")
     return f"'{key}'" + (f" in {origin}" if origin else "")

@@ -46,10 +46,10 @@ from pipeline.rectify.kernels import Kernel
 from pipeline.rig.device_settings import SurveyRig
 from pipeline.setting_fields import stated
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
-from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES, FARM_SHAPE, USUAL_DAY, USUAL_HOUR
+from pipeline.simulator.scenes.built_in import BUILT_IN_SCENES
+from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, USUAL_DAY, USUAL_HOUR
 from storage.parallel.pool import WorkerPool
 
-BUILT_IN_SCENES = FARM_NAMES
 USUAL_SIZE = f"{FARM_SHAPE[1]}x{FARM_SHAPE[0]}"
 RIG_FIELD = "field"  # the scene of which only the rig, or a recording, knows more than size and bands
 OF_THE_MACHINE = ("scheduler", "workers", "device")  # what of that day need not be there today
@@ -178,9 +178,9 @@ class Settings:
     )
     scene: SceneName = stated(
         "farm",
-        "`farm` (built in; `farm@2`), or a file: PNG, JPEG, BMP, GeoTIFF, .npy, .npz, .mat, ENVI, Zarr; as source "
-        "raster also a folder or a glob of georeferenced tiles; a pattern that each visit fills in, "
-        "{date:%Y-%m-%d}.tif or {new}.tif (the newest that was not surveyed)",
+        "`farm` or `scouting` (built in; `farm@2`, `scouting@1`), or a file: PNG, JPEG, BMP, GeoTIFF, .npy, .npz,"
+        " .mat, ENVI, Zarr; as source raster also a folder or a glob of georeferenced tiles; a pattern that each visit"
+        " fills in, {date:%Y-%m-%d}.tif or {new}.tif (the newest that was not surveyed)",
     )
     labels: str | None = stated(
         None, "Class colours or numbers on the scene's pixels; accuracy is reported then", example="labels.png"
@@ -191,7 +191,7 @@ class Settings:
         "auto",
         "Where pixels come from: sim (the simulated rig looks at the scene), rig (the one that the table [rig] names), "
         "raster (the file is a map already: its pixels are taken as they are), recorded (the sweeps of --sweeps); auto "
-        "is recorded where there are sweeps, raster for files, sim for `farm`, rig for the scene `field`",
+        "is recorded where there are sweeps, raster for files, sim for built-in scenes, rig for the scene `field`",
     )
     sweeps: str | None = stated(
         None,
@@ -301,7 +301,7 @@ class Settings:
         "Pixels unlike all that the weights were trained on get the class unknown: auto (where the weights know "
         "what is familiar to them, at 0.1%), off, or the fraction of known pixels that may be called unknown: 0.5%",
     )
-    seed: int = stated(0, "Seed of the scene `farm` and of all noise", "", 0, 2**63 - 1)
+    seed: int = stated(0, "Seed of a built-in scene and of all noise", "", 0, 2**63 - 1)
     effects: Effects = stated(
         "auto",
         "Effects of the simulated rig: auto (those that change a number by more than tol), all, none, or names with "
@@ -341,13 +341,32 @@ class Settings:
         0.0, "How far off the mirror may point; above 0 sweeps overlap, seams are registered", "px", 0, 300
     )
     size: Size | None = stated(
-        None, f"Size of the scene `farm`, width x height; {USUAL_SIZE} by default", "px", example=USUAL_SIZE
+        None, f"Size of a built-in scene, width x height; {USUAL_SIZE} by default", "px", example=USUAL_SIZE
     )
     day: int | None = stated(
-        None, f"Day of the year, for `farm`; {USUAL_DAY} by default, the 21st of June", "", 1, 366, example=USUAL_DAY
+        None,
+        f"Day of the year, for built-in scenes; {USUAL_DAY} by default, the 21st of June",
+        "",
+        1,
+        366,
+        example=USUAL_DAY,
     )
     hour: float | None = stated(
-        None, f"True solar time, for `farm`; {USUAL_HOUR:g} by default, noon is 12", "h", 0, 24, example=USUAL_HOUR
+        None,
+        f"True solar time, for built-in scenes; {USUAL_HOUR:g} by default, noon is 12",
+        "h",
+        0,
+        24,
+        example=USUAL_HOUR,
+    )
+    interest: float | None = stated(
+        None,
+        "Share of the scene `scouting` in patches of weeds, bare ground, poor growth or lodging; 0.02 to 0.1 by the"
+        " seed by default",
+        "",
+        0,
+        1,
+        example=0.0625,
     )
     camera: LineCamera = table("The line camera.", LineCamera)
     optics: Optics = table(

@@ -79,6 +79,7 @@ def choose_extent(
     prior: Prior,
     weights: Description,
     path: Path,
+    light_fraction: float,
     *,
     seconds: float,
     max_age: float | None,
@@ -105,7 +106,8 @@ def choose_extent(
     due = np.zeros(len(expected_errors.age_days), np.bool_)
     if max_age is not None:  # older than allowed if this visit did not look, nor the next as long after it
         due = np.asarray(expected_errors.age_days + prior.days > max_age)
-    wanted = ExtentGains(ScanPerformance.read(content), weights.class_names, expected_errors, there & due, there)
+    record = ScanPerformance.read(content, light_fraction)
+    wanted = ExtentGains(record, weights.class_names, expected_errors, there & due, there)
     if skip_below_error is not None and expected_errors.expected_wrong() < skip_below_error and not wanted.due.any():
         raise NothingToMend(
             prior.run,
@@ -132,7 +134,7 @@ def _best_extent(layout: PassLayout, wanted: ExtentGains, seconds: float) -> tup
     found: list[tuple[int, float, PartialScan]] = []
     least: list[float] = []
     enough = float(record.scores[MIOU].max()) - POORER
-    shortest, longest = record.exposures_ms[0], min(camera.exposure_ms, record.exposures_ms[-1])
+    shortest, longest = record.offered_ms(camera)
     for step in record.steps:
         rows = PatchRows.of(layout.uniform(step).sweeps()[1], layout.grid, camera)
         for exposure_ms in exposures_between(shortest, longest):

@@ -270,11 +270,13 @@ class SurveyRun(CaptureRun):
     def captures(self) -> tuple[LineSpec, LineSpec]:
         """How the pixels of the overview were captured, and those that are read in full."""
         settings, usual = self.settings, self.camera.exposure_ms
+        light = self.scene.light_fraction
         if self.plan.plain:
-            scan = LineSpec((settings.scan_exposure_ms or usual) / DEFAULT_EXPOSURE_MS, settings.scan_step or 1)
+            scan = LineSpec((settings.scan_exposure_ms or usual) * light / DEFAULT_EXPOSURE_MS, settings.scan_step or 1)
             return scan, scan
-        coarse = LineSpec((settings.coarse_exposure_ms or usual) / DEFAULT_EXPOSURE_MS, self.factor, self.factor)
-        return coarse, LineSpec(usual / DEFAULT_EXPOSURE_MS)
+        coarse_ms = settings.coarse_exposure_ms or usual
+        coarse = LineSpec(coarse_ms * light / DEFAULT_EXPOSURE_MS, self.factor, self.factor)
+        return coarse, LineSpec(usual * light / DEFAULT_EXPOSURE_MS)
 
     @property
     def capture(self) -> LineSpec:
@@ -450,7 +452,8 @@ def _plan_capture(
     if is_part and prior is not None:
         assert settings.seconds is not None  # checked with the settings
         limits = {"max_age": settings.max_age, "skip_below_error": settings.skip_below_error}
-        layout, extent, words = choose_extent(layout, prior, described, path, seconds=settings.seconds, **limits)
+        light = settings.sky.fraction_of_clear
+        layout, extent, words = choose_extent(layout, prior, described, path, light, seconds=settings.seconds, **limits)
         extent_notes = (words,)
     scans = choose_uniform_scan(layout, described, path, bands, settings)
     layout, plan, settings, plan_notes = lay_out_passes(layout, scans.chosen, settings)
@@ -468,6 +471,7 @@ def _scene_for(
     pixels = None
     if recorded is not None:
         scene, notes = recorded.scene()
+        scene = scene.in_light(settings.sky.fraction_of_clear)
     elif settings.is_map:
         pixels, scene, notes = open_map(settings, model.described.class_names)
     else:

@@ -75,7 +75,7 @@ def choose_uniform_scan(
                 "kept for validation"
             )
         return ScanChoice()
-    record = ScanPerformance.read(content)
+    record = ScanPerformance.read(content, settings.sky.fraction_of_clear)
     goals = {} if settings.goal is None else parse_goals(settings.goal)
     for name in goals:
         if name not in record.scores:

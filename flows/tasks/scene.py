@@ -22,7 +22,8 @@ from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import Once
 from pipeline.simulator.effects.effect import Effect
 from pipeline.simulator.rig_model import Sky
-from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, farm_scene
+from pipeline.simulator.scenes.built_in import built_in_scene
+from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Source
@@ -97,6 +98,12 @@ def check_scene_there(scene: str, *, is_map: bool) -> None:
 
 
 def open_scene(settings: Settings, known: Sequence[str] | None = None) -> tuple[RasterScene, tuple[str, ...]]:
+    """Open the scene in the light of the settings' sky; arguments, notes and errors are those of `_in_clear_light`."""
+    scene, notes = _in_clear_light(settings, known)
+    return scene.in_light(settings.sky.fraction_of_clear), notes
+
+
+def _in_clear_light(settings: Settings, known: Sequence[str] | None) -> tuple[RasterScene, tuple[str, ...]]:
     """Open the scene, say what was assumed; SceneError, WavelengthError: its file, SettingsError: not for a farm.
 
     Labels that no setting names, but that lie beside the scene, count where their classes are among the ``known`` ones.
@@ -108,7 +115,9 @@ def open_scene(settings: Settings, known: Sequence[str] | None = None) -> tuple[
             if value is not None:
                 raise SettingsError(f"--{name} is for scene files; the scene '{settings.scene}' brings its own")
         shape = settings.shape or FARM_SHAPE
-        farm = farm_scene(settings.seed, shape, camera=settings.camera, day=settings.day, hour=settings.hour)
+        more: dict[str, Any] = {} if settings.interest is None else {"interest": settings.interest}
+        moment = {"day": settings.day, "hour": settings.hour}
+        farm = built_in_scene(settings.scene, settings.seed, shape, camera=settings.camera, **moment, **more)
         return farm if settings.bands is None else _some_bands(farm, settings.bands), _notes_of_moment(
             settings.sky, settings.moment
         )
@@ -284,10 +293,10 @@ def seen_in_training(scene: RasterScene, weights: Description) -> str | None:
     Files are identified by what they hold, whatever their names and whatever bands are read of them.
     """
     split = weights.record.get("split", {})
-    if scene.key in split.get("pixels", {}):
+    if scene.clear_key in split.get("pixels", {}):
         return "other pixels"
     tiles = [one in split.get("content", ()) for one in scene.content]
-    if scene.key in split.get("train", {}).values() or (tiles and all(tiles)):
+    if scene.clear_key in split.get("train", {}).values() or (tiles and all(tiles)):
         return "all"
     return "tiles" if any(tiles) else None
 
@@ -299,7 +308,7 @@ def judged_labels(scene: RasterScene, weights: Description) -> NDArray[np.uint8]
     order = np.full(256, UNLABELLED, np.uint8)
     order[: len(scene.class_names)] = [weights.class_names.index(name) for name in scene.class_names]
     labels = order[scene.labels]
-    trained = weights.record.get("split", {}).get("pixels", {}).get(scene.key)
+    trained = weights.record.get("split", {}).get("pixels", {}).get(scene.clear_key)
     if trained is not None:
         labels[unpack_mask(trained, scene.shape)] = UNLABELLED
     return labels

@@ -119,9 +119,10 @@ def beyond_training(
         found += _season(settings.moment, trained, now=settings.source == "rig")
         usual, least = settings.camera.exposure_ms, trained.exposure_ms[0]
         one, other = settings.scan_exposure_ms or usual, settings.coarse_exposure_ms or usual
-        shortest = one if settings.plain else min(usual, other)
+        shortest = (one if settings.plain else min(usual, other)) * scene.light_fraction
         if shortest < DARKER * least and not settings.is_map:  # a raster has no exposures
-            found.append(f"lines of {shortest:g} ms (it saw {least:g} ms and more)")
+            under = "" if scene.light_fraction == 1 else " under a clear sky, by their light"
+            found.append(f"lines of {shortest:g} ms{under} (it saw {least:g} ms and more)")
         pixel_m, known_m = None, trained.ground_pixel_m
         if settings.scene in BUILT_IN_SCENES:
             pixel_m = FARM_PIXEL_M  # as it is drawn, wherever the rig is said to stand

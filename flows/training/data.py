@@ -15,7 +15,9 @@ from flows.terminal.figures import counted
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, FARM_NAMES, farm_scene
+from pipeline.simulator.scenes.built_in import built_in_laws, built_in_scene
+from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW
+from pipeline.simulator.scenes.farm.scouting import SCOUTING_LAW
 from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
 from storage.readers.datasets import DataSet, load_data_set
 from storage.readers.scene_files import SceneFile
@@ -25,7 +27,9 @@ FARM_SHAPE = (512, 640)  # of a training scene [px]
 FARM_TRAIN_SEED, FARM_VALIDATION_SEED = 100_000, 200_000  # surveys are shown on small seeds
 FARM_TEST_SEED = 300_000  # of farm scenes to judge on: neither trained on, nor validated on, nor shown
 SEASON_DAYS = (96, 304)  # of training scenes: April to October
+SCOUTED_DAYS = (136, 200)  # of scouted fields: every crop stands
 SEASON_HOURS = (9, 15)  # true solar time
+_SCOUTED = "scouting-"  # begins the names of scouted fields
 _GOLDEN, _SILVER = 0.6180339887, 0.4142135624  # steps round a circle that no number of points comes back on
 Report = Callable[[str, float, str], None]  # what is done, how far 0..1, a figure
 
@@ -46,7 +50,8 @@ class TrainingData:
         """Make one scene. Raises SceneError: its file; EmptySceneError: it has no value anywhere."""
         if self.files is None:
             seed, day, hour = read_farm_name(name)
-            return farm_scene(seed, FARM_SHAPE, camera=self.camera, day=day, hour=hour)
+            law = SCOUTING_LAW if name.startswith(_SCOUTED) else FARM_LAW
+            return built_in_scene(law, seed, FARM_SHAPE, camera=self.camera, day=day, hour=hour)
         return scene_of_file(self.files.load(name, "train"), self.camera)
 
 
@@ -67,18 +72,33 @@ def scene_of_file(file: SceneFile, camera: LineCamera) -> RasterScene:
     return replace(scene, regridded=file.regridded, content=file.content, pixel_m=file.pixel_m)
 
 
-def farm_test_data(scenes: int, camera: LineCamera) -> TrainingData:
-    """Scenes of the farm to judge weights on, all of them in ``train``."""
-    return TrainingData(FARM_LAW, farm_days(FARM_TEST_SEED, scenes, odd=True), (), (), camera)
+def farm_test_data(scenes: int, camera: LineCamera, dataset: str = FARM_LAW) -> TrainingData:
+    """Scenes of the built-in data to judge weights on, all of them in ``train``."""
+    laws = built_in_laws(dataset)
+    return TrainingData(",".join(laws), _built_in_days(laws, FARM_TEST_SEED, scenes, odd=True), (), (), camera)
 
 
-def farm_days(first_seed: int, count: int, *, odd: bool = False) -> tuple[str, ...]:
+def _built_in_days(laws: tuple[str, ...], first_seed: int, count: int, *, odd: bool = False) -> tuple[str, ...]:
+    """Name so many scenes, of each law in turn."""
+    names: list[str] = []
+    for number, law in enumerate(laws):
+        own = len(range(number, count, len(laws)))
+        if law == FARM_LAW:
+            names += farm_days(first_seed, own, odd=odd)
+        else:
+            names += [_SCOUTED + name for name in farm_days(first_seed, own, odd=odd, season=SCOUTED_DAYS)]
+    return tuple(names)
+
+
+def farm_days(
+    first_seed: int, count: int, *, odd: bool = False, season: tuple[int, int] = SEASON_DAYS
+) -> tuple[str, ...]:
     """Name scenes of the farm: seeds one after the other, a day of the season and an hour to each.
 
     Days go round the season by the golden section, so that any number of scenes covers it evenly. Weights learn on even
     days and are judged on odd ones.
     """
-    (first, last), (morning, evening) = SEASON_DAYS, SEASON_HOURS
+    (first, last), (morning, evening) = season, SEASON_HOURS
     names = []
     for i in range(count):
         day = first + 2 * int((0.5 + i * _GOLDEN) % 1 * ((last - first) // 2)) + odd
@@ -89,7 +109,7 @@ def farm_days(first_seed: int, count: int, *, odd: bool = False) -> tuple[str, .
 
 def read_farm_name(name: str) -> tuple[int, int, float]:
     """Seed, day and hour of a name that `farm_days` gave."""
-    seed, _, day, _, hour = name.split("-")
+    seed, _, day, _, hour = name.removeprefix(_SCOUTED).split("-")
     return int(seed), int(day), float(hour)
 
 
@@ -123,23 +143,23 @@ def _labelled_names(files: DataSet) -> tuple[str, ...]:
 def open_training_data(
     dataset: str, validation: int | None, scenes: int | None, camera: LineCamera, **choices: object
 ) -> TrainingData:
-    """Name the data: a built-in farm, or a path with the choices of `load_data_set`.
+    """Name the data: built-in scenes with commas between them, or a path with the choices of `load_data_set`.
 
     Without a number, one scene in eight (4 at most) goes to validation; a data set of one scene has none. Raises
     SettingsError: a choice that is for files was made for a farm, or the other way round.
     """
-    if dataset in FARM_NAMES:
+    if laws := built_in_laws(dataset):
         for choice, value in choices.items():
             if value not in (None, ()):
                 flag = "--" + choice.replace("_", "-")
-                raise SettingsError(
-                    f"{flag} is for scene files; the farm's scenes are drawn by seed and bring their own"
-                )
-        train = farm_days(FARM_TRAIN_SEED, FARM_SCENES if scenes is None else scenes)
-        kept = farm_days(FARM_VALIDATION_SEED, FARM_VALIDATION if validation is None else validation, odd=True)
-        return TrainingData(FARM_LAW, train, kept, (), camera)
+                raise SettingsError(f"{flag} is for scene files; built-in scenes are drawn by seed and bring their own")
+        train = _built_in_days(laws, FARM_TRAIN_SEED, FARM_SCENES if scenes is None else scenes)
+        left = FARM_VALIDATION * len(laws) if validation is None else validation
+        return TrainingData(
+            ",".join(laws), train, _built_in_days(laws, FARM_VALIDATION_SEED, left, odd=True), (), camera
+        )
     if scenes is not None:
-        raise SettingsError(f"--scenes is for the built-in farms; {dataset} has its own scenes")
+        raise SettingsError(f"--scenes is for built-in scenes; {dataset} has its own scenes")
     files = load_data_set(Path(dataset), **choices)  # type: ignore[arg-type]
     fraction = min(4, len(_labelled_names(files)) // 8)
     return file_data(files, fraction if validation is None else validation, camera)

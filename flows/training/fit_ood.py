@@ -30,7 +30,8 @@ from models.weights.parts import MAP_SCORES, TrainedOn
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES, FARM_PIXEL_M
+from pipeline.simulator.scenes.built_in import built_in_laws
+from pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
 from pipeline.simulator.scenes.farm.land import sun_over_farm
 
 
@@ -147,7 +148,7 @@ def _data_of(weights: Weights, request: OodRequest) -> TrainingData:
     """The scenes of the weights' training. Raises SettingsError: the data set is another."""
     split = weights.record.get("split") or {}
     own = [name for name in split.get("train", {}) if ": " not in name]  # others are those of what they began from
-    scenes = len(own) if request.dataset in FARM_NAMES else None
+    scenes = len(own) if built_in_laws(request.dataset) else None
     camera = LineCamera(**weights.record.get("camera", {}))
     held_out = {} if scenes else {"hold_out": tuple(split.get("held_out", ()))}
     data = open_training_data(

@@ -24,7 +24,7 @@ from pipeline.planning.coverage import cheapest_full
 from pipeline.rectify.region import mosaic_rows
 from pipeline.simulator.render import EFFECTS, Choice
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.farm.farm_scene import is_farm_key
+from pipeline.simulator.scenes.built_in import is_built_in_key
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.selection.choice import decide
 from pipeline.simulator.selection.survey_probe import probe_survey
@@ -56,7 +56,7 @@ def observe_scene(
     scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis, rng: np.random.Generator
 ) -> Example:
     """Look at a labelled scene on the basis, noise by ``rng``; a farm by all lines. SceneError: no labels, or a gap."""
-    if not is_farm_key(scene.key):
+    if not is_built_in_key(scene.key):
         return observe(scene, camera, grid, basis, rng)
     seed = int(rng.integers(2**31))
     if scene.labels is None:

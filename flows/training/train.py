@@ -33,7 +33,7 @@ from models.weights.checksummed_files import read_checkpoint
 from models.weights.files import CALIBRATION, CASCADE, Weights, save_weights, with_record
 from models.weights.parts import MAP_SCORES, TRAINED_ON
 from pipeline.errors import SceneError, SettingsError, ShapeError
-from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
+from pipeline.simulator.scenes.built_in import built_in_laws
 
 Split = dict[str, Any]
 FRAME_CROP, FARM_CROP = 384, 256  # px
@@ -244,7 +244,7 @@ def joined_split(split: Split, start: StartFile | None) -> Split:
 
 def usual_crop(dataset: str) -> int:
     """Size of the crops to train on [px]."""
-    return FARM_CROP if dataset in FARM_NAMES else FRAME_CROP
+    return FARM_CROP if built_in_laws(dataset) else FRAME_CROP
 
 
 def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
@@ -301,7 +301,7 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
         console.print(record["familiar"], markup=False, soft_wrap=True)
     figures = record["validation"]
     if figures is None:
-        left = request.dataset in FARM_NAMES or request.hold_out or request.choices.get("train_mask") is not None
+        left = built_in_laws(request.dataset) or request.hold_out or request.choices.get("train_mask") is not None
         on = request.dataset if left else "OTHER_SCENES"
         console.print(
             "no scene was kept for validation; to judge the weights on scenes that they were not trained on: "

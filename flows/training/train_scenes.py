@@ -29,7 +29,7 @@ from models.training.train import TrainingSettings
 from pipeline.errors import EmptySceneError, SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
+from pipeline.simulator.scenes.built_in import built_in_laws
 from pipeline.simulator.scenes.scene import RasterScene
 
 
@@ -133,7 +133,7 @@ def _common(request: TrainRequest, scene: RasterScene) -> About:
         notes = alike_notes({scene.name: scene.class_names[0]})
         raise SceneError(f"{request.dataset}: training needs two or more classes, and {notes[0]}")
     basis = SpectralBasis.spanning(scene.wavelength_nm, request.columns)
-    patch = request.patch or suggested_patch(scene.shape, built_in=request.dataset in FARM_NAMES)
+    patch = request.patch or suggested_patch(scene.shape, built_in=bool(built_in_laws(request.dataset)))
     about = About(basis, scene.class_names, scene.class_colours, patch, scene.wavelength_nm)
     network_config(request, about)  # refuses sizes that do not fit before the first look
     return about

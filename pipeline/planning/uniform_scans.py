@@ -58,23 +58,33 @@ class ScanPerformance:
     scores: Mapping[str, NDArray[np.float64]]  # by the goals' names, (step, exposure) 0..1
     scenes: int
     spread: NDArray[np.float64] | None = None  # of mIoU, (step, exposure), from scene to scene
+    light_fraction: float = 1.0  # in which these are the exposures, over a clear sky's, in which scenes were scanned
 
     @staticmethod
-    def read(content: Mapping[str, Any]) -> ScanPerformance:
-        """Take the table from a record of weights, in whatever order its exposures are."""
+    def read(content: Mapping[str, Any], light_fraction: float = 1.0) -> ScanPerformance:
+        """Take the table from a record of weights, in whatever order its exposures are.
+
+        In a fraction of a clear sky's light an exposure scores what the record has of one shorter by that fraction.
+        """
         order = np.argsort(content["exposures_ms"])
         tables = {MIOU: content["miou"], **content["per_class_iou"]}
         return ScanPerformance(
             tuple(content["steps"]),
-            tuple(float(content["exposures_ms"][i]) for i in order),
+            tuple(float(content["exposures_ms"][i]) / light_fraction for i in order),
             {name: np.asarray(table, np.float64)[:, order] for name, table in tables.items()},
             int(content["scenes"]),
             None if content.get("spread") is None else np.asarray(content["spread"], np.float64)[:, order],
+            light_fraction,
         )
 
+    def offered_ms(self, camera: LineCamera) -> tuple[float, float]:
+        """Return the shortest and the longest exposure to choose from; the camera's own is for a clear sky."""
+        return self.exposures_ms[0], min(camera.exposure_ms / self.light_fraction, self.exposures_ms[-1])
+
     def knows(self, exposure_ms: float) -> bool:
-        """Whether an exposure lies within the record."""
-        return self.exposures_ms[0] <= exposure_ms <= self.exposures_ms[-1]
+        """Whether an exposure, rounded as those that are offered, lies within the record."""
+        rounding = 0.5 * 10**-_DIGITS
+        return self.exposures_ms[0] - rounding <= exposure_ms <= self.exposures_ms[-1] + rounding
 
     def expected(self, step: int, exposure_ms: float) -> dict[str, float]:
         """Scores of a scan of a step and exposure within the record."""
@@ -114,14 +124,14 @@ def uniform_scans(
     seconds: float | None = None,
     exposures_ms: Sequence[float] | None = None,
 ) -> list[UniformScan]:
-    """Price scans of every step of a record and many exposures, no longer than the camera's own.
+    """Price scans of every step of a record and many exposures, none that takes more light than the camera's own.
 
     ``sweeps`` cover the field, by those steps of the record that can be taken, whatever their exposure. With
     ``seconds`` the longest exposure of each step that ends in time is among the scans. Where ``exposures_ms`` are
     given, no others are tried than those of them that the record knows.
     """
     found = []
-    shortest, longest = record.exposures_ms[0], min(camera.exposure_ms, record.exposures_ms[-1])
+    shortest, longest = record.offered_ms(camera)
     for step in sweeps:
         tried = exposures_between(shortest, longest)
         if exposures_ms is not None:

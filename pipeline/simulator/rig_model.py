@@ -17,6 +17,9 @@ from pipeline.setting_fields import assumed, check_stated, stated
 
 Coating = Literal["aluminium", "gold", "silver", "ideal"]  # ideal: reflects everything, at any angle
 Relief = Literal["flat", "step", "plane"]
+Cover = Literal["clear", "overcast"]
+LIGHT_UNDER: dict[Cover, float] = {"clear": 1.0, "overcast": 1 / 8}  # thick stratus passes 10 to 20 % (assumed)
+OF_THE_SCENE = ("light", "light_fraction")  # of a sky: the scene's electrons and its key have them
 LEAST_DISTANCE_M = 1e-3
 
 
@@ -108,8 +111,22 @@ class Sky:
     cloud_fraction: float = assumed(0.0, "Fraction of the light that a cloud takes; 0 is a clear sky", "", 0.0, 1.0)
     cloud_px_per_s: float = assumed(20.0, "Speed of the shadow's edge over the scene", "px/s", 0.0, 1e6)
     cloud_size_px: float = assumed(600.0, "Size of the clouds' shadows", "px", 1.0, 1e9)
+    light: Cover = stated("clear", "Cover of clouds: under an overcast sky exposures gather an eighth of the light")
+    light_fraction: float | None = stated(
+        None,
+        "Light on the field over that of a clear sky; by default 1 under a clear sky, 0.125 under an overcast one",
+        "",
+        0.01,
+        1.0,
+        example=0.2,
+    )
     brdf_per_rad: float = assumed(0.1, "Change of reflectance with the view angle", "1/rad", 0.0, 5.0)
     hot_spot: float = assumed(0.0, "Brightening where the view looks along the sun's rays", "", 0.0, 2.0)
+
+    @property
+    def fraction_of_clear(self) -> float:
+        """Return the light on the field over that of a clear sky."""
+        return LIGHT_UNDER[self.light] if self.light_fraction is None else self.light_fraction
 
 
 @dataclass(frozen=True)

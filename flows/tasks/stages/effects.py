@@ -21,7 +21,7 @@ from pipeline.simulator.effects.effect import Effect, Radiance, SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.effects.probe import Probe, unit_at
 from pipeline.simulator.render import BY_NAME, EFFECTS, expected_light
-from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.rig_model import OF_THE_SCENE, Rig
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.selection.choice import TOTAL, Decision, decide, list_effects, sum_up
 from pipeline.simulator.selection.survey_probe import probe_survey
@@ -89,10 +89,16 @@ def choose_effects(
         "asked": effects,
         "tol": str(tol),
         "camera": asdict(rig.camera),
-        "rig": {name: plain_value(part) for name, part in asdict(rig).items() if name != "camera"},
+        "rig": {name: plain_value(part) for name, part in _parts(rig).items() if name != "camera"},
         "sweeps": [asdict(sweep) for sweep in planned],
     }
     return Wanted(build, params)
+
+
+def _parts(rig: Rig) -> dict[str, Any]:
+    """Return the rig as tables, without the light that the scene's key has."""
+    parts = asdict(rig)
+    return parts | {"sky": {name: value for name, value in parts["sky"].items() if name not in OF_THE_SCENE}}
 
 
 def load_manifest(effects: StageRef) -> dict[str, Any]:

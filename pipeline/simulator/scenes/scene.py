@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from threading import Lock
 from typing import TYPE_CHECKING
 
@@ -31,6 +31,7 @@ DEFAULT_EXPOSURE_MS = 100.0  # the exposure at which a scene's electrons are sta
 WELL_FRACTION = 0.6  # of the full well, filled by the bright end of a scene without a radiance law
 BRIGHT_PERCENTILE = 99.9
 LEAST_BRIGHT = 1e-30  # electrons per unit of less would end the range of float32
+_DIMMED = "/light="  # before the fraction of the light, in the key of a scene in less than full light
 
 
 class SceneRaster:
@@ -128,7 +129,8 @@ class RasterScene:
     the pixels lie on the earth, as the scene's file says (None: it does not); ``pixel_m`` is how large a pixel of a
     scene without one is on the ground, where the scene's own law says so. ``regridded`` says that the labels came on
     another grid and were brought to the scene's. ``content`` are hashes of the files that it was read from, whatever
-    bands of them are taken. Planes, labels and electrons may be made when
+    bands of them are taken. ``light_fraction`` is the light on the scene over that of a clear sky; electrons have it
+    in them, scene values do not. Planes, labels and electrons may be made when
     they are first asked for; all else is known at once.
     """
 
@@ -147,6 +149,7 @@ class RasterScene:
     pixel_m: float | None = None
     regridded: bool = False
     content: tuple[str, ...] = ()
+    light_fraction: float = 1.0
 
     def __post_init__(self) -> None:
         if self.light.is_made():
@@ -172,6 +175,27 @@ class RasterScene:
     def shape(self) -> tuple[int, int]:
         """(y, x) size [px]."""
         return self.raster.shape[:2]
+
+    def in_light(self, fraction: float) -> RasterScene:
+        """Return the same scene in a fraction of the light that it is in now.
+
+        Scene and white reference give less electrons, by the same factor; scene values stay.
+        """
+        if fraction == 1:
+            return self
+
+        def light() -> SceneRadiance:
+            return SceneRadiance(
+                self.electrons * np.float32(fraction), self.white_reference_electrons * np.float32(fraction)
+            )
+
+        whole = self.light_fraction * fraction
+        return replace(self, key=f"{self.clear_key}{_DIMMED}{whole:g}", light=Once(light), light_fraction=whole)
+
+    @property
+    def clear_key(self) -> str:
+        """Return the key of the same scene under a clear sky."""
+        return self.key.partition(_DIMMED)[0]
 
     @property
     def electrons(self) -> NDArray[np.float32]:

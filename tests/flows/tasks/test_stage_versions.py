@@ -31,7 +31,8 @@ from tests.flows.tasks.stage_closure import Sources, Target, read_packages  # no
 
 VERSIONS = {**versions(), ingest_command.STAGE: ingest_command.VERSION}
 RECORD = Path(__file__).with_name("stage_digests.json")
-LIGHT = ("farm_scene", "raster_from_values", "make_source")  # who looks at what: runs bring it, no stage names it
+# who looks at what: runs bring it, no stage names it
+LIGHT = ("farm_scene", "scouting_scene", "raster_from_values", "make_source")
 BESIDES = {"effects": LIGHT, "capture": (*LIGHT, "field_source"), "evaluate": ("judged_labels",)}
 ROOTS = {ingest_command.STAGE: ("run_ingest",)}
 for _one in STAGES.values():

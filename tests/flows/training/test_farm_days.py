@@ -58,7 +58,7 @@ def test_two_days_of_a_field_are_one_land() -> None:
 @pytest.mark.parametrize(
     ("table", "words"),
     [
-        ({"scene": "field.png", "hour": 9.5}, "'hour' = 9.5 is for the scene farm@2"),
+        ({"scene": "field.png", "hour": 9.5}, "'hour' = 9.5 is for built-in scenes, whose crops grow; field.png"),
         ({"scene": FARM_LAW, "day": 0}, "'day' must be a whole number from 1 to 366, got 0"),
         ({"scene": FARM_LAW, "hour": 25}, "'hour' must be a number from 0 to 24 h"),
     ],
@@ -133,6 +133,21 @@ def test_training_days_cover_the_season() -> None:
     assert data.law == FARM_LAW
     assert [read_farm_name(name)[0] for name in farm_days(7, 2)] == [7, 8]
     assert read_farm_name("100003-day-168-hour-14") == (100_003, 168, 14.0)
+
+
+def test_training_mixes_built_in_scenes() -> None:
+    """Named with commas, each law has its part of the scenes, on days when crops stand, and test scenes of its own."""
+    data = open_training_data("farm@2, scouting", None, 7, LineCamera())
+    assert data.law == "farm@2,scouting@1"
+    scouted = [name for name in data.train if name.startswith("scouting-")]
+    assert (len(data.train), len(scouted), len(data.validation)) == (7, 3, 6)
+    assert data.train[:4] == open_training_data("farm", None, 4, LineCamera()).train
+    assert all(136 <= read_farm_name(name)[1] <= 201 for name in scouted)
+    assert [data.scene(name).name for name in (data.train[0], scouted[0])] == ["farm", "scouting"]
+    alone = open_training_data("scouting@1", 0, 3, LineCamera())
+    assert alone.train == tuple(scouted)
+    judged = farm_test_data(2, LineCamera(), "scouting").train
+    assert not {read_farm_name(name)[0] for name in judged} & {read_farm_name(name)[0] for name in scouted}
 
 
 def test_training_sees_the_farm_through_the_rig() -> None:

@@ -31,15 +31,14 @@ from pipeline.planning.uniform_scans import (
 
 CAMERA, COST, GRID = LineCamera(), CostModel(), SceneGrid(256, 320, 16, 4)
 SWEEPS = {step: uniform_sweeps(GRID, CAMERA, "x", step=step) for step in (1, 2, 4)}
-RECORD = ScanPerformance.read(
-    {
-        "scenes": 3,
-        "steps": [1, 2, 4],
-        "exposures_ms": [100.0, 25.0, 6.25],
-        "miou": [[0.94, 0.93, 0.89], [0.92, 0.91, 0.85], [0.83, 0.81, 0.74]],
-        "per_class_iou": {"weed": [[0.8, 0.7, 0.6], [0.7, 0.65, 0.5], [0.5, 0.4, 0.3]]},
-    }
-)
+CONTENT = {
+    "scenes": 3,
+    "steps": [1, 2, 4],
+    "exposures_ms": [100.0, 25.0, 6.25],
+    "miou": [[0.94, 0.93, 0.89], [0.92, 0.91, 0.85], [0.83, 0.81, 0.74]],
+    "per_class_iou": {"weed": [[0.8, 0.7, 0.6], [0.7, 0.65, 0.5], [0.5, 0.4, 0.3]]},
+}
+RECORD = ScanPerformance.read(CONTENT)
 
 
 def _scan(step: int, exposure_ms: float, camera: LineCamera = CAMERA) -> UniformScan:
@@ -65,6 +64,22 @@ def test_a_record_is_read_between_its_exposures_by_their_logarithm() -> None:
     assert RECORD.expected(2, 25.0) == pytest.approx({MIOU: 0.91, "weed": 0.65})
     assert RECORD.expected(1, 12.5) == pytest.approx({MIOU: 0.91, "weed": 0.65})
     assert RECORD.expected(1, 400.0) == RECORD.expected(1, 100.0)
+
+
+@pytest.mark.parametrize("light", [0.125, 0.2, 0.7])
+def test_in_less_light_longer_exposures_score_the_same(light: float) -> None:
+    """An exposure counts by its light; those offered range up to the camera's own light, and each is known."""
+    dim = ScanPerformance.read(CONTENT, light)
+    assert dim.expected(2, 25.0 / light) == pytest.approx(RECORD.expected(2, 25.0))
+    assert dim.offered_ms(CAMERA) == pytest.approx((6.25 / light, 100 / light))
+    assert dim.offered_ms(replace(CAMERA, exposure_ms=50.0))[1] == pytest.approx(50 / light)
+    scans = uniform_scans(dim, SWEEPS, CAMERA, COST, 270)
+    assert max(scan.exposure_ms for scan in scans) == pytest.approx(100 / light, abs=0.1)
+    assert all(dim.knows(scan.exposure_ms) for scan in scans)
+    for seconds in (10.0, 20.0):
+        clear, dim_scan = (choose_scan(some, ScanLimits(seconds)) for some in (SCANS, scans))
+        assert dim_scan.expected[MIOU] <= clear.expected[MIOU]
+        assert (dim_scan.step, dim_scan.exposure_ms) > (clear.step, clear.exposure_ms)
 
 
 @given(seconds=st.floats(0.1, 60.0))

@@ -248,32 +248,47 @@ class FarmPlan:
         return tuple(name for name in MATERIALS if name in there)
 
 
+def check_land(seed: int, shape: tuple[int, int]) -> None:
+    """Refuse a negative seed and an empty shape (SceneError)."""
+    if seed < 0 or min(shape) < 1:
+        raise SceneError(f"the farm needs a seed >= 0 and a shape of at least 1 x 1 px, got seed {seed}, shape {shape}")
+
+
 def farm_plan(seed: int, shape: tuple[int, int] = (1024, 1280), *, day: int = 172, hour: float = 11.0) -> FarmPlan:
     """Plan the farm: no pixel is drawn.
 
     Raises SceneError: a negative seed, an empty shape, a day that is not 1 to 366, or the sun below 5 degrees.
     """
-    if seed < 0 or min(shape) < 1:
-        raise SceneError(f"the farm needs a seed >= 0 and a shape of at least 1 x 1 px, got seed {seed}, shape {shape}")
+    check_land(seed, shape)
     sun = sun_over_farm(day, hour)
-    size = (max(shape[0] + 80, 640), max(shape[1] + 80, 640))
+    size = land_size(shape)
     parcels, borders = divide_land(stream(seed, "land"), size, PARCEL_AREA_PX)
     uses = allot(stream(seed, "use"), [visible_area(parcel, shape) for parcel in parcels], USE_FRACTIONS)
     kinds = allot(stream(seed, "borders"), [border.length for border in borders], BORDER_FRACTIONS)
     fields = tuple(
-        _plan_field(stream(seed, f"field {number}"), parcel, use)
+        plan_field(stream(seed, f"field {number}"), parcel, use)
         for number, (parcel, use) in enumerate(zip(parcels, uses, strict=True))
     )
     return FarmPlan(seed, shape, day, hour, sun, fields, tuple(zip(borders, kinds, strict=True)))
 
 
-def _plan_field(rng: np.random.Generator, parcel: Parcel, use: str) -> FieldPlan:
+def land_size(shape: tuple[int, int]) -> tuple[int, int]:
+    """Return the size of the land about a scene: 80 px more each way, and at least 640 (y, x) [px]."""
+    return max(shape[0] + 80, 640), max(shape[1] + 80, 640)
+
+
+def draw_tramlines(rng: np.random.Generator) -> Tramlines:
+    """Draw the wheel marks of a field."""
+    return Tramlines(rng.uniform(130, 180), rng.uniform(14, 17), rng.uniform(2.2, 3.2), rng.uniform(0, 180))
+
+
+def plan_field(rng: np.random.Generator, parcel: Parcel, use: str) -> FieldPlan:
     """Draw how a field is kept. Rows run along its longest side, up to 3 degrees off."""
     crop = CROPS.get(use)
     sides = np.roll(parcel.corners, -1, axis=0) - parcel.corners
     dy, dx = sides[np.hypot(sides[:, 0], sides[:, 1]).argmax()]
     period = rng.uniform(*(_ROWS_ELSEWHERE[use] if crop is None else crop.row_px))
-    trams = Tramlines(rng.uniform(130, 180), rng.uniform(14, 17), rng.uniform(2.2, 3.2), rng.uniform(0, 180))
+    trams = draw_tramlines(rng)
     tram_chance = {"soil": 0.3}.get(use, 0.0) if crop is None else crop.tram_chance
     return FieldPlan(
         parcel=parcel,

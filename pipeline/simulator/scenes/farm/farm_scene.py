@@ -22,6 +22,8 @@ crop that hardly covers the soil is soil. Edges are mixed by the fraction of the
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -53,7 +55,7 @@ from pipeline.simulator.scenes.farm.land import (
     stream,
 )
 from pipeline.simulator.scenes.farm.spectra import WHITE_REFERENCE_REFLECTANCE, band_centres, spectral_library
-from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
+from pipeline.simulator.scenes.scene import Drawn, RasterScene, SceneRadiance, SceneRaster
 
 # A law is what a seed is drawn by; it stands first in a scene's key, and one that is out there never changes.
 FARM_LAW = "farm@2"
@@ -66,11 +68,6 @@ WIDTHS = {"margin": (2.0, 4.5), "hedge": (4.5, 6.5), "ditch": (1.3, 2.2), "road"
 BANKS = {"margin": (0.0, 0.0), "hedge": (0.0, 0.0), "ditch": (2.5, 4.5), "road": (1.0, 2.5)}
 BARE_CROWN = 0.62  # cover of a crown without leaves
 SHADOW = 0.78  # of the ground under a crown's shadow that no direct sun reaches
-
-
-def is_farm_key(key: str) -> bool:
-    """Return whether a scene's key is of a farm."""
-    return key.partition("/")[0] == FARM_LAW
 
 
 def farm_scene(
@@ -92,20 +89,30 @@ def farm_scene(
     Raises SceneError: a negative seed, an empty shape, no such day, the sun below 5 degrees; WavelengthError: one band.
     """
     plan = farm_plan(seed, shape, day=USUAL_DAY if day is None else day, hour=USUAL_HOUR if hour is None else hour)
-    seen_by, size = camera or LineCamera(), f"{shape[0]}x{shape[1]}"
+    return planned_scene("farm", FARM_LAW, plan, bands, camera or LineCamera(), lambda: _draw(plan))
+
+
+def planned_scene(
+    name: str, law: str, plan: FarmPlan, bands: int, camera: LineCamera, draw: Callable[[], Drawn], more: str = ""
+) -> RasterScene:
+    """Give the scene of a plan, in the farm's materials and classes; ``more`` stands in its key behind the hour.
+
+    Raises WavelengthError: one band.
+    """
+    shape = plan.shape
     wavelength, fwhm = band_centres(bands)
 
     def light() -> SceneRadiance:
         library = spectral_library(bands, plan.materials)
-        return SceneRadiance(library.electrons(seen_by), library.white_reference_electrons(seen_by))
+        return SceneRadiance(library.electrons(camera), library.white_reference_electrons(camera))
 
     return RasterScene(
-        name="farm",
+        name=name,
         key=(
-            f"{FARM_LAW}/seed={seed}/day={plan.day}/shape={size}/hour={plan.hour:g}/bands={bands}"
-            f"/full_well={seen_by.full_scale_e:g}"
+            f"{law}/seed={plan.seed}/day={plan.day}/shape={shape[0]}x{shape[1]}/hour={plan.hour:g}{more}/bands={bands}"
+            f"/full_well={camera.full_scale_e:g}"
         ),
-        raster=SceneRaster((*shape, len(plan.materials)), labelled=True, draw=lambda: _draw(plan)),
+        raster=SceneRaster((*shape, len(plan.materials)), labelled=True, draw=draw),
         light=Once(light),
         white_reference=np.full(bands, WHITE_REFERENCE_REFLECTANCE, np.float32),
         wavelength_nm=wavelength,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from statistics import NormalDist
 from typing import NamedTuple
@@ -65,12 +66,11 @@ class Content(NamedTuple):
     fractions: Mixture
 
 
-def paint_fields(work: Painting) -> None:
-    """Draw every field."""
+def paint_fields(work: Painting, lodging: Field | None = None) -> None:
+    """Draw every field; ``lodging`` (y, x), of sd about 1, is highest where plants lie first, by default anywhere."""
     plan = work.plan
     standing = any(one.lodging > 0 and one.land_on(plan.day).phase == "crop" for one in plan.fields)
-    lodging = None  # a random field (y, x) whose highest parts lie first
-    if lodged_fraction(plan.day) > 0 and standing:
+    if lodging is None and lodged_fraction(plan.day) > 0 and standing:
         lodging = smooth_noise(stream(plan.seed, "lodging"), plan.shape, LODGED_PATCH_PX)
     for number, field in enumerate(plan.fields):
         index, cover, centres = parcel_pixels(field.parcel, plan.shape)
@@ -275,13 +275,17 @@ def _scatter(first: NDArray[np.int64], second: NDArray[np.int64], salt: int) -> 
 
 
 def plant_weeds(work: Painting) -> None:
-    """Draw the weeds of every field, each a disc of one spectrum."""
+    """Draw the weeds of every field."""
     grown: dict[str, list[NDArray[np.float64]]] = {}
     for number, field in enumerate(work.plan.fields):
         for name, plants in field_weeds(stream(work.plan.seed, f"weeds {number}"), field, work.plan.day).items():
             grown.setdefault(name, []).append(plants)
-    for name, parts in sorted(grown.items()):
-        plants = np.concatenate(parts)
+    draw_weeds(work, {name: np.concatenate(parts) for name, parts in grown.items()})
+
+
+def draw_weeds(work: Painting, grown: Mapping[str, Points]) -> None:
+    """Draw plants, each a disc of one spectrum: y, x and radius (n, 3) by spectrum."""
+    for name, plants in sorted(grown.items()):
         index, cover, _ = disc_pixels(plants[:, :2], plants[:, 2], work.plan.shape)
         work.canvas.over(index, 0.92 * cover, {name: np.ones_like(cover)}, "weed")
 

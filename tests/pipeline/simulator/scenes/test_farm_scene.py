@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError, WavelengthError
 from pipeline.geometry.camera import LineCamera
+from pipeline.simulator.scenes.built_in import is_built_in_key
 from pipeline.simulator.scenes.farm.farm_plan import CLASS_COLOURS, CLASSES, farm_plan
-from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, farm_scene, is_farm_key
+from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, farm_scene
 from pipeline.simulator.scenes.farm.spectra import MATERIALS
 from pipeline.simulator.scenes.scene import RasterScene
 
@@ -120,11 +121,11 @@ def test_planes_are_the_plans_materials() -> None:
     assert farm_scene(0, bands=3, day=225).electrons.shape == (len(plan.materials), 3)
 
 
-def test_a_key_tells_a_farm() -> None:
+def test_a_key_tells_a_built_in_scene() -> None:
     """By the law that it begins with; a file's tells none."""
     assert FARM_LAW == "farm@2"
-    assert is_farm_key(farm_scene(0, (8, 8)).key)
-    assert not is_farm_key("3f2a")
+    assert is_built_in_key(farm_scene(0, (8, 8)).key)
+    assert not is_built_in_key("3f2a")
 
 
 @pytest.mark.parametrize(
