@@ -108,8 +108,8 @@ def train(
     hold_out
         Names of scenes never to be trained on, with commas: 059,060. The split is kept in the weights.
     validation
-        How many scenes to keep from training, for the figures at its end; by default 3 of a built-in scene, one in eight of a
-        folder, 4 at most.
+        How many scenes to keep from training, for the figures at its end; by default 3 of a built-in scene, one in
+        eight of a folder, 4 at most.
     seed
         Of all that is drawn by chance: first weights, crops, noise.
     steps

@@ -46,10 +46,11 @@ from pipeline.rectify.kernels import Kernel
 from pipeline.rig.device_settings import SurveyRig
 from pipeline.setting_fields import stated
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
-from pipeline.simulator.scenes.built_in import BUILT_IN_SCENES
+from pipeline.simulator.scenes.built_in import BUILT_IN_NAMES
 from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, USUAL_DAY, USUAL_HOUR
 from storage.parallel.pool import WorkerPool
 
+BUILT_IN_SCENES = BUILT_IN_NAMES
 USUAL_SIZE = f"{FARM_SHAPE[1]}x{FARM_SHAPE[0]}"
 RIG_FIELD = "field"  # the scene of which only the rig, or a recording, knows more than size and bands
 OF_THE_MACHINE = ("scheduler", "workers", "device")  # what of that day need not be there today

@@ -83,7 +83,7 @@ class ScanPerformance:
 
     def knows(self, exposure_ms: float) -> bool:
         """Whether an exposure, rounded as those that are offered, lies within the record."""
-        rounding = 0.5 * 10**-_DIGITS
+        rounding = 0.5 * 10.0**-_DIGITS
         return self.exposures_ms[0] - rounding <= exposure_ms <= self.exposures_ms[-1] + rounding
 
     def expected(self, step: int, exposure_ms: float) -> dict[str, float]:

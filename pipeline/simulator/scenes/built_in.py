@@ -8,7 +8,7 @@ from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, FARM_NAMES, farm
 from pipeline.simulator.scenes.farm.scouting import SCOUTING_LAW, SCOUTING_NAMES, scouting_scene
 from pipeline.simulator.scenes.scene import RasterScene
 
-BUILT_IN_SCENES = (*FARM_NAMES, *SCOUTING_NAMES)
+BUILT_IN_NAMES = (*FARM_NAMES, *SCOUTING_NAMES)
 LAWS = dict.fromkeys(FARM_NAMES, FARM_LAW) | dict.fromkeys(SCOUTING_NAMES, SCOUTING_LAW)  # by the names of scenes
 
 

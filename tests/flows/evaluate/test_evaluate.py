@@ -304,7 +304,7 @@ def test_the_farm_is_judged_on_seeds_of_its_own(tmp_path: Path, monkeypatch: pyt
         ({"policies": ("mask",)}, "'mask' is none that can be judged"),
         ({"draws": 0}, "--draws must be at least 1"),
         ({"seed": -1}, "--seed must be at least 0"),
-        ({"scenes": 2}, "--scenes is for the built-in farm"),
+        ({"scenes": 2}, "--scenes is for built-in scenes"),
         ({"frames": ("099",)}, "has no frame 099; it has 001, 002, 003"),
     ],
 )
