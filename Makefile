@@ -1,4 +1,4 @@
-# SpectralZoom: setup, survey, survey-rig, test, lint, docs, notebooks, bench, faults, soak, lock.
+# SpectralZoom: setup, survey, survey-rig, test, lint, docs, notebooks, bench, paper, faults, soak, lock.
 #   make survey ARCHIVE=/data/field7    make test PY=python3.12 VENV=/tmp/venv    make test PYTEST_ARGS="-x tests/pipeline"
 PY ?= python3
 VENV ?= .venv
@@ -13,7 +13,7 @@ PIP := $(BIN)/python -m pip install -q --no-compile --disable-pip-version-check 
 # The tools beneath are asked to send no analytics.
 export DO_NOT_TRACK = 1
 
-.PHONY: setup survey survey-rig test lint docs notebooks bench faults soak lock
+.PHONY: setup survey survey-rig test lint docs notebooks bench paper faults soak lock
 .DEFAULT_GOAL := setup
 
 setup: $(BIN)/.ok
@@ -60,6 +60,13 @@ notebooks: $(BIN)/.ok
 bench: $(BIN)/.ok-dev
 	OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks $(BENCH); crashed=$$?; \
 		OMP_NUM_THREADS=1 $(BIN)/spectralzoom tradeoff && exit $$crashed
+
+PAPER ?=
+
+# Ten minutes: tables II and III of the paper, and whether 35 % of the patches score as much as all of them
+# (PAPER="--data FOLDER" for images and labels of your own, PAPER="--steps 1200" for longer training).
+paper: $(BIN)/.ok-dev
+	OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/bench_paper.py $(PAPER)
 
 FAULTS ?=
 

@@ -64,6 +64,11 @@ def score_multiply_adds(policy: str, config: SegmenterConfig, grid: SceneGrid) -
     return (score.adds + score.per_class * config.classes + score.per_column * config.columns) * pixels
 
 
+def pixel_scores(policy: str, seen: CoarsePrediction) -> Pixels:
+    """Score every pixel of the padded grid by ``entropy`` or ``sobel``, (y, x)."""
+    return _PIXEL_SCORES[policy].of(seen)
+
+
 def pixel_entropy(probability: NDArray[np.floating]) -> NDArray[np.float64]:
     """Entropy over the last axis [nat]; a probability of 0 adds 0."""
     exact = probability.astype(np.float64)

@@ -1,0 +1,152 @@
+"""Scenes and weights of the paper's tables: farms at four bands and at all, and folders of frames with labels.
+
+Networks that are trained here see what the paper's camera takes: an overview of area means, and fine patches.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from measure import ROOT
+from numpy.typing import NDArray
+
+from flows.training.data import FARM_SHAPE, FARM_TRAIN_SEED, farm_days, read_farm_name, scene_of_file
+from flows.training.train_scenes import as_read
+from models.network.sizes import SegmenterConfig
+from models.network.spectral import LineSpec, SpectralBasis, with_planes
+from models.training.capture_augmentation import CaptureAugmentation, ColumnNoise
+from models.training.examples import measured_normalisation, observe
+from models.training.spectral_start import LabelledPixels, linear_discriminants
+from models.training.train import Progress, TrainingSettings, train
+from models.weights.files import Weights, load_weights, save_weights
+from pipeline.errors import SceneError, WeightsError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid, block_means
+from pipeline.lazy import Once
+from pipeline.simulator.scenes.farm.farm_scene import farm_scene
+from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance
+from storage.readers.datasets import load_data_set
+
+SIDE, INPUTS = 1024, (4, 2)  # px; fine pixels a side of a coarse one
+FARM_SEEDS, TAUGHT_FARMS = (51, 52, 53), 12
+FOUR_NM = (450.0, 550.0, 650.0, 850.0)  # near the middles of the paper's RGB and near infrared
+PATCH = 16
+CAMERA = LineCamera()
+Image = NDArray[np.float32]
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """Scenes to judge, one at a time, with the weights that read them."""
+
+    name: str
+    weights: Weights
+    scenes: Mapping[str, Callable[[], RasterScene]]
+
+
+def coarse_image(columns: Image, factor: int) -> Image:
+    """Return area means of ``factor`` x ``factor`` px, each repeated over its pixels."""
+    means, _ = block_means(columns, np.ones(columns.shape[:2], np.intp), factor)
+    return means.repeat(factor, 0).repeat(factor, 1)
+
+
+class PaperCaptures(CaptureAugmentation):
+    """Shows crops as the paper takes them: area means to the overview, fine pixels to the full network."""
+
+    def draw(self, columns: Image, noise: ColumnNoise, rng: np.random.Generator) -> tuple[Image, Image]:
+        factor, fine = int(rng.choice((1, *INPUTS))), with_planes(columns, LineSpec())
+        return with_planes(coarse_image(columns, factor), LineSpec(step=factor, binned=factor)), fine
+
+
+def trained(name: str, scenes: Mapping[str, Callable[[], RasterScene]], patch: int, steps: int, say: Say) -> Weights:
+    """Train a network of its own, or take it from the temporary folder where that was done before."""
+    key = hashlib.sha256(repr((name, sorted(scenes), patch, steps)).encode()).hexdigest()[:12]
+    path = Path(tempfile.gettempdir()) / "spectralzoom-paper" / f"{key}.safetensors"
+    try:
+        return load_weights(path)
+    except WeightsError:
+        say(f"{name}: {len(scenes)} scenes to train on, {steps} steps")
+    made = [make() for make in scenes.values()]
+    first, rng = made[0], np.random.default_rng(0)
+    basis = SpectralBasis.spanning(first.wavelength_nm)
+    seen = [observe(scene, CAMERA, SceneGrid(*scene.shape, patch, 1), basis, rng) for scene in made]
+    normalisation = measured_normalisation(seen)
+    examples = as_read(seen, normalisation)
+    config = SegmenterConfig(len(first.class_names), basis.columns, patch)
+    start = linear_discriminants(LabelledPixels.drawn(examples, rng), config.classes)
+
+    def progress(now: Progress) -> None:
+        if now.step % 50 == 0:
+            say(f"{name}: step {now.step} of {steps}, loss {now.loss:.3f}")
+
+    model, summary = train(
+        config,
+        examples,
+        normalisation.gain_shift,
+        TrainingSettings(steps=steps, minutes=1e6),
+        progress,
+        start=start,
+        augmentation=PaperCaptures(normalisation),
+    )
+    record = {"training": summary, "split": {"train": dict.fromkeys(scenes, "")}}
+    weights = Weights(model, basis, normalisation, first.class_names, first.class_colours, record)
+    path.parent.mkdir(exist_ok=True)
+    save_weights(weights, path)
+    return weights
+
+
+def with_bands(scene: RasterScene, wanted_nm: Sequence[float]) -> RasterScene:
+    """Return a scene of the bands nearest to some wavelengths alone."""
+    at = [int(np.abs(scene.wavelength_nm - one).argmin()) for one in wanted_nm]
+    light = SceneRadiance(scene.electrons[:, at], scene.white_reference_electrons[at])
+    return replace(
+        scene,
+        light=Once.of(light),
+        white_reference=scene.white_reference[at],
+        wavelength_nm=scene.wavelength_nm[at],
+        fwhm_nm=None if scene.fwhm_nm is None else scene.fwhm_nm[at],
+    )
+
+
+def farm_four(steps: int, say: Say, side: int = SIDE, seeds: Sequence[int] = FARM_SEEDS) -> DataSet:
+    """Give farms at four bands, by weights trained on other farms."""
+
+    def taught(name: str) -> RasterScene:
+        seed, day, hour = read_farm_name(name)
+        return with_bands(farm_scene(seed, FARM_SHAPE, camera=CAMERA, day=day, hour=hour), FOUR_NM)
+
+    def judged(seed: int) -> RasterScene:
+        return with_bands(farm_scene(seed, (side, side), camera=CAMERA), FOUR_NM)
+
+    others = {name: partial(taught, name) for name in farm_days(FARM_TRAIN_SEED, TAUGHT_FARMS)}
+    weights = trained("farm, 4 bands", others, PATCH, steps, say)
+    return DataSet("farm, 4 bands", weights, {f"{seed}": partial(judged, seed) for seed in seeds})
+
+
+def farm_all(side: int = SIDE, seeds: Sequence[int] = FARM_SEEDS) -> DataSet:
+    """Give the same farms at all bands, by the shipped weights."""
+    weights = load_weights(ROOT / "models" / "shipped" / "farm.safetensors")
+    scenes = {f"{seed}": partial(farm_scene, seed, (side, side), camera=CAMERA) for seed in seeds}
+    return DataSet("farm, 270 bands", weights, scenes)
+
+
+def folder(path: Path, held_out: Sequence[str], steps: int, patch: int, say: Say, given: Path | None) -> DataSet:
+    """Give a folder's frames: those held out, every third where none is named, by weights of the others."""
+    files = load_data_set(path)
+    held_out = held_out or files.names[1::3]
+    scenes = {name: partial(lambda name: scene_of_file(files.load(name), CAMERA), name) for name in files.names}
+    taught = {name: make for name, make in scenes.items() if name not in held_out}
+    weights = load_weights(given) if given else trained(f"{path.resolve()}", taught, patch, steps, say)
+    split = weights.record.get("split", {})
+    known = {*split.get("train", ()), *split.get("validation", ())}
+    judged = {name: scenes[name] for name in held_out if name not in known}
+    if not judged:
+        raise SceneError(f"{given or path} leaves no frame to judge; train with some held out, or name others")
+    return DataSet(path.name, weights, judged)

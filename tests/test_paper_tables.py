@@ -1,0 +1,108 @@
+"""The paper's tables by a command: how patches are pooled and chosen, what rows cost, and a run on a toy data set."""
+
+from __future__ import annotations
+
+import importlib
+import tempfile
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from models.network.sizes import multiply_adds
+from models.network.spectral import LineSpec, patches_of
+from models.policies.policies import pixel_scores, score_multiply_adds, score_patches
+from models.reading.inference import CoarsePrediction, segment
+from pipeline.geometry.grid import SceneGrid
+from pipeline.planning.selection import select_patches
+from pipeline.simulator.scenes.scene import raster_from_values
+from tests.conftest import CLASSES, patchy_scene, random_weights
+
+BENCHMARKS = Path(__file__).parent / "benchmarks"
+BANDS_NM = (450.0, 550.0, 650.0, 850.0)
+SCENE_TOML = """
+bands = [0, 1, 2]
+wavelengths_nm = [450.0, 550.0, 650.0]
+labels = "labels/{number}.png"
+[classes]
+soil = 0
+crop = 1
+"""
+
+
+@pytest.fixture
+def paper(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The command's module."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    return importlib.import_module("bench_paper")
+
+
+def test_one_sharp_edge_wins_by_maximum_and_fine_texture_by_mean(paper: ModuleType) -> None:
+    """The paper pools edges by maximum, the project by mean: they choose different patches of the same image."""
+    grid = SceneGrid(16, 16, 8, 1)
+    image = np.zeros((16, 16, 1), np.float32)
+    image[4, 4] = 5.0  # one bright pixel in patch 0
+    image[8:, 8:] = np.indices((8, 8)).sum(axis=0)[..., None] // 2 % 2  # texture all over patch 3
+    seen = CoarsePrediction(grid, image, np.full((16, 16, 2), 0.5, np.float32))
+    by_maximum = paper.patch_maxima(pixel_scores("sobel", seen), grid)
+    assert by_maximum[0] == pytest.approx(10.0)
+    assert select_patches(by_maximum, 1).tolist() == [0]
+    assert select_patches(score_patches("sobel", seen), 1).tolist() == [3]
+
+
+def test_rows_are_maps_of_chosen_patches_and_cost_the_closed_form(paper: ModuleType) -> None:
+    """A row's counts are those of `segment`, ideal patches lower its errors one by one, and multiply-adds agree."""
+    values, labels = patchy_scene((64, 64), len(BANDS_NM), 0)
+    scene = raster_from_values(
+        values, paper.CAMERA, name="a", wavelength_nm=np.array(BANDS_NM), labels=labels, class_names=CLASSES
+    )
+    weights = random_weights(BANDS_NM)
+    config = weights.config
+    grid = SceneGrid(64, 64, config.patch, 4)
+    columns = np.random.default_rng(0).standard_normal((64, 64, config.columns)).astype(np.float32)
+    read = paper.read_scene(weights, columns, labels, grid, 2)
+    chosen = np.array([1, 6, 10])
+    fine = patches_of(columns, grid.patch)[chosen]
+    drawn = segment(weights, read.seen, fine, chosen, capture=LineSpec()).classes
+    assert (read.counts(chosen) == paper.confusion(labels, drawn, config.classes)).all()
+    wrong = [n.sum() - np.trace(n) for n in (read.counts(chosen[:0]), read.counts(chosen))]
+    assert wrong[0] - wrong[1] == read.scores("ideal", "mean", 0)[chosen].sum()
+
+    found = paper.judge(paper.DataSet("toy", weights, {"a": lambda: scene}), (4,), lambda text: None)
+    patches = (64 // config.patch) ** 2
+    for factor in (4, 2):
+        row = found[factor, "ED, maximum", "4"]
+        assert row.patches == [patches // factor**2 + 4]
+        score, bands = score_multiply_adds("sobel", config, grid), len(BANDS_NM)
+        assert row.multiply_adds == [multiply_adds(config, grid, 4, bands, score=score, apart=True).total]
+    fine_row = found[1, "random", "all"]
+    assert fine_row.patches == [patches]
+    assert fine_row.multiply_adds == [multiply_adds(config, grid, patches, len(BANDS_NM)).total]
+
+
+def test_the_command_judges_a_folder(
+    paper: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Frames of 64 x 64 px are trained on and judged; the tables have both inputs, and the claim a row for each."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    data, rng = tmp_path / "toy", np.random.default_rng(0)
+    for name in ("images", "labels"):
+        (data / name).mkdir(parents=True)
+    (data / "scene.toml").write_text(SCENE_TOML)
+    for number in range(3):
+        labels = np.kron(rng.integers(0, 2, (8, 8)), np.ones((8, 8), int)).astype(np.uint8)
+        values = 60 + 120 * labels[..., None] + rng.integers(0, 20, (64, 64, 3))
+        Image.fromarray(values.astype(np.uint8)).save(data / "images" / f"00{number}.png")
+        Image.fromarray(labels).save(data / "labels" / f"00{number}.png")
+    arguments = ["--data", str(data), "--steps", "2", "--patch", "8", "--patches", "4,16"]
+    checked = paper.rows(arguments)
+    printed = capsys.readouterr().out
+    assert [row.what.rpartition(" ")[2] for row in checked] == ["256", "512", "1024"]
+    lines = [" ".join(line.split()) for line in printed.splitlines()]
+    for start in ("Baseline 256", "Baseline 1024", "ED, maximum 4", "ED, mean 16", "TA (here gain) 4", "ideal* 16"):
+        assert any(line.startswith(start) for line in lines), start
+    again = paper.rows(arguments)  # by the weights that it kept
+    assert [row.figure for row in again] == [row.figure for row in checked]
+    assert "to train on" not in capsys.readouterr().err
