@@ -156,7 +156,7 @@ def run_verify(archive: str | Path, console: Console, *, remake: bool = False, a
 
 
 def contents(archive: Archive, now: datetime | None = None) -> dict[str, Any]:
-    """Runs, newest last, and stores by stage, oldest first, of an archive."""
+    """Return the runs, newest last, and stores by stage, oldest first, of an archive."""
     catalogue, moment = Catalogue.read(archive.root), now or datetime.now(UTC)
     sizes = archive.all_sizes(catalogue)
     kept, own = catalogue.kept_by_runs(sizes), catalogue.own_by_runs(sizes)
@@ -205,7 +205,7 @@ def _run_row(catalogue: Catalogue, run: Run, kept: int) -> dict[str, Any]:
 
 
 def _run_state(catalogue: Catalogue, run: Run, below: Iterable[str]) -> str:
-    """Told from manifests alone: verify reads every byte."""
+    """Return the state of a run by its manifests alone; `verify` reads every byte."""
     if run.problem is not None:
         return "damaged"
     stores = [catalogue.stores.get(uri) for uri in below]
@@ -222,7 +222,10 @@ def _age_s(created: str, now: datetime) -> float | None:
 
 
 def explanation(archive: Archive, product: str) -> dict[str, Any]:
-    """Lineage of a product as nested tables, and what changed since the version before it (ArchiveError: none)."""
+    """Return the lineage of a product as nested tables, and the changes since its earlier version.
+
+    Raises ArchiveError: none.
+    """
     catalogue = Catalogue.read(archive.root)
     found = find_product(catalogue, product)
     if isinstance(found, Run):
@@ -248,7 +251,7 @@ def explanation(archive: Archive, product: str) -> dict[str, Any]:
 
 
 def _tree(catalogue: Catalogue, uri: str, shown: set[str], path: tuple[str, ...]) -> dict[str, Any]:
-    """One store and below it what it was made of; what was shown already is not opened again."""
+    """Return one store and below it its inputs; a store already shown is not opened again."""
     store = catalogue.stores.get(uri)
     if store is None:
         return {"uri": uri, "problem": "is not there", "inputs": []}
@@ -275,7 +278,7 @@ def _tree(catalogue: Catalogue, uri: str, shown: set[str], path: tuple[str, ...]
 
 
 def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
-    """Return what verification found, and for what is broken what a repair would do."""
+    """Return the summary of a verification, with the repair of what is broken."""
     bad = [finding for finding in findings if finding.problem is not None]
     places = {finding.uri for finding in findings if finding.kind in ("whole", "broken")}
     broken = {finding.uri for finding in bad if finding.kind == "broken"}
@@ -296,7 +299,10 @@ def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
 
 
 def command(settings: Mapping[str, Any], out: str) -> str:
-    """The command for these settings into the archive ``out`` (it may have moved), as far as flags can say it."""
+    """Return the command for these settings into the archive ``out``, as far as flags can say it.
+
+    The archive may have moved since.
+    """
     if not settings:
         return ""
     asked, defaults = {**settings, "out": out}, Settings().to_dict()

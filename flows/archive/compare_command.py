@@ -86,7 +86,10 @@ def compare(archive: ArchiveName, old: str, new: str, *, out: OutFolder = None, 
 
 
 def find_run(catalogue: Catalogue, text: str) -> Run:
-    """A run by its id, `latest` (the newest with a map) or `previous`, of the same field before it (ArchiveError)."""
+    """Return a run by its id, `latest` or `previous`. Raises ArchiveError: there is none.
+
+    `latest` is the newest with a map, `previous` the one of the same field before it.
+    """
     mapped = [run for run in catalogue.runs if "class_map" in run.products]
     if text not in ("latest", "previous"):
         found = find_product(catalogue, f"runs/{text.rstrip('/').removeprefix('runs/')}")
@@ -111,7 +114,7 @@ def _is_same_field(old: Run, new: Run) -> bool:
 
 
 def _field_key(run: Run) -> str:
-    """Return what names the land: not the bands, nor the day and hour at which a farm was looked at."""
+    """Return a key of the land, which has neither the bands nor the day and hour at which a farm was captured."""
     key = str(run.receipt.get("scene", run.uri)).split("/light=")[0].split("/bands=")[0].split("/only=")[0]
     if not is_built_in_key(key):
         return key
@@ -185,7 +188,10 @@ def _comparison(runs: tuple[Run, Run], maps: list[ClassMap]) -> dict[str, Any]:
 
 
 def _classes(runs: tuple[Run, Run], joint: NDArray[np.int64], names: list[str]) -> list[dict[str, Any]]:
-    """Area in each map and the agreement of both, for each class that is in one of them; hectares where both know."""
+    """Return each class's area in both maps and their agreement, in hectares where both maps know them.
+
+    Classes that neither map has are left out.
+    """
     areas = [known for run in runs if (known := hectares_of_classes(run.receipt)) is not None]
     hectares = [{str(name).replace("_", " "): area for name, area in one.items()} for one in areas]
     found = []

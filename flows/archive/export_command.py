@@ -199,13 +199,13 @@ class Export:
         return {} if self.run.geobox is None else {"proj:code": None}
 
     def add(self, key: str, path: Path, title: str, kind: str, roles: list[str], **fields: Any) -> None:
-        """Name one file or store to the catalogue, by its address seen from the item."""
+        """Add one file or store to the catalogue, by its address from the item."""
         href = Path(os.path.relpath(path.resolve(), self.folder)).as_posix()
         self.assets[key] = {"href": href, "title": title, "type": kind, "roles": roles, **fields}
 
 
 def name_stores(export: Export) -> None:
-    """Name the archive's own stores and the run's files to the catalogue, where they are."""
+    """Add the archive's own stores and the run's files to the catalogue, where they are."""
     run, root = export.run, export.run.archive.root
     nowhere = export.nowhere
     there = ("mosaic", "class_map", *(("detail",) if run.store("detail") is not None else ()))
@@ -233,7 +233,7 @@ def name_stores(export: Export) -> None:
 
 
 def describe_item(export: Export) -> Item:
-    """The run's item, with all assets that were added."""
+    """Return the run's item, with all assets that were added."""
     run, receipt = export.run, export.run.receipt
     placed = run.geobox is not None
     where = "Images lie on a map." if placed else NOT_PLACED

@@ -49,7 +49,7 @@ class ExportedRun:
         return self.folder.name
 
     def store(self, product: str) -> StageRef | None:
-        """The store behind a product, None without one, or where its files were cleared away.
+        """Return the store of a product; None without one, or where its files were cleared away.
 
         Raises IncompleteStoreError: the archive has lost it, or a part of it.
         """
@@ -68,7 +68,7 @@ class ExportedRun:
         return ref
 
     def path(self, product: str) -> Path:
-        """Return where a product lies that every finished run has (IncompleteStoreError: this one has not)."""
+        """Return the path of a product that every finished run has. Raises IncompleteStoreError: this one has not."""
         if self.store(product) is None:
             raise IncompleteStoreError(f"the run {self.id} has no {product}: it did not finish; export another run")
         return self.archive.locate(self.receipt["products"][product])
@@ -79,7 +79,7 @@ class ExportedRun:
 
     @cached_property
     def geobox(self) -> GeoBox | None:
-        """Return where the run's map lies on the earth, by its pose or its scene's file; None where neither says it."""
+        """Return the grid of the run's map on the earth, by its pose or its scene's file; None where neither has it."""
         return load_geobox(self.path(self.map_product))
 
     @property
@@ -89,7 +89,10 @@ class ExportedRun:
 
 
 def open_exported(archive: Archive, name: str | None) -> ExportedRun:
-    """A run by name or address, else the latest; SettingsError: none, IncompleteStoreError: receipt unreadable."""
+    """Return a run by name or address, else the latest.
+
+    Raises SettingsError: there is none. Raises IncompleteStoreError: its receipt cannot be read.
+    """
     runs = archive.runs()
     if not runs:
         raise SettingsError(f"{archive.name} has no published run; survey into it first")
@@ -121,7 +124,10 @@ class Layer:
 
 
 def map_layers(run: ExportedRun) -> list[Layer]:
-    """Class map, confidence, attention (on its patches) and picture: on the map where there is one, else on angles."""
+    """Return the class map, confidence, attention (on its patches) and picture.
+
+    They are on the map where there is one, else on angles.
+    """
     product = run.map_product
     about = open_image(run.path(product), "classes").about
     colours = np.array(about.get("class_colours", ()), np.uint8).reshape(-1, 3)
@@ -139,7 +145,7 @@ def map_layers(run: ExportedRun) -> list[Layer]:
 
 
 def layer_tags(run: ExportedRun, product: str, geobox: GeoBox) -> dict[str, str]:
-    """Return what every image says of its run."""
+    """Return the tags of the run, which every image has."""
     return {
         "TIFFTAG_SOFTWARE": f"spectralzoom {run.receipt['versions'].get('spectralzoom', 'of unknown version')}",
         "run": run.id,
@@ -168,7 +174,7 @@ def image_layer(
     nodata: float,
     legend: ClassNames | None = None,
 ) -> tuple[CogImage, Callable[[], Rows]]:
-    """An image of a store as it stands there, on the store's own grid."""
+    """Return an image of a store on the store's own grid."""
     stored = open_image(run.path(product), array)
     geobox = geobox_of(run, stored)
     image = CogImage(geobox, stored.dtype.name, bands, nodata, legend, layer_tags(run, product, geobox))
@@ -178,7 +184,7 @@ def image_layer(
 def patch_layer(
     run: ExportedRun, product: str, array: str, bands: tuple[str, ...]
 ) -> tuple[CogImage, Callable[[], Rows]]:
-    """A figure of each patch, on the grid of the scene that their size in pixels gives."""
+    """Return a figure of each patch, on the scene's grid by their size in pixels."""
     stored, drawn = open_image(run.path(product), array), run.store("class_map")
     assert drawn is not None
     patch = int(run.archive.manifest(drawn)["params"]["grid"]["patch"])
@@ -194,7 +200,7 @@ def patch_layer(
 
 
 def _picture(run: ExportedRun) -> tuple[CogImage, Callable[[], Rows]]:
-    """The coarse mosaic in a photograph's tones, 1 to 255, and 0 where nothing was captured."""
+    """Yield the coarse mosaic in a photograph's tones, 1 to 255, and 0 where nothing was captured."""
     stored, ref = open_image(run.path("mosaic"), "coverage"), run.store("mosaic")
     assert ref is not None
     geobox = geobox_of(run, stored)
@@ -219,7 +225,7 @@ def seen_rows(run: ExportedRun) -> Iterator[tuple[int, NDArray[np.bool_]]]:
 
 
 def prior_map_layers(run: ExportedRun) -> list[Layer]:
-    """Days since each pixel was looked at; of a run with a prior map what changed, and from which class.
+    """Return the days since each pixel was captured; for a run with a prior map also the changes and earlier classes.
 
     On the map where there is a pose.
     """
@@ -249,7 +255,7 @@ def _product_with(run: ExportedRun, array: str) -> str | None:
 
 
 def _ages(run: ExportedRun) -> tuple[CogImage, Callable[[], Rows]]:
-    """Ages of the field's own pixels, unpacked: few readers of GeoTIFF know of scales."""
+    """Return the ages of the field's own pixels, unpacked: few readers of GeoTIFF know of scales."""
     image, packed = image_layer(run, PROBABILITIES, "age", ("age",), nodata=np.nan)
     return replace(image, dtype="float32"), lambda: ((first, unpacked_days(rows)) for first, rows in packed())
 

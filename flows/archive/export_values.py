@@ -68,7 +68,7 @@ def write_areas(run: ExportedRun, path: Path) -> None:
 
 
 def _counted(path: Path, count: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """(class,) pixels and mean confidence of the exported map; NaN for a class of which no pixel has one."""
+    """Return (class,) pixels and mean confidence of the exported map; NaN for a class of which no pixel has one."""
     pixels, sums, sure_pixels = np.zeros(256, np.int64), np.zeros(256), np.zeros(256, np.int64)
     for (_, classes), (_, sure) in zip(
         open_image(path, "classes").rows(), open_image(path, "confidence").rows(), strict=True
@@ -81,7 +81,7 @@ def _counted(path: Path, count: int) -> tuple[NDArray[np.int64], NDArray[np.floa
 
 
 def _estimate(run: ExportedRun, fraction: NDArray[np.float64]) -> tuple[FractionEstimate, list[str]]:
-    """Fractions with their errors, and of what they are for each class: empty where of nothing.
+    """Return the fractions with errors, and the pixels behind each class; empty for a class without any.
 
     Pixels that are mapped as a class with judged ones count by the receipt's confusion matrix, others by their
     probabilities.
@@ -98,7 +98,7 @@ def _estimate(run: ExportedRun, fraction: NDArray[np.float64]) -> tuple[Fraction
 
 
 def _probabilities(run: ExportedRun, count: int, mapped: NDArray[np.intp]) -> Iterator[NDArray[np.float32]]:
-    """Probabilities of the pixels mapped as some classes, (y, x, class); 1 of the class unknown where they are that."""
+    """Yield (y, x, class) probabilities of the pixels mapped as some classes; 1 where the class is unknown."""
     store = ProbabilityStore(run.path("class_probabilities"))
     for first, drawn in open_image(run.path("class_map"), "classes").rows():
         values = np.exp(store.read(slice(first, first + len(drawn)))[0])
@@ -123,7 +123,7 @@ class MosaicView:
 
     @property
     def words(self) -> str:
-        """Return how large its pixels are."""
+        """Return the size of its pixels, in words."""
         return "Pixels of the field" if self.factor == 1 else f"Pixels of {self.factor} x {self.factor} px"
 
     @cached_property
@@ -152,7 +152,7 @@ class MosaicView:
         return self.mosaic.factor
 
     def rows(self, bands: Sequence[int]) -> Rows:
-        """Values (row, x, band) of some bands with the number of the first row, from the top down."""
+        """Yield the number of the first row and values (row, x, band) of some bands, from the top down."""
         if self.ground is None:
             first = 0
             for block in self.mosaic.row_blocks():
@@ -171,7 +171,7 @@ class MosaicView:
 
 
 def _window_at(mosaic: Mosaic, pixels: NDArray[np.float64], factor: int, bands: Sequence[int]) -> Floats:
-    """Values at scene places (row, column, 2), of which only the rows and columns around them are read."""
+    """Return the values at scene places (row, column, 2); only the rows and columns around them are read."""
     known = pixels[np.isfinite(pixels).all(axis=-1)]
     if not len(known):
         return np.full((*pixels.shape[:2], len(bands)), np.nan, np.float32)
@@ -183,7 +183,7 @@ def _window_at(mosaic: Mosaic, pixels: NDArray[np.float64], factor: int, bands: 
 
 
 def spectral_layers(run: ExportedRun, choice: ProductChoice) -> list[Layer]:
-    """Reflectance and indices that were asked for.
+    """Return the reflectance and indices to export.
 
     Raises WavelengthError: the cube lacks bands of an index. SettingsError: an index wants reflectance, and the cube's
     values are none.

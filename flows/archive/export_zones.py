@@ -78,7 +78,10 @@ class ClassRaster:
         return None if self.geobox is None else pixel_side_m(self.geobox)
 
     def shaped(self, choice: ProductChoice) -> ClassRaster:
-        """Small regions given to a neighbour, classes grown in their order, and what that cut off given away again."""
+        """Return the raster with small regions given to a neighbour, and its classes grown in their order.
+
+        Regions that growing cuts off are given away again.
+        """
         if self.pixel_m is None:
             return self
         buffers = class_numbers(self.legend.names, choice.buffers_m, "--buffer")
@@ -102,7 +105,7 @@ def check_zones(run: ExportedRun, choice: ProductChoice) -> None:
 
 
 def zone_notes(run: ExportedRun, choice: ProductChoice) -> list[str]:
-    """Return what a prescription's reader has to know of it: cells that are finer than the map's pixels."""
+    """Return notes for readers of a prescription: cells that are finer than the map's pixels."""
     if not choice.doses or run.geobox is None or choice.flags.cell is None:
         return []
     cell_m, pixel_m = choice.flags.cell, plane_pixel_m(run.geobox)
@@ -224,7 +227,7 @@ class DosedField:
         return grid, covered, dose_cells(covered, treated, self.least_fraction)
 
     def outlines(self, plane: Places) -> NDArray[Any]:
-        """Outline all that has a class, in metres of a plane, with a vertex at every pixel's corner."""
+        """Return the outlines of all that has a class, in metres of a plane, with a vertex at every pixel's corner."""
         known = np.where(self.raster.classes == UNLABELLED, UNLABELLED, 0).astype(np.uint8)
         regions = outline_regions(known).of_classes()
         stepped = Coverage(regions.classes, shapely.segmentize(regions.polygons, 1.0)).moved(self.raster.transform)

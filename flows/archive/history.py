@@ -180,8 +180,8 @@ def read_moment(value: object) -> datetime | None:
 def time_of_visit(run: Run) -> datetime | None:
     """Return the moment that a run's visit is called by, else the day that its farm was drawn on.
 
-    Of others when they began, or were published. The day is of the year in which the run was published. None where
-    nothing of that can be read.
+    Other runs have the time when they began, or were published. The day is of the year in which the run was published.
+    None where nothing of that can be read.
     """
     named = read_moment(run.settings.get("visit"))
     if named is not None:
@@ -223,7 +223,7 @@ def _visit(archive: Archive, run: Run, row: Row, shown: ClassMap) -> dict[str, s
 
 
 def _format_row(receipt: Mapping[str, Any]) -> str:
-    """Seconds spent, and what became of the prior map."""
+    """Return a row of the table: the seconds spent, and the use of the prior map."""
     capture, memory = (receipt.get("savings") or {}).get("capture_s") or {}, receipt.get("memory")
     seconds = known_number(capture.get("done"))
     parts = [] if seconds is None else [f"{format_seconds(seconds)} at the camera"]

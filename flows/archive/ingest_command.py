@@ -76,10 +76,10 @@ def run_ingest(
 ) -> dict[str, Any]:
     """Store a source in an archive, with progress on ``console``; give the record that --json prints.
 
-    What the files hold and the flags say is the store's key: the same content is stored once, whatever it is called and
-    wherever it lies. Killed anywhere it leaves nothing under that key. Raises SceneError, WavelengthError: the source
-    cannot be used, or changed while it was read; ArchiveError: the name cannot be one in an archive, or the archive
-    cannot be written to.
+    The key of the store comes from the files' content and the flags. The same content is stored once, whatever its name
+    and place. Killed anywhere it leaves nothing under that key. Raises SceneError, WavelengthError: the source cannot
+    be used, or changed while it was read; ArchiveError: the name cannot be one in an archive, or the archive cannot be
+    written to.
     """
     if name is not None:
         check_name(name)
@@ -108,7 +108,7 @@ def run_ingest(
 
 
 def hash_files(source: CubeSource, report: Report = lambda done: None) -> list[SourceFile]:
-    """Size and SHA-256 of every file that a cube comes from; names are without folders, but those within a store."""
+    """Return the size and SHA-256 of every file of a cube; names have no folders, except within a store."""
     files: list[SourceFile] = []
     for number, path in enumerate(source.files):
         root = source.root
@@ -119,7 +119,7 @@ def hash_files(source: CubeSource, report: Report = lambda done: None) -> list[S
 
 
 def _next(record: Mapping[str, Any], source: str) -> str:
-    """The command that surveys what was stored: a camera's own numbers as a recording, anything else as a scene."""
+    """Return the command that surveys the stored cube: a camera's numbers as a recording, all others as a scene."""
     words = ["spectralzoom", "survey"]
     if record["source_dtype"].lstrip("<>=|") in ("u1", "u2", "i2"):
         path = Path(source)
@@ -136,7 +136,7 @@ def _stamps(source: CubeSource) -> list[tuple[int, int]]:
 
 
 def _key(name: str | None, source: CubeSource, files: Sequence[SourceFile]) -> dict[str, Any]:
-    """Return what the store depends on: content, the flags, and wavelengths that come from elsewhere than the files."""
+    """Return the parameters of the store: content, flags, and wavelengths from elsewhere than the files."""
     named = source.root is not None  # in a Zarr store names say where a chunk lies
     centres, widths = source.bands.wavelength_nm, source.bands.fwhm_nm
     return {

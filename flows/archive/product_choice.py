@@ -88,7 +88,7 @@ def choose_products(flags: ProductFlags) -> ProductChoice:
 
 
 def by_class(text: str | None, flag: str, example: str) -> dict[str, float]:
-    """Numbers by class out of ``weed=2.5,grass=1``. Raises SettingsError: not so, or less than 0."""
+    """Return the numbers by class from ``weed=2.5,grass=1``. Raises SettingsError: not so, or less than 0."""
     found = {}
     for part in split_list(text):
         name, _, number = part.partition("=")
@@ -99,7 +99,7 @@ def by_class(text: str | None, flag: str, example: str) -> dict[str, float]:
 
 
 def class_numbers(names: Sequence[str], wanted: Mapping[str, float], flag: str) -> dict[int, float]:
-    """The same by the numbers of a run's classes. Raises SettingsError: the run has no class of a name."""
+    """Return the same by the numbers of a run's classes. Raises SettingsError: the run has no class of a name."""
     unknown = sorted(set(wanted) - set(names))
     if unknown:
         raise SettingsError(f"{flag}: the run has no class {unknown[0]!r}; its classes are {', '.join(names)}")

@@ -1,6 +1,7 @@
 """The verbs `reprocess` and `evaluate ARCHIVE RUN`: surveys of an archive again, and maps judged later.
 
-What the archive holds is found by its key, raw light above all; only what new weights or newer stages change is made.
+Existing stores are found by their keys, raw light above all; only stores that new weights or newer stages change are
+made.
 """
 
 from __future__ import annotations
@@ -131,7 +132,7 @@ def reprocess_fields(
 def _asked(
     catalogue: Catalogue, run: Run, archive: str, weights: Path | None, pool: WorkerPool, renewed: Mapping[str, str]
 ) -> Settings | None:
-    """Return what to survey a field by again; None where its newest run is already as it would become.
+    """Return the settings of a field's new survey; None where its newest run is already as it would become.
 
     ``renewed`` names the newest run of each visit that may be another's prior map.
     """
@@ -210,7 +211,8 @@ def run_judge(
             if stage is not None and stage.name != evaluate.name and row.get("key"):
                 what = f"{stage.title} of {found.uri}"
                 survey.products[stage.name] = _store(catalogue, run.archive, what, str(row["key"]))
-        for name in _needed(survey):
+        raster, lines = ("condense_raster", "segment", "score"), ("rectify", "segment", "choose_effects", "score")
+        for name in raster if survey.is_map else lines:  # the stages by whose stores a map is judged
             if name not in survey.products:
                 raise ArchiveError(f"the {TITLES[name]} of {found.uri} is missing or damaged; run verify --repair")
         _check_same(catalogue, found, survey.products, run)
@@ -224,13 +226,6 @@ def run_judge(
             published = extend_with_accuracy(survey, draft, evaluate(survey, *made.there(*JUDGED)))
     show_published(published, settings.out, console)
     return published.receipt
-
-
-def _needed(survey: OpenSurvey) -> tuple[str, ...]:
-    """Return the stages by whose stores a map is judged."""
-    if survey.is_map:
-        return ("condense_raster", "segment", "score")
-    return ("rectify", "segment", "choose_effects", "score")
 
 
 def _store(catalogue: Catalogue, archive: Archive, what: str, key: str) -> StageRef:

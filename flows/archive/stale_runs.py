@@ -40,12 +40,12 @@ class Generation:
 
 
 def called(run: Run) -> str:
-    """The field that a run is of."""
+    """Return the name of the field that a run surveyed."""
     return str(run.receipt.get("survey") or run.facts.get("survey") or run.folder.name)
 
 
 def newest_runs(catalogue: Catalogue) -> list[Generation]:
-    """The newest run of every field, oldest first; runs whose settings cannot be read are fields of their own."""
+    """Return the newest run of every field, oldest first; a run with unreadable settings is a field of its own."""
     found: dict[str, Generation] = {}
     for run in catalogue.runs:  # oldest first
         name = called(run)
@@ -56,7 +56,7 @@ def newest_runs(catalogue: Catalogue) -> list[Generation]:
 
 
 def renewals(catalogue: Catalogue) -> dict[str, str]:
-    """For every run that was made again the newest of the same look, by their names."""
+    """Return the newest run of the same look for each run that was made again, by their names."""
     scan_passes: dict[str, list[str]] = {}
     for run in catalogue.runs:
         if run.settings:
@@ -66,7 +66,7 @@ def renewals(catalogue: Catalogue) -> dict[str, str]:
 
 
 def _recorded_run(catalogue: Catalogue, run: Run) -> Run:
-    """The run of this archive whose raw cubes a run was surveyed from as a recording; itself for all others."""
+    """Return the run of this archive whose raw cubes a run was surveyed from as a recording, else the run itself."""
     by_name = {one.folder.name: one for one in catalogue.runs}
     while run.settings.get("source") == RECORDED:
         place, _, name = str(run.settings.get("sweeps")).rpartition("/runs/")
@@ -79,8 +79,8 @@ def _recorded_run(catalogue: Catalogue, run: Run) -> Run:
 def from_raw_cubes(catalogue: Catalogue, run: Run, settings: Settings) -> Settings:
     """Return the settings of a survey of a run's own raw cubes as a recording, where its light is not found otherwise.
 
-    That is so where another version of the captures is wanted than a rig or a recording left, or where the files of a
-    recording or of a simulated scene are gone. Else, and where the raw cubes are gone too, the settings stay. Raises
+    That is so where the captures have another version than a rig or a recording left. It is so, too, where the files of
+    a recording or of a simulated scene are gone. Else, and where the raw cubes are gone too, the settings stay. Raises
     SettingsError, BudgetError: as `asked_again`.
     """
     raw = set(stores_of_lines(run.products, lambda uri: uri in catalogue.stores and not catalogue.stores[uri].cleared))
@@ -127,7 +127,7 @@ def is_called(generation: Generation, pattern: str) -> bool:
 
 
 def asked_again(run: Run, out: str | Path, weights: Path | None) -> Settings:
-    """The settings of a run for another survey into the archive ``out``, with other weights if they are given.
+    """Return the settings of a run for another survey into the archive ``out``, with other weights if these are given.
 
     Raises SettingsError, BudgetError: the run's settings cannot be read, or are not of this version.
     """
@@ -138,7 +138,7 @@ def asked_again(run: Run, out: str | Path, weights: Path | None) -> Settings:
 
 
 def stale_stores(catalogue: Catalogue, uris: set[str], weights: str | None) -> set[str]:
-    """Stores that a survey would not find as it wants them: gone, damaged, of another version, of other weights."""
+    """Return the stores that a survey would make again: gone, damaged, of another version, of other weights."""
     now, by_weights = versions(), {one.product.name for one in STAGES.values() if one.product.by_weights}
 
     def is_stale(store: Store | None) -> bool:
@@ -163,7 +163,7 @@ def is_current(catalogue: Catalogue, run: Run, settings: Settings) -> bool:
 
 
 def weights_key(settings: Settings) -> str | None:
-    """Return what the weights are called by what they hold, as stages know it; None where they cannot be read."""
+    """Return the key of the weights by their content, as stages know it; None where they cannot be read."""
     try:
         path = weights_path(settings)
         return _file_key(path, path.stat().st_mtime_ns, path.stat().st_size)

@@ -224,7 +224,7 @@ def _alone_on(name: str, root: Path) -> Iterator[None]:
 
 @contextmanager
 def _server(home: Path, port: int) -> Iterator[str]:
-    """Have a server on this machine, or use the one that PREFECT_API_URL names; gives where its pages are.
+    """Start a server on this machine, or use the one that PREFECT_API_URL names; yield the address of its pages.
 
     Raises SettingsError: the one that is named does not answer, or the port is taken.
     """
@@ -242,7 +242,7 @@ def _server(home: Path, port: int) -> Iterator[str]:
 
 @contextmanager
 def _own_temporary_folder() -> Iterator[None]:
-    """Have temporary files of this process in a folder that is this user's alone.
+    """Keep this process's temporary files in a folder that is this user's alone.
 
     Prefect's runner keeps what it starts in /tmp/runner_storage. That folder belongs to the first user who ever ran
     one: that one could exchange it, and no other can run one.
@@ -315,9 +315,10 @@ def _pause(fields: Sequence[str]) -> None:
 
 
 def _prepare(fields: Sequence[str]) -> None:
-    """Have one rig in Prefect's limits, and end what an earlier serve left.
+    """Set Prefect's limits so that a rig has one survey at a time, and end what an earlier serve left.
 
-    What was due while nothing was served is cancelled, since its time is over; what ran then has crashed.
+    Surveys that were due while serve was stopped are cancelled, since their time is over; those that ran then have
+    crashed.
     """
     filters, kind = cast(Any, prefect_filters), prefect_objects.StateType
     named = filters.DeploymentFilter(name=filters.DeploymentFilterName(any_=list(fields)))

@@ -107,7 +107,7 @@ def _print(rows: Sequence[CheckRow], console: Console) -> None:
 
 
 def _at(rig: SurveyRig, camera: str) -> SurveyRig:
-    """The rig with the camera at HOST, HOST:PORT or HOST:PORT:FILE_PORT."""
+    """Return the rig with the camera at HOST, HOST:PORT or HOST:PORT:FILE_PORT."""
     host, *ports = camera.split(":")
     if not host or len(ports) > 2 or not all(port.isdecimal() and 0 < int(port) < 65536 for port in ports):
         raise SettingsError(f"--camera expects HOST, HOST:PORT or HOST:PORT:FILE_PORT, got {camera!r}")
@@ -122,7 +122,10 @@ USUAL_SIZE = (256, 256)  # of a built-in scene [px]
 
 
 def emulated_settings(path: Path | None, flags: Mapping[str, object]) -> Settings:
-    """Settings of what is emulated (SettingsError: one cannot be used); a built-in scene is small unless told."""
+    """Return the settings of the emulated rig. Raises SettingsError: one cannot be used.
+
+    A built-in scene is small by default.
+    """
     wanted = load_settings(path, flags, usual={"source": "sim"})
     small = wanted.scene in BUILT_IN_SCENES and wanted.size is None
     return replace(wanted, size=USUAL_SIZE) if small else wanted
@@ -233,7 +236,7 @@ def _ending(event: threading.Event) -> Iterator[threading.Event]:
 
 
 def emulated_source(settings: Settings) -> tuple[SimulatedSource, tuple[str, ...]]:
-    """The scene through the simulated rig, and what was assumed of it (PipelineError); nothing is kept."""
+    """Return the scene through the simulated rig, and its assumptions; nothing is stored. Raises PipelineError."""
     with tempfile.TemporaryDirectory(prefix="spectralzoom-") as folder:
         apart = replace(settings, source="sim", out=str(Path(folder) / "effects"))
         run, _, notes = open_simulation(apart)

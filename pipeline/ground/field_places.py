@@ -67,24 +67,24 @@ class FieldScale:
         return None if self.area_m2 is None else self.area_m2 / M2_PER_HECTARE
 
     def hectares_per_hour(self, seconds: float) -> float | None:
-        """Ground in an hour of the camera where this field takes so many seconds; None without seconds or metres."""
+        """Return the hectares per hour of the camera for a field of so many seconds; None without seconds or metres."""
         return None if self.hectares is None or seconds <= 0 else self.hectares / seconds * SECONDS_PER_HOUR
 
 
 def field_of_view_deg(shape: tuple[int, int], ifov_rad: float) -> tuple[float, float]:
-    """Angles between the outer edges of a field of (y, x) px around the undeflected direction [deg]."""
+    """Return the angles between the outer edges of a field of (y, x) px around the undeflected direction [deg]."""
     down, across = (2 * np.arctan(size / 2 * ifov_rad) for size in shape)
     return float(np.rad2deg(down)), float(np.rad2deg(across))
 
 
 def scale_of_pixels(shape: tuple[int, int], ifov_rad: float, pixel_m: float | None) -> FieldScale:
-    """Tell the scale of a field whose pixels are all squares of one side [m]; without metres where that is None."""
+    """Return the scale of a field whose pixels are all squares of one side [m]; without metres where that is None."""
     area = None if pixel_m is None else shape[0] * shape[1] * pixel_m**2
     return FieldScale(shape, field_of_view_deg(shape, ifov_rad), pixel_m, area)
 
 
 def scale_of_view(view: GroundView, shape: tuple[int, int]) -> FieldScale:
-    """Tell the scale of a field of (y, x) px before a rig of which the place is known.
+    """Return the scale of a field of (y, x) px before a rig of which the place is known.
 
     Raises PoseError: no ray of the field meets the ground.
     """
@@ -115,7 +115,7 @@ def footprint_of(view: GroundView, shape: tuple[int, int]) -> GroundFootprint:
 
 
 def areas_by_number(place: FieldPlace, numbers: NDArray[np.integer], count: int) -> Floats | None:
-    """Sum the ground under a field's pixels by their (y, x) numbers, (count,) [m2]; None where it is unknown.
+    """Return the ground area of a field's numbers in (y, x), (count,) [m2]; None where it is unknown.
 
     Pixels with a number below 0 or from ``count`` on are left out, and those that show no ground.
     """
@@ -140,7 +140,7 @@ class NoPlace:
 
     @property
     def outline(self) -> BaseGeometry:
-        """Return what the field shows, in the coordinates that polygons are given in."""
+        """Return the outline of the field, in the coordinates that polygons are given in."""
         return shapely.box(0, 0, self.shape[1], self.shape[0])
 
     def to_pixels(self, shape: BaseGeometry) -> BaseGeometry:
@@ -148,7 +148,10 @@ class NoPlace:
         return shape
 
     def pixel_areas_m2(self, rows: slice, columns: slice) -> Floats | None:
-        """The ground under some pixels (row, column) [m2], NaN where they show none; None where it is unknown."""
+        """Return the ground under some pixels (row, column) [m2]; None where it is unknown.
+
+        Pixels that show none are NaN.
+        """
         size = rows.stop - rows.start, columns.stop - columns.start
         return None if self.pixel_m is None else np.full(size, self.pixel_m**2)
 
@@ -175,10 +178,8 @@ class PlacedPicture:
     @property
     def outline(self) -> BaseGeometry:
         corners = shapely.box(0, 0, self.shape[1], self.shape[0])
-        return self._on_map(shapely.segmentize(corners, max(self.shape) / EDGE_PARTS))
-
-    def _on_map(self, pixels: BaseGeometry) -> BaseGeometry:
-        return shapely.affinity.affine_transform(pixels, self.geobox.affine.to_shapely())
+        edges = shapely.segmentize(corners, max(self.shape) / EDGE_PARTS)
+        return shapely.affinity.affine_transform(edges, self.geobox.affine.to_shapely())
 
     def to_pixels(self, shape: BaseGeometry) -> BaseGeometry:
         return shapely.affinity.affine_transform(shape, (~self.geobox.affine).to_shapely())
@@ -216,7 +217,7 @@ class PosedField:
         return shapely.transform(seen, lambda points: frame.ground_to_map(self.view.scene_to_ground(points[:, ::-1])))
 
     def _seen(self, border_px: float) -> BaseGeometry:
-        """The part of the field that the map reaches, (x, y) from its centre [px]."""
+        """Return the part of the field that the map reaches, (x, y) from its centre [px]."""
         rows, columns = self.shape
         size = rows + 2 * round(border_px), columns + 2 * round(border_px)
         return shapely.Polygon(self.view.outline_px(size, self.grid.least_sink)[:, ::-1])

@@ -30,7 +30,7 @@ SAME_SIZE = 1e-6  # by which pixels of one size may differ
 
 
 def zoomed_out(geobox: GeoBox, factor: int, shape: tuple[int, int]) -> GeoBox:
-    """The grid of (y, x) ``shape`` whose pixels are ``factor`` of the given one's a side, from the same corner.
+    """Return the grid of (y, x) ``shape`` from the same corner, with pixels ``factor`` times as long.
 
     The last row and column may reach beyond the given grid: a scene is padded to whole coarse pixels.
     """
@@ -51,33 +51,35 @@ def shift_px(grid: GeoBox, other: GeoBox) -> tuple[float, float] | None:
 
 
 def georeference_record(geobox: GeoBox | None) -> dict[str, Any]:
-    """Return what says a place in the keys of stores: nothing for a scene that has none, so that its keys stay."""
+    """Return the place in the keys of stores; empty for a scene without one, so that its keys stay."""
     if geobox is None:
         return {}
     return {"georeference": {"crs": crs_key(geobox), "transform": [float(number) for number in geobox.affine[:6]]}}
 
 
 def crs_key(geobox: GeoBox) -> str:
-    """Return what says a grid's CRS in one word: its EPSG code, or all of it as WKT where it has none."""
+    """Return a grid's CRS as one word: its EPSG code, or all of it as WKT where it has none."""
     assert geobox.crs is not None
     return geobox.crs.to_wkt() if geobox.crs.epsg is None else f"EPSG:{geobox.crs.epsg}"
 
 
 def crs_name(geobox: GeoBox) -> str:
-    """Return what people call a grid's CRS: its EPSG code, or its name where it has none."""
+    """Return the usual name of a grid's CRS: its EPSG code, or its name where it has none."""
     assert geobox.crs is not None
     return str(geobox.crs.proj.name) if geobox.crs.epsg is None else crs_key(geobox)
 
 
 def pixel_side_m(geobox: GeoBox) -> float:
-    """Side of the square on the ground that is as large as the middle pixel [m]."""
+    """Return the side of the square that has the area of the middle pixel [m]."""
     rows, columns = geobox.shape
     middle = _m2_of_units(geobox, np.array([columns / 2]), np.array([rows / 2]))
     return float(np.sqrt(abs(float(geobox.affine.determinant)) * middle[0]))
 
 
 def pixel_rows_m2(geobox: GeoBox) -> Iterator[Floats]:
-    """Ground under the pixels of each row, (x,) [m2], from the first row down: of the ellipsoid, at any scale of a map.
+    """Yield the ground area of the pixels of each row, (x,) [m2], from the first row down.
+
+    It is measured on the ellipsoid, at any scale of the map.
 
     A projection's scale is asked for at `TIE_POINTS` places along each side, and linear between: off by 2e-5 in a UTM
     zone.
@@ -93,7 +95,7 @@ def pixel_rows_m2(geobox: GeoBox) -> Iterator[Floats]:
 
 
 def _m2_of_units(geobox: GeoBox, column: Floats, row: Floats) -> Floats:
-    """Square metres of the ellipsoid in one square of the map's unit, at places counted in pixels."""
+    """Return the square metres of the ellipsoid in one square of the map's unit, at places counted in pixels."""
     assert geobox.crs is not None
     crs = pyproj.CRS.from_wkt(geobox.crs.to_wkt())
     degrees, ellipsoid = crs.geodetic_crs, crs.get_geod()
@@ -115,19 +117,19 @@ def _m2_of_units(geobox: GeoBox, column: Floats, row: Floats) -> Floats:
 
 
 def crs_wkt(geobox: GeoBox) -> str:
-    """A grid's CRS as WKT."""
+    """Return a grid's CRS as WKT."""
     assert geobox.crs is not None
     return geobox.crs.to_wkt()
 
 
 def to_degrees(geobox: GeoBox) -> Places:
-    """Return what gives (..., 2) latitude and longitude [deg] of a map's x and y."""
+    """Return a function from a map's x and y to (..., 2) latitude and longitude [deg]."""
     transformer = pyproj.Transformer.from_crs(crs_wkt(geobox), WGS84, always_xy=True)
     return lambda x, y: np.stack(transformer.transform(x, y)[::-1], axis=-1)
 
 
 def degree_m(geobox: GeoBox) -> tuple[float, float]:
-    """Metres of a degree to the north and of one to the east, in the middle of a map."""
+    """Return the metres of a degree to the north and of one to the east, in the middle of a map."""
     middle = geobox.affine * (geobox.shape[1] / 2, geobox.shape[0] / 2)
     lat, lon = to_degrees(geobox)(*np.array(middle)[:, None])[0].tolist()
     geod = pyproj.Geod(ellps="WGS84")
@@ -139,7 +141,7 @@ def degree_m(geobox: GeoBox) -> tuple[float, float]:
 
 
 def to_plane(geobox: GeoBox) -> tuple[Places, str]:
-    """Return what gives (..., 2) metres east and north of a map's x and y, and the CRS (WKT) that they are in.
+    """Return a function from a map's x and y to (..., 2) metres east and north, and the CRS (WKT) of these.
 
     The map's own where it is projected in metres, else the UTM zone of its middle.
     """

@@ -1,7 +1,8 @@
 """The map's pixels: metres around the rig's foot in a projected CRS and back, and a grid there of what a scene shows.
 
-The metres are of the plane that touches the ellipsoid's normal at the foot (east, north, up); they go to longitude and
-latitude through Cartesian coordinates of the earth, so that nothing is taken for flat. By PROJ, without a network.
+The metres are of the plane that touches the ellipsoid's normal at the foot (east, north, up). They go to longitude and
+latitude through Cartesian coordinates of the earth, so that nothing is taken for flat. PROJ computes it, without a
+network.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ EDGE_POINTS = 33  # on each side of the footprint: straight on the ground, bent 
 
 
 def default_epsg(pose: RigPose) -> int:
-    """Give the EPSG code of the rig's UTM zone (WGS 84), of polar stereographic beyond 84 N and 80 S."""
+    """Return the EPSG code of the rig's UTM zone (WGS 84), of polar stereographic beyond 84 N and 80 S."""
     south, north = UTM_LATITUDES
     if not south <= pose.lat_deg <= north:
         return POLAR[pose.lat_deg > 0]
@@ -54,7 +55,7 @@ def default_epsg(pose: RigPose) -> int:
 
 
 def map_crs(pose: RigPose, epsg: int | None = None) -> pyproj.CRS:
-    """Give the projected CRS of a map around the rig: the one asked for, or that of ``default_epsg``.
+    """Return the projected CRS of a map around the rig: the one asked for, or that of ``default_epsg``.
 
     Raises PoseError: no such code, not a projected CRS in metres, or the rig stands outside the area it is made for.
     """
@@ -95,18 +96,20 @@ class MapFrame:
     crs: CRS
 
     def ground_to_geodetic(self, ground_m: ArrayLike) -> Floats:
-        """Give (..., 3) longitude, latitude [deg] and height above the ellipsoid [m] of east, north, up of the foot."""
+        """Return (..., 3) longitude, latitude [deg] and ellipsoidal height [m] of east, north, up of the foot."""
         ground = np.asarray(ground_m, np.float64)
         east, north, up = np.moveaxis(ground, -1, 0)
         return _stacked(self._around_foot.transform(east, north, up, direction="INVERSE"))
 
     def ground_to_map(self, ground_m: ArrayLike) -> Floats:
-        """Give map coordinates (..., 2) of points (..., 3) east, north, up of the foot [m]; NaN for NaN."""
+        """Return map coordinates (..., 2) of points (..., 3) east, north, up of the foot [m]; NaN for NaN."""
         place = self.ground_to_geodetic(ground_m)
         return _stacked(self._on_map.transform(place[..., 0], place[..., 1]))
 
     def map_to_ground(self, map_m: ArrayLike) -> Floats:
-        """Give the point of the ground's plane over map coordinates (..., 2), as (..., 3) east, north, up of the foot.
+        """Return the point of the ground's plane over map coordinates (..., 2).
+
+        It is (..., 3) east, north, up of the foot.
 
         The map gives longitude and latitude; the height follows from where their vertical meets the plane.
         """
@@ -119,7 +122,7 @@ class MapFrame:
         return point + rise[..., None] * up
 
     def _vertical(self, lon_deg: Floats, lat_deg: Floats) -> Floats:
-        """(..., 3) normals of the ellipsoid at other places, in east, north, up of the foot."""
+        """Return (..., 3) normals of the ellipsoid at other places, in east, north, up of the foot."""
         away = np.deg2rad(lon_deg - self.view.pose.lon_deg)
         lat, foot = np.deg2rad(lat_deg), np.deg2rad(self.view.pose.lat_deg)
         north = np.sin(lat) * np.cos(foot) - np.cos(lat) * np.sin(foot) * np.cos(away)
@@ -141,7 +144,7 @@ class MapFrame:
 
 
 def _stacked(parts: tuple[ArrayLike, ...]) -> Floats:
-    """Coordinates on the last axis; PROJ marks what it cannot do as infinite."""
+    """Return the coordinates on the last axis; PROJ gives infinite ones where it fails."""
     whole = np.stack([np.asarray(part, np.float64) for part in parts], axis=-1)
     return np.where(np.isfinite(whole), whole, np.nan)
 
@@ -162,7 +165,7 @@ class GroundGrid:
         return int(rows), int(columns)
 
     def scene_pixels(self, rows: slice, columns: slice) -> Floats:
-        """Give where map pixels lie in the scene's image, (row, column, 2); integers are centres of its pixels.
+        """Return the places of map pixels in the scene's image, (row, column, 2); integers are centres of its pixels.
 
         NaN where the field does not show the ground, or shows it beyond the map's reach.
         """
@@ -173,10 +176,10 @@ class GroundGrid:
         return np.where(inside[..., None], points + (size - 1) / 2, np.nan)
 
     def ground_m(self, rows: slice, columns: slice) -> Floats:
-        """Give the ground under the centres of map pixels, (row, column, 3) east, north and up of the foot [m].
+        """Return the ground under the centres of map pixels, (row, column, 3) east, north and up of the foot [m].
 
         Exact every ``TIE`` pixels and linear between. A map bends against the ground's plane by about the earth's
-        radius, so that this is off by TIE^2 resolution / 8 R of a pixel: 1e-6 at 5 cm, 2e-5 at 1 m (tested).
+        radius. So this is off by TIE^2 resolution / 8 R of a pixel: 1e-6 at 5 cm, 2e-5 at 1 m (tested).
         """
         affine, cuts = self.geobox.affine, (-(-(part.stop - part.start) // TIE) + 1 for part in (rows, columns))
         row, column = (np.linspace(part.start, part.stop, cut) for part, cut in zip((rows, columns), cuts, strict=True))
@@ -185,7 +188,7 @@ class GroundGrid:
         return _between(_between(exact, columns, 1), rows, 0)
 
     def counts(self) -> dict[str, int]:
-        """Scene pixels that the map shows, that meet the ground beyond its reach, and that meet none."""
+        """Return how many scene pixels the map shows, meet the ground beyond its reach, and meet none."""
         view, total = self.frame.view, self.scene_shape[0] * self.scene_shape[1]
         near, ground = (view.count_ground(self.scene_shape, sink) for sink in (self.least_sink, LEAST_SINK))
         return {"mapped_px": near, "beyond_reach_px": ground - near, "no_ground_px": total - ground}
@@ -196,8 +199,8 @@ def ground_grid(
 ) -> GroundGrid:
     """Lay a map's grid over the footprint of a field of (y, x) px. Its pixels start at multiples of their side.
 
-    ``epsg`` is the code of a projected CRS in metres, None for the rig's UTM zone; ``resolution_m`` the side of the
-    map's pixels, None for the median side of a scene pixel's footprint, rounded, or more where a long and narrow
+    ``epsg`` is the code of a projected CRS in metres, None for the rig's UTM zone; ``resolution_m`` is the side of the
+    map's pixels. None takes the median side of a scene pixel's footprint, rounded, or more where a long and narrow
     footprint would need a far larger map than the scene.
 
     Raises PoseError: no ray of the field meets the ground, the CRS does not suit the place, or the grid would have far
@@ -226,20 +229,20 @@ def ground_grid(
 
 
 def least_mapped_sink(view: GroundView, scene_shape: tuple[int, int]) -> float:
-    """Give the sink below which a field's rays meet the ground too far away to be mapped."""
+    """Return the sink below which a field's rays meet the ground too far away to be mapped."""
     farther: float = FAR_PIXELS ** (2 / 3)  # a footprint's area goes as w^-3
     return max(median_sink(view, scene_shape) / farther, LEAST_SINK)
 
 
 def grid_of_map(view: GroundView, scene_shape: tuple[int, int], geobox: GeoBox) -> GroundGrid:
-    """Give the grid of a map that is there already, as ``ground_grid`` made it for the view and scene."""
+    """Return the grid of a map that is there already, as ``ground_grid`` made it for the view and scene."""
     assert geobox.crs is not None
     frame = MapFrame(view, pyproj.CRS.from_wkt(geobox.crs.to_wkt()))
     return GroundGrid(frame, scene_shape, geobox, least_mapped_sink(view, scene_shape))
 
 
 def median_sink(view: GroundView, scene_shape: tuple[int, int]) -> float:
-    """Give the median by which the rays of a field that meet the ground sink; NaN if none does."""
+    """Return the median by which the rays of a field that meet the ground sink; NaN if none does."""
     y, x = (np.linspace(places[0], places[-1], min(len(places), SAMPLES)) for places in pixel_places(scene_shape))
     sink = view.sink(np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1))
     # w is linear, so that one of the corners, which are among the samples, sinks the most
@@ -248,19 +251,22 @@ def median_sink(view: GroundView, scene_shape: tuple[int, int]) -> float:
 
 
 def median_footprint_m(view: GroundView, scene_shape: tuple[int, int]) -> float:
-    """Side of the square that is as large as the median pixel's footprint, of the pixels that meet the ground."""
+    """Return the side of the square with the area of the median footprint of pixels that meet the ground [m]."""
     return float(view.height_m * view.ifov_rad * median_sink(view, scene_shape) ** -1.5)
 
 
 def round_step(step_m: float) -> float:
-    """The nearest of 1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8 times a power of ten, by ratio."""
+    """Return the nearest of 1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8 times a power of ten, by ratio."""
     power = int(np.floor(np.log10(step_m)))
     ratios = np.abs(np.log(np.array(ROUND_STEPS) * 10.0**power / step_m))
     return float(f"{ROUND_STEPS[int(np.argmin(ratios))]:g}e{power}")
 
 
 def _bounds(frame: MapFrame, outline: Floats) -> tuple[float, float, float, float]:
-    """Box on the map around part of a scene, given by its corners [px]; lines of the scene are lines on the ground."""
+    """Return the box on the map around part of a scene, given by its corners [px].
+
+    Lines of the scene are lines on the ground.
+    """
     fraction = np.linspace(0, 1, EDGE_POINTS)[:, None, None]
     sides = outline + fraction * (np.roll(outline, -1, axis=0) - outline)
     places = frame.ground_to_map(frame.view.scene_to_ground(sides.reshape(-1, 2)))

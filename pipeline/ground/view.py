@@ -82,7 +82,7 @@ class GroundView:
     """A posed rig with its pixel's angle: every scene point's ray and where it meets the ground.
 
     A ray v + x r + y d (tangents x and y, r right, d down) sinks by w = -n . ray per unit of depth, n being the
-    ground's normal with n_up = 1; it meets the ground at the depth height / w. All of this class follows from w being
+    ground's normal with n_up = 1. It meets the ground at the depth height / w. All of this class follows from w being
     linear in the scene.
     """
 
@@ -129,13 +129,13 @@ class GroundView:
         return float(self.pose.range_m * self.sinks[0])
 
     def sink(self, points_px: ArrayLike) -> Floats:
-        """Give w of scene points (..., 2): above 0 where the ray meets the ground, 0 at the horizon."""
+        """Return w of scene points (..., 2): above 0 where the ray meets the ground, 0 at the horizon."""
         tangents = _pairs(points_px) * self.ifov_rad
         w: Floats = self.sinks[0] + tangents[..., 1] * self.sinks[1] + tangents[..., 0] * self.sinks[2]
         return w
 
     def scene_to_ground(self, points_px: ArrayLike) -> Floats:
-        """Give where the rays of scene points (..., 2), y and x [px], meet the ground: (..., 3) of the foot [m].
+        """Return where rays of scene points (..., 2), y and x [px], meet the ground: (..., 3) from the foot [m].
 
         NaN where the ray is at or above the horizon.
         """
@@ -148,7 +148,7 @@ class GroundView:
         return points
 
     def ground_to_scene(self, ground_m: ArrayLike) -> Floats:
-        """Give the scene points (..., 2) [px] at which points (..., 3) east, north, up of the foot [m] are seen.
+        """Return the scene points (..., 2) [px] at which points (..., 3) east, north, up of the foot [m] are seen.
 
         The inverse of ``scene_to_ground``, and right for points above or below the plane too. NaN for points that lie
         beside or behind the pivot.
@@ -159,9 +159,9 @@ class GroundView:
         return points
 
     def area_m2(self, points_px: ArrayLike) -> Floats:
-        """Give the ground under a pixel as a map shows it (of a slope its level share), (...) [m2]; NaN off it.
+        """Return the ground under a pixel as a map shows it (of a slope its level share), (...) [m2]; NaN off it.
 
-        The cross product of the two sides of the footprint is -n (height ifov)^2 / w^3: its level part has no other
+        The cross product of the two sides of the footprint is -n (height ifov)^2 / w^3. Its level part has no other
         dependence on the direction.
         """
         w = self.sink(points_px)
@@ -176,7 +176,7 @@ class GroundView:
         return sum(int(np.count_nonzero(block + across > least_sink)) for block in blocks)
 
     def outline_px(self, scene_shape: tuple[int, int], least_sink: float) -> Floats:
-        """Give the corners (corner, 2) [px] of the part of a scene that sinks by ``least_sink`` or more, in order."""
+        """Return the corners (corner, 2) [px] of the part of a scene that sinks by ``least_sink`` or more, in order."""
         half_y, half_x = scene_shape[0] / 2, scene_shape[1] / 2
         corners = np.array([[-half_y, -half_x], [-half_y, half_x], [half_y, half_x], [half_y, -half_x]])
         excess = self.sink(corners) - least_sink
@@ -191,7 +191,7 @@ class GroundView:
 
 
 def pixel_places(scene_shape: tuple[int, int]) -> tuple[Floats, Floats]:
-    """Give y of every row and x of every column of a scene, from its centre [px]."""
+    """Return y of every row and x of every column of a scene, from its centre [px]."""
     rows, columns = (np.arange(size, dtype=np.float64) for size in scene_shape)
     return rows - (scene_shape[0] - 1) / 2, columns - (scene_shape[1] - 1) / 2
 

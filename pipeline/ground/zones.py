@@ -41,7 +41,9 @@ def on_field(shape: BaseGeometry, crs: pyproj.CRS | None, place: FieldPlace) -> 
         return shapely.intersection(shape, _grown(shapely.box(*place.outline.bounds), BORDER_PX))
     to_place = pyproj.Transformer.from_crs(crs, place.crs, always_xy=True)
     middle = _middle_deg(place) if crs.is_geographic else None
-    there, given = (_told_from(one, middle) for one in (_there(place, crs), shape))
+    back = pyproj.Transformer.from_crs(place.crs, crs, always_xy=True)
+    outline = shapely.transform(place.outline, lambda at: np.stack(back.transform(at[:, 0], at[:, 1]), axis=-1))
+    there, given = (_told_from(one, middle) for one in (outline, shape))
     around = _grown(there, ROUND_THE_FIELD * max(np.ptp(np.reshape(there.bounds, (2, 2)), axis=0)))
     near = shapely.intersection(given, around)
     if near.is_empty:
@@ -52,21 +54,15 @@ def on_field(shape: BaseGeometry, crs: pyproj.CRS | None, place: FieldPlace) -> 
 
 
 def extent_deg(shape: BaseGeometry, crs: pyproj.CRS) -> tuple[float, float, float, float]:
-    """West, south, east and north of a polygon [deg], for messages."""
+    """Return the west, south, east and north of a polygon [deg], for messages."""
     to_globe = pyproj.Transformer.from_crs(crs, WGS84, always_xy=True)
     places = shapely.get_coordinates(shape)
     lon, lat = to_globe.transform(places[:, 0], places[:, 1])
     return float(np.min(lon)), float(np.min(lat)), float(np.max(lon)), float(np.max(lat))
 
 
-def _there(place: FieldPlace, crs: pyproj.CRS) -> BaseGeometry:
-    """The outline of a field in the coordinates of polygons."""
-    back = pyproj.Transformer.from_crs(place.crs, crs, always_xy=True)
-    return shapely.transform(place.outline, lambda at: np.stack(back.transform(at[:, 0], at[:, 1]), axis=-1))
-
-
 def _middle_deg(place: FieldPlace) -> float | None:
-    """Longitude of a field that lies so near 180 degrees that polygons may cross it; None of one that does not."""
+    """Return the longitude of a field so near 180 degrees that polygons may cross it; None for all others."""
     assert place.crs is not None
     west, _, east, _ = extent_deg(place.outline, place.crs)
     middle = east if east - west > 180 else (west + east) / 2
@@ -74,7 +70,7 @@ def _middle_deg(place: FieldPlace) -> float | None:
 
 
 def _told_from(shape: BaseGeometry, middle_deg: float | None) -> BaseGeometry:
-    """A polygon with longitudes that lie within 180 degrees of ``middle_deg``; as it is where that is None."""
+    """Return a polygon with longitudes within 180 degrees of ``middle_deg``; unchanged where that is None."""
     if middle_deg is None:
         return shape
 
@@ -93,7 +89,7 @@ def _grown(shape: BaseGeometry, by: float) -> BaseGeometry:
 def pixels_inside(
     shapes: Sequence[BaseGeometry], size: tuple[int, int], *, origin: tuple[int, int] = (0, 0), touched: bool = False
 ) -> Mask:
-    """Tell which of (y, x) ``size`` pixels from row and column ``origin`` on lie in polygons given in pixels.
+    """Return which of (y, x) ``size`` pixels from row and column ``origin`` on lie in polygons given in pixels.
 
     A pixel belongs where its centre lies; with ``touched`` every pixel that a polygon touches does.
     """
@@ -118,7 +114,10 @@ class FieldZones:
         return ~self.kept
 
     def patch_fractions(self, grid: SceneGrid) -> Floats:
-        """Fraction of each patch's pixels that are kept, (patch,) 0..1; 0 of every patch that a no-go zone touches."""
+        """Return the fraction of each patch's pixels that are kept, (patch,) 0..1.
+
+        It is 0 for every patch that a no-go zone touches.
+        """
         fractions = _patch_means(self.kept, grid)
         return fractions if self.no_go is None else np.where(_patch_means(self.no_go, grid) > 0, 0.0, fractions)
 
@@ -140,7 +139,7 @@ def field_zones(area: Mask | None, no_go: Mask | None) -> FieldZones | None:
 
 
 def _patch_means(mask: Mask, grid: SceneGrid) -> Floats:
-    """Mean over the pixels of each patch that lie on the scene, (patch,)."""
+    """Return the mean over the pixels of each patch that lie on the scene, (patch,)."""
     total, fraction = patch_pixels(grid, mask).mean(axis=(1, 2)), grid.valid_fraction().ravel()
     means: Floats = np.divide(total, fraction, out=np.zeros(fraction.shape), where=fraction > 0)
     return means
@@ -166,7 +165,7 @@ def figures_of_plot(
     confidence: NDArray[np.float32],
     names: tuple[str, ...],
 ) -> PlotFigures:
-    """Work out the figures of a plot of this name, in pixels of a (y, x) class map and by name. Plots may overlap."""
+    """Return the figures of a plot whose outline is in pixels of a (y, x) class map. Plots may overlap."""
     rows, columns = _window(shape, classes.shape)
     size = rows.stop - rows.start, columns.stop - columns.start
     inside = pixels_inside([shape], size, origin=(rows.start, columns.start))
@@ -188,7 +187,7 @@ def figures_of_plot(
 
 
 def _window(shape: BaseGeometry, size: tuple[int, ...]) -> tuple[slice, slice]:
-    """Rows and columns of a map of ``size`` that a polygon can hold, one at least."""
+    """Return the rows and columns of a map of ``size`` that a polygon can hold, one at least."""
     bounds = np.zeros(4) if shape.is_empty else np.array(shape.bounds)
     firsts = (min(max(int(np.floor(low)), 0), most - 1) for low, most in zip(bounds[[1, 0]], size, strict=True))
     lasts = (min(max(int(np.ceil(high)), 1), most) for high, most in zip(bounds[[3, 2]], size, strict=True))

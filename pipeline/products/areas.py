@@ -63,8 +63,8 @@ def probable_fractions(swaths: Iterable[NDArray[np.floating]], classes: int) -> 
     """Estimate shares from probabilities (y, x, class), given as strips of a map from the top down.
 
     NaN where a pixel has no class. Strips are as high as a multiple of ``BLOCK_PX``, but for the last. Each pixel is
-    one draw by its probabilities; within a block of 16 x 16 px all draws go the same way, between blocks they are
-    independent, so that a map in large patches is not taken for surer than it is. NaN without any pixel.
+    one draw by its probabilities. Within a block of 16 x 16 px all draws go the same way, and blocks are independent.
+    So a map in large patches is not taken for surer than it is. NaN without any pixel.
     """
     total, expected, variance = 0, np.zeros(classes), np.zeros(classes)
     for swath in swaths:

@@ -40,12 +40,12 @@ class Heading:
         return float(np.sin(np.deg2rad(self.degrees))), float(np.cos(np.deg2rad(self.degrees)))
 
     def to_axes(self, x: Floats, y: Floats) -> Floats:
-        """Give (..., 2) along and across of places x east, y north, in the map's unit."""
+        """Return (..., 2) along and across of places x east, y north, in the map's unit."""
         sine, cosine = self._turn
         return np.stack([x * sine + y * cosine, x * cosine - y * sine], axis=-1)
 
     def from_axes(self, along: Floats, across: Floats) -> Floats:
-        """Give (..., 2) x and y; the inverse of ``to_axes``."""
+        """Return (..., 2) x and y; the inverse of ``to_axes``."""
         sine, cosine = self._turn
         return np.stack([along * sine + across * cosine, along * cosine - across * sine], axis=-1)
 
@@ -111,7 +111,7 @@ def covered_fractions(grid: CellGrid, mask: NDArray[np.bool_], transform: Affine
     """Return the fraction of each cell, (row, column), that the pixels of a mask (y, x) cover.
 
     Exact for pixels with straight sides. Each side of the outline, cut at the cells' borders, is a trapezoid to the far
-    end of its row of cells; with their signs these add up to the covered area (Green's theorem).
+    end of its row of cells. Added with their signs, these give the covered area (Green's theorem).
     """
     beside, beyond = np.zeros(grid.shape[0] * grid.shape[1]), np.zeros(grid.shape[0] * grid.shape[1])
     for sides in pixel_sides(mask, transform, to_axes):

@@ -112,7 +112,7 @@ NARROW = (
 
 
 def find_index(name: str) -> SpectralIndex:
-    """Give an index by its name, in capitals or not.
+    """Return an index by its name, in capitals or not.
 
     Raises SettingsError: there is none of that name, or it needs what no camera gives; the message lists similar names.
     """
@@ -131,7 +131,7 @@ def find_index(name: str) -> SpectralIndex:
 
 
 def _listed(name: str) -> SpectralIndex:
-    """An index of spyndex's list, its constants filled in."""
+    """Return an index of spyndex's list with its constants."""
     about, bands, constants = spyndex.indices[name], [], {}
     for symbol in about.bands:
         if symbol in spyndex.bands:
@@ -192,10 +192,10 @@ def _spread(wavelength_nm: NDArray[np.float64]) -> str:
 def index_values(
     index: SpectralIndex, values: NDArray[np.floating], wavelength_nm: Sequence[float], *, white: float = 1.0
 ) -> Floats:
-    """Work an index out of the values (..., band) of the bands that `pick_bands` gave, and their wavelengths [nm].
+    """Return an index from the values (..., band) of the bands that `pick_bands` gave, and their wavelengths [nm].
 
-    NaN where a band has no value, where the bands are darker than 1 % of ``white`` on the mean, and where the formula
-    has no finite value, as by a division by zero.
+    It is NaN where a band has no value, and where the bands are darker than 1 % of ``white`` on the mean. So it is
+    where the formula has no finite value, as by a division by zero.
     """
     usable: NDArray[np.bool_] = np.isfinite(values).all(axis=-1)
     usable &= np.where(usable, values.mean(axis=-1), -np.inf) >= DARK_FRACTION * white

@@ -1,10 +1,10 @@
 """Regions of a class map: small ones given to a neighbour, classes grown, and their outlines as polygons without gaps.
 
-A region is a set of pixels of one class that hang together by their sides. What has no class (255) is no region: it
-is never given to a class, nor takes anything from one, unless a class is grown over it on request.
+A region is a set of pixels of one class that hang together by their sides. Pixels without a class (255) are no region.
+They are never given to a class, nor take from one, unless a class is grown over them on request.
 
-Outlines go along the sides of pixels. Wherever three regions meet, all three have a vertex there: that is what makes
-the outlines a coverage in the words of shapely, whose simplification draws a border once for both its regions.
+Outlines go along the sides of pixels. Wherever three regions meet, all three have a vertex there. That makes the
+outlines a coverage in the words of shapely, whose simplification draws a border once for both its regions.
 """
 
 from __future__ import annotations
@@ -44,31 +44,32 @@ class Coverage:
     polygons: NDArray[Any]  # (polygon,) shapely's, x to the right and y down in pixels from the map's corner
 
     def areas(self, count: int) -> NDArray[np.float64]:
-        """(class,) area of the first ``count`` classes [px]."""
+        """Return (class,) areas of the first ``count`` classes [px]."""
         return np.bincount(self.classes, self.polygon_areas(), count)[:count].astype(np.float64)
 
     def polygon_areas(self) -> NDArray[np.float64]:
-        """(polygon,) area of each."""
+        """Return the area of each polygon, (polygon,)."""
         area: NDArray[np.float64] = shapely.area(self.polygons)
         return area
 
     def moved(self, transform: Affine) -> Coverage:
-        """The same in x and y of a map, to which ``transform`` leads from pixel corners."""
+        """Return the same coverage in x and y of a map; ``transform`` leads there from pixel corners."""
         a, b, c, d, e, f = transform[:6]
         turn, origin = np.array([[a, d], [b, e]]), np.array([c, f])
         return Coverage(self.classes, shapely.transform(self.polygons, lambda points: points @ turn + origin))
 
     def of_classes(self) -> Coverage:
-        """The same without what has no class."""
+        """Return the same coverage without the parts that have no class."""
         known = self.classes != UNLABELLED
         return Coverage(self.classes[known], self.polygons[known])
 
 
 def class_polygons(classes: Classes, tolerance_px: float = 1.0) -> Coverage:
-    """Outline the regions of a class map (y, x), and simplify their borders by about ``tolerance_px``.
+    """Return the outlines of the regions of a class map (y, x), simplified by about ``tolerance_px``.
 
-    A region of a few pixels keeps its outline, as its area would be lost with its corners: those below 32 squares of
-    the tolerance where a class's area would else be off by more than 1 %, or below 128, 512, 2048, or at last all.
+    A region of a few pixels keeps its outline, as its area would be lost with its corners. These are regions below 32
+    squares of the tolerance where a class's area would else be off by more than 1 %. The limit rises to 128, 512 and
+    2048, and at last to all regions, while it is.
     """
     framed = np.pad(classes, 1, constant_values=UNLABELLED)  # what has no class is simplified with its neighbours
     found = outline_regions(framed)
@@ -88,7 +89,7 @@ def class_polygons(classes: Classes, tolerance_px: float = 1.0) -> Coverage:
 
 
 def outline_regions(classes: Classes) -> Coverage:
-    """Outline the regions of a class map (y, x) along the sides of their pixels, those without a class too."""
+    """Return the outlines of the regions of a class map (y, x) along pixel sides, regions without a class included."""
     numbers, graph = find_regions(classes)
     found = sorted(features.shapes(numbers, connectivity=4), key=lambda one: one[1])
     stepped = shapely.segmentize([shapely.geometry.shape(one) for one, _ in found], 1.0)
@@ -106,9 +107,9 @@ class RegionGraph:
     sides: NDArray[np.int64]  # (pair,) how many sides of pixels lie between them
 
     def grouped(self, group: NDArray[np.integer]) -> RegionGraph:
-        """The graph of groups of regions, (region,) numbers of groups from 0; a group has its largest region's class.
+        """Return the graph of groups of regions, (region,) numbers of groups from 0.
 
-        Of equally large ones the first gives the class.
+        A group has its largest region's class. The first of equally large ones gives the class.
         """
         count = int(group.max(initial=-1)) + 1
         sizes = np.bincount(group, self.sizes, count).astype(np.int64)
@@ -121,7 +122,7 @@ class RegionGraph:
 def _summed(
     pairs: NDArray[np.integer], sides: NDArray[np.int64], count: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs of different regions, each once, with the sum of its sides."""
+    """Return pairs of different regions, each once, with the sum of its sides."""
     apart = pairs[:, 0] != pairs[:, 1]
     low, high = pairs[apart].min(axis=1).astype(np.int64), pairs[apart].max(axis=1).astype(np.int64)
     codes, number = np.unique(low * count + high, return_inverse=True)
@@ -147,11 +148,11 @@ def find_regions(classes: Classes) -> tuple[NDArray[np.int32], RegionGraph]:
 
 
 def merge_small(classes: Classes, least_px: float) -> Classes:
-    """Give every region of less than ``least_px`` pixels to the neighbour that it shares the longest border with.
+    """Return every region of less than ``least_px`` pixels to the neighbour that it shares the longest border with.
 
     Neighbours that are small as well stay together, as the class of the largest, until the whole is large enough.
-    What has no neighbour with a class stays, however small. Of borders equally long the neighbour numbered first (from
-    the upper left) is taken.
+    Regions without a neighbour of a class stay, however small. Among borders equally long the neighbour numbered first
+    (from the upper left) is taken.
     """
     if least_px <= 1:
         return classes.copy()
@@ -168,7 +169,10 @@ def merge_small(classes: Classes, least_px: float) -> Classes:
 
 
 def _links_of_small(graph: RegionGraph, least_px: float) -> NDArray[np.int64]:
-    """(link, 2): each small region with its neighbour of the longest border; none for those without a neighbour."""
+    """Return (link, 2): each small region with its neighbour of the longest border.
+
+    Regions without a neighbour have no link.
+    """
     known = (graph.classes[graph.pairs] != UNLABELLED).all(axis=1)
     pairs, sides = graph.pairs[known], np.tile(graph.sides[known], 2)
     ends = np.concatenate([pairs, pairs[:, ::-1]])
@@ -187,7 +191,10 @@ def _joined(links: NDArray[np.int64], count: int) -> NDArray[np.int32]:
 
 
 def grow_class(classes: Classes, number: int, radius_px: float) -> Classes:
-    """Give a class all pixels whose centres lie within ``radius_px`` of one of its own; what has no class stays so."""
+    """Return the map with a class grown over pixels whose centres lie within ``radius_px`` of its own.
+
+    Pixels without a class stay so.
+    """
     grown = classes.copy()
     if radius_px > 0 and (classes == number).any():
         away = ndimage.distance_transform_edt(classes != number)

@@ -57,7 +57,7 @@ class FileServer:
         return f"the camera's file server {self.host}:{self.port}"
 
     def most_s(self, size: int) -> float:
-        """Seconds that a file of ``size`` bytes may take with all its tries."""
+        """Return the seconds that a file of ``size`` bytes may take with all its tries."""
         return 2 * size / (1e3 * self.least_kb_s) + 3 * self.tries * (self.stall_s + self.pause_s)
 
 
@@ -155,7 +155,7 @@ class MirrorSettings(MirrorLink):
 
     @property
     def patience(self) -> Patience:
-        """Return how long transactions may take."""
+        """Return deadline, retries and quiet time of transactions."""
         return Patience(self.deadline_s, self.retries, self.quiet_s)
 
 
@@ -218,22 +218,22 @@ class SurveyRig(MirrorLink):
     provenance: str = stated("assumed", "Who confirmed the assumed values")
 
     def mirror(self, vector_pairs: int) -> MirrorSettings:
-        """Give the settings of the mirror's driver; SettingsError where they are out of range."""
+        """Return the settings of the mirror's driver; SettingsError where they are out of range."""
         link = {item.name: getattr(self, item.name) for item in fields(MirrorLink)}
         return MirrorSettings(**link, vector_pairs=vector_pairs, provenance=self.provenance, mounting=self.mounting)
 
     @property
     def mounting(self) -> Mounting:
-        """Return how the mirror is mounted."""
+        """Return the mounting of the mirror."""
         return Mounting(self.mirror_axes, self.mirror_clocking_deg, self.mirror_offset_x, self.mirror_offset_y)
 
     @property
     def camera(self) -> CameraAddress:
-        """Return where the camera's control socket is."""
+        """Return the address of the camera's control socket."""
         return CameraAddress(self.host, self.control_port, self.connect_s)
 
     @property
     def files(self) -> FileServer:
-        """Return where the camera's files are."""
+        """Return the address of the camera's files."""
         own = {name: getattr(self, name) for name in ("user", "password", "stall_s", "least_kb_s", "read_twice")}
         return FileServer(self.host, self.file_port, **own)

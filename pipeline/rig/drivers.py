@@ -23,7 +23,7 @@ from pipeline.rig.mirror.pro_mode import Trigger
 class MirrorDriver(Protocol):
     """A two-axis mirror that holds a position, or plays a list of them.
 
-    Positions are X and Y on the unit disk, 1 at the rim, of a mirror mounted straight; a driver turns them into the
+    Positions are X and Y on the unit disk, 1 at the rim, of a mirror mounted straight. A driver turns them into the
     device's own by ``rig.mounting``. `load_path` gets at most ``cost.vector_pairs`` of them.
     """
 
@@ -80,7 +80,7 @@ class MirrorDriver(Protocol):
         """Return the loaded position that plays now, or played last, counted from 0."""
 
     def start_log(self, rate_hz: float) -> None:
-        """Begin to log measured positions ``rate_hz`` times a second."""
+        """Start to log measured positions ``rate_hz`` times a second."""
 
     def read_log(self) -> MotionLog:
         """End the log and return it: positions (sample, 2), their rate, and when the first was taken.
@@ -91,7 +91,7 @@ class MirrorDriver(Protocol):
         """
 
     def close(self) -> None:
-        """Let go of the device."""
+        """Close the connection to the device."""
 
 
 @dataclass(frozen=True)
@@ -174,4 +174,4 @@ class CameraDriver(Protocol):
         """Return the mean frames (sample, band) beside a capture, by ``dark`` and ``white``; empty without any."""
 
     def close(self) -> None:
-        """Let go of the camera; a capture continues."""
+        """Close the connection to the camera; a capture continues."""

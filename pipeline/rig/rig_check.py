@@ -57,7 +57,7 @@ class CheckRow:
 
 
 def failed(device: Device, asked: str, error: PipelineError) -> CheckRow:
-    """Give the row of an error: what is wrong, and behind its semicolon what to do."""
+    """Return the row of an error: what is wrong, and behind its semicolon what to do."""
     came, _, mend = str(error).partition("; ")
     return CheckRow(device, asked, came, "fail", mend)
 

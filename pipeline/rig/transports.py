@@ -25,10 +25,10 @@ class Clock(Protocol):
     """A clock that never goes back. Deadlines are moments of it."""
 
     def now(self) -> float:
-        """Give the moment, counted from anywhere. [s]"""
+        """Return the moment, counted from anywhere. [s]"""
 
     def sleep(self, seconds: float) -> None:
-        """Let time pass; nothing for a time that is not above 0. [s]"""
+        """Wait for a time [s]; return at once where it is not above 0."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Closing(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Let go of what is held."""
+        """Release all that is held."""
 
 
 class DeviceGone(RigError):  # noqa: N818 - the name says what is the case
@@ -124,10 +124,10 @@ class Transport(Protocol):
         """Wait for bytes and give those that are there; none where the deadline passes first."""
 
     def drain(self) -> bytes:
-        """Give what is there already, without waiting."""
+        """Return the bytes that are there already, without waiting."""
 
     def close(self) -> None:
-        """Let go of the port."""
+        """Close the port."""
 
 
 class SerialTransport:
@@ -185,7 +185,7 @@ class SerialTransport:
             raise self._gone(error) from error
 
     def drain(self) -> bytes:
-        """Give what is there already, without waiting, and at most some buffers: a port may never fall silent."""
+        """Return what is there already, without waiting, and at most some buffers: a port may never fall silent."""
         drained = b""
         try:
             while len(drained) < _MOST_DRAINED and (there := self._serial.in_waiting):
@@ -277,7 +277,7 @@ class SocketTransport:
         return data
 
     def drain(self) -> bytes:
-        """Give what is there already, without waiting, and at most some buffers: a sender may never fall silent.
+        """Return what is there already, without waiting, and at most some buffers: a sender may never fall silent.
 
         DeviceGone: the connection is lost, or the other end closed it.
         """
@@ -307,8 +307,8 @@ class SocketTransport:
 class Wire:
     """One device behind a transport. Only one transaction runs at a time, and each begins with an empty line.
 
-    A read is asked again, within the deadline of the first; a write never is; a motion never is, and one that is not
-    acknowledged freezes all motions: where the mirror is is for a person to see, who connects anew then.
+    A read is asked again, within the deadline of the first. A write or a motion never is, and a motion that is not
+    acknowledged freezes all motions. A person has to look where the mirror stands, and connects anew then.
     """
 
     def __init__(self, transport: Transport, clock: Clock, patience: Patience) -> None:
@@ -389,7 +389,7 @@ class Wire:
         )
 
     def _empty_line(self, when: str, latest: float = math.inf, *, level: int = logging.WARNING) -> None:
-        """Drop what is on the line. Where an answer is still owed, wait for silence: it would pass for the next one."""
+        """Drop what is on the line. If an answer is still owed, wait for silence: it would pass for the next one."""
         stale = self.transport.drain()
         now = self.clock.now()
         latest = min(latest, now + 5 * self.patience.quiet_s)  # some devices never stop

@@ -94,7 +94,7 @@ class Archive:
 
     @property
     def name(self) -> str:
-        """Return what a person gives to open it again."""
+        """Return the address by which a person opens it again."""
         return str(self.root)
 
     @property
@@ -105,14 +105,14 @@ class Archive:
     # --- stages -------------------------------------------------------------------------------------------------------
 
     def ref(self, stage: str, key: str) -> StageRef:
-        """Address of a store, whether it is there or not."""
+        """Return the address of a store, whether it is there or not."""
         return store_at(self.root, stage, key)
 
     def locate(self, address: str) -> Path:
-        """Return where on this machine a product lies by its address relative to the archive, as a receipt gives it.
+        """Return the path on this machine of a product, by its address relative to the archive, as a receipt gives it.
 
-        Raises IncompleteStoreError: its store is not there, its files were cleared away, or one of them is missing, cut
-        short, a link or no file at all.
+        Raises IncompleteStoreError: the store is not there, or its files were cleared away. So does a file that is
+        missing, cut short, a link or no plain file.
         """
         uri = in_text(address)
         if uri is not None:
@@ -125,10 +125,10 @@ class Archive:
         return self.root / address
 
     def find(self, stage: str, key: str) -> StageRef | None:
-        """The published store, or None, also where its files were cleared away.
+        """Return the published store; None where there is none or its files were cleared away.
 
-        Sizes are compared with the manifest, content only by `verify`. Raises IncompleteStoreError: it is there,
-        but its manifest or a file is missing, or has another size.
+        Sizes are compared with the manifest, content only by `verify`. Raises IncompleteStoreError: it is there, but
+        its manifest or a file is missing, or has another size.
         """
         ref = store_at(self.root, stage, key)
         if not os.path.lexists(ref.path):
@@ -155,7 +155,7 @@ class Archive:
         params: Mapping[str, Any] | None = None,
         inputs: Sequence[str] = (),
     ) -> Iterator[StagedStore]:
-        """Give a folder to write into, and publish it when the block ends well.
+        """Yield a folder to write into, and publish it when the block ends well.
 
         One process at a time makes a key; the others wait and then find ``done``. When the block fails, the folder is
         removed and the archive is unchanged. Raises ArchiveError: the disk refuses; the message names the path and what
@@ -205,24 +205,30 @@ class Archive:
         return staged.ref, not staged.done
 
     def manifest(self, ref: StageRef) -> dict[str, Any]:
-        """Return what is known of a store: stage, key, version, params, inputs, created, libraries, files."""
+        """Return the facts of a store: stage, key, version, params, inputs, created, libraries, files."""
         return read_manifest(self.root / ref.uri)
 
     def stored_bytes(self, ref: StageRef) -> int:
-        """Size of a store's files by its manifest, as they were made: also of those that were cleared away."""
+        """Return the size of a store's files by its manifest, as they were made.
+
+        Files that were cleared away count too.
+        """
         return made_bytes(self.manifest(ref))
 
     def manifest_hash(self, ref: StageRef) -> str:
-        """SHA-256 of a store's manifest.json, and so of every byte of the store."""
+        """Return the SHA-256 of a store's manifest.json, and so of every byte of the store."""
         return manifest_sha256(self.root / ref.uri)
 
     def manifest_hashes(self, refs: Iterable[StageRef]) -> dict[str, str]:
-        """`manifest_hash` by address, of stores and of all they rest on, for ``RunDraft.publish(rests_on=...)``."""
+        """Return the `manifest_hash` of stores and of all they rest on, by address.
+
+        See ``RunDraft.publish(rests_on=...)``.
+        """
         plain = [store_at(self.root, ref.stage, ref.key) for ref in refs]
         return {ref.uri: manifest_sha256(ref.path) for ref in rests_on(self.root, plain)}
 
     def refs(self, stage: str | None = None) -> list[StageRef]:
-        """Every published store (of one stage), by stage and key."""
+        """Return every published store (of one stage), by stage and key."""
         return published_stores(self.root, stage)
 
     def discard(self, ref: StageRef, *, wait: bool = True, unnamed: bool = False) -> bool:
@@ -259,7 +265,7 @@ class Archive:
     def in_use(self, *, alone: bool = False) -> Iterator[bool]:
         """Keep others from clearing stores away while the block runs; many may do so at a time.
 
-        With ``alone`` ask to be the only one: gives False, at once, where another process uses the archive.
+        ``alone`` asks to be the only one, and gives False at once where another process uses the archive.
         """
         with refusals(self.root, "write to the archive"):
             release = take_lock(self._lock_path("use"), wait=not alone, shared=not alone)
@@ -285,15 +291,15 @@ class Archive:
         return removed
 
     def now(self) -> datetime:
-        """Time by the clock that tells how old stores are."""
+        """Return the time by the clock that the age of stores is counted by."""
         return datetime.now(UTC)
 
     def size_of(self, uri: str) -> int:
-        """Bytes of all files of a store or run, manifest included, as they are there now."""
+        """Return the bytes of all files of a store or run, manifest included, as they are there now."""
         return bytes_below(self.root / uri)
 
     def sizes(self, uris: Iterable[str]) -> dict[str, int]:
-        """`size_of` stores and runs, by address."""
+        """Return the sizes of stores and runs, as `size_of` counts them, by address."""
         return {uri: self.size_of(uri) for uri in uris}
 
     def kept_bytes(self, run: Run, catalogue: Catalogue) -> int:
@@ -309,17 +315,20 @@ class Archive:
         return self.sizes(sorted({*catalogue.stores, *below, *(uri for uris in below.values() for uri in uris)}))
 
     def take_moved(self) -> int:
-        """Bytes that went to and from a bucket since this was asked last, or the archive was opened."""
+        """Return the bytes that went to and from a bucket since the last call, or since the archive was opened."""
         return 0
 
     def lost_runs(self) -> list[str]:
-        """Addresses of runs whose manifest is gone, so that nothing tells what they name."""
+        """Return the addresses of runs that have lost their manifest, so that their stores are unknown."""
         return [
             f"runs/{path.name}" for path in without_manifest(self.root) if path.parent.name == "runs" and path.is_dir()
         ]
 
     def leftovers(self, keep_days: float) -> dict[str, int]:
-        """Return what broken-off uploads left in a bucket for ``keep_days``: address and bytes; nothing in a folder."""
+        """Return address and bytes of files that broken-off uploads left in a bucket for ``keep_days``.
+
+        None in a folder.
+        """
         return {}
 
     def drop_leftover(self, uri: str) -> None:
@@ -337,7 +346,7 @@ class Archive:
     # --- runs and spools ----------------------------------------------------------------------------------------------
 
     def new_run(self, name: str) -> RunDraft:
-        """Begin the folder of one run; nothing of it is seen under ``runs`` before :meth:`RunDraft.publish`."""
+        """Create the folder of one run; it is not seen under ``runs`` before :meth:`RunDraft.publish`."""
         stem = f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{run_stem(name)}"
         run_id, number = stem, 1
         with refusals(self.root, "write to the archive"):
@@ -351,7 +360,7 @@ class Archive:
         return self._draft(run_id, wait=False, extends=False)
 
     def extend_run(self, run_id: str, *, wait: bool = True) -> RunDraft | None:
-        """Begin to add to a published run; it stays as it is until :meth:`RunDraft.publish` of what is given.
+        """Open a published run to add to it; it stays as it is until :meth:`RunDraft.publish` of the draft returned.
 
         One process at a time does so; None where another does and ``wait`` is false. Raises ArchiveError: there is no
         run of this name.
@@ -382,11 +391,11 @@ class Archive:
         return RunDraft(run_id, folder, self.root, release, extends=extends)
 
     def runs(self) -> list[Path]:
-        """Folders of the published runs, oldest first."""
+        """Return the folders of the published runs, oldest first."""
         return published_runs(self.root)
 
     def spool_folder(self, key: str) -> Path:
-        """Folder for the lines of a capture under way; it outlives the process, unlike a staged store."""
+        """Return the folder for the lines of a capture under way; it outlives the process, unlike a staged store."""
         check_name(key)
         folder = self.root / "spool" / key
         with refusals(self.root, "write to the archive"):
@@ -401,7 +410,7 @@ class Archive:
             remove_tree(self.root / "spool" / key)
 
     def take_spooled(self) -> int:
-        """Bytes of the spools that were removed since this was asked last, or the archive was opened."""
+        """Return the bytes of the spools that were removed since the last call, or since the archive was opened."""
         taken, self._spooled = self._spooled, 0
         return taken
 

@@ -30,7 +30,7 @@ SIGNIFICANT_DIGITS = 12
 
 
 def stage_key(stage: str, version: int | str, params: Mapping[str, Any], inputs: Sequence[str]) -> str:
-    """Key of one stage's output: 20 hex digits of the SHA-256 of stage, version, parameters and input keys.
+    """Return the key of one stage's output: 20 hex digits of the SHA-256 of stage, version, parameters and input keys.
 
     Floats count to 12 significant digits, 2 and 2.0 alike; the order of parameters does not count, that of a list of
     inputs does. Raises ArchiveError: a parameter is of a kind that has no lasting text, such as a function.
@@ -40,12 +40,12 @@ def stage_key(stage: str, version: int | str, params: Mapping[str, Any], inputs:
 
 
 def canonical_json(value: object) -> str:
-    """One text for one meaning: sorted names, quantised floats, no spaces."""
+    """Return the same text for the same meaning: sorted names, quantised floats, no spaces."""
     return json.dumps(plain(value), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
 
 def plain(value: object) -> Any:
-    """The value as JSON knows it. Arrays become the hash of their bytes; NaN and infinities become words."""
+    """Return the value as JSON knows it. Arrays become the hash of their bytes; NaN and infinities become words."""
     if value is None or isinstance(value, bool | str):
         return value
     if isinstance(value, np.generic):
@@ -80,7 +80,7 @@ def plain(value: object) -> Any:
 
 
 def array_digest(array: NDArray[np.generic]) -> str:
-    """Hash of an array's shape and values."""
+    """Return a hash of an array's shape and values."""
     return hashlib.sha256(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes()).hexdigest()[:20]
 
 
@@ -103,20 +103,23 @@ class StageRef:
 
 
 def store_at(root: Path, stage: str, key: str) -> StageRef:
-    """Address of a store, whether it is there or not (ArchiveError: no such names can be)."""
+    """Return the address of a store, whether it is there or not. Raises ArchiveError: no store can have such names."""
     check_name(stage)
     check_name(key)
     return StageRef(stage, key, root / "stages" / stage / key)
 
 
 def published_stores(root: Path, stage: str | None = None) -> list[StageRef]:
-    """Every published store (of one stage), by stage and key."""
+    """Return every published store (of one stage), by stage and key."""
     folders = sorted((root / "stages").glob(f"{stage or '*'}/*"))
     return [StageRef(path.parent.name, path.name, path) for path in folders if _is_published(path)]
 
 
 def published_runs(root: Path) -> list[Path]:
-    """Folders of the published runs, oldest first: by the second in their names, then by when they were written."""
+    """Return the folders of the published runs, oldest first.
+
+    Runs are sorted by the second in their names, then by the time at which they were written.
+    """
     folders = [path for path in (root / "runs").glob("*") if _is_published(path)]
     ages = {path: (path / MANIFEST_NAME).lstat().st_mtime_ns for path in folders}
     return sorted(ages, key=lambda folder: (folder.name[:SECOND], ages[folder], folder.name))
@@ -128,14 +131,14 @@ def _is_published(folder: Path) -> bool:
 
 
 def without_manifest(root: Path) -> list[Path]:
-    """Return what lies among stores and runs and is neither: folders without a manifest, and other people's files."""
+    """Return folders without a manifest, and foreign files, that lie among stores and runs."""
     inside = [*root.glob("stages/*/*"), *root.glob("runs/*")]
     loose = [path for path in root.glob("stages/*") if not path.is_dir()]
     return sorted(path for path in (*inside, *loose) if not path.name.endswith(PART_SUFFIX) and not _is_published(path))
 
 
 def in_text(text: str) -> str | None:
-    """The store's address that a text such as ``stages/rectify/<key>/mosaic.zarr`` begins with, or None."""
+    """Return the store's address that begins a text such as ``stages/rectify/<key>/mosaic.zarr``, or None."""
     found = STORE_URI.match(text)
     if found is None or not all(is_name(part) for part in found.groups()):  # stages/../.. leads out of the archive
         return None

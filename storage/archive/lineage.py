@@ -51,7 +51,7 @@ class Catalogue:
         return found
 
     def inputs_of(self, uri: str) -> list[str]:
-        """Addresses of what a store was made of; a key that is nowhere stays a bare key."""
+        """Return the addresses of a store's inputs; a key without a store stays a bare key."""
         store = self.stores.get(uri)
         if store is None:
             return []
@@ -66,15 +66,15 @@ class Catalogue:
         return found
 
     def ancestors(self, uris: Iterable[str]) -> set[str]:
-        """Return what these stores rest on, themselves not counted; with keys that are nowhere."""
+        """Return the stores that these rest on, themselves not counted; with keys that are nowhere."""
         return reach(uris, self.inputs_of)
 
     def dependents(self, uris: Iterable[str]) -> set[str]:
-        """Return what rests on these stores, themselves not counted."""
+        """Return the stores and runs that rest on these stores, themselves not counted."""
         return reach(uris, lambda uri: self._made_of_it.get(uri, []))
 
     def inputs_first(self, uris: Iterable[str]) -> list[str]:
-        """These stores in such an order that none comes before what it was made of."""
+        """Return these stores in an order in which inputs come before the stores made of them."""
         wanted, done, ordered = set(uris), set[str](), list[str]()
         for start in sorted(wanted):
             waiting: list[tuple[str, Iterator[str]]] = [] if start in done else [(start, iter(self.inputs_of(start)))]
@@ -91,7 +91,7 @@ class Catalogue:
         return ordered
 
     def named_by(self, uri: str) -> list[Run]:
-        """Runs that name a store, or rest on it."""
+        """Return the runs that name a store, or rest on it."""
         return self._namers.get(uri, [])
 
     @cached_property
@@ -131,7 +131,7 @@ class Catalogue:
         }
 
     def roles(self, uri: str) -> set[str]:
-        """Return what runs call the stage that made a store, such as capture_fine."""
+        """Return the names that runs give the stage of a store, such as capture_fine."""
         return self._roles.get(uri.rpartition("/")[2], set())
 
     @cached_property
@@ -155,7 +155,7 @@ class Catalogue:
 
 
 def rests_on(root: Path, refs: Iterable[StageRef]) -> list[StageRef]:
-    """These stores and all that they were made of, as far as it is there, by address."""
+    """Return these stores and all that they were made of, where these are there, sorted by address."""
     found: dict[str, StageRef] = {}
     waiting = list(refs)
     while waiting:
@@ -169,7 +169,7 @@ def rests_on(root: Path, refs: Iterable[StageRef]) -> list[StageRef]:
 
 
 def reach(starts: Iterable[str], following: Callable[[str], Iterable[str]]) -> set[str]:
-    """All that can be reached, the starts themselves only where a circle leads back to them: then they are left out."""
+    """Return all that can be reached from the starts, without the starts themselves."""
     begun = set(starts)
     found, waiting = set(begun), list(begun)
     while waiting:
@@ -184,7 +184,7 @@ LATEST = "latest"  # the newest run
 
 
 def find_product(catalogue: Catalogue, text: str) -> str | Run:
-    """The address of a store that is there, or a run.
+    """Return the address of a store that is there, or a run.
 
     Raises ArchiveError: nothing is called so, several things are, or it could not be a name in any archive.
     """
@@ -220,7 +220,7 @@ def _store(catalogue: Catalogue, uri: str) -> str:
 
 
 def _named(catalogue: Catalogue, text: str) -> str:
-    """A product of the newest run that can be read, or a store by the beginning of its key."""
+    """Return a product of the newest run that can be read, or a store by the beginning of its key."""
     newest = next((run for run in reversed(catalogue.runs) if run.products), None)
     products = {} if newest is None else newest.products
     if text in products:
@@ -263,10 +263,10 @@ class Change:
 
 
 def version_before(catalogue: Catalogue, uri: str) -> Store | None:
-    """The newest earlier store of the same stage, of the same part in a survey and of the same scene; None: the first.
+    """Return the newest earlier store of the same stage, part of the survey and scene; None for the first one.
 
-    The part is what runs call it (capture_fine), or else what kind of store it was made of. The scene is known where
-    it or a store that it rests on has a parameter ``scene``.
+    The part is what runs call it (capture_fine), or else what kind of store it was made of. The scene is known where it
+    or a store that it rests on has a parameter ``scene``.
     """
     this = catalogue.stores[uri]
     before = [
@@ -283,7 +283,7 @@ def version_before(catalogue: Catalogue, uri: str) -> Store | None:
 
 
 def changes_between(catalogue: Catalogue, old: Store, new: Store) -> list[Change]:
-    """Return what differs, and for inputs that differ what differs in them, down to where it began."""
+    """Return the differences of two stores and, for inputs that differ, those within them, down to their origin."""
     found: list[Change] = []
     seen, waiting = set[tuple[str, str]](), [(old, new)]
     while waiting:
@@ -306,7 +306,7 @@ def changes_between(catalogue: Catalogue, old: Store, new: Store) -> list[Change
 
 
 def flatten(value: object, name: str = "") -> dict[str, Any]:
-    """Nested tables and lists of tables as dotted names: ``camera.samples``, ``sweeps[2].start_px``."""
+    """Return nested tables and lists of tables as dotted names: ``camera.samples``, ``sweeps[2].start_px``."""
     if isinstance(value, Mapping) and value:
         return {
             inner: one
@@ -327,7 +327,7 @@ def _differing(where: str, kind: Kind, old: Mapping[str, Any], new: Mapping[str,
 
 
 def _by_stage(catalogue: Catalogue, store: Store) -> dict[str, str]:
-    """Addresses of inputs, told apart by stage, and by number within one."""
+    """Return the addresses of inputs by stage, numbered within one stage."""
     found: dict[str, str] = {}
     for uri in catalogue.inputs_of(store.ref.uri):
         stage = uri.split("/")[1] if "/" in uri else "store that is not there"
@@ -352,5 +352,5 @@ def scenes_of(catalogue: Catalogue, uri: str) -> set[str]:
 
 
 def _moment(store: Store) -> tuple[str, int]:
-    """When a store was published; the file's own date decides where clocks were too coarse."""
+    """Return the time at which a store was published; the file's own date decides between equal times."""
     return store.created, (store.ref.path / "manifest.json").stat().st_mtime_ns

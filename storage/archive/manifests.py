@@ -1,7 +1,6 @@
 """Manifests: the facts of a published folder, the hash and size of every file, and a seal over the manifest itself.
 
-The seal is the SHA-256 of the manifest's text without it, so that a bit that flips in the manifest is found by the
-manifest alone.
+The seal is the SHA-256 of the manifest's text without it. A flipped bit in the manifest is found by the manifest alone.
 """
 
 from __future__ import annotations
@@ -56,10 +55,10 @@ def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """Content of a published folder's manifest.
+    """Return the content of a published folder's manifest.
 
-    Raises IncompleteStoreError: there is none, it cannot be read, its own seal says that it has changed, or it lists
-    what cannot be a file of this folder.
+    Raises IncompleteStoreError: there is none, it cannot be read, or its own seal contradicts it. So does a listed file
+    that cannot lie in this folder.
     """
     content, problem = try_manifest(folder)
     if problem is not None:
@@ -68,7 +67,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def try_manifest(folder: Path) -> tuple[dict[str, Any], str | None]:
-    """Content of a published folder's manifest and None, or nothing and what is wrong with it."""
+    """Return the content of a published folder's manifest and None, or nothing and its fault."""
     if folder.is_symlink():
         return {}, f"{folder.name} is a link, which is not followed: put there what it leads to"
     try:
@@ -80,7 +79,7 @@ def try_manifest(folder: Path) -> tuple[dict[str, Any], str | None]:
 
 
 def parse_manifest(written: bytes) -> tuple[dict[str, Any], str | None]:
-    """Content of a manifest as it was written and None, or nothing and what is wrong with it."""
+    """Return the content of a manifest's text and None, or nothing and its fault."""
     try:
         text = written.decode()
         content = json.loads(text)
@@ -104,7 +103,7 @@ def parse_manifest(written: bytes) -> tuple[dict[str, Any], str | None]:
 
 
 def manifest_sha256(folder: Path) -> str:
-    """SHA-256 of a published folder's manifest.json: what a run records of each store that it rests on.
+    """Return the SHA-256 of a published folder's manifest.json, which runs record of each store they rest on.
 
     Raises IncompleteStoreError: there is none.
     """
@@ -115,18 +114,18 @@ def manifest_sha256(folder: Path) -> str:
 
 
 def listed_bytes(manifest: Mapping[str, Any]) -> int:
-    """Size of all files that a manifest lists."""
+    """Return the size of all files that a manifest lists."""
     return sum(entry["size"] for entry in manifest["files"].values())
 
 
 def made_bytes(manifest: Mapping[str, Any]) -> int:
-    """Size of all files as they were made, also where they were cleared away since."""
+    """Return the size of all files as they were made, those cleared away since included."""
     size = _table(manifest.get(CLEARED)).get("bytes_before")
     return size if isinstance(size, int) else listed_bytes(manifest)
 
 
 def cleared_facts(before: Mapping[str, Any], sha256: str) -> dict[str, Any]:
-    """Facts for the manifest of a store whose files are cleared away: those of before, and what there was.
+    """Return the facts for the manifest of a store whose files are cleared away: earlier ones, and what was removed.
 
     ``before`` and ``sha256`` are the manifest that it has until then, and the SHA-256 of its file.
     """
@@ -152,7 +151,7 @@ def _table(value: object) -> Mapping[str, Any]:
 
 
 def extended_facts(before: Mapping[str, Any], sha256: str) -> dict[str, Any]:
-    """Facts for the manifest of a run that something is added to; it stays a run of the time at which it was published.
+    """Return the facts for the manifest of a run that is extended; its time of publication stays.
 
     ``before`` and ``sha256`` are the manifest that it has until then, and the SHA-256 of its file.
     """
@@ -171,7 +170,7 @@ def check_files(folder: Path, *, hashes: bool) -> None:
 
 
 def broken_files(folder: Path, manifest: Mapping[str, Any], *, hashes: bool) -> Iterator[tuple[str, str]]:
-    """Give name and problem of every file that is not as the manifest lists it; with ``hashes`` also extra ones."""
+    """Yield name and problem of every file that is not as the manifest lists it; with ``hashes`` also extra ones."""
     listed = manifest["files"]
     inner = {parent for name in listed for parent in PurePosixPath(name).parents}
     links = sorted(one for one in inner if (folder / one).is_symlink())  # the outer ones first
@@ -193,7 +192,7 @@ def broken_files(folder: Path, manifest: Mapping[str, Any], *, hashes: bool) -> 
 
 
 def file_problem(path: Path, entry: Mapping[str, Any], *, hashes: bool) -> str | None:
-    """Return what differs from the manifest's ``entry`` of a file, to follow its name; None where it is whole."""
+    """Return a file's difference from its ``entry`` in the manifest, to follow its name; None where it is whole."""
     try:
         size = plain_size(path)
         if size != entry["size"]:
@@ -219,7 +218,7 @@ def _seal(content: Mapping[str, Any]) -> str:
 
 @cache
 def library_versions() -> Mapping[str, str]:
-    """Versions of the libraries that a stored result may depend on, as installed when they were asked for first."""
+    """Return the installed versions of the libraries that a stored result may depend on."""
     found: dict[str, str] = {}
     for name in _DISTRIBUTIONS:
         with suppress(importlib.metadata.PackageNotFoundError):
@@ -228,7 +227,7 @@ def library_versions() -> Mapping[str, str]:
 
 
 def read_table(path: Path) -> dict[str, Any]:
-    """Content of a file directly in a published store's folder.
+    """Return the content of a file directly in a published store's folder.
 
     Raises IncompleteStoreError: the store's manifest does not list the file, or not one of these bytes.
     """

@@ -23,7 +23,10 @@ RESTS_ON = "rests_on"  # in a run's manifest: address of a store -> SHA-256 of i
 
 @dataclass(frozen=True)
 class StageRecord:
-    """One stage of a run, as its receipt has it. What was not measured (a stage read from the archive) is None."""
+    """One stage of a run, as its receipt has it.
+
+    Figures that were not measured (a stage read from the archive) are None.
+    """
 
     name: str
     key: str
@@ -106,7 +109,7 @@ class Run:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Return what the survey was asked for; from its manifest where that says so."""
+        """Return the settings of the survey; from the run's manifest where that has them."""
         return _table(self.facts.get("settings")) or _table(self.receipt.get("settings"))
 
     @property
@@ -137,13 +140,13 @@ class Run:
 
 
 def read_store(ref: StageRef) -> Store:
-    """One store by its manifest, damaged or not."""
+    """Return one store by its manifest, damaged or not."""
     facts, problem = try_manifest(ref.path)
     return Store(ref, facts, problem and f"{MANIFEST_NAME} is damaged: {problem}")
 
 
 def read_run(folder: Path, by_key: Mapping[str, list[str]]) -> Run:
-    """One run by its manifest and receipt, damaged or not; ``by_key`` says which stores there are."""
+    """Return one run by its manifest and receipt, damaged or not; ``by_key`` says which stores there are."""
     facts, broken = try_manifest(folder)
     problem = broken and f"{MANIFEST_NAME} is damaged: {broken}"
     receipt: dict[str, Any] = {}
@@ -160,7 +163,7 @@ def read_run(folder: Path, by_key: Mapping[str, list[str]]) -> Run:
 
 
 def _receipt(folder: Path, facts: Mapping[str, Any]) -> tuple[dict[str, Any], str | None]:
-    """The receipt, if every byte of it is as published, or what is wrong; a folder without one is a run without one."""
+    """Return the receipt, if every byte is as published, or its fault; a folder without a receipt has none."""
     entry = facts["files"].get(RECEIPT)
     if entry is None:
         return {}, None
@@ -175,7 +178,7 @@ def _receipt(folder: Path, facts: Mapping[str, Any]) -> tuple[dict[str, Any], st
 
 
 def _texts(value: object) -> Iterator[str]:
-    """Every text in nested lists and tables, names of tables included."""
+    """Yield every text in nested lists and tables, names of tables included."""
     waiting = [value]
     while waiting:
         one = waiting.pop()

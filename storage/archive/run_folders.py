@@ -1,7 +1,7 @@
 """The folder of one run: receipt, report and pictures, published together, and again as a whole with what is added.
 
-What a run says may grow once its accuracy is known: then a new folder takes the place of the old one in one step, under
-the same name and date, and its manifest says which one it had before. Killed anywhere, one of the two lies there whole.
+A run's facts may grow once its accuracy is known. Then a new folder replaces the old one in one step, under the same
+name and date, and its manifest names the earlier one. Killed anywhere, one of the two lies there whole.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ _UNSUPPORTED = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP)
 
 
 def date_of_store(root: Path, uri: str) -> str:
-    """When a store is made: now, or just after the last run that knows one of this address, if the clock was set back.
+    """Return the date of a new store: now, or after the last run that knows its address where the clock was set back.
 
-    By its date `verify` tells a store that was made anew from one whose manifest was written later.
+    `verify` uses the date to tell a store that was made anew from one whose manifest was written later.
     """
     now = datetime.now(UTC)
     folders = published_runs(root)
@@ -65,7 +65,7 @@ def date_of_store(root: Path, uri: str) -> str:
 class RunDraft:
     """The folder of one run while it is written. Published as a whole, or abandoned.
 
-    With ``extends`` the run is published already, and stays as it is unless `publish` is called.
+    A run that ``extends`` another is published already, and stays as it is unless `publish` is called.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class RunDraft:
 
     @property
     def published(self) -> Path:
-        """Return where the run lies once it is published."""
+        """Return the run's folder once it is published."""
         return self.folder.with_name(self.id)
 
     def __enter__(self) -> RunDraft:
@@ -109,8 +109,8 @@ class RunDraft:
     def publish(self, *, rests_on: Mapping[str, str] | None = None, **facts: Any) -> Path:
         """Make the run seen under ``runs``; gives its folder. ``facts`` go into the manifest.
 
-        ``rests_on`` is what `Archive.manifest_hashes` gives of the run's products: by it `verify` knows that their
-        manifests, too, are as they were, and `gc` what to keep, even where the receipt is damaged.
+        ``rests_on`` is the result of `Archive.manifest_hashes` for the run's products. `verify` compares their
+        manifests with it, and `gc` keeps these stores even where the receipt is damaged.
         """
         final = self.published
         with refusals(self._root, "write to the archive"):
@@ -125,7 +125,10 @@ class RunDraft:
         return final
 
     def bytes_published(self, *, rests_on: Mapping[str, str] | None = None, **facts: Any) -> int:
-        """Bytes of the folder, manifest included, were it published now with these facts; see `publish`."""
+        """Return the bytes of the folder, manifest included, if it were published now with these facts.
+
+        See `publish`.
+        """
         with refusals(self._root, "write to the archive"):
             self._write_manifest(rests_on, facts)
             return bytes_below(self.folder)
@@ -147,8 +150,8 @@ class RunDraft:
 def take_its_place(part: Path, final: Path) -> None:
     """Put a whole folder in the place of another, which goes.
 
-    Where the file system cannot exchange two folders there is a moment in which only the unfinished name leads to the
-    run: killed in it, `finish_extensions` has the rest to do.
+    Some file systems cannot exchange two folders: for a moment only the unfinished name leads to the run. If the
+    process is killed then, `finish_extensions` completes the exchange.
     """
     sync_path(final.parent)
     away = part
@@ -166,9 +169,9 @@ def take_its_place(part: Path, final: Path) -> None:
 
 
 def try_exchange(one: Path, other: Path) -> bool:
-    """Give two folders of one file system each other's name in one step, and have the disk know it.
+    """Return two folders of one file system each other's name in one step, and have the disk know it.
 
-    Linux does that (renameat2) on its local file systems; where it cannot, as on most network file systems, nothing is
+    Linux does that (renameat2) on its local file systems. Elsewhere, as on most network file systems, nothing is
     changed and the answer is False.
     """
     call = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
@@ -186,7 +189,7 @@ def try_exchange(one: Path, other: Path) -> bool:
 
 
 def unfinished_extensions(root: Path) -> Iterator[Path]:
-    """Whole folders that were about to take the place of a run, whose own name leads to nothing any more."""
+    """Yield whole folders that were about to replace a run and whose run is gone."""
     for part in sorted((root / "runs").glob(f"*{PART_SUFFIX}")):
         facts, problem = try_manifest(part)
         named = part.name.removesuffix(PART_SUFFIX)

@@ -50,7 +50,7 @@ def kind_of(path: Path) -> str | None:
 
 
 def plain_size(path: Path) -> int:
-    """Bytes of a file.
+    """Return the size of a file in bytes.
 
     Raises NotPlainError: it is a link, a pipe, or whatever else is no file. FileNotFoundError, OSError.
     """
@@ -60,7 +60,7 @@ def plain_size(path: Path) -> int:
 
 
 def open_plain(path: Path, flags: int = os.O_RDONLY) -> int:
-    """Give a descriptor of a file, which the caller closes.
+    """Return a descriptor of a file, which the caller closes.
 
     Raises NotPlainError: it is a link, a pipe, or whatever else is no file. FileNotFoundError, OSError.
     """
@@ -86,7 +86,7 @@ def plain_reader(path: Path) -> BinaryIO:
 
 
 def read_plain(path: Path) -> bytes:
-    """All bytes of a file; raises as `open_plain`."""
+    """Return all bytes of a file; raises as `open_plain`."""
     with plain_reader(path) as file:
         return file.read()
 
@@ -104,7 +104,7 @@ MOST_BYTES = 10_000_000  # settings are a page long
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The tables of a file; a byte order mark, as some editors write it, is passed over.
+    """Return the tables of a file; a byte order mark, as some editors write it, is passed over.
 
     Raises FileNotFoundError: there is no such file. ValueError: it cannot be read as TOML; the message says why.
     """
@@ -181,12 +181,12 @@ def refusals(path: Path, doing: str) -> Iterator[None]:
 
 
 def disk_advice(error: OSError) -> str | None:
-    """Return what a refusal of the disk means and what to do about it; None where the error is another."""
+    """Return the meaning of a refusal of the disk, and the remedy; None where the error is another."""
     return _ADVICE.get(error.errno or 0)
 
 
 def format_disk_error(error: OSError) -> str:
-    """`disk_advice`, or what the system says."""
+    """Return `disk_advice`, or the system's message."""
     return disk_advice(error) or f"{error.strerror or error}; free space or rights and run again"
 
 
@@ -216,7 +216,7 @@ def retire(path: Path) -> None:
 
 
 def sync_path(path: Path) -> None:
-    """Ask the disk to have a file's content, or a folder's names, before going on."""
+    """Write a file's content, or a folder's names, through to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -232,12 +232,12 @@ def rename_into_place(part: Path, final: Path) -> None:
 
 
 def files_below(folder: Path) -> list[Path]:
-    """Every file under a folder but its manifest, in a fixed order."""
+    """Return every file under a folder but its manifest, in a fixed order."""
     return sorted(path for path in folder.rglob("*") if path.is_file() and path != folder / MANIFEST_NAME)
 
 
 def bytes_below(folder: Path) -> int:
-    """Bytes of a folder's files, as far as they are there; none of a link to one."""
+    """Return the bytes of a folder's files, as far as they are there; 0 for a link to a folder."""
     if folder.is_symlink():
         return 0
     sizes = [path.lstat().st_size for path in files_below(folder) if path.exists()]
@@ -246,7 +246,10 @@ def bytes_below(folder: Path) -> int:
 
 
 def file_hash(path: Path) -> str:
-    """SHA-256 of a file's content, in hex (NotPlainError: it is a link, a pipe, or whatever else is no file)."""
+    """Return the SHA-256 of a file's content, in hex.
+
+    Raises NotPlainError: it is a link, a pipe or another special file.
+    """
     digest = hashlib.sha256()
     with plain_reader(path) as file:
         while block := file.read(_BLOCK):

@@ -18,11 +18,11 @@ PROBE_BYTES = 1 << 20  # a disk without room for so much is full
 
 @contextmanager
 def written_aside(folder: Path, names: Sequence[str]) -> Iterator[Path]:
-    """Give an empty folder to write ``names`` into; when the block ends well they replace those in ``folder``.
+    """Yield an empty folder to write ``names`` into; when the block ends well they replace those in ``folder``.
 
-    What belongs together is never mixed: old files of all names but the first go before the first is replaced, and the
-    last one to appear vouches for the others. When the block fails, ``folder`` is unchanged. Raises ArchiveError: the
-    folder is or lies below a file, or the disk refuses; the message names it and what to do.
+    Old and new files are never mixed. Old files of all names but the first are removed before the first is replaced;
+    the last one to appear vouches for the others. When the block fails, ``folder`` is unchanged. Raises ArchiveError:
+    the folder is or lies below a file, or the disk refuses; the message names it and what to do.
     """
     with refusals(folder, "export to"):
         make_folder(folder)
@@ -73,16 +73,16 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def to_json(content: Mapping[str, object]) -> str:
-    """JSON text, two spaces a level, in the content's own order; numbers that are not finite become null.
+    """Return JSON text, two spaces a level, in the content's own order; numbers that are not finite become null.
 
-    What would steer a terminal or turn words round stands as escapes, as JSON has them.
+    Characters that would steer a terminal or reverse text are written as JSON escapes.
     """
     text = json.dumps(_plain(content), indent=2, ensure_ascii=False, allow_nan=False)
     return visible(text, lambda letter: json.dumps(letter)[1:-1]) + "\n"
 
 
 def _plain(value: object) -> object:
-    """Plain lists, dictionaries and numbers; numpy's scalars by their ``item``."""
+    """Return plain lists, dictionaries and numbers; numpy's scalars by their ``item``."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -1,9 +1,9 @@
 """Maps of classes on the grid of a mosaic, and class probabilities of each pixel; those of the ground: `ground_maps`.
 
-Names of classes are CF flags. Of a pixel log-probabilities of its classes, how long ago it was looked at and by what
-light are kept, packed by CF's rules (scale_factor, add_offset), so that any reader of netCDF or Zarr gets numbers: a
-twentieth of a nat in a byte, an eighth of a day in two, a sixteenth of an octave of light in one. Classes less likely
-than one in 1100 are all stored as equally unlikely, and confidence as floats in steps of 1/256.
+Names of classes are CF flags. Each pixel has log-probabilities of its classes, and age and light of its last capture.
+They are packed by CF's rules (scale_factor, add_offset), so that any reader of netCDF or Zarr gets numbers. A byte
+counts twentieths of a nat for probabilities and sixteenths of an octave for light; two bytes count eighths of a day.
+Classes less likely than one in 1100 are all stored as equally unlikely, and confidence as floats in steps of 1/256.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ UNKNOWN, UNKNOWN_COLOUR = "unknown", (200, 0, 200)
 
 
 def with_unknown(legend: ClassNames) -> ClassNames:
-    """The classes with one more behind them, for pixels that are unlike all that the weights were trained on."""
+    """Return the classes and one more, for pixels unlike all that the weights were trained on."""
     name = UNKNOWN if UNKNOWN not in legend.names else f"{UNKNOWN}_spectrum"
     return ClassNames((*legend.names, name), np.vstack([legend.colours, np.array([UNKNOWN_COLOUR], np.uint8)]))
 
@@ -79,7 +79,7 @@ def with_unknown(legend: ClassNames) -> ClassNames:
 def create_class_map(
     path: Path, shape: tuple[int, ...], legend: ClassNames, *, grid: AngularGrid | None = None
 ) -> None:
-    """Begin a class map of (y, x) ``shape`` in which no pixel has a class yet.
+    """Create a class map of (y, x) ``shape`` in which no pixel has a class yet.
 
     Raises ShapeError: there are not as many colours as names.
     """
@@ -139,7 +139,7 @@ def check_named(classes: NDArray[np.integer], count: int) -> None:
 
 
 def class_flags(names: Sequence[str], colours: NDArray[np.uint8]) -> dict[str, Any]:
-    """CF's flag attributes of an image of class indices."""
+    """Return CF's flag attributes of an image of class indices."""
     return {
         "long_name": "class",
         "nodata": UNLABELLED,  # no _FillValue: xarray would make fractions of the numbers
@@ -150,7 +150,7 @@ def class_flags(names: Sequence[str], colours: NDArray[np.uint8]) -> dict[str, A
 
 
 def legend_of(group: zarr.Group) -> ClassNames:
-    """The classes that a group's attributes name."""
+    """Return the classes that a group's attributes name."""
     attributes: dict[str, Any] = dict(group.attrs)
     colours = np.array(attributes.get("class_colours", ()), np.uint8).reshape(-1, 3)
     return ClassNames(tuple(attributes.get("class_names", ())), colours)
@@ -166,9 +166,9 @@ def load_class_map(path: Path) -> ClassMap:
 def create_probabilities(
     path: Path, shape: tuple[int, int], legend: ClassNames, *, grid: AngularGrid | None = None, goes_on: bool = False
 ) -> None:
-    """Begin a store for a field of (y, x) ``shape`` of which nothing is known yet.
+    """Create a store for a field of (y, x) ``shape`` whose pixels are all unknown.
 
-    Where it ``goes_on`` from an earlier one there is also what its pixels were, where they changed: `OLD_CLASS`.
+    A store that ``goes_on`` from an earlier one also has the earlier classes of changed pixels: `OLD_CLASS`.
     """
     names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
     group, place = create_placed_group(path, "class_probabilities", grid, shape, names)
@@ -192,7 +192,7 @@ def create_probabilities(
 
 
 def old_class_flags(legend: ClassNames) -> dict[str, Any]:
-    """CF's flag attributes of an image of the classes that pixels had before."""
+    """Return CF's flag attributes of an image of the classes that pixels had before."""
     words = f"class remembered, where the map is sure of another one; {UNLABELLED} everywhere else"
     return {**class_flags(legend.names, legend.colours), "long_name": words}
 
@@ -256,7 +256,7 @@ def write_changes(path: Path, changed: Floats, patch_px: int) -> None:
 
 
 def unpacked_days(packed: NDArray[np.uint16]) -> Floats:
-    """Days of stored ages; NaN where nothing is known."""
+    """Return stored ages in days; NaN where nothing is known."""
     return np.where(packed == NEVER, np.float32(np.nan), packed * np.float32(DAY_STEP)).astype(np.float32)
 
 
@@ -274,9 +274,10 @@ class ProbabilityStore:
         return legend_of(self._group)
 
     def read(self, rows: slice = slice(None), columns: slice = slice(None)) -> tuple[Floats, Floats, Floats]:
-        """Log-probabilities (y, x, class) that sum to 1 once taken to powers, ages in days and light (y, x).
+        """Return log-probabilities (y, x, class), ages in days (y, x) and light (y, x).
 
-        NaN where nothing is known, no light where there was none.
+        The exponentials of the log-probabilities sum to 1. NaN stands where nothing is known; light is NaN where there
+        was none.
         """
         packed = read_array(self._group, "log_probability", np.s_[rows, columns])
         values = (packed * np.float32(STEP) + np.float32(FAINTEST)).astype(np.float32)
@@ -288,11 +289,11 @@ class ProbabilityStore:
         return values, days, np.where(packed_light == DARK, 0, light).astype(np.float32)
 
     def age(self, rows: slice = slice(None), columns: slice = slice(None)) -> Floats:
-        """(y, x) days since a pixel was looked at; NaN where nothing is known."""
+        """Return (y, x) days since each pixel was captured; NaN where nothing is known."""
         return unpacked_days(read_array(self._group, "age", np.s_[rows, columns]))
 
     def old_class(self) -> NDArray[np.uint8] | None:
-        """(y, x) class that a pixel had where it has another now, else 255; None of a first look."""
+        """Return (y, x) earlier classes of pixels that changed, else 255; None for a first visit."""
         return read_array(self._group, OLD_CLASS) if OLD_CLASS in self._group else None
 
     @property
@@ -301,5 +302,5 @@ class ProbabilityStore:
         return int(self._group["changed"].attrs["patch_px"])  # type: ignore[arg-type]
 
     def changed(self) -> Floats | None:
-        """Shares of pixels that changed, by patch; None of a first look."""
+        """Return the fraction of changed pixels of each patch; None for a first visit."""
         return read_array(self._group, "changed") if "changed" in self._group else None

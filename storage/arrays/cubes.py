@@ -199,7 +199,10 @@ class StoredSweep:
         return found if isinstance(found, Mapping) else None
 
     def quicklook(self) -> Quicklook | None:
-        """A small picture of the sweep, its values over the white reference; None where it was stored without one."""
+        """Return a small picture of the sweep, its values over the white reference.
+
+        None where it was stored without one.
+        """
         return quicklook_of(self.group)
 
 
@@ -215,16 +218,25 @@ class RawCube(StoredSweep):
         return len(self.time_s), self.references.dark.shape[0], len(self.wavelength_nm)
 
     def read(self, start: int = 0, stop: int | None = None) -> NDArray[np.uint16]:
-        """Raw numbers of the lines ``start`` to ``stop``, (line, sample, band) uint16; fastest on multiples of 64."""
+        """Return the raw numbers of the lines ``start`` to ``stop``, (line, sample, band) uint16.
+
+        Fastest on multiples of 64.
+        """
         return read_array(self.group, "dn", slice(start, stop))
 
     def read_lines(self, numbers: NDArray[np.intp]) -> NDArray[np.uint16]:
-        """Raw numbers of single lines in ascending order, (line, sample, band) uint16; decodes each chunk once."""
+        """Return the raw numbers of single lines in ascending order, (line, sample, band) uint16.
+
+        Decodes each chunk once.
+        """
         parts = np.split(numbers, np.flatnonzero(np.diff(numbers // SHARD_ROWS)) + 1)
         return np.concatenate([self.read(int(part[0]), int(part[-1]) + 1)[part - part[0]] for part in parts])
 
     def read_window(self, lines: slice, samples: slice) -> NDArray[np.uint16]:
-        """Raw numbers of some lines and samples, (line, sample, band) uint16; decodes the chunks that hold them."""
+        """Return the raw numbers of some lines and samples, (line, sample, band) uint16.
+
+        Decodes the chunks that hold them.
+        """
         return read_array(self.group, "dn", (lines, samples))
 
 

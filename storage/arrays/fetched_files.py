@@ -2,16 +2,16 @@
 
 A file of the camera is named by its whole path there, notes about the files by a name alone. Bytes are written at the
 end and nowhere else; a file that came damaged goes as a whole. Notes are on the disk when ``append`` returns; of files
-so is all but the last ``SYNC_BYTES``, since the camera still has them. What is held is compared when a transfer goes
-on.
+so is all but the last ``SYNC_BYTES``, since the camera still has them. Held bytes are compared when a transfer
+continues.
 
 ::
 
     <name>          the bytes of a file of the camera, or of notes, which have checksums of their own
     <name>%sums     records of how far the file reached, the CRC-32 of its bytes up to there, and that of the record
 
-What an earlier process left of a file is compared with its sums once, and cut off from where they do not fit: the
-camera is asked for it again.
+Files left by an earlier process are compared with their sums once, and cut off where they differ. The camera is asked
+for the rest again.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class FetchedFiles:
         self._sums: dict[str, _Sums] = {}
 
     def size(self, name: str) -> int:
-        """Bytes held of a file; 0 of one that is not there.
+        """Return the number of bytes held of a file; 0 of one that is not there.
 
         Raises NotKept: the disk does not give them, here or in other calls.
         """
@@ -76,7 +76,7 @@ class FetchedFiles:
             raise _unread(path, error) from error
 
     def read(self, name: str, start: int, stop: int) -> bytes:
-        """Some of the bytes held."""
+        """Return some of the bytes held."""
         path = self._path(name)
         try:
             self._compare(name, path)
@@ -130,7 +130,10 @@ class FetchedFiles:
             ) from error
 
     def _sum_up(self, name: str, path: Path, data: bytes) -> None:
-        """Take down how far a file reaches now. What the disk takes half of is cut off when the file is compared."""
+        """Take down how far a file reaches now.
+
+        A part that the disk took only half of is cut off when the file is compared.
+        """
         known = self._sums[name]
         reached, crc32 = known.reached + len(data), zlib.crc32(data, known.crc32)
         text, sums = _record(reached, crc32), _sums_of(path)
@@ -168,9 +171,9 @@ class FetchedFiles:
 
 
 def first_unlike(path: Path) -> int | None:
-    """From which byte on a fetched file is not as its sums say; None where all of it is. What is torn is no change.
+    """Return the number of the first byte of a fetched file that its sums contradict; None where all fits.
 
-    Raises OSError: one of both cannot be read.
+    A torn end is no change. Raises OSError: the file or its sums cannot be read.
     """
     found, changed = _agreeing(path)
     return found.reached if changed else None
@@ -185,7 +188,7 @@ def _sums_of(path: Path) -> Path:
 
 
 def _agreeing(path: Path) -> tuple[_Sums, bool]:
-    """Return how far bytes and sums of a file agree, and whether anything of either has changed since.
+    """Return up to where bytes and sums of a file agree, and whether any byte of either has changed since.
 
     Each sum is of all bytes before it, so one that is lost is passed over.
     """

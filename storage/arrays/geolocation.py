@@ -25,11 +25,11 @@ _TANGENT = "tangent of the undeflected direction's plane"
 def path_digest(
     position: NDArray[np.floating], usable: NDArray[np.bool_] | None = None, shift: NDArray[np.floating] | None = None
 ) -> str:
-    """Name a sweep's path, in 20 hex digits, by all that its scan paths depend on: usable lines and their places.
+    """Return a sweep's path as 20 hex digits of all that its scan paths depend on: usable lines and their places.
 
     Positions and their corrections ``shift`` are (line, 2), as of :func:`pipeline.rectify.scan_paths.make_scan_paths`.
-    What a line that is not usable reports does not count, nor whether a correction is zero or none. Camera, binning,
-    step and grid are the stage's own parameters.
+    Positions of unusable lines do not count, nor whether a correction is zero or none. Camera, binning, step and grid
+    are the stage's own parameters.
     """
     lines = np.asarray(position, np.float64)
     flags = np.ones(len(lines), np.bool_) if usable is None else np.asarray(usable, np.bool_)

@@ -1,8 +1,8 @@
 """Georeference of stored images: GeoBox or the camera's angles as attributes and coordinates, written and read.
 
-A GeoBox is said by CF's grid mapping with coordinates of pixel centres, and by GeoZarr's attributes ``proj:`` and
-``spatial:``, so that plain xarray, rioxarray and odc-geo find the same. A grid that is turned has no centres along its
-axes: as odc-geo has it, its coordinates count pixels, and the grid mapping's GeoTransform says the rest.
+A GeoBox is written as CF's grid mapping with coordinates of pixel centres, and as GeoZarr's attributes ``proj:`` and
+``spatial:``. Plain xarray, rioxarray and odc-geo find the same. A turned grid has no centres along its axes. Its
+coordinates count pixels, as in odc-geo, and the grid mapping's GeoTransform has the rest.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ _EVEN = 1e-3  # of a step, by which coordinates may differ from an even grid's
 def create_placed_group(
     path: Path, title: str, grid: AngularGrid | None, shape: tuple[int, ...], attributes: Mapping[str, Any]
 ) -> tuple[zarr.Group, dict[str, Any]]:
-    """Begin a store of images of (y, x) ``shape`` on a scene's grid, with the coordinates y and x.
+    """Create a store of images of (y, x) ``shape`` on a scene's grid, with the coordinates y and x.
 
     Gives the store, and the attributes that say of each of its images where it lies.
     """
@@ -77,7 +77,7 @@ def create_placed_group(
 
 
 def map_attributes(geobox: GeoBox) -> dict[str, Any]:
-    """GeoZarr ``proj:`` and ``spatial:`` attributes of a map; the transform maps pixel corners.
+    """Return the GeoZarr ``proj:`` and ``spatial:`` attributes of a map; the transform maps pixel corners.
 
     Raises PoseError: the grid has no CRS.
     """
@@ -117,7 +117,7 @@ def write_grid_mapping(group: zarr.Group, geobox: GeoBox) -> None:
 
 
 def _axis(crs: CRS, name: str) -> dict[str, str]:
-    """CF's words for one axis of a map."""
+    """Return CF's attributes of one axis of a map."""
     if crs.geographic:
         standard, unit = _DEGREES[name]
         return {"standard_name": standard, "long_name": f"{standard} of the pixel's centre", "units": unit}
@@ -159,7 +159,7 @@ def geobox_of_group(group: zarr.Group) -> GeoBox | None:
 def find_geobox(
     attributes: Mapping[str, Any], arrays: Mapping[str, zarr.Array[Any]], shape: tuple[int, int], dims: tuple[str, str]
 ) -> GeoBox | None:
-    """Return where an image of (y, x) ``shape`` lies, as its store says; None where it does not say CRS and grid.
+    """Return the grid on the earth of an image of (y, x) ``shape``, by its store; None without CRS and grid.
 
     ``attributes`` are the image's and its group's, ``arrays`` what else lies in the group, ``dims`` the names of the
     image's axes. Asked are GeoZarr's ``proj:`` and ``spatial:transform``, the grid mapping with its GeoTransform, and
@@ -180,7 +180,7 @@ def find_geobox(
 
 
 def _mapping(attributes: Mapping[str, Any], arrays: Mapping[str, zarr.Array[Any]]) -> dict[str, Any]:
-    """Attributes of the grid mapping: the one that the image names, else the only array that could be one."""
+    """Return the attributes of the grid mapping that the image names, else of the only array that could be one."""
     named = str(attributes.get("grid_mapping", "")).split(":")[0].split(" ")[0]
     if named in arrays:
         return dict(arrays[named].attrs)

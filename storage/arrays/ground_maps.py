@@ -64,11 +64,11 @@ class StoredImage:
 
     @property
     def geobox(self) -> GeoBox | None:
-        """Return where on the earth it lies; None where its store does not say."""
+        """Return the image's grid on the earth; None where its store has none."""
         return geobox_of_group(self.group)
 
     def rows(self) -> Iterator[tuple[int, NDArray[Any]]]:
-        """Rows with the number of the first, as many at a time as a shard has.
+        """Yield the number of the first row and the rows, as many at a time as a shard has.
 
         Raises IncompleteStoreError: a checksum says that the bytes have changed.
         """
@@ -87,7 +87,10 @@ def open_image(path: Path, name: str) -> StoredImage:
 
 
 def load_bands(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-    """Wavelengths and widths [nm] of the store at ``path``. Raises IncompleteStoreError where they are damaged."""
+    """Return the wavelengths and widths [nm] of the store at ``path``.
+
+    Raises IncompleteStoreError where they are damaged.
+    """
     return read_bands(open_group(path))
 
 
@@ -112,7 +115,7 @@ class GroundMapWriter:
     def __init__(
         self, path: Path, geobox: GeoBox, legend: ClassNames, *, about: Mapping[str, Any], goes_on: bool = False
     ) -> None:
-        """Begin a map; one of a survey that ``goes_on`` from an earlier one has images of what changed as well."""
+        """Create a map; one of a survey that ``goes_on`` from an earlier one has images of the changes as well."""
         place = map_attributes(geobox)
         names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
         self._group = create_group(path, "class map on the ground", {**place, **names, **about})

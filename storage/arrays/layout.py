@@ -1,8 +1,8 @@
 """The common layout of stored arrays: Zarr v3 codecs and chunks, bands, CF and GeoZarr attributes, rounding.
 
-Chunks of 32 x 32 px with all bands, in shards of 64 rows, each chunk with its own crc32c: one patch is one range read,
-and a flipped bit is an error instead of a wrong number. Images without bands are one chunk a shard. Codecs to choose
-from are tried in memory in the same layout.
+Chunks are 32 x 32 px with all bands, in shards of 64 rows, each with its own crc32c. One patch is one range read, and a
+flipped bit is an error instead of a wrong number. Images without bands are one chunk a shard. Codecs to choose from are
+tried in memory in the same layout.
 
 Pixels of which a scene knows nothing are taken out of stored images: no class, no value, no memory.
 """
@@ -60,7 +60,10 @@ class AngularGrid:
     geobox: GeoBox | None = None  # of the fine grid, where the scene's file says it
 
     def attributes(self, shape: tuple[int, int]) -> dict[str, Any]:
-        """GeoZarr ``spatial:`` attributes of an image of (y, x) ``shape``; the transform maps pixel corners."""
+        """Return the GeoZarr ``spatial:`` attributes of an image of (y, x) ``shape``.
+
+        The transform maps pixel corners.
+        """
         step = self.ifov_rad * self.factor
         top, left = (-size / 2 * self.ifov_rad for size in self.scene_shape)
         return {
@@ -74,12 +77,12 @@ class AngularGrid:
         }
 
     def record(self) -> dict[str, Any]:
-        """Return what `grid_of` needs to make this grid of angles again."""
+        """Return the values from which `grid_of` makes this grid of angles again."""
         return {"ifov_rad": self.ifov_rad, "scene_shape": list(self.scene_shape), "factor": self.factor}
 
 
 def grid_of(attributes: Mapping[str, Any]) -> AngularGrid | None:
-    """The grid of angles that a group's attributes record, or None."""
+    """Return the grid of angles that a group's attributes record, or None."""
     record = attributes.get("angular_grid")
     if not isinstance(record, dict):
         return None
@@ -88,7 +91,7 @@ def grid_of(attributes: Mapping[str, Any]) -> AngularGrid | None:
 
 
 def create_group(path: StorePlace, title: str, attributes: Mapping[str, Any]) -> zarr.Group:
-    """Begin a Zarr v3 store at ``path``, which must not exist."""
+    """Create a Zarr v3 store at ``path``, which must not exist."""
     if isinstance(path, Path):
         path.parent.mkdir(parents=True, exist_ok=True)
     return zarr.create_group(path, zarr_format=3, attributes={"Conventions": "CF-1.12", "title": title, **attributes})
@@ -106,7 +109,9 @@ class ArraySpec:
 
 
 def image_spec(dims: Sequence[str], shape: Sequence[int], dtype: str, *, whole: bool = False) -> ArraySpec:
-    """Rows and columns first, all bands in one chunk; a shard is 64 rows of at most 640 columns.
+    """Return the layout of an image: rows and columns first, all bands in one chunk.
+
+    A shard has 64 rows and at most 640 columns.
 
     It is one chunk where it is to be read ``whole``, and in images without bands: chunks of few bytes cost more calls
     than unpacking.
@@ -143,8 +148,8 @@ def create_array(
 ) -> zarr.Array[Any]:
     """Add an empty array: NaN where floating; ``_FillValue``, ``nodata`` or 0 where not; checksums come last.
 
-    ``packing`` is blosc's codec and its level. Of a ``flat`` image most pixels are like those beside them, as of a
-    map: bytes are packed whole, channel after channel, and files lie in one folder.
+    ``packing`` is blosc's codec and its level. Most pixels of a ``flat`` image, such as a map, are like their
+    neighbours. Its bytes are packed whole, channel after channel, and its files lie in one folder.
     """
     kind, (codec, level) = np.dtype(spec.dtype), packing
     shuffle = BloscShuffle.shuffle if flat else BloscShuffle.bitshuffle
@@ -243,7 +248,7 @@ def read_array(group: zarr.Group, name: str, selection: Any = ...) -> NDArray[An
 
 
 def read_bands(group: zarr.Group) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-    """Wavelengths and widths [nm] of a store."""
+    """Return the wavelengths and widths [nm] of a store."""
     return read_array(group, "wavelength"), read_array(group, "fwhm") if "fwhm" in group else None
 
 
@@ -267,7 +272,7 @@ def numbers_in_memory(values: NDArray[Any]) -> tuple[int, zarr.Array[Any]]:
 
 
 def bytes_held(held: Mapping[str, Any], *names: str) -> int:
-    """Return what some arrays of a store in memory take, without their metadata."""
+    """Return the bytes that some arrays of a store take in memory, without their metadata."""
     return sum(len(part) for key, part in held.items() if key.split("/")[0] in names and not key.endswith("zarr.json"))
 
 
@@ -292,7 +297,7 @@ def blank_pixels(path: Path, where: NDArray[np.bool_], images: Mapping[str, floa
 
 
 def blank_coarse(missing: NDArray[np.bool_], factor: int) -> NDArray[np.bool_]:
-    """(y, x) coarse pixels of ``factor`` px a side of which the scene has less than half."""
+    """Return (y, x) which coarse pixels of ``factor`` px a side lie less than half on the scene."""
     starts = [np.arange(0, side, factor) for side in missing.shape]
     gaps = np.add.reduceat(np.add.reduceat(missing.astype(np.int32), starts[0], axis=0), starts[1], axis=1)
     down, across = (np.minimum(factor, side - first) for first, side in zip(starts, missing.shape, strict=True))

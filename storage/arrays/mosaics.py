@@ -62,7 +62,7 @@ class MosaicWriter:
         grid: AngularGrid | None = None,
         simulation: Mapping[str, Any] | None = None,
     ) -> None:
-        """Begin a mosaic of (y, x) ``shape``; ``largest`` is the size that no score exceeds."""
+        """Create a mosaic of (y, x) ``shape``; ``largest`` is the greatest size of a score."""
         simulated = {} if simulation is None else {"simulation": dict(simulation)}
         self.path = path
         self.group, place = create_placed_group(path, "mosaic", grid, shape, simulated)
@@ -218,7 +218,7 @@ class Mosaic:
         return 1 if self.grid is None else self.grid.factor
 
     def scores(self, rows: slice = slice(None), columns: slice = slice(None)) -> NDArray[np.float32]:
-        """Scores of some pixels, (y, x, component) float32, NaN where nothing was seen.
+        """Return the scores of some pixels, (y, x, component) float32, NaN where no line was captured.
 
         Raises IncompleteStoreError: a checksum says that the bytes have changed.
         """
@@ -235,23 +235,29 @@ class Mosaic:
     def values(
         self, rows: slice = slice(None), columns: slice = slice(None), bands: Sequence[int] | None = None
     ) -> NDArray[np.float32]:
-        """Scene values of some pixels and bands (None: all), (y, x, band) float32, NaN where nothing was seen."""
+        """Return the scene values (y, x, band) of some pixels and bands (None: all), float32.
+
+        NaN stands where no line was captured.
+        """
         found = self.spectra(self.scores(rows, columns), bands)
         if not len(self.components):
             found[self.coverage(rows, columns) == 0] = np.nan
         return found
 
     def spectra(self, scores: NDArray[np.float32], bands: Sequence[int] | None = None) -> NDArray[np.float32]:
-        """Scene values (..., band) of some bands of scores (..., component)."""
+        """Return the scene values (..., band) of some bands of scores (..., component)."""
         return (self.components if bands is None else self.components.of_bands(bands)).restore(scores)
 
     def rows(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
-        """Scene values (y, x, band) with the number of the first row, as many rows at a time as a shard has."""
+        """Yield the number of the first row and scene values (y, x, band), as many rows at a time as a shard has."""
         for first in range(0, self.shape[0], SHARD_ROWS):
             yield first, self.values(slice(first, min(first + SHARD_ROWS, self.shape[0])))
 
     def thinned(self, step: int, bands: Sequence[int]) -> NDArray[np.float32]:
-        """Scene values of every ``step``-th pixel in some bands, (y, x, band), read a shard's rows at a time."""
+        """Return the scene values of every ``step``-th pixel in some bands, (y, x, band).
+
+        They are read a shard's rows at a time.
+        """
         starts = range(0, self.shape[0], SHARD_ROWS)
         blocks = (
             self.scores(slice(first, min(first + SHARD_ROWS, self.shape[0])))[-first % step :: step, ::step]
@@ -260,17 +266,20 @@ class Mosaic:
         return np.concatenate([self.spectra(block, bands) for block in blocks])
 
     def brightness(self, factor: int | None = None, bands: int | None = None) -> NDArray[np.float32]:
-        """Mean over the bands, or over so many of them spread over all, (y, x) in pixels of ``factor`` fine ones."""
+        """Return the mean over the bands, (y, x) in pixels of ``factor`` fine ones.
+
+        ``bands`` limits the mean to so many bands, spread over all.
+        """
         weights, offset = broad_weights(self.components, bands or self.components.bands)
         return np.concatenate([block @ weights + offset for block in self.row_blocks(factor)])
 
     def row_blocks(
         self, factor: int | None = None, rows: slice = slice(None), columns: slice = slice(None)
     ) -> Iterator[NDArray[np.float32]]:
-        """Scores of a window from the top down, (y, x, component), that end where shards do.
+        """Yield the scores of a window from the top down, (y, x, component), that end where shards do.
 
-        ``factor`` are the fine pixels to a side of those wanted, a multiple of its own: means of what was seen, NaN
-        where that is less than half; rows and columns count such pixels. None: its own pixels.
+        ``factor`` is the side of the wanted pixels in fine ones, a multiple of the store's own. Such pixels are means
+        of the captured ones, NaN where fewer than half are. Rows and columns count such pixels. None: its own pixels.
         """
         times = 1 if factor is None else factor // self.factor
         (first, last, _), (left, right, _) = (
@@ -370,5 +379,8 @@ def load_attention(path: Path) -> Attention:
 
 
 def chosen_patches(path: Path) -> NDArray[np.int64]:
-    """Numbers of the patches that an attention store chose, ascending (IncompleteStoreError: missing or damaged)."""
+    """Return the numbers of the patches that an attention store chose, ascending.
+
+    Raises IncompleteStoreError: missing or damaged.
+    """
     return np.flatnonzero(load_attention(path).rank.ravel() >= 0)

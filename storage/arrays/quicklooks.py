@@ -4,8 +4,8 @@
 
     <cube>.zarr/quicklook     (y, x, 3) uint8: every 4th line and sample, three bands, 2-98 % of each; 0 where missing
 
-It is gathered while lines are written, from three bands of those lines alone. Attributes say which bands they are, the
-step between its pixels, and the values that 0 and 255 stand for: one scale for all three where frames make scene values
+It is gathered while lines are written, from three bands of those lines alone. Attributes name the bands, the step
+between pixels, and the values that 0 and 255 stand for. All three bands have one scale where frames make scene values
 of them and they are near red, green and blue, else one each.
 """
 
@@ -31,7 +31,7 @@ Kind = Literal["true colour", "false colour", "grey", "by number"]
 
 
 def picture_bands(wavelength_nm: NDArray[np.floating] | None, count: int) -> tuple[tuple[int, int, int], Kind]:
-    """Bands to show as red, green and blue: those nearest 640, 550 and 460 nm, where they are near.
+    """Return the bands to show as red, green and blue: those nearest 640, 550 and 460 nm, where they are near.
 
     Else the longest, the middle and the shortest wavelength; without wavelengths at 3, 2 and 1 quarters of ``count``.
     """
@@ -50,7 +50,10 @@ def picture_bands(wavelength_nm: NDArray[np.floating] | None, count: int) -> tup
 
 
 def choose_bands(wavelength_nm: NDArray[np.floating]) -> tuple[tuple[int, int, int], str]:
-    """Bands to show as red, green, blue, and a caption: those nearest 640, 550, 460 nm, else false colour or grey."""
+    """Return the bands to show as red, green and blue, and a caption.
+
+    These are those nearest 640, 550 and 460 nm, else false colour or grey.
+    """
     waves = np.asarray(wavelength_nm, np.float64)
     bands, kind = picture_bands(waves, len(waves))
     named = f"{waves[bands[0]]:.0f}" if kind == "grey" else " / ".join(f"{waves[band]:.0f}" for band in bands)
@@ -58,7 +61,10 @@ def choose_bands(wavelength_nm: NDArray[np.floating]) -> tuple[tuple[int, int, i
 
 
 def picture_step(shape: tuple[int, ...]) -> int:
-    """Lines and samples a pixel of a (line, sample, ...) cube's picture; at most 1024 px come of the longer side."""
+    """Return the number of lines and samples for one pixel of a (line, sample, ...) cube's picture.
+
+    The longer side has at most 1024 px.
+    """
     longest = max(shape[:2])
     return max(-(-longest // MOST_PX), min(STEP, longest // LEAST_PX), 1)
 
@@ -74,7 +80,7 @@ class Quicklook:
     bands: tuple[int, ...] = ()  # (3,) of the cube
 
     def values(self) -> NDArray[np.float32]:
-        """The cube's values as far as 8 bits between ``low`` and ``high`` tell them, (y, x, 3)."""
+        """Return the cube's values, (y, x, 3), as far as 8 bits between ``low`` and ``high`` hold them."""
         low, high = (np.array(ends, np.float32) for ends in (self.low, self.high))
         values: NDArray[np.float32] = low + self.image.astype(np.float32) / np.float32(255) * (high - low)
         return values
@@ -83,9 +89,10 @@ class Quicklook:
 def stretched(
     image: NDArray[np.floating], *, step: int = 1, bands: tuple[int, ...] = (), together: bool = False
 ) -> Quicklook:
-    """Each band's 2nd to 98th percentile as 0..255, (y, x, band) in and out; what is not finite becomes 0.
+    """Return the 2nd to 98th percentile of each band as 0..255, (y, x, band) in and out.
 
-    With ``together`` all bands have one scale, from the least to the greatest of these: colours stay true.
+    Values that are not finite become 0. ``together`` gives all bands one scale, from the least to the greatest of
+    these: colours stay true.
     """
     ends = np.array([_ends(image[..., band]) for band in range(image.shape[-1])])
     low, high = (ends[:, 0], ends[:, 1])
@@ -102,13 +109,16 @@ def stretched(
 
 
 def _ends(plane: NDArray[np.floating]) -> NDArray[np.floating]:
-    """2nd and 98th percentile of what is known of a band; zeros where nothing is."""
+    """Return the 2nd and 98th percentile of a band's known values; zeros without any."""
     known = plane[np.isfinite(plane)]
     return np.percentile(known, (2, 98)) if known.size else np.zeros(2, plane.dtype)
 
 
 def stretch(image: NDArray[np.generic]) -> NDArray[np.float32]:
-    """Each band's 2nd to 98th percentile to 0..1, (y, x, band) float32; NaN becomes light grey, a flat band black."""
+    """Return the 2nd to 98th percentile of each band as 0..1, (y, x, band) float32.
+
+    NaN becomes light grey, a flat band black.
+    """
     values = np.asarray(image, np.float32)
     shown = np.full(values.shape, 0.86, np.float32)
     for band in range(values.shape[-1]):
@@ -122,9 +132,9 @@ def stretch(image: NDArray[np.generic]) -> NDArray[np.float32]:
 
 
 def develop(image: NDArray[np.generic], field: NDArray[np.generic]) -> NDArray[np.float32]:
-    """Scene values as a photograph, (y, x, 3) float32 0..1: one scale for all bands, so that colours stay true.
+    """Return the scene values as a photograph, (y, x, 3) float32 0..1.
 
-    White is the 99th percentile of ``field``; mid tones are lifted (power 0.45 to 1) until its median is medium grey.
+    All bands have one scale, so that colours stay true.
     """
     known = np.asarray(field, np.float32)
     known = known[np.isfinite(known)]
@@ -173,7 +183,7 @@ class LineThumbnail:
         self._rows.append(part)
 
     def finish(self) -> Quicklook:
-        """The picture of all lines taken so far."""
+        """Return the picture of all lines taken so far."""
         return stretched(np.concatenate(self._rows), step=self._step, bands=self._bands, together=self._together)
 
 
@@ -186,7 +196,7 @@ def write_quicklook(group: zarr.Group, found: Quicklook) -> None:
 
 
 def quicklook_of(group: zarr.Group) -> Quicklook | None:
-    """The picture of an opened cube or mosaic, None where it has none. The cube is not read.
+    """Return the picture of an opened cube or mosaic, None where it has none. The cube is not read.
 
     Raises IncompleteStoreError: the picture is damaged.
     """

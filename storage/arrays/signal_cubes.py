@@ -83,7 +83,7 @@ class LineRows:
 
 
 def score_spec(dims: tuple[str, str, str], shape: tuple[int, int, int], largest: float) -> ArraySpec:
-    """Layout of scores (component, row, column), whose size in steps is at most ``largest``."""
+    """Return the layout of scores (component, row, column), whose size in steps is at most ``largest``."""
     count, rows, columns = shape
     chunk = (max(count, 1), min(CHUNK, max(rows, 1)), min(CHUNK, max(columns, 1)))
     whole = (
@@ -136,7 +136,7 @@ class SignalCubeWriter:
         largest: float,
         frames_of: str | None = None,
     ) -> None:
-        """Begin a sweep; ``largest`` is the size that no score exceeds, ``frames_of`` a sweep with the same frames."""
+        """Create a sweep; ``largest`` is the greatest size of a score, ``frames_of`` a sweep with the same frames."""
         lines, samples, _ = header.shape
         self._header, self._step = header, step
         facts: dict[str, Any] = {"sweep": asdict(header.sweep), "source": header.source}
@@ -217,11 +217,11 @@ class SignalCube(StoredSweep):
         return lines, samples, len(self.components)
 
     def read_window(self, lines: slice, samples: slice) -> NDArray[np.signedinteger[Any]]:
-        """Scores of some lines and samples in steps, (line, sample, component)."""
+        """Return the scores of some lines and samples in steps, (line, sample, component)."""
         return read_array(self.group, "scores", (slice(None), lines, samples)).transpose(1, 2, 0)
 
     def read(self, start: int = 0, stop: int | None = None) -> NDArray[np.signedinteger[Any]]:
-        """Scores of the lines ``start`` to ``stop`` in steps, (line, sample, component)."""
+        """Return the scores of the lines ``start`` to ``stop`` in steps, (line, sample, component)."""
         return self.read_window(slice(start, stop), slice(None))
 
     @cached_property
@@ -232,9 +232,9 @@ class SignalCube(StoredSweep):
     def spectra(
         self, start: int, stop: int, samples: slice = slice(None), bands: Sequence[int] | None = None
     ) -> NDArray[np.float32]:
-        """Scene values of the lines ``start`` to ``stop`` and some samples and bands (None: all), rare ones too.
+        """Return the scene values of the lines ``start`` to ``stop`` and some samples and bands (None: all).
 
-        (line, sample, band) float32, NaN where unusable.
+        Rare spectra are included.
         """
         chosen = slice(None) if bands is None else list(bands)
         law = self.components if bands is None else self.components.of_bands(bands)
@@ -259,7 +259,10 @@ def check_condensed(group: zarr.Group, path: StorePlace) -> None:
 
 
 def score_layout(group: zarr.Group) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Rows and columns of a store of scores, and of what is one file of them (IncompleteStoreError: damaged)."""
+    """Return the rows and columns of a store of scores, and of one of its files.
+
+    Raises IncompleteStoreError: it is damaged.
+    """
     with damage_named(str(group.store_path)):
         scores = group["scores"]
         if not isinstance(scores, zarr.Array):
@@ -305,13 +308,13 @@ def open_signal_cubes(folder: Path) -> list[SignalCube]:
 class RestoredCube(RawCube):
     """Raw lines as their components give them back: their signal, rounded to whole numbers; the noise is gone.
 
-    What was unusable comes back as the largest number, which counts as saturated.
+    Unusable numbers come back as the largest number, which counts as saturated.
     """
 
     signal: SignalCube
 
     def read(self, start: int = 0, stop: int | None = None) -> NDArray[np.uint16]:
-        """Numbers of the lines ``start`` to ``stop``, (line, sample, band) uint16."""
+        """Return the numbers of the lines ``start`` to ``stop``, (line, sample, band) uint16."""
         first, last, _ = slice(start, stop).indices(len(self.time_s))
         values = self.signal.spectra(first, last)
         if self.references.by_mirror:
@@ -325,7 +328,7 @@ class RestoredCube(RawCube):
         return judge_elements(self.references).gain
 
     def read_window(self, lines: slice, samples: slice) -> NDArray[np.uint16]:
-        """Numbers of some lines and samples, (line, sample, band) uint16."""
+        """Return the numbers of some lines and samples, (line, sample, band) uint16."""
         return self.read(lines.start, lines.stop)[:, samples]
 
 

@@ -1,12 +1,12 @@
-"""The line spool: what a capture writes while it runs, so that a crash loses at most the lines since the last sync.
+"""The line spool: records of a capture while it runs, so that a crash loses at most the lines since the last sync.
 
-``<name>.lines`` begins with one JSON object on a line: what the lines belong to, with a checksum of its own. Records
-of one size follow, one a line: number, mirror X and Y, time, exposure, valid, a CRC-32, and the raw numbers (sample,
-band) uint16. The CRC continues that of the header, so that a record belongs to one sweep alone.
+``<name>.lines`` begins with one JSON object on a line: the sweep of the lines, with a checksum of its own. Records of
+one size follow, one a line: number, mirror X and Y, time, exposure, valid, a CRC-32, and the raw numbers (sample, band)
+uint16. The CRC continues that of the header, so that a record belongs to one sweep alone.
 
-A line counts when its record has its CRC. Records that do not count lie either behind the last that does, and are cut
-off: the capture continues there; or before it: these lines are lost, and are put back in their places when the source
-gives them again.
+A line counts when its record has its CRC. Other records behind the last that counts are cut off, and the capture
+continues there. Lines of other records before it are lost, until the source gives them again and they are put back in
+their places.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ class Spool:
         return self.count
 
     def read(self, first: int = 0, last: int | None = None) -> Iterator[Line | None]:
-        """Give the lines from ``first`` on, before ``last``; None for each that is not as it was captured."""
+        """Yield the lines from ``first`` on, before ``last``; None for each that is not as it was captured."""
         with plain_reader(self.path) as file:
             file.seek(self._place(first))
             for number in count(first) if last is None else range(first, last):
@@ -165,7 +165,7 @@ class Spool:
                 yield self._line(number, record)
 
     def blocks(self, size: int = SYNC_LINES) -> Iterator[list[Line]]:
-        """Give the lines in blocks of ``size``; the last may be shorter.
+        """Yield the lines in blocks of ``size``; the last may be shorter.
 
         Raises RigError: a line has changed since it was written, or is lost and not mended; names it.
         """
@@ -238,14 +238,14 @@ def spool_problems(path: Path) -> Iterator[str]:
 
 
 def line_values(numbers: Sequence[int]) -> str:
-    """Numbers of lines for a message: the first few, and how many more."""
+    """Return the numbers of lines for a message: the first few, and how many follow."""
     named = ", ".join(str(number) for number in numbers[:MOST_NAMED])
     more = f" and {len(numbers) - MOST_NAMED} more" if len(numbers) > MOST_NAMED else ""
     return f"line{'s' if len(numbers) > 1 else ''} {named}{more}"
 
 
 def _header(head: bytes) -> dict[str, Any] | None:
-    """Return what a file's first line says its lines belong to; None where it is damaged."""
+    """Return the header on a file's first line, which names the sweep of its lines; None where it is damaged."""
     found = next(read_checked(head), None)
     if found is None or found.state != "whole" or found.content is None or found.text + b"\n" != head:
         return None
@@ -255,7 +255,7 @@ def _header(head: bytes) -> dict[str, Any] | None:
 
 
 def _difference(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
-    """First thing in which two headers differ, in words."""
+    """Return the first difference between two headers, in words."""
     have, want = ({**head, **head["header"]} for head in (found, wanted))
     for name in sorted((set(have) | set(want)) - {"header"}):
         if have.get(name) != want.get(name):

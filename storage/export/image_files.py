@@ -98,7 +98,7 @@ def _refusals_of_gdal(path: Path) -> Iterator[None]:
 
 
 def _write_plain(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> None:
-    """An uncompressed TIFF in strips, block by block, from which GDAL makes the other."""
+    """Write an uncompressed TIFF in strips, block by block, from which GDAL makes the other."""
     (y, x), crs = image.geobox.shape, image.geobox.crs
     profile = {
         "driver": "GTiff",
@@ -135,7 +135,10 @@ def _write_plain(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> 
 
 
 def _tag_wavelengths(file: Any, image: CogImage) -> None:
-    """Say each band's wavelength and width: in GDAL's own domain IMAGERY [um], and as its driver of ENVI does [nm]."""
+    """Write each band's wavelength and width.
+
+    They are in GDAL's own domain IMAGERY [um], and as its driver of ENVI has them [nm].
+    """
     if image.wavelength_nm is None:
         return
     widths = [None] * len(image.bands) if image.fwhm_nm is None else image.fwhm_nm
@@ -149,9 +152,9 @@ def _tag_wavelengths(file: Any, image: CogImage) -> None:
 
 
 def value_span(path: Path, bands: Sequence[int]) -> tuple[float, float]:
-    """Values of some bands, counted from 1, that 2 % of a file's pixels are below and above; 0 and 1 without any.
+    """Return the 2nd and 98th percentile of a file's pixels in some bands, counted from 1; 0 and 1 without any value.
 
-    Of at most 512 x 512 pixels of the file.
+    At most 512 x 512 pixels of the file are read.
     """
     with importlib.import_module("rasterio").open(path) as file:
         y, x = (min(size, TILE) for size in file.shape)
@@ -208,7 +211,7 @@ def write_envi(header: Path, file: EnviFile, blocks: Blocks) -> Path:
 
 
 def _header_fields(file: EnviFile, kind: np.dtype[Any]) -> Iterator[tuple[str, str]]:
-    """Give sizes, type, byte order, bands, and the map where there is one."""
+    """Yield sizes, type, byte order, bands, and the map where there is one."""
     lines, samples, bands = file.shape
     if file.description:
         yield "description", _listed([file.description.replace("{", "(").replace("}", ")")])
@@ -267,9 +270,8 @@ def write_recorded_files(cube: RawCube, folder: Path) -> Path:
         NAME.white.*                 white frame; its header has the value of the white reference per band
         NAME.bad.*  NAME.flat.*      bad elements (1), and the relative response where there is one
 
-    Numbers stand in text with as many digits as give the same float64 again.
-    What is there under these names is replaced. Raises ArchiveError: the disk refuses; IncompleteStoreError: the cube
-    is damaged.
+    Numbers stand in text with as many digits as give the same float64 again. Files of these names are replaced. Raises
+    ArchiveError: the disk refuses; IncompleteStoreError: the cube is damaged.
     """
     make_folder(folder)
     name = cube.sweep.name

@@ -1,8 +1,8 @@
 """Files for map programs and machines: polygons (by GDAL), QGIS styles beside them and rasters, and ISOXML task data.
 
 Polygons are GeoPackage, GeoJSON and shapefile; styles (.qml) are classes with names and colours, ramps, bands as
-colours. Task data (ISO 11783-10, version 4) is TASKDATA.XML and the numbers of its grid, of type 2: rows from the
-south-west corner, each cell the dose as a 32 bit whole number in steps of the dictionary's entity for it.
+colours. Task data (ISO 11783-10, version 4) is TASKDATA.XML and the numbers of its grid, of type 2. Rows begin at the
+south-west corner; each cell has the dose as a 32 bit whole number in steps of the dictionary's entity for it.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ _OPTIONS: Mapping[str, Mapping[str, Any]] = {
 
 @contextmanager
 def _writing(path: Path, names: Sequence[str], when: str | None) -> Iterator[Path]:
-    """A folder to write into; GDAL's date of now is ``when``, what it refuses an ArchiveError."""
+    """Yield a folder to write into; GDAL's date of now is ``when``, and its refusals become ArchiveError."""
     pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": when})
     try:
         with written_aside(path.parent, names) as aside:
@@ -149,7 +149,7 @@ def write_task_data(folder: Path, grid: TaskGrid, words: TaskText) -> tuple[Path
 
 
 def _task_file(grid: TaskGrid, words: TaskText, length: int) -> ElementTree.Element:
-    """One planned task of one field with two treatment zones, one of them the grid's."""
+    """Return one planned task of one field with two treatment zones, one of them the grid's."""
     root = ElementTree.Element(
         "ISO11783_TaskData",
         VersionMajor="4",
@@ -188,14 +188,14 @@ def _task_file(grid: TaskGrid, words: TaskText, length: int) -> ElementTree.Elem
 
 
 def ramp_colour(fraction: float, ramp: Sequence[Colour]) -> Colour:
-    """The colour at a fraction, 0 to 1, of a ramp of colours evenly apart."""
+    """Return the colour at a fraction, 0 to 1, of a ramp of colours evenly apart."""
     place = min(max(fraction, 0.0), 1.0) * (len(ramp) - 1)
     low = min(int(place), len(ramp) - 2)
     return tuple(round(a + (place - low) * (b - a)) for a, b in zip(ramp[low], ramp[low + 1], strict=True))
 
 
 def write_class_style(path: Path, classes: Sequence[Entry]) -> None:
-    """Style a raster of class numbers."""
+    """Write the style of a raster of class numbers."""
     root, renderer = _raster({"type": "paletted", "band": "1", "opacity": "1", "alphaBand": "-1"})
     palette = SubElement(renderer, "colorPalette")
     for number, name, colour in classes:
@@ -204,7 +204,7 @@ def write_class_style(path: Path, classes: Sequence[Entry]) -> None:
 
 
 def write_ramp_style(path: Path, low: float, high: float, ramp: Sequence[Colour]) -> None:
-    """Style a raster of one band by a ramp of colours from ``low`` to ``high``."""
+    """Write the style of a raster of one band: a ramp of colours from ``low`` to ``high``."""
     span = {"classificationMin": f"{low:g}", "classificationMax": f"{high:g}"}
     root, renderer = _raster({"type": "singlebandpseudocolor", "band": "1", "opacity": "1", "alphaBand": "-1", **span})
     kind = {"colorRampType": "INTERPOLATED", "classificationMode": "2", "clip": "0"}
@@ -217,7 +217,10 @@ def write_ramp_style(path: Path, low: float, high: float, ramp: Sequence[Colour]
 
 
 def write_colour_style(path: Path, bands: Sequence[int], low: float, high: float) -> None:
-    """Style a raster by three of its bands, counted from 1, as red, green and blue, each from ``low`` to ``high``."""
+    """Write the style of a raster that shows three of its bands, counted from 1, as red, green and blue.
+
+    Each goes from ``low`` to ``high``.
+    """
     named = dict(zip(("redBand", "greenBand", "blueBand"), map(str, bands), strict=True))
     root, renderer = _raster({"type": "multibandcolor", "opacity": "1", "alphaBand": "-1", **named})
     for colour in ("red", "green", "blue"):
@@ -232,7 +235,7 @@ def write_colour_style(path: Path, bands: Sequence[int], low: float, high: float
 
 
 def write_polygon_style(path: Path, column: str, entries: Sequence[Entry]) -> None:
-    """Style polygons by the values of one column."""
+    """Write the style of polygons by the values of one column."""
     root = Element("qgis", version=QGIS_VERSION, styleCategories="Symbology")
     about = {"type": "categorizedSymbol", "attr": column, "symbollevels": "0", "enableorderby": "0"}
     renderer = SubElement(root, "renderer-v2", about)

@@ -35,12 +35,12 @@ _DIGITS = 9  # of a degree: 0.1 mm
 
 
 def clean_id(text: str, otherwise: str) -> str:
-    """The text as an id that is also a file's name; ``otherwise`` where nothing of it is left."""
+    """Return the text as an id that can name a file; ``otherwise`` where nothing of it is left."""
     return re.sub(r"[^A-Za-z0-9_-]+", "-", text).strip("-") or otherwise
 
 
 def footprint(geobox: GeoBox, seen: Iterable[tuple[int, NDArray[np.bool_]]]) -> dict[str, Any] | None:
-    """Convex outline of what a map shows, as a GeoJSON polygon in longitude and latitude, anticlockwise.
+    """Return the convex outline of what a map shows, as a GeoJSON polygon in longitude and latitude, anticlockwise.
 
     ``seen`` is first row and (row, x) whether the map shows anything there, in order. To within one pixel of the map;
     None where nothing is seen.
@@ -64,7 +64,10 @@ def footprint(geobox: GeoBox, seen: Iterable[tuple[int, NDArray[np.bool_]]]) -> 
 
 
 def projection(geobox: GeoBox) -> dict[str, Any]:
-    """Fields of the projection extension of an image on a map, from what its Zarr store says (PoseError: no CRS)."""
+    """Return the fields of the projection extension of an image on a map, by its Zarr store.
+
+    Raises PoseError: the map has no CRS.
+    """
     place = map_attributes(geobox)
     code = place.get("proj:code")
     return {
@@ -166,7 +169,7 @@ def _item(pystac: Any, item: Item) -> Any:
 
 
 def _extent(pystac: Any, items: Sequence[Any]) -> Any:
-    """Around all items; everywhere where no item says where it is, which STAC has no other word for."""
+    """Return the box around all items; the whole earth where no item has a place, as STAC knows no other value."""
     boxes = np.array([item.bbox for item in items if item.bbox is not None])
     box = [*boxes[:, :2].min(axis=0).tolist(), *boxes[:, 2:].max(axis=0).tolist()] if len(boxes) else _EVERYWHERE
     times = [(item.common_metadata.start_datetime, item.common_metadata.end_datetime) for item in items]

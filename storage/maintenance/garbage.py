@@ -123,7 +123,7 @@ def plan_clearance(archive: Archive, *, keep_days: float = 1.0, raw_too: bool = 
 
 
 def _spared(catalogue: Catalogue, named: set[str], keep_days: float, raw_too: bool, now: datetime) -> dict[str, str]:
-    """Stores that no run names and that stay for their own sake, with the reason."""
+    """Return the stores that no run names and that are kept all the same, with the reason."""
     kept: dict[str, str] = {}
     for uri, store in catalogue.stores.items():
         if uri in named:
@@ -140,7 +140,7 @@ def _spared(catalogue: Catalogue, named: set[str], keep_days: float, raw_too: bo
 
 
 def _age_days(store: Store, now: datetime) -> float:
-    """Days since a store was made or copied, by whichever clock is the later; negative where one runs ahead."""
+    """Return the days since a store was made or copied, by the later of both clocks; negative where one runs ahead."""
     made = (store.ref.path / MANIFEST_NAME).lstat().st_mtime
     try:
         created = datetime.fromisoformat(store.created)
@@ -151,7 +151,10 @@ def _age_days(store: Store, now: datetime) -> float:
 
 
 def _obstacle(archive: Archive, catalogue: Catalogue, staying: set[str]) -> str | None:
-    """Why it cannot be told what may go, where a receipt or a manifest that would tell is damaged or gone."""
+    """Return why no store may be removed; None where stores may be.
+
+    A damaged or missing receipt or manifest is an obstacle where it would name stores to keep.
+    """
     for uri in archive.lost_runs():
         return f"no store is removed: {uri} has lost its {MANIFEST_NAME} and does not tell what it names"
     for run in catalogue.runs:

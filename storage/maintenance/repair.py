@@ -1,7 +1,7 @@
 """Making an archive whole again: what is broken is named, taken away, and made anew by the surveys that name it.
 
-The raw lines of a rig, and stores of a version of a stage that is not made any more, cannot be made anew: they stay as
-they are. In a bucket what this machine's working copy has whole is uploaded again.
+Raw lines of a rig cannot be made anew, nor can stores of a former version of a stage: they stay as they are. Stores in
+a bucket that this machine's working copy has whole are uploaded again.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Repaired:
 def plan_repair(
     archive: Archive, findings: Iterable[Finding], *, versions: Mapping[str, int | str] | None = None
 ) -> RepairPlan:
-    """Tell what a repair would do with these findings; ``versions`` are the stages' as they are made now."""
+    """Return the repairs for these findings; ``versions`` are those that the stages have now."""
     catalogue = Catalogue.read(archive.root)
     bad = [one.uri for one in findings if one.kind in ("broken", "missing")]
     stores = [uri for uri in bad if uri.startswith("stages/") and uri.count("/") == 2]
@@ -108,7 +108,7 @@ def repair(
 
 
 def _hopeless(catalogue: Catalogue, uri: str, versions: Mapping[str, int | str] | None) -> str:
-    """Why a store cannot be made again; empty where it can."""
+    """Return why a store cannot be made again; empty where it can."""
     store, stage = catalogue.stores.get(uri), uri.split("/")[1]
     if catalogue.is_only_copy(uri):
         return "raw lines that cannot be had again: restore them from a copy; lines not named can still be read"
@@ -125,6 +125,6 @@ def _hopeless(catalogue: Catalogue, uri: str, versions: Mapping[str, int | str] 
 
 
 def _settings_text(run: Run) -> str:
-    """Settings in one text, without the archive's place and the notes, which ask for nothing."""
+    """Return the settings as one text, without the archive's place and the notes, which change nothing."""
     asked = {name: value for name, value in run.settings.items() if name not in ("notes", "out")}
     return canonical_json(asked) if asked else ""

@@ -1,7 +1,7 @@
 """Reading a whole archive again: every byte against its manifest, every manifest against its seal and its runs.
 
-A link or a pipe in the place of a file is reported and never opened. Of a broken file of an array it
-says which part it holds.
+A link or a pipe in the place of a file is reported and never opened. A finding on a broken file of an array names the
+part that it holds.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def verify_everything(
 
 
 def verify_growing(root: Path) -> Iterator[Finding]:
-    """Findings about spools and what lies beside them; none where all is as it was written."""
+    """Yield the findings about spools and what lies beside them; none where all is as it was written."""
     for folder in _inside(root / SPOOLS):
         for problem in _spool_problems(folder):
             yield Finding(f"{SPOOLS}/{folder.name}", problem, "growing")
@@ -183,7 +183,7 @@ def _identity_problems(catalogue: Catalogue, uri: str) -> Iterator[str]:
 
 
 def _misplaced(catalogue: Catalogue, root: Path) -> Iterator[Finding]:
-    """Runs that say that they are another (copies, or renamed), and what lies beside them without a manifest."""
+    """Yield findings on runs that name another run (copies, or renamed), and on leftovers without a manifest."""
     there = {run.folder.name for run in catalogue.runs}
     for run in catalogue.runs:
         stated = run.facts.get("run", run.folder.name)

@@ -147,7 +147,7 @@ class _Open:
     team: Executor | None = None
 
     def dismiss(self) -> None:
-        """Let workers go at once: the next use starts others."""
+        """Dismiss the workers at once: the next use starts others."""
         team, self.team = self.team, None
         if isinstance(team, ProcessPoolExecutor):
             for process in list((team._processes or {}).values()):
@@ -173,11 +173,11 @@ def run_blocks(
     They are begun in order, none more than a few before the oldest unfinished one: neighbours share what they read.
     The first error is raised once no block is being made any more: none writes after that.
 
-    On threads ``make`` is anything that may be called from several at once. Otherwise it and the items are pickled:
-    they hold absolute paths, never arrays or open files, and writing a block twice must give the same bytes.
-    ``report`` is called with the share done after each. Workers elsewhere are asked if they see the same in ``paths``,
-    the folders that the work reads or writes; from those in a staged store (``*.part``) goes what a killed worker left
-    of a file that another wrote again. Gives the results in the order of the items. Raises SettingsError: no scheduler
+    On threads ``make`` is anything that may be called from several at once. Otherwise it and the items are pickled.
+    They hold absolute paths, never arrays or open files, and writing a block twice must give the same bytes. ``report``
+    is called with the share done after each. Workers elsewhere are asked if they see the same in ``paths``, the folders
+    that the work reads or writes. Those in a staged store (``*.part``) are cleared of partial files that a killed
+    worker left and another wrote again. Gives the results in the order of the items. Raises SettingsError: no scheduler
     answers, or its workers see other files or run other versions. WorkerError: workers died, more often than a block is
     tried again.
     """
@@ -211,7 +211,7 @@ def _send_away(
     paths: Sequence[Path],
     ended: Callable[[int, Any], None],
 ) -> None:
-    """Have blocks made by processes; those whose worker died are made again by others."""
+    """Make blocks in processes; blocks whose worker died are made again by others."""
     left, held, deaths = dict.fromkeys(range(len(items))), _open[pool], 0
 
     def tick(number: int, result: Any) -> None:
@@ -254,7 +254,7 @@ def _send(
 ) -> None:
     """Send blocks in order, none ``window`` or more behind the oldest unfinished one; ``ended`` takes each result.
 
-    What is on its way is waited for before an error is raised.
+    Running blocks are waited for before an error is raised.
     """
     running: dict[Future[Any], int] = {}
     sent = 0
@@ -303,7 +303,7 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _inherited() -> Iterator[None]:
-    """Let processes and threads that begin meanwhile have the environment of workers, and never see Ctrl-C."""
+    """Give new processes and threads the environment of workers while the block runs, and keep Ctrl-C from them."""
     before = {name: os.environ.get(name) for name in _ENVIRONMENT}
     resource_tracker.ensure_running()  # where it starts later it lets signals through again
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -342,11 +342,11 @@ class Cluster(Executor):
         return sent
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Let go of the workers, which keep running."""
+        """Disconnect from the workers, which keep running."""
         self.client.close()
 
     def count(self) -> int:
-        """Blocks that can be made at a time (WorkerError: there are no workers)."""
+        """Return how many blocks can be made at a time. Raises WorkerError: there are no workers."""
         try:
             self.client.wait_for_workers(1, timeout=ANSWER_S)
         except TimeoutError:
@@ -357,7 +357,7 @@ class Cluster(Executor):
         return max(1, sum(int(threads) for threads in self.client.nthreads().values()))
 
     def check(self, paths: Sequence[Path]) -> int:
-        """Ask every worker for its versions and threads, and what it sees in some folders; gives `count`.
+        """Ask every worker for its versions and threads, and what it sees in some folders; return `count`.
 
         Raises SettingsError: one differs from this process; names it, both values and what to do. WorkerError: there is
         none, or one was lost meanwhile.
@@ -384,7 +384,7 @@ class Cluster(Executor):
 
 
 def about_here(folders: Sequence[str]) -> dict[str, str]:
-    """Return what this process runs, on how many threads, and what it sees in some folders, by name."""
+    """Return the versions and threads of this process, and its view of some folders, by name."""
     threads = {THREADS_OF: os.environ.get(THREADS_OF, "not set")}
     return versions_here() | threads | {folder: _seen(folder) for folder in folders}
 

@@ -82,7 +82,7 @@ class ArrayCube:
 def find_cube(arrays: Arrays, variable: str | None, path: Path, *, labels: bool = False) -> ArrayCube:
     """Find the array that is a cube: the one named, the only one with three axes, or the only one with wavelengths.
 
-    Of ``labels`` the only one with two axes comes first. ``variable`` may end in a step of time (``values:3``), or be
+    For ``labels`` the only one with two axes comes first. ``variable`` may end in a step of time (``values:3``), or be
     one. Nothing but names, shapes and attributes is read. Raises SceneError: there is no such array, there are several,
     or its axes are not y, x and band.
     """
@@ -122,7 +122,7 @@ def cube_source(
     fill, sizes = _fill(array), [int(array.shape[axis]) for axis in order]
 
     def read(start: int, stop: int) -> NDArray[Any]:
-        """Give some lines (line, sample, band)."""
+        """Return some lines (line, sample, band)."""
         selection: list[slice | int] = [slice(None)] * array.ndim
         selection[order[0]] = slice(start, stop)
         left = order
@@ -287,7 +287,7 @@ def _spectral_axes(arrays: Arrays, array: Any) -> list[int]:
 
 
 def _is_spectral(coordinate: Any) -> bool:
-    """Tell whether a coordinate says wavelengths: by its standard name or its unit."""
+    """Return whether a coordinate says wavelengths: by its standard name or its unit."""
     if coordinate is None or coordinate.ndim != 1:
         return False
     return coordinate.attrs.get("standard_name") in WAVELENGTHS or _unit(coordinate.attrs) in NANOMETRES | MICROMETRES
@@ -300,7 +300,7 @@ def _vector(arrays: Arrays, words: tuple[str, ...], count: int) -> str | None:
 
 
 def _is_line(arrays: Arrays, name: str, count: int) -> bool:
-    """Tell whether an array is ``count`` numbers in a row, along whichever of its axes."""
+    """Return whether an array is ``count`` numbers in a row, along whichever of its axes."""
     shape = arrays[name].shape if name in arrays else ()
     return bool(shape) and math.prod(shape) == max(shape) == count and arrays[name].dtype.kind in "uif"
 

@@ -110,7 +110,7 @@ def open_hdf_cube(path: Path, variable: str | None = None, *, labels: bool = Fal
 
 
 def _bad_bands(arrays: Mapping[str, Any], count: int) -> tuple[int, ...]:
-    """Bands, from 0, that a list of the file marks by 0, as EMIT's of good wavelengths does."""
+    """Return the bands, from 0, that a list of the file marks by 0, as EMIT's of good wavelengths does."""
     for name, array in arrays.items():
         if name.rpartition("/")[2].lower() in GOOD_BANDS and array.shape == (count,):
             return tuple(int(band) for band in np.flatnonzero(array[...] == 0))
@@ -148,7 +148,7 @@ def _other_place(
 
 
 def _prisma_cube(path: Path, level: str, arrays: Mapping[str, FileArray], about: Mapping[str, Any]) -> CubeSource:
-    """Both cubes of a PRISMA product of level 2 as one, its used bands by ascending wavelength.
+    """Return both cubes of a PRISMA product of level 2 as one, its used bands by ascending wavelength.
 
     Their axes are y, band and x. Pixels that are 0 in every band lie outside the swath.
     """
@@ -175,7 +175,7 @@ def _prisma_cube(path: Path, level: str, arrays: Mapping[str, FileArray], about:
     order = bands[np.argsort(np.array(centres)[bands], kind="stable")]
 
     def read(start: int, stop: int) -> NDArray[Any]:
-        """Give some lines (line, sample, band)."""
+        """Return some lines (line, sample, band)."""
         with reading(path, KIND):
             raw = [np.moveaxis(array[start:stop], 1, 2) for array, _, _ in parts]
         void = np.logical_and.reduce([(block == 0).all(axis=2) for block in raw])
@@ -201,7 +201,7 @@ def _prisma_cube(path: Path, level: str, arrays: Mapping[str, FileArray], about:
 
 
 def _prisma_place(about: Mapping[str, Any], shape: tuple[int, int]) -> tuple[GeoBox | None, tuple[str, ...]]:
-    """The grid between the centres of the upper left and the lower right pixel."""
+    """Return the grid between the centres of the upper left and the lower right pixel."""
     try:
         (west, north), (east, south) = (
             [float(about[f"Product_{corner}corner_{axis}"]) for axis in ("easting", "northing")]
@@ -215,7 +215,7 @@ def _prisma_place(about: Mapping[str, Any], shape: tuple[int, int]) -> tuple[Geo
 
 
 def _in_scope(arrays: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """All arrays by their paths; those of the array's group and of groups above by their names alone, too."""
+    """Return all arrays by their paths; those of the array's group and of groups above by their names alone, too."""
     groups = name.split("/")[:-1]
     found: dict[str, Any] = {}
     for depth in range(len(groups) + 1):
@@ -239,7 +239,7 @@ def _check_array(path: Path, name: str, array: FileArray, *, lines: tuple[int, i
 
 
 def _classic_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
-    """Arrays and attributes of a NetCDF file of version 3, which is no HDF5.
+    """Return the arrays and attributes of a NetCDF file of version 3, which is no HDF5.
 
     The file is read whole: asked for more bytes than it has, it would take the memory for them first.
     """
@@ -259,7 +259,7 @@ def _classic_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
 
 
 def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
-    """Arrays of an HDF5 file by their paths, and the attributes of its root.
+    """Return the arrays of an HDF5 file by their paths, and the attributes of its root.
 
     Only what is kept in this very file: links and virtual arrays may lead anywhere on the disk.
     """
@@ -301,7 +301,10 @@ def _words(about: Mapping[str, Any], item: Any) -> dict[str, Any]:
 
 
 def _plain(attributes: Any) -> dict[str, Any]:
-    """Attributes as Python's own texts and numbers, lists as arrays; those that cannot be read are left out."""
+    """Return the attributes as Python's own texts and numbers, lists as arrays.
+
+    Attributes that cannot be read are left out.
+    """
     found = {}
     for name in attributes:
         try:
@@ -321,8 +324,8 @@ def _plain(attributes: Any) -> dict[str, Any]:
 def open_array_file(path: Path, variable: str | None = None, *, labels: bool = False) -> CubeSource:
     """Open the array named, or the only one with three axes; one of a .npy file is never read as a whole.
 
-    Of ``labels`` the only one with two axes. Raises SceneError: there is no such array, or several; it is no table of
-    numbers; or it claims more than the file or the machine can hold.
+    For ``labels`` it is the only one with two axes. Raises SceneError: there is no such array, or several, or it is no
+    table of numbers. So does an array that claims more than the file or the machine can hold.
     """
     guard = partial(reading_array, path)
     with guard():
@@ -388,7 +391,7 @@ def _member(path: Path, member: zipfile.ZipInfo, claimed: int) -> NDArray[Any]:
 
 
 def _is_hdf(path: Path) -> bool:
-    """Tell whether a .mat file is of version 7.3, which is HDF5 behind 512 bytes of MATLAB's own."""
+    """Return whether a .mat file is of version 7.3, which is HDF5 behind 512 bytes of MATLAB's own."""
     with path.open("rb") as file:
         head = file.read(520)
     return b"\x89HDF\r\n\x1a\n" in (head[:8], head[512:])

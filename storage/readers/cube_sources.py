@@ -31,7 +31,7 @@ _GROUP_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/
 
 
 def machine_bytes() -> int:
-    """Memory of this machine, or of the part of it that this process may use [bytes]."""
+    """Return the memory of this machine, or of the part of it that this process may use [bytes]."""
     there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     for limit in _GROUP_LIMITS:
         with suppress(OSError, ValueError):  # no such file, or "max"
@@ -187,7 +187,7 @@ def read_by_chunks(read: ReadLines, lines: int, chunk_lines: int) -> ReadLines:
         return kept[number]
 
     def read_lines(start: int, stop: int) -> NDArray[Any]:
-        """Give some lines (line, sample, band)."""
+        """Return some lines (line, sample, band)."""
         with lock:
             numbers = range(start // chunk_lines, -(-stop // chunk_lines))
             parts = [
@@ -199,10 +199,9 @@ def read_by_chunks(read: ReadLines, lines: int, chunk_lines: int) -> ReadLines:
 
 
 def scene_lines(source: CubeSource, start: int, stop: int) -> NDArray[Any]:
-    """Lines as a scene shows them, (line, sample, band): over the white reference where dark and white are known.
+    """Return the lines as scene values, (line, sample, band).
 
-    float32 with NaN where a line is missing or the file says no data; the source's own numbers where
-    nothing is missing and there are no references.
+    These are over the white reference where dark and white frames are known.
     """
     raw = source.read(start, stop)
     valid = source.valid[start:stop]

@@ -54,7 +54,7 @@ class DataSet:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Return what was left out: scenes without labels, and labels without a scene."""
+        """Return notes on what was left out: scenes without labels, and labels without a scene."""
         bare = [Path(self.files[name]) for name in self.unlabelled]
         told = [f"of {len(self.files)} scenes {len(bare)} without labels left out: {listed_names(bare)}"]
         lone = [f"label files without a scene, {len(self.alone)}: {listed_names(self.alone)}"]
@@ -120,15 +120,7 @@ def load_data_set(
     train_mask: str | Path | None = None,
     mask_classes: Sequence[int] | None = None,
 ) -> DataSet:
-    """Name the scenes of a folder (``images/`` in it, or the files themselves) or of one file. Reads none of them yet.
-
-    A scene is named by the first number in its file's name (``images/059_image.png`` is ``059``), or by the whole name
-    where numbers are missing or alike. Its labels are those that scene.toml tells, or that have its name.
-
-    Those of ``hold_out`` are kept from training. ``train_mask`` says where to train in one scene: 0 is nowhere, number
-    i the label file's class ``mask_classes[i - 1]``, or i where that is None. Raises SceneError: there is no scene, a
-    name to hold out does not exist, a mask is given for several scenes, or labels may belong to several.
-    """
+    """List the scenes of a folder (``images/`` in it, or the files themselves) or of one file, without reading them."""
     files, label_files, alone = _scenes(path, train_mask)
     unknown = [name for name in hold_out if name not in files]
     if unknown:
@@ -156,10 +148,9 @@ def load_data_set(
 def split_labels(
     scene: SceneFile, train_mask: str | Path, mask_classes: Sequence[int] | None
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Labels to train on (where the mask's class is the label's) and the labelled rest, each (y, x), 255 elsewhere.
+    """Return the labels to train on (where the mask's class is the label's) and the labelled rest.
 
-    A mask that disagrees with the labels, or lies where there is none, trains nothing there. Raises SceneError: the
-    scene has no labels or classes by colour, the mask has another size, or a number that no class has.
+    Both are (y, x) and 255 elsewhere.
     """
     if scene.labels is None:
         raise SceneError(f"{scene.path} has no labels, which a training mask needs; give --labels")
@@ -214,7 +205,7 @@ def _scenes(
 
 
 def _match_by_settings(folder: Path, settings: SceneSettings) -> MatchedFiles:
-    """Images of a folder and their labels as ``labels`` in scene.toml tells; what holds labels is no image."""
+    """Return the images of a folder and their labels by ``labels`` in scene.toml; label files are no images."""
     entries = scene_entries(folder)
     told: dict[Path, Path] = {}
     for entry in entries:
@@ -233,8 +224,10 @@ def _match_by_settings(folder: Path, settings: SceneSettings) -> MatchedFiles:
 
 
 def _names(images: Sequence[Path]) -> dict[str, Path]:
-    """Names of scenes: their first numbers, where each has its own; else the names of the files, with their endings
-    where two differ by nothing else."""
+    """Return the names of scenes: their first numbers, where each has its own, else the names of their files.
+
+    Endings are kept where two names differ by nothing else.
+    """
     numbers = [scene_number(image) or "" for image in images]
     stems = [image.stem for image in images]
     for names in (numbers, stems):

@@ -165,10 +165,10 @@ def load_envi_header(path: Path) -> EnviHeader:
 def parse_envi_header(text: str, where: str = "the header") -> EnviHeader:
     """Read a header's text; messages call it ``where``.
 
-    Wavelengths come out in nm. Without a unit they are read as nm or micrometres by their size, and a note says so;
-    wavelengths that do not fit the bands are left out with a note. Raises SceneError: it does not begin with ENVI
-    (ArcGIS headers do not), a size, type or interleave is missing or impossible, or it says that its file holds more
-    than plain numbers (compressed, with bytes between frames).
+    Wavelengths come out in nm. Without a unit they are read as nm or micrometres by their size, and a note says so.
+    Wavelengths that do not fit the bands are left out with a note. Raises SceneError: it does not begin with ENVI
+    (ArcGIS headers do not), or a size, type or interleave is missing or impossible. So does a file that holds more than
+    plain numbers (compressed, with bytes between frames).
     """
     notes: list[str] = []
     fields, settings = split_header(text, where, notes)
@@ -239,7 +239,7 @@ def _refuse_layouts(fields: Mapping[str, str], kind: str, where: str) -> None:
 
 
 def is_headwall_folder(folder: Path) -> bool:
-    """Tell whether a folder holds parts of a cube as a Headwall camera names them."""
+    """Return whether a folder holds parts of a cube as a Headwall camera names them."""
     return any(_PART.fullmatch(entry.name) is not None for entry in folder.iterdir())
 
 
@@ -261,9 +261,9 @@ def open_envi_source(path: Path, *, scaled: bool = True) -> CubeSource:
 def open_headwall_cube(folder: Path) -> CubeSource:
     """Open the parts of a folder as one cube, in the order of their frames.
 
-    A part whose name says a later frame than where the one before it ends leaves lines between them that no file holds;
-    so does a file that is cut off. A part without any byte is left out. Raises SceneError: a part cannot be used, parts
-    differ in their frames, or too many lines between them are missing.
+    Lines are missing where a part's name has a later frame than the end of the part before it, and in a file that is
+    cut off. A part without any byte is left out. Raises SceneError: a part cannot be used, parts differ in their
+    frames, or too many lines between them are missing.
     """
     headers, notes = _headers(folder), list[str]()
     if not headers:
@@ -337,7 +337,7 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
         bands = Bands(header.wavelength_nm, header.fwhm_nm, units, origin)
 
     def read(start: int, stop: int) -> NDArray[Any]:
-        """Give some lines (line, sample, band)."""
+        """Return some lines (line, sample, band)."""
         block = np.zeros((stop - start, samples, count), native)
         for begin, part in parts.items():
             low, high = max(start, begin), min(stop, begin + len(part.values))

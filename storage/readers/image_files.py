@@ -143,7 +143,7 @@ def _reader(
     picture: bool,
     colours: NDArray[np.uint8] | None,
 ) -> ReadLines:
-    """Return what reads rows of some bands, from 1, of all pages; a picture is read once, as a whole."""
+    """Return a reader of rows of some bands, from 1, of all pages; a picture is read once, as a whole."""
 
     def read_window(first: int, last: int) -> NDArray[Any]:
         planes = []
@@ -155,7 +155,7 @@ def _reader(
     whole = cache(lambda: read_window(0, shape[0]))
 
     def read(first: int, last: int) -> NDArray[Any]:
-        """Give some rows, (y, x, band) (SceneError: they are damaged)."""
+        """Return some rows, (y, x, band) (SceneError: they are damaged)."""
         numbers = whole()[first:last] if picture else read_window(first, last)
         return numbers if colours is None else colours[numbers[..., 0]]
 
@@ -217,7 +217,7 @@ def _check_size(path: Path, driver: str, shape: tuple[int, int, int], item: int,
 
 
 def _is_mask(file: Any, channel: int) -> bool:
-    """Tell whether nearly all values of a channel are 0 or its greatest, in the middle of the image.
+    """Return whether nearly all values of a channel are 0 or its greatest, in the middle of the image.
 
     Programs call the fourth band of a file alpha where nothing says what it is.
     """
@@ -242,7 +242,7 @@ def _void(file: Any, alpha: int | None) -> NDArray[np.bool_] | None:
 
 
 def place_of_file(file: Any) -> tuple[GeoBox | None, tuple[str, ...]]:
-    """Return where an opened rasterio file lies; None with a note where it does not say so as a grid."""
+    """Return the grid on the earth of an opened rasterio file; None with a note where it has none."""
     if file.transform.is_identity:
         other = " and ".join([*(["ground control points"] if file.gcps[0] else []), *(["RPCs"] if file.rpcs else [])])
         return None, (f"its place is given by {other}, which are not read; warp it first (gdalwarp)",) if other else ()
@@ -262,7 +262,7 @@ def place_of_file(file: Any) -> tuple[GeoBox | None, tuple[str, ...]]:
 def place_of_envi(
     header: Mapping[str, str], data: Path, shape: tuple[int, int]
 ) -> tuple[GeoBox | None, tuple[str, ...]]:
-    """Return where an ENVI file of (line, sample) ``shape`` lies, by its ``map info``, as GDAL reads it."""
+    """Return the grid of an ENVI file of (line, sample) ``shape``, by its ``map info``, as GDAL reads it."""
     if "map info" not in header:
         return None, ()
     rasterio = importlib.import_module("rasterio")

@@ -1,8 +1,8 @@
 """Label files that belong to scenes by their names.
 
 Labels are pictures, or polygons where there is no picture. They lie beside their images (``001_mask.png``,
-``field_a_labels.png``, ``field_a.gpkg``) or in a folder of labels there, or beside a folder of images
-(``labels/001.png``, ``annotations/001_annotation.png``); names are equal, or but for a word such as ``_mask``. Upper
+``field_a_labels.png``, ``field_a.gpkg``) or in a folder of labels. That folder lies there, or beside a folder of images
+(``labels/001.png``, ``annotations/001_annotation.png``). Names are equal, or differ by a word such as ``_mask``. Upper
 and lower case are alike.
 """
 
@@ -50,7 +50,7 @@ class MatchedFiles:
 
 
 def scene_entries(folder: Path) -> list[Path]:
-    """Files and Zarr stores that may be scenes or labels, by name; hidden ones are left out."""
+    """Return the files and Zarr stores that may be scenes or labels, by name; hidden ones are left out."""
     return sorted(
         entry
         for entry in folder.iterdir()
@@ -60,7 +60,7 @@ def scene_entries(folder: Path) -> list[Path]:
 
 
 def image_folder(folder: Path) -> Path:
-    """Return where the images of a folder lie: in a folder ``images`` in it, where there is one, or in itself."""
+    """Return the folder of images: the folder ``images`` in this one, where there is one, or this one."""
     inner = sorted(entry for entry in folder.iterdir() if is_image_folder(entry) and entry.is_dir())
     return next((entry for entry in inner if entry.name == "images"), inner[0] if inner else folder)
 
@@ -94,7 +94,10 @@ def match_folder(folder: Path) -> MatchedFiles:
 
 
 def find_label(scene: Path) -> Path | None:
-    """The label file of one scene by its name; None where there is none (SceneError: there are several)."""
+    """Return the label file of one scene by its name; None where there is none.
+
+    Raises SceneError: there are several.
+    """
     if not scene.parent.is_dir() or (scene.is_dir() and not is_store(scene)):
         return None
     try:
@@ -119,7 +122,7 @@ def folders_within(folder: Path) -> str:
 
 
 def listed_names(paths: Iterable[Path]) -> str:
-    """The first names, and how many more there are."""
+    """Return the first names, and how many follow."""
     names = [path.name for path in paths]
     more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
     return ", ".join(names[:SHOWN]) + more
@@ -131,7 +134,10 @@ def is_store(entry: Path) -> bool:
 
 
 def _in_label_folders(folder: Path) -> list[Path]:
-    """All pictures that may be labels in folders of labels: in this one, or beside it where it is one of images."""
+    """Return all pictures that may be labels in folders of labels.
+
+    Such a folder lies in this one, or beside it where it is one of images.
+    """
     return [entry for inner in _label_folders(folder) for entry in scene_entries(inner)]
 
 
@@ -142,7 +148,10 @@ def _label_folders(folder: Path) -> list[Path]:
 
 
 def _polygons_about(folder: Path) -> list[Path]:
-    """Files of polygons that may be labels: in a folder, in one of labels, or beside it where it is one of images."""
+    """Return the files of polygons that may be labels.
+
+    They lie in a folder, in one of labels, or beside it where it is one of images.
+    """
     places = [folder, *([folder.parent] if is_image_folder(folder) else []), *_label_folders(folder)]
     return [
         entry
@@ -153,7 +162,7 @@ def _polygons_about(folder: Path) -> list[Path]:
 
 
 def _label_of(image: Path, candidates: Sequence[Path]) -> Path | None:
-    """The one that has the image's name; without one, that differs by a word for images, too."""
+    """Return the file that has the image's name, else the one that differs by a word for images."""
     stem = image.stem.lower()
     for alike in (lambda name: name, lambda name: _IMAGE_WORD.sub("", name)):
         wanted = alike(stem)
@@ -202,6 +211,6 @@ def filled(pattern: str, scene: Path) -> str:
 
 
 def scene_number(path: Path) -> str | None:
-    """``059_image.png`` -> ``059``: the first digits of the file's name."""
+    """Return the first digits of the file's name: ``059_image.png`` -> ``059``."""
     digits = re.search(r"\d+", path.stem)
     return None if digits is None else digits.group()

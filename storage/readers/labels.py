@@ -103,8 +103,8 @@ def load_labels(
     """Read a label file of numbers or exact colours; without ``classes`` every value found becomes one.
 
     ``geobox`` is the grid of the scene: labels with a place of their own are brought to it. Raises SceneError: the file
-    cannot be read, lies beside the scene, has another size and no place, a value that is no class (named with its
-    count), or more than 64 values where no classes are stated.
+    cannot be read, lies beside the scene, or has another size and no place. So does a value that is no class (named
+    with its count), and more than 64 values where no classes are stated.
     """
     by_colour = any(isinstance(value, tuple) for value in (*classes.values(), unlabelled))
     read = load_codes(address, geobox, by_number=bool(classes) and not by_colour, classes=classes.values())
@@ -189,7 +189,7 @@ def _whole_numbers(values: NDArray[Any], address: str | Path, *, by_number: bool
 
 
 def _grid_difference(own: GeoBox, scene: GeoBox) -> str:
-    """Say how the grid of labels differs from a scene's; nothing where the pixels are the same."""
+    """Return how the grid of labels differs from a scene's; empty where the pixels are the same."""
     if own.crs != scene.crs:
         return f"are in {crs_name(own)}, the scene in {crs_name(scene)}"
     shift = shift_px(scene, own)
@@ -228,9 +228,9 @@ def colour_of(code: int) -> Colour:
 
 
 def found_codes(codes: NDArray[np.int64], none: int | None, is_colour: bool, where: str) -> dict[str, ClassValue]:
-    """One class for each value in the file, ascending: ``class_N`` after a number, ``colour_RRGGBB`` after a colour.
+    """Return one class for each value in the file, ascending.
 
-    A name follows from the value alone: a file without some of the classes names the others alike.
+    Classes are called ``class_N`` after a number, ``colour_RRGGBB`` after a colour.
     """
     found = [int(code) for code in np.unique(codes) if code != none and code >= 0]
     if len(found) > MOST_FOUND_CLASSES:
@@ -285,7 +285,7 @@ def class_colours(classes: Mapping[str, ClassValue], stated: Mapping[str, Colour
 
 
 def default_colour(index: int) -> Colour:
-    """Colour of class ``index`` where the file says none: eight safe ones, then hues a golden angle apart."""
+    """Return the colour of class ``index`` where the file has none: eight safe ones, then hues a golden angle apart."""
     if index < len(_EIGHT_COLOURS):
         return _EIGHT_COLOURS[index]
     turn = index * 0.618033988749895 % 1.0

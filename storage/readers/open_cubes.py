@@ -56,10 +56,7 @@ _BEGINNINGS = {  # of files, and the endings that go with them
 
 
 def split_variable(address: str | Path) -> tuple[Path, str | None]:
-    """``scene.mat:cube`` -> path and variable, with the step of time in ``cube:3``; None where none is named.
-
-    The variable of a NetCDF or HDF5 file may begin with its groups: ``scene.h5:SERC/Reflectance/Reflectance_Data``.
-    """
+    """Return path and variable of ``scene.mat:cube``, with the step of time in ``cube:3``; None where none is named."""
     found = _WITH_VARIABLE.match(str(address))
     if found is None:
         return Path(address), None
@@ -67,7 +64,7 @@ def split_variable(address: str | Path) -> tuple[Path, str | None]:
 
 
 def reader_of(address: str | Path) -> Reader:
-    """Tell which reader takes an address; none where there is no such file, or one of a kind that is not read.
+    """Return the reader that takes an address; none where there is no such file, or it is of a kind that is not read.
 
     A folder is a Zarr store or a Headwall camera's, an ENVI cube is named by its header or its data file.
     """
@@ -92,9 +89,9 @@ def open_cube(
     """Open whatever holds a cube; nothing of its numbers is read yet but pictures, .mat and .npz, which are whole.
 
     ``address`` may name an array and a step of time: ``STORE:ARRAY:3``. ``dark`` and ``white`` are ENVI or .npy files
-    of reference frames, averaged over their lines; they win over those in a Headwall folder. Of ``labels`` numbers are
-    those that stand in the file: no scale is applied, and of several arrays that with two axes is meant. Raises
-    SceneError: there is no such thing, it is damaged, or not of a kind or shape that can be used.
+    of reference frames, averaged over their lines; they win over those in a Headwall folder. Numbers of ``labels`` are
+    those in the file, without any scale; of several arrays that with two axes is meant. Raises SceneError: there is no
+    such thing, it is damaged, or not of a kind or shape that can be used.
     """
     path, variable = split_variable(address)
     frames: list[tuple[str, str | Path | None]] = [("dark", dark), ("white", white)]

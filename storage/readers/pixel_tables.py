@@ -28,7 +28,7 @@ ORDERS: Mapping[Literal["C", "F"], str] = {
 
 
 def check_picture(shape: tuple[int, ...], where: object) -> None:
-    """Question a table of numbers that is given for a scene of one band, and say how it becomes a cube (SceneError)."""
+    """Raise SceneError where a scene of one band is a table of spectra; the message shows how it becomes a cube."""
     if max(shape) < max(MOST_UNEVEN * min(shape), 1000):
         return
     bands, turned = min(shape), ".T" if shape[0] < shape[1] else ""
@@ -58,8 +58,8 @@ class SpectraTable:
     def folded(self, values: NDArray[Any], usual: Literal["C", "F"]) -> tuple[NDArray[Any], str]:
         """Return (y, x, band) values, and a note of the order that the pixels were taken in.
 
-        Of the ``usual`` order of the file's kind (F: down the columns) and the other one the other is taken where its
-        picture is clearly smoother.
+        The ``usual`` order of the file's kind (F: down the columns) is taken, unless the other one gives the clearly
+        smoother picture.
         """
         spectra = np.moveaxis(values, self.pixel_axis, 0).reshape(self.rows * self.columns, -1)
         few = spectra[:, :: max(1, spectra.shape[1] // SMOOTHED_BANDS)]

@@ -84,11 +84,13 @@ class PointingTable:
     first_row: int  # number of the first row in the file, as an editor counts them
 
     def of_cube(self, name: str, lines: int, mounting: Mounting = STRAIGHT, *, alone: bool = False) -> LinePointing:
-        """Give the pointing of a cube's ``lines`` lines: rows whose ``sweep`` is its name, or all without that column.
+        """Return the pointing of a cube's ``lines`` lines.
 
-        Where the cube is ``alone``, and no row has its name, the column cuts it into sweeps. ``mounting`` leads from
-        the device's positions to the model's. Raises SceneError: the table has no row or another number of rows for the
-        cube, a value that is no number, out of range or beyond the mirror, times that do not rise, or no valid row.
+        Its rows are those whose ``sweep`` is its name, or all without that column.
+
+        If the cube is ``alone`` and no row has its name, the column cuts it into sweeps. ``mounting`` leads from the
+        device's positions to the model's. Raises SceneError: the cube has no row or another number of rows, or no valid
+        one. So does a value that is no number, out of range or beyond the mirror, and times that do not rise.
         """
         rows, sweeps = np.arange(len(self.columns[KINDS[self.kind][0]])), tuple(dict.fromkeys(self.sweep or ()))
         cut = self.sweep is not None and alone and name not in sweeps
@@ -133,7 +135,7 @@ class PointingTable:
         return LinePointing(self.kind, self._positions(rows, valid, mounting), valid, time_s, exposure_ms, part)
 
     def _positions(self, rows: NDArray[np.intp], valid: NDArray[np.bool_], mounting: Mounting) -> Floats:
-        """(line, 2) positions of the model, or (line, 1) places; made up between valid lines for those that are not."""
+        """Return (line, 2) positions of the model, or (line, 1) places; values of invalid lines are interpolated."""
         values = np.stack([self.columns[name][rows] for name in KINDS[self.kind]], axis=-1)
         values = np.stack([_filled(column, valid) for column in values.T], axis=-1)
         if self.kind in WITHOUT_MIRROR:
@@ -168,7 +170,7 @@ class PointingTable:
 
 
 def _filled(values: Floats, valid: NDArray[np.bool_]) -> Floats:
-    """The values, with those of lines that are not valid and not known interpolated between valid ones."""
+    """Return the values; unknown ones of invalid lines are interpolated between valid lines."""
     known = valid | np.isfinite(values)
     at = np.arange(len(values))
     return values if known.all() else np.interp(at, at[known], values[known])
@@ -177,8 +179,8 @@ def _filled(values: Floats, valid: NDArray[np.bool_]) -> Floats:
 def load_pointing_table(path: Path) -> PointingTable:
     """Read a table with a row a line.
 
-    Raises SceneError: it cannot be read, has no row, a column that is not known, a cell that is no number, or not
-    exactly one kind of pointing.
+    Raises SceneError: it cannot be read, has no row, an unknown column, or a cell that is no number. So does a table
+    that has not exactly one kind of pointing.
     """
     header: list[str]
     cells: Sequence[Sequence[object]]
@@ -211,7 +213,7 @@ def load_pointing_table(path: Path) -> PointingTable:
 
 
 def _numbers(path: Path, name: str, cells: Sequence[object], first_row: int) -> Floats:
-    """The cells of a column as numbers; empty ones and None are NaN, True is 1."""
+    """Return the cells of a column as numbers; empty ones and None are NaN, True is 1."""
     values = np.empty(len(cells))
     for number, cell in enumerate(cells):
         text = str(cell).strip().lower()
@@ -226,7 +228,7 @@ def _numbers(path: Path, name: str, cells: Sequence[object], first_row: int) -> 
 
 
 def _csv_cells(path: Path) -> tuple[list[str], list[list[str]]]:
-    """Names of the columns and the cells of all rows; the delimiter is the one that the header has."""
+    """Return the names of the columns and the cells of all rows; the header's delimiter holds."""
     text = _text(path)
     lines = text.splitlines()
     header = lines[0] if lines else ""
@@ -308,7 +310,7 @@ def load_played_vector(path: Path, mounting: Mounting = STRAIGHT) -> PlayedVecto
 
 
 def follow_vector(vector: PlayedVector, middle_s: Floats, where: str) -> LinePointing:
-    """Give the pointing of lines by a played vector and the times of their mid exposures (line,) [s].
+    """Return the pointing of lines by a played vector and the times of their mid exposures (line,) [s].
 
     Times count from when the first line's exposure began; lines without a time, or outside of the path's time, are not
     valid. Raises SceneError: no line lies within the path's time.
@@ -330,6 +332,6 @@ def follow_vector(vector: PlayedVector, middle_s: Floats, where: str) -> LinePoi
 
 
 def find_pointing(folder: Path, stem: str) -> Path | None:
-    """The pointing file of a cube in a folder, by its name: ``STEM.pointing.csv``, ``.parquet`` or ``.toml``."""
+    """Return the pointing file of a cube in a folder, by its name: ``STEM.pointing.csv``, ``.parquet`` or ``.toml``."""
     names = [f"{stem}.pointing{ending}" for ending in ENDINGS]
     return next((folder / name for name in names if (folder / name).is_file()), None)

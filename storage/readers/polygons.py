@@ -1,8 +1,8 @@
 """Polygons out of GeoJSON, GeoPackage and shapefile: zones with names, and labels burnt onto the pixels of a scene.
 
-A pixel has the class of the polygon that its centre lies in, of the later one in the file where several do, and none
-outside. On a scene with a place polygons lie where their CRS says; on one without, they are in pixels, x to the right
-and y down from the upper left corner.
+A pixel has the class of the polygon around its centre: of the last one in the file where several hold it, and none
+outside. On a scene with a place polygons lie where their CRS says. On a scene without one they are in pixels, x to the
+right and y down from the upper left corner.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def polygons_of(shape: BaseGeometry) -> BaseGeometry:
 
 
 def split_layer(source: str | Path) -> tuple[Path, str | None]:
-    """``FILE.gpkg:LAYER`` -> path and layer; None where none is named."""
+    """Return path and layer of ``FILE.gpkg:LAYER``; None where no layer is named."""
     head, mark, layer = str(source).rpartition(".gpkg:")
     return Path(f"{head}.gpkg" if mark else source), layer if mark else None
 
@@ -143,7 +143,7 @@ def _layer_of(path: Path, layer: str | None) -> str | None:
 
 
 def _names(content: PolygonLayer, named_by: str | None, source: str) -> list[str]:
-    """Return what each polygon is called."""
+    """Return the name of each polygon."""
     numbers = [str(row + 1) for row in content.rows]
     by_word = {name.lower(): name for name in reversed(content.fields)}
     if named_by is not None and named_by not in content.fields:
@@ -156,7 +156,7 @@ def _names(content: PolygonLayer, named_by: str | None, source: str) -> list[str
 
 
 def word_of(value: object) -> str:
-    """An attribute as a name; empty where it says nothing."""
+    """Return an attribute as a name; empty where it has no value."""
     if value is None or (isinstance(value, float | np.floating) and np.isnan(value)):
         return ""
     if isinstance(value, float | np.floating) and float(value).is_integer():
@@ -178,8 +178,8 @@ def load_polygon_labels(
     """Burn the polygons of ``FILE`` or ``FILE.gpkg:LAYER`` onto the (y, x) pixels of a scene; and notes.
 
     Classes are those of the settings, by name or by number, else every value of the attribute that says them. Raises
-    SceneError: there is no such file, layer or attribute, no polygon, none on the scene, no CRS where one is needed
-    or one where none is known, or a class that the settings lack.
+    SceneError: the file, layer or attribute is missing, there is no polygon, or none on the scene. So does a missing
+    CRS where one is needed, one where none is known, or a class that the settings lack.
     """
     layer = _labels_in(address)
     attribute, said = _classes_said(layer, address, settings)
@@ -235,7 +235,7 @@ def _labels_in(address: str | Path) -> PolygonLayer:
 
 
 def _classes_said(layer: PolygonLayer, address: str | Path, settings: SceneSettings) -> tuple[str, list[str]]:
-    """The attribute that says classes, and its word for each polygon; empty where it says none."""
+    """Return the attribute with the classes, and each polygon's value of it; empty where there is none."""
     by_word = {name.lower(): name for name in reversed(layer.fields)}
     stated = settings.class_attribute
     found = next((by_word[word] for word in CLASS_ATTRIBUTES if word in by_word), None) if stated is None else stated
@@ -250,7 +250,7 @@ def _classes_said(layer: PolygonLayer, address: str | Path, settings: SceneSetti
 
 
 def _named(said: Iterable[str], unlabelled: ClassValue | None, where: str) -> dict[str, ClassValue]:
-    """A class for every word: numbers as label pictures have them, other words in their order from 1."""
+    """Return a class for every word: numbers as label pictures have them, other words in their order from 1."""
     words = sorted({word for word in said if word and word != str(unlabelled)})
     if len(words) > MOST_FOUND_CLASSES:
         raise SceneError(
@@ -265,7 +265,7 @@ def _named(said: Iterable[str], unlabelled: ClassValue | None, where: str) -> di
 
 
 def _index_of(word: str, classes: dict[str, ClassValue], unlabelled: ClassValue | None) -> int | None:
-    """Index of the class that a polygon's word means, by name or number; 255 for unlabelled, None for no class."""
+    """Return the index of the class of a polygon's word, by name or number; 255 for unlabelled, None for no class."""
     if word and word == str(unlabelled):
         return UNLABELLED
     names, values = list(classes), list(classes.values())
@@ -275,7 +275,10 @@ def _index_of(word: str, classes: dict[str, ClassValue], unlabelled: ClassValue 
 
 
 def _moved(layer: PolygonLayer, place: FieldPlace, address: str | Path) -> list[BaseGeometry]:
-    """Polygons in pixels of the scene, as far as they lie on it (SceneError: none does, or their CRS does not fit)."""
+    """Return the polygons in pixels of the scene, cut to it.
+
+    Raises SceneError: none lies on it, or their CRS does not fit.
+    """
     crs = layer.crs
     if place.crs is None and crs is not None:
         raise SceneError(
@@ -301,7 +304,7 @@ def _moved(layer: PolygonLayer, place: FieldPlace, address: str | Path) -> list[
 
 
 def _burn(polygons: Sequence[tuple[BaseGeometry, int | None]], shape: tuple[int, int]) -> NDArray[np.uint8]:
-    """(y, x) index of the class of each pixel's centre, the last polygon's where several hold it."""
+    """Return (y, x) index of the class at each pixel's centre; the last polygon wins."""
     if not polygons:
         return np.full(shape, UNLABELLED, np.uint8)
     return np.asarray(rasterio_features.rasterize(polygons, out_shape=shape, fill=UNLABELLED, dtype="uint8"))

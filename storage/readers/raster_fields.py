@@ -57,9 +57,9 @@ def open_raster(
 ) -> SceneFile:
     """Open a file, or the tiles of a folder or a glob as one field, to be read some rows at a time.
 
-    Of tiles that overlap the first by name wins where it has a value; what no tile shows is missing. ``labels`` are on
-    the pixels of the whole field. Raises SceneError, WavelengthError: as `open_scene_file`, or the tiles do not lie on
-    one grid, do not say where they lie, or have other bands.
+    The first tile by name that has a value wins where several overlap; pixels without any tile are missing. ``labels``
+    are on the pixels of the whole field. Raises SceneError, WavelengthError: as `open_scene_file`, or the tiles do not
+    lie on one grid, do not say where they lie, or have other bands.
     """
     files = tiles_of(address)
     if len(files) == 1:
@@ -216,7 +216,10 @@ def _placed(opened: Sequence[SceneFile]) -> tuple[list[_Tile], GeoBox]:
 
 
 def _origin(first: SceneFile, other: SceneFile, grid: GeoBox, own: GeoBox) -> tuple[int, int]:
-    """Row and column of a tile on the grid of the first (SceneError: other pixels, or pixels that lie between)."""
+    """Return the row and column of a tile on the grid of the first.
+
+    Raises SceneError: its pixels have another size, or lie between those of the first.
+    """
     shift = shift_px(grid, own)
     if shift is None:
         sizes = [f"{abs(one.affine.a):g} x {abs(one.affine.e):g}" for one in (grid, own)]

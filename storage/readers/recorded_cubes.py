@@ -64,7 +64,7 @@ def find_cubes(path: Path) -> list[Path]:
 
 
 def _stem(path: Path) -> str:
-    """Name of a cube without the endings of its files."""
+    """Return the name of a cube without the endings of its files."""
     stem = path.name.removesuffix(path.suffix) if path.suffix.lower() == ".hdr" else path.name
     ending = Path(stem).suffix
     return stem.removesuffix(ending) if ending.lower() in (*filter(None, DATA_ENDINGS), ".zarr") else stem
@@ -97,7 +97,7 @@ def open_recorded_cube(path: Path, wavelengths: Sequence[float] | None) -> Recor
 
 
 def with_bits(camera: LineCamera, cubes: Sequence[RecordedFile], notes: list[str]) -> LineCamera:
-    """The camera with as many bits as the numbers have, by some lines of each cube.
+    """Return the camera with as many bits as the numbers need, by some lines of each cube.
 
     Raises SceneError: most numbers are above full scale, and would not be with their bytes swapped; or some are below
     0.
@@ -186,7 +186,10 @@ def find_references(
 
 
 def _load_fitting(file: Path, frame: tuple[int, ...], kind: str, notes: list[str]) -> NDArray[np.float32]:
-    """A frame (sample, band), summed to a cube's binning where it has more samples (SceneError: it does not fit)."""
+    """Return a frame (sample, band), summed to a cube's binning where it has more samples.
+
+    Raises SceneError: it does not fit.
+    """
     values, _ = load_frame(file)
     notes.append(f"{kind} frame from {file.name}")
     parts = values.shape[0] // frame[0]

@@ -8,11 +8,11 @@
     a folder with raw_<frame> files       a Headwall camera's capture
     NAME.zarr                             a cube of anyone's
 
-Beside a cube ``NAME`` of files are found, where no flag names them: ``NAME.pointing.csv`` (.parquet, .toml),
-``NAME.dark.hdr``, ``NAME.white.hdr``, ``NAME.bad.hdr``, ``NAME.flat.hdr``, or ``dark*.hdr`` and ``white*.hdr`` for all
-cubes of the folder. The header of an ENVI cube may say ``line axis = y``: lines lie along y of the field, and the scan
-goes along x. The header of a white frame may say ``white_reference = {...}``, the value of the white reference per
-band, and ``mirror at rest = 1`` where it was taken so.
+Files beside a cube ``NAME`` are found where no flag names them: ``NAME.pointing.csv`` (.parquet, .toml),
+``NAME.dark.hdr``, ``NAME.white.hdr``, ``NAME.bad.hdr`` and ``NAME.flat.hdr``. Frames for all cubes of the folder are
+``dark*.hdr`` and ``white*.hdr``. The header of an ENVI cube may say ``line axis = y``: lines lie along y of the field,
+and the scan goes along x. The header of a white frame may hold ``white_reference = {...}``, the value of the white
+reference per band. ``mirror at rest = 1`` says that it was taken so.
 """
 
 from __future__ import annotations
@@ -62,7 +62,10 @@ LINE_PRODUCTS = {"raw_coarse": "signal_coarse", "raw_fine": "signal_fine"}  # of
 
 
 def stores_of_lines(products: Mapping[str, str], is_there: Callable[[str], bool]) -> list[str]:
-    """Addresses of the stores that hold a run's lines: raw ones, or condensed ones where those were cleared away."""
+    """Return the addresses of the stores that hold a run's lines.
+
+    These are the raw ones, or the condensed ones where the raw ones were cleared away.
+    """
     pairs = [(products[raw], products.get(signal)) for raw, signal in LINE_PRODUCTS.items() if raw in products]
     return [raw if signal is None or is_there(raw) else signal for raw, signal in pairs]
 
@@ -71,8 +74,8 @@ def stores_of_lines(products: Mapping[str, str], is_there: Callable[[str], bool]
 class Recording:
     """A recording, opened; no line has been read.
 
-    ``camera`` is the one given, with the samples, bits, exposure and period that the recording has; of a scan without a
-    mirror its lens is so long that lines are parallel.
+    ``camera`` is the one given, with the samples, bits, exposure and period that the recording has. A scan without a
+    mirror has so long a lens that lines are parallel.
     """
 
     name: str
@@ -84,7 +87,10 @@ class Recording:
     light: tuple[str, ...]  # what the numbers are known by without reading them: a manifest's hash, or file stamps
 
     def key(self) -> dict[str, Any]:
-        """Give what captures from the recording depend on: lines, references, bands and light, but no place or name."""
+        """Return all that captures from the recording depend on: lines, references, bands and light.
+
+        Its place and name are not among them.
+        """
         arrays = [
             array
             for one in self.sweeps
@@ -212,7 +218,7 @@ def _open_files(path: Path, camera: LineCamera, given: RecordedWith) -> Recordin
 def _point(
     cube: RecordedFile, camera: LineCamera, given: RecordedWith, notes: list[str], *, alone: bool
 ) -> LinePointing | None:
-    """The pointing of a cube by the file given, one named like the cube, or none."""
+    """Return the pointing of a cube by the file given, or by one named like the cube; None without either."""
     file, lines = given.pointing, cube.source.shape[0]
     if file is not None and file.is_dir():
         folder, names = file, [f"{cube.name}{middle}{end}" for middle in ("", ".pointing") for end in ENDINGS]
@@ -238,7 +244,7 @@ def _point(
 def _without_mirror(
     cube: RecordedFile, pointing: LinePointing | None, camera: LineCamera, pixel_m: float | None, notes: list[str]
 ) -> tuple[LineCamera, list[LinePointing | None]]:
-    """Camera and pointing of a straight scan without a mirror: its middle is the field's centre."""
+    """Return the camera and pointing of a straight scan without a mirror: its middle is the field's centre."""
     lines = cube.source.shape[0]
     if pointing is None:
         notes.append(f"{cube.name} has no pointing: taken as an even straight scan along y with one pixel a line")
@@ -283,7 +289,7 @@ def _timed(
 def _sweeps_of(
     cube: RecordedFile, pointing: LinePointing, camera: LineCamera, given: RecordedWith, notes: list[str]
 ) -> list[RecordedSweep]:
-    """The sweeps of one cube: one, or those that its pointing table cuts it into."""
+    """Return the sweeps of one cube: one, or as many as its pointing table cuts it into."""
     source = cube.source
     valid = source.valid & pointing.valid
     time_s = _middle_s(source, pointing.time_s, camera, notes)
@@ -334,7 +340,7 @@ def _sweeps_of(
 
 
 def _line_reader(source: CubeSource, own: NDArray[np.intp]) -> Callable[[NDArray[np.intp]], NDArray[np.uint16]]:
-    """Reader of single lines of a sweep, whose lines are the lines ``own`` of the cube."""
+    """Return a reader of single lines of a sweep that consists of the lines ``own`` of the cube."""
 
     def read_lines(numbers: NDArray[np.intp]) -> NDArray[np.uint16]:
         lines = np.concatenate([source.read(first, stop) for first, stop in line_runs(own[numbers])])
@@ -349,7 +355,10 @@ def _line_reader(source: CubeSource, own: NDArray[np.intp]) -> Callable[[NDArray
 
 
 def _middle_s(source: CubeSource, stated_s: Floats | None, camera: LineCamera, notes: list[str]) -> Floats:
-    """(line,) times of mid exposure since the first exposure began: as stated, by the files' stamps, or even."""
+    """Return (line,) times of mid exposure since the first exposure began [s].
+
+    They are as stated, by the files' stamps, or even.
+    """
     at = np.arange(source.shape[0])
     if stated_s is None and source.lines.time_s is not None:
         exposure_ms = camera.exposure_ms
@@ -416,7 +425,7 @@ def find_recorded_run(address: str | Path) -> tuple[Run, tuple[int, int] | None]
 
 
 def _named_run(address: str | Path) -> tuple[str, str | None] | None:
-    """The archive and the run, where one is named, that an address stands for; None where it is no such address."""
+    """Return the archive and the run (None: unnamed) that an address names; None where it is no such address."""
     text = str(address).rstrip("/")
     place, _, run = text.rpartition("/runs/")
     if place and run and is_archive(place):
@@ -425,7 +434,7 @@ def _named_run(address: str | Path) -> tuple[str, str | None] | None:
 
 
 def _run_with_cubes(address: str, name: str | None) -> tuple[Archive, Run, list[Path]]:
-    """A run of an archive with its raw cubes, the newest that has some where none is named."""
+    """Return a run of an archive with its raw cubes: the named one, or the newest that has some."""
     archive = open_archive(address, create=False, write=False)
     folders = archive.runs()
     if name is not None and name not in [folder.name for folder in folders]:

@@ -73,9 +73,9 @@ class SceneDraft:
 def draft_scene(address: str | Path, report: Report = lambda done, name: None) -> SceneDraft:
     """Look at the images and labels of a folder, or at one file and its labels.
 
-    Of images the first is read, of the others the sizes; of label files all are read. Raises SceneError: there is
-    nothing to look at, the first image cannot be read, labels may belong to several images, or have no classes because
-    their values are mixed.
+    The first image is read, of the others only the sizes; label files are all read. Raises SceneError: there is no file
+    to read, or the first image cannot be read. So do labels that may belong to several images, or that have no classes
+    because their values are mixed.
     """
     path, _ = split_variable(address)
     alone = not path.is_dir() or is_store(path)
@@ -134,7 +134,7 @@ def _named_step(address: str | Path) -> tuple[str | Path, tuple[str, ...]]:
 
 
 def _shared_labels(found: MatchedFiles, shape: tuple[int, ...]) -> MatchedFiles:
-    """Give all images the only label file, where it is called by a word for labels alone and has their size."""
+    """Return all images the only label file, where it is called by a word for labels alone and has their size."""
     if found.labels or len(found.alone) != 1 or found.alone[0].stem.lower() not in LABEL_WORDS:
         return found
     with suppress(PipelineError):
@@ -144,7 +144,7 @@ def _shared_labels(found: MatchedFiles, shape: tuple[int, ...]) -> MatchedFiles:
 
 
 def _pattern(found: MatchedFiles, folder: Path) -> str | None:
-    """The ``labels`` of a scene.toml that tells each image its own file, and others none; None where none does."""
+    """Return the ``labels`` of a scene.toml that matches each image to its own file; None where no pattern does."""
     for image, label in list(found.labels.items())[:1]:
         place = os.path.relpath(label.parent, folder)
         number = scene_number(image)
@@ -163,7 +163,7 @@ def _pattern(found: MatchedFiles, folder: Path) -> str | None:
 def _classes(
     found: MatchedFiles, shape: tuple[int, int, int], unseen: list[str], report: Report
 ) -> tuple[FoundClass, ...]:
-    """All values of the label files, as classes; notes name what cannot be read or has another size than its image."""
+    """Return all values of the label files, as classes; notes name files that cannot be read or have another size."""
     counts: Counter[int] = Counter()
     greys: Counter[int] = Counter()  # of files without colours, while others have some
     for number, (image, label) in enumerate(found.labels.items()):
@@ -196,7 +196,7 @@ def _classes(
 
 
 def _polygon_classes(found: MatchedFiles, unseen: list[str], report: Report) -> tuple[FoundClass, ...]:
-    """All classes of label files that are polygons, and their fractions of the labelled pixels."""
+    """Return all classes of label files that are polygons, and their fractions of the labelled pixels."""
     settings, counts, readable = SceneSettings(), Counter[str](), list[Path]()
     for number, (image, label) in enumerate(found.labels.items()):
         report(number / len(found.labels), label.name)

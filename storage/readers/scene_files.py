@@ -77,7 +77,7 @@ class SceneFile:
         )
 
     def with_labels(self, labels: NDArray[np.uint8], note: str) -> SceneFile:
-        """The same scene with other labels; its provenance says so."""
+        """Return the same scene with other labels; its provenance has the note."""
         return replace(self, labels=labels, provenance=(*self.provenance, note))
 
 
@@ -92,14 +92,14 @@ def load_scene_file(
 ) -> SceneFile:
     """Read a scene from an image, .npy, .npz, .mat, ENVI, Zarr, NetCDF, HDF5 or a Headwall folder.
 
-    ``path`` may be ``FILE.mat:ARRAY`` or ``STORE.zarr:ARRAY``, and end in a step of time, ``FILE.npy:STEP``. Axes
-    are y, x, band; two axes are one band. What comes in lines with dark and white frames is taken over the white
-    reference. What is given here wins over the ``scene.toml`` beside the file, and that over what the file says: a file
-    of class numbers or colours on the same pixels, or of polygons (others are found by their names), bands to use,
-    counted from 0, and wavelengths [nm], one for each band used or for each of the file. ``classes`` are those of a
-    scene.toml that states none. Labels found by their names that cannot be used are left out with a note where no
-    ``labels_needed``. Raises SceneError: a file is missing, damaged, of a kind or shape that cannot be used, or the
-    labels do not fit. WavelengthError: wavelengths are missing, or their number, unit or range is wrong.
+    ``path`` may be ``FILE.mat:ARRAY`` or ``STORE.zarr:ARRAY``, and end in a step of time, ``FILE.npy:STEP``. Axes are
+    y, x, band; two axes are one band. Lines with dark and white frames are taken over the white reference. Arguments
+    win over the ``scene.toml`` beside the file, and that over the file itself. ``labels`` is a file of class numbers or
+    colours on the same pixels, or of polygons; others are found by their names. ``bands`` count from 0; ``wavelengths``
+    [nm] are one for each band used or for each of the file. ``classes`` are those of a scene.toml that states none.
+    Labels found by their names that cannot be used are left out with a note where no ``labels_needed``. Raises
+    SceneError: a file is missing, damaged, of a kind or shape that cannot be used, or the labels do not fit.
+    WavelengthError: wavelengths are missing, or their number, unit or range is wrong.
     """
     return _open(path, labels, bands, wavelengths, classes or {}, labels_needed, keep=True)
 
@@ -173,7 +173,7 @@ def _open(
 
 
 def _stated_scaling(scale: float, offset: float) -> str:
-    """Return what scene.toml does to the numbers, for hashes; empty where it does nothing."""
+    """Return scene.toml's scaling of the numbers, for hashes; empty where there is none."""
     return "" if (scale, offset) == (1.0, 0.0) else f"{SETTINGS_NAME} scale {scale!r} offset {offset!r}"
 
 
@@ -199,7 +199,7 @@ def with_stated_values(source: CubeSource, address: str | Path) -> CubeSource:
     nodata, plain = USUAL_NODATA if nodata is None and source.dtype.kind in "if" else nodata, source.read
 
     def read(start: int, stop: int) -> NDArray[np.float32]:
-        """Give some lines (line, sample, band), NaN where the file has no value."""
+        """Return some lines (line, sample, band), NaN where the file has no value."""
         return unpacked(plain(start, stop), settings.scale, settings.offset, nodata)
 
     return replace(source, read=read, dtype=np.dtype(np.float32), nodata=None, notes=(*source.notes, note))
@@ -243,7 +243,7 @@ def _content_hash(file: Path, files: tuple[Path, ...]) -> str:
 def _chosen_bands(
     bands: Sequence[int] | None, settings: SceneSettings, count: int, path: Path, bad: Sequence[int]
 ) -> tuple[list[int], tuple[str, ...]]:
-    """Bands to use, and a note: without a word of the user's, those that the file itself does not call bad."""
+    """Return the bands to use, and a note; without a choice by the user, all that the file does not call bad."""
     where = "--bands" if bands is not None else f"bands in {settings.path}"
     chosen = bands if bands is not None else settings.bands
     if chosen is None:
@@ -310,7 +310,7 @@ def load_field_labels(address: str | Path, shape: tuple[int, int]) -> tuple[Labe
 
 
 def _one_class_note(found: Labels) -> tuple[str, ...]:
-    """Question labels that are all alike: the one value may mean unlabelled."""
+    """Return a question on labels that are all alike: the one value may mean unlabelled. Empty otherwise."""
     there = np.unique(found.index[found.index != UNLABELLED])
     if len(there) != 1:
         return ()
@@ -352,7 +352,7 @@ class FileValues:
 
     @property
     def scaling(self) -> str:
-        """Return what scene.toml does to the numbers, for hashes."""
+        """Return scene.toml's scaling of the numbers, for hashes."""
         return _stated_scaling(self.scale, self.offset)
 
     def notes(self, settings: Path | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -483,7 +483,7 @@ class ValueCount:
         return (*notes, *self._dark_note())
 
     def _dark_note(self) -> tuple[str, ...]:
-        """Say where the bright end is so far above all else that hardly any light is left for it."""
+        """Return a note where the bright end is so far above all else that hardly any light is left for it."""
         lit = np.concatenate(self._lit) if self._lit else np.empty(0, np.float32)
         if not lit.size:
             return ()
@@ -498,7 +498,7 @@ class ValueCount:
 
 
 def bands_text(bands: Sequence[int]) -> str:
-    """Band numbers as ``--bands`` takes them: ``0-3,7``."""
+    """Return the band numbers as ``--bands`` takes them: ``0-3,7``."""
     runs: list[list[int]] = []
     for band in bands:
         if runs and band == runs[-1][1] + 1:

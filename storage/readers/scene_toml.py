@@ -87,7 +87,7 @@ def find_scene_settings(scene: Path) -> SceneSettings:
 
 
 def is_image_folder(folder: Path) -> bool:
-    """Tell whether a folder's name says that images lie in it, and what belongs to them beside it."""
+    """Return whether a folder's name says that images lie in it, and what belongs to them beside it."""
     return folder.name.lower() in IMAGE_FOLDERS
 
 
@@ -119,7 +119,7 @@ MICROMETRES = (0.2, 5.0)
 
 
 def check_wavelengths(wavelengths: Sequence[float] | NDArray[np.float64], where: str) -> NDArray[np.float64]:
-    """Give the wavelengths as float64 [nm], any order.
+    """Return the wavelengths as float64 [nm], any order.
 
     Raises WavelengthError: they are not finite, look like micrometres, or lie outside 200-3000 nm.
     """
@@ -191,7 +191,7 @@ def _fit(
 
 
 def _from_file(path: Path, dropped: Sequence[int], chosen: list[int], file_bands: int) -> Bands:
-    """Rows of nm and FWHM, less the dropped ones (counted from 1)."""
+    """Return the rows of nm and FWHM, less the dropped ones (counted from 1)."""
     table = _table(path)
     bad = [row for row in dropped if not 1 <= row <= len(table)]
     if bad:
@@ -210,7 +210,7 @@ def _from_file(path: Path, dropped: Sequence[int], chosen: list[int], file_bands
 
 
 def _table(path: Path) -> NDArray[np.float64]:
-    """Rows of a text file that begin with a number; headings are passed over. (row, 1 or 2)"""
+    """Return the rows of a text file that begin with a number; headings are passed over. (row, 1 or 2)"""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:

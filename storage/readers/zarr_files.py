@@ -63,11 +63,10 @@ def find_zarr_store(path: Path) -> Path | None:
 def open_zarr_cube(path: Path, variable: str | None = None, *, labels: bool = False) -> CubeSource:
     """Open one array of a store, or of the ``cube.zarr`` in a folder, as a cube.
 
-    Of this project: ingested cubes, mosaics. Of anyone's: the only array with three axes of numbers, or the one named,
-    at the step of time named (``values:3`` or ``3``); wavelengths come from a coordinate of that name, or of the band
-    axis with a unit.
-    Raises SceneError: the store is damaged, holds no such array, has dims that are not known, a codec that is not
-    allowed, or claims to hold far more than lies on the disk.
+    Stores of this project have ingested cubes or mosaics. Other stores have the only array with three axes of numbers,
+    or the one named, at the step of time named (``values:3`` or ``3``). Wavelengths come from a coordinate of that
+    name, or of the band axis with a unit. Raises SceneError: the store is damaged, or has no such array, unknown dims
+    or a codec that is not allowed. So does one that claims far more than lies on the disk.
     """
     path = find_zarr_store(path) or path
     with reading(path, "Zarr"):
@@ -156,7 +155,7 @@ def _read_json(path: Path) -> Mapping[str, Any]:
 
 
 def _codecs(content: object) -> Iterator[str]:
-    """Give names of all codecs in an array's metadata, those within others too."""
+    """Yield names of all codecs in an array's metadata, those within others too."""
     if isinstance(content, dict):
         for key in ("codecs", "index_codecs", "filters", "compressor", "compressors"):
             listed = content.get(key) or []
@@ -208,7 +207,10 @@ def write_ingested_cube(
 
 
 def stored_dtype(source: CubeSource, report: Report = lambda done: None) -> np.dtype[Any]:
-    """Type of the store: uint8 and uint16 stay, other whole numbers become uint16 where all fit, the rest float32."""
+    """Return the type of the store.
+
+    uint8 and uint16 stay, other whole numbers become uint16 where all fit, the rest float32.
+    """
     if source.dtype.kind == "b" or source.dtype == np.uint8:
         return np.dtype(np.uint8)
     if source.dtype == np.uint16:

@@ -1,12 +1,12 @@
 """An archive in a bucket: the same stores, keys and runs, worked on in a folder of this machine.
 
-A store's or run's manifest has the same address in the bucket; its files lie below ``<address>/<attempt>/``, the
-attempt being the beginning of the SHA-256 of the manifest that lists them: two writers never mix theirs. A store is
-published in the working copy first, then uploaded; a conditional put of its manifest, last, publishes it for everybody:
-the first one wins, for ever, and others take what stands. Files are fetched when their path is asked for.
+A store's or run's manifest has the same address in the bucket. Its files lie below ``<address>/<attempt>/``. The
+attempt is the beginning of the SHA-256 of the manifest that lists them, so that two writers never mix theirs. A store
+is published in the working copy first, then uploaded. A conditional put of its manifest, last, publishes it: the first
+writer wins, for ever, and others take what stands. Files are fetched when their path is asked for.
 
-What was made is kept in the working copy where the bucket stops answering, and the same command uploads it. All of the
-working copy that is in the bucket may be deleted at any time while no process works on it.
+Results stay in the working copy where the bucket stops answering, and the same command uploads them. All of the working
+copy that is in the bucket may be deleted at any time while no process works on it.
 """
 
 from __future__ import annotations
@@ -75,11 +75,13 @@ class ObjectArchive(Archive):
     # --- stores -------------------------------------------------------------------------------------------------------
 
     def ref(self, stage: str, key: str) -> StageRef:
-        """Address of a store, whether it is there or not; its path fetches it."""
+        """Return the address of a store, whether it is there or not; its path fetches it."""
         return RemoteRef(stage, key, store_at(self.root, stage, key).path, self._fetch)
 
     def find(self, stage: str, key: str) -> StageRef | None:
-        """The published store, or None, also where its files were cleared away; what waits here is uploaded.
+        """Return the published store; None where there is none or its files were cleared away.
+
+        A store that waits here is uploaded.
 
         Raises IncompleteStoreError: its manifest in the bucket is damaged.
         """
@@ -93,28 +95,30 @@ class ObjectArchive(Archive):
         return None if is_cleared(read_manifest(self.root / ref.uri)) else ref
 
     def is_known(self, ref: StageRef) -> bool:
-        """Tell whether a store was published, also where its files were cleared away since; its manifest is here then.
+        """Return whether a store was published, also where its files were cleared away since.
 
-        Raises IncompleteStoreError: its manifest in the bucket is damaged.
+        Its manifest is here then.
+
+        Its manifest is here then. Raises IncompleteStoreError: its manifest in the bucket is damaged.
         """
         return super().is_known(ref) or self._find(ref.uri)
 
     def manifest_hashes(self, refs: Iterable[StageRef]) -> dict[str, str]:
-        """`manifest_hash` by address, of stores and of all they rest on, each of which is in the bucket then."""
+        """Return the `manifest_hash` of stores and of all they rest on, by address, once each is in the bucket."""
         given = list(refs)
         self._ensure(super().manifest_hashes(given))
         return super().manifest_hashes(given)
 
     def locate(self, address: str) -> Path:
-        """Return where on this machine a product lies by its address relative to the archive; fetched if need be."""
+        """Return the path on this machine of a product, by its address relative to the archive; fetched if need be."""
         self._fetch(in_text(address) or "/".join(address.split("/")[:2]))
         return super().locate(address)
 
     def discard(self, ref: StageRef, *, wait: bool = True, unnamed: bool = False) -> bool:
         """Take one store away for good, here and in the bucket; see `Archive.discard`.
 
-        Its manifest goes first. With ``unnamed`` it comes back where a run that names it has been published since this
-        archive was opened; publishing a run looks for its stores after that.
+        Its manifest goes first. An ``unnamed`` store comes back where a run that names it has been published since this
+        archive was opened. Publishing a run looks for its stores after that.
         """
         manifest = f"{ref.uri}/{MANIFEST_NAME}"
         standing = self.objects.read(manifest)
@@ -170,11 +174,11 @@ class ObjectArchive(Archive):
         return self._sending(super()._begin_run(f"{run_id}-{secrets.token_hex(3)}"))  # which no other machine takes
 
     def extend_run(self, run_id: str, *, wait: bool = True) -> RunDraft | None:
-        """Begin to add to a run that is published here or in the bucket; see `Archive.extend_run`."""
+        """Open a run that is published here or in the bucket to add to it; see `Archive.extend_run`."""
         return self._sending(super().extend_run(run_id, wait=wait))
 
     def _sending(self, draft: RunDraft | None) -> RunDraft | None:
-        """Have a run uploaded once it is published in the working copy, and then look for its stores once more."""
+        """Upload a run once it is published in the working copy, and then look for its stores once more."""
 
         def send(uri: str) -> None:
             self._upload(uri, first=draft is not None and not draft.extends)
@@ -222,7 +226,7 @@ class ObjectArchive(Archive):
                 self._fetch_files(uri, [RECEIPT])
 
     def now(self) -> datetime:
-        """Time by the clock that dates the objects, rounded up: it tells whole seconds."""
+        """Return the time by the clock that dates the objects, rounded up to whole seconds."""
         if not self.writes:
             return super().now()
         self.objects.write(".now", b"")
@@ -230,25 +234,25 @@ class ObjectArchive(Archive):
         return super().now() if dated is None else dated[1] + timedelta(seconds=1)
 
     def size_of(self, uri: str) -> int:
-        """Bytes of all objects of a store or run."""
+        """Return the bytes of all objects of a store or run."""
         return sum(one.size for one in self.objects.listing(uri).values())
 
     def sizes(self, uris: Iterable[str]) -> dict[str, int]:
-        """`size_of` stores and runs, by address."""
+        """Return the sizes of stores and runs, as `size_of` counts them, by address."""
         names = list(uris)
         return dict(zip(names, some_at_a_time(self.size_of, names), strict=True))
 
     def take_moved(self) -> int:
-        """Bytes of objects sent and brought since this was asked last, or the archive was opened."""
+        """Return the bytes of objects sent and received since the last call, or since the archive was opened."""
         return self.objects.take_moved()
 
     def lost_runs(self) -> list[str]:
-        """Addresses of runs in the bucket of which there are files, but no manifest, neither there nor here."""
+        """Return the addresses of runs in the bucket that have files, but no manifest there or here."""
         here = {f"runs/{folder.name}" for folder in self.runs()}
         return [uri for uri in _lost_runs(self.objects.listing("runs")) if uri not in here]
 
     def leftovers(self, keep_days: float) -> dict[str, int]:
-        """Files in the bucket that no manifest publishes, older than ``keep_days``: folder and bytes."""
+        """Return folders and bytes of files in the bucket that no manifest publishes, older than ``keep_days``."""
         there = self.objects.listing()
         latest = max((one.changed for one in there.values()), default=None)
         uploads: dict[str, list[Listed]] = {}
@@ -327,7 +331,7 @@ class ObjectArchive(Archive):
         return True
 
     def _lay(self, uri: str, manifest: bytes, changed: datetime) -> None:
-        """Have a manifest here, with the date of its object; files that it lists otherwise than before go."""
+        """Write a manifest here, with the date of its object; files that it lists otherwise are removed."""
         folder = self.root / uri
         with self._locked(f"copy-{uri.replace('/', '-')}"), self._aside() as aside:
             before, problem = try_manifest(folder)
@@ -347,7 +351,7 @@ class ObjectArchive(Archive):
 
     @contextmanager
     def _aside(self) -> Iterator[Path]:
-        """Give a folder of the working copy for what is not whole yet; a disk that refuses says so in words."""
+        """Yield a folder of the working copy for what is not whole yet; a disk that refuses says so in words."""
         with (
             refusals(self.root, "write to the working copy"),
             TemporaryDirectory(prefix=ASIDE, dir=self.root, ignore_cleanup_errors=True) as named,
@@ -355,7 +359,7 @@ class ObjectArchive(Archive):
             yield Path(named)
 
     def _fetch(self, uri: str) -> None:
-        """Have a store or run here whole; of one of which nothing is known, a reader says what it finds.
+        """Fetch a whole store or run; an unknown one is left to the reader, who reports its absence.
 
         Raises IncompleteStoreError: an object of it is missing or has changed, or all of it was removed since.
         """
@@ -419,7 +423,7 @@ class ObjectArchive(Archive):
             self._lay(uri, *dated)  # by its date it is known as what stands
 
     def _ensure(self, uris: Iterable[str]) -> None:
-        """See that stores stand in the bucket as they are known here; those that do not are uploaded.
+        """Upload the stores that are not in the bucket as they are known here.
 
         Raises IncompleteStoreError: one is neither in the bucket nor whole here.
         """
@@ -444,12 +448,12 @@ def _is_address(uri: str) -> bool:
 
 
 def _files_at(uri: str, manifest: bytes) -> str:
-    """Address of the files that a manifest lists."""
+    """Return the address of the files that a manifest lists."""
     return f"{uri}/{hashlib.sha256(manifest).hexdigest()[:16]}"
 
 
 def _manifests(there: Mapping[str, Listed]) -> dict[str, Listed]:
-    """Return what is published, by address."""
+    """Return the published stores and runs, by address."""
     depths = {"stages": 4, "runs": 3}
     named = {
         path.removesuffix(f"/{MANIFEST_NAME}"): one
@@ -460,7 +464,7 @@ def _manifests(there: Mapping[str, Listed]) -> dict[str, Listed]:
 
 
 def _lost_runs(there: Mapping[str, Listed]) -> list[str]:
-    """Runs of which there are files, but no manifest, and that are not about to be uploaded."""
+    """Return the runs that have files, but no manifest, and that are not about to be uploaded."""
     files = {path: found[1] for path in there if path.startswith("runs/") and (found := ATTEMPT.fullmatch(path))}
     latest = max((one.changed for one in there.values()), default=None)
     old = {uri for path, uri in files.items() if latest and (latest - there[path].changed).total_seconds() >= UPLOAD_S}
@@ -529,7 +533,7 @@ def open_object_archive(text: str | Path, *, create: bool = True, write: bool = 
 
 
 def _find_mark(objects: Objects, *, create: bool) -> None:
-    """See that a prefix has the mark that makes it an archive; where ``create``, write it if need be.
+    """Check that a prefix has the mark that makes it an archive; ``create`` writes it where it is missing.
 
     A store that anyone may overwrite is refused.
     """

@@ -1,6 +1,6 @@
 """An archive's place in a bucket, and its objects: read, written, listed and removed, each of them as a whole.
 
-How the bucket is reached stands in the environment, as for any S3 client: AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY,
+The environment says how the bucket is reached, as for any S3 client: AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY,
 AWS_REGION, AWS_ENDPOINT_URL. SPECTRALZOOM_WORK names the folder of working copies.
 """
 
@@ -74,7 +74,7 @@ class ObjectPlace:
         return f"s3://{self.bucket}/{self.prefix}" if self.prefix else f"s3://{self.bucket}"
 
     def working_copy(self) -> Path:
-        """Folder on this machine in which the archive is worked on; its last part is what the archive is called."""
+        """Return the folder of the archive's working copy on this machine; its last part is the archive's name."""
         base = os.environ.get("SPECTRALZOOM_WORK")
         if base is None:
             base = os.environ.get("XDG_DATA_HOME") or str(Path.home() / ".local" / "share")
@@ -194,7 +194,10 @@ class Objects:
         self._moved, self._counting = 0, Lock()
 
     def take_moved(self) -> int:
-        """Bytes of objects written and read since this was asked last; names, listings and headers do not count."""
+        """Return the bytes of objects written and read since the last call.
+
+        Names, listings and headers do not count.
+        """
         with self._counting:
             taken, self._moved = self._moved, 0
         return taken
@@ -204,11 +207,14 @@ class Objects:
             self._moved += size
 
     def read(self, name: str) -> bytes | None:
-        """Content of a small object, None where there is none."""
+        """Return the content of a small object, None where there is none."""
         return None if (found := self.read_dated(name)) is None else found[0]
 
     def read_dated(self, name: str) -> tuple[bytes, datetime] | None:
-        """Content of a small object and when it was written, by the store's clock."""
+        """Return the content of a small object and its time of writing; None where there is none.
+
+        The time is by the store's clock.
+        """
         with answers_of(self.place):
             try:
                 answer = self.store.get(name)
@@ -240,7 +246,7 @@ class Objects:
         self._count(len(source) if isinstance(source, bytes) else source.stat().st_size)
 
     def blocks(self, name: str) -> Iterator[memoryview]:
-        """Content of an object, some MB at a time (FileNotFoundError: there is none)."""
+        """Yield the content of an object, some MB at a time. Raises FileNotFoundError: there is none."""
         with answers_of(self.place):
             for block in self.store.get(name).stream(PART_BYTES):
                 found = memoryview(block)
@@ -281,13 +287,13 @@ class Objects:
                 aside.unlink(missing_ok=True)
 
     def children(self, folder: str) -> list[str]:
-        """Names of what lies in a folder and is one itself."""
+        """Return the names of the folders in a folder."""
         with answers_of(self.place):
             found = self.store.list_with_delimiter(folder)
         return sorted(prefix.rstrip("/").rpartition("/")[2] for prefix in found["common_prefixes"])
 
     def listing(self, folder: str | None = None) -> dict[str, Listed]:
-        """Every object below a folder, or below the prefix, by its name."""
+        """Return every object below a folder, or below the prefix, by its name."""
         found: dict[str, Listed] = {}
         with answers_of(self.place):
             for batch in self.store.list(folder, chunk_size=1000):

@@ -13,8 +13,8 @@ from storage.remote.object_stores import Objects, is_remote, parse_place
 def open_archive(address: str | Path, *, create: bool = True, write: bool = True) -> Archive:
     """Open the archive at a folder or ``s3://bucket/prefix``, or make it where ``create``.
 
-    Raises ArchiveError: the path is a file, is not there, or does not let itself be written to (``write``); obstore,
-    which an archive on S3 needs, is not installed. SettingsError: an address on S3 that is none.
+    Raises ArchiveError: the path is a file, is not there, or cannot be written to (``write``). So does a missing
+    obstore, which an archive on S3 needs. SettingsError: an address on S3 that is none.
     """
     if is_remote(address):
         return open_object_archive(address, create=create, write=write)
@@ -34,8 +34,8 @@ def is_archive(address: str | Path) -> bool:
 def verify_archive(archive: Archive, progress: Progress | None = None) -> list[Finding]:
     """Check every store and every run; each file and shard that is broken has a finding of its own.
 
-    Of an archive in a bucket every object is read again, and what grows in the working copy; findings are named as in a
-    folder.
+    Every object of an archive in a bucket is read again, and all that grows in the working copy. Findings are named as
+    in a folder.
     """
     if isinstance(archive, ObjectArchive):
         return [*archive.verify_everything(progress), *verify_growing(archive.root)]

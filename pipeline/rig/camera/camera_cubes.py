@@ -1,7 +1,7 @@
 """Bytes of a capture's files to lines with their frames' numbers and times, and of its references to mean frames.
 
-What the camera itself writes is read strictly here, for the loop that waits for it; folders from anywhere are read by
-``storage.readers.envi_files``.
+The camera's own files are read strictly here, for the loop that waits for them; ``storage.readers.envi_files`` reads
+folders from anywhere.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def parse_cube_header(text: str, where: str) -> CubeHeader:
 
 
 def cube_lines(header: CubeHeader, data: bytes) -> CubeLines:
-    """Give the lines that are whole in ``data``, (line, sample, band)."""
+    """Return the lines that are whole in ``data``, (line, sample, band)."""
     held = min(max(len(data) - header.offset, 0) // header.line_bytes, header.lines)
     shape = (held, header.bands, header.samples)
     values = np.ndarray(shape, header.dtype, data, header.offset if held else 0).transpose(0, 2, 1)
@@ -150,7 +150,7 @@ def read_capture(names: Iterable[str], read: Read) -> CapturedLines:
 
 
 def read_references(names: Iterable[str], read: Read) -> dict[str, CubeLines]:
-    """Give the reference cubes of a folder by ``dark`` and ``white``, where there are such.
+    """Return the reference cubes of a folder by ``dark`` and ``white``, where there are such.
 
     RigError where one has no header, a wrong one, or frames less or more, or there are two of a kind.
     """
@@ -201,7 +201,7 @@ def _placed(parts: list[tuple[int, CubeLines]], notes: list[str]) -> list[tuple[
 
 
 def _times(by_name: Mapping[str, str], first: int, cube: CubeLines, read: Read, notes: list[str]) -> LineTimes | None:
-    """Return what the part's index says of its lines; None where there is none that can be read."""
+    """Return the times of a part's lines by its index; None where there is none that can be read."""
     name = next((name for name in by_name if (match := FRAME_INDEX.fullmatch(name)) and int(match[1]) == first), None)
     if name is None:
         notes.append(f"there is no frame index for raw_{first}")
@@ -239,10 +239,10 @@ class MeanFrame:
 def mean_frame(lines: NDArray[np.integer]) -> MeanFrame:
     """Average frames (line, sample, band); exact sums, so that the order of frames does not matter.
 
-    All frames look at the same thing, so an element scatters about its median by its noise alone: by 12 sigma it
-    jumps. Sigma is 1.4826 / sqrt(2) of the median step from frame to frame, which one change amid the frames does not
-    widen, and at least that of most elements, and 1 DN. A frame whose scatter about the medians, each at most those
-    12 sigma, is 3 times that of most frames shows something else. ShapeError where there is no frame.
+    All frames look at the same thing, so an element scatters about its median by its noise alone: by 12 sigma it jumps.
+    Sigma is 1.4826 / sqrt(2) of the median step from frame to frame, which one change amid the frames does not widen.
+    It is at least that of most elements, and 1 DN. A frame whose scatter about the medians, each at most those 12
+    sigma, is 3 times that of most frames shows something else. ShapeError where there is no frame.
     """
     if lines.ndim != 3 or not lines.size:
         raise ShapeError(f"expected at least one frame (line, sample, band), got {lines.shape}; capture the reference")
@@ -314,7 +314,7 @@ def as_references(
 
 
 def _strays(lines: NDArray[np.integer]) -> tuple[NDArray[np.bool_], tuple[int, ...]]:
-    """Elements (sample, band) that jump, and frames that show something else; none where too few frames tell."""
+    """Return outlier elements (sample, band) and outlier frames; none where there are too few frames."""
     count, samples, bands = lines.shape
     jumping, scatter = np.zeros((samples, bands), np.bool_), np.zeros(count)
     if count < FRAMES_FOR_JUMPS:

@@ -1,8 +1,8 @@
 """Files of the camera over FTP: fetched in order, continued where an earlier try ended, and every byte read twice.
 
-FTP says nothing of what is in a file, so one that came with bytes lost, doubled or put in between can have the right
-size. What is held is therefore read again and compared before it counts, and dropped whole where it differs from two
-readings. What the camera itself gives alike twice cannot be doubted here.
+FTP has no checksums: a file with bytes lost, doubled or inserted can have the right size. Held bytes are therefore read
+again and compared before they count, and dropped whole where two readings differ from them. Bytes that the camera
+itself gives alike twice cannot be doubted here.
 """
 
 from __future__ import annotations
@@ -48,7 +48,10 @@ class FileSession(ftplib.FTP):
         self._together = False
 
     def size_of(self, name: str) -> int | None:
-        """Bytes of a file; None where the server does not say, DamagedTransfer where its answer is no size."""
+        """Return the bytes of a file; None where the server does not say.
+
+        Raises DamagedTransfer: its answer is no size.
+        """
         said = self.sendcmd(f"SIZE {name}")
         if not said.startswith("213"):
             return None
@@ -61,7 +64,7 @@ class FileSession(ftplib.FTP):
         return int(found[1])
 
     def pieces(self, name: str, start: int, size: int) -> Generator[bytes]:
-        """Give the bytes of a file from ``start`` on, to its end.
+        """Return the bytes of a file from ``start`` on, to its end.
 
         DamagedTransfer where the file continues after ``size`` bytes, or ends before them; DeadlinePassed where less
         than ``least_kb_s`` came.
@@ -126,7 +129,7 @@ class FileSession(ftplib.FTP):
 
     @property
     def heard(self) -> str:
-        """Return what came of the reply that was waited for last."""
+        """Return in words how much came of the reply that was waited for last."""
         return f"{MOST_REPLY - self._most} bytes of a reply came" if self._most < MOST_REPLY else "nothing came"
 
     def _too_slow(self, name: str, gained: int) -> str:
@@ -141,7 +144,7 @@ class FileSession(ftplib.FTP):
 
 @contextmanager
 def open_session(server: FileServer) -> Iterator[FileSession]:
-    """A session that is logged in; its errors are raised as RigError.
+    """Yield a session that is logged in; its errors are raised as RigError.
 
     DeviceRefused where the server says no, DamagedTransfer where it speaks no FTP, DeadlinePassed or DeviceGone where
     it is not there.
@@ -211,10 +214,10 @@ class Kept(Protocol):
     """Store of fetched bytes: files named as on the camera, of which a part may be there already."""
 
     def size(self, name: str) -> int:
-        """Bytes held of a file; 0 of one that is not there."""
+        """Return the number of bytes held of a file; 0 of one that is not there."""
 
     def read(self, name: str, start: int, stop: int) -> bytes:
-        """Some of the bytes held."""
+        """Return some of the bytes held."""
 
     def append(self, name: str, data: bytes) -> None:
         """Add bytes at the end."""
@@ -252,8 +255,8 @@ def fetch_files(
 ) -> None:
     """Fetch files one after the other until ``kept`` holds them whole.
 
-    What is held from an earlier call is compared before anything is added to it. A transfer that breaks off is taken
-    up again; what has come stays in ``kept`` however this ends, unless it is damaged, and a later call continues there.
+    Bytes held from an earlier call are compared before any are added. A transfer that breaks off is taken up again.
+    Fetched bytes stay in ``kept`` however this ends, unless they are damaged, and a later call continues there.
 
     Raises RigError where a file is not the one of which a part is held, is larger than it can be, or comes damaged each
     time; DeviceRefused where the server does not give it, or takes another password; DeadlinePassed or DeviceGone where
@@ -275,7 +278,7 @@ def log_in(server: FileServer) -> str:
 
 @dataclass
 class _Fetch:
-    """One file on its way. Of the bytes that are held the first ``sure`` ones came alike twice."""
+    """One file on its way. The first ``sure`` bytes of those held came alike twice."""
 
     server: FileServer
     file: RemoteFile
@@ -393,7 +396,7 @@ class _Fetch:
         self.sure = self.earlier = 0
 
     def _whole_size(self, session: FileSession) -> int:
-        """Size by the server; the listing must agree, or the file still grows."""
+        """Return the size by the server; where the listing differs, the file still grows."""
         listed, most = self.file.size, self.file.most
         told = session.size_of(self.file.name)
         size = listed if told is None else told

@@ -6,7 +6,7 @@ files from anywhere (``storage.readers.envi_files``), or a camera's own (``camer
 
 ``frameIndex_<n>.txt`` lies beside ``raw_<n>``: a heading, then a line a frame with its number and its time in
 microseconds. Versions of the camera's program differ in what stands between the two (a tab or spaces) and in the line
-ends; frames may be missing or listed twice. Tested on small indices made in these layouts.
+ends. Frames may be missing or listed twice. Tested on small indices made in these layouts.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ _MS = {"us": 1e-3, "µs": 1e-3, "μs": 1e-3, "microseconds": 1e-3, "s": 1e3, "se
 
 
 def split_header(text: str, where: str, notes: list[str]) -> tuple[dict[str, str], dict[str, str]]:
-    """Fields, and settings in comments: as written, keys in lower case, the outer braces taken off.
+    """Return the fields, and settings in comments: as written, keys in lower case, without the outer braces.
 
-    What was made of strange forms is added to ``notes``; messages call the header ``where``. SceneError where it does
-    not begin with ENVI (ArcGIS headers do not), or a brace is never closed.
+    ``notes`` tell how strange forms were read; messages call the header ``where``. SceneError where it does not begin
+    with ENVI (ArcGIS headers do not), or a brace is never closed.
     """
     lines = text.lstrip("\ufeff").splitlines()
     first = next((number for number, line in enumerate(lines) if line.strip()), None)
@@ -63,7 +63,7 @@ def split_header(text: str, where: str, notes: list[str]) -> tuple[dict[str, str
 
 
 def _pairs(lines: list[str], where: str, notes: list[str]) -> Iterator[tuple[str, str]]:
-    """Keys and values, the outer braces taken off."""
+    """Yield keys and values without the outer braces."""
     number = 0
     while number < len(lines):
         line = lines[number].strip()
@@ -80,7 +80,7 @@ def _pairs(lines: list[str], where: str, notes: list[str]) -> Iterator[tuple[str
 
 
 def _braced(value: str, lines: list[str], number: int, where: str, notes: list[str]) -> tuple[str, int]:
-    """The inside of a value that begins with a brace, to where it closes, and the number of the line after it."""
+    """Return the inside of a value that begins with a brace, and the number of the line after its end."""
     parts = [value]
     depth = _depth(value)
     end = number
@@ -102,13 +102,13 @@ def _braced(value: str, lines: list[str], number: int, where: str, notes: list[s
 
 
 def _depth(text: str) -> int:
-    """Braces opened less those closed; escaped ones do not count."""
+    """Return the number of open braces; escaped ones do not count."""
     bare = re.sub(r"\\[{}]", "", text)
     return bare.count("{") - bare.count("}")
 
 
 def finite_number(text: str) -> float | None:
-    """The number that a text is; None where it is none, or not finite."""
+    """Return the number that a text is; None where it is none, or not finite."""
     try:
         number = float(text)
     except ValueError:
@@ -119,7 +119,7 @@ def finite_number(text: str) -> float | None:
 def wavelengths_nm(
     fields: Mapping[str, str], channels: int, notes: list[str]
 ) -> tuple[NDArray[np.float64] | None, float]:
-    """(band,) centres [nm] and what one of the header's units is in nm.
+    """Return (band,) centres [nm] and the header's unit in nm.
 
     Without a unit they are read as nm or micrometres by their size; those that do not fit the bands are left out. Notes
     say so.
@@ -145,7 +145,7 @@ def wavelengths_nm(
 
 
 def listed_numbers(fields: Mapping[str, str], key: str, count: int, notes: list[str]) -> NDArray[np.float64] | None:
-    """Numbers of a list, whatever commas and spaces stand between them; None with a note where it is none."""
+    """Return the numbers of a list with any commas and spaces between; None with a note where it is none."""
     if key not in fields:
         return None
     words = [word for word in re.split(r"[,\s]+", fields[key]) if word]
@@ -210,11 +210,11 @@ def parse_frame_index(lines: Iterable[str], name: str = "the frame index", where
 
 
 def times_of_lines(index: FrameIndex, first_frame: int, lines: int, lost: int = 0) -> LineTimes:
-    """Give each of a file's ``lines`` its frame and time.
+    """Return each of a file's ``lines`` its frame and time.
 
-    Lines are frames in order, the first of them ``first_frame`` (the number in the file's name). Where as many frames
-    are listed as there are lines, they are its lines whatever their numbers: the camera dropped those missing. So they
-    are where as many are listed as there were lines before the file lost its last ``lost`` ones. An index whose numbers
+    Lines are frames in order, the first of them ``first_frame`` (the number in the file's name). If as many frames are
+    listed as there are lines, they are its lines whatever their numbers: the camera dropped those missing. So they are
+    where as many are listed as there were lines before the file lost its last ``lost`` ones. An index whose numbers
     begin at 0 in a later file counts from that file's start.
     """
     if len(index.frame) in (lines, lines + lost):
@@ -237,7 +237,7 @@ def times_of_lines(index: FrameIndex, first_frame: int, lines: int, lost: int = 
 
 
 def _rows(lines: Iterable[str]) -> _Rows:
-    """Numbers of all lines that are frames; other lines are counted."""
+    """Return the numbers of all lines that are frames, and how many other lines there are."""
     rows = _Rows()
     column, scale = None, 1.0
     for number, line in enumerate(lines):

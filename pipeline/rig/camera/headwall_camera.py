@@ -62,9 +62,9 @@ class CaptureUnknown(StateUnknown):
 class HeadwallCamera:
     """A line camera for surveys: its commands and its files. Nothing is connected before the first command.
 
-    After a reply that was late or damaged the connection is given up and made anew, so that what comes late is never
-    taken for the next command's reply. ``connect`` makes a connection. Commands raise DeviceRefused, DeadlinePassed or
-    DeviceGone besides what they say themselves.
+    After a late or damaged reply the connection is closed and opened again. So a late answer is never taken for the
+    next command's reply. ``connect`` makes a connection. Commands raise DeviceRefused, DeadlinePassed or DeviceGone
+    besides what they say themselves.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class HeadwallCamera:
 
     @classmethod
     def at(cls, address: CameraAddress, server: FileServer, *, clock: Clock = SYSTEM_CLOCK, **given: Any) -> Self:
-        """A camera on the network."""
+        """Return a camera on the network."""
 
         def connect() -> SocketTransport:
             return SocketTransport(address.host, address.port, clock, connect_s=address.connect_s)
@@ -110,9 +110,9 @@ class HeadwallCamera:
     def capture(self, frames: int, *, cubes: int = 1, prefix: str = "") -> Capture:
         """Begin a capture of ``cubes`` files (0: until stopped) of ``frames`` lines (0: the camera's own number).
 
-        Sent once. Where no reply comes the camera is asked whether it captures and which folders are new, and that is
-        said in the error; captures and settings are refused from then on: a person looks, and connects anew.
-        Raises CaptureUnknown then, and SettingsError where a number or the prefix cannot be used.
+        Sent once. If no reply comes, the camera is asked whether it captures and which folders are new, and the error
+        says so. Captures and settings are refused from then on: a person looks, and connects anew. Raises
+        CaptureUnknown then, and SettingsError where a number or the prefix cannot be used.
         """
         check_capture(frames, cubes, prefix)
         with self._lock:
@@ -168,7 +168,10 @@ class HeadwallCamera:
         return read_capture([file.name for file in files], _reader(kept))
 
     def references(self, folder: str, kept: Kept, *, claim: FrameClaim | None = None) -> dict[str, MeanFrame]:
-        """Mean frames of the reference cubes in a capture's folder, by ``dark`` and ``white``; empty without any."""
+        """Return the mean frames of the reference cubes in a capture's folder, by ``dark`` and ``white``.
+
+        Empty without any.
+        """
         files = [file for file in self._finished(folder, claim) if file.base.lower().startswith(("dark", "white"))]
         fetch_files(self.server, files, kept, clock=self.clock)
         cubes = read_references([file.name for file in files], _reader(kept))
@@ -202,7 +205,7 @@ class HeadwallCamera:
             raise AssertionError("unreachable")
 
     def _open(self) -> None:
-        """Have a connection that stands at its prompt, with nothing left over from before."""
+        """Open a connection that stands at its prompt, with no earlier input left over."""
         if self._line is not None:
             try:
                 if stale := self._reader.held + self._line.drain():
@@ -279,7 +282,7 @@ class HeadwallCamera:
             )
 
     def _folders(self) -> set[str] | None:
-        """Folders of the capture root; None where the camera does not list it."""
+        """Return the folders of the capture root; None where the camera does not list it."""
         try:
             return {entry.name for entry in self.list_files(CAPTURE_ROOT)}
         except DeviceRefused as error:
@@ -302,7 +305,10 @@ class HeadwallCamera:
         )
 
     def _finished(self, folder: str, claim: FrameClaim | None) -> list[RemoteFile]:
-        """Files of a folder, as two listings in a row have them: one that lost an entry on its way looks whole."""
+        """Return the files of a folder once two listings in a row agree.
+
+        A listing that lost an entry on its way looks whole.
+        """
         if self.is_capturing():
             raise RigError(f"a capture still runs, so files of {folder} may grow; wait for its end, or stop it")
         listed = self.list_files(folder)
@@ -323,7 +329,7 @@ def _reader(kept: Kept) -> Read:
 
 
 def bounded(files: Sequence[RemoteFile], claim: FrameClaim) -> list[RemoteFile]:
-    """Give the files with the most that each can have: cubes what was asked for, references and texts a fixed number.
+    """Return the files with the most that each can have: cubes what was asked for, references and texts a fixed number.
 
     RigError where one claims more, or all cubes together do, or there are too many files.
     """

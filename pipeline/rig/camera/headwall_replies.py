@@ -110,7 +110,7 @@ class ReplyReader:
 
 
 def _parse(data: bytes) -> list[Said]:
-    """Replies in the text before a prompt: mostly one; none in a greeting or an empty line."""
+    """Return the replies in the text before a prompt: mostly one; none in a greeting or an empty line."""
     text = data.decode("utf-8", errors="replace").strip("\0 \t\r\n")
     if not text:
         return []
@@ -138,7 +138,10 @@ def check_repeated(said: Said, sent: str, port: str) -> None:
 
 
 def response_of(said: Said, name: str, port: str) -> Any:
-    """The response of a reply that says success; DeviceRefused, and what to do, where it says no; RigError for none."""
+    """Return the response of a reply that reports success.
+
+    Raises DeviceRefused, with the remedy: it reports a failure. Raises RigError: there is none.
+    """
     if said.reply is None:
         raise RigError(
             f"{port} answered {name} with {said.text[:200]!r}, expected JSON; is this the camera's control port?"
@@ -157,7 +160,7 @@ def response_of(said: Said, name: str, port: str) -> Any:
 
 
 def as_folder(response: Any) -> str:
-    """The folder of a capture; MisfitError where this answers another command."""
+    """Return the folder of a capture. Raises MisfitError: the response answers another command."""
     folder = response.get("folder") if isinstance(response, dict) else None
     if not isinstance(folder, str) or not folder:
         raise MisfitError("a reply without a folder")
@@ -185,7 +188,10 @@ def as_truth(response: Any) -> bool:
 
 
 def as_listing(response: Any) -> list[RemoteFile]:
-    """Entries of a folder, by name; MisfitError where this answers another command, RigError for a name not to use."""
+    """Return the entries of a folder, by name.
+
+    Raises MisfitError: the response answers another command. Raises RigError: a name cannot be used.
+    """
     if not isinstance(response, list):
         raise MisfitError("a reply that is no list")
     found = []

@@ -1,11 +1,11 @@
 """Captures of a sweep: what each is called, what the vector memory holds during it, and where its lines lie then.
 
-Which of them it was, and how far it may be off, is recorded with the positions. Times of lines are the mirror's; the
+The records of the positions name the way that was used, and its possible error. Times of lines are the mirror's; the
 camera stamps its frames in whole microseconds of its own clock.
 
 A capture's prefix says which lines of which sweep it takes, so that a folder tells what it holds.
-``coarse-0_cy-31p5_0p5_96x16x16_0`` is the sweep ``coarse-0``, a coarse one whose lines lie along y, on strip -31.5 px,
-from scan coordinate 0.5 px on, of 96 lines of 16 held positions, binned by 16; the capture begins at its line 0. ``p``
+``coarse-0_cy-31p5_0p5_96x16x16_0`` is the coarse sweep ``coarse-0``, whose lines lie along y. It is on strip -31.5 px,
+from scan coordinate 0.5 px on, of 96 lines of 16 held positions, binned by 16. The capture begins at its line 0. ``p``
 is the decimal point; a number that takes more room than its bits is ``b`` and those, to base 32.
 """
 
@@ -47,11 +47,11 @@ class FrameTimes:
 
 
 def mend_times(frames: FrameTimes) -> tuple[Ints, Ints, list[str]]:
-    """Give every line a stamp and a number, and say what was done.
+    """Return every line a stamp and a number, and say what was done.
 
-    Frames come at a steady rate or later, never sooner: a stamp off its neighbours' by half a period strayed, and
-    where all after one are early the clock was set back. Both follow their neighbours then; so do lines without a
-    stamp. A later stamp counts, since a frame may have been dropped.
+    Frames come at a steady rate or later, never sooner. A stamp off its neighbours' by half a period strayed; where all
+    after one are early the clock was set back. Both follow their neighbours then; so do lines without a stamp. A later
+    stamp counts, since a frame may have been dropped.
     """
     number, notes = whole_numbers(frames.number)
     if (number < 0).all():
@@ -79,7 +79,7 @@ def mend_times(frames: FrameTimes) -> tuple[Ints, Ints, list[str]]:
 
 
 def whole_numbers(number: Ints) -> tuple[Ints, list[str]]:
-    """Frame numbers, gaps filled where the lines around them leave no doubt, and what was found."""
+    """Return the frame numbers and findings; gaps are filled where the lines around them leave no doubt."""
     filled, notes = number.copy(), []
     known = np.flatnonzero(number >= 0)
     for left, right in pairwise(known.tolist()):
@@ -94,7 +94,7 @@ def whole_numbers(number: Ints) -> tuple[Ints, list[str]]:
 
 
 def _strayed(late: Floats, period_us: float) -> Bools:
-    """Stamps off the median of their neighbours by half a period."""
+    """Return which stamps differ from the median of their neighbours by half a period."""
     if len(late) < 3:
         return np.zeros(len(late), np.bool_)
     window = min(_WINDOW, len(late) - 1 + len(late) % 2)  # odd
@@ -166,9 +166,9 @@ def lines_by_time(
 ) -> LinePositions:
     """Take the track's position at mid exposure of each line, counted from the commands' times.
 
-    ``began_s`` is when the log or the path began, ``capture_s`` when the capture did, by one clock. What passes between
-    a command and the first frame is not known, so a constant offset of the lines stays, for registration
-    that go both ways. A stamp that goes back or is missing is made up from its neighbours.
+    ``began_s`` is when the log or the path began, ``capture_s`` when the capture did, by one clock. The time between a
+    command and the first frame is unknown. A constant offset of the lines stays, for registration of sweeps that go
+    both ways. A stamp that goes back or is missing is made up from its neighbours.
     """
     stamp, number, notes = mend_times(frames)
     first_s = float(np.mean(capture_s) - np.mean(began_s)) + float(scan_path.time_s[0])
@@ -185,12 +185,12 @@ def lines_by_time(
 
 
 def _at(scan_path: MirrorScanPath, time_s: Floats) -> Floats:
-    """Logged positions between samples, (time, 2)."""
+    """Return the logged positions between samples, (time, 2)."""
     return np.stack([np.interp(time_s, scan_path.time_s, scan_path.position[:, axis]) for axis in (0, 1)], axis=-1)
 
 
 def _apart_px(scan_path: MirrorScanPath, camera: LineCamera, times: tuple[Floats, Floats]) -> float:
-    """Root mean square of how far the view moves between two times of each line. [px]"""
+    """Return the root mean square distance that the view moves between two times of each line. [px]"""
     if not len(times[0]):
         return 0.0
     one, other = (direction_to_scene(position_to_direction(_at(scan_path, time_s))) for time_s in times)
@@ -215,7 +215,7 @@ class Announced:
 
 
 def capture_prefix(sweep: Sweep, first: int = 0) -> str:
-    """Give the prefix of a capture of a sweep's lines from ``first`` on.
+    """Return the prefix of a capture of a sweep's lines from ``first`` on.
 
     SettingsError where the sweep's name holds what a folder's name must not, or is too long.
     """
@@ -277,13 +277,16 @@ class CapturePath:
         return self.stop - self.first
 
     def frames_at(self, index: int) -> int | None:
-        """Frames that edges were counted of, where the cell ``index`` was played last; None within a line."""
+        """Return how many frames had their edges counted, where the cell ``index`` was played last.
+
+        None within a line.
+        """
         frames, rest = divmod(index + 1 - LEAD, self.sweep.step)
         return None if rest else frames
 
 
 def next_path(sweep: Sweep, first: int, camera: LineCamera, *, vector_pairs: int, triggered: bool) -> CapturePath:
-    """Give the path of the sweep's lines from ``first`` on, as many as the vector memory takes.
+    """Return the path of the sweep's lines from ``first`` on, as many as the vector memory takes.
 
     SettingsError where the positions of one line do not fit the memory, PoseError where one is beyond the disk.
     """
@@ -295,7 +298,7 @@ def next_path(sweep: Sweep, first: int, camera: LineCamera, *, vector_pairs: int
 
 
 def path_of(sweep: Sweep, lines: tuple[int, int], camera: LineCamera, *, triggered: bool) -> CapturePath:
-    """Give the path of some of the sweep's lines; PoseError where a position is beyond the mirror's disk."""
+    """Return the path of some of the sweep's lines; PoseError where a position is beyond the mirror's disk."""
     held: NDArray[Any] = sweep_positions(sweep, camera)[slice(*lines)].reshape(-1, 2)
     lead = held[:LEAD] if triggered else held[:0]
     cells, middle = (
@@ -361,7 +364,7 @@ def place_lines(
     camera: LineCamera,
     scan_path: MirrorScanPath | None,
 ) -> PlacedLines:
-    """Give each line of the path its row of the capture, up to the last one that is there whole.
+    """Return each line of the path its row of the capture, up to the last one that is there whole.
 
     UntiedError where nothing, or what contradicts itself, ties frames to the mirror.
     """
@@ -392,7 +395,7 @@ def _tied(
     *,
     total: int,
 ) -> LinePositions:
-    """Positions by the edges that stepped the mirror, else by its log, else by the commands' times."""
+    """Return the positions by the edges that stepped the mirror, else by its log, else by the commands' times."""
     if taken.triggered:
         counted = None if taken.index_at_end is None else path.frames_at(taken.index_at_end)
         taken_in_all = max(total, int(frames.number.max()) + 1)

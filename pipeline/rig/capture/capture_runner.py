@@ -1,10 +1,10 @@
 """One capture after the other on a rig: path up, mirror to its start, both begun in order, and the end taken down.
 
 The journal says what the rig has acknowledged of a stage's captures, one JSON object a line beside the files fetched
-from the camera. A process that is killed leaves it behind; the next one reads which folder on the camera holds which
-lines, so that nothing the rig acknowledged is captured twice. Each line has a checksum. A torn line counts as not
-written, and so does one that has changed since; but then a capture whose end is missing is not continued: the mirror
-may stand elsewhere now.
+from the camera. A process that is killed leaves it behind. The next one reads there which folder on the camera holds
+which lines. Lines that the rig acknowledged are not captured twice. Each line has a checksum. A torn line counts as not
+written, and so does one that has changed since. A capture whose end is missing then is not continued: the mirror may
+stand elsewhere now.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class CaptureJournal:
         self._read()
 
     def holding(self, sweep: Sweep, line: int) -> CaptureRecord | None:
-        """The latest capture that has a line of the sweep and is not spent."""
+        """Return the latest capture that has a line of the sweep and is not spent."""
         fits = [one for one in self._taken.values() if one.sweep == sweep and one.first <= line < one.stop]
         return next((one for one in reversed(fits) if not one.spent), None)
 
@@ -180,7 +180,7 @@ class RigDevices:
     clock: Clock
 
     def close(self) -> None:
-        """Let go of both, whatever either says."""
+        """Close both devices, whatever either raises."""
         for device in (self.steering, self.camera):
             try:
                 device.close()
@@ -209,8 +209,8 @@ class CaptureRunner:
     def take(self, path: CapturePath) -> CaptureRecord:
         """Take the lines of a path, and wait until they are on the camera.
 
-        Motions and the capture are sent once. Where something fails after the mirror or the camera has begun, both are
-        told to stop.
+        Motions and the capture are sent once. If anything fails after the mirror or the camera has begun, both are told
+        to stop.
         """
         steering, prefix = self.devices.steering, capture_prefix(path.sweep, path.first)
         exposed = exposing(self._camera, path.sweep)

@@ -1,16 +1,16 @@
 """The rig as a source of lines: a sweep's positions go to the mirror, captures to the camera, and lines come back.
 
-A sweep is taken in captures, each of as many lines as the mirror's vector memory holds positions for. Of each the
-camera's files are fetched, its lines tied to the mirror, summed over neighbours as the sweep wants, and given in order.
-Where pulses step the mirror a line's position is the one sent to it at mid exposure, as the wire has it (float32);
-without them it is the one that the mirror's log measured. Time is by the camera's own stamps, to a microsecond.
+A sweep is taken in captures, each of as many lines as the mirror's vector memory holds positions for. Each capture's
+files are fetched, and its lines tied to the mirror, summed over neighbours as the sweep wants, and given in order. A
+line's position is the one sent to the mirror at mid exposure where pulses step it, as the wire has it (float32).
+Without them it is the one that the mirror's log measured. Time is by the camera's own stamps, to a microsecond.
 
-Over an emulated rig lines are those of the simulated source it looks with, bit for bit, in however many captures: their
-noise is keyed by the sweep's name and the line's number, which captures are called by. Times differ where a load falls
-in the midst of a sweep: the simulated one continues without a break, a rig has to stop for it.
+Over an emulated rig lines are those of its simulated source, bit for bit, in however many captures. Their noise is
+keyed by the sweep's name and the line's number, which name the captures, too. Times differ where a load falls amid a
+sweep: the simulated one continues, a rig has to stop for it.
 
-Whatever the rig has acknowledged is in a journal beside the fetched files, so a later call with the same ``kept`` takes
-up a transfer where it broke off, and captures only what the camera does not have.
+A journal beside the fetched files records all that the rig has acknowledged. A later call with the same ``kept``
+continues a transfer where it broke off, and captures only what the camera does not have.
 """
 
 from __future__ import annotations
@@ -107,13 +107,13 @@ class RigSource:
         return {"rig": told, "references": list(notes), "captures": self._journal.captures, **damage}
 
     def keeping(self, kept: Kept) -> RigSource:
-        """Give the same source with its files elsewhere."""
+        """Return the same source with its files elsewhere."""
         other = self.saying(self._say)
         other._kept, other._journal, other._whole = kept, CaptureJournal(kept), {}
         return other
 
     def saying(self, say: Say) -> RigSource:
-        """Give the same source with a report of what the rig is at."""
+        """Return the same source with a report of what the rig is at."""
         other = copy(self)
         other._say, other._runner = say, None
         return other
@@ -122,8 +122,8 @@ class RigSource:
     def session(self) -> Iterator[CaptureRunner]:
         """Hold on to the devices over several calls; inner sessions share them.
 
-        Raises DeviceGone, DeadlinePassed or RigError where a device is not there, or another one is, and StateUnknown
-        where what an earlier session sent was not acknowledged; nothing is sent again by this process.
+        Raises DeviceGone, DeadlinePassed or RigError where a device is missing or another one is there. Raises
+        StateUnknown where the last order of an earlier session was not acknowledged; this process repeats no order.
         """
         if self._runner is not None:
             yield self._runner
@@ -142,7 +142,7 @@ class RigSource:
             devices.close()
 
     def lines(self, sweep: Sweep, first: int = 0) -> Iterator[Line]:
-        """Give the sweep's lines one by one, from line ``first`` on.
+        """Yield the sweep's lines one by one, from line ``first`` on.
 
         Raises ShapeError where sums of ``sweep.binning`` samples at full scale do not fit uint16; PoseError where a
         position of the sweep is out of the mirror's reach; StateUnknown where a motion or a capture was sent and not
@@ -176,7 +176,7 @@ class RigSource:
                     self._give_up(taken, line, why, last=barren >= BARREN)
 
     def lines_again(self, sweep: Sweep, numbers: Sequence[int]) -> Iterator[Line]:
-        """Give single lines of those given before, in order, from the files of the captures that hold them.
+        """Yield single lines of those given before, in order, from the files of the captures that hold them.
 
         Nothing is captured for them. A line that no capture gives any more comes as one that the camera dropped: there,
         and not valid. RigError where a device failed, or the password is not taken.
@@ -211,9 +211,9 @@ class RigSource:
         return Line(number, nothing, float(x), float(y), time_s, exposing(self.camera, sweep).exposure_ms, valid=False)
 
     def references(self, sweep: Sweep) -> References:
-        """Dark and white frames with the sweep's binning, captured and fetched once for all sweeps of its exposure.
+        """Return the dark and white frames with the sweep's binning.
 
-        RigError where the camera has none beside its captures, they do not fit, or a device failed.
+        They are captured and fetched once for all sweeps of an exposure.
         """
         exposure_ms, folders = sweep.exposure_ms, self._journal.references
         if folders.get(exposure_ms, "") not in self._whole:
@@ -229,7 +229,10 @@ class RigSource:
         return References(dark, white, whole.white_reference, bad, by_mirror=self.rig.white_at_rest)
 
     def _known_references(self, runner: CaptureRunner, folder: str) -> tuple[References, tuple[str, ...]] | None:
-        """The frames of an earlier session; None where the camera no longer has them: it was emptied, or is another."""
+        """Return the frames of an earlier session.
+
+        None: the camera no longer has them, because it was emptied or replaced.
+        """
         try:
             return self._whole_references(runner, folder)
         except RigError as error:
@@ -239,7 +242,7 @@ class RigSource:
             return None
 
     def _whole_references(self, runner: CaptureRunner, folder: str) -> tuple[References, tuple[str, ...]]:
-        """Dark and white frames of all samples, and what was found of them."""
+        """Return the dark and white frames of all samples, and findings on them."""
         frames = runner.devices.camera.references(folder, self._kept, claim=self._claim(1))
         missing = [kind for kind in ("dark", "white") if kind not in frames]
         if missing:
@@ -292,7 +295,7 @@ class RigSource:
         return exposed.mid_exposure_s(float(number))
 
     def _give_up(self, taken: CaptureRecord, line: int, why: str, *, last: bool) -> None:
-        """Give a capture up: what it lacks is captured again, unless that has been tried already."""
+        """Abandon a capture: lines that it lacks are captured again, unless that has been tried already."""
         self._journal.spend(taken, why)
         if last:
             raise RigError(

@@ -60,12 +60,12 @@ class EmulatedCapture:
     _whole: dict[str, bytes] | None = None  # all files, once no frame is to come
 
     def due(self, now_s: float) -> int:
-        """Frames whose exposure is over."""
+        """Return how many frames are exposed by now."""
         whole = int(np.floor((now_s - self.began_s - self.exposure_s) / self.period_s + 1e-9)) + 1
         return max(whole if self.most_frames is None else min(whole, self.most_frames), 0)
 
     def exposures(self, from_s: float, to_s: float) -> Floats:
-        """Begin and end (exposure, 2) of exposures that begin at ``from_s`` or later and before ``to_s``."""
+        """Return begin and end (exposure, 2) of exposures that begin at ``from_s`` or later and before ``to_s``."""
         bounds = np.ceil((np.array([from_s, to_s]) - self.began_s) / self.period_s - 1e-9).astype(np.int64)
         first, stop = np.clip(bounds, 0, self.most_frames)
         begins = self.began_s + np.arange(first, stop) * self.period_s
@@ -80,11 +80,11 @@ class EmulatedCapture:
         self.most_frames = self.due(now_s)
 
     def pending(self, now_s: float, most: int = _BLOCK) -> Ints:
-        """Numbers of the next frames, ``most`` at most, that are over by now and not taken yet."""
+        """Return the numbers of the next frames, ``most`` at most, that are exposed and not taken yet."""
         return np.arange(self._taken, max(min(self._taken + most, self.due(now_s)), self._taken))
 
     def middle_s(self, numbers: Ints) -> Floats:
-        """Mid exposure of frames. [s]"""
+        """Return the times of mid exposure of frames [s]."""
         middle: Floats = self.began_s + numbers * self.period_s + self.exposure_s / 2
         return middle
 
@@ -94,11 +94,11 @@ class EmulatedCapture:
         self._taken += len(lines)
 
     def drop(self) -> None:
-        """Have the files no longer; the capture is over."""
+        """Discard the files; the capture is over."""
         self._lines, self._whole = [], {}
 
     def files(self) -> dict[str, bytes]:
-        """Names without the folder, and contents, of what has been taken."""
+        """Return names, without the folder, and contents of the files taken so far."""
         if self._whole is not None:
             return self._whole
         found: dict[str, bytes] = {"imu_gps.txt": b"Roll\tPitch\tYaw\tLat\tLon\tAlt\tTimestamp\n"}
@@ -169,7 +169,7 @@ class CameraDevice:
         self._lock = threading.RLock()
 
     def greet(self) -> list[Chunk]:
-        """Return what a new connection is sent."""
+        """Return the greeting for a new connection."""
         return [Chunk(0.0, b"Hyperspec control" + PROMPT)]
 
     def command(self, line: str) -> list[Chunk] | None:
@@ -189,19 +189,19 @@ class CameraDevice:
         return bool(self.captures) and self.captures[-1].running(self.clock.now())
 
     def exposures(self, from_s: float, to_s: float) -> NDArray[np.float64]:
-        """Give begin and end (exposure, 2) of exposures that begin in a span of time: pulses for a mirror's trigger."""
+        """Return begin and end (exposure, 2) of exposures that begin in a span of time, for a mirror's trigger."""
         with self._lock:
             spans = [capture.exposures(from_s, to_s) for capture in self.captures]
             return np.concatenate([np.zeros((0, 2)), *spans])
 
     def files(self) -> dict[str, bytes]:
-        """All files by their whole names, as they are now."""
+        """Return all files by their whole names, as they are now."""
         with self._lock:
             self._poll()
             return {f"{one.folder}/{name}": data for one in self.captures for name, data in one.files().items()}
 
     def folders(self) -> set[str]:
-        """All folders."""
+        """Return all folders."""
         every = {"/", self.unit.root, *(capture.folder for capture in self.captures)}
         return every | {
             "/" + "/".join(name.split("/")[1:end]) for name in every for end in range(2, name.count("/") + 1)
@@ -376,7 +376,7 @@ class CameraServer(Closing):
                 self._start(self._talk, self._listener.accept()[0])
 
     def _talk(self, connection: socket.socket) -> None:
-        """One client, until it says exit, goes away, or the server closes."""
+        """Serve one client until it says exit, goes away, or the server closes."""
         talk = CameraConnection(self.device)
         with connection, suppress(OSError):
             connection.settimeout(_SLICE_S)
@@ -395,7 +395,7 @@ class CameraServer(Closing):
                 connection.sendall(chunk.data)
 
     def _wait(self, seconds: float) -> None:
-        """Let the device's time pass, unless the server closes."""
+        """Wait while the device's time passes, unless the server closes."""
         clock = self.device.clock
         until = clock.now() + seconds
         while not self._ended.is_set() and (left := until - clock.now()) > 0:

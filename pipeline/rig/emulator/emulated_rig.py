@@ -2,21 +2,21 @@
 
 Noise and drifts of the simulator are keyed by a sweep's name and a line's number, so the camera has to know both. The
 name, with the sweep's geometry, is in the capture's prefix (:func:`pipeline.rig.capture.capture_paths.announced`). The
-number is that of the line whose planned position is nearest to the one the mirror holds at mid exposure: what the
-vector index says where the path is the planned one, and still right where it was loaded in parts, begins with a
-lead-in, or lost an edge.
+number is that of the line whose planned position is nearest to the mirror's at mid exposure. It is the vector index
+where the path is the planned one. It also holds for a path that was loaded in parts, begins with a lead-in, or lost an
+edge.
 
-Where the mirror holds what was planned, to the last bit of the wire's float32, a line is that of the simulated source,
-bit for bit. Elsewhere it is looked at from where the mirror is. A capture that announces nothing has streams of its
+A line is that of the simulated source, bit for bit, where the mirror holds the planned position to the last bit of the
+wire's float32. Elsewhere it is looked at from where the mirror is. A capture that announces nothing has streams of its
 own, by its folder and frame.
 
-Pulses, as the cable has it: one for each held position of the sweep that a capture announces, evenly over the exposure
-(a pulse generator between camera and mirror would give them; cameras have none); one as each exposure begins; or none.
+The cable has one pulse for each held position of the sweep that a capture announces, evenly over the exposure. A pulse
+generator between camera and mirror would give them; cameras have none. Or it has one as each exposure begins, or none.
 
 A planned sweep that is announced (by a capture's prefix, :func:`pipeline.rig.capture.capture_paths.capture_prefix`),
 loaded and played gives the simulated source's lines, bit for bit; see :mod:`pipeline.rig.emulator.emulated_rig`. A path
-that is played by trigger begins with a lead-in cell: the mirror takes the first as it is run, and one more at each
-rising edge. Without trigger it is run at (positions of a line) / (frame period), and is the planned one where it begins
+that is played by trigger begins with a lead-in cell. The mirror takes the first cell as it is run, and one more at each
+rising edge. Without trigger it is run at (positions of a line) / (frame period). It is the planned one where it begins
 within half a held position of the first exposure. A capture with the prefix ``references`` has dark and white cubes.
 
 The mirror's controller hangs on a pty, which is opened as a real port is.
@@ -78,7 +78,7 @@ class OffPlanAim(Aim):
     cost_ns = MappingProxyType({"exact": 0.2})
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
-        """Give the shifts of a block's lines, along the line and the scan. [px]"""
+        """Return the shifts of a block's lines, along the line and the scan. [px]"""
         return self.shift_px[block.numbers - self.first]
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
@@ -94,7 +94,7 @@ class SceneView:
     mounting: Mounting = STRAIGHT
 
     def lines(self, told: Announced, held: Floats, times_ms: tuple[float, float], started_s: float) -> Raw:
-        """Give raw lines (line, sample, band) of a sweep, not binned.
+        """Return raw lines (line, sample, band) of a sweep, not binned.
 
         ``held`` are (line, step, 2) positions of the device during each exposure, ``times_ms`` exposure and frame
         period; ``started_s`` is when the sweep began, for what drifts, unless the source's own clock knows.
@@ -117,20 +117,23 @@ class SceneView:
         return np.concatenate(raw)
 
     def alone(self, name: str, held: Floats, times_ms: tuple[float, float], started_s: float) -> Raw:
-        """Give one raw line (1, sample, band) along x of a position (2,) of the device that belongs to no sweep."""
+        """Return one raw line (1, sample, band) along x of a position (2,) of the device that belongs to no sweep."""
         place = self._place(self.mounting.to_model(held))
         sweep = Sweep(name, "fine", "x", float(place[0]), float(place[1]), 1)
         return self._render(self._rig(times_ms), self.source.choice, sweep, range(1), started_s)
 
     def numbers(self, sweep: Sweep, seen: Floats) -> Ints:
-        """Give the line (line,) of the sweep that each exposure (line, step, 2) is nearest to."""
+        """Return the line (line,) of the sweep that each exposure (line, step, 2) is nearest to."""
         scan = self._place(seen)[..., 1].mean(axis=1)
         number = np.rint((scan - sweep.start_px - (sweep.step - 1) / 2) / sweep.step)
         lines: Ints = np.clip(number, 0, sweep.lines - 1).astype(np.int64)
         return lines
 
     def references(self, times_ms: tuple[float, float], frames: int) -> dict[str, Raw]:
-        """Dark and white frames (frame, sample, band) whose means are the source's, to half of 1 / ``frames`` DN."""
+        """Return dark and white frames (frame, sample, band) whose means are the source's.
+
+        The means agree to half of 1 / ``frames`` DN.
+        """
         taken = replace(self.source, rig=self._rig(times_ms)).references(AT_REST)
         dither = ((np.arange(frames) + 0.5) / frames)[:, None, None]
         return {
@@ -139,11 +142,11 @@ class SceneView:
         }
 
     def _place(self, position: Floats) -> Floats:
-        """Along the line and the scan, (..., 2). [px]"""
+        """Return the position along the line and the scan, (..., 2). [px]"""
         return direction_to_scene(position_to_direction(position)) / self.source.camera.ifov_rad
 
     def _rig(self, times_ms: tuple[float, float]) -> Rig:
-        """The source's rig, or one whose camera was told other times."""
+        """Return the source's rig, with the times that the camera was set to."""
         camera = self.source.camera
         if np.allclose(times_ms, (camera.exposure_ms, camera.frame_ms), rtol=1e-9):
             return self.source.rig
@@ -160,7 +163,7 @@ class SceneView:
 
 
 def _runs(number: Ints, alike: NDArray[np.bool_]) -> Iterator[slice]:
-    """Exposures in a row whose lines follow each other and that are all as planned, or all not."""
+    """Yield consecutive exposures whose lines follow each other and that are all as planned, or all not."""
     edges = np.flatnonzero((np.diff(number) != 1) | (np.diff(alike.astype(np.int8)) != 0)) + 1
     for start, stop in zip([0, *edges], [*edges, len(number)], strict=True):
         yield slice(int(start), int(stop))
@@ -179,8 +182,7 @@ class SceneCamera(CameraDevice):
     kept
         So many finished captures keep their files, and references always; 0 is all.
 
-    With ``aside`` frames are looked at by calls of :meth:`keep_looking` alone, from a thread; until then it is
-    capturing.
+    ``aside`` leaves frames to calls of :meth:`keep_looking` from a thread; until then it is capturing.
     """
 
     def __init__(
@@ -200,7 +202,7 @@ class SceneCamera(CameraDevice):
         self.aside = False
 
     def pulses(self, from_s: float, to_s: float) -> Floats:
-        """Give rises and falls (pulse, 2) of the trigger pulses that rise from ``from_s`` on and before ``to_s``."""
+        """Return rises and falls (pulse, 2) of the trigger pulses that rise from ``from_s`` on and before ``to_s``."""
         found = [np.zeros((0, 2))]
         if self.wired == "none":
             return found[0]
@@ -246,7 +248,7 @@ class SceneCamera(CameraDevice):
         return capture
 
     def _seen(self, positions: Floats, middle_s: Floats) -> Raw:
-        """Raw lines (line, sample, band) of exposures by the middle of each."""
+        """Return the raw lines (line, sample, band) of exposures by their mid times."""
         capture = next((one for one in reversed(self.captures) if one.began_s <= middle_s[0]), None)
         if capture is None:
             return self.view.alone("no capture", positions[0], (self.exposure_ms, self.period_ms), 0.0)
@@ -265,7 +267,7 @@ class SceneCamera(CameraDevice):
 
 
 def _prefix(capture: EmulatedCapture) -> str:
-    """Return what a capture's folder is called, without its number."""
+    """Return the name of a capture's folder, without its number."""
     return capture.folder.rsplit("/", 1)[-1].rpartition("_")[0]
 
 
@@ -348,15 +350,13 @@ class _Line:
             if stop in ready:
                 return
             if self._master in ready:
-                self._take(os.read(self._master, _MOST_READ))
+                data = os.read(self._master, _MOST_READ)
+                self._in_free_s = max(self._device.clock.now(), self._in_free_s) + len(data) * self._byte_s
+                heapq.heappush(self._in, (self._in_free_s, next(self._order), data))
             while self._in and self._in[0][0] <= self._device.clock.now():
                 due, _, data = heapq.heappop(self._in)
                 self._schedule(self._device.receive(data), due)  # not from now: waking late is not the device's doing
             self._deliver()
-
-    def _take(self, data: bytes) -> None:
-        self._in_free_s = max(self._device.clock.now(), self._in_free_s) + len(data) * self._byte_s
-        heapq.heappush(self._in, (self._in_free_s, next(self._order), data))
 
     def _schedule(self, chunks: list[Chunk], since_s: float) -> None:
         for delay_s, data in chunks:
@@ -378,7 +378,7 @@ class _Line:
                 return
 
     def _patience(self) -> float | None:
-        """Real time until something is due; None where nothing is."""
+        """Return the real time until the next event; None without one."""
         waiting = [queue[0][0] for queue in (self._in, self._out) if queue]
         if not waiting:
             return None
@@ -442,7 +442,7 @@ class EmulatedRig:
 
     @property
     def state(self) -> str:
-        """Return what both devices do now, in words."""
+        """Return the state of both devices, in words."""
         x, y = self.mirror.positions(self.clock.now())
         last = f", last: {self.mirror.acts[-1].request.words}" if self.mirror.acts else ""
         camera = "capturing" if self.camera.is_capturing() else "idle"
@@ -477,7 +477,7 @@ class ServedRig(Closing):
         self._thread.start()
 
     def close(self) -> None:
-        """Let go of the pty and the sockets; clients see the devices go."""
+        """Close the pty and the sockets; clients see the devices go."""
         self._ended.set()
         self._thread.join()
         self._server.close()

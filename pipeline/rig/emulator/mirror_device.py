@@ -1,11 +1,11 @@
 """The emulated mirror controller: bytes in, bytes out, and its registers; time only by the clock that it is given.
 
-What drivers ask for in both modes of the documented protocol. Assumed, as the documents leave it open: an empty line
-has no answer; NO answers a line that is not known, ERROR one that is too long; what comes while the controller boots is
-lost; in pro mode bytes that are no frame are answered by error 0001 at the next boundary, requests are checked by their
-CRC after GOPROCRC alone, and replies always carry it. Two other firmwares are emulated, too: one that checks the CRC of
-requests after GOPRO as well (``crc="required"``), and one that knows no GOPROCRC and sends 00 00 in the CRC's place
-(``crc="absent"``).
+It has what drivers ask for in both modes of the documented protocol. Assumed, as the documents leave it open: an empty
+line has no answer; NO answers a line that is not known, ERROR one that is too long. Bytes that come while the
+controller boots are lost. Bytes in pro mode that are no frame are answered by error 0001 at the next boundary. Requests
+are checked by their CRC after GOPROCRC alone, and replies always carry it. Two other firmwares are emulated, too. One
+checks the CRC of requests after GOPRO as well (``crc="required"``). The other knows no GOPROCRC and sends 00 00 in the
+CRC's place (``crc="absent"``).
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ class RegisterFile:
         return Frame(command)
 
     def get(self, number: int) -> bytes:
-        """Give a register's cell; RefusedError where there is no such register."""
+        """Return a register's cell; RefusedError where there is no such register."""
         self._state.advance()
         register = self._find(number)
         value = register.read()
@@ -163,8 +163,8 @@ class RegisterFile:
     def put(self, cells: Mapping[int, bytes]) -> None:
         """Write registers at one moment; held positions go out together.
 
-        RefusedError where a register is missing, read only or out of range, and then none is written; or one does not
-        take its value as things stand, and then those before it are.
+        Raises RefusedError: a register is missing, read only or out of range, and none is written. It is raised, too,
+        where one does not take its value in the present state; those before it are written then.
         """
         values = {number: self._find(number).check(cell) for number, cell in cells.items()}
         self._state.advance()
@@ -175,7 +175,10 @@ class RegisterFile:
         self._state.aim()
 
     def get_cells(self, number: int, offset: int, length: int) -> bytes:
-        """Give whole cells of the vector memory or of a log's slot (else RefusedError); offset and length in bytes."""
+        """Return whole cells of the vector memory or of a log's slot; offset and length are in bytes.
+
+        Raises RefusedError: the cells are not whole, or not there.
+        """
         start, stop = _cells(offset, length)
         if number == VECTOR_MEMORY:
             _within(stop, self._state.memory.size)
@@ -285,12 +288,12 @@ def _vector_unit(state: MirrorState, channel: int) -> dict[int, Register]:
 
 
 def _item(holder: Any, key: int) -> tuple[Callable[[], Any], Callable[[Any], object]]:
-    """Return how an item of a list or of a dictionary is read and written."""
+    """Return a reader and a writer of an item of a list or of a dictionary."""
     return partial(operator.getitem, holder, key), partial(operator.setitem, holder, key)
 
 
 def _attribute(holder: object, name: str, kind: type = int) -> tuple[Callable[[], Any], Callable[[Any], object]]:
-    """Return how an attribute is read and written."""
+    """Return a reader and a writer of an attribute."""
     return partial(getattr, holder, name), lambda value: setattr(holder, name, kind(value))
 
 
@@ -323,7 +326,7 @@ class Request:
 
     @property
     def words(self) -> str:
-        """Return what was asked, for people: the line, or the command's name."""
+        """Return the request for people: the line, or the command's name."""
         if self.frame is None:
             return self.line or "bytes that are no frame"
         known = {command.value: command.name for command in Command}
@@ -377,13 +380,13 @@ class MirrorDevice:
                     self.state.trigger(pulses[:, 0], pulses[:, 1])
 
     def positions(self, times_s: ArrayLike) -> Floats:
-        """Give where the mirror truly was, (..., 2) device X and Y, at times of the clock up to now (...)."""
+        """Return the true mirror positions, (..., 2) device X and Y, at times of the clock up to now (...)."""
         self.take_pulses()
         with self._lock:
             return self.state.positions(times_s)
 
     def sent(self, times_s: ArrayLike) -> Floats:
-        """Give where the mirror was sent, (..., 2), at times of the clock up to now (...)."""
+        """Return the commanded mirror positions, (..., 2), at times of the clock up to now (...)."""
         self.take_pulses()
         with self._lock:
             self.state.advance()

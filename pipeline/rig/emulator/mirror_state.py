@@ -1,9 +1,9 @@
 """The emulated mirror controller: its motion in closed form, vector units, targets, status and log. No protocol.
 
 Nothing runs by itself: everything is worked out up to the clock's moment when it is asked for, so time may run at any
-speed. Assumed of a vector unit, as no document says it: the first cell is taken at the run command, with an external
-trigger too, whose edges then take one cell each; a unit that is done keeps its last cell and reports that it no longer
-runs.
+speed. Assumptions on the vector unit, which no document describes: the run command takes the first cell, with an
+external trigger too. Each edge of the trigger then takes one cell. A unit that is done keeps its last cell and reports
+that it no longer runs.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class AxisMotion:
 
     @property
     def commanded(self) -> float:
-        """Return what the axis goes to."""
+        """Return the position that the axis goes to."""
         return self._command[-1]
 
     def command(self, time_s: float, place: float) -> None:
@@ -76,11 +76,11 @@ class AxisMotion:
                 del column[:-KEPT_STEPS]
 
     def rest(self, time_s: float) -> None:
-        """Be at rest at 0 at once, as after a loss of power; the past is forgotten."""
+        """Reset to rest at 0 at once, as after a loss of power; the past is forgotten."""
         self._time, self._place, self._rate, self._command = [time_s], [0.0], [0.0], [0.0]
 
     def places(self, times_s: ArrayLike) -> Floats:
-        """Give where the axis was at times (...), in the unit of its commands.
+        """Return the positions of the axis at times (...), in the unit of its commands.
 
         Times before the oldest command that is remembered are given the place then.
         """
@@ -95,18 +95,21 @@ class AxisMotion:
         return np.where(still, np.asarray(self._command)[at], places)
 
     def commands(self, times_s: ArrayLike) -> Floats:
-        """Give where the axis was sent to at times (...); times before the oldest that is remembered get the oldest."""
+        """Return the positions that the axis was sent to at times (...).
+
+        Times before the oldest that is remembered get the oldest.
+        """
         at = np.searchsorted(np.asarray(self._time), np.asarray(times_s, np.float64), side="right") - 1
         return np.asarray(self._command)[np.clip(at, 0, None)]
 
     def place(self, time_s: float) -> float:
-        """Give where the axis was at one time, which is faster for the time after the last command."""
+        """Return where the axis was at one time, which is faster for the time after the last command."""
         if time_s < self._time[-1]:
             return float(self.places(time_s))
         return self._moved(time_s - self._time[-1])[0]
 
     def unsettled(self, time_s: float) -> float:
-        """Give a bound on how far the axis may still be off its command from a time on, oscillation included."""
+        """Return a bound on how far the axis may still be off its command from a time on, oscillation included."""
         place, rate = self._moved(max(time_s - self._time[-1], 0.0))
         return math.hypot(place - self._command[-1], rate)
 
@@ -123,7 +126,10 @@ class AxisMotion:
 
 @lru_cache(maxsize=4096)
 def _response(angle: float, damping: float) -> tuple[float, float]:
-    """Responses to a unit impulse and a unit step at one time; a vector is played with few different times."""
+    """Return the responses to a unit impulse and a unit step at one time.
+
+    They are cached: a vector is played with few different times.
+    """
     impulse, rise = responses(np.array([angle]), damping)
     return float(impulse[0]), float(rise[0])
 
@@ -155,7 +161,7 @@ class VectorPlayer:
         return self.start + max(self._played - 1, 0) % self.length if self.length > 0 else self.start
 
     def run(self, time_s: float) -> None:
-        """Begin with the first cell."""
+        """Start with the first cell."""
         self.running, self._began_s, self._played = True, time_s, 0
         self._edges.clear()
 
@@ -171,7 +177,7 @@ class VectorPlayer:
             self._edges.extend((rises_s if self.external is Trigger.RISING_EDGE else both).tolist())
 
     def due(self, now_s: float) -> Iterator[tuple[float, int]]:
-        """Give the steps (time, cell) since the last call up to now, and stop where the run is over."""
+        """Yield the steps (time, cell) since the last call up to now, and stop where the run is over."""
         if not self.running or self.length < 1:
             return
         total = math.inf if self.cycles < 0 else self.cycles * self.length
@@ -231,7 +237,7 @@ class MirrorState:
         self.restart(clock.now())
 
     def restart(self, now_s: float) -> None:
-        """Be as after power came: at rest in the middle, memory and registers empty."""
+        """Reset to the state after power came: at rest in the middle, memory and registers empty."""
         self.players = [VectorPlayer(self.unit.ends) for _ in range(CHANNELS)]
         self.memory = np.zeros(2 * self.unit.vector_pairs, np.float32)
         self.static = [dict.fromkeys(Unit, 0.0) for _ in range(CHANNELS)]
@@ -266,7 +272,7 @@ class MirrorState:
         self.advance()
 
     def positions(self, times_s: ArrayLike) -> NDArray[np.float64]:
-        """Give where the mirror was, (..., 2), at times up to now (...)."""
+        """Return the mirror's positions, (..., 2), at times up to now (...)."""
         self.advance()
         return np.stack([axis.places(times_s) for axis in self.axes], axis=-1)
 
@@ -326,14 +332,14 @@ class PositionLogger:
         return min(int((until - self._began_s) * self.rate_hz + 1e-9) + 1, self._state.unit.log_rows)
 
     def run(self, on: bool) -> None:
-        """Begin anew, or stop; a logger that is stopped keeps its rows."""
+        """Start anew, or stop; a logger that is stopped keeps its rows."""
         if on:
             self._began_s, self._stopped_s = self._state.clock.now(), None
         elif self.running:
             self._stopped_s = self._state.clock.now()
 
     def cells(self, slot: int, start: int, stop: int) -> bytes:
-        """Give the cells of some rows of a slot; of registers that are no feedback, 0."""
+        """Return the cells of some rows of a slot; of registers that are no feedback, 0."""
         times = (self._began_s or 0.0) + np.arange(start, stop) / self.rate_hz
         channel = self.slots[slot] - FEEDBACK_X
         if channel not in range(CHANNELS):

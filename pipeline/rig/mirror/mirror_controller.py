@@ -55,12 +55,12 @@ Progress = Callable[[int, int], None]  # cells done, cells in all
 
 
 def wire_positions(positions: ArrayLike, mounting: Mounting = STRAIGHT) -> NDArray[np.float32]:
-    """Give positions (position, 2) at the precision of the wire, float32, where rounding carries none beyond the rim.
+    """Return positions (position, 2) at the precision of the wire, float32, where rounding carries none beyond the rim.
 
     They are those of the device that is mounted so, for what a straight one gets by the wire.
 
-    Raises ShapeError where they are not of that shape, or none, and PoseError where one is not finite or beyond the
-    rim; the message names the first.
+    Raises ShapeError: they have another shape, or there is none. Raises PoseError: one is not finite or beyond the rim;
+    the message names the first.
     """
     given = np.asarray(positions)
     if given.ndim != 2 or given.shape[1:] != (2,) or not len(given):
@@ -109,7 +109,7 @@ def upload(link: ProLink, cells: bytes, read_back: ReadBack, progress: Progress 
 
 
 def frames_to_check(frames: int, read_back: ReadBack) -> list[int]:
-    """Give the numbers of the frames that are read back."""
+    """Return the numbers of the frames that are read back."""
     if read_back == "none":
         return []
     if read_back == "all":
@@ -142,7 +142,10 @@ def check_play(first: int, stop: int, rate_hz: float, cycles: int, loaded: int) 
 
 
 def hold_values(x: float, y: float) -> dict[int, Value]:
-    """Registers that send both channels to a position, hold it and end any path, in one frame, which they fill."""
+    """Return the registers that send both channels to a position, hold it and end any path.
+
+    They fill one frame.
+    """
     follow = {**X.followed(X.static_system), **Y.followed(Y.static_system)}
     halt = {X.vector(VectorRegister.RUN): 0, Y.vector(VectorRegister.RUN): 0}
     return {X.static_xy: float(x), Y.static_xy: float(y), **follow, **halt}
@@ -152,9 +155,9 @@ def hold_values(x: float, y: float) -> dict[int, Value]:
 class MotionLog:
     """Positions that the controller measured at a steady rate.
 
-    ``started_s`` is when the start was acknowledged, by the driver's clock, and ``start_error_s`` how much earlier it
-    may have been: the time of the request itself. Offset and drift against frame times are found where lines
-    get their positions.
+    ``started_s`` is when the start was acknowledged, by the driver's clock. ``start_error_s`` is how much earlier it
+    may have been: the time of the request itself. Offset and drift against frame times are found where lines get their
+    positions.
     """
 
     position: NDArray[np.float32]  # (sample, 2) X and Y
@@ -189,8 +192,8 @@ class MirrorController(Closing):
     def connect(self, *, known: bool = False) -> Identity:
         """Find the controller in whichever mode it is, and bring it to pro mode. Nothing moves.
 
-        With ``known`` only the models that the documents are of are taken, or the one that the settings expect. Raises
-        DeadlinePassed or DeviceGone where nothing answers, RigError where another device does.
+        ``known`` restricts the models to documented ones, or to the one that the settings expect. Raises DeadlinePassed
+        or DeviceGone where nothing answers, RigError where another device does.
         """
         self._pairs, self._identity = 0, None
         found, expected = self._modes.connect(), self.settings.expected_id
@@ -205,7 +208,10 @@ class MirrorController(Closing):
         return found
 
     def identity(self) -> Identity:
-        """Return what the controller said it is when it was connected; RigError where it is not connected."""
+        """Return the controller's answers on its identity from when it was connected.
+
+        Raises RigError: it is not connected.
+        """
         self._check_connected()
         assert self._identity is not None
         return self._identity
@@ -216,12 +222,15 @@ class MirrorController(Closing):
         return self._modes.found_in_pro
 
     def status(self) -> Status:
-        """Status bits, now."""
+        """Return the present status bits."""
         self._check_connected()
         return Status(self._link.ask(ask_status(), "the status", cell_int))
 
     def temperature(self) -> float:
-        """Temperature, read in simple mode; RigError where a path plays, as modes are not changed under it. [deg C]"""
+        """Return the temperature, read in simple mode.
+
+        Raises RigError: a path plays, and modes are not changed under it.
+        """
         self._check_idle("ask for its temperature")
         with self._modes.simple() as lines:
             return lines.temperature()
@@ -238,8 +247,8 @@ class MirrorController(Closing):
     def goto(self, x: float, y: float) -> None:
         """Send the mirror to a position and hold it there; comes back once that is acknowledged, not at rest.
 
-        Raises PoseError outside the disk, before anything is sent, RigError where the status forbids motion, and
-        StateUnknown where it was not acknowledged, or motions are frozen.
+        Raises PoseError: the position is outside the disk; no byte is sent. Raises RigError: the status forbids motion.
+        Raises StateUnknown: it was not acknowledged, or motions are frozen.
         """
         target = wire_positions([(x, y)], self.settings.mounting)[0]
         self._move(hold_values(*target), f"going to {target[0]:.6g}; {target[1]:.6g}")
@@ -313,12 +322,12 @@ class MirrorController(Closing):
         return any(map(cell_int, self._link.ask(get_values(registers), "whether a path plays", read_values)))
 
     def index(self) -> int:
-        """Position of the loaded path that plays now: the cell of X."""
+        """Return the position of the loaded path that plays now: the cell of X."""
         self._check_connected()
         return self._link.ask(get_value(X.vector(VectorRegister.INDEX)), "the place in the path", cell_int)
 
     def start_log(self, rate_hz: float) -> None:
-        """Begin to log measured positions ``rate_hz`` times a second: X in slot 0, Y in slot 1."""
+        """Start to log measured positions ``rate_hz`` times a second: X in slot 0, Y in slot 1."""
         self._check_connected()
         self._logging = None
         self._link.tell(set_values({LOG_RUN: 0}), "stopping the log")
@@ -331,8 +340,8 @@ class MirrorController(Closing):
     def read_log(self, samples: int | None = None) -> MotionLog:
         """End the log and fetch ``samples`` of it, or as many as the time since the start has.
 
-        Never more than the logger holds. Where it holds fewer than expected, the device says so and the log ends there.
-        RigError where no log was started.
+        Never more than the logger holds. A log with fewer values than expected ends where the device says so. RigError
+        where no log was started.
         """
         if self._logging is None:
             raise RigError(f"no log was started on {self.wire.port}; start one before the path runs")
@@ -348,7 +357,7 @@ class MirrorController(Closing):
         return MotionLog(position, rate_hz, after, after - before)
 
     def close(self) -> None:
-        """Let go of the port; the mirror stays where it is."""
+        """Close the port; the mirror stays where it is."""
         self._identity = None
         self.wire.transport.close()
 

@@ -60,7 +60,7 @@ _WORDS = {
 
 
 def to_line(request: str) -> bytes:
-    """Give the bytes of a request; ShapeError where it is not ASCII, empty, too long, or has an end of its own."""
+    """Return the bytes of a request; ShapeError where it is not ASCII, empty, too long, or has an end of its own."""
     if not request.isascii() or not request or any(character in request for character in "\r\n"):
         raise ShapeError(f"expected one line of ASCII, got {request!r}")
     line = request.encode("ascii") + END
@@ -254,7 +254,7 @@ class Modes:
         """Find the controller in either mode, ask what it is, and leave it in pro mode. Nothing moves.
 
         Raises DeadlinePassed where nothing answers in either mode, RigError where something else does, or DeviceGone.
-        Where frames are not answered as the settings send them, the error says whether they are the other way.
+        If frames are not answered in the form of the settings, the error says whether they are in the other form.
         """
         with self.pro.wire.lock:
             self.found_in_pro = False
@@ -288,7 +288,7 @@ class Modes:
 
     @contextmanager
     def simple(self) -> Iterator[SimpleLink]:
-        """Simple mode for as long as the block lasts; where a mode is not reached, connect again.
+        """Keep simple mode while the block runs; connect again where a mode is not reached.
 
         Raises DeadlinePassed, DeviceRefused or DeviceGone.
         """

@@ -2,7 +2,7 @@
 
 A frame is ``7E | address 00 | command | size | payload | CRC, low byte first | 7E``; 7D and 7E between the boundaries
 are sent as 7D and the byte with bit 5 turned. The CRC is CRC-16/ARC over address to payload. It fits the one documented
-frame (``00 11 04 00 00 00 00 | F2 81``) and is not confirmed on hardware, so a reader only says whether it fits. That
+frame (``00 11 04 00 00 00 00 | F2 81``) and is not confirmed on hardware. So a reader only says whether it fits. That
 it begins at 0 leaves open whether the address counts; as the address is 0, either way gives the same CRC.
 
 Numbers in payloads are big-endian. A register's id takes two bytes, its cell four: a float32, or an integer. Several
@@ -73,7 +73,7 @@ class ErrorCode(IntEnum):
 
 
 def format_error(code: int) -> str:
-    """Say an error code of the device in words, with its number."""
+    """Return an error code of the device in words, with its number."""
     known = {error.value: error.words for error in ErrorCode}
     return f"{known.get(code, 'an error that this driver does not know')} (code {code:04X})"
 
@@ -104,7 +104,7 @@ def _crc_step(value: int) -> int:
 
 
 def crc_arc(data: bytes) -> int:
-    """Give the CRC-16/ARC of bytes: polynomial 8005 reflected, beginning at 0."""
+    """Return the CRC-16/ARC of bytes: polynomial 8005 reflected, beginning at 0."""
     crc = 0
     for byte in data:
         crc = crc >> 8 ^ _crc_step((crc ^ byte) & 0xFF)
@@ -112,7 +112,7 @@ def crc_arc(data: bytes) -> int:
 
 
 def encode(frame: Frame, *, with_crc: bool = True) -> bytes:
-    """Give the bytes of a frame, boundaries and escapes included; 00 00 in the CRC's place without one.
+    """Return the bytes of a frame, boundaries and escapes included; 00 00 in the CRC's place without one.
 
     Raises ShapeError where the payload is too long, or the address or the command is no byte.
     """
@@ -183,7 +183,7 @@ Value = float | int
 
 
 def float_cell(value: float) -> bytes:
-    """Give the cell of a float32; ShapeError where the value does not fit."""
+    """Return the cell of a float32; ShapeError where the value does not fit."""
     try:
         return struct.pack(">f", value)
     except OverflowError:
@@ -191,14 +191,14 @@ def float_cell(value: float) -> bytes:
 
 
 def int_cell(value: int) -> bytes:
-    """Give the cell of an integer of 32 bits, with or without a sign; ShapeError where the value does not fit."""
+    """Return the cell of an integer of 32 bits, with or without a sign; ShapeError where the value does not fit."""
     if not -(2**31) <= value < 2**32:
         raise ShapeError(f"expected an integer of 32 bits, got {value}")
     return (value & 0xFFFFFFFF).to_bytes(CELL, "big")
 
 
 def to_cell(value: Value) -> bytes:
-    """Give the cell of a float or of an integer, by its type."""
+    """Return the cell of a float or of an integer, by its type."""
     return int_cell(value) if isinstance(value, int) else float_cell(value)
 
 
@@ -213,22 +213,22 @@ def cell_int(cell: bytes) -> int:
 
 
 def ask_status() -> Frame:
-    """Ask for the status bits; the reply is one cell."""
+    """Return a request for the status bits; the reply is one cell."""
     return Frame(Command.STATUS, _NO_ARGUMENT)
 
 
 def go_simple() -> Frame:
-    """Ask for simple mode, which is communication mode 0."""
+    """Return a request for simple mode, which is communication mode 0."""
     return Frame(Command.SET_MODE, _NO_ARGUMENT)
 
 
 def get_value(register: int) -> Frame:
-    """Ask for a register; the reply is its cell."""
+    """Return a request for a register; the reply is its cell."""
     return Frame(Command.GET_VALUE, _id(register))
 
 
 def get_values(registers: Sequence[int]) -> Frame:
-    """Ask for 1 to 8 registers (else ShapeError); the reply is their count and their cells."""
+    """Return a request for 1 to 8 registers (else ShapeError); the reply is their count and their cells."""
     return Frame(Command.GET_VALUES, _count(len(registers)) + b"".join(map(_id, registers)))
 
 
@@ -239,7 +239,7 @@ def set_values(values: Mapping[int, Value]) -> Frame:
 
 
 def get_vector(register: int, start: int, count: int) -> Frame:
-    """Ask for the cells ``start`` to ``start + count`` of a vector; the reply is the cells."""
+    """Return a request for the cells ``start`` to ``start + count`` of a vector; the reply is the cells."""
     return Frame(Command.GET_VECTOR, _span(register, start, count))
 
 
@@ -405,11 +405,11 @@ class ChannelRegisters:
         self.control = 0x4002 + 5 * self.channel  # which system controls the channel
 
     def vector(self, register: VectorRegister) -> int:
-        """Id of a register of the vector unit."""
+        """Return the id of a register of the vector unit."""
         return self.vector_system << 8 | register
 
     def followed(self, system: int) -> dict[int, int]:
-        """Values that make the channel follow an input, controlled by position."""
+        """Return the values that make the channel follow an input, controlled by position."""
         return {self.control: self.xy_system, self.input: system}
 
 
@@ -433,5 +433,5 @@ X, Y = ChannelRegisters(0), ChannelRegisters(1)
 
 
 def log_slot(slot: int) -> int:
-    """Id of the register that says what a slot of the logger takes down, and of the vector that it takes down."""
+    """Return the id of the register that assigns a slot of the logger, which is also that of the vector it records."""
     return 0x2400 | slot

@@ -81,12 +81,12 @@ class Turbulence(Aim):
 
 
 def turbulence_px(rig: Rig) -> float:
-    """Give the deviation of the angle of arrival per axis, sqrt(1.09 Cn2 d D^(-1/3)), from the farthest part. [px]
+    """Return the deviation of the angle of arrival per axis, sqrt(1.09 Cn2 d D^(-1/3)), from the farthest part. [px]
 
-    Spherical waves: air near the point tilts them less than air near the aperture, by (z / d)^(5/3) a length of way, so
-    that 3/8 of a plane wave's 2.91 are left [1]. D is the aperture as seen at rest, 10.6 mm of 15. Valid for
-    Kolmogorov's spectrum with one Cn2 all along the way, for D between inner and outer scale, sqrt(lambda d) not much
-    wider than D, and weak turbulence, `rytov_variance` up to 1. 0 without a distance; no way is longer than
+    In spherical waves air near the point tilts them less than air near the aperture, by (z / d)^(5/3) a length of way.
+    So 3/8 of a plane wave's 2.91 are left [1]. D is the aperture as seen at rest, 10.6 mm of 15. It is valid for
+    Kolmogorov's spectrum with one Cn2 all along the way, and D between inner and outer scale. sqrt(lambda d) must not
+    be much wider than D, and turbulence weak: `rytov_variance` up to 1. 0 without a distance; no way is longer than
     `FARTHEST_M`.
     """
     metres = _way_m(rig)
@@ -96,7 +96,7 @@ def turbulence_px(rig: Rig) -> float:
 
 
 def rytov_variance(rig: Rig, wavelength_nm: float) -> float:
-    """Give how strong the turbulence is: of the light's logarithm in spherical waves, 0.5 Cn2 k^(7/6) d^(11/6) [1]."""
+    """Return the variance of the light's logarithm in spherical waves by turbulence, 0.5 Cn2 k^(7/6) d^(11/6) [1]."""
     waves_per_m = 2 * math.pi / (wavelength_nm * 1e-9)
     return float(0.5 * rig.air.turbulence_cn2 * waves_per_m ** (7 / 6) * _way_m(rig) ** (11 / 6))
 
@@ -109,16 +109,16 @@ def _way_m(rig: Rig) -> float:
 class Wind(Displacement):
     """Crop motion: the scene sways by a travelling wave along the wind, its phase and direction drawn for a survey.
 
-    All of the scene sways, as one that stands at mid exposure; where f t_frame is above one half, a fast sway shows as
-    a slow one. The smear within an exposure is neither modelled nor counted: up to 2 pi f t_exp of the amplitude, 2 %
-    of it at 1 Hz in 3 ms and 62 % in 100 ms. ``why`` tells how many px that are.
+    All of the scene sways, as one that stands at mid exposure. A fast sway shows as a slow one if f t_frame is above
+    one half. The smear within an exposure is neither modelled nor counted. It is up to 2 pi f t_exp of the amplitude: 2
+    % of it at 1 Hz in 3 ms and 62 % in 100 ms. ``why`` tells how many px that are.
     """
 
     name = "wind"
     cost_ns = MappingProxyType({"exact": 0.9})
 
     def displaced(self, block: SweepBlock, along_px: Floats, scan_px: Floats, variant: str) -> tuple[Floats, Floats]:
-        """Give the crop's sway at scene points (line, sample): along the line and the scan. [px]
+        """Return the crop's sway at scene points (line, sample): along the line and the scan. [px]
 
         A plane wave A sin(2 pi (f t - way / gust) + phase), its way and its motion along the wind's heading.
         """
@@ -149,23 +149,23 @@ class Wind(Displacement):
 
 
 def sway_px(rig: Rig) -> float:
-    """Give the amplitude of the canopy's sway, A / (d IFOV); 0 for a scene without a distance. [px]"""
+    """Return the amplitude of the canopy's sway, A / (d IFOV); 0 for a scene without a distance. [px]"""
     air = rig.air
     return 0.0 if air.distance_m is None else air.wind_amplitude_m / (air.distance_m * rig.camera.ifov_rad)
 
 
 def sway_gradient(rig: Rig) -> float:
-    """Give by how much the sway differs from one px to the next at most, 2 pi A over the length of a gust."""
+    """Return by how much the sway differs from one px to the next at most, 2 pi A over the length of a gust."""
     return 2 * math.pi * rig.air.wind_amplitude_m / GUST_M if sway_px(rig) else 0.0
 
 
 def line_to_line_px(rig: Rig) -> float:
-    """Give the most that the crop moves from one line to the next, 2 A |sin(pi f t_frame)| / (d IFOV). [px]"""
+    """Return the most that the crop moves from one line to the next, 2 A |sin(pi f t_frame)| / (d IFOV). [px]"""
     return 2 * sway_px(rig) * abs(math.sin(math.pi * sways_per_line(rig)))
 
 
 def within_exposure_px(rig: Rig) -> float:
-    """Give the most that the crop moves while a line is exposed, 2 A |sin(pi f t_exp)| / (d IFOV) up to 2 A. [px]"""
+    """Return the most that the crop moves while a line is exposed, 2 A |sin(pi f t_exp)| / (d IFOV) up to 2 A. [px]"""
     sways = min(rig.air.wind_hz * rig.camera.exposure_ms * 1e-3, 0.5)
     return 2 * sway_px(rig) * math.sin(math.pi * sways)
 
@@ -179,9 +179,9 @@ class Parallax(Displacement):
     """Displacement of what is not at the scene's distance, for which scale and geometry are right.
 
     The virtual pinhole lies a lever L behind the pivot on the chief ray. A ray meets a surface at distance d, taken
-    along the chief ray, L (1/d - 1/d0) times its way from the line's centre beside the point of distance d0, where
-    depth is read. Occlusion is left out: within a displacement of a step a sample may see the other depth, within the
-    bound.
+    along the chief ray, beside the point of distance d0, where depth is read. It is off by L (1/d - 1/d0) times its way
+    from the line's centre. Occlusion is left out: within a displacement of a step a sample may see the other depth,
+    within the bound.
     """
 
     name = "parallax"
@@ -214,7 +214,7 @@ class Parallax(Displacement):
 
 
 def closeness(air: Air, row: Floats) -> Floats:
-    """Give 1 / distance at rows of the scene, -1 its first and 1 its last. [1/m]
+    """Return 1 / distance at rows of the scene, -1 its first and 1 its last. [1/m]
 
     A ``step`` is farthest up to the middle row and nearest from there on; along a ``plane`` it runs evenly between
     them.
@@ -231,7 +231,7 @@ def closeness(air: Air, row: Floats) -> Floats:
 
 
 def greatest_fraction(air: Air) -> float:
-    """Greatest displacement per px of way from the line's centre."""
+    """Return the greatest displacement per px of distance from the line's centre."""
     if air.distance_m is None:
         return 0.0
     ends = closeness(air, np.array([-1.0, 1.0])) - 1 / air.distance_m
@@ -239,7 +239,7 @@ def greatest_fraction(air: Air) -> float:
 
 
 def reach_m(rig: Rig) -> tuple[float, float] | None:
-    """Give the nearest and the farthest distance that the scene's relief has [m]; None for one without a distance."""
+    """Return the nearest and the farthest distance that the scene's relief has [m]; None for one without a distance."""
     ends = rig.distances_m
     if ends is None or rig.air.distance_m is None:
         return None
@@ -254,7 +254,7 @@ def has_relief(rig: Rig) -> bool:
 
 
 def sample_distances(block: SweepBlock) -> Floats:
-    """Give the distance where each sample looks by the plan, (line, sample) [m]; (1, 1) where all of it is the same."""
+    """Return the distance at which each sample looks by the plan, (line, sample) [m]; (1, 1) if all are alike."""
     ends = reach_m(block.rig)
     if ends is None or ends[0] == ends[1]:
         return np.full((1, 1), FARTHEST_M if ends is None else ends[0])
@@ -297,8 +297,9 @@ KRUSE = 0.585  # of the root of 1 km [5]
 class Absorption(Gain):
     """Fraction of the light that gases leave over a distance, averaged over the width of a band.
 
-    Water vapour about 720, 820 and 940 nm, oxygen at 690 and 760 nm: the band model of [4] for whole atmospheres, taken
-    to paths of metres (assumed). ``range`` takes each sample's own distance, ``uniform`` the middle.
+    It has water vapour about 720, 820 and 940 nm, and oxygen at 690 and 760 nm. The band model of [4] for whole
+    atmospheres is taken to paths of metres (assumed). ``range`` takes each sample's own distance, ``uniform`` the
+    middle.
     """
 
     name = "absorption"
@@ -331,7 +332,7 @@ class Absorption(Gain):
         return GainRange.of(passed, nm, uneven=float(passed.max(initial=0.0) - passed.min(initial=1.0)))
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
-        """Give the fraction that passes, (line, sample, band), or (1, 1, band) where one distance stands for all.
+        """Return the fraction that passes, (line, sample, band), or (1, 1, band) where one distance stands for all.
 
         Every sample's is read off a table over the logarithm of the distance, by straight lines.
         """
@@ -350,7 +351,7 @@ class Absorption(Gain):
 
 
 def transmission(metres: Floats, rig: Rig, wavelength_nm: Floats) -> Floats:
-    """Give the fraction of light that passes so much air near the ground, (distance, band).
+    """Return the fraction of light that passes so much air near the ground, (distance, band).
 
     The bands are Gaussians of ``optics.fwhm_nm``, cut at 2 standard deviations.
     """
@@ -370,7 +371,7 @@ def transmission(metres: Floats, rig: Rig, wavelength_nm: Floats) -> Floats:
 class PathRadiance(LightChange):
     """Light L at a distance d arrives as L exp(-beta d) + H (1 - exp(-beta d)), beta of ``extinction_per_m``.
 
-    H, the light of endless air, is ``air.airlight_fraction`` of the white reference's and follows the daylight; none is
+    H, the light of endless air, is ``air.airlight_fraction`` of the white reference's and follows the daylight. None is
     added where the white reference's light is not known. ``range`` takes each sample's own distance, ``uniform`` the
     middle.
     """
@@ -402,7 +403,7 @@ class PathRadiance(LightChange):
         return Bound(worst, f"air {verb} {most} and adds its own, over {spoken_reach(reach)}")
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
-        """Give what passes between the nearest and the farthest sample, and the greatest light that air adds. [e-]
+        """Return what passes between the nearest and the farthest sample, and the greatest light that air adds. [e-]
 
         Added light is the airlight's fraction of the white reference's, where that is known, times what the daylight
         grows by.
@@ -426,7 +427,7 @@ class PathRadiance(LightChange):
         )
 
     def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
-        """Give light (line, sample, band) [e-] with what air takes of it and adds; changed in place."""
+        """Return light (line, sample, band) [e-] with what air takes of it and adds; changed in place."""
         reach = reach_m(block.rig)
         if reach is None:
             return light
@@ -444,11 +445,11 @@ class PathRadiance(LightChange):
 
 
 def extinction_per_m(air: Air, wavelength_nm: Floats) -> Floats:
-    """Give the extinction of aerosol and molecules near the ground, (band,) [1/m]: 0.17 /km in all at 23 km, 550 nm.
+    """Return the extinction of aerosol and molecules near the ground, (band,) [1/m]: 0.17 /km in all at 23 km, 550 nm.
 
-    At 550 nm it is Koschmieder's for the visibility [3], no less than the molecules'; what these do not explain is
-    aerosol, which falls by Angstrom's exponent: 1.14 [4], below 7.4 km Kruse's 0.585 V^(1/3) [5]. Above 336 km no
-    aerosol is left. Valid from 400 to 1000 nm beside the lines of gases, and down to some 0.5 km of visibility.
+    At 550 nm it is Koschmieder's for the visibility [3], no less than the molecules'. The rest is aerosol, which falls
+    by Angstrom's exponent: 1.14 [4], below 7.4 km Kruse's 0.585 V^(1/3) [5]. Above 336 km no aerosol is left. Valid
+    from 400 to 1000 nm beside the lines of gases, and down to some 0.5 km of visibility.
     """
     molecules = rayleigh_per_m(np.array([VISIBLE_NM]))[0]
     aerosol = max(KOSCHMIEDER / air.visibility_km * 1e-3 - molecules, 0.0)
@@ -457,16 +458,19 @@ def extinction_per_m(air: Air, wavelength_nm: Floats) -> Floats:
 
 
 def rayleigh_per_m(wavelength_nm: Floats) -> Floats:
-    """Give what molecules scatter at sea level, (band,) [1/m]: the optical depth of [4], Eq. 2-4, over 8434 m."""
+    """Return the scattering by molecules at sea level, (band,) [1/m].
+
+    It is the optical depth of [4], Eq. 2-4, over 8434 m.
+    """
     micron = wavelength_nm * 1e-3
     return 1 / (micron**4 * (115.6406 - 1.3366 / micron**2)) / AIR_MASS_M
 
 
 def _contrast(probe: Probe, rig: Rig) -> Floats:
-    """Greatest difference of a signal and the light of endless air, over the signal's unit, (band,).
+    """Return the greatest difference of a signal from the light of endless air, over the signal's unit, (band,).
 
-    Daylight multiplies both; clouds and the angle of view change the signal alone: H counts over their greatest factor,
-    and the darkest signal after their least.
+    Daylight multiplies both; clouds and the angle of view change the signal alone. So H counts over their greatest
+    factor, and the darkest signal after their least.
     """
     if probe.white_e is None:
         return probe.level
@@ -484,7 +488,10 @@ def _contrast(probe: Probe, rig: Rig) -> Floats:
 
 
 def _between(near: Floats, far: Floats) -> Floats:
-    """Fraction of the light lost between two optical depths, exp(-near) - exp(-far), however near they lie."""
+    """Return the fraction of light lost between two optical depths, exp(-near) - exp(-far).
+
+    It is accurate however close they are.
+    """
     return -np.exp(-near) * np.expm1(near - far)
 
 

@@ -50,7 +50,7 @@ def blurred_bound(
 
 
 def even(variance: Floats, bands: int) -> Moments:
-    """Give the moments of a blur that is the same in all bands: no shift, and (2,) variance along line and scan."""
+    """Return the moments of a blur that is the same in all bands: no shift, and (2,) variance along line and scan."""
     return Moments(np.zeros((2, bands)), np.repeat(np.asarray(variance, np.float64)[:, None], bands, axis=1))
 
 
@@ -83,9 +83,10 @@ class Diffraction(Blur):
 
 @cache  # not at import: SciPy takes its time
 def airy_gaussians() -> tuple[Floats, Floats]:
-    """Give shares, none below 0, of sum 1, and widths (sd) [lambda / D] of Gaussians whose sum is an Airy pattern.
+    """Return shares, none below 0, of sum 1, and widths (sd) [lambda / D] of Gaussians whose sum is an Airy pattern.
 
-    By least squares on what the pupil passes: within 0.004 of it up to 0.6 of its cut-off. For bounds, not for light.
+    The least squares fit to the pupil's transfer is within 0.004 of it up to 0.6 of its cut-off. For bounds, not for
+    light.
     """
     size, u = np.geomspace(0.1, 160.0, 24), np.concatenate([np.geomspace(1e-3, 0.02, 30), np.linspace(0.03, 1.5, 150)])
     weight = 1 / (1 + (u / 0.5) ** 4)
@@ -97,7 +98,7 @@ def airy_gaussians() -> tuple[Floats, Floats]:
 
 
 def _waves(rig: Rig, wavelength_nm: Floats, normal: Floats | None) -> Floats:
-    """lambda over the pupil's widths along line and scan, (2, band). [px]"""
+    """Return lambda over the pupil's widths along line and scan, (2, band). [px]"""
     angle = np.asarray(wavelength_nm, np.float64) * 1e-9 / (rig.optics.aperture_mm * 1e-3)
     return angle / rig.camera.ifov_rad * np.sqrt(spread_of_waves(normal))[:, None]
 
@@ -128,7 +129,7 @@ class Defocus(Blur):
     cost_ns = MappingProxyType({"disc": 5.7})  # of seven points
 
     def cost_at(self, probe: Probe, rig: Rig) -> Mapping[str, float]:
-        """Give the cost of as many points as stand for the disc; one is a Gaussian, which costs nothing."""
+        """Return the cost of as many points as stand for the disc; one is a Gaussian, which costs nothing."""
         along, scan = defocus_px(rig, rig.air.distance_m).tolist()
         points = disc_points((along, scan))[0].shape[1]
         return {"disc": _POINT_NS * points if points > 1 else 0.0}
@@ -148,9 +149,9 @@ class Defocus(Blur):
 
 
 def defocus_px(rig: Rig, distance_m: float | None, normal: Floats | None = None) -> Floats:
-    """Give the axes of the blur's disc, (2,) along line and scan: pupil |1/d - 1/d_f| / IFOV; 0 without a distance.
+    """Return the axes of the blur's disc, (2,) along line and scan: pupil |1/d - 1/d_f| / IFOV; 0 without a distance.
 
-    In px; the variance of such an even disc is a sixteenth of its diameter squared.
+    It is in px; the variance of such an even disc is a sixteenth of its diameter squared.
     """
     if distance_m is None or distance_m == rig.optics.focus_m:
         return np.zeros(2)
@@ -163,14 +164,15 @@ class Keystone(Blur):
     """Shift along the line, of its own in each band: a line is imaged longer at one wavelength than at another.
 
     At the last wavelength a sample sees the scene ``keystone_px / 2`` further along the line (towards higher samples)
-    than the mirror model says, at the first as much less far; linear from 400 to 1000 nm, and held beyond.
+    than the mirror model says. At the first wavelength it sees it as much less far. The shift is linear from 400 to
+    1000 nm, and held beyond.
     """
 
     name = "keystone"
     cost_ns = MappingProxyType({"linear": 3.9})
 
     def merged(self, rig: Rig) -> Merged:
-        """Give what it costs beside diffraction, whose several widths have to be shifted each."""
+        """Return what it costs beside diffraction, whose several widths have to be shifted each."""
         return Merged(DIFFRACTION.name, AIRY, 6.5)
 
     def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
@@ -194,7 +196,7 @@ class Keystone(Blur):
 
 
 def keystone_shift(rig: Rig, wavelength_nm: Floats) -> Floats:
-    """Give how far along the line each band sees beside the mirror model's place, (band,) from -k/2 to k/2. [px]"""
+    """Return the shift of each band along the line from the mirror model's place, (band,) from -k/2 to k/2 [px]."""
     fraction = (np.asarray(wavelength_nm, np.float64) - FIRST_NM) / (LAST_NM - FIRST_NM)
     return rig.optics.keystone_px * (np.clip(fraction, 0.0, 1.0) - 0.5)
 

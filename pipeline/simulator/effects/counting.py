@@ -1,7 +1,7 @@
 """The readout: draws of shot and read noise, and the effects dark current, defects, saturation and quantisation.
 
-Every element takes one deviate, whatever its light. The count of photons grows with both: two images of nearly the same
-light have nearly the same noise, and their difference is that of the light.
+Every element takes one deviate, whatever its light. The count of photons grows with both. So two images of nearly the
+same light have nearly the same noise, and their difference is that of the light.
 """
 
 from __future__ import annotations
@@ -50,11 +50,10 @@ def normal_deviates(rng: np.random.Generator, count: int) -> Radiance:
 
 
 def photon_counts(expected: Radiance, deviate: Radiance) -> Radiance:
-    """Give exact Poisson counts: the quantile of each deviate's probability; 0 where 0 or less is expected.
+    """Return exact Poisson counts: the quantile of each deviate's probability; 0 where 0 or less is expected.
 
-    ``expected``: Electrons, any shape, finite. [e-]
-    ``deviate``: Standard normal, the same shape.
-    Returns the same shape, whole numbers (above 2^24 as near as float32 comes). [e-]
+    ``expected``: Electrons, any shape, finite. [e-] ``deviate``: Standard normal, the same shape. Returns the same
+    shape, whole numbers (above 2^24 as near as float32 comes). [e-]
     """
     counts = np.zeros(expected.size, np.float32)
     mean, normal = expected.reshape(-1), deviate.reshape(-1)
@@ -72,7 +71,7 @@ def photon_counts(expected: Radiance, deviate: Radiance) -> Radiance:
 
 
 def rounded_counts(expected: Radiance, deviate: Radiance) -> Radiance:
-    """Give nearly Poisson counts: mean, variance and third cumulant are right; for `least_expected` on.
+    """Return nearly Poisson counts: mean, variance and third cumulant are right; for `least_expected` on.
 
     The first terms of the quantile's expansion, as `photon_counts` has it. Rounding and the square add 5/36 to the
     variance, which is taken off before.
@@ -89,8 +88,8 @@ def rounded_counts(expected: Radiance, deviate: Radiance) -> Radiance:
 def divergence(expected: Floats, read_noise_e: float) -> Floats:
     """Bound how far one cheap draw's distribution is from the exact one's (chi-square divergence).
 
-    The leading terms of its Gram-Charlier expansion: c2^2 / 2 + c4^2 / 24 of the differences of variance and fourth
-    cumulant, in units of the standard deviation. Without read noise that is 1 / (216 expected^2).
+    These are the leading terms of its Gram-Charlier expansion: c2^2 / 2 + c4^2 / 24. c2 and c4 are the differences of
+    variance and fourth cumulant, in units of the standard deviation. Without read noise that is 1 / (216 expected^2).
     """
     variance = np.maximum(expected + read_noise_e**2, np.finfo(float).tiny)
     fraction = expected / variance
@@ -101,10 +100,10 @@ def divergence(expected: Floats, read_noise_e: float) -> Floats:
 
 @lru_cache
 def least_expected(read_noise_e: float) -> float:
-    """Give from how many expected electrons on cheap draws may stand for exact ones; 0 is at any light.
+    """Return from how many expected electrons on cheap draws may stand for exact ones; 0 is at any light.
 
-    From there on, a patch of `CHIP_SAMPLES` cheap numbers and one of exact ones have a total variation of at most
-    sqrt(N divergence) / 2 <= `MOST_VARIATION`.
+    From there on, a patch of `CHIP_SAMPLES` cheap numbers and one of exact ones are close: their total variation is at
+    most sqrt(N divergence) / 2 <= `MOST_VARIATION`.
     """
     levels = np.geomspace(1e-3, 1e6, 4096)
     too_far = divergence(levels, read_noise_e) * CHIP_SAMPLES > (2 * MOST_VARIATION) ** 2
@@ -112,13 +111,13 @@ def least_expected(read_noise_e: float) -> float:
 
 
 def chip_variation(read_noise_e: float) -> float:
-    """Give the greatest total variation between a patch of cheap numbers and one of exact ones, where cheap is used."""
+    """Return the greatest total variation between a patch of cheap numbers, where these are used, and an exact one."""
     levels = np.geomspace(max(least_expected(read_noise_e), 1e-3), 1e6, 4096)
     return float(np.sqrt(CHIP_SAMPLES * divergence(levels, read_noise_e).max()) / 2)
 
 
 def separable(sd: float, other: float) -> float:
-    """Twice the total variation between two normal distributions of one mean: the deviations that noise counts.
+    """Return twice the total variation distance of two normal distributions of one mean and these deviations.
 
     0 where both are alike, 2 where one has no spread. Their densities cross at x^2 = 2 ln(a / b) / (1 / b^2 - 1 / a^2).
     """
@@ -133,14 +132,14 @@ def separable(sd: float, other: float) -> float:
 
 
 def _series_quantile(mean: Floats, z: Floats) -> Floats:
-    """Poisson quantile at Phi(z) for means from `SERIES_FROM_E` on.
+    """Return the Poisson quantile at Phi(z) for means from `SERIES_FROM_E` on.
 
     C(x) = Gamma(x, mean) / Gamma(x) runs smoothly through the distribution, F(k) = C(k + 1): where C(x) = Phi(z), the
-    quantile is floor(x). x is expanded in 1 / sqrt(mean) [1]; where it comes as near to a whole number as the expansion
+    quantile is floor(x). x is expanded in 1 / sqrt(mean) [1]. If it comes as near to a whole number as the expansion
     may err, the distribution itself is asked.
 
-    [1] Giles, "Algorithm 955: approximation of the inverse Poisson cumulative distribution function", ACM Trans.
-           Math. Softw. 42, 2016. doi:10.1145/2699466
+    [1] Giles, "Algorithm 955: approximation of the inverse Poisson cumulative distribution function", ACM Trans. Math.
+    Softw. 42, 2016. doi:10.1145/2699466
     """
     root, square = np.sqrt(mean), z * z
     x = mean + root * z
@@ -157,7 +156,7 @@ def _series_quantile(mean: Floats, z: Floats) -> Floats:
 
 
 def _summed_quantile(mean: Floats, z: Floats) -> Floats:
-    """Poisson quantile at Phi(z) for small means: how many of the sums of probabilities lie below."""
+    """Return the Poisson quantile at Phi(z) for small means: the number of cumulative probabilities below it."""
     counts = np.zeros_like(mean)
     asked = scipy.special.ndtr(z)
     chance = np.exp(-mean)
@@ -217,7 +216,7 @@ def warmth(temperature_deg_c: float) -> float:
 
 
 def band_gap_ev(kelvin: float) -> float:
-    """Silicon's band gap by Varshni's formula with the constants of [1]. [eV]"""
+    """Return silicon's band gap by Varshni's formula with the constants of [1]. [eV]"""
     return 1.1557 - 7.021e-4 * kelvin**2 / (1108 + kelvin)
 
 
@@ -227,7 +226,7 @@ def _log_generation(temperature_deg_c: float) -> float:
 
 
 def dark_electrons(rig: Rig) -> float:
-    """Give the expected dark electrons of one exposure in a sound element; 0 in an ideal sensor. [e-]"""
+    """Return the expected dark electrons of one exposure in a sound element; 0 in an ideal sensor. [e-]"""
     if rig.detector.noiseless:
         return 0.0
     seconds = rig.camera.exposure_ms * 1e-3
@@ -256,19 +255,19 @@ class Defects(Effect):
 
 
 def dead_elements(rig: Rig, bands: int) -> Mask:
-    """Give the elements without response, (sample, band) of the whole camera."""
+    """Return the elements without response, (sample, band) of the whole camera."""
     return _mask(rig.detector.unit, "dead", rig.camera.samples, bands, fraction=rig.detector.dead_fraction)
 
 
 def hot_electrons(rig: Rig, bands: int) -> Radiance:
-    """Give what hot elements add in one exposure, (sample, band) of the whole camera. [e-]"""
+    """Return the electrons that hot elements add in one exposure, (sample, band) of the whole camera [e-]."""
     detector = rig.detector
     mask = _mask(detector.unit, "hot", rig.camera.samples, bands, fraction=detector.hot_fraction)
     return mask * np.float32(most_hot_electrons(rig))
 
 
 def most_hot_electrons(rig: Rig) -> float:
-    """Give what a hot element adds in one exposure; 0 where the sensor has none, or is ideal. [e-]"""
+    """Return the electrons that a hot element adds in one exposure [e-]; 0 where the sensor has none, or is ideal."""
     detector = rig.detector
     if detector.noiseless or not detector.hot_fraction:
         return 0.0
@@ -331,7 +330,7 @@ class Shot(Effect):
     cost_ns = MappingProxyType({EXACT: 10.0, GAUSSIAN: 3.9})  # of light above `SERIES_FROM_E`
 
     def cost_at(self, probe: Probe, rig: Rig) -> Mapping[str, float]:
-        """Give the cost at the light along the probe's lines: few electrons are counted one by one.
+        """Return the cost at the light along the probe's lines: few electrons are counted one by one.
 
         Cheap draws pay for the exact ones that stand in for them where too few electrons are expected.
         """
@@ -368,7 +367,7 @@ class Shot(Effect):
 
 
 def in_unit(deviations: float, sd_e: float, probe: Probe, rig: Rig) -> float:
-    """Give deviations of a noise of ``sd_e`` in each sample [e-] in the unit of the probe."""
+    """Return deviations of a noise of ``sd_e`` in each sample [e-] in the unit of the probe."""
     if probe.unit == "sigma":
         return deviations
     return deviations * sd_e * float(np.sqrt(probe.binning)) / rig.camera.electrons_per_dn
@@ -376,7 +375,7 @@ def in_unit(deviations: float, sd_e: float, probe: Probe, rig: Rig) -> float:
 
 @dataclass(frozen=True)
 class ReadNoise(Effect):
-    """Normal, with the camera's standard deviation. In one draw with the shot noise where that is not exact.
+    """Normal, with the camera's standard deviation. It is one draw with the shot noise where that is not exact.
 
     Noise counts twice the total variation between the distributions of a sample with and without: see `separable`.
     """
@@ -385,7 +384,7 @@ class ReadNoise(Effect):
     cost_ns = MappingProxyType({"exact": 3.2})
 
     def merged(self, rig: Rig) -> Merged | None:
-        """Give what it costs in the shot noise's draw: nothing, where no well comes between them."""
+        """Return what it costs in the shot noise's draw: nothing, where no well comes between them."""
         if rig.camera.read_noise_e < LEAST_MERGED_READ_E or well_reached(rig, rig.camera.read_noise_e):
             return None
         return Merged(SHOT.name, GAUSSIAN, 0.0)

@@ -1,8 +1,8 @@
 """Effects in general: a name, variants from exact to cheap, a bound on the error of each, a cost, and an action.
 
-It works at one of six places of the chain, in this order: the mirror looks elsewhere (``Aim``), rays meet the scene
-elsewhere (``Displacement``), the footprint is blurred or shifted band by band (``Blur``), light is multiplied
-(``Gain``) or changed (``LightChange``), electrons are read out. All before the readout are linear in the light.
+It works at one of six places of the chain, in this order. The mirror looks elsewhere (``Aim``); rays meet the scene
+elsewhere (``Displacement``). The footprint is blurred or shifted band by band (``Blur``); light is multiplied
+(``Gain``) or changed (``LightChange``); electrons are read out. All before the readout are linear in the light.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Effect(Protocol):
 
     @property
     def name(self) -> str:
-        """Return what flags, manifest and streams call it."""
+        """Return the effect's name in flags, manifest and streams."""
 
     @property
     def cost_ns(self) -> Mapping[str, float]:
@@ -78,35 +78,35 @@ class Aim(Effect, Protocol):
     """The mirror looks beside its plan."""
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
-        """Give how far, (line, step, 2) along the line and the scan at every held position; step may be 1. [px]"""
+        """Return the displacement, (line, step, 2) along line and scan at every held position [px]; step may be 1."""
 
 
 class Displacement(Effect, Protocol):
     """Rays meet the scene elsewhere than at its plane's own place."""
 
     def displaced(self, block: SweepBlock, along_px: Floats, scan_px: Floats, variant: str) -> tuple[Floats, Floats]:
-        """Give what to add to scene points (line, sample): along the line and the scan. [px]"""
+        """Return the displacement to add to scene points (line, sample): along the line and the scan [px]."""
 
 
 class Blur(Effect, Protocol):
     """The footprint is blurred by a kernel that is not negative and sums to 1; kernels of all blurs are folded."""
 
     def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
-        """Give what it does to each band; ``normal`` (3,) is the mirror's in the camera frame, None at rest."""
+        """Return what it does to each band; ``normal`` (3,) is the mirror's in the camera frame, None at rest."""
 
 
 class Gain(Effect, Protocol):
     """Light is multiplied."""
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
-        """Give the factor, an array that broadcasts to (line, sample, band)."""
+        """Return the factor, an array that broadcasts to (line, sample, band)."""
 
 
 class LightChange(Effect, Protocol):
     """Light is changed in another linear way: spectra mixed, light added."""
 
     def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
-        """Give the changed light of a block, (line, sample, band) [e-]; may work in place."""
+        """Return the changed light of a block, (line, sample, band) [e-]; may work in place."""
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ class SweepBlock:
         return self.sweep.line_px()[self.numbers]
 
     def stream(self, effect: str, number: int) -> np.random.Generator:
-        """Give an effect's random stream at one line: blocks, order and other effects never change it."""
+        """Return an effect's random stream at one line: blocks, order and other effects never change it."""
         return _stream(self.seed, self.sweep.name, effect, number)
 
 
@@ -174,11 +174,11 @@ def survey_stream(seed: int, effect: str) -> np.random.Generator:
 
 
 def unit_stream(unit: int, effect: str) -> np.random.Generator:
-    """Give the stream of what belongs to one copy of the rig, whatever it looks at: its fixed patterns."""
+    """Return the stream of what belongs to one copy of the rig, whatever it looks at: its fixed patterns."""
     return _stream(unit, effect)
 
 
 def _stream(entropy: int, *key: str | int) -> np.random.Generator:
-    """Give a stream whose key is hashed to its state; words of SFC64 take half the time of a counter-based Philox."""
+    """Return a stream whose key is hashed to its state; words of SFC64 take half the time of a counter-based Philox."""
     words = [zlib.crc32(one.encode()) if isinstance(one, str) else one for one in key]
     return np.random.Generator(np.random.SFC64(np.random.SeedSequence(entropy=entropy, spawn_key=words)))

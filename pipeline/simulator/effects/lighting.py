@@ -27,8 +27,8 @@ _PROBES = 65  # lines of a sweep, and samples of a line, at which angles are tak
 class Drift(Gain):
     """Light at a line's mid exposure over the light at the survey's start, to which the scene is stated.
 
-    It is SPECTRL2 under a clear sky. A survey that starts in the night is relative to the light of a sun 1 deg high;
-    with the sun at the horizon or below the light is 0. Without a time of day there is none.
+    It is SPECTRL2 under a clear sky. A survey that starts in the night is relative to the light of a sun 1 deg high.
+    The light is 0 with the sun at the horizon or below. Without a time of day there is none.
     """
 
     name = "drift"
@@ -93,7 +93,7 @@ class Cloud(Gain):
         return GainRange.between(1 - fraction, 1.0, len(probe.wavelength_nm), uneven=fraction)
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
-        """Give 1 less what the shadow takes at each sample's place and time, (line, sample, 1); (1, 1, 1) if clear."""
+        """Return 1 less the cloud's shadow at each sample's place and time, (line, sample, 1); (1, 1, 1) if clear."""
         sky = block.rig.sky
         if sky.cloud_fraction == 0:
             return np.ones((1, 1, 1), np.float32)
@@ -107,7 +107,7 @@ class Cloud(Gain):
 
 
 def shadow(way_px: Floats, size_px: float) -> Floats:
-    """Give how much of a cloud lies between the sun and points so far along its way, 0 to 1; the period is 2 sizes.
+    """Return the fraction of a cloud between the sun and points so far along its way, 0 to 1; the period is 2 sizes.
 
     It is 1 about every even multiple of the size, 0 about the odd ones, 1/2 in the middle of an edge.
     """
@@ -149,7 +149,7 @@ class Brdf(Gain):
         return GainRange.between(least, greatest, bands, uneven=greatest - least)
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
-        """Give 1 + b a + h exp(-phase / 2 deg) of each sample's direction, (line, sample, 1), 0 where that is below."""
+        """Return 1 + b a + h exp(-phase / 2 deg) of each sample's direction, (line, sample, 1), at least 0."""
         sky = block.rig.sky
         if sky.brdf_per_rad == 0 and sky.hot_spot == 0:
             return np.ones((1, 1, 1), np.float32)
@@ -167,7 +167,7 @@ def _angles(sweep: Sweep, camera: LineCamera, scan_px: Floats, slopes: Floats) -
 
 
 def _extremes(sweeps: tuple[Sweep, ...], camera: LineCamera) -> tuple[float, float]:
-    """Greatest angle from the undeflected direction and least phase within the sweeps [rad]."""
+    """Return the greatest angle from the undeflected direction and least phase within the sweeps [rad]."""
     greatest, least = 0.0, np.inf
     for sweep in (sweep for sweep in sweeps if sweep.lines):
         ends = [np.linspace(0, count - 1, _PROBES).round().astype(int) for count in (sweep.lines, camera.samples)]

@@ -32,7 +32,7 @@ POSITIONS, FOLDED = "positions", "folded"
 
 
 def beside_plan_px(probe: Probe, rig: Rig) -> tuple[float, float]:
-    """Give how far beside its plan the rig may look by drift, hysteresis, jitter, turbulence and lag. [px]
+    """Return how far beside its plan the rig may look by drift, hysteresis, jitter, turbulence and lag. [px]
 
     Along the line and the scan. Lines lie turned by where the mirror looks: the farther from the middle, the more.
     """
@@ -95,8 +95,8 @@ class SlitBox(Effect):
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by half as much again as the probe measured; where it has not, by the box's variance and the span.
 
-        How a variant errs depends on what lies within the footprint, which no derivative of the image tells. What is
-        rounded in tables, and what lines turn more where the mirror looks beside its plan, add a little.
+        The error of a variant depends on the light within the footprint, which no derivative of the image gives.
+        Rounding in tables adds a little, and so do lines that turn more where the mirror looks beside its plan.
         """
         width, bands = rig.camera.slit_px, len(probe.wavelength_nm)
         why = f"{_words(variant)} in place of a footprint {width:.2g} px wide and 1 px long"
@@ -113,14 +113,14 @@ class SlitBox(Effect):
 
 
 def box_parts(variant: str, rig: Rig, views: RayViews) -> Parts:
-    """Give into how many boxes a variant parts the footprint, across and along, for views all over a sweep."""
+    """Return into how many boxes a variant parts the footprint, across and along, for views all over a sweep."""
     if variant in _STATED:
         return fewest_parts(_STATED[variant], box_of(variant, rig), views)
     return _COUNTED.get(variant, (1, 1))
 
 
 def box_of(variant: str, rig: Rig) -> tuple[float, float]:
-    """Give the widths of slit and pixel; 0 where the footprint is off. [px]"""
+    """Return the widths of slit and pixel; 0 where the footprint is off. [px]"""
     return (0.0, 0.0) if variant == OFF else (rig.camera.slit_px, 1.0)
 
 
@@ -172,21 +172,24 @@ class Smear(Effect):
 
 
 def _courses(sweeps: tuple[Sweep, ...], rig: Rig) -> Iterator[Floats]:
-    """Ways of held positions beside their plan, (line, step), of each kind of sweep that has several. [px]"""
+    """Yield the paths of held positions beside their plan, (line, step) [px].
+
+    There is one for each kind of sweep that holds several positions a line.
+    """
     for sweep in {(one.lines, one.step): one for one in sweeps if one.lines and one.step > 1}.values():
         numbers = np.arange(sweep.lines)
         yield transient(rig, sweep, numbers) + beside_plan(rig.mirror.positions_per_line, sweep.step, numbers)
 
 
 def smeared_positions(block: SweepBlock, variant: str) -> Floats:
-    """Give the mirror positions (line, step, 2) at which a footprint stands in an exposure."""
+    """Return the mirror positions (line, step, 2) at which a footprint stands in an exposure."""
     if variant == POSITIONS and block.sweep.step > 1:
         return block.positions
     return block.middle[:, None]
 
 
 def folded_positions(sweep: Sweep, variant: str) -> int:
-    """Give how many held positions the footprint itself holds, 1 px apart along the scan."""
+    """Return the number of held positions that the footprint itself holds, 1 px apart along the scan."""
     return sweep.step if variant == FOLDED else 1
 
 

@@ -85,14 +85,14 @@ class Vignetting(Gain):
 
 
 def sweep_ends(probe: Probe, camera: LineCamera) -> Floats:
-    """Give o_z at the first and the last position of every sweep, (2 sweep,); it never turns round in between."""
+    """Return o_z at the first and the last position of every sweep, (2 sweep,); it never turns round in between."""
     ends = [sweep.held_px().ravel()[[0, -1]] for sweep in probe.sweeps]
     found = [ahead(sweep.swath_px, px, camera) for sweep, px in zip(probe.sweeps, ends, strict=True)]
     return np.concatenate(found) if found else np.zeros(0)
 
 
 def ahead(along_px: float, scan_px: Floats, camera: LineCamera) -> Floats:
-    """Give o_z, the part along the camera's axis, of the unit directions to points of the scene."""
+    """Return o_z, the part along the camera's axis, of the unit directions to points of the scene."""
     xi, eta = along_px * camera.ifov_rad, scan_px * camera.ifov_rad
     return eta / np.sqrt(1 + xi**2 + eta**2)
 
@@ -101,9 +101,9 @@ def ahead(along_px: float, scan_px: Floats, camera: LineCamera) -> Floats:
 class Polarisation(Gain):
     """Light goes with the coating's reflectance at the chief ray's incidence over that at rest, 45 deg.
 
-    By Fresnel for bare metal: from 20 to 70 deg aluminium goes from +0.5 to -3.7 % (mean of 400 to 1000 nm; -5.4 % at
-    820 nm), gold in the blue from -1.8 to +18 %. Valid for unpolarised light and a spectrograph that takes both
-    polarisations alike. One factor for each line and band, at mid exposure.
+    Fresnel's equations for bare metal give it. From 20 to 70 deg aluminium goes from +0.5 to -3.7 % (mean of 400 to
+    1000 nm; -5.4 % at 820 nm). Gold goes from -1.8 to +18 % in the blue. Valid for unpolarised light and a spectrograph
+    that takes both polarisations alike. One factor for each line and band, at mid exposure.
     """
 
     name = "polarisation"
@@ -141,7 +141,7 @@ class Polarisation(Gain):
 
 
 def _incidence(view_directions: Floats) -> Floats:
-    """Angle between chief ray and mirror normal where the mirror looks along unit directions of this o_z. [rad]"""
+    """Return the angle between chief ray and mirror normal for unit look directions with this o_z. [rad]"""
     return np.arccos(np.sqrt((1 - view_directions) / 2))
 
 
@@ -157,7 +157,7 @@ def _factors_between(incidence_rad: Floats, rig: Rig, wavelength_nm: Floats) -> 
 def reflectance(coating: Coating, wavelength_nm: Floats, incidence_rad: Floats) -> Floats:
     """Return the fraction of unpolarised light that a coating reflects, (incidence, band): both polarisations' mean.
 
-    Valid from 311 to 1937 nm, and for films that no light passes (50 nm or more); beyond, the index of the nearest end
+    Valid from 311 to 1937 nm, and for films that no light passes (50 nm or more). Beyond, the index of the nearest end
     is held.
     """
     if coating == "ideal":
@@ -169,7 +169,7 @@ def reflectance(coating: Coating, wavelength_nm: Floats, incidence_rad: Floats) 
 
 
 def fresnel(index: Indices, incidence_rad: Floats) -> tuple[Floats, Floats]:
-    """Give what a surface in air reflects of light polarised across (s) and within (p) the plane of incidence [1]."""
+    """Return what a surface in air reflects of light polarised across (s) and within (p) the plane of incidence [1]."""
     cosine, square = np.cos(incidence_rad), index**2
     beyond = np.sqrt(square - np.sin(incidence_rad) ** 2)  # index times the cosine behind the surface
     across = np.abs((cosine - beyond) / (cosine + beyond)) ** 2

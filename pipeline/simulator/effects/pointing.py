@@ -34,10 +34,10 @@ _MOST_DEVIATES = 6.0  # beyond, one line in 5e8 lies
 
 
 def end_gains(sweep: Sweep, camera: LineCamera) -> Floats:
-    """Give the derivatives of a line's points (along, scan) by those of its centre, (line, point, 2, 2).
+    """Return the derivatives of a line's points (along, scan) by those of its centre, (line, point, 2, 2).
 
-    The points are the line's two ends and its centre, where the derivatives are 1 and 0. At the end of 320 px a
-    centre that moves by 1 px along the line moves the point by .034 px along the scan.
+    The points are the line's two ends and its centre, where the derivatives are 1 and 0. At the end of 320 px a centre
+    that moves by 1 px along the line moves the point by .034 px along the scan.
     """
     slopes = np.array([-0.5, 0.0, 0.5]) * camera.samples * camera.ifov_rad
     centre = sweep.line_px()[:, None]
@@ -63,8 +63,8 @@ def at_line_ends(sweeps: Iterable[Sweep], camera: LineCamera, along: float, scan
 class Jitter(Aim):
     """A normal deviate of the tilt about either axis, anew for every line.
 
-    At rest the view moves by 2 sigma in the plane of incidence, which is the scan's axis, and by sqrt(2) sigma across
-    it, along the line; elsewhere by the derivatives of the exact reflection.
+    At rest the view moves by 2 sigma in the plane of incidence, which is the scan's axis. Across it, along the line, it
+    moves by sqrt(2) sigma. Elsewhere the derivatives of the exact reflection say how far.
     """
 
     name = "jitter"
@@ -79,8 +79,8 @@ class Jitter(Aim):
         """Bound what the worst of all lines' deviates changes; with a probability of 1e-3 a survey goes beyond.
 
         A line changes by at most its slope's share in the two tilts times the length of the two deviates. That length
-        exceeds m with probability exp(-m^2 / 2), so any of n lines' does with at most n exp(-m^2 / 2): m is
-        sqrt(2 ln(n / 1e-3)), 5.4 for 2560 lines.
+        exceeds m with probability exp(-m^2 / 2), so any of n lines' does with at most n exp(-m^2 / 2). m is sqrt(2 ln(n
+        / 1e-3)), 5.4 for 2560 lines.
         """
         sigma, lines = _sigma_px(rig), probe.lines
         if sigma == 0 or lines == 0:
@@ -103,11 +103,11 @@ class Jitter(Aim):
 
 
 def tilt_to_scene(normals: Floats) -> Floats:
-    """Give the derivatives of scene tangents with respect to tilts of the mirror, (..., 2, 2).
+    """Return the derivatives of scene tangents with respect to tilts of the mirror, (..., 2, 2).
 
-    ``normals``: (..., 3) unit normals.
-    Returns rows are along the line and along the scan; columns a tilt about the axis most nearly in the plane of
-    incidence, which moves the view across that plane, and one about y, which moves it within. At rest diag(sqrt(2), 2).
+    ``normals``: (..., 3) unit normals. Returns rows are along the line and along the scan. Columns are a tilt about the
+    axis most nearly in the plane of incidence, and one about y. The first moves the view across that plane, the second
+    within it. At rest diag(sqrt(2), 2).
     """
     within = np.stack([normals[..., 2], np.zeros_like(normals[..., 0]), -normals[..., 0]], axis=-1)  # y x n
     within /= np.hypot(normals[..., 2], normals[..., 0])[..., None]
@@ -171,10 +171,10 @@ class ThermalDrift(Aim):
 
 
 def pointing_field(unit: int, position: Floats) -> Floats:
-    """Give a smooth field over the disk, (..., 2) for positions (..., 2); between -1 and 1 on it. [-]
+    """Return a smooth field over the disk, (..., 2) for positions (..., 2); between -1 and 1 on it. [-]
 
-    A sum of the six Zernike polynomials up to degree 2 in the disk's own coordinates, each at most 1 in size, with
-    normal deviates for weights whose sizes sum to 1.
+    It is a sum of the six Zernike polynomials up to degree 2 in the disk's own coordinates, each at most 1 in size.
+    Their weights are normal deviates, scaled so that their sizes sum to 1.
     """
     x, y = position[..., 0], position[..., 1]
     modes = np.stack([np.ones_like(x), x, y, 2 * (x * x + y * y) - 1, x * x - y * y, 2 * x * y], axis=-1)
@@ -188,7 +188,7 @@ def _course(rig: Rig, sweep: Sweep, position: Floats) -> Floats:
 
 
 def scan_sign(sweep: Sweep) -> float:
-    """Give 1 for a scan towards greater coordinates (or one that stands still), -1 for one that comes back."""
+    """Return 1 for a scan towards greater coordinates (or one that stands still), -1 for one that comes back."""
     held = sweep.held_px().ravel()
     return -1.0 if len(held) > 1 and held[-1] < held[0] else 1.0
 
@@ -207,11 +207,11 @@ class Pointing(Aim, ABC):
     @property
     @abstractmethod
     def reach_px(self) -> tuple[float, float]:
-        """Return how far it looks beside at most, along the line and the scan [px]."""
+        """Return the greatest displacement, along the line and the scan [px]."""
 
     @abstractmethod
     def of_lines(self, sweep_name: str, lines: range) -> Floats:
-        """Give the error of some lines of a sweep, (line, 2) along the line and the scan [px]."""
+        """Return the error of some lines of a sweep, (line, 2) along the line and the scan [px]."""
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
         return self.of_lines(block.sweep.name, block.lines)[:, None]
@@ -229,9 +229,9 @@ class Pointing(Aim, ABC):
 class PointingErrors(Pointing):
     """Errors of the mirror's reported places, in px of the scene along the line and the scan.
 
-    Every sweep has an offset drawn evenly from ``-offset_px`` to ``offset_px`` in either axis, and every line a
-    normal deviate of ``jitter_px`` rms in either. Each is drawn from a stream of its own, keyed (seed, sweep name) and
-    (seed, sweep name, line number): no line's error depends on which others were asked for.
+    Every sweep has an offset drawn evenly from ``-offset_px`` to ``offset_px`` in either axis, and every line a normal
+    deviate of ``jitter_px`` rms in either. Each is drawn from a stream of its own, keyed (seed, sweep name) and (seed,
+    sweep name, line number). So no line's error depends on which others are computed.
     """
 
     offset_px: float = ACCURACY_PX
@@ -251,11 +251,11 @@ class PointingErrors(Pointing):
         return most, most
 
     def offset(self, sweep_name: str) -> Floats:
-        """Give the systematic error of a sweep, (2,) along the line and the scan [px]."""
+        """Return the systematic error of a sweep, (2,) along the line and the scan [px]."""
         return self._stream(sweep_name).uniform(-self.offset_px, self.offset_px, 2)
 
     def of_lines(self, sweep_name: str, lines: range) -> Floats:
-        """Give the whole error of some lines of a sweep, (line, 2) along the line and the scan [px]."""
+        """Return the whole error of some lines of a sweep, (line, 2) along the line and the scan [px]."""
         jitter = np.array([self._stream(sweep_name, number).standard_normal(2) for number in lines]).reshape(-1, 2)
         return self.offset(sweep_name) + self.jitter_px * jitter
 
@@ -276,7 +276,7 @@ class CommonOffset(Pointing):
         return abs(self.offset_px[0]), abs(self.offset_px[1])
 
     def of_lines(self, sweep_name: str, lines: range) -> Floats:
-        """Give the error of some lines, (line, 2) along the line and the scan [px]."""
+        """Return the error of some lines, (line, 2) along the line and the scan [px]."""
         return np.tile(np.array(self.offset_px, np.float64), (len(lines), 1))
 
 
@@ -321,10 +321,10 @@ class Staircase(Aim):
 
 
 def beside_plan(positions: float, step: int, numbers: NDArray[np.int64], parts: int = 1) -> Floats:
-    """Give the mean position less the planned one in each part of each held px of path, (line, step * parts). [px]
+    """Return the mean position less the planned one in each part of each held px of path, (line, step * parts). [px]
 
     Held positions are ``1 / positions`` px apart. Within a time t, counted in px of path, the mirror lags the ramp by
-    frac(positions * t) / positions; what that has of its mean is the result.
+    frac(positions * t) / positions. The result is the difference of that from its mean.
     """
     edges = np.arange(step * parts + 1) / parts
     place = positions * (numbers[:, None] * float(step) + edges)
@@ -338,7 +338,7 @@ def beside_plan(positions: float, step: int, numbers: NDArray[np.int64], parts: 
 
 
 def _parts(positions: float, step: int, variant: str) -> int:
-    """Equal parts of an exposure; positions a / b change at multiples of 1 / a of it."""
+    """Return how many equal parts an exposure has; positions a / b change at multiples of 1 / a of it."""
     if variant == CENTRES or step > 1:
         return 1
     ratio = Fraction(positions).limit_denominator(1000)
@@ -364,9 +364,9 @@ class Lag(Aim):
     """Mirror lag and overshoot: what is left of the start of a sweep, as the mean shift over each held position.
 
     The mirror follows its commands as a second-order system, x'' + 2 zeta x' + x = 0 in units of 1 / natural frequency.
-    Calibration takes away the way that one in steady motion lies behind; what is left is the free oscillation between
-    it and a mirror that starts from rest. Before a sweep it has flown back by the sweep's length, has had ``settled_s``
-    to come to rest one held position ahead, and takes the first step as line 0 begins.
+    Calibration takes away the way that one in steady motion lies behind. The remainder is the free oscillation between
+    it and a mirror that starts from rest. Before a sweep it has flown back by the sweep's length, and has had
+    ``settled_s`` to come to rest one held position ahead. It takes the first step as line 0 begins.
     """
 
     name = "lag"
@@ -385,7 +385,7 @@ class Lag(Aim):
 
 
 def greatest_lag_px(rig: Rig, sweeps: Iterable[Sweep]) -> float:
-    """Give the greatest shift along the scan of any line. [px]"""
+    """Return the greatest shift along the scan of any line. [px]"""
     worst = 0.0
     for sweep in {(one.lines, one.step): one for one in sweeps if one.lines}.values():
         numbers = np.arange(sweep.lines)
@@ -395,7 +395,7 @@ def greatest_lag_px(rig: Rig, sweeps: Iterable[Sweep]) -> float:
 
 
 def transient(rig: Rig, sweep: Sweep, numbers: NDArray[np.int64]) -> Floats:
-    """Give the mean shift along the scan over each held position of some lines, (line, step). [px]"""
+    """Return the mean shift along the scan over each held position of some lines, (line, step). [px]"""
     camera, mirror = rig.camera, rig.mirror
     pace = 2 * math.pi * mirror.natural_hz * 1e-3  # [1/ms]
     period, held = pace * camera.frame_ms, pace * camera.exposure_ms / sweep.step
@@ -412,10 +412,11 @@ def transient(rig: Rig, sweep: Sweep, numbers: NDArray[np.int64]) -> Floats:
 
 
 def responses(time: Floats, damping: float) -> tuple[Floats, Floats]:
-    """Give the responses to a unit impulse and to a unit step, of a system with natural frequency 1 rad/s.
+    """Return the responses to a unit impulse and to a unit step, of a system with natural frequency 1 rad/s.
 
     ``time`` (...) is times that frequency, from 0 on [rad]. With g the first and h the second, the matrix exponential
-    of the free system is [[1 - h, g], [-g, 1 - h - 2 zeta g]]; by expm1 and sinc right below, at and above damping 1.
+    of the free system is [[1 - h, g], [-g, 1 - h - 2 zeta g]]. Computed by expm1 and sinc, it is accurate below, at and
+    above damping 1.
     """
     with np.errstate(under="ignore"):
         if damping <= 1:
@@ -433,7 +434,7 @@ def responses(time: Floats, damping: float) -> tuple[Floats, Floats]:
 
 
 def _early_rise(time: Floats, damping: float) -> Floats:
-    """The step response by its Taylor series, from h'' + 2 zeta h' + h = 1: where 1 - rest would cancel."""
+    """Return the step response by its Taylor series, from h'' + 2 zeta h' + h = 1, where 1 - rest would cancel."""
     before, term = np.zeros_like(time), time**2 / 2
     total = term.copy()
     for order in range(3, _TERMS):
@@ -445,8 +446,8 @@ def _early_rise(time: Floats, damping: float) -> Floats:
 def _at_start(mirror: MirrorMotion, sweep: Sweep, period: float, held: float) -> Floats:
     """State (place [px], rate) as line 0 begins: at rest, less steady motion; and what is left of the way back.
 
-    A mirror in steady motion has the errors of all steps before: a geometric series over lines, I - exp(A period) its
-    denominator, whose determinant h^2 + 2 zeta h g + g^2 is a sum.
+    A mirror in steady motion has the errors of all steps before, a geometric series over lines. Its denominator is I -
+    exp(A period), whose determinant h^2 + 2 zeta h g + g^2 is a sum.
     """
     damping = mirror.damping
     times, height, every = _steps(mirror, sweep, period, held)
@@ -462,7 +463,7 @@ def _at_start(mirror: MirrorMotion, sweep: Sweep, period: float, held: float) ->
 
 
 def _steps(mirror: MirrorMotion, sweep: Sweep, period: float, held: float) -> tuple[Floats, float, float]:
-    """Times from the steps of one pattern before the sweep to its start, the steps' height, the pattern's length.
+    """Return times from a pattern's steps before the sweep to its start, the steps' heights, and the pattern's length.
 
     A pattern is a line with its number of positions, rounded, or one position that is held for several lines.
     """

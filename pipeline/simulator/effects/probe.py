@@ -48,10 +48,10 @@ class Detail:
 class Probe:
     """Maxima over the samples of a few lines, band by band, as the footprint of slit and pixel alone shows the scene.
 
-    All but the electrons are over the unit of the tolerance: one standard deviation of the noise of the number that is
-    stored, or one DN of it. Where that sums ``binning`` samples, a maximum is of the mean of their sizes over the noise
-    of their mean: a change of whatever sign at each of them is bounded, and only as far as needed where they differ.
-    Axis 0 of ``slope`` and ``curvature`` is (along the line, along the scan).
+    All but the electrons are over the unit of the tolerance. That is one standard deviation of the noise of the stored
+    number, or one DN of it. If that sums ``binning`` samples, a maximum is of the mean of their sizes over the noise of
+    their mean. So a change of any sign at each of them is bounded, and only as far as needed where they differ. Axis 0
+    of ``slope`` and ``curvature`` is (along the line, along the scan).
     """
 
     unit: Unit
@@ -83,7 +83,7 @@ class Probe:
     ends_e: Floats | None = None  # (2, band) least and greatest light of all the scene, None as `anywhere` [e-]
 
     def within(self, reach_px: float) -> Probe:
-        """Give the probe of what lies no farther from the samples: it has the greatest slope, curvature and span there.
+        """Return the probe of the light no farther from the samples, with the greatest slope, curvature and span there.
 
         Farther than has been looked, light changes by at most the greatest difference in a px.
         """
@@ -97,7 +97,7 @@ class Probe:
         return found if spectral is None else replace(found, spectral_slope=spectral[0], spectral_curvature=spectral[1])
 
     def blurred_by(self, sd_px: float) -> Probe:
-        """Give the probe of what a Gaussian of this size sees of the scene, its derivatives among it."""
+        """Return the probe of what a Gaussian of this size sees of the scene, its derivatives among it."""
         wide = self.afar is not None and sd_px > WIDE_PX
         return self.with_detail(self.afar) if wide and self.afar else self.within(_FAR_SDS * sd_px)
 
@@ -114,9 +114,9 @@ class Probe:
     def change_blurred(self, variance_px2: Floats, mean_way: float = 1.0) -> Floats:
         """Bound what it changes in each band, (band,): C s^2 / 2, or G E|x| where that is less, or the span.
 
-        E|x| is ``mean_way`` times s, at most 1; the smaller bound takes over where the image is a step or a point. What
-        lies beside the sweeps counts as far as the kernel reaches, and beyond by the fraction of it that does; a wide
-        Gaussian is a narrow one, and one of the rest of its variance that sees means of several pixels.
+        E|x| is ``mean_way`` times s, at most 1; the smaller bound takes over where the image is a step or a point.
+        Light beside the sweeps counts as far as the kernel reaches, and beyond by the fraction of it that does. A wide
+        Gaussian is taken as a narrow one, followed by one of the remaining variance over means of several pixels.
         """
         widest = float(np.sqrt(np.max(variance_px2, initial=0.0)))
         if self.anywhere is None or widest == 0:
@@ -134,7 +134,7 @@ class Probe:
         return np.asarray(np.minimum(self.change_blurred(narrow, mean_way) + wide, self.anywhere))
 
     def with_detail(self, detail: Detail) -> Probe:
-        """Give the same probe with the steepest and the most curved light of another place."""
+        """Return the same probe with the steepest and the most curved light of another place."""
         return replace(
             self,
             span=detail.span,
@@ -159,12 +159,12 @@ class Probe:
 
 
 def _times(steep: Floats, way: Floats | float) -> Floats:
-    """Their product; 0 where there is no way, however steep it is."""
+    """Return the product; 0 where ``way`` is 0, however steep."""
     return np.multiply(steep, way, out=np.zeros(np.shape(steep)), where=np.not_equal(way, 0))
 
 
 def stored_mean(light: NDArray[np.floating], binning: int) -> NDArray[np.floating]:
-    """Give the mean of each ``binning`` neighbours, (..., sample, band) -> (..., sample // binning, band).
+    """Return the mean of each ``binning`` neighbours, (..., sample, band) -> (..., sample // binning, band).
 
     A remainder is dropped, as in the raw lines.
     """
@@ -176,7 +176,7 @@ def stored_mean(light: NDArray[np.floating], binning: int) -> NDArray[np.floatin
 
 
 def noise_electrons(signal: NDArray[np.floating], rig: Rig, binning: int = 1) -> Radiance:
-    """Give one standard deviation of shot noise, read noise and quantisation at each signal; never 0. [e-]
+    """Return one standard deviation of shot noise, read noise and quantisation at each signal; never 0. [e-]
 
     ``signal`` is the mean of ``binning`` samples, each with noise of its own, and the noise is that of the mean.
     """
@@ -188,30 +188,30 @@ def noise_electrons(signal: NDArray[np.floating], rig: Rig, binning: int = 1) ->
 
 
 def unit_at(signal: NDArray[np.floating], rig: Rig, unit: Unit, binning: int = 1) -> Radiance:
-    """Give what a unit of the tolerance, of a number that sums ``binning`` samples, is of their mean signal. [e-]"""
+    """Return what a unit of the tolerance, of a number that sums ``binning`` samples, is of their mean signal. [e-]"""
     if unit == "sigma":
         return noise_electrons(signal, rig, binning)
     return np.full_like(signal, rig.camera.electrons_per_dn / binning)
 
 
 def fixed_variance(rig: Rig) -> float:
-    """Give the variance of read noise and quantisation, which light does not change. [e-^2]"""
+    """Return the variance of read noise and quantisation, which light does not change. [e-^2]"""
     camera = rig.camera
     return camera.read_noise_e**2 + camera.electrons_per_dn**2 / 12
 
 
 def unit_electrons(light_e: Floats, probe: Probe, rig: Rig) -> Floats:
-    """Give the unit of the probe at some light [e-]; what does not follow the light is the smallest unit met."""
+    """Return the unit of the probe at some light [e-]; what does not follow the light is the smallest unit met."""
     if probe.unit == "sigma" and not rig.detector.noiseless:
         return np.sqrt((np.maximum(light_e, 0.0) + fixed_variance(rig)) / probe.binning)
     return np.full_like(light_e, probe.unit_least_dn * rig.camera.electrons_per_dn)
 
 
 def lights_within(probe: Probe, rig: Rig) -> tuple[Floats, Floats]:
-    """Give least and greatest light of every band, (band,) each [e-]: where level and span have their units from.
+    """Return least and greatest light of every band, (band,) each [e-]: where level and span have their units from.
 
-    Where the probe does not hold them: with U(S)^2 = (S + n) / m for means of m samples, the greatest S has level
-    S / U(S), and the least a difference of span U to it, or a smaller.
+    Where the probe does not hold them: with U(S)^2 = (S + n) / m for means of m samples, the greatest S has level S /
+    U(S), and the least a difference of span U to it, or a smaller.
     """
     if probe.own_e is not None:
         return probe.own_e[0], probe.own_e[1]
@@ -245,7 +245,7 @@ class GainRange:
 
     @staticmethod
     def between(least: float, greatest: float, bands: int, *, uneven: float = 0.0) -> GainRange:
-        """The same in all bands."""
+        """Return the range from ``least`` to ``greatest``, the same in all bands."""
         no = np.zeros(bands)
         return GainRange(np.full(bands, least), np.full(bands, greatest), uneven, no, no, no, no, no)
 
@@ -265,20 +265,20 @@ def _differences(factors: Floats, wavelength_nm: Floats) -> tuple[Floats, Floats
 
 
 def rising_runs(wavelength_nm: Floats) -> list[slice]:
-    """Give the runs of bands whose wavelengths rise: where they fall back or stay, another detector begins."""
+    """Return the runs of bands whose wavelengths rise: where they fall back or stay, another detector begins."""
     breaks = np.flatnonzero(~(np.diff(wavelength_nm) > 0)) + 1
     ends = [0, *breaks.tolist(), len(wavelength_nm)]
     return [slice(start, stop) for start, stop in pairwise(ends)]
 
 
 def rising_gaps(wavelength_nm: Floats) -> Floats:
-    """Give the distances of neighbouring bands within runs. [nm]"""
+    """Return the distances of neighbouring bands within runs. [nm]"""
     gaps = np.diff(wavelength_nm)
     return gaps[gaps > 0]
 
 
 def difference_rates(wavelength_nm: Floats) -> Floats:
-    """Weights of the second difference D, (2, band): of the steps down and up to the neighbours. [1/nm^2]
+    """Return the weights of the second difference D, (2, band): of the steps down and up to the neighbours. [1/nm^2]
 
     D I = up (I_next - I) + down (I_last - I) is the second derivative of any parabola. 0 at both ends of a run.
     """
@@ -291,7 +291,7 @@ def difference_rates(wavelength_nm: Floats) -> Floats:
 
 
 def second_difference(spectra: NDArray[Real], wavelength_nm: Floats) -> NDArray[Real]:
-    """Give D I of spectra (..., band), as :func:`difference_rates` defines it. [1/nm^2]"""
+    """Return D I of spectra (..., band), as :func:`difference_rates` defines it. [1/nm^2]"""
     down, up = difference_rates(wavelength_nm).astype(spectra.dtype)
     steps, out = np.diff(spectra, axis=-1), np.zeros_like(spectra)
     out[..., :-1] = up[:-1] * steps
@@ -300,7 +300,7 @@ def second_difference(spectra: NDArray[Real], wavelength_nm: Floats) -> NDArray[
 
 
 def steepest_difference(spectra: NDArray[Real], wavelength_nm: Floats) -> NDArray[Real]:
-    """Give |I'| of spectra (..., band) towards the steeper neighbour of each band; 0 for a run of one band. [1/nm]"""
+    """Return |I'| of spectra (..., band) towards the steeper neighbour of each band; 0 for a run of one band. [1/nm]"""
     gaps = np.diff(wavelength_nm)
     rate = np.divide(1, gaps, out=np.zeros_like(gaps), where=gaps > 0).astype(spectra.dtype)
     steep, out = np.abs(np.diff(spectra, axis=-1)) * rate, np.zeros_like(spectra)
@@ -310,7 +310,7 @@ def steepest_difference(spectra: NDArray[Real], wavelength_nm: Floats) -> NDArra
 
 
 def spectral_differences_between(ends_e: Floats, wavelength_nm: Floats) -> Floats:
-    """Greatest divided differences, (2, band), of any spectra between two, (2, band): light of what is not looked at.
+    """Return the greatest divided differences, (2, band), of any spectra between two, (2, band): for unprobed light.
 
     Second differences are greatest where bands are at one end and their neighbours at the other.
     """

@@ -44,9 +44,9 @@ class BandGroup(NamedTuple):
 class Response(LightChange):
     """Each band is averaged over its neighbours so that variances add up to the rig's: fwhm_rig^2 - fwhm_scene^2.
 
-    ``exact`` is the heat kernel exp(v/2 D) of the bands' second divided difference D: no weight below 0, sum 1, mean 0
-    and variance v exactly, on bands at any distance. The first and the last band keep their light: what lies beyond
-    is not known.
+    ``exact`` is the heat kernel exp(v/2 D) of the bands' second divided difference D. It has no weight below 0, sum 1,
+    mean 0 and variance v exactly, on bands at any distance. The first and the last band keep their light: what lies
+    beyond is not known.
     """
 
     name = "response"
@@ -55,7 +55,7 @@ class Response(LightChange):
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it by I'' v / 2, or by I' sqrt(v) where that is less; 0 where the scene's bands are as wide.
 
-        The kernel solves a heat equation: the change is the mean of D I over the time v / 2, so the bound holds on any
+        The kernel solves a heat equation. The change is the mean of D I over the time v / 2, so the bound holds on any
         spectrum.
         """
         wavelength = np.asarray(probe.wavelength_nm, np.float64)
@@ -76,13 +76,13 @@ class Response(LightChange):
 
 
 def widen_bands(spectra: Radiance, wavelength_nm: Floats, fwhm_nm: Floats | None, wanted_nm: float) -> Radiance:
-    """Give spectra as bands of width ``wanted_nm`` see them; any linear measure of light, (..., band).
+    """Return spectra as bands of width ``wanted_nm`` see them; any linear measure of light, (..., band).
 
     Factors of light serve as well as light: (component, band) electrons.
 
     ``wavelength_nm``, ``fwhm_nm``: (band,) centres, and widths of the spectra's own bands; None or NaN where not known,
-    and then nothing is done.
-    Returns array of the same shape and type; ``spectra`` itself where its bands are all as wide already.
+    and then nothing is done. Returns array of the same shape and type; ``spectra`` itself where its bands are all as
+    wide already.
     """
     variance = missing_variance(wanted_nm, fwhm_nm, spectra.shape[-1])
     if not variance.any():
@@ -94,7 +94,7 @@ def widen_bands(spectra: Radiance, wavelength_nm: Floats, fwhm_nm: Floats | None
 
 
 def missing_variance(wanted_nm: float, fwhm_nm: Floats | None, bands: int) -> Floats:
-    """Give the variance that Gaussian bands lack to be ``wanted_nm`` wide, (band,); 0 where not known. [nm^2]"""
+    """Return the variance that Gaussian bands lack to be ``wanted_nm`` wide, (band,); 0 where not known. [nm^2]"""
     if fwhm_nm is None:
         return np.zeros(bands)
     widths = np.nan_to_num(np.asarray(fwhm_nm, np.float64), nan=np.inf, posinf=np.inf)
@@ -117,10 +117,10 @@ def _band_groups(wavelength_nm: tuple[float, ...], variance: tuple[float, ...]) 
 
 
 def _heat_kernel(wavelength_nm: Floats, variance: Floats) -> Floats:
-    """Rows of exp(v/2 D), (band, band), each with its own variance v.
+    """Return the rows of exp(v/2 D), (band, band), each with its own variance v.
 
     D leaves straight lines and both ends as they are. So a spectrum is parted into the line through its ends, which
-    stays, and a rest that is 0 there; on the rest D is a symmetric matrix after scaling by the root of the gaps.
+    stays, and a rest that is 0 there. On the rest D is a symmetric matrix after scaling by the root of the gaps.
     """
     bands = len(wavelength_nm)
     if bands < 3:
@@ -176,7 +176,7 @@ class Smile(LightChange):
         return Bound(steep * shift + min(bent, steep * shift * 2 * part * (1 - part)), why)
 
     def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
-        """Give light (line, sample, band) [e-] at the wavelengths that each sample sees; as it is without a smile."""
+        """Return light (line, sample, band) [e-] at the wavelengths that each sample sees; as it is without a smile."""
         camera, smile = block.rig.camera, block.rig.optics.smile_nm
         if smile == 0 or light.shape[-1] < 2:
             return light
@@ -188,7 +188,7 @@ class Smile(LightChange):
 
 
 def wavelength_shift(samples: int, smile_nm: float) -> Floats:
-    """Give by how much longer the wavelength of each sample is than its band's, (sample,). [nm]"""
+    """Return the excess of each sample's wavelength over its band's, (sample,) [nm]."""
     half = (samples - 1) / 2
     if half == 0:
         return np.zeros(samples)
@@ -197,7 +197,7 @@ def wavelength_shift(samples: int, smile_nm: float) -> Floats:
 
 @lru_cache(maxsize=4)
 def _tap_weights(wavelength_nm: tuple[float, ...], smile_nm: float, samples: int) -> tuple[int, NDArray[np.float32]]:
-    """Give the offset of the first tap and the weights of all, (tap, sample, band)."""
+    """Return the offset of the first tap and the weights of all, (tap, sample, band)."""
     wavelength, shift = np.array(wavelength_nm), wavelength_shift(samples, smile_nm)
     taps: list[tuple[slice, NDArray[np.int64], Floats]] = []
     for run in rising_runs(wavelength):
@@ -219,7 +219,7 @@ def _tap_weights(wavelength_nm: tuple[float, ...], smile_nm: float, samples: int
 
 
 def _run_taps(wavelength: Floats, shift: Floats) -> list[tuple[NDArray[np.int64], Floats]]:
-    """Taps of one run of rising wavelengths: which band beside its own, and how much of it, (sample, band) each."""
+    """Return the taps of one run of rising wavelengths, (sample, band) each: band offsets and their weights."""
     wanted = np.clip(wavelength + shift[:, None], wavelength[0], wavelength[-1])
     gap = np.clip(np.searchsorted(wavelength, wanted, side="right") - 1, 0, len(wavelength) - 2)
     width = np.diff(wavelength)[gap]
@@ -291,12 +291,12 @@ class Striping(Gain):
 
 
 def response_gain(rig: Rig, bands: int) -> Radiance:
-    """Give the gains of the sensor's elements, (sample, band) of the whole camera."""
+    """Return the gains of the sensor's elements, (sample, band) of the whole camera."""
     return _gains(rig.detector.unit, "prnu", rig.camera.samples, bands, fraction=rig.detector.prnu_std)
 
 
 def stripe_gain(rig: Rig) -> Radiance:
-    """Give the gains of the sensor's columns, (sample, 1) of the whole camera."""
+    """Return the gains of the sensor's columns, (sample, 1) of the whole camera."""
     return _gains(rig.detector.unit, "striping", rig.camera.samples, 1, fraction=rig.detector.striping_std)
 
 
@@ -318,8 +318,8 @@ def _gains(unit: int, kind: str, samples: int, bands: int, *, fraction: float) -
 class StrayLight(LightChange):
     """A fraction of all the light in a line is scattered over its detector: (1 - f) S + f K S. A band is a row.
 
-    Of it ``stray_even`` falls evenly, the rest as a Gaussian ``stray_halo_px`` wide (sd), reflected at the detector's
-    edges. K has no weight below 0 and keeps all light.
+    A fraction ``stray_even`` of it falls evenly, the rest as a Gaussian ``stray_halo_px`` wide (sd), reflected at the
+    detector's edges. K has no weight below 0 and keeps all light.
 
     The Gaussian passes only the slowest cosines of a frame, so it is a product with few of them.
     """
@@ -338,7 +338,7 @@ class StrayLight(LightChange):
         return Bound(optics.stray_fraction * spread + halo, why)
 
     def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
-        """Give the light after scattering; works in place."""
+        """Return the light after scattering; works in place."""
         optics = block.rig.optics
         if optics.stray_fraction == 0:
             return light
@@ -357,8 +357,8 @@ class StrayLight(LightChange):
 def _most_halo(probe: Probe, rig: Rig, spread: float) -> float:
     """Bound |H - mean| over the unit at any sample, H the halo's own light.
 
-    It is at most the light that the kernel takes elsewhere than an even one would, times the range of signals: the
-    brightest less the darkest, and never more than twice the greatest way from the mean. That is ``spread`` units,
+    It is at most the light that the kernel takes elsewhere than an even one would, times the range of signals, the
+    brightest less the darkest. It is never more than twice the greatest way from the mean. That is ``spread`` units,
     each at most the unit at the brightest sample.
     """
     elsewhere = _uneven_fraction((rig.camera.samples, len(probe.wavelength_nm)), rig.optics.stray_halo_px)
@@ -370,7 +370,7 @@ def _most_halo(probe: Probe, rig: Rig, spread: float) -> float:
 
 @lru_cache(maxsize=16)
 def _uneven_fraction(counts: tuple[int, ...], sd_px: float) -> float:
-    """Greatest fraction of a sample's halo that comes from elsewhere than if it were even: 1 narrow, 0 endless."""
+    """Return the greatest fraction of a sample's halo that differs from an even one: 1 narrow, 0 endless."""
     even = 1.0
     for count in counts:
         waves, passed = _cosines(count, sd_px)
@@ -381,7 +381,7 @@ def _uneven_fraction(counts: tuple[int, ...], sd_px: float) -> float:
 
 @lru_cache(maxsize=16)
 def _cosines(count: int, sd_px: float) -> tuple[Radiance, NDArray[np.float64]]:
-    """Orthonormal cosines (mode, count) that a Gaussian reflected at both ends passes, and the fraction it passes."""
+    """Return orthonormal cosines (mode, count), passed by a Gaussian reflected at both ends, and fractions passed."""
     passed = np.exp(-((np.pi * sd_px / count * np.arange(count)) ** 2) / 2)
     modes = np.arange(count)[passed > LEAST_MODE]
     waves = np.cos(np.pi / count * np.outer(modes, np.arange(count) + 0.5))

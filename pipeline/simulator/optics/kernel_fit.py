@@ -1,8 +1,8 @@
 """Footprints: slit, pixel and every blur folded to few kernels that all bands share; tables of their weights.
 
 A kernel is a box (the slit across the line, the pixel along it) convolved with a Gaussian of a shift and a variance of
-its own. Gaussians of a ladder of sizes, at a few of the bands' shifts, stand for all bands; what a sum passes of a wave
-is compared with the optical transfer function behind the footprint of slit, pixel and scene. Wide ones look at every
+its own. Gaussians of a ladder of sizes, at a few of the bands' shifts, stand for all bands. The waves that a sum passes
+are compared with the optical transfer function behind the footprint of slit, pixel and scene. Wide ones look at every
 second, fourth, ... pixel of the scene, blurred before: see `SceneRaster.thinned`.
 """
 
@@ -31,17 +31,17 @@ _SMOOTH = 0.6  # sd of the Gaussian about each point over the distance of rings,
 
 
 def disc_contrast(along: Floats, scan: Floats, axes: Axes) -> Floats:
-    """Give what an even elliptic disc of diameters ``axes`` [px] passes of waves [1/px]: 2 J1(v) / v."""
+    """Return the transmission of waves [1/px] by an even elliptic disc of diameters ``axes`` [px]: 2 J1(v) / v."""
     v = np.pi * np.hypot(axes[0] * along, axes[1] * scan)
     return np.asarray(np.where(v > 1e-6, 2 * scipy.special.j1(v) / np.maximum(v, 1e-6), 1.0))
 
 
 @lru_cache(maxsize=64)
 def disc_points(axes: Axes) -> tuple[Floats, Floats]:
-    """Give points (2, point) along line and scan [px], and the variance (2,) of a Gaussian about each [px^2].
+    """Return points (2, point) along line and scan [px], and the variance (2,) of a Gaussian about each [px^2].
 
-    All count alike. With the Gaussians they have the disc's mean and variance, a sixteenth of its diameters squared.
-    Small discs are one Gaussian; of very wide ones the edge is blurred.
+    All count alike. Together with the Gaussians they have the disc's mean and variance, a sixteenth of its diameters
+    squared. Small discs are one Gaussian; of very wide ones the edge is blurred.
     """
     radii = _rings(max(axes))
     counts = [1, *(6 * (ring + 1) for ring in range(len(radii)))]
@@ -53,7 +53,7 @@ def disc_points(axes: Axes) -> tuple[Floats, Floats]:
 
 
 def _rings(diameter: float) -> tuple[float, ...]:
-    """Radii over the disc's: each ring in the middle of as much of the disc's area as it has points, or nearly."""
+    """Return the radii over the disc's, one ring in the middle of each equal part of its area, or nearly."""
     for most, radii in _FITTED:
         if diameter <= most:
             return radii
@@ -108,7 +108,7 @@ class Kernels:
 def _fit(
     told: bytes, bands: int, box: tuple[float, float], held: int, disc: Axes
 ) -> tuple[Kernels, Floats, Floats, float]:
-    """Kernels, shares and their error for bands (6, band), no two alike: shift, variance and waves."""
+    """Return kernels, fractions and their error for bands (6, band), no two alike: shift, variance and waves."""
     moments = np.frombuffer(told).reshape(6, bands)
     if bands <= _OWN and not moments[4:].any():
         return Kernels(moments[:2], moments[2:4], np.ones(bands, np.intp)), np.eye(bands), np.eye(bands), 0.0
@@ -184,7 +184,7 @@ def _candidates(moments: Floats, place: Floats) -> Iterator[Kernels]:
 
 
 def _ladder(widest: Floats, core: float, ratio: float) -> list[tuple[float, int]]:
-    """Sizes [px, the smaller of along and scan] and the levels at which they are looked through."""
+    """Return the sizes [px, the smaller of along and scan] and the pyramid levels used for them."""
     wave = float(widest.min())
     least = min(_SHARPEST * wave, core)
     afar = 2 * _size_at(2)
@@ -198,7 +198,7 @@ def _ladder(widest: Floats, core: float, ratio: float) -> list[tuple[float, int]
 
 
 def _steps(shift: Floats) -> Floats:
-    """Return how far neighbouring nodes lie apart, (2, 1): what is between two of them is wider than either."""
+    """Return the distance of neighbouring nodes, (2, 1): light between two of them is wider than either."""
     if shift.shape[1] == 1:
         return np.zeros((2, 1))
     return np.asarray(np.abs(np.diff(shift, axis=1)).max(axis=1, keepdims=True))
@@ -209,7 +209,7 @@ def _size_at(level: int) -> float:
 
 
 def _nodes(moments: Floats, place: Floats, count: int) -> Floats:
-    """Moments (4, count) at even steps along the bands' curve, both ends among them; the middle alone."""
+    """Return the moments (4, count) at even steps along the bands' curve, with both ends; one node is its middle."""
     order = np.argsort(place)
     if count >= len(place):
         return moments[:, order]
@@ -219,7 +219,7 @@ def _nodes(moments: Floats, place: Floats, count: int) -> Floats:
 
 
 def _seen_at(level: int) -> Floats:
-    """Return what the pixels of a level, linear between each other, pass of the waves, (wave,)."""
+    """Return the transmission of waves by the pixels of a level, linear between each other, (wave,)."""
     passed: Floats = (np.sinc(level * _ALONG) * np.sinc(level * _SCAN)) ** 2
     while level > 1:
         level //= 2
@@ -228,14 +228,14 @@ def _seen_at(level: int) -> Floats:
 
 
 def _gaussian(shift: Floats, variance: Floats) -> Transfer:
-    """Return what Gaussians pass of the waves, (wave, kernel), with their phases."""
+    """Return the transmission of waves by Gaussians, (wave, kernel), with their phases."""
     turned = np.outer(_ALONG, shift[0]) + np.outer(_SCAN, shift[1])
     spread = np.outer(_ALONG**2, variance[0]) + np.outer(_SCAN**2, variance[1])
     return np.exp(-2j * np.pi * turned - 2 * np.pi**2 * spread)
 
 
 def _passed(kernels: Kernels, own: Floats) -> Transfer:
-    """Return what kernels pass of the waves behind slit and pixel, (wave, kernel)."""
+    """Return the transmission of waves by kernels behind slit and pixel, (wave, kernel)."""
     left = kernels.variance - THINNED * (kernels.level**2 - 1)
     seen = {level: _seen_at(level) for level in set(kernels.level.tolist())}
     through = own[:, None] * np.stack([seen[level] for level in kernels.level.tolist()], axis=1)
@@ -243,13 +243,16 @@ def _passed(kernels: Kernels, own: Floats) -> Transfer:
 
 
 def _wanted(moments: Floats, own: Floats) -> Transfer:
-    """Return what bands pass of the waves, (wave, band), for moments (6, band)."""
+    """Return the transmission of waves by bands, (wave, band), for moments (6, band)."""
     across = np.hypot(np.outer(_ALONG, moments[4]), np.outer(_SCAN, moments[5]))
     return (own * _seen_at(1))[:, None] * _gaussian(moments[:2], moments[2:4]) * pupil_contrast(across)
 
 
 def _fractions(passed: Transfer, wanted: Transfer) -> Floats:
-    """Shares (kernel, band) by least squares, none below 0 and of sum 1, by what kernels and bands pass of waves."""
+    """Return the fractions (kernel, band), none negative and of sum 1.
+
+    They are a least squares fit of what kernels and bands pass of waves.
+    """
     count, bands = passed.shape[1], wanted.shape[1]
     system = np.concatenate([passed.real, passed.imag, np.full((1, count), _SUM)])
     right = np.concatenate([wanted.real, wanted.imag, np.full((1, bands), _SUM)])
@@ -315,11 +318,11 @@ class Footprint:
 
     @property
     def mixing(self) -> Floats:
-        """Return how much each kernel counts in each band, (kernel, band); of sum 1 in each."""
+        """Return the weight of each kernel in each band, (kernel, band); of sum 1 in each."""
         return self.fractions @ self.between
 
     def afar(self, along: Floats, scan: Floats) -> Floats:
-        """Give the light at places (place,) some px beyond slit and pixel, (place, band). [1/px^2]
+        """Return the light at places (place,) some px beyond slit and pixel, (place, band). [1/px^2]
 
         Box, disc, held positions and pixels count by their variance: there they are small beside the Gaussians that
         reach.
@@ -332,7 +335,7 @@ class Footprint:
         return light @ self.mixing
 
     def windows(self) -> list[tuple[int, NDArray[np.intp]]]:
-        """Give the levels, and numbers of kernels that look at pixels of that level through one window."""
+        """Return the levels, and numbers of kernels that look at pixels of that level through one window."""
         found = []
         for level in np.unique(self.level):
             there = np.flatnonzero(self.level == level)
@@ -344,7 +347,7 @@ class Footprint:
         return found
 
     def by_parts(self) -> tuple[Footprint, Footprint | None]:
-        """Give the kernels whose box is parted, and those of pixels left out, which lie upright; None without any."""
+        """Return the kernels whose box is parted, and those of pixels left out, which lie upright; None without any."""
         fine = self.level == 1
         return self._some(fine), None if fine.all() else self._some(~fine)
 
@@ -353,9 +356,9 @@ class Footprint:
         return replace(self, shift=shift, variance=variance, fractions=fractions, level=self.level[which])
 
     def part(self, level: int, which: NDArray[np.intp]) -> Footprint:
-        """Give some kernels of a level, in its px. Beyond level 1 boxes lie upright: they are small beside Gaussians.
+        """Return some kernels of a level, in its px. Beyond level 1 boxes lie upright: they are small beside Gaussians.
 
-        What blurs a scene before pixels are left out is taken off the Gaussians.
+        Blur of the scene from leaving out pixels is taken off the Gaussians.
         """
         some = replace(self, fractions=self.fractions[which], level=self.level[which])
         shift, variance = self.shift[:, which], self.variance[:, which]
@@ -373,7 +376,7 @@ def fold(box: tuple[float, float], parts: tuple[int, int], held: int, blurs: Mom
 
     ``box``: widths of slit and pixel, across and along, 0 for none [px]. ``held``: positions 1 px apart along the scan.
     Returns the fewest kernels that change no wave of any band by more than `NEGLIGIBLE` of its amplitude, or the best
-    that were tried; no share is below 0, and they sum to 1.
+    that were tried. No share is below 0, and they sum to 1.
     """
     waves = blurs.waves if blurs.waves is not None and blurs.waves.any() else np.zeros_like(blurs.shift)
     told, band = np.unique(np.concatenate([blurs.shift, blurs.variance, waves]), axis=1, return_inverse=True)
@@ -397,7 +400,7 @@ _SDS = 6.5  # of a Gaussian: nothing beyond
 
 
 def box_weight(distance: Floats, width: float, held: int = 1) -> Floats:
-    """Give the linear kernel averaged over a box and over ``held`` positions 1 px apart, at distances [px]."""
+    """Return the linear kernel averaged over a box and over ``held`` positions 1 px apart, at distances [px]."""
     places = np.arange(held) - (held - 1) / 2
     total = np.zeros(np.shape(distance))
     for place in places:
@@ -410,7 +413,7 @@ def box_weight(distance: Floats, width: float, held: int = 1) -> Floats:
 
 
 def blurred_weight(width: float, variance: Floats, held: int = 1) -> tuple[Floats, Floats]:
-    """Give distances (place,) from -reach to reach and weights (kernel, place) with Gaussians of variance (kernel,)."""
+    """Return distances (place,) from -reach to reach and Gaussian weights (kernel, place) of variance (kernel,)."""
     reach = math.ceil(1 + width / 2 + (held - 1) / 2 + _SDS * math.sqrt(variance.max(initial=0.0))) + 1
     distance = np.arange(-reach * PER_PX, reach * PER_PX + 1) / PER_PX
     sharp = box_weight(distance, width, held)
@@ -440,7 +443,7 @@ class TapTable(NamedTuple):
 
     @property
     def taps(self) -> int:
-        """Return how many pixels along the axis a position reads."""
+        """Return the number of pixels along the axis that a position reads."""
         return int(self.weight.shape[1])
 
     @staticmethod
@@ -468,7 +471,7 @@ class TapTable(NamedTuple):
 
 
 def _rows(place: Floats, taps: int, reach: float, kernels: tuple[Floats, Floats]) -> Floats:
-    """Weights (kernel, tap, place), scaled to sum 1 at every place."""
+    """Return the weights (kernel, tap, place), scaled to sum 1 at every place."""
     distance, weight = kernels
     apart = place[None, :] - np.arange(taps)[:, None]
     rows: Floats = np.stack([np.interp(apart, distance, one, left=0.0, right=0.0) for one in weight])
@@ -487,6 +490,6 @@ def _reach(distance: Floats, weight: Floats, tail: float) -> float:
 
 
 def _integral(t: Floats) -> Floats:
-    """Integral of the kernel of linear interpolation from 0 to t."""
+    """Return the integral of the kernel of linear interpolation from 0 to t."""
     a = np.minimum(np.abs(t), 1.0)
     return np.sign(t) * a * (1 - a / 2)

@@ -1,8 +1,8 @@
 """Rays of the camera over the mirror: where they meet the scene plane, how they spread there, and the pupil they pass.
 
 The aperture is the mirror's disc, foreshortened in the plane of incidence and only there. At rest that plane holds the
-scan, so the pupil is an ellipse: the whole diameter along the line, and |n_z| of it, 0.71, along the scan. Diffraction
-is then wider along the scan, defocus wider along the line.
+scan. The pupil is then an ellipse: the whole diameter along the line, and |n_z| of it, 0.71, along the scan.
+Diffraction is then wider along the scan, defocus wider along the line.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ REST_NORMAL: Floats = np.array([np.sqrt(0.5), 0.0, -np.sqrt(0.5)])
 class RayViews:
     """Directions of samples, and how far the scene point moves per px of the camera, along and across; (n,) each.
 
-    ``along`` and ``scan`` are tangents or px; the others are px of the scene over px of the camera: ``along_run`` and
-    ``scan_run`` for a ray moved along the line, ``along_turn`` and ``scan_turn`` for one moved across it.
+    ``along`` and ``scan`` are tangents or px. The others are px of the scene over px of the camera. ``along_run`` and
+    ``scan_run`` are for a ray moved along the line, ``along_turn`` and ``scan_turn`` for one moved across it.
     """
 
     along: Floats
@@ -37,17 +37,17 @@ class RayViews:
     scan_turn: Floats
 
     def __getitem__(self, which: slice | NDArray[np.intp]) -> RayViews:
-        """Some of the samples."""
+        """Return some of the samples."""
         return RayViews(*(getattr(self, one.name)[which] for one in fields(self)))
 
     def thinned(self, level: int, before: int) -> RayViews:
-        """The same places in px of a scene of which every ``level``-th pixel is left, after ``before`` others."""
+        """Return the same places in px of a scene thinned to every ``level``-th pixel after ``before`` others."""
         if level == 1:
             return self
         return replace(self, along=self.along / level + before, scan=self.scan / level + before)
 
     def table(self) -> Floats:
-        """All of them as rows, (6, n), in the order in which they stand here."""
+        """Return all values as rows, (6, n), in the order of the fields."""
         return np.stack([np.asarray(getattr(self, one.name), np.float64) for one in fields(self)])
 
     def flat(self) -> RayViews:
@@ -55,7 +55,7 @@ class RayViews:
 
 
 def exact_views(normal: Floats, across: Floats | float, slopes: Floats) -> RayViews:
-    """Give where camera rays (across, slope, 1) meet the scene after the mirror, as tangents.
+    """Return the points of the scene that camera rays (across, slope, 1) meet after the mirror, as tangents.
 
     ``normal`` is (..., 3), of arrays that broadcast. The reflection is written out for the two tangents; the ray's
     length cancels. Their derivatives follow by the rule for quotients.
@@ -76,9 +76,9 @@ def exact_views(normal: Floats, across: Floats | float, slopes: Floats) -> RayVi
 
 
 def spread_of_waves(normal: Floats | None = None) -> Floats:
-    """Give the variance that diffraction has along (line, scan), over that of a round pupil of the mirror's diameter.
+    """Return the variance that diffraction has along (line, scan), over that of a round pupil of the mirror's diameter.
 
-    A pupil |n_z| wide along (n_x, n_y) and 1 across spreads waves by 1 / n_z^2 and 1; on the camera's own axes that is
+    A pupil |n_z| wide along (n_x, n_y) and 1 across spreads waves by 1 / n_z^2 and 1. On the camera's own axes that is
     1 + n_y^2 / n_z^2 and 1 + n_x^2 / n_z^2. The covariance n_x n_y / n_z^2 is left out: it is 0 at rest.
 
     ``normal``: (..., 3) mirror normals in the camera frame; None is the mirror at rest. Returns (..., 2).
@@ -88,7 +88,7 @@ def spread_of_waves(normal: Floats | None = None) -> Floats:
 
 
 def spread_of_rays(normal: Floats | None = None) -> Floats:
-    """Give the variance of the pupil along (line, scan), over that of a round one: 1 - n_y^2 and 1 - n_x^2, (..., 2).
+    """Return the variance of the pupil along (line, scan), over that of a round one: 1 - n_y^2 and 1 - n_x^2, (..., 2).
 
     The covariance -n_x n_y is left out: it is 0 at rest.
     """
@@ -97,18 +97,18 @@ def spread_of_rays(normal: Floats | None = None) -> Floats:
 
 
 def pupil_contrast(u: Floats) -> Floats:
-    """Give what a round pupil passes of a wave of u cycles per lambda / D: its autocorrelation, 0 from u = 1 on.
+    """Return the transmission of u cycles per lambda / D by a round pupil: its autocorrelation, 0 from u = 1 on.
 
     2 / pi (acos u - u sqrt(1 - u^2)) (Goodman, Introduction to Fourier Optics, section 6.3). An elliptic pupil passes a
-    wave as a round one does when u is counted along its own axes. The 6 nm of a band are too little to tell: they
-    change u by 1 %, evenly to both sides, and no contrast by more than 1e-5.
+    wave as a round one does when u is counted along its own axes. The 6 nm of a band are too few to matter. They change
+    u by 1 %, evenly to both sides, and no contrast by more than 1e-5.
     """
     inside = np.minimum(np.abs(u), 1.0)
     return np.asarray(2 / np.pi * (np.arccos(inside) - inside * np.sqrt(1 - inside * inside)))
 
 
 def normals_met(sweeps: Iterable[Sweep], camera: LineCamera) -> Floats:
-    """Give the mirror's normals at rest and at both ends of every sweep, (n, 3).
+    """Return the mirror's normals at rest and at both ends of every sweep, (n, 3).
 
     Both spreads are monotonic along a sweep (n_x / n_z = 1 / (eta - sqrt(1 + xi^2 + eta^2)) in scene tangents), so the
     ends hold the extremes.
@@ -120,7 +120,7 @@ def normals_met(sweeps: Iterable[Sweep], camera: LineCamera) -> Floats:
 
 
 def middle_normal(sweep: Sweep, camera: LineCamera) -> Floats:
-    """Give the mirror's normal in the middle of a sweep, (3,): one kernel for all its lines, whatever the block."""
+    """Return the mirror's normal in the middle of a sweep, (3,): one kernel for all its lines, whatever the block."""
     middle = sweep.start_px + (sweep.lines * sweep.step - 1) / 2
     tangents = np.array([sweep.swath_px, middle]) * camera.ifov_rad
     return direction_to_normal(scene_to_direction(tangents))

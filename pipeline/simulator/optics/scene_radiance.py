@@ -44,7 +44,7 @@ class _Mixing:
 
     @staticmethod
     def of(fractions: Radiance, between: Floats, spectra: Radiance) -> _Mixing:
-        """That of spectra (component, band): bands between the same nodes are made at once."""
+        """Return the mixing of spectra (component, band): bands between the same nodes are made at once."""
         bands, cuts = spectra.shape[1], [0]
         for cut in (np.flatnonzero(np.diff((between > 0).argmax(axis=0))) + 1).tolist():
             if min(cut - cuts[-1], bands - cut) >= LEAST_BANDS:
@@ -72,7 +72,7 @@ class Looker:
     """Looks at scenes through one footprint, from views whose shape is within a range."""
 
     def __init__(self, footprint: Footprint, extremes: RayViews) -> None:
-        """``extremes`` are views all over what will be looked at; their places do not matter."""
+        """Take ``extremes``: views spread over all that will be sampled; their places do not matter."""
         self.footprint = footprint
         self._extremes = extremes
 
@@ -83,13 +83,14 @@ class Looker:
         return [(level, some, Gatherer(whole.part(level, some), self._extremes)) for level, some in windows]
 
     def scan_pass(self, scene: RasterScene, steps: Sequence[RayViews], *, along_y: bool, exposures: float) -> Radiance:
-        """Give the light (n, band) of samples that look so at each of the held positions. [e-]
+        """Return the light (n, band) of samples that look so at each of the held positions. [e-]
 
         A sample's light does not depend on the others.
         """
         spectra = scene.electrons * np.float32(exposures)
         levels = np.unique(self.footprint.level).tolist()
-        pixels = {level: _pixels(scene, along_y, level) for level in levels}
+        rasters = {level: np.ascontiguousarray(scene.raster.thinned(level), np.float32) for level in levels}
+        pixels = {level: ScenePixels(raster, along_y) for level, raster in rasters.items()}
         sums = np.ones(self.footprint.kernels)
         for _, some, gatherer in self.gatherers:
             sums[some] = gatherer.parts
@@ -125,7 +126,3 @@ class Looker:
             for level, some, gatherer in self.gatherers:
                 seen = views.thinned(level, THINNED_MARGIN)
                 gatherer.gather(pixels[level], seen, out, numbers[some], gains[some])
-
-
-def _pixels(scene: RasterScene, along_y: bool, level: int) -> ScenePixels:
-    return ScenePixels(np.ascontiguousarray(scene.raster.thinned(level), np.float32), along_y)

@@ -1,8 +1,8 @@
 """Light through a footprint: for every sample one window of pixels, and for every kernel a weight for each of them.
 
-A footprint that lies turned in the scene is parted across the slit: each part is a box that does not lie turned, in its
-right place. The parts are moved beside their places, and widened, by so much that all together have the second moments
-of the turned footprint. There are as few as misplace little of its light.
+A footprint that lies turned in the scene is parted across the slit. Each part is a box parallel to the scene's axes, in
+its right place. The parts are moved beside their places, and widened, by so much that all together have the second
+moments of the turned footprint. There are as few as misplace little of its light.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Gatherer:
     """Gathers a scene's components through a footprint at views whose shape is within a range."""
 
     def __init__(self, footprint: Footprint, views: RayViews) -> None:
-        """``views`` are some that hold the extremes of all that will be gathered."""
+        """Take ``views`` that include the extremes of all that will be gathered."""
         self.footprint = footprint
         width, (across, along) = footprint.box, footprint.parts
         variance = footprint.variance + disc_points(footprint.disc)[1][:, None]
@@ -59,7 +59,7 @@ class Gatherer:
 
     @property
     def parts(self) -> int:
-        """Return how many boxes each kernel is summed over."""
+        """Return the number of boxes that each kernel is summed over."""
         return int(self._kernels.place.shape[1])
 
     def gather(
@@ -79,7 +79,7 @@ class Gatherer:
 
 
 def kernels_of(footprint: Footprint) -> window_sums.PartedKernels:
-    """Give a footprint's kernels and the parts of its box as the compiled loops take them."""
+    """Return a footprint's kernels and the parts of its box as the compiled loops take them."""
     (across, along), (slit, pixel) = footprint.parts, footprint.box
     variance = footprint.variance + np.array([[pixel / along], [slit / across]]) ** 2 / 12
     points, about = disc_points(footprint.disc)
@@ -90,7 +90,7 @@ def kernels_of(footprint: Footprint) -> window_sums.PartedKernels:
 
 
 def place_parts(footprint: Footprint, views: RayViews) -> tuple[Floats, Radiance]:
-    """Give how the parts of kernels lie for samples in the middle of a pixel, along and scan.
+    """Return the places of the parts of kernels for samples in the middle of a pixel, along and scan.
 
     Returns scales of one part (kernel, 2, n), and how far beside the pixel parts lie, (kernel, 2, part, n) [px].
     """
@@ -104,7 +104,7 @@ def place_parts(footprint: Footprint, views: RayViews) -> tuple[Floats, Radiance
 
 
 def part_places(footprint: Footprint) -> Radiance:
-    """Give the middles of the parts, (2, part) across and along, in px of the camera: of boxes at a disc's points."""
+    """Return the middles of the parts, (2, part) across and along, in px of the camera: of boxes at a disc's points."""
     across, along = footprint.parts
     turn = ((np.arange(across) + 0.5) / across - 0.5) * footprint.box[0]
     run = ((np.arange(along) + 0.5) / along - 0.5) * footprint.box[1]
@@ -113,7 +113,7 @@ def part_places(footprint: Footprint) -> Radiance:
 
 
 def fewest_parts(fraction: float, box: tuple[float, float], views: RayViews) -> Parts:
-    """Give the fewest boxes that misplace at most a ``fraction`` of the light where views are turned most.
+    """Return the fewest boxes that misplace at most a ``fraction`` of the light where views are turned most.
 
     ``box`` is across and along [px]. A blur, or held positions, make the fraction smaller.
     """
@@ -127,7 +127,7 @@ def fewest_parts(fraction: float, box: tuple[float, float], views: RayViews) -> 
 
 @lru_cache(maxsize=256)
 def misplaced(parts: Parts, box: tuple[float, float], shape: tuple[float, ...]) -> float:
-    """Give the fraction of light, by size, that so many boxes put elsewhere than the turned footprint does.
+    """Return the fraction of light, by size, that so many boxes put elsewhere than the turned footprint does.
 
     ``shape`` is px of the scene along and scan per px of the camera along the line, then across it. Half of the
     fraction times the range of a scene within the footprint is the most that a sample changes.
@@ -137,7 +137,7 @@ def misplaced(parts: Parts, box: tuple[float, float], shape: tuple[float, ...]) 
 
 
 def _weights(parts: Parts, box: tuple[float, float], shape: tuple[float, ...]) -> Floats:
-    """Weights (phase, along, scan) of the pixels around a sample, in closed form."""
+    """Return the weights (phase, along, scan) of the pixels around a sample, in closed form."""
     none, views = np.zeros((2, 1)), RayViews(*(np.array([one]) for one in (0.0, 0.0, *shape)))
     footprint: Footprint = fold(box, parts, 1, Moments(none, none))
     scale, places = place_parts(footprint, views)

@@ -53,7 +53,7 @@ class ReachedCells:
         return not self.apart_px.any()
 
     def rows_within(self, first: int, last: int, nearest_px: float, farthest_px: float) -> Mask:
-        """Give which pixels of rows lie farther than the one and no farther than the other, (row, column)."""
+        """Return which pixels of rows lie farther than the one and no farther than the other, (row, column)."""
         rows = np.arange(first, min(last, self.shape[0])) // self.cell_px
         apart = self.apart_px[rows]
         within: Mask = np.repeat((apart > nearest_px) & (apart <= farthest_px), self.cell_px, axis=1)
@@ -61,7 +61,7 @@ class ReachedCells:
 
 
 def reached_cells(shape: tuple[int, int], camera: LineCamera, sweeps: Sequence[Sweep]) -> ReachedCells:
-    """Ask for every cell of a scene whether any sweep sees some of it; what lies outside shows the scene's edge."""
+    """Return which cells of a scene any sweep sees in part; outside, the scene's edge is repeated."""
     cell = max(2, math.ceil(math.sqrt(shape[0] * shape[1] / _CELLS)))
     y, x = (np.arange(0, size, cell) + (cell - size) / 2 for size in shape)
     reached = np.zeros((len(y), len(x)), np.bool_)
@@ -85,7 +85,7 @@ def reached_cells(shape: tuple[int, int], camera: LineCamera, sweeps: Sequence[S
 def _edge_cells(
     sweep: Sweep, camera: LineCamera, shape: tuple[int, int], cell: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Cells at the scene's edge that a sweep sees repeated outside of it."""
+    """Return the cells at the scene's edge that a sweep sees repeated outside of it."""
     count = max(_PROBES, 2 * max(shape) // cell)
     lines = sweep.start_px + np.linspace(0, sweep.lines - 1, count)
     slopes = np.linspace(-0.5, 0.5, count) * camera.samples * camera.ifov_rad
@@ -119,7 +119,7 @@ class WideLight:
 
 
 def seen_widely(scene: RasterScene, exposure_ms: float) -> WideLight:
-    """Give what is `WIDE_PX` wide and wider sees of all the scene: means of 2 x 2 blocks of `BLOCK_PX`.
+    """Return what is `WIDE_PX` wide and wider sees of all the scene: means of 2 x 2 blocks of `BLOCK_PX`.
 
     Derivatives are the greatest along either axis.
     """
@@ -143,7 +143,7 @@ def seen_widely(scene: RasterScene, exposure_ms: float) -> WideLight:
 
 
 def _spectral_differences(parts: Radiance, spectra: Radiance, wavelength_nm: Floats) -> Radiance:
-    """Greatest first and second divided differences over wavelength of light, (2, band) [e-/nm, e-/nm^2]."""
+    """Return the greatest first and second divided differences over wavelength of light, (2, band) [e-/nm, e-/nm^2]."""
     if spectra.ndim == 1:
         light = to_bands(parts, spectra)
         steep, bent = steepest_difference(light, wavelength_nm), second_difference(light, wavelength_nm)
@@ -156,12 +156,12 @@ def _spectral_differences(parts: Radiance, spectra: Radiance, wavelength_nm: Flo
 
 
 def _largest(values: Radiance) -> Radiance:
-    """Greatest size of each band, (band,)."""
+    """Return the largest magnitude in each band, (band,)."""
     return np.asarray(np.maximum(values.max(axis=(0, 1), initial=0.0), -values.min(axis=(0, 1), initial=0.0)))
 
 
 def _means(scene: RasterScene) -> Iterator[Radiance]:
-    """Components of windows of two by two blocks, a block apart, in overlapping parts of the scene."""
+    """Yield the components of windows of two by two blocks, a block apart, in overlapping parts of the scene."""
     planes = scene.planes
     short = [-size % BLOCK_PX for size in scene.shape]
     if any(short):
@@ -181,9 +181,9 @@ _ENDLESS = 1e9  # span and curvature of an image whose shifts show as they are
 
 
 def blended_surroundings(probe: Probe, rig: Rig, moving: Sequence[Effect]) -> Probe:
-    """Give the probe of an image that all blurs and shifts of a rig have passed, with what they bring from beside.
+    """Return the probe of an image that all blurs and shifts of a rig have passed, with what they bring from beside.
 
-    Shifts bring what lies within their way; each part of a blur has the greatest derivatives of what it reaches, and
+    Shifts bring what lies within their way. Each part of a blur has the greatest derivatives of what it reaches, and
     the image has the mean of its parts'. The same probe where nothing lies beside the sweeps.
     """
     if probe.anywhere is None:
@@ -213,7 +213,7 @@ def _blended(probe: Probe, reach_px: float, way_px: float, parts: Sequence[tuple
 
 
 def _seen_through(probe: Probe, beside_px: float, sd_px: float) -> Detail:
-    """The least of what bounds derivatives and span of an image that a Gaussian has blurred, up to so far beside."""
+    """Return the least bound of derivatives and span of an image blurred by a Gaussian, up to this distance away."""
     assert probe.anywhere is not None
     last = max((one.reach_px for one in probe.beside), default=0.0)
     found = []
@@ -229,7 +229,7 @@ def _seen_through(probe: Probe, beside_px: float, sd_px: float) -> Detail:
 
 
 def greatest_way_px(probe: Probe, rig: Rig, effects: Sequence[Effect]) -> float:
-    """Return how far all effects move the image together at most, by their bounds on one that rises evenly. [px]"""
+    """Return the greatest displacement by all effects together, by their bounds on an image that rises evenly [px]."""
     moving = [one for one in effects if any(hasattr(one, act) for act in ("aim", "displaced"))]
     bands = len(probe.wavelength_nm)
     rising = replace(
@@ -247,7 +247,7 @@ def greatest_way_px(probe: Probe, rig: Rig, effects: Sequence[Effect]) -> float:
 
 
 def _blur_parts(probe: Probe, rig: Rig, blurs: Sequence[Any]) -> list[tuple[float, float]]:
-    """Shares and sizes (sd) of the Gaussians that a rig's blurs are the sum of, as wide as in any band. [px]"""
+    """Return the fractions and sizes (sd) of the Gaussians that make up a rig's blurs, as wide as in any band. [px]"""
     nm = np.asarray(probe.wavelength_nm, np.float64)
     sizes, waves = [0.0], [0.0]
     for normal in normals_met(probe.sweeps, rig.camera):
@@ -262,7 +262,7 @@ def _blur_parts(probe: Probe, rig: Rig, blurs: Sequence[Any]) -> list[tuple[floa
 
 
 def light_brought(probe: Probe, rig: Rig, moving: Iterable[Effect]) -> Probe:
-    """Give the probe of light to which blurs and shifts have brought some from beside what the sweeps see.
+    """Return the probe of light to which blurs and shifts have brought some from beside what the sweeps see.
 
     They change no signal by more than their bounds, and none to what is nowhere in the scene. The same probe where
     nothing lies beside.

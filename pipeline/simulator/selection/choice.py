@@ -1,10 +1,10 @@
 """The decision: which effects to compute, and how, so that what is left out stays within one tolerance; its manifest.
 
-The tolerance is of the numbers that are stored, sums of samples where a sweep bins them: an effect counts by what it
-does at the binning where it does most.
+The tolerance applies to stored numbers, sums of samples where a sweep bins them. An effect counts by its change at the
+binning where that is greatest.
 
-Greedy: start with everything exact; of all cheaper options that still fit, take the one that saves most per error that
-it adds; until none fits. Because one long step may be shut out by a short one, the same is tried after each single
+The search is greedy, and starts with everything exact. The cheaper option that still fits and saves most per added
+error is taken, until none fits. One long step may be shut out by a short one. So the same is tried after each single
 step, and the cheapest end counts: it saves at least half of what can be saved. A larger tolerance never costs more, but
 may switch a cheap effect on again in exchange for a dear one.
 """
@@ -82,7 +82,7 @@ class Decision:
         return cost_of((one.menu for one in self.taken), {one.name: one.option for one in self.taken})
 
     def cost_of(self, one: Treatment) -> float:
-        """Per px and band, of one effect beside the others as they are taken [ns]."""
+        """Return the cost per px and band of one effect beside the other effects as chosen [ns]."""
         return one.menu.cost_beside(one.option, {other.name: other.option for other in self.taken})
 
     @property
@@ -122,7 +122,7 @@ def decide(
 
 
 def named_effects(asked: str, known: Sequence[str]) -> frozenset[str] | None:
-    """Give the effects that ``asked`` demands; None where the tolerance decides.
+    """Return the effects that ``asked`` demands; None where the tolerance decides.
 
     Raises SettingsError: a name is not known (names the nearest that is), or there is none.
     """
@@ -210,7 +210,7 @@ def _reason(menu: Menu, option: Option, tolerance: float, named: frozenset[str] 
 
 
 def list_effects(decision: Decision, measured: Mapping[str, float] | None = None) -> list[dict[str, Any]]:
-    """Give one plain row for every effect, in the order of the chain; ``measured`` is what `verify` found, by name.
+    """Return one plain row for every effect, in the order of the chain; ``measured`` is what `verify` found, by name.
 
     ``bound`` is on the change of any stored number, at the worst binning, with the factor of safety, in ``unit`` (0
     where exact or absent, None where there is none); ``cost_s`` are estimated CPU seconds of all sweeps; ``why`` is a
@@ -257,7 +257,7 @@ def sum_up(decision: Decision, measured: Mapping[str, float] | None = None) -> d
 
 
 def explain(one: Treatment, decision: Decision) -> str:
-    """Say why an effect is on or off, with the magnitude that its own bound states."""
+    """Return why an effect is on or off, with the magnitude that its own bound states."""
     unit, tolerance = UNIT_NAMES[decision.unit], _number(decision.tolerance)
     left_out = f"left out it could change a stored number by {_number(one.menu.off.error)} {unit}"
     asked = one.name in [word.strip() for word in decision.asked.split(",")]

@@ -1,8 +1,8 @@
 """Extrema of a scene: where it is steepest, most curved, brightest and darkest, in and beside the sweeps.
 
-Works on the scene's own pixels, strip by strip, with the slit's box along the scan; it is fast and right to a pixel,
-and leaves the exact numbers to closer looks. Of components a few bands stand for all; where bands have planes
-of their own, each is looked at, tile by tile: see `BandTiles`.
+It works on the scene's own pixels, strip by strip, with the slit's box along the scan. It is fast and right to a pixel,
+and leaves the exact numbers to closer looks. A few bands stand for all where planes are components; where bands have
+planes of their own, each is searched, tile by tile: see `BandTiles`.
 """
 
 from __future__ import annotations
@@ -46,18 +46,18 @@ class PixelOptics:
 
     @property
     def halo(self) -> int:
-        """Return how far kernels, differences and sums reach. [px]"""
+        """Return the reach of kernels, differences and sums [px]."""
         return len(self.slit) // 2 + len(self.pixel) // 2 + 1 + self.binning // 2
 
     def noise(self, light: Radiance) -> Radiance:
-        """Give one standard deviation at each light [e-]."""
+        """Return one standard deviation at each light [e-]."""
         noise: Radiance = np.sqrt(np.maximum(light, 0) + np.float32(self.fixed_noise))
         return noise
 
     def worths(self, light: Radiance) -> Iterator[Radiance]:
-        """Measures of light without its halo, (row, column, band) each: the higher, the more worth a look.
+        """Yield measures of light without its halo, (row, column, band) each: higher ones are probed first.
 
-        Where samples are summed, sizes are averaged along the line, as the probe does.
+        Summed samples count by the average of sizes along the line, as in the probe.
         """
         inner = (slice(self.halo, -self.halo), slice(self.halo, -self.halo))
         for along_y in self.turned:
@@ -77,7 +77,7 @@ class PixelOptics:
             yield np.divide(self._summed(mixed, line)[inner], noise)
 
     def _summed(self, values: Radiance, axis: int) -> Radiance:
-        """Mean over the samples of a stored number about each pixel, along an axis."""
+        """Return the mean over the samples of a stored number about each pixel, along an axis."""
         if self.binning == 1:
             return values
         steps = np.arange(self.binning) - self.binning // 2
@@ -121,7 +121,7 @@ class Ranking:
         self._offers.setdefault(kind, []).append(offers[:, offers[0] > -np.inf])
 
     def best(self, tier: int, most: int) -> Floats:
-        """Give the best of each kind in turns, none twice, (place, 2) rows and columns."""
+        """Return the best of each kind in turns, none twice, (place, 2) rows and columns."""
         offers = [np.concatenate(some, axis=1) for kind, some in self._offers.items() if kind[0] == tier]
         best = [_worst_first(places, most) for places in offers]
         ranked = [list(zip(*places[1:].astype(int).tolist(), strict=True)) for places in best]
@@ -130,14 +130,14 @@ class Ranking:
 
 
 def _worst_first(places: Floats, most: int) -> Floats:
-    """The first places, (row, place) of worth and where they lie, by worth and then by where."""
+    """Return the first places by measure and then by location, (row, place): measure, and where they lie."""
     if places.shape[1] > most:
         places = places[:, places[0] >= np.partition(places[0], -most)[-most]]
     return places[:, np.lexsort(places[::-1])[::-1][:most]]
 
 
 def band_groups(bands: int) -> list[slice]:
-    """Give the groups of neighbouring bands whose worst stands for each of them."""
+    """Return the groups of neighbouring bands whose worst stands for each of them."""
     edges = np.linspace(0, bands, min(bands, BAND_GROUPS) + 1).round().astype(int).tolist()
     return [slice(first, last) for first, last in pairwise(edges)]
 
@@ -216,7 +216,10 @@ class BandTiles:
                 ranking.offer((tier, sort, number), *(one[group == number] for one in offered))
 
     def _window(self, row: int, column: int, band: int) -> Radiance:
-        """Light about a tile in a band and its neighbours, (row, column, 3); the scene's edge is repeated."""
+        """Return the light about a tile in a band and its neighbours, (row, column, 3).
+
+        The scene's edge is repeated.
+        """
         halo, (rows, columns) = self._optics.halo, self._scene.shape
         down = np.arange(row - halo, row + self._tile + halo).clip(0, rows - 1)
         right = np.arange(column - halo, column + self._tile + halo).clip(0, columns - 1)
@@ -233,7 +236,7 @@ class BandTiles:
         return np.arange(0, columns, self._tile)
 
     def _measures(self, light: Radiance) -> list[Radiance]:
-        """Worth of every tile of a strip for every measure, (tile, band) each; the strip has a pixel beside it."""
+        """Return every measure of every tile of a strip, (tile, band) each; the strip has one pixel of margin."""
         inner = light[1:-1, 1:-1]
         starts = self._starts(inner.shape[1])
 
@@ -262,7 +265,7 @@ class BandTiles:
     def _wide_steps(
         self, light: Radiance, starts: NDArray[np.intp], greatest: Callable[[Radiance], Radiance], noise: Radiance
     ) -> list[Radiance]:
-        """Between means of half tiles, and between any two pixels: what a slit shows that is wider than a pixel."""
+        """Return the steps between means of half tiles, and between any two pixels, for slits wider than a pixel."""
         high, low = light.max(axis=0)[1:-1], light.min(axis=0)[1:-1]
         span: Radiance = greatest(high[None]) + greatest(-low[None])
         rows, columns = (_halves(size, self._tile) for size in light.shape[:2])
@@ -277,7 +280,7 @@ class BandTiles:
 
 
 def _halves(size: int, tile: int) -> NDArray[np.intp]:
-    """Firsts of half tiles, of a row with a pixel on either side."""
+    """Return the first pixels of half tiles, for a row with a pixel of margin on either side."""
     firsts = np.arange(1, size - 1, tile)
     both = np.unique(np.concatenate([firsts, firsts + tile // 2]))
     found: NDArray[np.intp] = both[both < size - 1]
@@ -324,8 +327,8 @@ def find_extrema(
     """Find the places where light changes most over its noise, and where there is most and least of it.
 
     ``sweeps`` are of one binning, ``cells`` say how far they see, ``reaches`` how far beside them to look as well [px];
-    ``most`` places at most are found where they see, within each reach, and beyond, each in a tile of its own for one
-    measure and band. Raises SceneError: the scene holds a number that is not finite.
+    At most ``most`` places are found where sweeps see, within each reach, and beyond. Each is in a tile of its own for
+    one measure and band. Raises SceneError: the scene holds a number that is not finite.
     """
     spectra = scene.electrons * np.float32(camera.exposure_ms / DEFAULT_EXPOSURE_MS)
     optics = PixelOptics.of(camera, sweeps[0].binning, tuple(sorted({sweep.along == "y" for sweep in sweeps})))
@@ -384,7 +387,7 @@ def _offer(
 def chosen_bands(spectra: Radiance) -> NDArray[np.intp]:
     """Choose the brightest band and those least like the ones chosen, at most ``CHOSEN_BANDS``.
 
-    Of bands with planes of their own, which do not tell of each other: as many, evenly.
+    Bands with planes of their own are chosen evenly, and as many: they do not predict each other.
     """
     if spectra.ndim == 1:
         return np.unique(np.linspace(0, len(spectra) - 1, CHOSEN_BANDS).round().astype(np.intp))

@@ -1,14 +1,14 @@
 """Options of the decision: for every effect, off and each variant with its error and cost.
 
-A bound is the change of a stored number in units of its noise (or in DN), at the worst binning of the survey. Where a
-drawn displacement or gain moves the light (jitter, turbulence, wind), it is on the change with the same draws. Where
-the draw is the noise itself (shot, read, dark) what matters is the total variation between the distributions of a
-number with and without: noise that changes it by ``t`` counts ``2 t`` deviations, as much as a change that could be
-told apart as often. Total variation is a metric and no later stage increases it: so all bounds may be summed.
+A bound is the change of a stored number in units of its noise (or in DN), at the worst binning of the survey. If a
+drawn displacement or gain moves the light (jitter, turbulence, wind), it is on the change with the same draws. If the
+draw is the noise itself (shot, read, dark), the total variation between the distributions of a number with and without
+it counts. Noise that changes it by ``t`` counts ``2 t`` deviations, as much as a change that could be detected as
+often. Total variation is a metric and no later stage increases it: so all bounds may be summed.
 
 Kernels that are not negative and sum to 1 have gain 1 at most, readout none. Gains of light (vignetting, drift, ...)
 multiply the errors of all other effects in the light, each by its own greatest factor, and change the unit: with
-sigma(S)^2 = S + n, g sigma(S) / sigma(g S) grows with g; so the greatest gains count for errors made elsewhere, and the
+sigma(S)^2 = S + n, g sigma(S) / sigma(g S) grows with g. So the greatest gains count for errors made elsewhere, and the
 least of its own for a gain that is left out. Blurs and shifts of each band's own colour edges: light then changes over
 wavelength where the scene's does not.
 """
@@ -79,7 +79,7 @@ class Menu:
         return self.variants[0]
 
     def cost_beside(self, option: Option, others: Mapping[str, Option]) -> float:
-        """Give what an option costs beside those taken for other effects, by name [ns]: draws may be shared."""
+        """Return the cost of an option beside those taken for other effects, by name [ns]: draws may be shared."""
         one = self.merged
         if one is None or option.variant == OFF or one.other not in others or others[one.other].variant != one.variant:
             return option.cost_ns
@@ -94,7 +94,7 @@ def acts_on_light(effect: Effect) -> bool:
 def list_options(probes: Probe | Sequence[Probe], rig: Rig, effects: Sequence[Effect]) -> tuple[Menu, ...]:
     """Ask every effect for the bounds of its options; errors are in the unit of the probes.
 
-    Of several probes, one for each binning and exposure of a survey, every option has the error of the worst.
+    Every option has the error of the worst probe; a survey has one for each binning and exposure.
 
     Raises SettingsError: two effects have one name, or a bound is negative or not a number; names it.
     """
@@ -178,7 +178,7 @@ def _is_present(effect: Effect, probe: Probe, rig: Rig) -> bool:
 
 
 def _even_probe(probe: Probe, derivatives: float) -> Probe:
-    """The probe of a scene of level 1 and the same derivatives in every band."""
+    """Return the probe of a scene of level 1 and the same derivatives in every band."""
     ones, both = np.ones(len(probe.wavelength_nm)), np.full((2, len(probe.wavelength_nm)), derivatives)
     alone = replace(probe, beside=(), afar=None, anywhere=None, own_e=None, ends_e=None)
     seen = replace(alone, level=ones, spread=ones, span=ones, slope=both, curvature=both)
@@ -206,7 +206,7 @@ def _gain_beside(effect: Effect, ranges: Sequence[GainRange | None], place: int,
 
 
 def cost_of(menus: Iterable[Menu], options: Mapping[str, Option]) -> float:
-    """Give what options, one for each menu by its name, cost together per px and band [ns]."""
+    """Return the cost of options together, one for each menu by its name, per px and band [ns]."""
     return math.fsum(menu.cost_beside(options[menu.name], options) for menu in menus)
 
 
@@ -218,11 +218,11 @@ class Growth:
     rig: Rig
 
     def of_errors(self, gain: float) -> float:
-        """Give the most that gains up to ``gain``, 1 or more, multiply an error made elsewhere."""
+        """Return the most that gains up to ``gain``, 1 or more, multiply an error made elsewhere."""
         return gain * self.unit_ratio(gain)
 
     def of_gain(self, own: GainRange | None, others: float) -> float:
-        """Give the most that the other gains, and its own light, multiply the error of a gain that is left out."""
+        """Return the most that the other gains, and its own light, multiply the error of a gain that is left out."""
         if own is None:
             return self.of_errors(others)
         low, high = float(own.least.min(initial=1.0)), float(own.greatest.max(initial=1.0))
@@ -233,7 +233,7 @@ class Growth:
         return others * max(ends)
 
     def unit_ratio(self, gain: float) -> float:
-        """Give the most that a unit is over the one that light multiplied by ``gain`` has."""
+        """Return the most that a unit is over the one that light multiplied by ``gain`` has."""
         if self.probe.unit == "dn" or self.rig.detector.noiseless:
             return 1.0
         fixed = fixed_variance(self.rig)
@@ -242,10 +242,10 @@ class Growth:
 
 
 def light_after(probe: Probe, ranges: Iterable[GainRange], rig: Rig) -> Probe:
-    """Give the probe of light after some gains, their greatest factors taken off: those are for `Growth`.
+    """Return the probe of light after some gains, their greatest factors taken off: those are for `Growth`.
 
-    By Leibniz' rule for differences, (g I)' <= g I' + g' I and (g I)'' <= g I'' + 2 g' I' + g'' I; where light is
-    added, its own. What does not shrink with the light counts by the unit of the darkest.
+    Leibniz' rule for differences gives (g I)' <= g I' + g' I and (g I)'' <= g I'' + 2 g' I' + g'' I. Added light has
+    its own differences. Light that the factor does not reduce counts by the unit of the darkest.
     """
     passed = list(ranges)
     if not passed:
@@ -282,12 +282,12 @@ def light_after(probe: Probe, ranges: Iterable[GainRange], rig: Rig) -> Probe:
 
 
 def light_through(probe: Probe, rig: Rig, blurs: Iterable[Any]) -> Probe:
-    """Give the probe of light that has passed blurs (their exact variants), with the spectral differences they make.
+    """Return the probe of light that has passed blurs (their exact variants), with the spectral differences they make.
 
     A kernel of shift s and variance v makes I(x + s) blurred, whose derivative over wavelength is s' I_x + v' I_xx / 2
     beside the scene's own, and its second one s'' I_x + v'' I_xx / 2 + (s' + v' d/dx / 2)^2 I_xx. At a step v' I_xx / 2
     is at most I_x times the change of the width. Diffraction is a sum of Gaussians whose widths grow with the
-    wavelength: of a wide one the derivatives over the width's logarithm are at most certain parts of the span.
+    wavelength. The derivatives of a wide one over the width's logarithm are at most certain parts of the span.
     """
     passed = list(blurs)
     if not passed or len(probe.wavelength_nm) < 2:
@@ -304,7 +304,7 @@ def light_through(probe: Probe, rig: Rig, blurs: Iterable[Any]) -> Probe:
 
 
 def _differences(probe: Probe, rig: Rig, blurs: list[Any], normal: Floats) -> tuple[Floats, Floats]:
-    """Greatest first and second differences over wavelength, (2, band) each for either axis of the image."""
+    """Return the greatest first and second differences over wavelength, (2, band) each for either axis of the image."""
     nm = np.asarray(probe.wavelength_nm, np.float64)
     blurred = Moments.together([blur.moments(rig, nm, blur.variants[0], normal) for blur in blurs], len(nm))
     steep, bend = np.zeros((2, *probe.slope.shape))
@@ -320,7 +320,7 @@ def _differences(probe: Probe, rig: Rig, blurs: list[Any], normal: Floats) -> tu
 
 
 def _by_gaussian(probe: Probe, nm: Floats, shift: Floats, variance: Floats, width: Floats) -> tuple[Floats, Floats]:
-    """Greatest differences through Gaussians of a shift and variance in each band, (2, band) each.
+    """Return the greatest differences through Gaussians of a shift and variance in each band, (2, band) each.
 
     ``width`` (2, band) is the part of it that grows in proportion to the wavelength.
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -66,7 +67,10 @@ def light_seen(
     footprint: Footprint,
     shifts: Sequence[tuple[Way, Way]] = (((0.0, 0.0), (0.0, 0.0)),),
 ) -> Radiance:
-    """Light (shift, view, band) through a footprint, with rays turned and points moved (along, scan) by shifts [px]."""
+    """Return light (shift, view, band) through a footprint.
+
+    Rays are turned and points moved (along, scan) by shifts [px].
+    """
     exposures, ifov = camera.exposure_ms / DEFAULT_EXPOSURE_MS, camera.ifov_rad
     light = np.empty((len(shifts), len(views.slope), len(scene.wavelength_nm)), np.float32)
     for along_y in (False, True):
@@ -85,7 +89,7 @@ def light_seen(
 
 
 def rays_of(views: SampleViews, camera: LineCamera, turned: Way = (0.0, 0.0)) -> RayViews:
-    """Give the middle rays of samples, moved by (along, across) px of the camera, in tangents."""
+    """Return the middle rays of samples, moved by (along, across) px of the camera, in tangents."""
     ifov = camera.ifov_rad
     tangents = np.stack([views.swath_px, views.scan_px], axis=-1) * ifov
     normal = direction_to_normal(scene_to_direction(tangents))
@@ -93,12 +97,12 @@ def rays_of(views: SampleViews, camera: LineCamera, turned: Way = (0.0, 0.0)) ->
 
 
 def line_sums(camera: LineCamera, binning: int) -> int:
-    """Give how many stored numbers of a line stand for all of it."""
+    """Return the number of stored numbers that stand for all of a line."""
     return min(camera.samples // binning, max(LINE_SAMPLES // binning, _LEAST_SUMS))
 
 
 def views_of_lines(sweeps: tuple[Sweep, ...], camera: LineCamera, room: int) -> SampleViews:
-    """Lines spread over all sweeps, the most oblique among them, of samples evenly from end to end.
+    """Return lines spread over all sweeps, the most oblique included, with samples evenly from end to end.
 
     All sweeps sum as many samples to a number.
     """
@@ -127,7 +131,7 @@ def views_of_lines(sweeps: tuple[Sweep, ...], camera: LineCamera, room: int) -> 
 def views_of_places(
     places: Floats, scene: RasterScene, camera: LineCamera, sweeps: tuple[Sweep, ...], beside_px: float | None = None
 ) -> SampleViews:
-    """Patches around places, each as the finest and the most oblique sweep of each orientation see it.
+    """Return patches around places, in the view of the finest and the most oblique sweep of each orientation.
 
     ``beside_px``: patches lie where their places are, up to so far beside what a sweep sees, as if its lines and their
     samples went on; None: a sweep's own samples, the nearest ones. All sweeps sum as many samples to a number.
@@ -154,7 +158,7 @@ def views_of_places(
 def places_beyond(
     places: Floats, scene: RasterScene, camera: LineCamera, sweeps: tuple[Sweep, ...]
 ) -> NDArray[np.bool_]:
-    """Give which places no sweep sees itself, (place,): its nearest samples look beside them."""
+    """Return which places no sweep sees itself, (place,): its nearest samples look beside them."""
     centred = places - (np.array(scene.shape) - 1) / 2
     found = np.ones(len(places), np.bool_)
     for along_y in {sweep.along == "y" for sweep in sweeps}:
@@ -185,7 +189,10 @@ def _held(sweep: Sweep) -> Sweep:
 
 
 def sample_offsets(binning: int) -> Floats:
-    """Steps of a patch around a place: stored numbers along the line and lines along the scan, (number, 2)."""
+    """Return the steps of a patch around a place, (number, 2).
+
+    They are stored numbers along the line and lines along the scan.
+    """
     beside = _BESIDE if binning == 1 else 1
     return np.stack(np.meshgrid(np.arange(-beside, beside + 1.0), np.arange(-1.0, 2.0)), axis=-1).reshape(-1, 2)
 
@@ -221,30 +228,26 @@ _LINES_AT_ONCE = 256
 def line_means(
     scene: RasterScene, camera: LineCamera, sweeps: Sequence[Sweep], beside_px: Sequence[float] = (0.0,)
 ) -> Radiance:
-    """Give the mean over samples and bands of every position that any sweep holds, (position,) [e-].
+    """Return the mean over samples and bands of every position that any sweep holds, (position,) [e-].
 
-    Of the pixels that middle rays meet: a slit, and positions that one line holds, give means between these. Positions
-    continue beyond a sweep's ends as far as its slit reaches, and as far as ``beside_px``, by which lines also lie
-    beside their strip.
+    Means are those of the pixels that middle rays meet. A slit, and positions that one line holds, give means between
+    these. Positions continue beyond a sweep's ends as far as its slit reaches, and as far as ``beside_px``, by which
+    lines also lie beside their strip.
     """
     spectra = scene.electrons * np.float32(camera.exposure_ms / DEFAULT_EXPOSURE_MS)
     mean = spectra / spectra.shape[0] if spectra.ndim == 1 else spectra.mean(axis=1)
     grey = (scene.planes.reshape(-1, scene.planes.shape[2]) @ mean.astype(np.float32)).reshape(scene.shape)
     beyond, found = np.ceil(camera.slit_px / 2 + 1) + max(beside_px), []
-    courses = sorted({_course(sweep) for sweep in sweeps if sweep.lines})
-    for along_y, swath, lines in ((one[0], one[1] + beside, one[2]) for one in courses for beside in beside_px):
+    held_by = ((one, one.start_px, one.start_px + one.lines * one.step) for one in sweeps if one.lines)
+    courses = sorted({(one.along == "y", one.swath_px, start, stop) for one, start, stop in held_by})
+    for (along_y, swath, start, stop), beside in itertools.product(courses, beside_px):
         pixels, middle = (grey.T if along_y else grey), (np.array(scene.shape) - 1) / 2
         down, right = middle[::-1] if along_y else middle
-        held = np.arange(lines[0] - beyond, lines[1] + beyond)
+        held = np.arange(start - beyond, stop + beyond)
         for first in range(0, len(held), _LINES_AT_ONCE):
             some = held[first : first + _LINES_AT_ONCE]
-            along, scan = points_of_scan(swath, camera, some[:, None], camera.pixel_slopes())
+            along, scan = points_of_scan(swath + beside, camera, some[:, None], camera.pixel_slopes())
             row = np.rint(scan + down).clip(0, pixels.shape[0] - 1).astype(np.intp)
             column = np.rint(along + right).clip(0, pixels.shape[1] - 1).astype(np.intp)
             found.append(pixels[row, column].mean(axis=1))
     return np.concatenate(found)
-
-
-def _course(sweep: Sweep) -> tuple[bool, float, tuple[float, float]]:
-    """Orientation, strip, and the first held position and the one after the last: what tells paths apart."""
-    return sweep.along == "y", sweep.swath_px, (sweep.start_px, sweep.start_px + sweep.lines * sweep.step)

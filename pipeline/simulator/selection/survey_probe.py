@@ -89,13 +89,13 @@ class ProbedLines:
         return ProbedLines(parts[0], tuple(parts[1:]), scale, binning, rig, unit)
 
     def span_to(self, low: Radiance, high: Radiance) -> Floats:
-        """Greatest difference of a stored number and light between two ends, (band,), over its unit."""
+        """Return the greatest difference of a stored number and light between two ends, (band,), over its unit."""
         least, most = self.own.min(axis=0), self.own.max(axis=0)
         off = np.maximum(most - low, high - least)
         return _greatest(stored_mean(_above(off, np.maximum(np.abs(low), np.abs(high))), self.binning) / self.scale)
 
     def beside(self, scene: RasterScene, covered: bool) -> dict[str, Any]:
-        """Give what the probe knows of what lies beside the sweeps; ``covered``: they see all, but for a px or two."""
+        """Return the probe's values beside the sweeps; ``covered``: sweeps see all of the scene but a px or two."""
         least_unit = self.scale.min(axis=0)[None]
         low, high = self.own.min(axis=(0, 1)), self.own.max(axis=(0, 1))
         own_unit = unit_at(np.minimum(low, high)[None], self.rig, self.unit, self.binning)
@@ -163,10 +163,10 @@ def sum_up_probes(probes: ProbedLines, scene: RasterScene, sweeps: tuple[Sweep, 
 
 
 def worst_of_groups(probe: Probe) -> Probe:
-    """Give the probe with the worst of each group of neighbouring bands in all of them: one was looked at for each.
+    """Return the probe with the worst of each group of neighbouring bands in all of them: one was looked at for each.
 
-    Lights of the groups are the least and the greatest of any of their bands: a level that is one band's, and the span
-    of another, do not tell the least light of a third.
+    Lights of the groups are the least and the greatest of any of their bands. A level of one band and the span of
+    another do not give the least light of a third.
     """
     groups = band_groups(len(probe.wavelength_nm))
 
@@ -202,9 +202,9 @@ def worst_of_groups(probe: Probe) -> Probe:
 
 
 def _derivatives(seen: Radiance, scale: Radiance, binning: int) -> tuple[Floats, Floats]:
-    """Greatest first and second derivatives, (2, band) each over the unit, by differences within half a px.
+    """Return the greatest first and second derivatives, (2, band) each over the unit, by differences within half a px.
 
-    Of a stored number the mean size over its samples: they may be moved one way or the other.
+    A stored number has the mean size over its samples: they may be moved one way or the other.
     """
     level, high = seen[0], np.abs(seen[0]).max(axis=0)
 
@@ -223,7 +223,10 @@ def _derivatives(seen: Radiance, scale: Radiance, binning: int) -> tuple[Floats,
 
 
 def _spectral_derivatives(level: Radiance, wavelength_nm: Floats, scale: Radiance, binning: int) -> Floats:
-    """Greatest first and second divided differences over wavelength, (2, band) over the unit; 0 where there is none."""
+    """Return the greatest first and second divided differences over wavelength, (2, band) over the unit.
+
+    0 where there is none.
+    """
     nm = np.asarray(wavelength_nm, np.float64)
     if len(nm) < 2:
         return np.zeros((2, len(nm)))
@@ -232,7 +235,7 @@ def _spectral_derivatives(level: Radiance, wavelength_nm: Floats, scale: Radianc
 
 
 def _above(difference: Radiance, high: Radiance) -> Radiance:
-    """0 where a difference is at most rounding."""
+    """Return the difference; 0 where it is at most rounding."""
     return np.where(difference > _ROUNDING * np.abs(high), difference, np.float32(0))
 
 
@@ -279,9 +282,9 @@ def probe_survey(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Un
 def probe_scene(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "sigma") -> Probe:
     """Look at the scene through the footprint alone where it is steepest, brightest and darkest, and along some lines.
 
-    Where to look is found on the scene's own pixels, so that the maxima hold for the whole image. Raises SceneError:
-    the scene holds a number that is not finite; SettingsError: no line to take, or sweeps of several binnings or
-    exposures; PoseError: a sweep is out of the mirror's reach.
+    The places to look are found on the scene's own pixels, so that the maxima hold for the whole image. Raises
+    SceneError: the scene holds a number that is not finite; SettingsError: no line to take, or sweeps of several
+    binnings or exposures; PoseError: a sweep is out of the mirror's reach.
     """
     taken = _taken(sweeps)
     binnings = {sweep.binning for sweep in taken}
@@ -318,7 +321,7 @@ def probe_scene(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Uni
 def _views_beside(
     scene: RasterScene, camera: LineCamera, sweeps: tuple[Sweep, ...], places: Extrema
 ) -> list[SampleViews]:
-    """Patches beside the sweeps, within each reach of them and farther; none where nothing is."""
+    """Return patches beside the sweeps, within each distance and beyond it; none where nothing is there."""
     beyond = places.seen[places_beyond(places.seen, scene, camera, sweeps)]
     near = [np.concatenate([beyond, places.beside[0]]), *places.beside[1:]]
     if not any(map(len, (*near, places.far))):
@@ -337,7 +340,9 @@ def _taken(sweeps: Sequence[Sweep]) -> tuple[Sweep, ...]:
 def _slit_errors(
     scene: RasterScene, rig: Rig, views: SampleViews, sweeps: tuple[Sweep, ...], unit: Unit
 ) -> dict[str, float]:
-    """Greatest change by every variant of the slit, over the unit: off, or against the finest, beside the rig's blurs.
+    """Return the greatest change by every variant of the slit, over the unit.
+
+    A variant is off, or compared with the finest, with all of the rig's blurs.
 
     Each sweep is seen through the boxes that a variant takes for it.
     """
@@ -382,7 +387,7 @@ def _roughest(scene: RasterScene, rig: Rig, views: SampleViews, unit: Unit) -> N
 def _changes(
     scene: RasterScene, rig: Rig, views: SampleViews, footprint: Footprint, finest: Radiance, scale: Radiance
 ) -> Floats:
-    """Greatest change of each stored number by another footprint, over the unit, (number,): measured, with its sign."""
+    """Return the greatest signed change of each stored number by another footprint, over the unit, (number,)."""
     light, greatest = light_seen(scene, rig.camera, views, footprint, _PHASES), np.zeros(views.sums)
     compiled_loops.greatest_changes(light, finest, scale, views.binning, _ROUNDING, greatest)
     return greatest
@@ -396,11 +401,14 @@ def _footprint(
 
 
 def _blurs(rig: Rig, wavelength_nm: Floats, sweeps: Sequence[Sweep]) -> list[Moments]:
-    """All that the rig's optics blur and shift in the sweeps where that is least and most; once where it is the same.
+    """Return all blurs and shifts of the rig's optics in the sweeps where they are least and most.
 
-    The slit's variants stand beside all other effects: what leaving out a blur changes is bounded for any slit.
+    One where both agree. The slit's variants stand beside all other effects: what leaving out a blur changes is bounded
+    for any slit.
     """
-    found = [_moments(rig, wavelength_nm, middle_normal(sweep, rig.camera)) for sweep in sweeps]
+    normals = [middle_normal(sweep, rig.camera) for sweep in sweeps]
+    all_blurs = [[blur.moments(rig, wavelength_nm, blur.variants[0], one) for blur in _OPTICS] for one in normals]
+    found = [Moments.together(blurs, len(wavelength_nm)) for blurs in all_blurs]
     found.sort(key=lambda one: float(_size(one).sum()))
     least, most = found[0], found[-1]
     return [least] if np.allclose(_size(least), _size(most), rtol=_ALIKE) else [least, most]
@@ -410,11 +418,6 @@ def _size(blurs: Moments) -> Floats:
     return blurs.spread if blurs.waves is None else blurs.spread + blurs.waves**2
 
 
-def _moments(rig: Rig, wavelength_nm: Floats, normal: Floats) -> Moments:
-    found = [blur.moments(rig, wavelength_nm, blur.variants[0], normal) for blur in _OPTICS]
-    return Moments.together(found, len(wavelength_nm))
-
-
 def _stored(values: Radiance, views: SampleViews) -> Radiance:
-    """Means over the samples of each stored number, (..., number, band)."""
+    """Return the means over the samples of each stored number, (..., number, band)."""
     return np.asarray(stored_mean(values, views.binning), np.float32)

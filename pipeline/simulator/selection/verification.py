@@ -38,7 +38,7 @@ MIDDLE_RAYS: Mapping[Effect, str] = {ROTATION: ROTATION.variants[0]}  # the scen
 
 
 def candidate_blocks(whole: Sequence[SweepBlock], places: Floats, *, lines: int = VERIFIED_LINES) -> list[SweepBlock]:
-    """Give blocks of few lines about places of the scene and about the first, middle and last line of every sweep.
+    """Return blocks of few lines about places of the scene and about the first, middle and last line of every sweep.
 
     ``whole``: every sweep as one block of all its lines; ``places``: (place, 2) rows and columns that are steep, bright
     or dark [px]. Returns at most `MOST_CANDIDATES`, evenly out of all, none twice.
@@ -54,9 +54,9 @@ def worst_blocks(
 ) -> dict[str, SweepBlock]:
     """Choose where bounds are hardest to keep: the steepest, brightest, darkest and most oblique of some blocks.
 
-    Of numbers as they are stored, of each binning its own. ``render`` gives expected electrons (line, sample, band),
-    ``units`` one unit of the tolerance at each [e-], from electrons and their binning. Returns them by name; one block
-    may have several. Raises ShapeError: there is nothing to choose from.
+    They are blocks of stored numbers, separate for each binning. ``render`` gives expected electrons (line, sample,
+    band), ``units`` one unit of the tolerance at each [e-], from electrons and their binning. Returns them by name; one
+    block may have several. Raises ShapeError: there is nothing to choose from.
     """
     best: dict[str, tuple[float, SweepBlock]] = {}
     least = min((block.sweep.binning for block in candidates), default=1)
@@ -134,9 +134,9 @@ def verify(decision: Decision, render: Render, blocks: Mapping[str, SweepBlock],
 
     Draws are paired: the difference is the effect's alone. Effects of the readout change distributions, not expected
     light, and are not measured. ``render`` gives expected electrons (line, sample, band) of a block with some effects
-    on, ``units`` one unit of the tolerance at each [e-]. Returns the greatest change of a stored number in units: by
-    the name of each effect that is not exact and bounded by more than `HARDLY`, and of `TOTAL`; where ``none`` was
-    asked for, of that alone.
+    on, ``units`` one unit of the tolerance at each [e-]. Returns the greatest change of a stored number in units, by
+    name. The names are `TOTAL` and each effect that is not exact and bounded by more than `HARDLY`. A request for
+    ``none`` returns that alone.
 
     Raises BoundError: a change exceeds the bound that the decision counted on; names effect, bound, change and place.
     """
@@ -210,11 +210,11 @@ def misplaced_electrons(light: NDArray[np.floating], contrast: NDArray[np.floati
 
 
 def misplaced_fraction(block: SweepBlock, exact: Mapping[Effect, str], chosen: Mapping[Effect, str]) -> float:
-    """Give the fraction of the contrast about a sample by which two ways to compute its light may differ at most.
+    """Return the fraction of the contrast about a sample by which two ways to compute its light may differ at most.
 
-    Tables of weights misplace up to `TABULATED` of the light along either axis, in either image; where blurs or held
-    positions differ, so do the kernels that stand for those of all bands, each right to `NEGLIGIBLE` unless its
-    footprint says otherwise. Half counts.
+    Tables of weights misplace up to `TABULATED` of the light along either axis, in either image. Kernels that stand for
+    those of all bands differ, too, where blurs or held positions do. Each is right to `NEGLIGIBLE` unless its footprint
+    says otherwise. Half counts.
     """
     if _folded(exact) == _folded(chosen):
         return 2 * TABULATED
@@ -236,7 +236,7 @@ def misplaced_in_tails(
 
 
 def tails_fraction(block: SweepBlock, exact: Mapping[Effect, str], chosen: Mapping[Effect, str]) -> Floats:
-    """Give the fraction of light, by size, that two ways put elsewhere beyond `REACH_PX` by other kernels, (band,)."""
+    """Return the fraction of light that two renderings place differently beyond `REACH_PX`, by kernels, (band,)."""
     positions = (folded_positions(block.sweep, _way(ways, SMEAR)) for ways in (exact, chosen))
     same = len(set(positions)) == 1 and _folded(exact) == _folded(chosen)
     if same or _way(exact, DIFFRACTION) != _way(chosen, DIFFRACTION):
@@ -254,7 +254,7 @@ def _folded(ways: Mapping[Effect, str]) -> dict[str, str]:
 
 
 def contrast_about(block: SweepBlock, render: Render, reach_px: int = REACH_PX) -> Floats:
-    """Give the range of the scene's light within a reach of each sample, (1, sample, band). [e-]
+    """Return the range of the scene's light within a reach of each sample, (1, sample, band). [e-]
 
     The scene is looked at by middle rays, a px and half a px apart: pixels may lie between those of one look.
     """
@@ -264,14 +264,15 @@ def contrast_about(block: SweepBlock, render: Render, reach_px: int = REACH_PX) 
     wide = replace(block, sweep=held, lines=range(max(ends[0], 0), min(ends[1], held.lines)))
     if not wide.lines:
         return np.zeros((1, block.rig.camera.samples, len(block.wavelength_nm)))
-    probes = (render(replace(wide, sweep=_beside(held, *way)), MIDDLE_RAYS) for way in _HALVES)
+    moved = (replace(held, swath_px=held.swath_px + along, start_px=held.start_px + scan) for along, scan in _HALVES)
+    probes = (render(replace(wide, sweep=one), MIDDLE_RAYS) for one in moved)
     ends_e = np.max([(seen.max(axis=0), -seen.min(axis=0)) for seen in probes], axis=0)
     most, least = (scipy.ndimage.maximum_filter1d(one, 2 * reach_px + 1, axis=0, mode="nearest") for one in ends_e)
     return np.asarray((most + least).astype(np.float64)[None])
 
 
 def _beyond(sweep: Sweep, rig: Rig, reach_px: int) -> Sweep:
-    """All positions that a sweep holds, one by one, and those beyond its ends; none that the mirror does not reach."""
+    """Return a sweep of every held position, extended beyond its ends where the mirror reaches that far."""
     held = replace(sweep, step=1, lines=sweep.lines * sweep.step)
     wide = replace(held, start_px=held.start_px - reach_px - 1, lines=held.lines + 2 * (reach_px + 1))
     try:
@@ -279,7 +280,3 @@ def _beyond(sweep: Sweep, rig: Rig, reach_px: int) -> Sweep:
     except PoseError:
         return held
     return wide
-
-
-def _beside(sweep: Sweep, along_px: float, scan_px: float) -> Sweep:
-    return replace(sweep, swath_px=sweep.swath_px + along_px, start_px=sweep.start_px + scan_px)
