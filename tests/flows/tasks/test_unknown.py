@@ -160,7 +160,7 @@ def test_a_rate_needs_weights_that_were_measured(survey_png: Survey, weights: Pa
 
 
 def _notes(weights: Path, nm: tuple[float, ...] = RGB_NM, **flags: Any) -> tuple[str, ...]:
-    scene: Any = SimpleNamespace(wavelength_nm=np.array(nm), shape=(96, 128))
+    scene: Any = SimpleNamespace(wavelength_nm=np.array(nm), shape=(96, 128), light_fraction=1.0)
     return beyond_training(load_settings(None, flags), scene, describe_weights(weights), SEEN, weights)
 
 
@@ -190,7 +190,7 @@ def test_what_training_did_not_see_is_told_in_one_note(weights: Path, flags: dic
 
 def test_a_pixel_of_another_size_is_told(weights: Path) -> None:
     """Before weights that know pixels of 1 cm."""
-    scene: Any = SimpleNamespace(wavelength_nm=np.array(RGB_NM), shape=(96, 128))
+    scene: Any = SimpleNamespace(wavelength_nm=np.array(RGB_NM), shape=(96, 128), light_fraction=1.0)
     other = TrainedOn(3, SEEN.wavelength_nm, SEEN.exposure_ms, 2, CLASSES, None, None, 0.01)
     (note,) = beyond_training(load_settings(None, {}), scene, describe_weights(weights), other, weights)
     assert "pixels of 12 cm of the ground (it saw 1 cm)" in note
