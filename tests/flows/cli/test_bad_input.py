@@ -216,7 +216,7 @@ def test_interrupted_survey_says_how_to_go_on(
 
 
 TRAINING = {
-    "scenes of files": (2, "scene.png -o new.safetensors --scenes 3", "--scenes is for the built-in farm"),
+    "scenes of files": (2, "scene.png -o new.safetensors --scenes 3", "--scenes is for built-in scenes"),
     "-o is a folder": (2, "scene.png -o archive --labels labels.png", "archive is a folder, expected a file"),
     "no patch": (2, "scene.png -o new.safetensors --patch 0", "--patch must be above 0, got 0"),
     "sizes do not fit": (
