@@ -31,16 +31,14 @@ class Limits:
     light: Exact  # (light,) ascending, exposures as fractions of the reference
     steps: tuple[int, ...]  # ascending pixels from line to line
     fine: Exact  # (step, light, rate)
-    coarse: Exact  # (light, rate) of a coarse pass
 
-    def at(self, rate: float, light: float, step: float | None) -> float:
-        """The distance for a rate, even in the logarithms of rate and light; ``step`` None is the coarse pass.
+    def at(self, rate: float, light: float, step: float) -> float:
+        """Return the distance for a rate, even in the logarithms of rate and light.
 
         Light and rates beyond those that were measured count as the nearest that was, other steps as the next wider.
         """
-        row = min(int(np.searchsorted(self.steps, step or 1)), len(self.steps) - 1)
-        table = self.coarse if step is None else self.fine[row]
-        by_rate = [float(np.interp(np.log(light), np.log(self.light), column)) for column in table.T]
+        row = min(int(np.searchsorted(self.steps, step)), len(self.steps) - 1)
+        by_rate = [float(np.interp(np.log(light), np.log(self.light), column)) for column in self.fine[row].T]
         return float(np.interp(np.log(rate), np.log(self.rates), by_rate))
 
 
@@ -73,10 +71,10 @@ class OodDetector:
     ) -> NDArray[np.bool_]:
         """Pixels (..., column) that lie farther away than all but a fraction ``rate`` of known ones, (...).
 
-        ``bands``: Of the camera. A binned pixel is the mean of as many readings. One without columns is not unknown.
+        ``bands``: Of the camera. A pixel without columns is not unknown.
         """
-        limit = self.limits.at(rate, capture.light, None if capture.binned > 1 else capture.step)
-        readings = capture.binned * min(1.0, bands / self.bands)  # fewer bands are as fewer readings
+        limit = self.limits.at(rate, capture.light, capture.step)
+        readings = min(1.0, bands / self.bands)  # fewer bands are as fewer readings
         distance = self.lit(capture.light, readings).distance(columns)
         with np.errstate(invalid="ignore"):
             return np.asarray(distance > limit, np.bool_)

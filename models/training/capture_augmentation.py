@@ -12,11 +12,10 @@ from models.network.spectral import LineSpec, Normalisation, with_planes
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS
 
 REFERENCE_MS = DEFAULT_EXPOSURE_MS  # exposures are told as fractions of this one, at which looks are made
-STEPS = MappingProxyType({1: 0.45, 2: 0.3, 4: 0.2, 8: 0.05})  # how often crops have lines so many pixels apart
-UNIFORM, INTERLACED, TWO_PASSES = range(3)
-KINDS_OF_CAPTURE = (0.65, 0.2, 0.15)  # how often
-BINNED = 4  # lines and samples of a coarse pass to a pixel
-DARKEST_COARSE_MS = 10.0  # of a coarse pass, whose samples are read in fours
+STEPS = MappingProxyType({1: 0.4, 2: 0.25, 4: 0.27, 8: 0.08})  # how often crops have lines so many pixels apart
+INTERLACED = 0.5  # how many of the crops with lines apart show a first pass and closer lines across areas
+AREAS = (0.3, 0.4, 0.3)  # how often so many areas have closer lines
+ACROSS = 0.5  # how many of them are as wide as the crop
 TINY = 1e-9  # added to correlations, which rounding may leave with an eigenvalue below 0
 Matrix = NDArray[np.float64]
 Columns = NDArray[np.float32]  # (y, x, column)
@@ -76,24 +75,14 @@ class CaptureAugmentation:
     def draw(self, columns: Columns, noise: ColumnNoise, rng: np.random.Generator) -> tuple[Columns, Columns]:
         """Show a crop (y, x, column) as a capture drawn by chance: what the overview reads, and the full network.
 
-        A uniform scan; two of them, of which one covers a rectangle (lines captured between others); or two passes,
-        where the overview reads binned pixels and the full network a scan. Exposures are even in their logarithm.
+        A uniform scan, or a first pass with closer lines across areas. Exposures are even in their logarithm.
         """
-        kind = rng.choice(3, p=KINDS_OF_CAPTURE)
         odds = {step: often for step, often in STEPS.items() if len(columns) % step == 0}
         step = int(rng.choice(list(odds), p=np.array(list(odds.values())) / sum(odds.values())))
-        image = self.scan(columns, noise, light=self._light(rng), step=step, rng=rng)
-        if kind == TWO_PASSES:
-            light = max(self._light(rng), DARKEST_COARSE_MS / REFERENCE_MS)
-            return self.coarse_pass(columns, noise, light=light, rng=rng), image
-        if kind == INTERLACED and step > 1:
-            finer = step // int(rng.choice([own for own in (2, 4, 8) if own <= step]))
-            (top, bottom), (left, right) = (
-                sorted(rng.integers(0, size // step + 1, 2) * step) for size in image.shape[:2]
-            )
-            part = np.s_[top:bottom, left:right]
-            if bottom > top and right > left:
-                image[part] = self.scan(columns[part], noise, light=self._light(rng), step=finer, rng=rng)
+        if step > 1 and rng.random() < INTERLACED:
+            image = self.interlaced(columns, noise, step=step, rng=rng)
+        else:
+            image = self.scan(columns, noise, light=self._light(rng), step=step, rng=rng)
         return image, image
 
     def _light(self, rng: np.random.Generator) -> float:
@@ -108,51 +97,64 @@ class CaptureAugmentation:
         ``light`` is the exposure as a fraction of the reference; ``step`` is a power of two that divides the rows.
         """
         scaled = columns @ self.unwhiten
-        if step > 1:
-            scaled = scaled.reshape(-1, step, *scaled.shape[1:]).mean(axis=1)
-        scaled = self._noisy(scaled, noise, light, rng, samples=step)
-        for _ in range(step.bit_length() - 1):
-            scaled = _twice_the_rows(scaled)
-        return with_planes(scaled @ self.normalisation.whitening, LineSpec(light, step))
+        means = scaled.reshape(-1, step, *scaled.shape[1:]).mean(axis=1)
+        lines = self._noisy(means, noise, light, rng, samples=step)
+        between = rows_between(lines, len(columns), first=(step - 1) / 2, apart=step) if step > 1 else lines
+        return with_planes(between @ self.normalisation.whitening, LineSpec(light, step))
 
-    def coarse_pass(self, columns: Columns, noise: ColumnNoise, *, light: float, rng: np.random.Generator) -> Columns:
-        """Show a crop as a pass of lines ``BINNED`` px apart, so many samples binned, each pixel repeated."""
-        scaled = columns @ self.unwhiten
-        y, x, _ = scaled.shape
-        means = scaled.reshape(y // BINNED, BINNED, x // BINNED, BINNED, -1).mean(axis=(1, 3))
-        means = self._noisy(means, noise, light, rng, samples=BINNED**2, readings=BINNED)
-        repeated = np.repeat(np.repeat(means, BINNED, axis=0), BINNED, axis=1)
-        return with_planes(repeated @ self.normalisation.whitening, LineSpec(light, BINNED, BINNED))
+    def interlaced(self, columns: Columns, noise: ColumnNoise, *, step: int, rng: np.random.Generator) -> Columns:
+        """Show a crop as a first pass that stares at rows ``step`` px apart, and areas with later lines between them.
+
+        Where an area has closer lines, those of the first pass stay among them, each with its own exposure.
+        """
+        scaled, size = columns @ self.unwhiten, len(columns)
+        light, first = self._light(rng), int(rng.integers(step))
+        lines = self._noisy(scaled[first::step], noise, light, rng)
+        between = rows_between(lines, size, first=first, apart=step)
+        image = with_planes(between @ self.normalisation.whitening, LineSpec(light, step))
+        for _ in range(rng.choice(len(AREAS), p=AREAS)):
+            rows = slice(*np.sort(rng.integers(0, size + 1, 2)))
+            samples = slice(*np.sort(rng.integers(0, columns.shape[1] + 1, 2)))
+            samples = slice(None) if rng.random() < ACROSS else samples
+            closer, later = step // int(rng.choice([own for own in (2, 4, 8) if own <= step])), self._light(rng)
+            start = first % closer
+            taken = self._noisy(scaled[start::closer, samples], noise, later, rng)
+            taken[first // closer :: step // closer] = lines[:, samples]
+            between = rows_between(taken, size, first=start, apart=closer) @ self.normalisation.whitening
+            nearest = np.clip(np.rint((np.arange(size) - start) / closer), 0, len(taken) - 1) * closer + start
+            own = np.where((nearest - first) % step == 0, light, later)
+            planes = np.stack([LineSpec(float(one), closer).planes for one in own])[:, None]
+            planes = np.broadcast_to(planes, (*between.shape[:-1], planes.shape[-1]))
+            image[rows, samples] = np.concatenate([between, planes], axis=-1)[rows]
+        return image
 
     def _noisy(
-        self,
-        scaled: Columns,
-        noise: ColumnNoise,
-        light: float,
-        rng: np.random.Generator,
-        *,
-        samples: int,
-        readings: int = 1,
+        self, scaled: Columns, noise: ColumnNoise, light: float, rng: np.random.Generator, *, samples: int = 1
     ) -> Columns:
-        """With what so many readings of an exposure of ``light`` add to a mean of ``samples`` pixels of the reference.
-
-        A line of several pixels is read once, a coarse pixel as often as it has samples along its line.
-        """
+        """With what an exposure of ``light`` adds to a mean of ``samples`` pixels of the reference."""
         values = scaled * self.normalisation.spread + self.normalisation.centre
-        more = noise.variance(values, light) / readings - noise.variance(values, 1.0) / samples
+        more = noise.variance(values, light) - noise.variance(values, 1.0) / samples
         size = np.sqrt(np.maximum(more, 0)) / self.normalisation.spread
         mixing = np.linalg.cholesky(noise.correlation() + TINY * np.eye(len(noise.shot))).T.astype(np.float32)
         drawn = rng.standard_normal(scaled.shape, np.float32) @ mixing
         return np.asarray(scaled + size.astype(np.float32) * drawn, np.float32)
 
 
-def _twice_the_rows(image: Columns) -> Columns:
-    """Rows between rows, by Catmull-Rom at a quarter of the way, with the border repeated."""
-    before, at, after, beyond = (
-        np.pad(image, ((2, 2), (0, 0), (0, 0)), mode="edge")[i : len(image) + 1 + i] for i in range(4)
+def rows_between(lines: Columns, size: int, *, first: float, apart: float) -> Columns:
+    """Interpolate ``size`` rows from lines (line, x, column) at row ``first`` and every ``apart`` rows, by Catmull-Rom.
+
+    The border's lines are repeated beyond it.
+    """
+    at = (np.arange(size) - first) / apart
+    before = np.floor(at).astype(np.intp)
+    t = (at - before).astype(np.float32)
+    weights = (
+        ((-0.5 * t + 1.0) * t - 0.5) * t,
+        (1.5 * t - 2.5) * t * t + 1.0,
+        ((-1.5 * t + 2.0) * t + 0.5) * t,
+        (0.5 * t - 0.5) * t * t,
     )
-    third = (-0.0703125 * before + 0.8671875 * at + 0.2265625 * after - 0.0234375 * beyond).astype(np.float32)
-    first = (-0.0234375 * before + 0.2265625 * at + 0.8671875 * after - 0.0703125 * beyond).astype(np.float32)
-    grown = np.empty((2 * len(image), *image.shape[1:]), np.float32)
-    grown[0::2], grown[1::2] = first[:-1], third[1:]
-    return grown
+    rows = np.zeros((size, *lines.shape[1:]), np.float32)
+    for tap, weight in enumerate(weights, start=-1):
+        rows += weight[:, None, None] * lines[np.clip(before + tap, 0, len(lines) - 1)]
+    return rows

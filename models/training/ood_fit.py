@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from models.network.sizes import PLANES
 from models.network.spectral import Normalisation
 from models.reading.ood import Exact, Limits, OodDetector
-from models.training.capture_augmentation import BINNED, REFERENCE_MS, STEPS, CaptureAugmentation, ColumnNoise
+from models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation, ColumnNoise
 from models.training.examples import Example
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
@@ -58,8 +58,8 @@ def fit_ood(
     noises = noises or [ColumnNoise(np.zeros(pixels.shape[1]), np.zeros((pixels.shape[1], pixels.shape[1])))]
     noise = ColumnNoise(np.mean([one.shot for one in noises], axis=0), np.mean([one.read for one in noises], axis=0))
     shot, read = _noise_of_columns(noise, centres, normalisation)
-    none = np.zeros((1, 1, 1))
-    draft = OodDetector(centres, covariance, shot, read, Limits(np.ones(1), np.ones(1), (1,), none, none[0]), bands)
+    nothing = Limits(np.ones(1), np.ones(1), (1,), np.zeros((1, 1, 1)))
+    draft = OodDetector(centres, covariance, shot, read, nothing, bands)
     limits = measured_limits(draft, validation, augmentation, rng, lambda done: report(0.5 + done / 2))
     return replace(draft, limits=limits)
 
@@ -136,7 +136,7 @@ def measured_limits(
     light = [one for one in LIGHT if one * REFERENCE_MS >= augmentation.darkest_ms] if noisy else [1.0]
     varied = noisy and augmentation.darkest_ms < REFERENCE_MS
     steps = tuple(step for step in STEPS if all(len(one.labels) % step == 0 for one in examples)) if varied else (1,)
-    fine, coarse = np.empty((len(steps), len(light), len(RATES))), np.empty((len(light), len(RATES)))
+    fine = np.empty((len(steps), len(light), len(RATES)))
     for j, fraction in enumerate(light):
         for i, step in enumerate(steps):
             distances = []
@@ -145,28 +145,7 @@ def measured_limits(
                 if one.noise is not None:
                     pixels = augmentation.scan(pixels, one.noise, light=fraction, step=step, rng=rng)[..., :-PLANES]
                 distances.append(ood_detector.lit(fraction).distance(pixels[one.labels != UNLABELLED]))
-            fine[i, j] = _beyond(distances)
+            together = np.concatenate(distances).astype(np.float64)
+            fine[i, j] = np.quantile(together, 1 - np.array(RATES))
             report((j * len(steps) + i + 1) / (len(steps) * len(light)))
-        coarse[j] = _beyond([_binned_distances(ood_detector, one, augmentation, fraction, rng) for one in examples])
-    return Limits(np.array(RATES), np.array(light), steps, fine, coarse)
-
-
-def _binned_distances(
-    ood_detector: OodDetector,
-    example: Example,
-    augmentation: CaptureAugmentation,
-    light: float,
-    rng: np.random.Generator,
-) -> NDArray[np.float32]:
-    """Distances of the labelled pixels of a coarse pass; those of one class throughout."""
-    size = tuple(side // BINNED * BINNED for side in example.labels.shape)
-    labels = example.labels[: size[0], : size[1]].reshape(size[0] // BINNED, BINNED, size[1] // BINNED, BINNED)
-    known = (labels != UNLABELLED).all(axis=(1, 3))
-    pixels = np.asarray(example.columns[: size[0], : size[1]], np.float32)
-    noise = example.noise or ColumnNoise(np.zeros(pixels.shape[2]), np.zeros((pixels.shape[2],) * 2))
-    coarse = augmentation.coarse_pass(pixels, noise, light=light, rng=rng)[::BINNED, ::BINNED, :-PLANES]
-    return ood_detector.lit(light, BINNED).distance(coarse[known])
-
-
-def _beyond(distances: list[NDArray[np.float32]]) -> NDArray[np.float64]:
-    return np.asarray(np.quantile(np.concatenate(distances).astype(np.float64), 1 - np.array(RATES)))
+    return Limits(np.array(RATES), np.array(light), steps, fine)

@@ -41,7 +41,7 @@ else:
 NORMALISATION = ("centre", "spread", "whitening")
 FORMAT = "spectralzoom-weights/4"
 OF_COMPONENTS = ("centres", "covariance", "shot", "read")
-OF_LIMITS = ("rates", "light", "fine", "coarse")
+OF_LIMITS = ("rates", "light", "fine")
 SPREAD = "normalisation.spread"
 CASCADE = "cascade"  # of a record: what reading a part of the patches in full loses
 CALIBRATION = "calibration"  # of a record: how sure of themselves maps may be, and the temperature, where one is needed
@@ -190,7 +190,7 @@ def load_ood(weights: Path) -> OodDetector:
     tensors, about = _read_part(weights, described, OOD, spreads=("light", "rates")), described.ood_detector
     try:
         arrays = {name: tensors[name].double().numpy() for name in (*OF_COMPONENTS, *OF_LIMITS)}
-        limits = Limits(arrays["rates"], arrays["light"], about.steps, arrays["fine"], arrays["coarse"])
+        limits = Limits(arrays["rates"], arrays["light"], about.steps, arrays["fine"])
         found = OodDetector(**{name: arrays[name] for name in OF_COMPONENTS}, limits=limits, bands=about.bands)
         found.lit(float(limits.light[0]))  # refuses a covariance that is none
     except (KeyError, ValueError) as error:

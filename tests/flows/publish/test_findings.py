@@ -75,7 +75,7 @@ def _judged(weights: Path, folder: Path, content: dict[str, Any], limit: float =
     path = folder / "judged.safetensors"
     shutil.copy(weights, path)
     one, table = np.eye(3), np.full((1, 1, 2), limit)
-    limits = Limits(np.array([0.001, 0.05]), np.ones(1), (1,), table, table[0])
+    limits = Limits(np.array([0.001, 0.05]), np.ones(1), (1,), table)
     ood_detector = OodDetector(np.zeros((1, 3)), one[None], 1e-9 * one[None], 1e-9 * one, limits, 3)
     add_ood(path, path, ood_detector, SEEN, {MAP_SCORES: content})
     return path

@@ -39,7 +39,7 @@ def judging(weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Maker:
         path = tmp_path_factory.mktemp("judging") / "w.safetensors"
         shutil.copy(weights, path)
         one, table = np.eye(3), np.full((1, 1, 2), limit)
-        limits = Limits(np.array([0.001, 0.05]), np.ones(1), (1,), table, table[0])
+        limits = Limits(np.array([0.001, 0.05]), np.ones(1), (1,), table)
         ood_detector = OodDetector(np.zeros((1, 3)), one[None], 1e-9 * one[None], 1e-9 * one, limits, 3)
         add_ood(path, path, ood_detector, SEEN, {})
         return path

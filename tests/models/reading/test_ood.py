@@ -18,9 +18,7 @@ COLUMNS = 5
 
 def some_limits(distance: float = 2.0) -> Limits:
     """The same distance for both rates, all light and both steps."""
-    return Limits(
-        np.array([0.001, 0.01]), np.array([0.03, 1.0]), (1, 2), np.full((2, 2, 2), distance), np.full((2, 2), distance)
-    )
+    return Limits(np.array([0.001, 0.01]), np.array([0.03, 1.0]), (1, 2), np.full((2, 2, 2), distance))
 
 
 def some_ood(seed: int = 0, components: int = 3, **changed: Any) -> OodDetector:
@@ -96,9 +94,9 @@ def test_a_pixel_without_columns_is_not_unknown() -> None:
 
 
 def test_a_capture_is_held_against_its_own_limit() -> None:
-    """Lines between two spacings that were measured count as the wider; binned pixels have limits of their own."""
+    """Lines between two spacings that were measured count as the wider."""
     fine = np.array([1.0, 3.0])[:, None, None] * np.ones((2, 2, 2))
-    limits = Limits(np.array([0.001, 0.01]), np.array([0.03, 1.0]), (1, 2), fine, np.full((2, 2), 6.0))
+    limits = Limits(np.array([0.001, 0.01]), np.array([0.03, 1.0]), (1, 2), fine)
     ood_detector = some_ood(
         covariance=np.stack([np.eye(COLUMNS)] * 3),
         shot=np.zeros((3, COLUMNS, COLUMNS)),
@@ -106,17 +104,16 @@ def test_a_capture_is_held_against_its_own_limit() -> None:
         limits=limits,
     )
     pixels = ood_detector.centres[0] + np.sqrt([[0.9], [2.0], [5.0], [7.0]])  # so far away, squared
-    captures = [LineSpec(), LineSpec(step=1.5), LineSpec(step=2), LineSpec(step=4, binned=4)]
+    captures = [LineSpec(), LineSpec(step=1.5), LineSpec(step=2)]
     told = [ood_detector.unknown(pixels, rate=0.01, capture=one, bands=10).sum() for one in captures]
-    assert told == [3, 2, 2, 1]
+    assert told == [3, 2, 2]
 
 
 def test_limits_lie_between_those_that_were_measured() -> None:
     """By the logarithms of rate and light; beyond them the nearest; a step between two counts as the wider."""
     fine = np.array([[[4.0, 2.0], [3.0, 1.0]], [[8.0, 6.0], [7.0, 5.0]]])
-    limits = Limits(np.array([0.001, 0.1]), np.array([0.01, 1.0]), (1, 4), fine, 10 * fine[0])
+    limits = Limits(np.array([0.001, 0.1]), np.array([0.01, 1.0]), (1, 4), fine)
     assert limits.at(0.001, 0.01, 1) == 4
     assert limits.at(0.01, 0.1, 1) == pytest.approx(2.5)
     assert limits.at(0.5, 0.001, 2) == 6
     assert limits.at(0.1, 5.0, 8) == 5
-    assert limits.at(0.001, 1.0, None) == 30

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from models.network.spectral import LineSpec, Normalisation, SpectralBasis
 from models.training import capture_augmentation
-from models.training.capture_augmentation import CaptureAugmentation, ColumnNoise
+from models.training.capture_augmentation import CaptureAugmentation, ColumnNoise, rows_between
 from pipeline.geometry.camera import LineCamera, expose
 
 BANDS = np.linspace(400.0, 1000.0, 60)
@@ -72,23 +72,28 @@ def _flat(normalisation: Normalisation, value: float, shape: tuple[int, int]) ->
 SILENT = ColumnNoise(np.zeros(12), np.zeros((12, 12)))
 
 
-def _silent_scan(augmentation: CaptureAugmentation, columns: np.ndarray, step: int) -> np.ndarray:
+def _silent_scan(
+    augmentation: CaptureAugmentation, columns: np.ndarray, step: int, light: float = 1.0
+) -> np.ndarray:
     """A scan in which nothing is drawn by chance."""
-    return augmentation.scan(columns, SILENT, light=1.0, step=step, rng=np.random.default_rng(0))
+    return augmentation.scan(columns, SILENT, light=light, step=step, rng=np.random.default_rng(0))
 
 
-def test_rows_between_two_lines_are_interpolated_by_their_cubic() -> None:
-    """Lines two rows apart lie between two rows each, which see four lines by Catmull-Rom a quarter of the way."""
-    augmentation, _ = _augmentation()
-    image = np.zeros((32, 1, 12), np.float32)
-    image[16:18] = 1  # one line
+def test_rows_between_lines_are_interpolated_by_their_cubic() -> None:
+    """A row between lines sees four of them by Catmull-Rom; a row of a line is that line, and the border repeats."""
+    lines = np.zeros((8, 1, 1), np.float32)
+    lines[4] = 1
     t = 0.25
     before, at, after, beyond = (
         np.array([-t + 2 * t**2 - t**3, 2 - 5 * t**2 + 3 * t**3, t + 4 * t**2 - 3 * t**3, t**3 - t**2]) / 2
     )
-    seen = _silent_scan(augmentation, image, 2)[..., :12]
-    expected = [0, beyond, before, after, at, at, after, before, beyond, 0]
-    np.testing.assert_allclose(seen[12:22, 0, 0], expected, atol=1e-6)
+    seen = rows_between(lines, 16, first=0.5, apart=2)[:, 0, 0]
+    np.testing.assert_allclose(seen[4:14], [0, beyond, before, after, at, at, after, before, beyond, 0], atol=1e-6)
+    ramp = np.arange(8, dtype=np.float32)[:, None, None]
+    rows = rows_between(ramp, 32, first=3, apart=4)[:, 0, 0]
+    np.testing.assert_allclose(rows[7:28], (np.arange(7, 28) - 3) / 4, atol=1e-5)
+    assert (rows[3::4] == np.arange(8)).all()
+    assert (rows[:3] <= rows[3]).all()
 
 
 @pytest.mark.parametrize("step", [1, 2, 4, 8])
@@ -127,33 +132,6 @@ def test_a_scan_is_as_noisy_as_its_light_makes_it(light: float, step: int) -> No
     np.testing.assert_allclose(inner.reshape(-1, 12).var(axis=0), added * share, rtol=0.08)
 
 
-def test_a_coarse_pass_repeats_means_that_are_read_four_times() -> None:
-    """Each 4 x 4 pixels are alike, their mean in silence; noise is that of four readings less that of their pixels."""
-    augmentation, normalisation = _augmentation()
-    image, unwhiten = np.random.default_rng(1).normal(size=(16, 24, 12)).astype(np.float32), augmentation.unwhiten
-    seen = augmentation.coarse_pass(image, SILENT, light=0.5, rng=np.random.default_rng(0))
-    means = image.reshape(4, 4, 6, 4, 12).mean(axis=(1, 3))
-    np.testing.assert_allclose(seen[..., :12], means.repeat(4, 0).repeat(4, 1), atol=1e-4)
-    assert (seen[..., 12:] == LineSpec(0.5, 4, 4).planes).all()
-    noise, plain = _noise(), _flat(normalisation, 0.3, (400, 400))
-    seen = augmentation.coarse_pass(plain, noise, light=0.1, rng=np.random.default_rng(3))
-    pixels = seen.reshape(100, 4, 100, 4, 15)
-    assert (pixels == pixels[:, :1, :, :1]).all()
-    told = (pixels[:, 0, :, 0, :12] @ unwhiten * normalisation.spread).reshape(-1, 12).var(axis=0)
-    spectrum = np.full(12, 0.3)
-    added = noise.variance(spectrum, 0.1) / 4 - noise.variance(spectrum, 1.0) / 16
-    np.testing.assert_allclose(told, added, rtol=0.08)
-
-
-def _drawn(kind: int, monkeypatch: pytest.MonkeyPatch) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """An image, and what is shown of it to the overview and the full network, of many captures of one kind."""
-    monkeypatch.setattr(capture_augmentation, "KINDS_OF_CAPTURE", np.eye(3)[kind])
-    augmentation, _ = _augmentation(12.0)
-    rng = np.random.default_rng(4)
-    image = rng.normal(size=(32, 32, 12)).astype(np.float32)
-    return [(image, *augmentation.draw(image, SILENT, rng)) for _ in range(60)]
-
-
 def _captures(planes: np.ndarray) -> list[LineSpec]:
     """The captures of an image, by its planes."""
     logarithms = np.unique(planes.reshape(-1, 3), axis=0) * [4, 2, 2]
@@ -162,12 +140,15 @@ def _captures(planes: np.ndarray) -> list[LineSpec]:
 
 def test_uniform_scans_have_every_spacing_and_light(monkeypatch: pytest.MonkeyPatch) -> None:
     """Both networks see one capture, whose exposure lies between the darkest and the reference."""
-    augmentation, found = _augmentation()[0], []
-    for image, overview, detail in _drawn(capture_augmentation.UNIFORM, monkeypatch):
+    monkeypatch.setattr(capture_augmentation, "INTERLACED", 0.0)
+    augmentation, _ = _augmentation(12.0)
+    rng, found = np.random.default_rng(4), []
+    image = rng.normal(size=(32, 32, 12)).astype(np.float32)
+    for _ in range(60):
+        overview, detail = augmentation.draw(image, SILENT, rng)
         assert detail is overview
         (own,) = _captures(overview[..., 12:])
-        scan = _silent_scan(augmentation, image, int(own.step))
-        np.testing.assert_allclose(overview[..., :12], scan[..., :12], atol=1e-4)
+        np.testing.assert_allclose(overview, _silent_scan(augmentation, image, int(own.step), own.light), atol=1e-4)
         found.append(own)
     assert {own.step for own in found} == set(capture_augmentation.STEPS)
     light = np.array([own.light for own in found])
@@ -175,40 +156,38 @@ def test_uniform_scans_have_every_spacing_and_light(monkeypatch: pytest.MonkeyPa
     assert 0.8 < light.max() < 1.0001
 
 
-def test_lines_between_others_are_a_second_capture_beside_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a rectangle of whole lines there are finer ones, in a light of their own; around it nothing changes."""
-    augmentation, both = _augmentation()[0], 0
-    for image, overview, detail in _drawn(capture_augmentation.INTERLACED, monkeypatch):
-        assert detail is overview
-        planes = overview[..., 12:]
-        finest = planes[..., 1].min()
-        inside = (planes != planes[np.unravel_index(planes[..., 1].argmax(), (32, 32))]).any(axis=-1)
-        captures = _captures(planes)
-        wide = max(int(own.step) for own in captures)
-        expected = _silent_scan(augmentation, image, wide)[..., :12]
-        if inside.any():
-            both += 1
-            rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
-            part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-            assert inside[part].all()
-            assert rows[0] % wide == columns[0] % wide == len(rows) % wide == len(columns) % wide == 0
-            fine = min(int(own.step) for own in captures)
-            assert wide % fine == 0
-            assert fine < wide
-            assert finest == LineSpec(step=fine).planes[1]
-            expected[part] = _silent_scan(augmentation, image[part], fine)[..., :12]
-            assert len(captures) == 2
-        np.testing.assert_allclose(overview[..., :12], expected, atol=1e-4)
-    assert both > 10
+@pytest.mark.parametrize("step", [2, 4, 8])
+def test_a_first_pass_stares_at_its_rows(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
+    """Without areas every ``step``-th row is read as it is, from any first row, and those between are interpolated."""
+    monkeypatch.setattr(capture_augmentation, "AREAS", (1.0,))
+    augmentation, _ = _augmentation()
+    image = np.random.default_rng(1).normal(size=(32, 5, 12)).astype(np.float32)
+    begun = set()
+    for seed in range(40):
+        seen = augmentation.interlaced(image, SILENT, step=step, rng=np.random.default_rng(seed))
+        same = np.isclose(seen[..., :12], image, atol=1e-4).all(axis=(1, 2))
+        (first,) = {int(row) % step for row in np.flatnonzero(same)}
+        assert same[first::step].all()
+        (own,) = _captures(seen[..., 12:])
+        assert own.step == step
+        begun.add(first)
+    assert begun == set(range(step))
 
 
-def test_two_passes_show_the_overview_binned_pixels_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The full network sees a scan of its own, of the same place."""
-    augmentation = _augmentation()[0]
-    for image, overview, detail in _drawn(capture_augmentation.TWO_PASSES, monkeypatch)[:10]:
-        (coarse,), (fine,) = _captures(overview[..., 12:]), _captures(detail[..., 12:])
-        assert (coarse.step, coarse.binned, fine.binned) == (4, 4, 1)
-        means = image.reshape(8, 4, 8, 4, 12).mean(axis=(1, 3)).repeat(4, 0).repeat(4, 1)
-        np.testing.assert_allclose(overview[..., :12], means, atol=1e-4)
-        scan = _silent_scan(augmentation, image, int(fine.step))
-        np.testing.assert_allclose(detail[..., :12], scan[..., :12], atol=1e-4)
+def test_later_lines_lie_between_those_of_the_first_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In an area each line keeps its own exposure and noise; pixels tell the nearest line's, and how close lines are."""
+    monkeypatch.setattr(capture_augmentation, "AREAS", (0.0, 1.0))
+    monkeypatch.setattr(capture_augmentation, "ACROSS", 1.0)
+    augmentation, normalisation = _augmentation(3.0)
+    lights = iter([0.5, 0.05])
+    monkeypatch.setattr(augmentation, "_light", lambda rng: next(lights))
+    unwhiten, plain = np.linalg.inv(normalisation.whitening.astype(np.float64)), _flat(normalisation, 0.3, (64, 2000))
+    seen = augmentation.interlaced(plain, _noise(), step=8, rng=np.random.default_rng(8))
+    captures = {(round(own.light, 3), own.step) for own in _captures(seen[..., 12:])}
+    closer = min(step for _, step in captures)
+    assert captures == {(0.5, 8), (0.5, closer), (0.05, closer)}
+    values = (seen[..., :12] - plain) @ unwhiten * normalisation.spread
+    for light in (0.5, 0.05):
+        rows = (seen[..., 12:] == LineSpec(light, closer).planes).all(axis=(1, 2))
+        told = _noise().variance(np.full(12, 0.3), light) - _noise().variance(np.full(12, 0.3), 1.0)
+        np.testing.assert_allclose(values[rows].var(axis=1).max(axis=0), told, rtol=0.15)  # rows of lines have most
