@@ -46,12 +46,14 @@ class MultiplyAddsSaving(Saving):
 
 
 class CaptureSaving(Saving):
-    """Seconds of capture: everything is the cheapest scan nearly as good as any, by the scan performance table.
+    """Seconds of capture. Everything is every line at the camera's exposure.
 
-    Without such a table it is every line at the camera's exposure, and ``full_scan`` (in words) is missing.
+    ``uniform`` are the seconds of the cheapest uniform scan that is nearly as good as any by the weights' record, and
+    ``uniform_scan`` names it; both are missing without such a record.
     """
 
-    full_scan: str | None = None
+    uniform: float | None = None
+    uniform_scan: str | None = None
 
 
 class Savings(_Part):

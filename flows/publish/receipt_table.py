@@ -64,13 +64,16 @@ def cost_rows(savings: Mapping[str, Any]) -> list[dict[str, Any]]:
 def byte_rows(receipt: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the bytes of a run against the reference, a row each.
 
-    They are in MB, so that rows compare, but where the reference is smaller than a tenth of one.
+    They are in MB, so that rows compare, but where the reference is smaller than a tenth of one. Bytes moved have a row
+    where some were.
     """
     told, rows = receipt["data_bytes"], []
     full = told["reference"]
     show = format_bytes if full is not None and full < LEAST_REFERENCE else format_megabytes
     for name, label in BYTE_LABELS.items():
         done = told[name]
+        if done == 0 and name.startswith("moved"):
+            continue
         words = "not counted" if done is None else show(done)
         ratio = None if done is None or not full else done / full
         rows.append({"label": label, "done": words, "full": show(full), "ratio": ratio})
@@ -92,6 +95,9 @@ def print_table(receipt: Receipt, console: Console) -> None:
     costs = [*cost_rows(receipt["savings"]), *byte_rows(receipt)]
     rows = [[row["label"], row["done"], row["full"], format_percent(row["ratio"])] for row in costs]
     console.print(table(columns, rows, whole=columns[1:]))
+    if "capture_s" in receipt["savings"]:
+        usual = f"{receipt['settings']['camera']['exposure_ms']:g} ms"
+        console.print(f"Everything: every line of {usual}, kept as captured, each of its patches read in full.")
     if reused := format_reused(receipt):
         console.print(escape(reused))
     for name, words in finding_rows({name: receipt[name] for name in ("memory", "unknown") if name in receipt}):
@@ -117,11 +123,12 @@ def headline(receipt: Receipt, captured_again: float | None = None) -> str:
             "pixel."
         )
     else:
-        usual = f"every line of {receipt['settings']['camera']['exposure_ms']:g} ms" if scan else "a scan of everything"
-        best = capture.get("full_scan")
-        whole = f"the cheapest scan that is nearly as good as any ({best})" if best else usual
+        usual = f"every line of {receipt['settings']['camera']['exposure_ms']:g} ms"
         done, full = (format_seconds(capture[name]) for name in ("done", "full"))
-        words.append(f"Capture took {done} instead of {full} for {whole} ({format_percent(capture['ratio'])}).")
+        words.append(f"Capture took {done} instead of {full} for {usual} ({format_percent(capture['ratio'])}).")
+        if capture.get("uniform") is not None:
+            least = f"{format_seconds(capture['uniform'])} ({capture['uniform_scan']})"
+            words.append(f"The cheapest uniform scan that is nearly as good as any takes {least}.")
     if is_pending(receipt):
         words.append("The map is not judged yet: its accuracy is added once it is.")
     if (accuracy := receipt.get("accuracy")) is not None:

@@ -187,12 +187,12 @@ def _savings(run: SurveyRun, plan: FinePlan, read: NDArray[np.intp]) -> dict[str
         return _model_savings(run, read)
     done = [*run.plan.coarse, *plan.sweeps]
     entries = capture_savings(done, run.plan.full, run.camera, run.grid, cost=run.settings.cost)
-    reference = run.scans.reference  # the cheapest scan that is nearly as good as any; without a table, every line
-    full_s = run.plan.full_s if reference is None else reference.seconds
-    capture = SavingEntry(run.plan.coarse_s + plan.seconds, full_s, "predicted").as_dict()
+    capture = SavingEntry(run.plan.coarse_s + plan.seconds, run.plan.full_s, "predicted").as_dict()
+    if (uniform := run.scans.reference) is not None:  # the cheapest scan that is nearly as good as any
+        capture |= {"uniform": uniform.seconds, "uniform_scan": uniform.words}
     return {
         **{name: entry.as_dict() for name, entry in entries.items()},
-        "capture_s": capture if reference is None else capture | {"full_scan": reference.words},
+        "capture_s": capture,
         **_model_savings(run, read),
     }
 

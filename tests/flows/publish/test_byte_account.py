@@ -224,8 +224,6 @@ def test_terminal_and_page_show_megabytes_against_one_reference() -> None:
         ("bytes captured", "2 MB", "4 MB", 0.5),
         ("bytes written", "7 MB", "4 MB", 1.75),
         ("bytes kept", "1.5 MB", "4 MB", 0.375),
-        ("bytes moved, bucket", "0 MB", "4 MB", 0),
-        ("bytes moved, workers", "0 MB", "4 MB", 0),
     ]
     words = "Reused, found and not written again: 1 store, 0.25 MB of the bytes kept."
     page = render_report(make_receipt(), PNG)
