@@ -1,4 +1,4 @@
-"""How `make docs` builds these pages: Markdown by MyST, two tables made from the code, and every reference checked."""
+"""Build these pages by `make docs`: Markdown by MyST, two tables made from the code, and every reference checked."""
 
 from __future__ import annotations
 

@@ -112,7 +112,7 @@ class OpenedRun:
 
     @cached_property
     def receipt(self) -> Mapping[str, Any]:
-        """What it says for itself: settings, stages, savings, accuracy, products.
+        """Receipt of the run: settings, stages, savings, accuracy, products.
 
         Raises IncompleteStoreError: it is damaged.
         """

@@ -1,4 +1,4 @@
-"""What the command line does, as functions: quiet, with settings as keywords, told of by a callback, raising errors."""
+"""Verbs of the command line as functions: quiet, keywords for settings, a callback for progress, errors raised."""
 
 from __future__ import annotations
 

@@ -158,7 +158,7 @@ class UnknownRule:
 
 @dataclass(frozen=True)
 class FullReading:
-    """What the full network was asked and did, (patch_y, patch_x) each."""
+    """Patches that the full network could read and did, (patch_y, patch_x) each."""
 
     gain: NDArray[np.float64]  # that the policy expected
     read: NDArray[np.bool_]  # patches that it read

@@ -129,7 +129,7 @@ class PatchBudget:
 
     @property
     def most_patches(self) -> NDArray[np.intp]:
-        """As many patches as the limits pay for, whatever they promise."""
+        """Return the number of patches that the limits pay for, whatever gain they promise."""
         return self.choose(np.full(math.prod(self.grid.patch_shape), np.inf))
 
     @property

@@ -327,7 +327,7 @@ class SurveyRun(CaptureRun):
 
     @property
     def likely_patches(self) -> NDArray[np.intp]:
-        """As many patches as a uniform scan or a raster is likely to have read in full, by what the weights record.
+        """Return how many patches are likely to be read in full, by the record of the weights.
 
         With a limit of multiply-adds these are the most that it pays for; with a gain that nothing is recorded of, all.
         """

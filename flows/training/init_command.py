@@ -192,7 +192,7 @@ def _unseen(draft: SceneDraft) -> list[str]:
 
 
 def _first(path: Path, draft: SceneDraft) -> str | None:
-    """What has to be written before the next command runs; None where it runs at once."""
+    """Return what has to be written before the next command runs; None where it runs at once."""
     if draft.wavelength_nm is not None:
         return None
     return f"write the {draft.shape[2]} wavelengths into {path}: wavelengths_nm or wavelengths_file, as its lines say"

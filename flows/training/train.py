@@ -123,7 +123,7 @@ class Lesson:
 
     @cached_property
     def start(self) -> Mapping[str, Any]:
-        """What the network begins with: earlier weights, or the linear discriminants of its scenes."""
+        """Tensors that the network begins with: earlier weights, or the linear discriminants of its scenes."""
         begun = {} if self.begun is None else self.begun.state
         if "spectral.weight" in begun:
             return begun

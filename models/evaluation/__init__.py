@@ -1,1 +1,1 @@
-"""How good a map or a placement is, and how sure that is."""
+"""Scores of maps and of placements, with their uncertainty."""

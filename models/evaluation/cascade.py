@@ -1,4 +1,4 @@
-"""What a full reading of a part of the patches loses, by the least gain that a patch has to promise."""
+"""Loss of reading a part of the patches in full, by the least gain that a patch has to promise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a map is likely to score, by what it says of itself: expected counts, put right by how such came true before.
+"""Expected scores of a map without labels: counts by its own probabilities, corrected by earlier maps.
 
 The probabilities of a map say how many pixels of each class it is likely to have right, wrong and missed, and so the
 IoU of each class without a label. Maps are surer along borders and of rare classes than they may be, the more so the
@@ -47,7 +47,7 @@ def expected_counts(swaths: Iterable[NDArray[np.floating]], classes: int) -> Flo
 
 @dataclass(frozen=True)
 class ExpectedScore:
-    """What a map is likely to score, 0..1: its mIoU with a standard deviation, and the IoU of classes likely there."""
+    """Expected score of a map, 0..1: mIoU with a standard deviation, and the IoU of classes likely there."""
 
     miou: float
     error: float
@@ -80,7 +80,7 @@ class ScoredMap:
 
 
 def fitted_bias(maps: Sequence[ScoredMap]) -> Floats:
-    """By how much the logits of the classes' IoU lay above those that maps expected of themselves, (class,).
+    """Return the mean excess of the logits of the classes' IoU over what maps expected of themselves, (class,).
 
     Scenes count by the pixels that they were expected to have; a class that is rare in all of them is put right less.
     """
@@ -93,7 +93,7 @@ def fitted_bias(maps: Sequence[ScoredMap]) -> Floats:
 
 
 def error_of_passes(maps: Sequence[ScoredMap]) -> float:
-    """How far the mIoU of a map lies from the one expected, beyond what small classes explain: each by the others."""
+    """Return the error of expected mIoU beyond what small classes explain; each scene is judged by the others."""
     beyond = []
     for i, one in enumerate(maps):
         others = [*maps[:i], *maps[i + 1 :]]
@@ -104,7 +104,7 @@ def error_of_passes(maps: Sequence[ScoredMap]) -> float:
 
 @dataclass(frozen=True)
 class MapScores:
-    """How what maps of uniform scans expect of themselves came true, by step and exposure."""
+    """Corrections of expected scores, by step and exposure of uniform scans."""
 
     steps: tuple[int, ...]
     exposures_ms: tuple[float, ...]  # ascending
@@ -114,7 +114,7 @@ class MapScores:
 
     @staticmethod
     def fitted(maps: Mapping[tuple[int, float], Sequence[ScoredMap]]) -> MapScores:
-        """Of maps by step and exposure, of the same scenes for every pair of both."""
+        """Fit corrections to maps by step and exposure, of the same scenes for every pair of both."""
         steps, exposures = sorted({step for step, _ in maps}), sorted({exposure for _, exposure in maps})
         scan_passes = [[maps[step, exposure] for exposure in exposures] for step in steps]
         return MapScores(
@@ -135,7 +135,7 @@ class MapScores:
         return MapScores(steps, exposures, bias, error, int(content["scenes"]))
 
     def as_dict(self) -> dict[str, Any]:
-        """As a record keeps them."""
+        """Return the corrections as a record keeps them."""
         return {
             "scenes": self.scenes,
             "steps": list(self.steps),
@@ -145,7 +145,7 @@ class MapScores:
         }
 
     def expected(self, counts: Floats, step: int, exposure_ms: float) -> ExpectedScore | None:
-        """What a map of a uniform scan is likely to score by its `expected_counts`; None of a look beyond these."""
+        """Return the expected score of a map by its `expected_counts`; None for a scan beyond the record."""
         if step not in self.steps or not self.exposures_ms[0] <= exposure_ms <= self.exposures_ms[-1]:
             return None
         if len(counts) != self.bias.shape[-1]:

@@ -43,7 +43,7 @@ def confusion(labels: NDArray[np.integer], predicted: NDArray[np.integer], class
 
 
 def labelled_classes(counts: NDArray[np.number]) -> NDArray[np.bool_]:
-    """Which classes the labels have among the pixels judged, (..., class, class) -> (..., class)."""
+    """Return which classes the labels have among the pixels judged, (..., class, class) -> (..., class)."""
     held: NDArray[np.bool_] = counts.sum(axis=-1) > 0
     return held
 
@@ -177,7 +177,7 @@ def paired_interval(
 
 
 def _drawn(count: int, draws: int, seed: list[int]) -> NDArray[np.int64]:
-    """How often each of ``count`` is drawn in as many goes, (draw, count)."""
+    """Return the number of times that each of ``count`` is drawn in as many goes, (draw, count)."""
     return np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=draws)
 
 

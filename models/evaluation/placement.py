@@ -1,4 +1,4 @@
-"""How well patches were placed: against those whose fine look lowers the loss most, and against other placements.
+"""Quality of a placement of patches: beside the ideal one, which knows the loss, and beside other policies.
 
 Evaluation only: all of it needs labels and the whole scene at full resolution, none of it is a survey's own cost.
 """

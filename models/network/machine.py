@@ -1,4 +1,4 @@
-"""How networks use the machine: its processor or an accelerator that it has, threads of torch, and freed memory."""
+"""Use of the machine by networks: processor or accelerator, torch's threads, and freed memory."""
 
 from __future__ import annotations
 

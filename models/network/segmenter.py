@@ -58,7 +58,7 @@ class Segmenter(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where its numbers lie, and it computes."""
+        """Device on which its numbers lie and it computes."""
         return self.full_classes.weight.device
 
     def forward(self, image: Tensor, detail: Tensor, patch_index: Tensor, origin: Tensor) -> tuple[Tensor, Tensor]:
@@ -127,7 +127,7 @@ class Segmenter(nn.Module):
         scene = torch.arange(b, device=patch_index.device)[:, None, None, None]
 
         def under(image: Tensor) -> Tensor:
-            """What lies under the patches, (B * K, c, p, p)."""
+            """Return the part of an image under the patches, (B * K, c, p, p)."""
             return image.permute(0, 2, 3, 1)[scene, y[..., :, None], x[..., None, :]].flatten(0, 1).permute(0, 3, 1, 2)
 
         features = self.full_head(self.full_stem(torch.cat([patches.flatten(0, 1), under(overview.features)], dim=1)))

@@ -194,12 +194,12 @@ class Normalisation:
 
     @property
     def gain_shift(self) -> NDArray[np.float32]:
-        """What 100 % more light adds to normalised columns beyond doubling them, (column,)."""
+        """Return what 100 % more light adds to normalised columns beyond doubling them, (column,)."""
         return np.asarray((self.centre / self.spread) @ self.whitening, np.float32)
 
 
 class LineSpec(NamedTuple):
-    """How pixels were captured; without arguments by every line of the reference exposure."""
+    """Capture of pixels: light, line spacing, binning; without arguments every line of the reference exposure."""
 
     light: float = 1.0  # exposure as a fraction of the reference
     step: float = 1  # line spacing [px]
@@ -207,7 +207,7 @@ class LineSpec(NamedTuple):
 
     @property
     def planes(self) -> NDArray[np.float32]:
-        """What the network reads beside spectral features, (3,): 0 for what is at least the reference."""
+        """Return what the network reads beside spectral features, (3,): 0 for what is at least the reference."""
         return np.asarray(np.log2(np.maximum([1 / self.light, self.step, self.binned], 1)) / PLANE_SCALES, np.float32)
 
     @property
@@ -230,7 +230,7 @@ class LineSpec(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CaptureMap:
-    """How each pixel of an image was captured, where that differs from pixel to pixel."""
+    """Capture of each pixel of an image, where that differs from pixel to pixel."""
 
     specs: tuple[LineSpec, ...]
     number: NDArray[np.uint8]  # (...) of each pixel's capture among them
@@ -269,7 +269,7 @@ def with_planes(columns: NDArray[np.floating], capture: Capture) -> NDArray[np.f
 
 
 def all_alive(columns: NDArray[np.floating]) -> bool:
-    """Whether no pixel is dead, without a copy of the columns."""
+    """Return whether no pixel is dead, without a copy of the columns."""
     return not columns.size or bool(columns.min() >= -MOST_COLUMN and columns.max() <= MOST_COLUMN)
 
 
@@ -292,7 +292,7 @@ def fill_dead(patches: NDArray[np.floating], dead: NDArray[np.bool_]) -> NDArray
 
 
 def readable(dead: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which patches can be read, (P, y, x) dead pixels -> (P,)."""
+    """Return which patches can be read, (P, y, x) dead pixels -> (P,)."""
     return np.asarray(dead.mean(axis=(1, 2)) <= MOST_DEAD, np.bool_)
 
 

@@ -1,4 +1,4 @@
-"""How doubtful a remembered map is, patch by patch, and what a look at each patch would mend of it."""
+"""Expected errors of a remembered map, patch by patch, and the gain of capturing each patch again."""
 
 from __future__ import annotations
 

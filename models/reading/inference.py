@@ -41,7 +41,7 @@ ROWS_DRAWN = 64  # at once
 
 @dataclass(frozen=True)
 class CoarsePass:
-    """What the overview reads of a scene, or of a region of a field, on the padded grid."""
+    """Spectral features that the overview reads of a scene, or of a region of a field, on the padded grid."""
 
     grid: SceneGrid
     columns: NDArray[np.float32]  # (y, x, column) normalised
@@ -72,7 +72,7 @@ class Read:
     overview: Overview
 
     def counts_for(self, weights: Weights, coarse_pass: CoarsePass) -> bool:
-        """Whether these weights would read the same of this coarse pass."""
+        """Return whether these weights would read the same of this coarse pass."""
         alike = self.of.columns is coarse_pass.columns and self.of.living is coarse_pass.living
         told = self.of.origin == coarse_pass.origin and self.of.capture == coarse_pass.capture
         return self.by is weights.segmenter and alike and told
@@ -80,7 +80,7 @@ class Read:
 
 @dataclass(frozen=True)
 class CoarsePrediction(CoarsePass):
-    """What the overview says of a scene, on the padded grid."""
+    """Prediction of the overview for a scene, on the padded grid."""
 
     probability: NDArray[np.float32]  # (y, x, class)
     gain: NDArray[np.float32] | None = field(default=None, kw_only=True)  # (patch_y, patch_x) expected [nat per px]

@@ -1,4 +1,4 @@
-"""How far a pixel's spectrum lies from all that training saw, and from which distance on it is called unknown.
+"""Distance of a pixel's spectrum from all training spectra, and the distance from which it is called unknown.
 
 What training saw is a number of components, each a middle and a covariance of normalised spectral columns, and what the
 light of a look adds to their spread. A pixel lies as far away as from the component whose middle is nearest. Columns
@@ -96,7 +96,7 @@ def _floored(covariance: Exact) -> Exact:
 
 
 def _whitening(covariance: Exact) -> Exact:
-    """What rows of this covariance are multiplied with to have the covariance 1."""
+    """Return the matrix that brings rows of this covariance to the covariance 1."""
     lower = np.linalg.cholesky(covariance)
     return np.asarray(scipy.linalg.solve_triangular(lower, np.eye(len(lower)), lower=True).T)
 

@@ -1,4 +1,4 @@
-"""What is known of a field after a look: the memory of it brought to today, pixel by pixel.
+"""Class probabilities of a field after a visit: the prior map brought to today, pixel by pixel.
 
 Where weights have a reader of memories, it weighs what is remembered against what was seen; without one the surer of
 both stands. Where today's look did not go, the memory stays and fades with its age.
@@ -44,7 +44,7 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class ClassProbabilities:
-    """What is known of a field, or of a part of it, after a look."""
+    """Class probabilities of a field, or of a part of it, after a visit."""
 
     log_probability: Floats  # (y, x, class)
     age_days: Floats  # (y, x) since a look went there
@@ -91,7 +91,7 @@ def pooled(columns: Floats) -> Floats:
 
 
 def first_probabilities(observation: CurrentVisit) -> ClassProbabilities:
-    """What is known of a field that nobody looked at before: what was seen today, be it coarsely."""
+    """Return the class probabilities of a field without a prior map: those of the current visit."""
     kept = np.maximum(observation.log_probability, np.float32(FAINTEST))  # NaN stays
     light = np.where(observation.seen, observation.light / observation.step**2, 0).astype(np.float32)
     return ClassProbabilities(kept, _ages(kept, np.zeros(observation.seen.shape, np.float32)), light)
@@ -139,7 +139,7 @@ def _nothing(shape: tuple[int, ...]) -> Floats:
 def _recalled(
     memory: PriorMap, observation: CurrentVisit, reader: TemporalReader | None, rows: slice
 ) -> ClassProbabilities:
-    """What is believed of some rows; the outermost of them see less than there is."""
+    """Return the class probabilities of some rows; the outermost rows see fewer neighbours than there are."""
     before, today = memory.probabilities.log_probability[rows], observation.log_probability[rows]
     known, shown = _told(before), _told(today)
     seen = observation.seen[rows] & shown
@@ -160,7 +160,7 @@ def _recalled(
 
 
 def _held_until_settled(old: Floats, after: Floats, seen: NDArray[np.bool_], days: float) -> Floats:
-    """What a reader makes of pixels (y, x, class), where nobody looked the less of it the less of a day went by.
+    """Mix memory and reader where nobody looked: on the first day the reader's share grows from 0 to 1, (y, x, class).
 
     A reader was trained on days; of a memory of this minute it has nothing to tell that the memory does not know.
     """
@@ -197,7 +197,7 @@ def in_classes(log_probability: Floats, numbers: Sequence[int]) -> Floats:
 
 
 def faded(log_probability: Floats, age_days: Floats) -> Floats:
-    """What a memory is worth after some days without a look: mixed with knowing nothing."""
+    """Fade a memory with its age: mix it with equal probabilities."""
     left = np.exp(-age_days.astype(np.float64) / FADES_DAYS).astype(np.float32)[..., None]
     mixed = left * np.exp(log_probability) + (1 - left) / log_probability.shape[-1]
     expected_gain: Floats = np.log(np.maximum(mixed, np.float32(math.exp(FAINTEST)))).astype(np.float32)
@@ -222,7 +222,7 @@ def _read(
     images: Sequence[NDArray[np.generic]],
     rows: slice,
 ) -> Floats:
-    """What the reader says of images of some rows, which begin with a coarse pixel."""
+    """Return the reader's log-probabilities of some rows, which begin with a coarse pixel."""
     s, (y, x) = CELL_PX, images[2].shape
     down, across = -(-y // s), -(-x // s)
     cells = slice(rows.start // s, rows.start // s + down)
@@ -256,7 +256,7 @@ def _image(values: NDArray[np.generic]) -> Tensor:
 
 @dataclass(frozen=True)
 class TemporalAgreement:
-    """How memory, look and map compare, added up over regions of a field."""
+    """Comparison of prior map, current visit and map, added up over regions of a field."""
 
     observation: NDArray[np.int64]  # (class before, class of today's look alone) pixels that both know
     changed: NDArray[np.int64]  # (class before, class of the map) pixels that both are sure of
@@ -298,7 +298,7 @@ class TemporalAgreement:
 
     @property
     def is_of_another_field(self) -> bool:
-        """Whether memory and look have hardly more in common than any two fields."""
+        """Return whether prior map and visit have hardly more in common than any two fields."""
         return self.agreement < LEAST_AGREEMENT and kappa(self.observation) < LEAST_KAPPA  # NaN is not
 
 

@@ -78,7 +78,7 @@ class Region:
 
     @property
     def kept_patches(self) -> Box:
-        """What is kept, in patches of the field."""
+        """Return the patches of the field that are kept of this region."""
         return self.kept.over(self.field.patch)
 
     def numbers_here(self, patch_index: NDArray[np.integer]) -> NDArray[np.int64]:
@@ -96,7 +96,7 @@ class Region:
 
     @property
     def kept_here(self) -> tuple[slice, slice]:
-        """What belongs to the region, in rows and columns of what is read."""
+        """Return the rows and columns of what is read that belong to the region."""
         top, left = self.kept.top - self.read.top, self.kept.left - self.read.left
         return slice(top, top + self.kept.shape[0]), slice(left, left + self.kept.shape[1])
 

@@ -1,4 +1,4 @@
-"""How far the confidence of maps lies beside the fraction that is right, and the one temperature that puts it there."""
+"""Calibration: the gap between confidence and accuracy of maps, and the one temperature that closes it."""
 
 from __future__ import annotations
 

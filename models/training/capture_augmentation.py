@@ -1,4 +1,4 @@
-"""What shorter exposures and wider steps would have shown of a look: noise of its columns by the light that it had."""
+"""Crops as shorter exposures and wider line spacings would show them, with the noise of their light."""
 
 from __future__ import annotations
 
@@ -37,20 +37,20 @@ class ColumnNoise:
     def of_bands(
         matrix: NDArray[np.floating], value_of_electron: NDArray[np.floating], read_noise_e: float
     ) -> ColumnNoise:
-        """By the weights (band, column) of columns and what an electron at the reference exposure is worth, (band,)."""
+        """Make the noise of weights (band, column), by the value of an electron at the reference exposure, (band,)."""
         weight, value = matrix.astype(np.float64), value_of_electron.astype(np.float64)
         shot = (weight**2).T @ value
         read = (weight * (read_noise_e * value[:, None]) ** 2).T @ weight
         return ColumnNoise(shot, read)
 
     def correlation(self) -> Matrix:
-        """How columns err together, (column, column): bands that two of them share."""
+        """Return the correlation of the columns' errors, (column, column): some columns share bands."""
         size = np.sqrt(np.maximum(np.diag(self.read), 1e-300))
         correlation: Matrix = self.read / np.outer(size, size)
         return correlation
 
     def variance(self, columns: NDArray[np.floating], light: float) -> NDArray[np.floating]:
-        """Of columns (..., column) in scene values; light below 0 counts as none."""
+        """Return the variance of columns (..., column) in scene values; light below 0 counts as none."""
         read = np.diag(self.read).astype(columns.dtype) / light**2
         variance: NDArray[np.floating] = np.maximum(columns, 0) * (self.shot / light).astype(columns.dtype) + read
         return variance
@@ -131,7 +131,7 @@ class CaptureAugmentation:
     def _noisy(
         self, scaled: Columns, noise: ColumnNoise, light: float, rng: np.random.Generator, *, samples: int = 1
     ) -> Columns:
-        """With what an exposure of ``light`` adds to a mean of ``samples`` pixels of the reference."""
+        """Add the noise of an exposure of ``light`` to means of ``samples`` pixels of the reference."""
         values = scaled * self.normalisation.spread + self.normalisation.centre
         more = noise.variance(values, light) - noise.variance(values, 1.0) / samples
         size = np.sqrt(np.maximum(more, 0)) / self.normalisation.spread

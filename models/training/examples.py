@@ -62,7 +62,7 @@ def observe(
 
 
 def noise_of(scene: RasterScene, matrix: NDArray[np.float32], camera: LineCamera) -> ColumnNoise:
-    """What light and readings of a camera leave in the columns of a scene."""
+    """Return the noise of light and readings of a camera in the columns of a scene."""
     return ColumnNoise.of_bands(matrix, scene.white_reference / scene.white_reference_electrons, camera.read_noise_e)
 
 

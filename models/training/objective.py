@@ -1,4 +1,4 @@
-"""What a training step asks for: patches drawn, the map with them and without, and what the scorer said of them.
+"""Loss of a training step: patches drawn, the map with them and without, and the scorer's error.
 
 A crop is read twice: with no fine patch, and with a fraction of the patches drawn from ``FRACTIONS``. What the loss
 falls by at a captured patch is what the scorer learns to tell; a patch without a label tells it nothing. Three phases
@@ -126,7 +126,7 @@ def map_loss(logits: Tensor, losses: Tensor, labels: Tensor, weight: Tensor, *, 
 
 
 def scoring_loss(score: Tensor, gain: Tensor, known: Tensor | None = None) -> Tensor:
-    """How far scores of patches are from what these gained, in size and in order, (B, K) and (B, K); gains are clipped.
+    """Return the loss of scores of patches beside what these gained, in size and in order, (B, K) and (B, K).
 
     Huber's loss and, with a fifth of its weight, the pairs of a scene that stand in the wrong order. Patches that are
     not ``known`` (B, K), which nothing is labelled in, have no say; 0, with a gradient of 0, where none is known.

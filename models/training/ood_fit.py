@@ -1,4 +1,4 @@
-"""What weights take for familiar: components of the spectra of training scenes, and the limits that others give."""
+"""Fit of the detector of unknown pixels: components of training spectra, and limits by other scenes."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def fit_ood(
 
 
 def _noise_of_columns(noise: ColumnNoise, centres: Exact, normalisation: Normalisation) -> tuple[Exact, Exact]:
-    """What light leaves in normalised columns of each spectrum, (component, column, column), and what readings leave.
+    """Return the noise in normalised columns: of light for each spectrum, (component, column, column), and of readings.
 
     Both are of the reference exposure.
     """

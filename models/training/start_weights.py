@@ -28,7 +28,7 @@ BESIDE = ("class_colours", *(f"normalisation.{name}" for name in NORMALISATION))
 def column_change(
     old_basis: SpectralBasis, old: Normalisation, basis: SpectralBasis, new: Normalisation
 ) -> NDArray[np.float64]:
-    """What normalised columns of the new data say of the old ones, (new column, old column).
+    """Return the matrix from normalised columns of the new data to the old ones, (new column, old column).
 
     By wavelength, whatever the number of columns; median and spread of the new data take the place of the old ones.
     """
@@ -66,7 +66,7 @@ def for_columns(
 
 @dataclass(frozen=True)
 class Start:
-    """What training begins from, in the segmenter's own names, and what became of each tensor of the file."""
+    """Tensors that training begins from, by the segmenter's names, and what became of each tensor of the file."""
 
     state: dict[str, Tensor]
     record: dict[str, Any]  # for the weights' record: file, hash, matched, resized, skipped

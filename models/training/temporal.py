@@ -37,7 +37,7 @@ WARM_UP = 50  # steps
 
 @dataclass(frozen=True)
 class PastPass:
-    """What one look says of a land on a day, by the weights that the reader is for."""
+    """Class probabilities of a land by one scan of a day, from the weights that the reader is for."""
 
     step: int  # pixels between its lines
     light: float  # exposure as a fraction of the reference
@@ -56,7 +56,7 @@ class Visit:
 
 @dataclass(frozen=True)
 class TemporalTraining:
-    """How long and how to train."""
+    """Length and settings of a training of the reader."""
 
     minutes: float = 32.0
     steps: int = 4000
@@ -209,7 +209,7 @@ def _sequence(
 
 
 def _seen(side: int, partly: bool, factor: int, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Where a look went, (y, x, 1): everywhere, in a block of rows, or beside one."""
+    """Draw the captured part of a visit, (y, x, 1): everything, a block of rows, or all beside it."""
     seen = np.ones((side, side, 1), np.float32)
     if partly:
         cell = 4 * factor

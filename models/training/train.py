@@ -31,7 +31,7 @@ KEEP_EVERY_S = 120.0  # between checkpoints
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """How long and how to train. ``minutes`` ends the run early, with the learning rate brought down in time."""
+    """Length and settings of a training. ``minutes`` ends the run early; the learning rate falls in time."""
 
     steps: int = 2000
     batch: int = 4
@@ -62,7 +62,7 @@ class TrainingError(PipelineError, RuntimeError):
 
 @dataclass
 class Course:
-    """How far a run has come; plain numbers, kept in its checkpoint."""
+    """Progress of a run: plain numbers, kept in its checkpoint."""
 
     step: int = 0
     seconds: float = 0.0  # of earlier processes, up to the last checkpoint
@@ -118,7 +118,7 @@ class Trainer:
 
     @property
     def done(self) -> float:
-        """How far the run is, 0..1, by steps or by time, whichever is further."""
+        """Progress of the run, 0..1, by steps or by time, whichever is further."""
         seconds = self.course.seconds + time.monotonic() - self._started
         return max(self.course.step / self.settings.steps, seconds / (60 * self.settings.minutes))
 

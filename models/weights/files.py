@@ -50,7 +50,7 @@ KINDS = {"F32": "torch.float32", "U8": "torch.uint8"}  # by safetensors' names
 
 @dataclass(frozen=True)
 class Description:
-    """What a file of weights says of itself; to read that takes neither its tensors nor torch."""
+    """Description of a weights file; reading it takes neither its tensors nor torch."""
 
     config: SegmenterConfig
     basis: SpectralBasis
@@ -80,7 +80,7 @@ class Weights:
 
     @property
     def temperature(self) -> float:
-        """What logits of maps are divided by; 1 unless the record of training has another."""
+        """Divisor of the logits of maps; 1 unless the record of training has another."""
         return float((self.record.get(CALIBRATION) or {}).get("temperature", 1.0))
 
     def columns(self, values: NDArray[np.floating], wavelength_nm: NDArray[np.floating]) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""What a file of weights may hold beside the network: what is familiar to it, and its reader of prior maps."""
+"""Parts of a weights file beside the network: detector of unknown pixels, reader of prior maps."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class TrainedOn:
 
 @dataclass(frozen=True)
 class OodPart:
-    """What is familiar to weights, by its description."""
+    """Detector of unknown pixels, by its description."""
 
     key: str  # names what it holds
     trained_on: TrainedOn
@@ -76,7 +76,7 @@ class OodPart:
 
     @property
     def map_scores(self) -> MapScores | None:
-        """How what maps expect of themselves came true; None of weights that were trained in one light."""
+        """Return the corrections of expected scores; None for weights that were trained in one light."""
         scores = self.record.get(MAP_SCORES)
         return None if scores is None else MapScores.read(scores)
 

@@ -143,7 +143,7 @@ def _field(
     margin_px: float,
     swaths: Sequence[Sweep] | None = None,
 ) -> Field:
-    """What strips at every offset, or those given, show of the patches that are worth something."""
+    """Return what strips at every offset, or those given, show of the patches that are worth something."""
     if swaths is None:
         swaths = swaths_at_patches(grid, camera, along, margin_px=margin_px)
     views = edges_from(grid, camera, swaths, expected_gain > 0, margin_px=margin_px)
@@ -168,7 +168,7 @@ def _sweeps(field: Field, cover: Cover) -> list[Sweep]:
 
 
 def _scale(scores: NDArray[np.floating]) -> float:
-    """What very large and very small scores are divided by, a power of two: their plan is that of usual ones, exactly.
+    """Return the divisor of very large and very small scores, a power of two, so that plans stay the same exactly.
 
     1 for scores of any usual size. Products of two worths and sums over patches then stay within float64.
     """

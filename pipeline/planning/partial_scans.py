@@ -40,7 +40,7 @@ class PartialScan:
 
 @dataclass(frozen=True)
 class PatchRows:
-    """How the patches of a field lie in the sweeps of a scan: row after row along the lines.
+    """Rows of patches of a field in the sweeps of a scan, along the lines.
 
     ``row`` (patch,) is the number of each patch's row among all rows of all sweeps, -1 where no sweep shows its middle;
     ``first`` and ``stop`` (sweep, row) are the lines that show a row, 0 and 0 where none does.
@@ -76,7 +76,7 @@ class PatchRows:
         return np.asarray(self.stop > self.first)
 
     def sums(self, expected_gain: Floats) -> Floats:
-        """What looks at the patches (patch,) of each row are worth together, (sweep, row)."""
+        """Return the sum of the gains (patch,) of each row of patches, (sweep, row)."""
         shown = self.row >= 0
         found = np.bincount(self.row[shown], expected_gain[shown], self.first.size).reshape(self.first.shape)
         return np.where(self.there, found, 0.0)

@@ -122,7 +122,7 @@ class Cover:
 
 @dataclass(frozen=True)
 class Field:
-    """What can be seen from where, what it is worth, and what lines cost."""
+    """Field as strips see it: what each shows, what that is worth, and what lines cost."""
 
     views: Views
     expected_gain: Floats  # (patch,), 0 for patches that are not wanted

@@ -1,4 +1,4 @@
-"""What a strip of lines shows: the lines that each patch needs, strips at every offset worth trying, their reach."""
+"""Strips of lines: the lines that each patch needs, strips at every offset worth trying, their reach."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ def format_scan(step: int, exposure_ms: float) -> str:
 
 @dataclass(frozen=True)
 class ScanPerformance:
-    """What maps of uniform scans scored on scenes kept from training, by step and exposure."""
+    """Scores of uniform scans on scenes kept from training, by step and exposure."""
 
     steps: tuple[int, ...]
     exposures_ms: tuple[float, ...]  # ascending
@@ -82,7 +82,7 @@ class ScanPerformance:
         return self.exposures_ms[0], min(camera.exposure_ms / self.light_fraction, self.exposures_ms[-1])
 
     def knows(self, exposure_ms: float) -> bool:
-        """Whether an exposure, rounded as those that are offered, lies within the record."""
+        """Return whether an exposure, rounded as those that are offered, lies within the record."""
         rounding = 0.5 * 10.0**-_DIGITS
         return self.exposures_ms[0] - rounding <= exposure_ms <= self.exposures_ms[-1] + rounding
 
@@ -97,20 +97,20 @@ class ScanPerformance:
 
 @dataclass(frozen=True)
 class ScanLimits:
-    """What a scan may cost, and what it is to reach; None and {} where that is no matter."""
+    """Limits of a scan's cost, and goals of its score; None and {} set no limit."""
 
     seconds: float | None = None
     bytes_raw: float | None = None
     goals: Mapping[str, float] = field(default_factory=dict)  # by name, 0..1
 
     def afford(self, scan: UniformScan) -> bool:
-        """Whether a scan costs no more."""
+        """Return whether a scan costs no more."""
         return (self.seconds is None or scan.seconds <= self.seconds) and (
             self.bytes_raw is None or scan.bytes_raw <= self.bytes_raw
         )
 
     def reached_by(self, scan: UniformScan) -> bool:
-        """Whether a scan is expected to reach the goals."""
+        """Return whether a scan is expected to reach the goals."""
         return all(scan.expected[name] >= least for name, least in self.goals.items())
 
 
@@ -218,7 +218,7 @@ def frontier(scans: Sequence[UniformScan]) -> list[UniformScan]:
 
 
 def _too_little(scans: Sequence[UniformScan], limits: ScanLimits) -> str:
-    """What no scan costs as little as, with the least of each limit."""
+    """Name the limit that no scan meets, with the least that one takes."""
     fastest, smallest = min(scans, key=lambda scan: scan.seconds), min(scans, key=lambda scan: scan.bytes_raw)
     asked, least = [], []
     if limits.seconds is not None:
@@ -231,7 +231,7 @@ def _too_little(scans: Sequence[UniformScan], limits: ScanLimits) -> str:
 
 
 def _too_much(scans: Sequence[UniformScan], paid: Sequence[UniformScan], limits: ScanLimits) -> str:
-    """Which goal is beyond what the weights ever reached, or beyond what the limits pay for."""
+    """Name the goal beyond the weights' record, or beyond what the limits pay for."""
     for name, least in limits.goals.items():
         best = max(scan.expected[name] for scan in scans)
         if best < least:

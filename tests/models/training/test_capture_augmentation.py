@@ -72,9 +72,7 @@ def _flat(normalisation: Normalisation, value: float, shape: tuple[int, int]) ->
 SILENT = ColumnNoise(np.zeros(12), np.zeros((12, 12)))
 
 
-def _silent_scan(
-    augmentation: CaptureAugmentation, columns: np.ndarray, step: int, light: float = 1.0
-) -> np.ndarray:
+def _silent_scan(augmentation: CaptureAugmentation, columns: np.ndarray, step: int, light: float = 1.0) -> np.ndarray:
     """A scan in which nothing is drawn by chance."""
     return augmentation.scan(columns, SILENT, light=light, step=step, rng=np.random.default_rng(0))
 
