@@ -173,7 +173,7 @@ def test_a_first_pass_stares_at_its_rows(monkeypatch: pytest.MonkeyPatch, step: 
 
 
 def test_later_lines_lie_between_those_of_the_first_pass(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In an area each line keeps its own exposure and noise; pixels tell the nearest line's, and how close lines are."""
+    """In an area each line keeps its own exposure and noise; a pixel has the capture of its nearest line."""
     monkeypatch.setattr(capture_augmentation, "AREAS", (0.0, 1.0))
     monkeypatch.setattr(capture_augmentation, "ACROSS", 1.0)
     augmentation, normalisation = _augmentation(3.0)
