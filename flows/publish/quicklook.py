@@ -68,6 +68,8 @@ class QuicklookData:
     changed: bool = False  # ``score`` is the fraction of a patch's pixels that the full network changed, NaN elsewhere
     scan: bool = False  # a uniform scan, which looked nowhere twice
     raster: bool = False  # no lines were taken: ``raw`` is the image of its coarse means
+    was: NDArray[np.integer] | None = None  # (y, x) class before of pixels that changed, 255 elsewhere
+    days: float = 0.0  # since the visit before
 
 
 def draw_quicklook(path: str | Path, panels: QuicklookData) -> None:
@@ -152,9 +154,17 @@ def _draw_raw(axes: Axes, data: QuicklookData) -> None:
 
 
 def _draw_rectified(axes: Axes, data: QuicklookData) -> None:
+    """Panel 1, second half: the field; of a revisit the field in grey, and today's classes where they are new."""
+    if data.was is not None:
+        changed = data.was != UNLABELLED
+        grey = np.repeat((0.25 + 0.6 * grey_of(data.rectified))[..., None], 3, axis=-1)
+        classes = class_rgb(data.class_map, class_palette(data.class_colours))
+        _show(axes, np.where(changed[..., None], classes, grey).astype(np.float32), interpolation="nearest")
+        words = f"{np.count_nonzero(changed)} px of another class than {data.days:.3g} days before, in today's colours"
+        return _caption(axes, "Changed", words)
     _, words = choose_bands(data.wavelength_nm)
     _show(axes, colours_of(data, data.rectified))
-    _caption(axes, "Raster" if data.raster else "Rectified", words)
+    return _caption(axes, "Raster" if data.raster else "Rectified", words)
 
 
 def colours_of(data: QuicklookData, image: NDArray[np.generic]) -> NDArray[np.float32]:

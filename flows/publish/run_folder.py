@@ -218,6 +218,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
     found = load_class_map(products["segment"].path / "class_map.zarr")
     order = np.argsort(attention.rank.ravel(), kind="stable")
     accuracy = receipt.get("accuracy")
+    memory, drawn = receipt.get("memory"), ProbabilityStore(products["segment"].path / "class_probabilities.zarr")
     moment = run.settings.moment  # of a farm that grows
     notes = [] if moment is None else [f"day {moment[0]}, {moment[1]:g} h"]
     if accuracy is not None and accuracy["miou"] is not None:
@@ -249,6 +250,8 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
         confidence=found.confidence,
         along=run.plan.along,
         note="   ·   ".join(notes),
+        was=None if memory is None or memory["put_aside"] else drawn.old_class(),
+        days=0.0 if memory is None else memory["days"],
     )
 
 

@@ -166,6 +166,23 @@ def test_a_plain_scan_shows_how_sure_its_map_is(monkeypatch: pytest.MonkeyPatch,
     assert "2  Where it captured again" not in told
 
 
+def test_a_revisit_shows_what_changed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Pixels that changed have today's colours, the others are grey; the caption counts them and tells the days."""
+    words, images = list[tuple[str, str]](), list[np.ndarray]()
+    monkeypatch.setattr(quicklook, "_caption", lambda axes, title, text: words.append((title, text)))
+    show = quicklook._show
+    monkeypatch.setattr(quicklook, "_show", lambda axes, image, **given: (images.append(image), show(axes, image)))
+    data = make_data(96, 128)
+    was = np.full((96, 128), 255, np.uint8)
+    was[5:7, 10:20] = 1
+    now = np.where(was == 255, data.class_map, 0).astype(np.uint8)
+    draw_quicklook(tmp_path / "picture.png", replace(data, was=was, days=7.0, class_map=now))
+    assert ("Changed", "20 px of another class than 7 days before, in today's colours") in words
+    changed = images[1]
+    assert (changed[was != 255] == np.float32(data.class_colours[0] / 255)).all()
+    assert np.ptp(changed[was == 255], axis=-1).max() == 0
+
+
 def test_a_legend_of_long_names_lies_within_the_picture():
     figure = Figure(figsize=(15, 6), layout="constrained")
     names = tuple(f"buildings_grass_trees_and_drives_{number}" for number in range(16))
