@@ -30,8 +30,12 @@ $(BIN)/.ok-dev: $(BIN)/.ok
 	$(PIP) -e '.[dev,s3,bench]'
 	touch $@
 
+# A visit, and of the built-in farm the visit a week later, which goes on from the map of the first.
 survey: $(BIN)/.ok
 	$(BIN)/spectralzoom survey --scene $(SCENE) --seconds $(SECONDS) --out $(ARCHIVE)
+ifeq ($(SCENE),farm)
+	$(BIN)/spectralzoom survey --scene farm --day 179 --seconds 8 --prior latest --no-controls --out $(ARCHIVE)
+endif
 
 # A rig emulated behind a pty and sockets, a whole survey through it, and the simulated one beside it. About a minute.
 survey-rig: $(BIN)/.ok-dev
