@@ -172,7 +172,8 @@ class Planner(OpenSurvey):
             why = f"waits for {error}" if isinstance(error, _WaitsError) else str(error)
             row = StageForecast(stage, "blocked", None, why)
             ref = _Awaited(STAGES[stage].product.name, "", Path(), stage)
-        self.rows.append(row)
+        if row not in self.rows:  # lines that later ones lie between are asked for twice
+            self.rows.append(row)
         self.products[stage] = ref
         return ref
 

@@ -93,7 +93,7 @@ def test_reflectance_lies_on_the_map_with_its_wavelengths(posed: Products) -> No
     ground, mosaic = posed.store("ground_map"), posed.store("mosaic")
     assert is_cog(posed.file("reflectance"))
     scene, about = posed.store("class_map"), posed.store("class_map").attrs["angular_grid"]
-    fine, factor = ground_grid(GroundView(POSE, about["ifov_rad"]), scene["classes"].shape), 4
+    fine, factor = ground_grid(GroundView(POSE, about["ifov_rad"]), scene["classes"].shape), 1
     grid = grid_of_map(fine.frame.view, fine.scene_shape, fine.geobox.zoom_out(factor))
     rows, columns = (slice(0, size) for size in grid.shape)
     values = open_mosaic(posed.archive / posed.receipt["products"]["mosaic"]).values()

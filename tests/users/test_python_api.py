@@ -106,17 +106,14 @@ def test_classes_are_those_of_the_store(run: OpenedRun) -> None:
     np.testing.assert_array_equal(run.confidence, stored.confidence)
 
 
-def test_a_coarse_pixel_lies_on_its_fine_ones(run: OpenedRun) -> None:
-    """Places of mosaic and map are of one grid: the middle of four centres is the coarse centre."""
-    fine, coarse = run.class_map, run.mosaic
+def test_mosaic_and_map_share_their_pixels(run: OpenedRun) -> None:
+    """Their places are equal, so that xarray joins both by coordinates."""
+    classes, mosaic = run.class_map, run.mosaic
     for axis in ("y", "x"):
-        middle = fine[axis].values.reshape(-1, 4).mean(axis=1)
-        np.testing.assert_allclose(coarse[axis].values, middle, atol=1e-12)
-        assert coarse[axis].attrs["units"] == "rad"
-    under = fine.reindex_like(coarse, method="nearest")
-    assert under.dtype == np.uint8
-    joined = coarse.where(under == int(under[0, 0]))  # by coordinates: what has others is left out
-    assert joined.shape == coarse.shape
+        np.testing.assert_array_equal(mosaic[axis].values, classes[axis].values)
+        assert mosaic[axis].attrs["units"] == "rad"
+    joined = mosaic.where(classes == int(classes[0, 0]))  # what has other coordinates is left out
+    assert joined.shape == mosaic.shape
     assert np.isfinite(joined.values[0, 0]).all()
 
 

@@ -78,7 +78,7 @@ def harvested(folder: Path, place: str) -> Iterator[Path]:
 
 @pytest.fixture(scope="module", params=PLACES)
 def visited(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, weights: Path) -> Visited:
-    """Both visits, the later one three days after the first with half of the lines: some patches are not looked at."""
+    """Both visits, the later one three days after the first by some lines of a swath: much is not looked at."""
     folder = tmp_path_factory.mktemp(request.param)
     archive, out = folder / "archive", folder / "maps"
     sharp = with_record(load_weights(weights), calibration={"temperature": 0.2})  # maps that hardly differ by chance
@@ -95,10 +95,9 @@ def visited(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     with without_effects(), pytest.MonkeyPatch.context() as patch:
         for name in ("CERTAIN", "SURE"):  # untrained weights are sure of nothing: what they say is taken for sure
             patch.setattr(prior_map, name, 1e-6)
-        for scene, visit, budget in zip(harvested(folder, request.param), VISITS, ("1", "0.8"), strict=True):
-            settings = load_settings(
-                None, given | {"scene": str(scene), "source": "sim", "visit": visit, "budget": budget}
-            )
+        for scene, visit, extent in zip(harvested(folder, request.param), VISITS, ("whole", "1:40-90"), strict=True):
+            asked = {"scene": str(scene), "source": "sim", "visit": visit, "scan_step": 1, "extent": extent}
+            settings = load_settings(None, given | asked)
             posed = replace(settings, pose=POSE) if request.param == "posed" else settings
             runs.append(run_survey(posed, QUIET))
     answers = [run_export(archive, run.folder.name, out, envi=False, console=QUIET) for run in runs]
@@ -146,11 +145,12 @@ def test_images_lie_where_the_class_map_lies(visited: Visited) -> None:
 
 
 def test_what_was_not_looked_at_grows_older(visited: Visited) -> None:
-    """Three days where no patch was chosen, none where one was; the rest of the memory is kept."""
-    probabilities, rank = visited.store("class_probabilities"), visited.store("attention")["rank"].values
-    observation = np.kron(rank >= 0, np.ones((PATCH, PATCH), np.bool_))[: SHAPE[0], : SHAPE[1]]
-    assert 0 < observation.mean() < 1
-    np.testing.assert_array_equal(probabilities["age"].values, np.where(observation, 0.0, 3.0))
+    """Three days where no line looked, none in the patches where lines did; the rest of the memory is kept."""
+    age, seen = visited.store("class_probabilities")["age"].values, visited.store("mosaic")["coverage"].values > 0
+    assert 0 < seen.mean() < 1
+    assert set(np.unique(age)) == {0.0, 3.0}
+    assert (age[~seen] == 3).all()
+    assert (age[seen] == 0).mean() > 0.9  # a patch that is seen in part keeps its memory
 
 
 def test_receipt_and_page_have_the_hectares(visited: Visited) -> None:

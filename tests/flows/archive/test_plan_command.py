@@ -188,11 +188,11 @@ def test_plan_as_json_and_as_a_table(settings: Settings, archive: Path, capsys: 
     _show(asked, as_json=True)
     content = json.loads(capsys.readouterr().out)
     ahead = [row for row in content["stages"] if row["state"] in ("to run", "blocked")]
-    assert content["to_make"] == len(ahead) == 7
+    assert content["to_make"] == len(ahead) == 8
     _show(asked)
     shown = capsys.readouterr().out
     assert all(row["stage"] in shown for row in content["stages"])
-    assert "7 stages to make" in shown
+    assert "8 stages to make" in shown
     _show(replace(settings, out=str(archive)))
     assert "everything is stored" in capsys.readouterr().out
 

@@ -136,7 +136,7 @@ def test_wrong_words_are_refused(
 def test_unusual_files_are_scanned_or_refused(command_line: Any, tmp_path: Path) -> None:
     """One band, sixty full wells beside dark rows; of pixels without a value the first is named.
 
-    A scan is decided by its own sweeps: of one that takes every line, smear is no effect.
+    A scan is decided by its own sweeps: of a first pass, whose lines stare, smear is no effect.
     """
     np.save(tmp_path / "one.npy", np.random.default_rng(0).uniform(0.1, 1, (20, 30, 1)).astype(np.float32))
     out = tmp_path / "scan"
@@ -144,7 +144,7 @@ def test_unusual_files_are_scanned_or_refused(command_line: Any, tmp_path: Path)
         "simulate", tmp_path / "one.npy", "-o", out, *narrow(tmp_path), "--coarse", "--wavelengths", "650", "--json"
     )
     rows = {row["name"]: row for row in json.loads(ended.out)["effects"]}
-    assert (rows["smile"]["reason"], rows["smear"]["state"]) == ("absent", "on")
+    assert (rows["smile"]["reason"], rows["smear"]["reason"]) == ("absent", "absent")
     rows = np.zeros((128, 160, 3), np.float32)
     rows[1::2] = 1
     np.save(tmp_path / "rows.npy", rows)
