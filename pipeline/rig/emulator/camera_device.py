@@ -64,12 +64,11 @@ class EmulatedCapture:
         whole = int(np.floor((now_s - self.began_s - self.exposure_s) / self.period_s + 1e-9)) + 1
         return max(whole if self.most_frames is None else min(whole, self.most_frames), 0)
 
-    def exposures(self, from_s: float, to_s: float) -> Floats:
-        """Return begin and end (exposure, 2) of exposures that begin at ``from_s`` or later and before ``to_s``."""
+    def begins(self, from_s: float, to_s: float) -> Floats:
+        """Return when exposures begin, (exposure,), of those that begin at ``from_s`` or later and before ``to_s``."""
         bounds = np.ceil((np.array([from_s, to_s]) - self.began_s) / self.period_s - 1e-9).astype(np.int64)
         first, stop = np.clip(bounds, 0, self.most_frames)
-        begins = self.began_s + np.arange(first, stop) * self.period_s
-        return np.stack([begins, begins + self.exposure_s], axis=-1)
+        return np.asarray(self.began_s + np.arange(first, stop) * self.period_s)
 
     def running(self, now_s: float) -> bool:
         """Return whether frames are still to come."""
@@ -187,12 +186,6 @@ class CameraDevice:
     def is_capturing(self) -> bool:
         """Return whether a capture runs."""
         return bool(self.captures) and self.captures[-1].running(self.clock.now())
-
-    def exposures(self, from_s: float, to_s: float) -> NDArray[np.float64]:
-        """Return begin and end (exposure, 2) of exposures that begin in a span of time, for a mirror's trigger."""
-        with self._lock:
-            spans = [capture.exposures(from_s, to_s) for capture in self.captures]
-            return np.concatenate([np.zeros((0, 2)), *spans])
 
     def files(self) -> dict[str, bytes]:
         """Return all files by their whole names, as they are now."""

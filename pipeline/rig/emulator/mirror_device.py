@@ -3,9 +3,7 @@
 It has what drivers ask for in both modes of the documented protocol. Assumed, as the documents leave it open: an empty
 line has no answer; NO answers a line that is not known, ERROR one that is too long. Bytes that come while the
 controller boots are lost. Bytes in pro mode that are no frame are answered by error 0001 at the next boundary. Requests
-are checked by their CRC after GOPROCRC alone, and replies always carry it. Two other firmwares are emulated, too. One
-checks the CRC of requests after GOPRO as well (``crc="required"``). The other knows no GOPROCRC and sends 00 00 in the
-CRC's place (``crc="absent"``).
+are checked by their CRC after GOPROCRC alone, and replies always carry it.
 """
 
 from __future__ import annotations
@@ -33,6 +31,7 @@ from pipeline.rig.mirror.pro_mode import (
     CELL,
     ERROR_FLAG,
     FEEDBACK_X,
+    FEEDBACK_Y,
     LOG_RATE,
     LOG_RUN,
     LOG_SLOTS,
@@ -103,7 +102,16 @@ class RegisterFile:
     def __init__(self, state: MirrorState) -> None:
         self._state = state
         self.logger = PositionLogger(state)
-        self._registers = {**_feedback(state), **_logger(self.logger), **_channel(state, 0), **_channel(state, 1)}
+        each = [Register(*_item(self.logger.slots, slot), 0, 0xFFFF, whole=True) for slot in range(LOG_SLOTS)]
+        self._registers = {log_slot(slot): register for slot, register in enumerate(each)} | {
+            FEEDBACK_X: Register(lambda: state.axes[0].place(state.moment)),
+            FEEDBACK_Y: Register(lambda: state.axes[1].place(state.moment)),
+            VECTOR_MEMORY: Register(lambda: 0, whole=True),  # whether the head's own copy is valid
+            LOG_RUN: Register(lambda: self.logger.running, lambda on: self.logger.run(bool(on)), 0, 1, whole=True),
+            LOG_RATE: Register(*_attribute(self.logger, "rate_hz", float), 1.0, HIGHEST_HZ),
+            **_channel(state, 0),
+            **_channel(state, 1),
+        }
 
     def answer(self, frame: Frame) -> Frame:
         """Carry out a frame of pro mode and give the reply, which may say why not."""
@@ -220,24 +228,6 @@ def _cells(offset: int, length: int) -> tuple[int, int]:
 def _within(stop: int, size: int) -> None:
     if stop > size:
         raise RefusedError(ErrorCode.VECTOR_INDEX)
-
-
-def _feedback(state: MirrorState) -> dict[int, Register]:
-    """Return the registers of the optical feedback, and of the vector memory."""
-
-    def place(channel: int) -> float:
-        return state.axes[channel].place(state.moment)
-
-    table = {FEEDBACK_X + channel: Register(partial(place, channel)) for channel in (0, 1)}
-    table[VECTOR_MEMORY] = Register(lambda: 0, whole=True)  # whether the head's own copy is valid
-    return table
-
-
-def _logger(logger: PositionLogger) -> dict[int, Register]:
-    table = {log_slot(slot): Register(*_item(logger.slots, slot), 0, 0xFFFF, whole=True) for slot in range(LOG_SLOTS)}
-    table[LOG_RUN] = Register(lambda: logger.running, lambda on: logger.run(bool(on)), 0, 1, whole=True)
-    table[LOG_RATE] = Register(*_attribute(logger, "rate_hz", float), 1.0, HIGHEST_HZ)
-    return table
 
 
 def _channel(state: MirrorState, channel: int) -> dict[int, Register]:
@@ -434,18 +424,15 @@ class MirrorDevice:
         self.acts.append(Act(self.clock.now(), request))
         if request.damaged is not None:  # answered to the command that the bytes seem to hold, if any
             command = request.damaged.data[1] if len(request.damaged.data) > 1 else 0
-            return self._framed(refuse(command & ~ERROR_FLAG, ErrorCode.FRAME_INVALID))
+            return encode(refuse(command & ~ERROR_FLAG, ErrorCode.FRAME_INVALID))
         if request.frame is not None:
             if self.mode is Mode.PRO_CRC and not request.frame.crc_good:
-                return self._framed(refuse(request.frame.command & ~ERROR_FLAG, ErrorCode.CRC_WRONG))
+                return encode(refuse(request.frame.command & ~ERROR_FLAG, ErrorCode.CRC_WRONG))
             reply = self.registers.answer(request.frame)
             if reply.command == Command.SET_MODE:
                 self.set_mode(Mode.SIMPLE)
-            return self._framed(reply)
+            return encode(reply)
         return self._simple(request.line).encode("ascii") + END
-
-    def _framed(self, reply: Frame) -> bytes:
-        return encode(reply, with_crc=self.unit.crc != "absent")
 
     def _simple(self, line: str) -> str:
         """Carry out a line, in capitals and without its end, and give the answer without an end."""
@@ -461,8 +448,8 @@ class MirrorDevice:
             case simple.TEMPERATURE:
                 return f"{self.unit.temperature_c:.2f}"
             case simple.GO_PRO:
-                self.set_mode(Mode.PRO_CRC if self.unit.crc == "required" else Mode.PRO)
-            case simple.GO_PRO_CRC if self.unit.crc != "absent":
+                self.set_mode(Mode.PRO)
+            case simple.GO_PRO_CRC:
                 self.set_mode(Mode.PRO_CRC)
             case simple.START:
                 pass
