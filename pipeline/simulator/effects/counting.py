@@ -11,21 +11,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from pipeline.lazy import deferred
+from pipeline.simulator import compiled_loops
 from pipeline.simulator.effects.effect import Bound, Effect, Merged, unit_stream
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Rig
-
-if TYPE_CHECKING:  # numba takes half a second to import: a plan of a survey never needs it
-    from pipeline.simulator import compiled_loops
-else:
-    compiled_loops = deferred("pipeline.simulator.compiled_loops")
 
 Floats = NDArray[np.float64]
 Radiance = NDArray[np.float32]

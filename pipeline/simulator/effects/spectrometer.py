@@ -6,22 +6,17 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from pipeline.lazy import deferred
+from pipeline.simulator import compiled_loops
 from pipeline.simulator.effects.counting import normal_deviates
 from pipeline.simulator.effects.effect import Bound, Gain, LightChange, SweepBlock, unit_stream
 from pipeline.simulator.effects.probe import GainRange, Probe, difference_rates, rising_gaps, rising_runs
 from pipeline.simulator.rig_model import Rig
-
-if TYPE_CHECKING:
-    from pipeline.simulator import compiled_loops
-else:
-    compiled_loops = deferred("pipeline.simulator.compiled_loops")
 
 Floats = NDArray[np.float64]
 Radiance = NDArray[np.float32]

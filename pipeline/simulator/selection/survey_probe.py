@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel, Sweep, exposing
-from pipeline.lazy import deferred
+from pipeline.simulator import compiled_loops
 from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import OFF
 from pipeline.simulator.effects.line import SLIT, UPRIGHT, box_of, box_parts
@@ -45,14 +45,11 @@ from pipeline.simulator.selection.sample_views import (
     views_of_places,
 )
 
-if TYPE_CHECKING:
-    from pipeline.simulator import compiled_loops
-else:
-    compiled_loops = deferred("pipeline.simulator.compiled_loops")
-
 Floats = NDArray[np.float64]
 Radiance = NDArray[np.float32]
 Way = tuple[float, float]
+_DERIVATIVES = ("span", "slope", "curvature", "spectral_slope", "spectral_curvature")
+_BY_BAND = ("level", "spread", *_DERIVATIVES, "anywhere", "anywhere_spectral")  # of a probe
 _ROUNDING = 2e-6  # of the level: less is rounding of float32
 _NEAR, _FAR = 0.25, 0.5  # px by which the footprint is shifted
 
@@ -183,19 +180,13 @@ def worst_of_groups(probe: Probe) -> Probe:
     def ends(values: Floats | None) -> Floats | None:
         return None if values is None else np.stack([-worst(-values[0]), worst(values[1])])
 
+    values: dict[str, Any] = {name: getattr(probe, name) for name in _BY_BAND}
+    values = {name: None if one is None else worst(one) for name, one in values.items()}
     return replace(
         probe,
-        level=worst(probe.level),
-        spread=worst(probe.spread),
-        span=worst(probe.span),
-        slope=worst(probe.slope),
-        curvature=worst(probe.curvature),
-        spectral_slope=worst(probe.spectral_slope),
-        spectral_curvature=worst(probe.spectral_curvature),
+        **values,
         beside=tuple(map(of_detail, probe.beside)),
         afar=None if probe.afar is None else of_detail(probe.afar),
-        anywhere=None if probe.anywhere is None else worst(probe.anywhere),
-        anywhere_spectral=None if probe.anywhere_spectral is None else worst(probe.anywhere_spectral),
         own_e=ends(probe.own_e),
         ends_e=ends(probe.ends_e),
     )
