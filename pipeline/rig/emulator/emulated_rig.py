@@ -63,7 +63,6 @@ from pipeline.simulator.simulated import SimulatedSource, render_lines
 from pipeline.source import AT_REST
 
 REFERENCE_FRAMES = 32
-_AT_ONCE = 8  # frames looked at while the camera takes no other request
 
 
 @dataclass(frozen=True)
@@ -209,20 +208,7 @@ class SceneCamera(CameraDevice):
         """Return whether a capture runs, or its frames are still being written."""
         if super().is_capturing():
             return True
-        return self.aside and any(len(capture.pending(self.clock.now(), 1)) for capture in self.captures[-1:])
-
-    def keep_looking(self) -> bool:
-        """Look at some frames that are over; False where there are none. Others may speak to the camera meanwhile."""
-        with self._lock:
-            waiting = ((one, one.pending(self.clock.now(), _AT_ONCE)) for one in self.captures[-2:])
-            capture, numbers = next(((one, some) for one, some in waiting if len(some)), (None, np.zeros(0, np.int64)))
-        if capture is None:
-            return False
-        middle_s = capture.middle_s(numbers)
-        lines = self._seen(self._positions(middle_s), middle_s)
-        with self._lock:
-            capture.put(lines)
-        return True
+        return self.aside and any(len(capture.pending(self.clock.now())) for capture in self.captures[-1:])
 
     def _poll(self) -> None:
         if not self.aside:
