@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import SceneError, ShapeError
+from pipeline.errors import SceneError
 from pipeline.simulator import compiled_loops
 from pipeline.simulator.effects.counting import (
     DARK_CURRENT,
@@ -43,11 +43,8 @@ def read_out(light: Radiance, block: SweepBlock, chosen: Mapping[Any, str] | Cho
 
     ``light``: (line, sample, band) of the block; negative values count as 0. [e-]
     Returns (line, sample, band) uint16, before binning.
-    Raises SceneError: a number is not finite; names the first. ShapeError: the light is not the block's.
+    Raises SceneError: a number is not finite; names the first.
     """
-    expected_shape = (len(block.lines), block.rig.camera.samples, len(block.wavelength_nm))
-    if light.shape != expected_shape:
-        raise ShapeError(f"expected light of {expected_shape} (line, sample, band), got {light.shape}")
     readout = Readout(block, Choice.of(chosen))
     raw = np.empty(light.shape, np.uint16)
     for row, number in enumerate(block.numbers):

@@ -16,7 +16,6 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import position_to_normal
 from pipeline.geometry.scan import Sweep, line_positions, points_of_scan
@@ -212,12 +211,6 @@ class PointingErrors(Aim):
     seed: int = 0
     name = "pointing"
     cost_ns = MappingProxyType({"exact": 0.2})
-
-    def __post_init__(self) -> None:
-        for name in ("offset_px", "jitter_px"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0):
-                raise SettingsError(f"{name} of the pointing errors must be finite and not negative, got {value}")
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
         return self.of_lines(block.sweep.name, block.lines)[:, None]

@@ -171,10 +171,8 @@ class Smile(LightChange):
         return Bound(steep * shift + min(bent, steep * shift * 2 * part * (1 - part)), why)
 
     def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
-        """Return light (line, sample, band) [e-] at the wavelengths that each sample sees; as it is without a smile."""
+        """Return light (line, sample, band) [e-] at the wavelengths that each sample sees."""
         camera, smile = block.rig.camera, block.rig.optics.smile_nm
-        if smile == 0 or light.shape[-1] < 2:
-            return light
         bands = tuple(map(float, block.wavelength_nm))
         first, weights = _tap_weights(bands, float(smile), camera.samples)
         out = np.empty(light.shape, np.float32)
@@ -335,8 +333,6 @@ class StrayLight(LightChange):
     def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
         """Return the light after scattering; works in place."""
         optics = block.rig.optics
-        if optics.stray_fraction == 0:
-            return light
         along, along_kept = _cosines(light.shape[1], optics.stray_halo_px)
         across, across_kept = _cosines(light.shape[2], optics.stray_halo_px)
         kept = np.outer(along_kept, across_kept) * (1 - optics.stray_even)

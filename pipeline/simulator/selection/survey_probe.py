@@ -273,18 +273,13 @@ def probe_survey(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Un
 def probe_scene(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "sigma") -> Probe:
     """Look at the scene through the footprint alone where it is steepest, brightest and darkest, and along some lines.
 
-    The places to look are found on the scene's own pixels, so that the maxima hold for the whole image. Raises
-    SceneError: the scene holds a number that is not finite; SettingsError: no line to take, or sweeps of several
-    binnings or exposures; PoseError: a sweep is out of the mirror's reach.
+    The places to look are found on the scene's own pixels, so that the maxima hold for the whole image. Sweeps are of
+    one binning and exposure. Raises SceneError: the scene holds a number that is not finite; SettingsError: no line to
+    take; PoseError: a sweep is out of the mirror's reach.
     """
     taken = _taken(sweeps)
-    binnings = {sweep.binning for sweep in taken}
-    if len(binnings) > 1:
-        raise SettingsError(f"expected sweeps of one binning, got {sorted(binnings)}; probe each of them")
-    if len({exposing(rig.camera, sweep) for sweep in taken}) > 1:
-        raise SettingsError("expected sweeps of one exposure, got several; probe each of them")
     rig = rig.taking(taken[0])
-    binning, camera, bands = binnings.pop(), rig.camera, len(scene.wavelength_nm)
+    binning, camera, bands = taken[0].binning, rig.camera, len(scene.wavelength_nm)
     room = max(min(MOST_VALUES // bands, MOST_SAMPLES), 64)
     lines = views_of_lines(taken, camera, room // 3)
     most = (room - room // 3) // (len(sample_offsets(binning)) * binning * len({sweep.along for sweep in taken}))
