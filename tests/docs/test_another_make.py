@@ -16,6 +16,7 @@ from spectral.io import envi
 
 from pipeline.errors import RigError, SettingsError
 from pipeline.geometry.scan import line_positions
+from pipeline.rig.camera.camera_files import KeptInMemory
 from pipeline.rig.capture.capture_paths import REFERENCES, capture_prefix
 from pipeline.rig.capture.capture_runner import RigDevices
 from pipeline.rig.capture.rig_source import RigSource
@@ -26,7 +27,7 @@ from pipeline.rig.opening import open_camera_driver, open_mirror_driver
 from pipeline.rig.rig_check import check_camera
 from pipeline.rig.transports import StateUnknown
 from tests.docs.pages import DOCS, ROOT, blocks_of
-from tests.pipeline.rig.in_process import InProcessRig, KeptInMemory, ManualClock
+from tests.pipeline.rig.in_process import InProcessRig, ManualClock
 from tests.pipeline.rig.small_rig import CAMERA, FINE, small_source
 
 MODULE = "folder_camera"
