@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Self, TypeVar
 
-from pipeline.errors import RigError
+from pipeline.errors import RigError, SettingsError
 from pipeline.rig.camera.camera_cubes import CapturedLines, MeanFrame, Read, mean_frame, read_capture, read_references
 from pipeline.rig.camera.camera_files import Kept, Progress, RemoteFile, fetch_files
 from pipeline.rig.camera.headwall_replies import (
@@ -44,6 +44,7 @@ from pipeline.rig.transports import (
 
 LOG = logging.getLogger(__name__)
 LONGEST_GREETING = 1 << 16  # bytes
+CAPTURE_ROOT = "/captured"  # where new folders appear; assumed, the reply to a capture shows it
 MOST_PASSED_OVER = 32  # replies to other commands, while one is waited for
 Answer = TypeVar("Answer")
 MOST_TEXT = 1 << 26  # bytes of a header, a frame index or another text: an index of two million frames
@@ -52,6 +53,10 @@ MOST_REFERENCE_FRAMES = 2048
 MOST_FILES = 4096
 _RAW = re.compile(r"raw_\d+", re.IGNORECASE)
 _REFERENCE = re.compile(r"(dark|white)[a-z_]*", re.IGNORECASE)
+
+
+class CaptureUnknown(StateUnknown):
+    """A capture was sent and not acknowledged; what was found on asking stands in the message."""
 
 
 class HeadwallCamera:
@@ -105,12 +110,14 @@ class HeadwallCamera:
     def capture(self, frames: int, *, cubes: int = 1, prefix: str = "") -> Capture:
         """Begin a capture of ``cubes`` files (0: until stopped) of ``frames`` lines (0: the camera's own number).
 
-        Sent once. If no reply comes, captures and settings are refused from then on: a person looks, and connects
-        anew. Raises StateUnknown then, and SettingsError where a number or the prefix cannot be used.
+        Sent once. If no reply comes, the camera is asked whether it captures and which folders are new, and the error
+        says so. Captures and settings are refused from then on: a person looks, and connects anew. Raises
+        CaptureUnknown then, and SettingsError where a number or the prefix cannot be used.
         """
         check_capture(frames, cubes, prefix)
         with self._lock:
             self._check_known("capture")
+            before = self._folders()
             self._open()
             sent_s = self.clock.now()
             try:
@@ -120,12 +127,8 @@ class HeadwallCamera:
             except DeviceRefused:
                 raise
             except RigError as error:
-                self.unknown = "a capture was sent and not acknowledged"
                 self._hang_up()
-                raise StateUnknown(
-                    f"capture (prefix {prefix!r}) was sent and its reply is lost: {error}. It is not sent again. Look "
-                    "at the camera, stop what runs there, then run again, which connects anew"
-                ) from error
+                raise self._find_out(error, before, prefix) from error
             except BaseException:  # interrupted while it waited
                 self.unknown = "a capture was sent and the wait for its reply was interrupted"
                 self._hang_up()
@@ -146,7 +149,9 @@ class HeadwallCamera:
             return False
 
     def list_files(self, folder: str) -> list[RemoteFile]:
-        """List one folder, in the order of names."""
+        """List one folder, in the order of names; SettingsError for an empty name."""
+        if not folder:
+            raise SettingsError("expected a folder of the camera to list, such as /captured, got an empty name")
         return self._ask("listFiles", folder, as_listing)
 
     def fetch(
@@ -275,6 +280,29 @@ class HeadwallCamera:
                 f"{name} is refused: {self.unknown}, so whether the camera captures is not known. Look at the "
                 "camera, stop what runs there, then run again, which connects anew"
             )
+
+    def _folders(self) -> set[str] | None:
+        """Return the folders of the capture root; None where the camera does not list it."""
+        try:
+            return {entry.name for entry in self.list_files(CAPTURE_ROOT)}
+        except DeviceRefused as error:
+            LOG.warning("%s: a capture whose reply is lost will not be found by its folder", error)
+            return None
+
+    def _find_out(self, error: RigError, before: set[str] | None, prefix: str) -> CaptureUnknown:
+        """Freeze, ask the camera what it does, and say it."""
+        self.unknown = "a capture was sent and not acknowledged"
+        try:
+            does = "captures" if self.is_capturing() else "does not capture"
+            now = None if before is None else self._folders()
+            new = sorted(now - before) if before is not None and now is not None else []
+            found = f"asked again it {does}, and new are {'the folders ' + ', '.join(new) if new else 'no folders'}"
+        except RigError as other:
+            found = f"asked again it does not answer: {other}"
+        return CaptureUnknown(
+            f"capture (prefix {prefix!r}) was sent and its reply is lost: {error}. It is not sent again; {found}. "
+            "Look at the camera, stop what runs there, then run again, which connects anew"
+        )
 
     def _finished(self, folder: str, claim: FrameClaim | None) -> list[RemoteFile]:
         """Return the files of a folder once two listings in a row agree.

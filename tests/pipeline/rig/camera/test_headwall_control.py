@@ -9,14 +9,17 @@ import pytest
 
 from pipeline.errors import RigError, SettingsError
 from pipeline.rig.camera import headwall_replies
-from pipeline.rig.camera.headwall_camera import HeadwallCamera
+from pipeline.rig.camera.headwall_camera import CaptureUnknown, HeadwallCamera
 from pipeline.rig.camera.headwall_replies import ReplyReader
 from pipeline.rig.device_settings import ControlPatience, FileServer
-from pipeline.rig.transports import Clock, DeviceRefused, StateUnknown
+from pipeline.rig.transports import Clock, DeviceGone, DeviceRefused, StateUnknown
 from tests.pipeline.rig.in_process import ManualClock
 from tests.pipeline.rig.scripted import Late, Pair, Reply, ScriptedTransport
 
 HELLO = b"Hyperspec\r\nhpi> "
+
+
+LIST_ROOT = b'listFiles("/captured")\r'
 
 
 CAPTURE = b'capture({"prefix": "f1", "maxCubes": 1, "maxFramesPerCube": 500})\r'
@@ -60,6 +63,7 @@ def test_every_command(echo: bool) -> None:
     with talk(
         [
             answer(b'configure({"exposure": 10.5, "framePeriod": 11})\r', b"{}"),
+            answer(LIST_ROOT, b"[]"),
             answer(CAPTURE, b'{"folder": "/captured/f1_0"}'),
             answer(IS_CAPTURING, b"true"),
             answer(b"stopCapture\r", b"true"),
@@ -130,7 +134,7 @@ def test_what_is_no_reply_in_the_end(reply: bytes | None, hello: bytes, words: s
 def test_refusals(why: bytes, remedy: str) -> None:
     """A capture that is refused did not begin: told once, nothing frozen or sent again; to stop none is no failure."""
     stop = [(b"stopCapture\r", refused(b"stopCapture\r", why)), (IS_CAPTURING, said(IS_CAPTURING, b"false"))]
-    with talk([(CAPTURE, refused(CAPTURE, why)), *stop]) as control:
+    with talk([(LIST_ROOT, said(LIST_ROOT, b"[]")), (CAPTURE, refused(CAPTURE, why)), *stop]) as control:
         with pytest.raises(DeviceRefused, match=f"refused capture: {why.decode()}; .*{remedy}"):
             control.capture(500, prefix="f1")
         assert control.unknown == ""
@@ -138,10 +142,17 @@ def test_refusals(why: bytes, remedy: str) -> None:
 
 
 def test_capture_without_a_reply() -> None:
-    """It is sent once, and captures and settings are refused then; one that runs can be stopped."""
-    stop: list[Pair] = [(b"stopCapture\r", said(b"stopCapture\r", b"true"))]
-    with talk([(CAPTURE, b"")], stop) as control:
-        with pytest.raises(StateUnknown, match=r"prefix 'f1'. was sent and its reply is lost: .* not sent again"):
+    """It is sent once; the camera is asked what it does and which folders are new, and captures are refused then."""
+    old, new = (b'{"name": "/captured/%s", "isDirectory": true}' % name for name in (b"f0_0", b"f1_0"))
+    with talk(
+        [(LIST_ROOT, said(LIST_ROOT, b"[" + old + b"]")), (CAPTURE, b"")],
+        [
+            (IS_CAPTURING, said(IS_CAPTURING, b"true")),
+            (LIST_ROOT, said(LIST_ROOT, b"[" + old + b", " + new + b"]")),
+            (b"stopCapture\r", said(b"stopCapture\r", b"true")),
+        ],
+    ) as control:
+        with pytest.raises(CaptureUnknown, match=r"asked again it captures, and new are the folders /captured/f1_0\."):
             control.capture(500, prefix="f1")
         for refused_now in (lambda: control.capture(500, prefix="f1"), lambda: control.configure(10, 10)):
             with pytest.raises(StateUnknown, match="stop what runs there, then run again, which connects anew"):
@@ -149,9 +160,20 @@ def test_capture_without_a_reply() -> None:
         assert control.stop()
 
 
+def test_capture_and_then_nobody() -> None:
+    """Where the camera does not answer afterwards either, that is what is told."""
+    gone = DeviceGone("the connection was lost")
+    pairs: list[Pair] = [(LIST_ROOT, said(LIST_ROOT, b"[]")), (CAPTURE, [gone])]
+    with (
+        talk(pairs, [(IS_CAPTURING, [gone])], retries=0) as control,
+        pytest.raises(CaptureUnknown, match="asked again it does not answer"),
+    ):
+        control.capture(500, prefix="f1")
+
+
 def test_capture_that_is_interrupted() -> None:
     """Ctrl-C while the reply is awaited leaves captures frozen, since one may run."""
-    pairs: list[Pair] = [(CAPTURE, b"")]
+    pairs: list[Pair] = [(LIST_ROOT, said(LIST_ROOT, b"[]")), (CAPTURE, b"")]
     with talk(pairs) as control:
         control.clock.sleep = Interrupting(control.clock)  # type: ignore[method-assign]
         with pytest.raises(KeyboardInterrupt):

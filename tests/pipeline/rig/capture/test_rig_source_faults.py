@@ -207,7 +207,7 @@ def test_full_camera_ends_the_sweep_at_once():
 def test_nothing_is_sent_to_a_rig_of_unknown_state():
     """A capture whose reply is lost freezes the rig for this process, whoever holds the source; another may go on."""
     with small_rig(faults={CameraFault.SILENT: 1}) as rig:
-        rig.emulated.camera.faults.passes = 1  # configure comes before the capture
+        rig.emulated.camera.faults.passes = 2  # configure and listFiles come before the capture
         source, kept = rig.source(), KeptInMemory()
         with pytest.raises(StateUnknown, match="not sent again"):
             list(source.keeping(kept).lines(FINE))
