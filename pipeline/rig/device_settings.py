@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass, fields
-from typing import Literal, get_args
+from typing import Literal
 
 from pipeline.errors import SettingsError
 from pipeline.geometry.mirror import STRAIGHT, Axes, Mounting
@@ -149,9 +149,6 @@ class MirrorSettings(MirrorLink):
 
     def __post_init__(self) -> None:
         check_stated(self, "mirror")
-        for name, choices in {"ends": get_args(Ends), "read_back": get_args(ReadBack)}.items():
-            if getattr(self, name) not in choices:
-                raise SettingsError(f"mirror.{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}")
 
     @property
     def patience(self) -> Patience:

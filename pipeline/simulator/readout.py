@@ -6,13 +6,13 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import SceneError, ShapeError
-from pipeline.lazy import deferred
+from pipeline.errors import SceneError
+from pipeline.simulator import compiled_loops
 from pipeline.simulator.effects.counting import (
     DARK_CURRENT,
     DEFECTS,
@@ -33,11 +33,6 @@ from pipeline.simulator.effects.counting import (
 from pipeline.simulator.effects.effect import OFF, SweepBlock
 from pipeline.simulator.render import Choice
 
-if TYPE_CHECKING:
-    from pipeline.simulator import compiled_loops
-else:
-    compiled_loops = deferred("pipeline.simulator.compiled_loops")
-
 Radiance = NDArray[np.float32]
 
 
@@ -48,11 +43,8 @@ def read_out(light: Radiance, block: SweepBlock, chosen: Mapping[Any, str] | Cho
 
     ``light``: (line, sample, band) of the block; negative values count as 0. [e-]
     Returns (line, sample, band) uint16, before binning.
-    Raises SceneError: a number is not finite; names the first. ShapeError: the light is not the block's.
+    Raises SceneError: a number is not finite; names the first.
     """
-    expected_shape = (len(block.lines), block.rig.camera.samples, len(block.wavelength_nm))
-    if light.shape != expected_shape:
-        raise ShapeError(f"expected light of {expected_shape} (line, sample, band), got {light.shape}")
     readout = Readout(block, Choice.of(chosen))
     raw = np.empty(light.shape, np.uint16)
     for row, number in enumerate(block.numbers):
@@ -104,17 +96,18 @@ class Readout:
     def electrons(self, light: Radiance, number: int) -> Radiance:
         """Give what leaves the amplifier for one line's light, (sample, band); each noise of its own draw. [e-]"""
         expected, shot = self._expected(light, number), self._variant(SHOT.name)
-        if shot == OFF:
-            return self._with_read_noise(self._within_well(expected), number)
-        deviate = self._deviates(SHOT.name, number)
-        if shot == EXACT:
-            return self._with_read_noise(self._within_well(photon_counts(expected, deviate)), number)
-        least = least_expected(0.0)
-        dim = np.flatnonzero(expected < np.float32(least)) if least else np.zeros(0, np.intp)
-        exact = photon_counts(expected.take(dim), deviate.take(dim))
-        counts = rounded_counts(expected, deviate)
-        counts.reshape(-1)[dim] = exact
-        return self._with_read_noise(self._within_well(counts), number)
+        electrons = expected
+        if shot != OFF:
+            deviate = self._deviates(SHOT.name, number)
+            electrons = (photon_counts if shot == EXACT else rounded_counts)(expected, deviate)
+            if shot != EXACT and (least := least_expected(0.0)):
+                dim = np.flatnonzero(expected < np.float32(least))
+                electrons.reshape(-1)[dim] = photon_counts(expected.take(dim), deviate.take(dim))
+        if self.full_well_e is not None:
+            np.minimum(electrons, np.float32(self.full_well_e), out=electrons)
+        if self.read_noise_e:
+            electrons += self._deviates(READ_NOISE.name, number) * np.float32(self.read_noise_e)
+        return electrons
 
     def converted(self, electrons: Radiance) -> NDArray[np.uint16]:
         """Give the converter's numbers, rounded half to even, within 0 and its full scale."""
@@ -170,18 +163,6 @@ class Readout:
                 f" expects {expected[sample, band]} electrons; give a scene and a rig of finite numbers"
             )
         return expected
-
-    def _within_well(self, electrons: Radiance) -> Radiance:
-        return (
-            electrons
-            if self.full_well_e is None
-            else np.minimum(electrons, np.float32(self.full_well_e), out=electrons)
-        )
-
-    def _with_read_noise(self, electrons: Radiance, number: int) -> Radiance:
-        if self.read_noise_e:
-            electrons += self._deviates(READ_NOISE.name, number) * np.float32(self.read_noise_e)
-        return electrons
 
     def _deviates(self, stream: str, number: int) -> Radiance:
         """Standard normal deviates of one line, (sample, band)."""

@@ -167,8 +167,7 @@ def _looker(
 
 def kernel_error(block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> float:
     """Give by how much of a wave's amplitude the kernels of a choice's footprint are wrong at most."""
-    choice = Choice.of(chosen)
-    return _footprint(block, choice, folded_positions(block.sweep, choice.variant("smear"))).error
+    return _footprint(block, Choice.of(chosen)).error
 
 
 def tails_apart(
@@ -179,11 +178,8 @@ def tails_apart(
     Where their blurs or held positions differ, other kernels are fitted to the same patterns; where these have tails,
     so has what the kernels are wrong by.
     """
-    held, found = block.sweep.positions, []
-    for choice in map(Choice.of, (one, other)):
-        found.append(
-            replace(_footprint(block, choice, folded_positions(block.sweep, choice.variant("smear"))), held=held)
-        )
+    held = block.sweep.positions
+    found = [replace(_footprint(block, choice), held=held) for choice in map(Choice.of, (one, other))]
     log_px, turn = np.linspace(math.log(reach_px), math.log(_BEYOND_PX), _RINGS), 2 * np.pi / _TURNS
     radius, angle = np.repeat(np.exp(log_px), _TURNS), np.tile(np.arange(_TURNS) * turn, _RINGS)
     along, scan = radius * np.cos(angle), radius * np.sin(angle)
@@ -192,10 +188,11 @@ def tails_apart(
     return np.asarray(area @ apart)
 
 
-def _footprint(block: SweepBlock, choice: Choice, held: int) -> Footprint:
+def _footprint(block: SweepBlock, choice: Choice) -> Footprint:
     normal = middle_normal(block.sweep, block.rig.camera)
     found = [one.moments(block.rig, block.wavelength_nm, way, normal) for one, way in choice.doing("moments")]
     box = box_of(choice.variant("slit"), block.rig)
+    held = folded_positions(block.sweep, choice.variant("smear"))
     return fold(box, (1, 1), held, Moments.together(found, len(block.wavelength_nm)))
 
 

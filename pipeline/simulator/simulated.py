@@ -20,7 +20,7 @@ from pipeline.geometry.scan import CostModel, Sweep, exposing, line_positions, m
 from pipeline.simulator.effects.counting import DEFECTS, dead_elements, hot_electrons
 from pipeline.simulator.effects.effect import OFF, SweepBlock
 from pipeline.simulator.effects.mirror_throughput import VIGNETTING
-from pipeline.simulator.effects.pointing import Pointing
+from pipeline.simulator.effects.pointing import PointingErrors
 from pipeline.simulator.effects.spectrometer import PRNU, RESPONSE, SMILE, STRIPING
 from pipeline.simulator.readout import dark_frame, read_out
 from pipeline.simulator.render import USUAL, Choice, expected_light
@@ -50,7 +50,7 @@ class SimulatedSource:
     chosen: Mapping[Any, str] | Choice = USUAL
     name: str = "sim"
     clock: Mapping[str, float] | None = None
-    pointing: Pointing | None = None
+    pointing: PointingErrors | None = None
 
     def __post_init__(self) -> None:
         _ = self.choice  # refuses variants that effects do not have

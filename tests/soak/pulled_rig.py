@@ -77,7 +77,7 @@ class PulledRig:
                 self._port = EmulatedPort(self.rig.mirror)
                 link = self._folder / LINK
                 link.unlink(missing_ok=True)
-                link.symlink_to(self._port.open())
+                link.symlink_to(self._port.path)
             if self._server is None:
                 control, files = self._address
                 self._server = CameraServer(self.rig.camera, port=control, file_port=files)

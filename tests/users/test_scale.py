@@ -15,7 +15,7 @@ from flows.tasks.zones import place_of_field
 from pipeline.geometry.camera import LineCamera
 from pipeline.ground.field_places import scale_of_pixels, scale_of_view
 from pipeline.ground.view import GroundView, RigPose
-from pipeline.simulator.scenes.farm.farm_scene import PIXEL_M, farm_scene
+from pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M, farm_scene
 from tests.conftest import Survey
 
 PAGE = Path(__file__).parents[2] / "docs" / "ground.md"
@@ -27,14 +27,14 @@ def test_the_example_of_a_pose_shows_the_farm_as_large_as_it_says() -> None:
     told = {one.name: one.metadata["json_schema_extra"]["example"] for one in fields(RigPose)}
     common = {name: told[name] for name in ("lon_deg", "lat_deg", "heading_deg", "tilt_deg")}
     (block,) = re.findall(r"```toml\n(\[pose\].*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    own = scale_of_pixels(shape, camera.ifov_rad, PIXEL_M)
+    own = scale_of_pixels(shape, camera.ifov_rad, FARM_PIXEL_M)
     for asked in (
         {**common, "height_m": told["height_m"]},
         {**common, "range_m": told["range_m"]},
         tomllib.loads(block)["pose"],
     ):
         seen = scale_of_view(GroundView(RigPose(**asked), camera.ifov_rad), shape)
-        assert seen.pixel_m == pytest.approx(PIXEL_M, rel=0.01)
+        assert seen.pixel_m == pytest.approx(FARM_PIXEL_M, rel=0.01)
         assert seen.hectares == pytest.approx(own.hectares, rel=0.03)
 
 
@@ -42,7 +42,7 @@ def test_the_farm_says_how_large_it_is() -> None:
     """Without a pose, by its own ground pixel."""
     scene = farm_scene(1, (20, 50), bands=2)
     scale = place_of_field(load_settings(), scene).scale(LineCamera().ifov_rad)
-    assert (scale.pixel_m, scale.hectares) == (PIXEL_M, pytest.approx(20 * 50 * PIXEL_M**2 / 1e4))
+    assert (scale.pixel_m, scale.hectares) == (FARM_PIXEL_M, pytest.approx(20 * 50 * FARM_PIXEL_M**2 / 1e4))
 
 
 def test_a_receipt_says_no_metres_where_nobody_knows(surveyed_png: Survey, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ is the decimal point; a number that takes more room than its bits is ``b`` and t
 
 from __future__ import annotations
 
+import base64
 import re
 import struct
 from dataclasses import dataclass, replace
@@ -199,7 +200,6 @@ def _apart_px(scan_path: MirrorScanPath, camera: LineCamera, times: tuple[Floats
 
 LEAD = 1  # cells before the first line's: a unit that waits for edges takes its first cell at the run command, assumed
 REFERENCES = "references"  # prefix of a capture that is made for the dark and white frames in its folder
-_DIGITS = "0123456789abcdefghijklmnopqrstuv"
 _LONGEST = 14  # b and 64 bits
 _NUMBER = r"(-?\d+(?:p\d+)?|b[0-9a-v]{13})"
 _FORM = re.compile(rf"(.+)_([cf])([xy]){_NUMBER}_{_NUMBER}_(\d+)x(\d+)x(\d+)(?:x(\d+))?_(\d+)", re.DOTALL)
@@ -245,17 +245,13 @@ def _written(value: float) -> str:
     short = repr(float(value)).removesuffix(".0")
     if len(short) < _LONGEST and set(short) <= set("-.0123456789"):
         return short.replace(".", "p")
-    bits = int.from_bytes(struct.pack(">d", value), "big")
-    return "b" + "".join(_DIGITS[bits >> shift & 31] for shift in range(60, -1, -5))
+    return "b" + base64.b32hexencode(struct.pack(">d", value)).decode().lower().rstrip("=")
 
 
 def _number(text: str) -> float:
     if not text.startswith("b"):
         return float(text.replace("p", "."))
-    bits = 0
-    for digit in text[1:]:
-        bits = bits << 5 | _DIGITS.index(digit)
-    return float(struct.unpack(">d", (bits & (1 << 64) - 1).to_bytes(8, "big"))[0])
+    return float(struct.unpack(">d", base64.b32hexdecode(f"{text[1:].upper()}==="))[0])
 
 
 @dataclass(frozen=True)

@@ -173,7 +173,13 @@ class RigSource:
                     why = str(error)
                 barren = 0 if line > before else barren + 1
                 if line < taken.stop:
-                    self._give_up(taken, line, why, last=barren >= BARREN)
+                    self._journal.spend(taken, why)
+                    if barren >= BARREN:
+                        raise RigError(
+                            f"sweep {sweep.name}: {BARREN} captures in a row gave no line {line}; the last, "
+                            f"{taken.folder}: {why}. The {line} lines before it are kept; mend that and run again"
+                        )
+                    LOG.warning("%s: line %d is captured again; %s: %s", sweep.name, line, taken.folder, why)
 
     def lines_again(self, sweep: Sweep, numbers: Sequence[int]) -> Iterator[Line]:
         """Yield single lines of those given before, in order, from the files of the captures that hold them.
@@ -293,16 +299,6 @@ class RigSource:
         if known and origin is not None:
             return (stamp_us - origin) * 1e-6 + exposed.mid_exposure_s(0.0)
         return exposed.mid_exposure_s(float(number))
-
-    def _give_up(self, taken: CaptureRecord, line: int, why: str, *, last: bool) -> None:
-        """Abandon a capture: lines that it lacks are captured again, unless that has been tried already."""
-        self._journal.spend(taken, why)
-        if last:
-            raise RigError(
-                f"sweep {taken.sweep.name}: {BARREN} captures in a row gave no line {line}; the last, {taken.folder}: "
-                f"{why}. The {line} lines before it are kept; mend that and run again"
-            )
-        LOG.warning("%s: line %d is captured again; %s: %s", taken.sweep.name, line, taken.folder, why)
 
     def _claim(self, frames: int) -> FrameClaim:
         return FrameClaim(frames, self.camera.samples, len(self.wavelength_nm))

@@ -11,9 +11,7 @@ from __future__ import annotations
 import io
 import json
 import logging
-import os
 import socket
-import stat
 import threading
 import warnings
 from collections.abc import Callable, Sequence
@@ -35,7 +33,7 @@ Raw = NDArray[np.uint16]
 Lines = Callable[[Floats, Floats], Raw]  # positions (line, 2), times (line,) of mid exposure -> (line, sample, band)
 Positions = Callable[[Floats], Floats]  # times (line,) -> (line, 2)
 
-_BLOCK = 64  # frames looked at together
+_BLOCK = 8  # frames looked at together, while the camera takes no other request
 PROMPT = b"\r\nhpi> "
 MOST_LINE = 4096
 STARTED_US = 1_500_000_000_000_000  # by the camera's clock at 0 of the emulator's
@@ -64,12 +62,11 @@ class EmulatedCapture:
         whole = int(np.floor((now_s - self.began_s - self.exposure_s) / self.period_s + 1e-9)) + 1
         return max(whole if self.most_frames is None else min(whole, self.most_frames), 0)
 
-    def exposures(self, from_s: float, to_s: float) -> Floats:
-        """Return begin and end (exposure, 2) of exposures that begin at ``from_s`` or later and before ``to_s``."""
+    def begins(self, from_s: float, to_s: float) -> Floats:
+        """Return when exposures begin, (exposure,), of those that begin at ``from_s`` or later and before ``to_s``."""
         bounds = np.ceil((np.array([from_s, to_s]) - self.began_s) / self.period_s - 1e-9).astype(np.int64)
         first, stop = np.clip(bounds, 0, self.most_frames)
-        begins = self.began_s + np.arange(first, stop) * self.period_s
-        return np.stack([begins, begins + self.exposure_s], axis=-1)
+        return np.asarray(self.began_s + np.arange(first, stop) * self.period_s)
 
     def running(self, now_s: float) -> bool:
         """Return whether frames are still to come."""
@@ -79,9 +76,9 @@ class EmulatedCapture:
         """Take no frame that is not over."""
         self.most_frames = self.due(now_s)
 
-    def pending(self, now_s: float, most: int = _BLOCK) -> Ints:
-        """Return the numbers of the next frames, ``most`` at most, that are exposed and not taken yet."""
-        return np.arange(self._taken, max(min(self._taken + most, self.due(now_s)), self._taken))
+    def pending(self, now_s: float) -> Ints:
+        """Return the numbers of some of the next frames that are exposed and not taken yet."""
+        return np.arange(self._taken, max(min(self._taken + _BLOCK, self.due(now_s)), self._taken))
 
     def middle_s(self, numbers: Ints) -> Floats:
         """Return the times of mid exposure of frames [s]."""
@@ -188,12 +185,6 @@ class CameraDevice:
         """Return whether a capture runs."""
         return bool(self.captures) and self.captures[-1].running(self.clock.now())
 
-    def exposures(self, from_s: float, to_s: float) -> NDArray[np.float64]:
-        """Return begin and end (exposure, 2) of exposures that begin in a span of time, for a mirror's trigger."""
-        with self._lock:
-            spans = [capture.exposures(from_s, to_s) for capture in self.captures]
-            return np.concatenate([np.zeros((0, 2)), *spans])
-
     def files(self) -> dict[str, bytes]:
         """Return all files by their whole names, as they are now."""
         with self._lock:
@@ -207,12 +198,23 @@ class CameraDevice:
             "/" + "/".join(name.split("/")[1:end]) for name in every for end in range(2, name.count("/") + 1)
         }
 
+    def keep_looking(self) -> bool:
+        """Look at some frames that are over; False where there are none. Others may speak to the camera meanwhile."""
+        with self._lock:
+            waiting = ((one, one.pending(self.clock.now())) for one in self.captures[-2:])
+            capture, numbers = next(((one, some) for one, some in waiting if len(some)), (None, np.zeros(0, np.int64)))
+        if capture is None:
+            return False
+        middle_s = capture.middle_s(numbers)
+        lines = self._lines(self._positions(middle_s), middle_s)
+        with self._lock:
+            capture.put(lines)
+        return True
+
     def _poll(self) -> None:
         """Look at all frames that are over by now."""
-        for capture in self.captures:
-            while len(numbers := capture.pending(self.clock.now())):
-                middle_s = capture.middle_s(numbers)
-                capture.put(self._lines(self._positions(middle_s), middle_s))
+        while self.keep_looking():
+            pass
 
     def _do(self, line: str) -> Any:
         name, _, rest = line.partition("(")
@@ -422,7 +424,7 @@ def _file_server(device: CameraDevice, address: tuple[str, int], kind: type[File
 
 
 class _FilesInMemory(AbstractedFS):  # type: ignore[misc]
-    """A device's files as a read-only file system."""
+    """A device's files by their whole names, to be asked for and fetched: the control socket lists them."""
 
     @property
     def device(self) -> CameraDevice:
@@ -441,17 +443,8 @@ class _FilesInMemory(AbstractedFS):  # type: ignore[misc]
     def realpath(self, path: str) -> str:
         return path
 
-    def chdir(self, path: str) -> None:
-        self.cwd = path
-
     def isfile(self, path: str) -> bool:
         return path in self.device.files()
-
-    def isdir(self, path: str) -> bool:
-        return path in self.device.folders()
-
-    def lexists(self, path: str) -> bool:
-        return self.isfile(path) or self.isdir(path)
 
     def getsize(self, path: str) -> int:
         return len(self._content(path))
@@ -460,18 +453,6 @@ class _FilesInMemory(AbstractedFS):  # type: ignore[misc]
         file = io.BytesIO(self._content(name))
         file.name = name  # servers ask for it
         return file
-
-    def listdir(self, path: str) -> list[str]:
-        under = path.rstrip("/") + "/"
-        every = [*self.device.files(), *self.device.folders()]
-        return sorted({name[len(under) :].split("/")[0] for name in every if name.startswith(under) and name != under})
-
-    def stat(self, path: str) -> Any:
-        mode = stat.S_IFDIR | 0o555 if self.isdir(path) else stat.S_IFREG | 0o444
-        size = 0 if self.isdir(path) else self.getsize(path)
-        return os.stat_result((mode, 0, 0, 1, 0, 0, size, 0, 0, 0))
-
-    lstat = stat
 
     def _content(self, path: str) -> bytes:
         try:

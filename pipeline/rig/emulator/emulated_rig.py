@@ -43,7 +43,6 @@ from pipeline.geometry.mirror import STRAIGHT, Mounting, direction_to_scene, pos
 from pipeline.geometry.scan import Sweep, sweep_positions
 from pipeline.rig.capture.capture_paths import REFERENCES, Announced, announced
 from pipeline.rig.device_settings import Pulses
-from pipeline.rig.emulator import Chunk
 from pipeline.rig.emulator.camera_device import (
     CameraDevice,
     CameraServer,
@@ -54,7 +53,6 @@ from pipeline.rig.emulator.camera_device import (
     Raw,
 )
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.emulator.mirror_state import MirrorUnit
 from pipeline.rig.mirror.mirror_controller import wire_positions
 from pipeline.rig.transports import BITS_PER_BYTE, SYSTEM_CLOCK, Clock, Closing
 from pipeline.simulator.effects.effect import Aim, Bound, SweepBlock
@@ -65,7 +63,6 @@ from pipeline.simulator.simulated import SimulatedSource, render_lines
 from pipeline.source import AT_REST
 
 REFERENCE_FRAMES = 32
-_AT_ONCE = 8  # frames looked at while the camera takes no other request
 
 
 @dataclass(frozen=True)
@@ -186,17 +183,9 @@ class SceneCamera(CameraDevice):
     """
 
     def __init__(
-        self,
-        view: SceneView,
-        mirror: MirrorDevice,
-        clock: Clock,
-        *,
-        wired: Pulses = "position",
-        kept: int = 0,
-        unit: CameraUnit | None = None,
+        self, view: SceneView, mirror: MirrorDevice, clock: Clock, *, wired: Pulses = "position", kept: int = 0
     ) -> None:
-        unit = CameraUnit() if unit is None else unit
-        unit = replace(unit, wavelength_nm=tuple(view.source.wavelength_nm.tolist()))
+        unit = CameraUnit(wavelength_nm=tuple(view.source.wavelength_nm.tolist()))
         super().__init__(self._seen, clock, positions=mirror.sent, unit=unit)
         self.view, self.mirror, self.wired, self.kept = view, mirror, wired, kept
         self.aside = False
@@ -209,7 +198,7 @@ class SceneCamera(CameraDevice):
         for capture in self.captures[-2:]:  # one may just have ended
             told = announced(_prefix(capture)) if self.wired == "position" else None
             steps = 1 if told is None else told.sweep.positions
-            begins = capture.exposures(from_s - capture.exposure_s, to_s)[:, :1]
+            begins = capture.begins(from_s - capture.exposure_s, to_s)[:, None]
             rises = (begins + np.arange(steps) * (capture.exposure_s / steps)).ravel()
             rises = rises[(rises >= from_s) & (rises < to_s)]
             found.append(np.stack([rises, rises + capture.exposure_s / (2 * steps)], axis=-1))
@@ -219,20 +208,7 @@ class SceneCamera(CameraDevice):
         """Return whether a capture runs, or its frames are still being written."""
         if super().is_capturing():
             return True
-        return self.aside and any(len(capture.pending(self.clock.now(), 1)) for capture in self.captures[-1:])
-
-    def keep_looking(self) -> bool:
-        """Look at some frames that are over; False where there are none. Others may speak to the camera meanwhile."""
-        with self._lock:
-            waiting = ((one, one.pending(self.clock.now(), _AT_ONCE)) for one in self.captures[-2:])
-            capture, numbers = next(((one, some) for one, some in waiting if len(some)), (None, np.zeros(0, np.int64)))
-        if capture is None:
-            return False
-        middle_s = capture.middle_s(numbers)
-        lines = self._seen(self._positions(middle_s), middle_s)
-        with self._lock:
-            capture.put(lines)
-        return True
+        return self.aside and any(len(capture.pending(self.clock.now())) for capture in self.captures[-1:])
 
     def _poll(self) -> None:
         if not self.aside:
@@ -278,26 +254,19 @@ _NAP_S = 0.01
 
 
 class EmulatedPort(Closing):
-    """A pty and the thread that serves it, from :meth:`open` to :meth:`close`; use it as a context.
+    """A pty and the thread that serves it, until :meth:`close`; ``path`` is the name that users open. Also a context.
 
     The device's clock paces the bytes, too. ``baud`` is the speed in both directions; 0 lets bytes through as they
-    come: USB ports do that whatever their speed says.
+    come: USB ports do that whatever their speed says. RigError where this system has no ptys.
     """
 
     def __init__(self, device: MirrorDevice, *, baud: int = 0) -> None:
-        self.device, self.baud = device, baud
-        self.path = ""
-        self._master = self._slave = self._wake = -1
-        self._thread: threading.Thread | None = None
-
-    def __enter__(self) -> EmulatedPort:
-        self.open()
-        return self
-
-    def open(self) -> str:
-        """Make the pty, serve it, and give the name that users open; RigError where this system has no ptys."""
-        if self._thread is not None:
-            raise RigError(f"the emulated port {self.path} is open; close it first")
+        self.device = device
+        self._byte_s = BITS_PER_BYTE / baud if baud else 0.0
+        self._order = count()
+        self._in: list[tuple[float, int, bytes]] = []  # when it reached the device
+        self._out: list[tuple[float, int, bytes]] = []
+        self._in_free_s = self._out_free_s = 0.0
         try:
             self._master, self._slave = os.openpty()
             tty.setraw(self._slave)  # else line discipline would echo, and turn CR into LF
@@ -305,22 +274,20 @@ class EmulatedPort(Closing):
             raise RigError(f"no pty for the emulated port: {error}; ptys are there on Linux and macOS") from error
         os.set_blocking(self._master, False)
         self.path = os.ttyname(self._slave)
-        read_end, self._wake = os.pipe()
-        self._thread = threading.Thread(target=self._serve, args=(read_end,), name="emulated mirror port", daemon=True)
+        self._stop, self._wake = os.pipe()
+        self._thread = threading.Thread(target=self._serve, name="emulated mirror port", daemon=True)
         self._thread.start()
-        return self.path
 
     def close(self) -> None:
         """End the thread and let go of the pty; users of the port see the device go. Nothing where it is closed."""
-        if self._thread is None:
-            return
-        os.close(self._wake)
-        self._thread.join()
-        self._thread = None
+        if self._wake >= 0:
+            os.close(self._wake)
+            self._wake = -1
+            self._thread.join()
 
-    def _serve(self, read_end: int) -> None:
+    def _serve(self) -> None:
         try:
-            _Line(self.device, self._master, self.baud).serve(read_end)
+            self._carry()
         except OSError as error:
             LOG.info("%s: the device went away (%s)", self.path, error)
         except Exception:
@@ -328,46 +295,32 @@ class EmulatedPort(Closing):
         finally:
             for descriptor in (self._master, self._slave):
                 os.close(descriptor)
-            select.select([read_end], [], [])  # until close() is called
-            os.close(read_end)
+            select.select([self._stop], [], [])  # until close() is called
+            os.close(self._stop)
 
-
-class _Line:
-    """Bytes between the master's end of a pty and a device, at the pace of the device's clock."""
-
-    def __init__(self, device: MirrorDevice, master: int, baud: int) -> None:
-        self._device, self._master = device, master
-        self._byte_s = BITS_PER_BYTE / baud if baud else 0.0
-        self._order = count()
-        self._in: list[tuple[float, int, bytes]] = []  # when it reached the device
-        self._out: list[tuple[float, int, bytes]] = []
-        self._in_free_s = self._out_free_s = 0.0
-
-    def serve(self, stop: int) -> None:
-        """Carry bytes until ``stop`` is closed at its other end; OSError where the device goes away."""
+    def _carry(self) -> None:
+        """Carry bytes until the port is closed; OSError where the device goes away."""
+        clock = self.device.clock
         while True:
-            ready, _, _ = select.select([stop, self._master], [], [], self._patience())
-            if stop in ready:
+            ready, _, _ = select.select([self._stop, self._master], [], [], self._patience())
+            if self._stop in ready:
                 return
             if self._master in ready:
                 data = os.read(self._master, _MOST_READ)
-                self._in_free_s = max(self._device.clock.now(), self._in_free_s) + len(data) * self._byte_s
+                self._in_free_s = max(clock.now(), self._in_free_s) + len(data) * self._byte_s
                 heapq.heappush(self._in, (self._in_free_s, next(self._order), data))
-            while self._in and self._in[0][0] <= self._device.clock.now():
-                due, _, data = heapq.heappop(self._in)
-                self._schedule(self._device.receive(data), due)  # not from now: waking late is not the device's doing
+            while self._in and self._in[0][0] <= clock.now():
+                since_s, _, data = heapq.heappop(self._in)
+                for delay_s, reply in self.device.receive(data):
+                    due = since_s + delay_s  # not from now: waking late is not the device's doing
+                    if self._byte_s:
+                        due = self._out_free_s = max(due, self._out_free_s) + len(reply) * self._byte_s
+                    heapq.heappush(self._out, (due, next(self._order), reply))
             self._deliver()
-
-    def _schedule(self, chunks: list[Chunk], since_s: float) -> None:
-        for delay_s, data in chunks:
-            due = since_s + delay_s
-            if self._byte_s:
-                due = self._out_free_s = max(due, self._out_free_s) + len(data) * self._byte_s
-            heapq.heappush(self._out, (due, next(self._order), data))
 
     def _deliver(self) -> None:
         """Write what is due; what a user does not take waits."""
-        while self._out and self._out[0][0] <= self._device.clock.now():
+        while self._out and self._out[0][0] <= self.device.clock.now():
             due, order, data = heapq.heappop(self._out)
             try:
                 written = os.write(self._master, data)
@@ -382,7 +335,7 @@ class _Line:
         waiting = [queue[0][0] for queue in (self._in, self._out) if queue]
         if not waiting:
             return None
-        left = (min(waiting) - self._device.clock.now()) / getattr(self._device.clock, "speed", 1.0)
+        left = (min(waiting) - self.device.clock.now()) / getattr(self.device.clock, "speed", 1.0)
         return left if left > 0 else _RETRY_S if self._out and self._out[0][0] <= min(waiting) else 0.0
 
 
@@ -430,14 +383,12 @@ class EmulatedRig:
         *,
         wired: Pulses = "position",
         kept: int = 0,
-        mirror: MirrorUnit | None = None,
-        camera: CameraUnit | None = None,
         mounting: Mounting = STRAIGHT,
     ) -> None:
         self.clock = clock
-        self.mirror = self.mirror_kind(self.clock, unit=mirror)
+        self.mirror = self.mirror_kind(self.clock)
         view = SceneView(source, mounting)
-        self.camera = self.camera_kind(view, self.mirror, self.clock, wired=wired, kept=kept, unit=camera)
+        self.camera = self.camera_kind(view, self.mirror, self.clock, wired=wired, kept=kept)
         self.mirror.pulses = self.camera.pulses
 
     @property
@@ -464,7 +415,7 @@ class ServedRig(Closing):
     def __init__(self, rig: EmulatedRig, baud: int) -> None:
         self.rig = rig
         self._port = EmulatedPort(rig.mirror, baud=baud)
-        self.port = self._port.open()
+        self.port = self._port.path
         try:
             self._server = rig.server_kind(rig.camera)
         except BaseException:

@@ -3,9 +3,7 @@
 It has what drivers ask for in both modes of the documented protocol. Assumed, as the documents leave it open: an empty
 line has no answer; NO answers a line that is not known, ERROR one that is too long. Bytes that come while the
 controller boots are lost. Bytes in pro mode that are no frame are answered by error 0001 at the next boundary. Requests
-are checked by their CRC after GOPROCRC alone, and replies always carry it. Two other firmwares are emulated, too. One
-checks the CRC of requests after GOPRO as well (``crc="required"``). The other knows no GOPROCRC and sends 00 00 in the
-CRC's place (``crc="absent"``).
+are checked by their CRC after GOPROCRC alone, and replies always carry it.
 """
 
 from __future__ import annotations
@@ -27,49 +25,19 @@ from pipeline.errors import ShapeError
 from pipeline.rig.emulator import Chunk
 from pipeline.rig.emulator.mirror_state import MirrorState, MirrorUnit, PositionLogger
 from pipeline.rig.mirror import mirror_requests as simple
+from pipeline.rig.mirror import pro_mode as pro
 from pipeline.rig.mirror.mirror_requests import END, MOST_LINE, Reply
-from pipeline.rig.mirror.pro_mode import (
-    BOUNDARY,
-    CELL,
-    ERROR_FLAG,
-    FEEDBACK_X,
-    LOG_RATE,
-    LOG_RUN,
-    LOG_SLOTS,
-    MOST_PAYLOAD,
-    VECTOR_MEMORY,
-    ChannelRegisters,
-    Command,
-    Damaged,
-    ErrorCode,
-    Frame,
-    FrameReader,
-    Trigger,
-    Unit,
-    VectorRegister,
-    cell_float,
-    cell_int,
-    encode,
-    float_cell,
-    int_cell,
-    log_slot,
-    read_register,
-    read_registers,
-    read_vector,
-    refuse,
-    values_reply,
-)
 from pipeline.rig.transports import Clock
 
 LOWEST_HZ, HIGHEST_HZ = 0.0, 10_000.0
 _CURRENT_A = 0.7
-_LOGGED = range(log_slot(0), log_slot(LOG_SLOTS))  # vectors of the logger
+_LOGGED = range(pro.log_slot(0), pro.log_slot(pro.LOG_SLOTS))  # vectors of the logger
 
 
 class RefusedError(Exception):
     """The controller answers with an error code."""
 
-    def __init__(self, code: ErrorCode) -> None:
+    def __init__(self, code: pro.ErrorCode) -> None:
         super().__init__(code.name)
         self.code = code
 
@@ -88,12 +56,12 @@ class Register:
     def check(self, cell: bytes) -> float | int:
         """Read a cell that is to be written; RefusedError where it may not be, or is out of range."""
         if self.write is None:
-            raise RefusedError(ErrorCode.READ_ONLY)
-        value: float | int = cell_int(cell) if self.whole else cell_float(cell)
+            raise RefusedError(pro.ErrorCode.READ_ONLY)
+        value: float | int = pro.cell_int(cell) if self.whole else pro.cell_float(cell)
         if self.signed and value >= 2**31:
             value -= 2**32
         if not self.least <= value <= self.most:  # NaN is in no range
-            raise RefusedError(ErrorCode.OUT_OF_RANGE)
+            raise RefusedError(pro.ErrorCode.OUT_OF_RANGE)
         return value
 
 
@@ -103,62 +71,73 @@ class RegisterFile:
     def __init__(self, state: MirrorState) -> None:
         self._state = state
         self.logger = PositionLogger(state)
-        self._registers = {**_feedback(state), **_logger(self.logger), **_channel(state, 0), **_channel(state, 1)}
+        each = [Register(*_item(self.logger.slots, slot), 0, 0xFFFF, whole=True) for slot in range(pro.LOG_SLOTS)]
+        self._registers = {pro.log_slot(slot): register for slot, register in enumerate(each)} | {
+            pro.FEEDBACK_X: Register(lambda: state.axes[0].place(state.moment)),
+            pro.FEEDBACK_Y: Register(lambda: state.axes[1].place(state.moment)),
+            pro.VECTOR_MEMORY: Register(lambda: 0, whole=True),  # whether the head's own copy is valid
+            pro.LOG_RUN: Register(lambda: self.logger.running, lambda on: self.logger.run(bool(on)), 0, 1, whole=True),
+            pro.LOG_RATE: Register(*_attribute(self.logger, "rate_hz", float), 1.0, HIGHEST_HZ),
+            **_channel(state, 0),
+            **_channel(state, 1),
+        }
 
-    def answer(self, frame: Frame) -> Frame:
+    def answer(self, frame: pro.Frame) -> pro.Frame:
         """Carry out a frame of pro mode and give the reply, which may say why not."""
-        command = frame.command & ~ERROR_FLAG
+        command = frame.command & ~pro.ERROR_FLAG
         try:
             return self._carry_out(frame.command, frame.payload)
         except RefusedError as refused:
-            return refuse(command, refused.code)
+            return pro.refuse(command, refused.code)
         except ShapeError:
-            return refuse(command, ErrorCode.LENGTH_MISMATCH)
+            return pro.refuse(command, pro.ErrorCode.LENGTH_MISMATCH)
 
-    def _carry_out(self, command: int, payload: bytes) -> Frame:
+    def _carry_out(self, command: int, payload: bytes) -> pro.Frame:
         match command:
-            case Command.FIRMWARE_ID | Command.STATUS:
+            case pro.Command.FIRMWARE_ID | pro.Command.STATUS:
                 _expect(payload in (b"", b"\x00\x00"))
-                asked_id = command == Command.FIRMWARE_ID
-                return Frame(command, int_cell(self._state.unit.firmware_id if asked_id else int(self._state.status())))
-            case Command.SET_MODE:  # which is the device's own affair
+                asked_id = command == pro.Command.FIRMWARE_ID
+                return pro.Frame(
+                    command, pro.int_cell(self._state.unit.firmware_id if asked_id else int(self._state.status()))
+                )
+            case pro.Command.SET_MODE:  # which is the device's own affair
                 _expect(len(payload) == 2)
                 if any(payload):
-                    raise RefusedError(ErrorCode.OUT_OF_RANGE)
-            case Command.GET_VALUE:
-                register, cell = read_register(payload)
+                    raise RefusedError(pro.ErrorCode.OUT_OF_RANGE)
+            case pro.Command.GET_VALUE:
+                register, cell = pro.read_register(payload)
                 _expect(not cell)
-                return Frame(command, self.get(register))
-            case Command.SET_VALUE:
-                register, cell = read_register(payload)
+                return pro.Frame(command, self.get(register))
+            case pro.Command.SET_VALUE:
+                register, cell = pro.read_register(payload)
                 _expect(bool(cell))
                 self.put({register: cell})
-            case Command.GET_VALUES:
-                asked = read_registers(payload, with_cells=False)
+            case pro.Command.GET_VALUES:
+                asked = pro.read_registers(payload, with_cells=False)
                 _expect(bool(asked))
-                return values_reply([self.get(number) for number, _ in asked])
-            case Command.SET_VALUES:
-                given = read_registers(payload, with_cells=True)
+                return pro.values_reply([self.get(number) for number, _ in asked])
+            case pro.Command.SET_VALUES:
+                given = pro.read_registers(payload, with_cells=True)
                 _expect(bool(given))
                 self.put(dict(given))
-            case Command.GET_VECTOR:
-                register, offset, length, cells = read_vector(payload)
+            case pro.Command.GET_VECTOR:
+                register, offset, length, cells = pro.read_vector(payload)
                 _expect(not cells)
-                return Frame(command, self.get_cells(register, offset, length))
-            case Command.SET_VECTOR:
-                register, offset, length, cells = read_vector(payload)
+                return pro.Frame(command, self.get_cells(register, offset, length))
+            case pro.Command.SET_VECTOR:
+                register, offset, length, cells = pro.read_vector(payload)
                 _expect(len(cells) == length)
                 self.put_cells(register, offset, cells)
             case _:
-                raise RefusedError(ErrorCode.COMMAND_UNKNOWN)
-        return Frame(command)
+                raise RefusedError(pro.ErrorCode.COMMAND_UNKNOWN)
+        return pro.Frame(command)
 
     def get(self, number: int) -> bytes:
         """Return a register's cell; RefusedError where there is no such register."""
         self._state.advance()
         register = self._find(number)
         value = register.read()
-        return int_cell(int(value)) if register.whole else float_cell(float(value))
+        return pro.int_cell(int(value)) if register.whole else pro.float_cell(float(value))
 
     def put(self, cells: Mapping[int, bytes]) -> None:
         """Write registers at one moment; held positions go out together.
@@ -180,19 +159,19 @@ class RegisterFile:
         Raises RefusedError: the cells are not whole, or not there.
         """
         start, stop = _cells(offset, length)
-        if number == VECTOR_MEMORY:
+        if number == pro.VECTOR_MEMORY:
             _within(stop, self._state.memory.size)
             return self._state.memory[start:stop].astype(">f4").tobytes()
         if number not in _LOGGED:
-            raise RefusedError(ErrorCode.NO_REGISTER)
+            raise RefusedError(pro.ErrorCode.NO_REGISTER)
         _within(stop, self.logger.rows)
-        return self.logger.cells(number - log_slot(0), start, stop)
+        return self.logger.cells(number - pro.log_slot(0), start, stop)
 
     def put_cells(self, number: int, offset: int, data: bytes) -> None:
         """Write whole cells of the vector memory (else RefusedError)."""
         start, stop = _cells(offset, len(data))
-        if number != VECTOR_MEMORY:
-            raise RefusedError(ErrorCode.READ_ONLY if number in _LOGGED else ErrorCode.NO_REGISTER)
+        if number != pro.VECTOR_MEMORY:
+            raise RefusedError(pro.ErrorCode.READ_ONLY if number in _LOGGED else pro.ErrorCode.NO_REGISTER)
         _within(stop, self._state.memory.size)
         self._state.advance()
         self._state.memory[start:stop] = np.frombuffer(data, ">f4")
@@ -200,7 +179,7 @@ class RegisterFile:
     def _find(self, number: int) -> Register:
         found = self._registers.get(number)
         if found is None:
-            raise RefusedError(ErrorCode.NO_REGISTER)
+            raise RefusedError(pro.ErrorCode.NO_REGISTER)
         return found
 
 
@@ -210,52 +189,34 @@ def _expect(fits: bool) -> None:
 
 
 def _cells(offset: int, length: int) -> tuple[int, int]:
-    if offset % CELL or length % CELL:
-        raise RefusedError(ErrorCode.VECTOR_ALIGNMENT)
-    if not 0 < length <= MOST_PAYLOAD:
-        raise RefusedError(ErrorCode.LENGTH_MISMATCH)
-    return offset // CELL, (offset + length) // CELL
+    if offset % pro.CELL or length % pro.CELL:
+        raise RefusedError(pro.ErrorCode.VECTOR_ALIGNMENT)
+    if not 0 < length <= pro.MOST_PAYLOAD:
+        raise RefusedError(pro.ErrorCode.LENGTH_MISMATCH)
+    return offset // pro.CELL, (offset + length) // pro.CELL
 
 
 def _within(stop: int, size: int) -> None:
     if stop > size:
-        raise RefusedError(ErrorCode.VECTOR_INDEX)
-
-
-def _feedback(state: MirrorState) -> dict[int, Register]:
-    """Return the registers of the optical feedback, and of the vector memory."""
-
-    def place(channel: int) -> float:
-        return state.axes[channel].place(state.moment)
-
-    table = {FEEDBACK_X + channel: Register(partial(place, channel)) for channel in (0, 1)}
-    table[VECTOR_MEMORY] = Register(lambda: 0, whole=True)  # whether the head's own copy is valid
-    return table
-
-
-def _logger(logger: PositionLogger) -> dict[int, Register]:
-    table = {log_slot(slot): Register(*_item(logger.slots, slot), 0, 0xFFFF, whole=True) for slot in range(LOG_SLOTS)}
-    table[LOG_RUN] = Register(lambda: logger.running, lambda on: logger.run(bool(on)), 0, 1, whole=True)
-    table[LOG_RATE] = Register(*_attribute(logger, "rate_hz", float), 1.0, HIGHEST_HZ)
-    return table
+        raise RefusedError(pro.ErrorCode.VECTOR_INDEX)
 
 
 def _channel(state: MirrorState, channel: int) -> dict[int, Register]:
     """Return the inputs of a channel, and which of them it follows."""
-    registers = ChannelRegisters(channel)
+    registers = pro.ChannelRegisters(channel)
     inputs = {registers.static_system, registers.vector_system}
 
     def choose(system: int) -> None:
         if system not in inputs:
-            raise RefusedError(ErrorCode.SYSTEM_NOT_SELECTABLE)
+            raise RefusedError(pro.ErrorCode.SYSTEM_NOT_SELECTABLE)
         state.inputs[channel] = system
 
     table = {
         registers.input: Register(lambda: state.inputs[channel], choose, 0, 0xFF, whole=True),
         registers.control: Register(*_item(state.controls, channel), 0, 0xFF, whole=True),
     }
-    for unit in Unit:
-        most = _CURRENT_A if unit is Unit.CURRENT else 1.0
+    for unit in pro.Unit:
+        most = _CURRENT_A if unit is pro.Unit.CURRENT else 1.0
         table[registers.static_system << 8 | unit] = Register(*_item(state.static[channel], unit), -most, most)
     return {**table, **_vector_unit(state, channel)}
 
@@ -267,24 +228,24 @@ def _vector_unit(state: MirrorState, channel: int) -> dict[int, Register]:
         if not on:
             player.stop()
         elif player.length < 1 or player.start + player.length > most:
-            raise RefusedError(ErrorCode.VECTOR_INDEX)
+            raise RefusedError(pro.ErrorCode.VECTOR_INDEX)
         else:
             player.run(state.moment)
 
     rows = {
-        VectorRegister.UNIT: Register(*_attribute(player, "unit", Unit), 0, 2, whole=True),
-        VectorRegister.RUN: Register(lambda: player.running, run, 0, 1, whole=True),
-        VectorRegister.START: Register(*_attribute(player, "start"), 0, most, whole=True),
-        VectorRegister.END: Register(*_attribute(player, "end"), 0, most, whole=True),
-        VectorRegister.FREQUENCY: Register(*_attribute(player, "frequency_hz", float), 1e-3, HIGHEST_HZ),
-        VectorRegister.LOWEST: Register(lambda: LOWEST_HZ),
-        VectorRegister.HIGHEST: Register(lambda: HIGHEST_HZ),
-        VectorRegister.CYCLES: Register(*_attribute(player, "cycles"), -1, 2**31 - 1, whole=True, signed=True),
-        VectorRegister.TRIGGER: Register(*_attribute(player, "external", Trigger), 0, 2, whole=True),
-        VectorRegister.OUTPUT: Register(lambda: state.played[channel]),
-        VectorRegister.INDEX: Register(lambda: player.index, whole=True),
+        pro.VectorRegister.UNIT: Register(*_attribute(player, "unit", pro.Unit), 0, 2, whole=True),
+        pro.VectorRegister.RUN: Register(lambda: player.running, run, 0, 1, whole=True),
+        pro.VectorRegister.START: Register(*_attribute(player, "start"), 0, most, whole=True),
+        pro.VectorRegister.END: Register(*_attribute(player, "end"), 0, most, whole=True),
+        pro.VectorRegister.FREQUENCY: Register(*_attribute(player, "frequency_hz", float), 1e-3, HIGHEST_HZ),
+        pro.VectorRegister.LOWEST: Register(lambda: LOWEST_HZ),
+        pro.VectorRegister.HIGHEST: Register(lambda: HIGHEST_HZ),
+        pro.VectorRegister.CYCLES: Register(*_attribute(player, "cycles"), -1, 2**31 - 1, whole=True, signed=True),
+        pro.VectorRegister.TRIGGER: Register(*_attribute(player, "external", pro.Trigger), 0, 2, whole=True),
+        pro.VectorRegister.OUTPUT: Register(lambda: state.played[channel]),
+        pro.VectorRegister.INDEX: Register(lambda: player.index, whole=True),
     }
-    return {ChannelRegisters(channel).vector(name): register for name, register in rows.items()}
+    return {pro.ChannelRegisters(channel).vector(name): register for name, register in rows.items()}
 
 
 def _item(holder: Any, key: int) -> tuple[Callable[[], Any], Callable[[Any], object]]:
@@ -316,8 +277,8 @@ class Request:
 
     mode: Mode
     line: str = ""
-    frame: Frame | None = None
-    damaged: Damaged | None = None
+    frame: pro.Frame | None = None
+    damaged: pro.Damaged | None = None
 
     @property
     def command(self) -> int | None:
@@ -329,7 +290,7 @@ class Request:
         """Return the request for people: the line, or the command's name."""
         if self.frame is None:
             return self.line or "bytes that are no frame"
-        known = {command.value: command.name for command in Command}
+        known = {command.value: command.name for command in pro.Command}
         return known.get(self.frame.command, f"command {self.frame.command:02X}").lower().replace("_", " ")
 
 
@@ -399,12 +360,12 @@ class MirrorDevice:
             self.state.restart(now)
             self.registers = RegisterFile(self.state)
             self.mode = Mode.SIMPLE
-            self._line, self._reader = b"", FrameReader()
+            self._line, self._reader = b"", pro.FrameReader()
             self._boots_until = now + boot_s if boot_s > 0 else -math.inf
 
     def set_mode(self, mode: Mode) -> None:
         """Speak another mode from the next byte on."""
-        self.mode, self._line, self._reader = mode, b"", FrameReader()
+        self.mode, self._line, self._reader = mode, b"", pro.FrameReader()
 
     def _take_line(self, data: bytes, out: list[Chunk]) -> bytes:
         """Take bytes up to the end of a line, and give those behind it: a line may change the mode."""
@@ -418,9 +379,9 @@ class MirrorDevice:
 
     def _take_frame(self, data: bytes, out: list[Chunk]) -> bytes:
         """Take bytes up to a boundary, and give those behind it: a frame may change the mode."""
-        taken, end, rest = data.partition(bytes((BOUNDARY,)))
+        taken, end, rest = data.partition(bytes((pro.BOUNDARY,)))
         for found in self._reader.feed(taken + end):
-            whole, damaged = (found, None) if isinstance(found, Frame) else (None, found)
+            whole, damaged = (found, None) if isinstance(found, pro.Frame) else (None, found)
             self._answer(Request(self.mode, frame=whole, damaged=damaged), out)
         return rest
 
@@ -434,18 +395,15 @@ class MirrorDevice:
         self.acts.append(Act(self.clock.now(), request))
         if request.damaged is not None:  # answered to the command that the bytes seem to hold, if any
             command = request.damaged.data[1] if len(request.damaged.data) > 1 else 0
-            return self._framed(refuse(command & ~ERROR_FLAG, ErrorCode.FRAME_INVALID))
+            return pro.encode(pro.refuse(command & ~pro.ERROR_FLAG, pro.ErrorCode.FRAME_INVALID))
         if request.frame is not None:
             if self.mode is Mode.PRO_CRC and not request.frame.crc_good:
-                return self._framed(refuse(request.frame.command & ~ERROR_FLAG, ErrorCode.CRC_WRONG))
+                return pro.encode(pro.refuse(request.frame.command & ~pro.ERROR_FLAG, pro.ErrorCode.CRC_WRONG))
             reply = self.registers.answer(request.frame)
-            if reply.command == Command.SET_MODE:
+            if reply.command == pro.Command.SET_MODE:
                 self.set_mode(Mode.SIMPLE)
-            return self._framed(reply)
+            return pro.encode(reply)
         return self._simple(request.line).encode("ascii") + END
-
-    def _framed(self, reply: Frame) -> bytes:
-        return encode(reply, with_crc=self.unit.crc != "absent")
 
     def _simple(self, line: str) -> str:
         """Carry out a line, in capitals and without its end, and give the answer without an end."""
@@ -461,8 +419,8 @@ class MirrorDevice:
             case simple.TEMPERATURE:
                 return f"{self.unit.temperature_c:.2f}"
             case simple.GO_PRO:
-                self.set_mode(Mode.PRO_CRC if self.unit.crc == "required" else Mode.PRO)
-            case simple.GO_PRO_CRC if self.unit.crc != "absent":
+                self.set_mode(Mode.PRO)
+            case simple.GO_PRO_CRC:
                 self.set_mode(Mode.PRO_CRC)
             case simple.START:
                 pass

@@ -15,7 +15,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import groupby
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -220,7 +219,6 @@ class MirrorUnit:
     temperature_c: float = 25.0
     vector_pairs: int = 1500  # of X and Y, in one memory
     ends: Ends = "exclusive"  # what the device takes the end of a range for; not settled (erratum E14)
-    crc: Literal["either", "required", "absent"] = "either"  # of requests, see `mirror_device`
     log_rows: int = 16_000  # of the logger; more could not be addressed
     turnaround_s: float = 2e-4  # from a request's last byte to the reply
     stiffness: Stiffness = field(default_factory=Stiffness)

@@ -18,35 +18,8 @@ from pipeline.errors import RigError, SettingsError, ShapeError
 from pipeline.geometry.mirror import STRAIGHT, Mounting, check_reach
 from pipeline.geometry.scan import device_range
 from pipeline.rig.device_settings import MirrorSettings, ReadBack
+from pipeline.rig.mirror import pro_mode as pro
 from pipeline.rig.mirror.mirror_requests import Identity, Modes, ProLink
-from pipeline.rig.mirror.pro_mode import (
-    CELL,
-    FEEDBACK_X,
-    FEEDBACK_Y,
-    LOG_RATE,
-    LOG_RUN,
-    VECTOR_CELLS,
-    VECTOR_MEMORY,
-    ErrorCode,
-    Status,
-    Trigger,
-    Unit,
-    Value,
-    VectorRegister,
-    X,
-    Y,
-    ask_status,
-    cell_float,
-    cell_int,
-    get_value,
-    get_values,
-    get_vector,
-    log_slot,
-    read_values,
-    set_values,
-    set_vector,
-    split_cells,
-)
 from pipeline.rig.transports import SYSTEM_CLOCK, Clock, Closing, DeviceRefused, SerialTransport, Transport, Wire
 
 LOG = logging.getLogger(__name__)
@@ -79,31 +52,34 @@ def upload(link: ProLink, cells: bytes, read_back: ReadBack, progress: Progress 
     ``read_back`` is "none", "sampled" (every tenth frame and the ends of both channels) or "all"; ``progress`` gets
     cells done and cells in all, those read back included. RigError names a cell that holds something else.
     """
-    frames = [cells[at : at + VECTOR_CELLS * CELL] for at in range(0, len(cells), VECTOR_CELLS * CELL)]
+    frames = [cells[at : at + pro.VECTOR_CELLS * pro.CELL] for at in range(0, len(cells), pro.VECTOR_CELLS * pro.CELL)]
     checked = frames_to_check(len(frames), read_back)
-    total = (len(cells) + sum(len(frames[number]) for number in checked)) // CELL
+    total = (len(cells) + sum(len(frames[number]) for number in checked)) // pro.CELL
     done = 0
 
     def tell(sent: bytes) -> None:
         nonlocal done
-        done += len(sent) // CELL
+        done += len(sent) // pro.CELL
         if progress is not None:
             progress(done, total)
 
     for number, sent in enumerate(frames):
-        start = number * VECTOR_CELLS
-        link.tell(set_vector(VECTOR_MEMORY, start, sent), f"writing cells {start} to {start + len(sent) // CELL}")
+        start = number * pro.VECTOR_CELLS
+        link.tell(
+            pro.set_vector(pro.VECTOR_MEMORY, start, sent), f"writing cells {start} to {start + len(sent) // pro.CELL}"
+        )
         tell(sent)
     for number in checked:
-        sent, start = frames[number], number * VECTOR_CELLS
-        held = read_cells(link, VECTOR_MEMORY, start, len(sent) // CELL)
-        for cell, (one, other) in enumerate(zip(split_cells(sent), split_cells(held), strict=True), start):
+        sent, start = frames[number], number * pro.VECTOR_CELLS
+        held = read_cells(link, pro.VECTOR_MEMORY, start, len(sent) // pro.CELL)
+        for cell, (one, other) in enumerate(zip(pro.split_cells(sent), pro.split_cells(held), strict=True), start):
             if one != other:
-                pairs = len(cells) // CELL // 2
+                pairs = len(cells) // pro.CELL // 2
                 axis, position = ("X", cell) if cell < pairs else ("Y", cell - pairs)
                 raise RigError(
                     f"cell {cell} of the vector memory on {link.wire.port} ({axis} of position {position}) holds "
-                    f"{cell_float(other):.9g}, {cell_float(one):.9g} was sent; nothing was moved: load the path again"
+                    f"{pro.cell_float(other):.9g}, {pro.cell_float(one):.9g} was sent; nothing was moved: load the "
+                    "path again"
                 )
         tell(sent)
 
@@ -123,11 +99,11 @@ def read_cells(link: ProLink, register: int, start: int, count: int) -> bytes:
     """Read cells of a vector, at most as many as one frame takes."""
 
     def parse(payload: bytes) -> bytes:
-        if len(payload) != count * CELL:
+        if len(payload) != count * pro.CELL:
             raise ShapeError(f"expected {count} cells, got {len(payload)} bytes")
         return payload
 
-    return link.ask(get_vector(register, start, count), f"reading cells {start} to {start + count}", parse)
+    return link.ask(pro.get_vector(register, start, count), f"reading cells {start} to {start + count}", parse)
 
 
 def check_play(first: int, stop: int, rate_hz: float, cycles: int, loaded: int) -> None:
@@ -141,14 +117,14 @@ def check_play(first: int, stop: int, rate_hz: float, cycles: int, loaded: int) 
         )
 
 
-def hold_values(x: float, y: float) -> dict[int, Value]:
+def hold_values(x: float, y: float) -> dict[int, pro.Value]:
     """Return the registers that send both channels to a position, hold it and end any path.
 
     They fill one frame.
     """
-    follow = {**X.followed(X.static_system), **Y.followed(Y.static_system)}
-    halt = {X.vector(VectorRegister.RUN): 0, Y.vector(VectorRegister.RUN): 0}
-    return {X.static_xy: float(x), Y.static_xy: float(y), **follow, **halt}
+    follow = {**pro.X.followed(pro.X.static_system), **pro.Y.followed(pro.Y.static_system)}
+    halt = {pro.X.vector(pro.VectorRegister.RUN): 0, pro.Y.vector(pro.VectorRegister.RUN): 0}
+    return {pro.X.static_xy: float(x), pro.Y.static_xy: float(y), **follow, **halt}
 
 
 @dataclass(frozen=True)
@@ -221,10 +197,10 @@ class MirrorController(Closing):
         """Return whether it was in pro mode when it was connected: an earlier session or another program left it so."""
         return self._modes.found_in_pro
 
-    def status(self) -> Status:
+    def status(self) -> pro.Status:
         """Return the present status bits."""
         self._check_connected()
-        return Status(self._link.ask(ask_status(), "the status", cell_int))
+        return pro.Status(self._link.ask(pro.ask_status(), "the status", pro.cell_int))
 
     def temperature(self) -> float:
         """Return the temperature, read in simple mode.
@@ -256,11 +232,11 @@ class MirrorController(Closing):
     def settle(self, within_s: float) -> None:
         """Wait until the mirror is at rest; RigError where it is not, or the device trimmed the target to the rim."""
         until = self.wire.clock.now() + within_s
-        while Status.NOT_STABLE in (status := self.status()):
+        while pro.Status.NOT_STABLE in (status := self.status()):
             if self.wire.clock.now() >= until:
                 raise RigError(f"the mirror on {self.wire.port} is not at rest after {within_s:g} s; {status.sentence}")
             self.wire.clock.sleep(_POLL_S)
-        if Status.TRIMMED in status:
+        if pro.Status.TRIMMED in status:
             raise RigError(f"the mirror on {self.wire.port} is not where it was sent; {status.sentence}")
 
     def load_path(
@@ -283,7 +259,9 @@ class MirrorController(Closing):
         upload(self._link, cells.T.astype(">f4").tobytes(), read_back or self.settings.read_back, progress)
         self._pairs = len(cells)
 
-    def run(self, first: int, stop: int, rate_hz: float, cycles: int = 1, trigger: Trigger = Trigger.OFF) -> None:
+    def run(
+        self, first: int, stop: int, rate_hz: float, cycles: int = 1, trigger: pro.Trigger = pro.Trigger.OFF
+    ) -> None:
         """Play the loaded positions ``first`` to ``stop``, half open, at ``rate_hz`` positions a second.
 
         X plays from cell 0 on, Y from behind the X of all loaded positions, ``cycles`` times (-1: without end);
@@ -294,47 +272,59 @@ class MirrorController(Closing):
         with self.wire.lock:
             self.wire.check_known("running a path")
             self.halt()
-            for name, begin, channel in (("X", 0, X), ("Y", self._pairs, Y)):
+            for name, begin, channel in (("X", 0, pro.X), ("Y", self._pairs, pro.Y)):
                 start, end = device_range((begin + first, begin + stop), self.settings.ends)
-                values: dict[VectorRegister, Value] = {
-                    VectorRegister.UNIT: int(Unit.XY),
-                    VectorRegister.START: start,
-                    VectorRegister.END: end,
-                    VectorRegister.FREQUENCY: float(rate_hz),
-                    VectorRegister.CYCLES: cycles,
-                    VectorRegister.TRIGGER: int(trigger),
+                values: dict[pro.VectorRegister, pro.Value] = {
+                    pro.VectorRegister.UNIT: int(pro.Unit.XY),
+                    pro.VectorRegister.START: start,
+                    pro.VectorRegister.END: end,
+                    pro.VectorRegister.FREQUENCY: float(rate_hz),
+                    pro.VectorRegister.CYCLES: cycles,
+                    pro.VectorRegister.TRIGGER: int(trigger),
                 }
-                frame = set_values({channel.vector(register): value for register, value in values.items()})
+                frame = pro.set_values({channel.vector(register): value for register, value in values.items()})
                 self._link.tell(frame, f"setting up the path's {name}")
-            follow: dict[int, Value] = {**X.followed(X.vector_system), **Y.followed(Y.vector_system)}
-            both = {channel.vector(VectorRegister.RUN): 1 for channel in (X, Y)}  # in one frame: they begin together
+            follow: dict[int, pro.Value] = {
+                **pro.X.followed(pro.X.vector_system),
+                **pro.Y.followed(pro.Y.vector_system),
+            }
+            both = {
+                channel.vector(pro.VectorRegister.RUN): 1 for channel in (pro.X, pro.Y)
+            }  # in one frame: they begin together
             self._move(follow | both, f"running positions {first}:{stop}")
 
     def halt(self) -> None:
         """Stop playing; the mirror stays where it is. Works where motions are frozen, too."""
         self._check_connected()
-        self._link.tell(set_values({channel.vector(VectorRegister.RUN): 0 for channel in (X, Y)}), "halting the path")
+        self._link.tell(
+            pro.set_values({channel.vector(pro.VectorRegister.RUN): 0 for channel in (pro.X, pro.Y)}),
+            "halting the path",
+        )
 
     def is_playing(self) -> bool:
         """Return whether a unit plays a path."""
         self._check_connected()
-        registers = [channel.vector(VectorRegister.RUN) for channel in (X, Y)]
-        return any(map(cell_int, self._link.ask(get_values(registers), "whether a path plays", read_values)))
+        registers = [channel.vector(pro.VectorRegister.RUN) for channel in (pro.X, pro.Y)]
+        return any(
+            map(pro.cell_int, self._link.ask(pro.get_values(registers), "whether a path plays", pro.read_values))
+        )
 
     def index(self) -> int:
         """Return the position of the loaded path that plays now: the cell of X."""
         self._check_connected()
-        return self._link.ask(get_value(X.vector(VectorRegister.INDEX)), "the place in the path", cell_int)
+        return self._link.ask(
+            pro.get_value(pro.X.vector(pro.VectorRegister.INDEX)), "the place in the path", pro.cell_int
+        )
 
     def start_log(self, rate_hz: float) -> None:
         """Start to log measured positions ``rate_hz`` times a second: X in slot 0, Y in slot 1."""
         self._check_connected()
         self._logging = None
-        self._link.tell(set_values({LOG_RUN: 0}), "stopping the log")
-        slots = {log_slot(0): FEEDBACK_X, log_slot(1): FEEDBACK_Y}
-        self._link.tell(set_values({**slots, LOG_RATE: float(rate_hz)}), "setting up the log")
+        self._link.tell(pro.set_values({pro.LOG_RUN: 0}), "stopping the log")
+        slots = {pro.log_slot(0): pro.FEEDBACK_X, pro.log_slot(1): pro.FEEDBACK_Y}
+        self._link.tell(pro.set_values({**slots, pro.LOG_RATE: float(rate_hz)}), "setting up the log")
         before = self.wire.clock.now()
-        self._link.tell(set_values({LOG_RUN: 1}), "starting the log")
+        self._link.tell(pro.set_values({pro.LOG_RUN: 1}), "starting the log")
         self._logging = float(rate_hz), before, self.wire.clock.now()
 
     def read_log(self, samples: int | None = None) -> MotionLog:
@@ -347,11 +337,11 @@ class MirrorController(Closing):
             raise RigError(f"no log was started on {self.wire.port}; start one before the path runs")
         rate_hz, before, after = self._logging
         elapsed = self.wire.clock.now() - after
-        self._link.tell(set_values({LOG_RUN: 0}), "stopping the log")
+        self._link.tell(pro.set_values({pro.LOG_RUN: 0}), "stopping the log")
         self._logging = None
         wanted = min(int(elapsed * rate_hz) if samples is None else samples, self.settings.log_samples)
         columns = [self._logged(slot, wanted) for slot in (0, 1)]
-        held = min(map(len, columns)) // CELL
+        held = min(map(len, columns)) // pro.CELL
         measured = np.stack([np.frombuffer(column, ">f4", held) for column in columns], axis=-1).astype(np.float32)
         position = self.settings.mounting.to_model(measured).astype(np.float32, copy=False)
         return MotionLog(position, rate_hz, after, after - before)
@@ -361,20 +351,20 @@ class MirrorController(Closing):
         self._identity = None
         self.wire.transport.close()
 
-    def _move(self, values: dict[int, Value], name: str) -> None:
+    def _move(self, values: dict[int, pro.Value], name: str) -> None:
         self._check_connected()
         self.wire.check_known(name)
         if (status := self.status()).stops_motion:
             raise RigError(f"{name} is refused on {self.wire.port}; {status.sentence}; mend that first")
-        self._link.move(set_values(values), name)
+        self._link.move(pro.set_values(values), name)
 
     def _logged(self, slot: int, samples: int) -> bytes:
         cells = b""
-        for start in range(0, samples, VECTOR_CELLS):
+        for start in range(0, samples, pro.VECTOR_CELLS):
             try:
-                cells += read_cells(self._link, log_slot(slot), start, min(VECTOR_CELLS, samples - start))
+                cells += read_cells(self._link, pro.log_slot(slot), start, min(pro.VECTOR_CELLS, samples - start))
             except DeviceRefused as error:
-                if error.code != ErrorCode.VECTOR_INDEX:
+                if error.code != pro.ErrorCode.VECTOR_INDEX:
                     raise
                 LOG.warning("the log on %s ends at %d of %d samples", self.wire.port, start, samples)
                 break

@@ -59,16 +59,6 @@ _WORDS = {
 }
 
 
-def to_line(request: str) -> bytes:
-    """Return the bytes of a request; ShapeError where it is not ASCII, empty, too long, or has an end of its own."""
-    if not request.isascii() or not request or any(character in request for character in "\r\n"):
-        raise ShapeError(f"expected one line of ASCII, got {request!r}")
-    line = request.encode("ascii") + END
-    if len(line) > MOST_LINE:
-        raise ShapeError(f"the controller takes lines of {MOST_LINE} bytes, got {len(line)}: {request!r}")
-    return line
-
-
 class LineReader:
     """Finds lines in a stream, however it is cut."""
 
@@ -152,7 +142,7 @@ class SimpleLink:
 
             return receive
 
-        return self.wire.exchange(to_line(request), request, kind, receiver)
+        return self.wire.exchange(request.encode("ascii") + END, request, kind, receiver)
 
 
 @dataclass(frozen=True)

@@ -11,21 +11,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from pipeline.lazy import deferred
+from pipeline.simulator import compiled_loops
 from pipeline.simulator.effects.effect import Bound, Effect, Merged, unit_stream
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Rig
-
-if TYPE_CHECKING:  # numba takes half a second to import: a plan of a survey never needs it
-    from pipeline.simulator import compiled_loops
-else:
-    compiled_loops = deferred("pipeline.simulator.compiled_loops")
 
 Floats = NDArray[np.float64]
 Radiance = NDArray[np.float32]
@@ -215,14 +209,10 @@ def warmth(temperature_deg_c: float) -> float:
     return math.exp(_log_generation(temperature_deg_c) - _log_generation(REFERENCE_DEG_C))
 
 
-def band_gap_ev(kelvin: float) -> float:
-    """Return silicon's band gap by Varshni's formula with the constants of [1]. [eV]"""
-    return 1.1557 - 7.021e-4 * kelvin**2 / (1108 + kelvin)
-
-
 def _log_generation(temperature_deg_c: float) -> float:
     kelvin = temperature_deg_c + ZERO_DEG_C_K
-    return 1.5 * math.log(kelvin) - band_gap_ev(kelvin) / (2 * BOLTZMANN_EV_PER_K * kelvin)
+    band_gap_ev = 1.1557 - 7.021e-4 * kelvin**2 / (1108 + kelvin)  # silicon's, by Varshni's formula as in [1]
+    return 1.5 * math.log(kelvin) - band_gap_ev / (2 * BOLTZMANN_EV_PER_K * kelvin)
 
 
 def dark_electrons(rig: Rig) -> float:

@@ -93,11 +93,8 @@ class Cloud(Gain):
         return GainRange.between(1 - fraction, 1.0, len(probe.wavelength_nm), uneven=fraction)
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
-        """Return 1 less the cloud's shadow at each sample's place and time, (line, sample, 1); (1, 1, 1) if clear."""
-        sky = block.rig.sky
-        if sky.cloud_fraction == 0:
-            return np.ones((1, 1, 1), np.float32)
-        sweep = block.sweep
+        """Return 1 less the cloud's shadow at each sample's place and time, (line, sample, 1)."""
+        sky, sweep = block.rig.sky, block.sweep
         along, scan = points_of_scan(sweep.swath_px, block.rig.camera, block.scan_px[:, None], block.slopes)
         x, y = (along, scan) if sweep.along == "x" else (scan, along)
         turn, place = survey_stream(block.seed, self.name).random(2)
@@ -141,8 +138,6 @@ class Brdf(Gain):
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
         slope, bands = rig.sky.brdf_per_rad, len(probe.wavelength_nm)
-        if not slope and not rig.sky.hot_spot:
-            return GainRange.between(1.0, 1.0, bands)
         angle, phase = _extremes(probe.sweeps, rig.camera)
         least = max(1 - slope * angle, 0.0)
         greatest = 1 + slope * angle + rig.sky.hot_spot * float(np.exp(-phase / HOT_SPOT_RAD))
@@ -151,12 +146,8 @@ class Brdf(Gain):
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
         """Return 1 + b a + h exp(-phase / 2 deg) of each sample's direction, (line, sample, 1), at least 0."""
         sky = block.rig.sky
-        if sky.brdf_per_rad == 0 and sky.hot_spot == 0:
-            return np.ones((1, 1, 1), np.float32)
         angle, phase = _angles(block.sweep, block.rig.camera, block.scan_px, block.slopes)
-        factor = 1 + sky.brdf_per_rad * angle
-        if sky.hot_spot:
-            factor = factor + sky.hot_spot * np.exp(-phase / HOT_SPOT_RAD)
+        factor = 1 + sky.brdf_per_rad * angle + sky.hot_spot * np.exp(-phase / HOT_SPOT_RAD)
         return np.maximum(factor, 0.0)[..., None].astype(np.float32)
 
 

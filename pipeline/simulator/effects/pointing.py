@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import zlib
-from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
 from fractions import Fraction
@@ -17,7 +16,6 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import position_to_normal
 from pipeline.geometry.scan import Sweep, line_positions, points_of_scan
@@ -198,57 +196,30 @@ def _along_and_scan(rig: Rig) -> tuple[float, float]:
     return math.cos(turn), math.sin(turn)
 
 
-class Pointing(Aim, ABC):
-    """An aim of the chain, on wherever there is one: the mirror looks beside the places that it reports."""
-
-    name = "pointing"
-    cost_ns = MappingProxyType({"exact": 0.2})
-
-    @property
-    @abstractmethod
-    def reach_px(self) -> tuple[float, float]:
-        """Return the greatest displacement, along the line and the scan [px]."""
-
-    @abstractmethod
-    def of_lines(self, sweep_name: str, lines: range) -> Floats:
-        """Return the error of some lines of a sweep, (line, 2) along the line and the scan [px]."""
-
-    def aim(self, block: SweepBlock, variant: str) -> Floats:
-        return self.of_lines(block.sweep.name, block.lines)[:, None]
-
-    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound by slope times the greatest error."""
-        along, scan = self.reach_px
-        if along == scan == 0:
-            return Bound(0.0, "the mirror looks where it reports")
-        why = f"the mirror looks up to {along:.2g} px beside along the line and {scan:.2g} px along the scan"
-        return Bound(probe.moved(*at_line_ends(probe.sweeps, rig.camera, along, scan)), why)
-
-
 @dataclass(frozen=True)
-class PointingErrors(Pointing):
-    """Errors of the mirror's reported places, in px of the scene along the line and the scan.
+class PointingErrors(Aim):
+    """An aim of the chain, on wherever there is one: the mirror looks beside the places that it reports.
 
-    Every sweep has an offset drawn evenly from ``-offset_px`` to ``offset_px`` in either axis, and every line a normal
-    deviate of ``jitter_px`` rms in either. Each is drawn from a stream of its own, keyed (seed, sweep name) and (seed,
-    sweep name, line number). So no line's error depends on which others are computed.
+    Errors are in px of the scene along the line and the scan. Every sweep has an offset drawn evenly from
+    ``-offset_px`` to ``offset_px`` in either axis, and every line a normal deviate of ``jitter_px`` rms in either. Each
+    is drawn from a stream of its own, keyed (seed, sweep name) and (seed, sweep name, line number). So no line's error
+    depends on which others are computed.
     """
 
     offset_px: float = ACCURACY_PX
     jitter_px: float = REPEATABILITY_PX
     seed: int = 0
+    name = "pointing"
+    cost_ns = MappingProxyType({"exact": 0.2})
 
-    def __post_init__(self) -> None:
-        for name in ("offset_px", "jitter_px"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0):
-                raise SettingsError(f"{name} of the pointing errors must be finite and not negative, got {value}")
+    def aim(self, block: SweepBlock, variant: str) -> Floats:
+        return self.of_lines(block.sweep.name, block.lines)[:, None]
 
-    @property
-    def reach_px(self) -> tuple[float, float]:
-        """Greatest offset and six deviates of jitter, in either axis [px]."""
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
+        """Bound by slope times the greatest error in either axis: the offset, and six deviates of jitter."""
         most = self.offset_px + _MOST_DEVIATES * self.jitter_px
-        return most, most
+        why = f"the mirror looks up to {most:.2g} px beside along the line and {most:.2g} px along the scan"
+        return Bound(probe.moved(*at_line_ends(probe.sweeps, rig.camera, most, most)), why)
 
     def offset(self, sweep_name: str) -> Floats:
         """Return the systematic error of a sweep, (2,) along the line and the scan [px]."""
@@ -262,22 +233,6 @@ class PointingErrors(Pointing):
     def _stream(self, sweep_name: str, *line: int) -> np.random.Generator:
         key = np.random.SeedSequence(entropy=self.seed, spawn_key=(zlib.crc32(sweep_name.encode()), *line))
         return np.random.Generator(np.random.Philox(key))
-
-
-@dataclass(frozen=True)
-class CommonOffset(Pointing):
-    """A mirror that looks beside every reported place by the same (along, scan) px."""
-
-    offset_px: tuple[float, float]
-
-    @property
-    def reach_px(self) -> tuple[float, float]:
-        """Its size [px]."""
-        return abs(self.offset_px[0]), abs(self.offset_px[1])
-
-    def of_lines(self, sweep_name: str, lines: range) -> Floats:
-        """Return the error of some lines, (line, 2) along the line and the scan [px]."""
-        return np.tile(np.array(self.offset_px, np.float64), (len(lines), 1))
 
 
 JITTER, HYSTERESIS, THERMAL_DRIFT = Jitter(), Hysteresis(), ThermalDrift()

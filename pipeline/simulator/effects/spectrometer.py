@@ -6,22 +6,17 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from pipeline.lazy import deferred
+from pipeline.simulator import compiled_loops
 from pipeline.simulator.effects.counting import normal_deviates
 from pipeline.simulator.effects.effect import Bound, Gain, LightChange, SweepBlock, unit_stream
 from pipeline.simulator.effects.probe import GainRange, Probe, difference_rates, rising_gaps, rising_runs
 from pipeline.simulator.rig_model import Rig
-
-if TYPE_CHECKING:
-    from pipeline.simulator import compiled_loops
-else:
-    compiled_loops = deferred("pipeline.simulator.compiled_loops")
 
 Floats = NDArray[np.float64]
 Radiance = NDArray[np.float32]
@@ -176,10 +171,8 @@ class Smile(LightChange):
         return Bound(steep * shift + min(bent, steep * shift * 2 * part * (1 - part)), why)
 
     def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
-        """Return light (line, sample, band) [e-] at the wavelengths that each sample sees; as it is without a smile."""
+        """Return light (line, sample, band) [e-] at the wavelengths that each sample sees."""
         camera, smile = block.rig.camera, block.rig.optics.smile_nm
-        if smile == 0 or light.shape[-1] < 2:
-            return light
         bands = tuple(map(float, block.wavelength_nm))
         first, weights = _tap_weights(bands, float(smile), camera.samples)
         out = np.empty(light.shape, np.float32)
@@ -340,8 +333,6 @@ class StrayLight(LightChange):
     def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
         """Return the light after scattering; works in place."""
         optics = block.rig.optics
-        if optics.stray_fraction == 0:
-            return light
         along, along_kept = _cosines(light.shape[1], optics.stray_halo_px)
         across, across_kept = _cosines(light.shape[2], optics.stray_halo_px)
         kept = np.outer(along_kept, across_kept) * (1 - optics.stray_even)

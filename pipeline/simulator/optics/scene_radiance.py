@@ -5,21 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.lazy import deferred
+from pipeline.simulator import compiled_loops
 from pipeline.simulator.optics.kernel_fit import Footprint
 from pipeline.simulator.optics.rays import RayViews
 from pipeline.simulator.optics.tap_sums import Gatherer, ScenePixels
 from pipeline.simulator.scenes.scene import THINNED_MARGIN, RasterScene
-
-if TYPE_CHECKING:
-    from pipeline.simulator import compiled_loops
-else:
-    compiled_loops = deferred("pipeline.simulator.compiled_loops")
 
 Floats = NDArray[np.float64]
 Radiance = NDArray[np.float32]

@@ -10,19 +10,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.lazy import deferred
+from pipeline.simulator import compiled_loops
 from pipeline.simulator.optics.kernel_fit import TAIL, Footprint, Moments, TapTable, box_weight, disc_points, fold
 from pipeline.simulator.optics.rays import RayViews
-
-if TYPE_CHECKING:  # numba takes half a second to import: a plan of a survey never needs it
-    from pipeline.simulator import compiled_loops as window_sums
-else:
-    window_sums = deferred("pipeline.simulator.compiled_loops")
 
 Floats = NDArray[np.float64]
 Radiance = NDArray[np.float32]
@@ -71,14 +65,14 @@ class Gatherer:
         ``numbers`` (kernel,) where in ``out`` kernels belong. A sample's light does not depend on the others.
         """
         (rows, columns, components), along_y = pixels.planes.shape, pixels.along_y
-        raster = window_sums.PixelTable(columns, rows, components, along_y)
+        raster = compiled_loops.PixelTable(columns, rows, components, along_y)
         table = views.table()
-        window_sums.gather_windows(
+        compiled_loops.gather_windows(
             pixels.planes.reshape(-1), raster, table, self._kernels, self._along, self._scan, numbers, gains, out
         )
 
 
-def kernels_of(footprint: Footprint) -> window_sums.PartedKernels:
+def kernels_of(footprint: Footprint) -> compiled_loops.PartedKernels:
     """Return a footprint's kernels and the parts of its box as the compiled loops take them."""
     (across, along), (slit, pixel) = footprint.parts, footprint.box
     variance = footprint.variance + np.array([[pixel / along], [slit / across]]) ** 2 / 12
@@ -86,7 +80,7 @@ def kernels_of(footprint: Footprint) -> window_sums.PartedKernels:
     variance = np.array(variance + about[:, None], order="C")
     between = slit**2 / 12 * (1 - 1 / across**2) + float((points[1] ** 2).mean())
     shift = np.array(footprint.shift, np.float32, order="C")
-    return window_sums.PartedKernels(shift, variance, between, part_places(footprint))
+    return compiled_loops.PartedKernels(shift, variance, between, part_places(footprint))
 
 
 def place_parts(footprint: Footprint, views: RayViews) -> tuple[Floats, Radiance]:
@@ -99,7 +93,7 @@ def place_parts(footprint: Footprint, views: RayViews) -> tuple[Floats, Radiance
     off = np.empty((footprint.kernels, 2, kernels.place.shape[1], count), np.float32)
     table, beside = views.table(), np.zeros((2, count), np.float32)
     for kernel in range(footprint.kernels):
-        window_sums.place_parts(table, beside, kernel, kernels, scale[kernel], off[kernel])
+        compiled_loops.place_parts(table, beside, kernel, kernels, scale[kernel], off[kernel])
     return scale, off
 
 

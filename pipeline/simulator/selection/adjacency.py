@@ -136,23 +136,11 @@ def seen_widely(scene: RasterScene, exposure_ms: float) -> WideLight:
             slope = np.maximum(slope, _largest(ahead - middle))
             curvature = np.maximum(curvature, _largest(ahead + behind - 2 * middle))
         if bands > 1:
-            spectral = np.maximum(spectral, _spectral_differences(parts, spectra, nm))
+            both = steepest_difference(means, nm), second_difference(means, nm)
+            spectral = np.maximum(spectral, [_largest(one) for one in both])
     window = 2 * BLOCK_PX
     steep, bent = np.stack([slope] * 2) / np.float32(window), np.stack([curvature] * 2) / np.float32(window**2)
     return WideLight(low, high, steep, bent, spectral)
-
-
-def _spectral_differences(parts: Radiance, spectra: Radiance, wavelength_nm: Floats) -> Radiance:
-    """Return the greatest first and second divided differences over wavelength of light, (2, band) [e-/nm, e-/nm^2]."""
-    if spectra.ndim == 1:
-        light = to_bands(parts, spectra)
-        steep, bent = steepest_difference(light, wavelength_nm), second_difference(light, wavelength_nm)
-        return np.stack([_largest(steep), _largest(bent)])
-    gaps = np.diff(wavelength_nm)
-    rate = np.divide(1, gaps, out=np.zeros_like(gaps), where=gaps > 0).astype(np.float32)
-    ahead = _largest(parts @ (np.diff(spectra, axis=1) * rate))
-    steep = np.maximum(np.append(ahead, np.float32(0)), np.append(np.float32(0), ahead))
-    return np.stack([steep, _largest(parts @ second_difference(spectra, wavelength_nm))])
 
 
 def _largest(values: Radiance) -> Radiance:

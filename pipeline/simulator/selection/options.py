@@ -96,13 +96,8 @@ def list_options(probes: Probe | Sequence[Probe], rig: Rig, effects: Sequence[Ef
 
     Every option has the error of the worst probe; a survey has one for each binning and exposure.
 
-    Raises SettingsError: two effects have one name, or a bound is negative or not a number; names it.
+    Raises SettingsError: a bound is negative or not a number; names it.
     """
-    seen: set[str] = set()
-    for effect in effects:
-        if effect.name in seen:
-            raise SettingsError(f"two effects are named {effect.name!r}; register each once")
-        seen.add(effect.name)
     some = [probes] if isinstance(probes, Probe) else probes
     each = [_options_of(probe, rig.taking(probe.sweeps[0]) if probe.sweeps else rig, effects) for probe in some]
     return tuple(_worst_of(menus) for menus in zip(*each, strict=True))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel, Sweep, exposing
-from pipeline.lazy import deferred
+from pipeline.simulator import compiled_loops
 from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import OFF
 from pipeline.simulator.effects.line import SLIT, UPRIGHT, box_of, box_parts
@@ -45,14 +45,11 @@ from pipeline.simulator.selection.sample_views import (
     views_of_places,
 )
 
-if TYPE_CHECKING:
-    from pipeline.simulator import compiled_loops
-else:
-    compiled_loops = deferred("pipeline.simulator.compiled_loops")
-
 Floats = NDArray[np.float64]
 Radiance = NDArray[np.float32]
 Way = tuple[float, float]
+_DERIVATIVES = ("span", "slope", "curvature", "spectral_slope", "spectral_curvature")
+_BY_BAND = ("level", "spread", *_DERIVATIVES, "anywhere", "anywhere_spectral")  # of a probe
 _ROUNDING = 2e-6  # of the level: less is rounding of float32
 _NEAR, _FAR = 0.25, 0.5  # px by which the footprint is shifted
 
@@ -183,19 +180,13 @@ def worst_of_groups(probe: Probe) -> Probe:
     def ends(values: Floats | None) -> Floats | None:
         return None if values is None else np.stack([-worst(-values[0]), worst(values[1])])
 
+    values: dict[str, Any] = {name: getattr(probe, name) for name in _BY_BAND}
+    values = {name: None if one is None else worst(one) for name, one in values.items()}
     return replace(
         probe,
-        level=worst(probe.level),
-        spread=worst(probe.spread),
-        span=worst(probe.span),
-        slope=worst(probe.slope),
-        curvature=worst(probe.curvature),
-        spectral_slope=worst(probe.spectral_slope),
-        spectral_curvature=worst(probe.spectral_curvature),
+        **values,
         beside=tuple(map(of_detail, probe.beside)),
         afar=None if probe.afar is None else of_detail(probe.afar),
-        anywhere=None if probe.anywhere is None else worst(probe.anywhere),
-        anywhere_spectral=None if probe.anywhere_spectral is None else worst(probe.anywhere_spectral),
         own_e=ends(probe.own_e),
         ends_e=ends(probe.ends_e),
     )
@@ -282,18 +273,13 @@ def probe_survey(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Un
 def probe_scene(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "sigma") -> Probe:
     """Look at the scene through the footprint alone where it is steepest, brightest and darkest, and along some lines.
 
-    The places to look are found on the scene's own pixels, so that the maxima hold for the whole image. Raises
-    SceneError: the scene holds a number that is not finite; SettingsError: no line to take, or sweeps of several
-    binnings or exposures; PoseError: a sweep is out of the mirror's reach.
+    The places to look are found on the scene's own pixels, so that the maxima hold for the whole image. Sweeps are of
+    one binning and exposure. Raises SceneError: the scene holds a number that is not finite; SettingsError: no line to
+    take; PoseError: a sweep is out of the mirror's reach.
     """
     taken = _taken(sweeps)
-    binnings = {sweep.binning for sweep in taken}
-    if len(binnings) > 1:
-        raise SettingsError(f"expected sweeps of one binning, got {sorted(binnings)}; probe each of them")
-    if len({exposing(rig.camera, sweep) for sweep in taken}) > 1:
-        raise SettingsError("expected sweeps of one exposure, got several; probe each of them")
     rig = rig.taking(taken[0])
-    binning, camera, bands = binnings.pop(), rig.camera, len(scene.wavelength_nm)
+    binning, camera, bands = taken[0].binning, rig.camera, len(scene.wavelength_nm)
     room = max(min(MOST_VALUES // bands, MOST_SAMPLES), 64)
     lines = views_of_lines(taken, camera, room // 3)
     most = (room - room // 3) // (len(sample_offsets(binning)) * binning * len({sweep.along for sweep in taken}))

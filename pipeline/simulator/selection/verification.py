@@ -140,7 +140,14 @@ def verify(decision: Decision, render: Render, blocks: Mapping[str, SweepBlock],
 
     Raises BoundError: a change exceeds the bound that the decision counted on; names effect, bound, change and place.
     """
-    full = [_rendered(name, block, render, decision, units) for name, block in _once_each(blocks).items()]
+    names: dict[tuple[str, range], list[str]] = {}
+    for name, block in blocks.items():
+        names.setdefault((block.sweep.name, block.lines), []).append(name)
+    full = []
+    for block, said in ((blocks[said[0]], said) for said in names.values()):
+        light = stored_mean(render(block, decision.exact), block.sweep.binning)
+        unit = np.broadcast_to(units(np.asarray(light, np.float32), block.sweep.binning), light.shape)
+        full.append(_Rendered(" and ".join(said), block, light, unit, render))
     changed = [
         one
         for one in decision.taken
@@ -164,19 +171,6 @@ def verify(decision: Decision, render: Render, blocks: Mapping[str, SweepBlock],
             )
         measured[name] = max((one.greatest for one in found), default=0.0)
     return measured
-
-
-def _once_each(blocks: Mapping[str, SweepBlock]) -> dict[str, SweepBlock]:
-    names: dict[tuple[str, range], list[str]] = {}
-    for name, block in blocks.items():
-        names.setdefault((block.sweep.name, block.lines), []).append(name)
-    return {" and ".join(said): blocks[said[0]] for said in names.values()}
-
-
-def _rendered(name: str, block: SweepBlock, render: Render, decision: Decision, units: Units) -> _Rendered:
-    light = stored_mean(render(block, decision.exact), block.sweep.binning)
-    unit = np.broadcast_to(units(np.asarray(light, np.float32), block.sweep.binning), light.shape)
-    return _Rendered(name, block, light, unit, render)
 
 
 def _greatest_change(

@@ -14,13 +14,14 @@ import numpy as np
 
 from pipeline.rig.emulator import Chunk
 from pipeline.rig.emulator.mirror_device import MirrorDevice, Mode, Request
-from pipeline.rig.mirror.mirror_requests import END, ID, VERSION, Reply
+from pipeline.rig.mirror.mirror_requests import END, GO_PRO, GO_PRO_CRC, ID, VERSION, Reply
 from pipeline.rig.mirror.pro_mode import (
     CELL,
     VECTOR_MEMORY,
     Command,
     ErrorCode,
     Frame,
+    FrameReader,
     Status,
     encode,
     int_cell,
@@ -106,7 +107,13 @@ class Fault:
 
 
 class FaultyMirror(MirrorDevice):
-    """A controller that fails; ``gone`` and ``hung`` say that no port knows it any more, or that it takes no bytes."""
+    """A controller that fails; ``gone`` and ``hung`` say that no port knows it any more, or that it takes no bytes.
+
+    ``crc`` is its firmware: one checks the CRC of requests after GOPRO as well ("required"), one knows no GOPROCRC and
+    sends 00 00 in the CRC's place ("absent").
+    """
+
+    crc = "either"
 
     def __init__(self, clock: Any, faults: Sequence[Fault] = (), **given: Any) -> None:
         self.faults: tuple[Fault, ...] = ()
@@ -136,6 +143,20 @@ class FaultyMirror(MirrorDevice):
                     return instead
                 data = fault.incoming(self, data)
             return super().receive(data)
+
+    def _simple(self, line: str) -> str:
+        if self.crc == "absent" and line == GO_PRO_CRC:
+            return Reply.NO
+        return super()._simple(GO_PRO_CRC if self.crc == "required" and line == GO_PRO else line)
+
+    def carry_out(self, request: Request) -> bytes:
+        """Do what a request asks for; a firmware without CRCs has none in its reply."""
+        reply = super().carry_out(request)
+        if self.crc != "absent" or request.mode is Mode.SIMPLE:
+            return reply
+        (frame,) = FrameReader().feed(reply)
+        assert isinstance(frame, Frame)
+        return encode(frame, with_crc=False)
 
     def _answer(self, request: Request, out: list[Chunk]) -> None:
         if self.gone:

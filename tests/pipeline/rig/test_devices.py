@@ -187,13 +187,11 @@ def test_clocks_never_go_back():
         ("vector_pairs", 8192),
         ("log_rate_hz", 20000),
         ("log_samples", True),
-        ("ends", "open"),
-        ("read_back", "some"),
     ],
 )
 def test_settings_that_mean_nothing_are_refused(name: str, value: Any):
-    """A number that nothing can mean (a deadline in ms) names the setting and the range, a choice those there are."""
-    with pytest.raises(SettingsError, match=f"mirror.{name} must be (a number from .* to|one of) .*, got '?{value}"):
+    """A number that nothing can mean (a deadline in ms) names the setting and the range."""
+    with pytest.raises(SettingsError, match=f"mirror.{name} must be a number from .* to .*, got {value}"):
         MirrorSettings(**{name: value})
 
 

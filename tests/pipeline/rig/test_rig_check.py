@@ -18,7 +18,6 @@ from pipeline.rig.capture.capture_paths import capture_prefix
 from pipeline.rig.device_settings import FileServer, MirrorSettings, Pulses
 from pipeline.rig.emulator.camera_device import CameraUnit
 from pipeline.rig.emulator.mirror_device import Mode
-from pipeline.rig.emulator.mirror_state import MirrorUnit
 from pipeline.rig.mirror.mirror_controller import MirrorController, MotionLog
 from pipeline.rig.mirror.pro_mode import Command, Status
 from pipeline.rig.rig_check import SQUARE, CheckRow, check_camera, check_mirror, check_triggers, failed, works
@@ -33,10 +32,11 @@ SETS = {Command.SET_VALUE, Command.SET_VALUES, Command.SET_VECTOR}
 
 
 @contextmanager
-def rig(*faults: str, camera: CameraFaults | None = None, **given: Any) -> Iterator[InProcessRig]:
+def rig(*faults: str, camera: CameraFaults | None = None, crc: str = "either", **given: Any) -> Iterator[InProcessRig]:
     """An emulated rig whose mirror's faults strike at the first occasion."""
     struck = [make_fault(name, at=0) for name in faults]
     whole = FaultyRig(small_source(), ManualClock(), mirror_faults=struck, camera_faults=camera, **given)
+    whole.mirror.crc = crc
     with InProcessRig(whole) as line:
         yield line
 
@@ -213,7 +213,7 @@ def test_camera_out_of_order() -> None:
 )
 def test_frames_with_and_without_a_crc_are_tried(crc: Any, with_crc: bool, came: str) -> None:
     """Both ways of sending frames are tried on each firmware; nothing is set, and no row fails."""
-    with rig(mirror=MirrorUnit(crc=crc)) as line:
+    with rig(crc=crc) as line:
         rows = mirror_rows(line, with_crc=with_crc)
         assert re.match(came, next(row.came for row in rows if row.asked == FRAMES))
         assert {row.verdict for row in rows} == {"ok"}
@@ -223,11 +223,11 @@ def test_frames_with_and_without_a_crc_are_tried(crc: Any, with_crc: bool, came:
 @pytest.mark.parametrize(("crc", "with_crc", "right"), [("required", False, "true"), ("absent", True, "false")])
 def test_a_wrong_crc_setting_fails_with_the_right_one(crc: Any, with_crc: bool, right: str) -> None:
     """The setting that is answered stands in the row, and the same check passes with it."""
-    with rig(mirror=MirrorUnit(crc=crc)) as line:
+    with rig(crc=crc) as line:
         (row,) = mirror_rows(line, with_crc=with_crc)
         assert (row.asked, row.verdict, row.mend) == ("connect", "fail", f"set with_crc = {right} in [rig]")
         assert not set_anything(line)
-    with rig(mirror=MirrorUnit(crc=crc)) as line:
+    with rig(crc=crc) as line:
         assert works(mirror_rows(line, with_crc=not with_crc), "mirror")
 
 

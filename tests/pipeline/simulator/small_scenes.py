@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import map_coordinates
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.lazy import Once
 from pipeline.simulator.effects.counting import GAUSSIAN, SHOT
+from pipeline.simulator.effects.pointing import PointingErrors
 from pipeline.simulator.render import BY_NAME, EFFECTS, Choice
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster, raster_from_values
 
@@ -41,3 +43,15 @@ def effects_on(*names: str) -> Choice:
     """Give effects by their names, in the order of the chain: exact ones, but for shot noise, which is cheap."""
     assert set(names) <= set(BY_NAME)
     return Choice(tuple((one, GAUSSIAN if one is SHOT else one.variants[0]) for one in EFFECTS if one.name in names))
+
+
+@dataclass(frozen=True)
+class CommonOffset(PointingErrors):
+    """A mirror that looks beside every reported place by the same (along, scan) px."""
+
+    way_px: tuple[float, float] = (0.0, 0.0)
+    jitter_px: float = 0.0
+
+    def offset(self, sweep_name: str) -> NDArray[np.float64]:
+        """Give the same error for every sweep."""
+        return np.array(self.way_px)

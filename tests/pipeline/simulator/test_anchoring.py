@@ -13,11 +13,10 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, Sweep
 from pipeline.rectify.registration.overlaps import BroadSweep
 from pipeline.rectify.registration.seams import Anchor, anchor_sweep
-from pipeline.simulator.effects.pointing import CommonOffset
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
-from tests.pipeline.simulator.small_scenes import effects_on, image_scene, seen_at
+from tests.pipeline.simulator.small_scenes import CommonOffset, effects_on, image_scene, seen_at
 
 CAMERA = LineCamera(samples=96)
 GRID = SceneGrid(240, 300, 16, 4)
@@ -47,7 +46,9 @@ def anchored(
 ) -> Anchor:
     """A sweep seen by a mirror that looks beside the plan, on the mosaic of one that does not."""
     seen = textured() if scene is None else scene
-    source = SimulatedSource(seen, Rig(CAMERA), 0, effects_on("rotation", "read-noise"), pointing=CommonOffset(offset))
+    source = SimulatedSource(
+        seen, Rig(CAMERA), 0, effects_on("rotation", "read-noise"), pointing=CommonOffset(way_px=offset)
+    )
     broad = BroadSweep.read(SimulatedSweep(source, sweep), CAMERA)
     return anchor_sweep(broad, CAMERA, replace(GRID, factor=factor), coarse_mean(seen, factor), prior_px=prior_px)
 

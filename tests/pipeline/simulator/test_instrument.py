@@ -13,12 +13,11 @@ from pipeline.errors import PoseError
 from pipeline.geometry.camera import LineCamera, expose, footprint
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import Sweep, line_positions
-from pipeline.simulator.effects.pointing import CommonOffset
 from pipeline.simulator.render import EFFECTS, USUAL, Choice, expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig, Sky
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import render_lines, sweep_block
-from tests.pipeline.simulator.small_scenes import effects_on, image_scene, made_scene, seen_at
+from tests.pipeline.simulator.small_scenes import CommonOffset, effects_on, image_scene, made_scene, seen_at
 
 CAMERA = LineCamera()
 OPTICS = effects_on("rotation", "slit", "smear")
@@ -63,7 +62,7 @@ def test_shifted_lines_see_the_shifted_place() -> None:
     scene = scene_of(smooth((200, 700, 1)))
     sweep = Sweep("s", "fine", "x", swath_px=10.0, start_px=-50.0, lines=20, step=2)
     moved = replace(sweep, swath_px=17.0, start_px=-38.5)
-    beside = Choice(((CommonOffset((7.0, 11.5)), "exact"), *OPTICS.effects))
+    beside = Choice(((CommonOffset(way_px=(7.0, 11.5)), "exact"), *OPTICS.effects))
     shifted = light_of(scene, sweep, range(3, 9), beside)
     np.testing.assert_allclose(shifted, light_of(scene, moved, range(3, 9)), rtol=1e-5)
 

@@ -60,7 +60,6 @@ from pipeline.simulator.scenes.scene import Drawn, RasterScene, SceneRadiance, S
 # A law is what a seed is drawn by; it stands first in a scene's key, and one that is out there never changes.
 FARM_LAW = "farm@2"
 FARM_NAMES = ("farm", FARM_LAW)
-PIXEL_M = 0.12  # on the ground
 FARM_SHAPE = (1024, 1280)  # (y, x) unless another is asked for [px]
 FARM_PIXEL_M = 0.12  # of the ground that a pixel shows
 USUAL_DAY, USUAL_HOUR = 172, 11.0  # the 21st of June, an hour before noon
@@ -119,7 +118,7 @@ def planned_scene(
         fwhm_nm=fwhm,
         class_names=CLASSES,
         class_colours=CLASS_COLOURS.copy(),
-        pixel_m=PIXEL_M,
+        pixel_m=FARM_PIXEL_M,
     )
 
 

@@ -117,8 +117,9 @@ def test_what_it_sees_is_asked_once() -> None:
         device.files()
     assert [time for _, time in seen] == pytest.approx([0.014 + 0.01 * number for number in range(100)])
     assert [x for x, _ in seen] == pytest.approx([time / 10 for _, time in seen])
-    pulses = np.concatenate([device.exposures(*span) for span in pairwise(np.linspace(0, 2, 38))])
-    np.testing.assert_allclose(pulses, 0.01 + np.arange(100)[:, None] * 0.01 + [0, 0.008], atol=1e-12)
+    (capture,) = device.captures
+    begins = np.concatenate([capture.begins(*span) for span in pairwise(np.linspace(0, 2, 38))])
+    np.testing.assert_allclose(begins, 0.01 + np.arange(100) * 0.01, atol=1e-12)
 
 
 @pytest.mark.parametrize(("fault", "words"), [(CameraFault.FULL, "disk full"), (CameraFault.BUSY, "busy capturing")])

@@ -63,11 +63,8 @@ def test_both_modes_speak_through_the_pty() -> None:
 def test_nothing_is_left_behind() -> None:
     """After closing, twice even, there are as many threads and open files as before."""
     before = (threading.active_count(), descriptors())
-    port = EmulatedPort(MirrorDevice(SYSTEM_CLOCK))
     for _ in range(3):
-        path = port.open()
-        with pytest.raises(RigError, match=f"{path} is open"):
-            port.open()
+        port = EmulatedPort(MirrorDevice(SYSTEM_CLOCK))
         port.close()
         port.close()
     assert (threading.active_count(), descriptors()) == before
@@ -118,4 +115,4 @@ def test_without_ptys_there_is_one_clear_message(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(os, "openpty", none)
     with pytest.raises(RigError, match="no pty for the emulated port: out of pty devices"):
-        EmulatedPort(MirrorDevice(SYSTEM_CLOCK)).open()
+        EmulatedPort(MirrorDevice(SYSTEM_CLOCK))

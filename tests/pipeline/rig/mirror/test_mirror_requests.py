@@ -10,17 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import RigError, ShapeError
+from pipeline.errors import RigError
 from pipeline.rig.device_settings import Patience
-from pipeline.rig.mirror.mirror_requests import (
-    LineReader,
-    ProLink,
-    SimpleLink,
-    check_done,
-    read_temperature,
-    read_text,
-    to_line,
-)
+from pipeline.rig.mirror.mirror_requests import LineReader, ProLink, SimpleLink, check_done, read_temperature, read_text
 from pipeline.rig.mirror.pro_mode import cell_int, get_value
 from pipeline.rig.transports import DeadlinePassed, DeviceRefused, StateUnknown, Wire
 from tests.pipeline.rig.mirror.mirror_bytes import CONNECT, ENTER, GREET, LEAVE, WELL, WHO, connected, pair, set_value
@@ -148,15 +140,6 @@ def test_a_motion_answered_by_nonsense_freezes():
     pair = (b"XY=0.500000;0.000000\r\n", b"O\xcb\r\n")
     with scripted([pair]) as transport, pytest.raises(StateUnknown, match="may have happened or not: expected OK"):
         SimpleLink(wire(transport)).do("XY=0.500000;0.000000", "motion")
-
-
-@pytest.mark.parametrize("request_", ["", "X=1\r\nX=2", "X=½", "X" * 63])
-def test_requests_are_lines(request_: str):
-    """A request ends in CR LF; empty, double, foreign and long lines are refused, 64 bytes with the end still go."""
-    assert to_line("START") == b"START\r\n"
-    assert len(to_line("X" * 62)) == 64
-    with pytest.raises(ShapeError, match=r"one line of ASCII|lines of 64 bytes, got 65"):
-        to_line(request_)
 
 
 @given(st.lists(st.text(st.characters(min_codepoint=33, max_codepoint=126), min_size=1), max_size=6), st.data())

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from pipeline.errors import SceneError, ShapeError
+from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.counting import (
@@ -199,12 +199,6 @@ def test_light_that_is_not_finite_is_refused(value: float) -> None:
     light[2, 40, 3] = value
     with pytest.raises(SceneError, match=rf"sweep fine: line 12, sample 40, band 3 expects {value} electrons"):
         read_out(light, block_of(Rig(), range(10, 14)), EVERYTHING)
-
-
-def test_light_of_another_block_is_refused() -> None:
-    """Shapes are compared, both are named."""
-    with pytest.raises(ShapeError, match=r"\(16, 640, 20\) \(line, sample, band\), got \(3, 640, 20\)"):
-        read_out(even(1, 3), block_of(Rig()), {})
 
 
 def test_one_band_and_an_odd_number_of_elements() -> None:

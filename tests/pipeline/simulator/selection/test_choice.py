@@ -276,12 +276,6 @@ def test_bounds_that_are_no_numbers_are_refused_by_name():
         decide(PROBE, RIG, [MadeUp("smear", math.nan)], 0.1)
 
 
-def test_names_are_unique():
-    """A second effect of one name would be lost."""
-    with pytest.raises(SettingsError, match="two effects are named 'shot'"):
-        decide(PROBE, RIG, [MadeUp("shot", 1.0), MadeUp("shot", 2.0)], 0.1)
-
-
 FIELDS = {"name", "state", "variant", "bound", "measured", "cost_s", "why", "reason", "left_out", "magnitude", "unit"}
 EFFECTS = [
     MadeUp("wind", 0.0),
