@@ -176,7 +176,7 @@ def _bands_of(cube: ArrayCube, arrays: Arrays, count: int) -> Bands:
     unit = _unit(arrays[found].attrs)
     scale = _scale(unit, float(centres.max()))
     if scale is None or not (np.isfinite(centres) & (centres > 0)).all():
-        return Bands(units=unit)
+        return Bands()
     stated = f"in {unit}" if unit not in UNSAID else "without a unit, read by their size"
     beside, widths = _vector(arrays, ("fwhm",), count), None
     if beside is not None:
@@ -184,7 +184,7 @@ def _bands_of(cube: ArrayCube, arrays: Arrays, count: int) -> Bands:
         widths = np.asarray(arrays[beside][...], np.float64).ravel()
         widths = widths * (scale if own in UNSAID else _scale(own, 0.0) or np.nan)
         widths = widths if (widths > 0).all() else None
-    return Bands(centres * scale, widths, unit, f"wavelengths from the array {found}, {stated}")
+    return Bands(centres * scale, widths, f"wavelengths from the array {found}, {stated}")
 
 
 _AXES = {(False, False): (3, 4, 2), (True, False): (2, 3), (False, True): (4,), (True, True): (3, 4)}

@@ -194,7 +194,7 @@ def _prisma_cube(path: Path, level: str, arrays: Mapping[str, FileArray], about:
         dtype=np.dtype(np.float32),
         read=read_by_chunks(read, lines, chunk),
         files=(path,),
-        bands=Bands(np.array(centres)[order], np.array(widths)[order], "nm", "wavelengths from List_Cw of the file"),
+        bands=Bands(np.array(centres)[order], np.array(widths)[order], "wavelengths from List_Cw of the file"),
         geobox=geobox,
         notes=(f"a PRISMA product of level 2{level}; {unused} bands without a wavelength are left out", *notes),
     )

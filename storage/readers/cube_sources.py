@@ -93,7 +93,6 @@ class LineFacts:
     time_s: NDArray[np.float64] | None = None  # (line,) since the first stamp; NaN where not known
     exposure_ms: NDArray[np.float64] | None = None  # (line,)
     frame: NDArray[np.int64] | None = None  # (line,) as the camera counts; -1 where not known
-    first_stamp_us: int | None = None
 
 
 @dataclass(frozen=True)
@@ -102,7 +101,6 @@ class Bands:
 
     wavelength_nm: NDArray[np.float64] | None = None  # (band,)
     fwhm_nm: NDArray[np.float64] | None = None  # (band,)
-    units: str = ""  # of wavelengths, as the file says them
     origin: str = ""  # one sentence
 
 
@@ -125,8 +123,7 @@ class CubeSource:
     void: NDArray[np.bool_] | None = None  # (line, sample) transparent or masked, which have no value
     scaling: str = ""  # scale and offset that were applied to the file's numbers, for hashes
     headers: Mapping[str, str] = field(default_factory=dict)  # file name -> its text
-    root: Path | None = None  # of a store whose files' names count, too
-    by_names: tuple[tuple[int, ...], ...] = ()  # numbers in the files' names, where lines or times follow from them
+    root: Path | None = None  # of a store or folder whose files' names count, too
     notes: tuple[str, ...] = ()
 
     @property

@@ -14,9 +14,8 @@ references of a real MV.X.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +31,7 @@ from pipeline.rig.camera.camera_texts import (
     finite_number,
     listed_numbers,
     parse_frame_index,
+    place_parts,
     split_header,
     times_of_lines,
     wavelengths_nm,
@@ -81,6 +81,11 @@ class EnviCube:
     values: NDArray[Any]
     lost_lines: int  # that the header states and the file does not hold whole
     notes: tuple[str, ...]
+
+    @property
+    def frames(self) -> tuple[Any, ...]:
+        """What frames of one cube have in common."""
+        return self.values.shape[1:], self.values.dtype
 
 
 def open_envi_cube(path: str | Path) -> EnviCube:
@@ -265,51 +270,44 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     cut off. A part without any byte is left out. Raises SceneError: a part cannot be used, parts differ in their
     frames, or too many lines between them are missing.
     """
-    headers, notes = _headers(folder), list[str]()
+    headers, notes, opened = _headers(folder), list[str](), dict[int, EnviCube]()
     if not headers:
         raise SceneError(
             f"{folder} is a folder, expected a file, a Zarr store, or a folder with raw_<frame> files of a Headwall "
             "camera; name one of the files in it"
         )
-    opened: dict[int, EnviCube] = {}
     for number, header in headers.items():
-        _, data = find_envi_pair(header)
+        data = find_envi_pair(header)[1]
         if data.stat().st_size == 0:
             notes.append(f"{data.name} is empty and left out")
         else:
             opened[number] = open_envi_cube(header)
     if not opened:
         raise SceneError(f"every part of {folder} is empty; copy the folder again")
-    parts = _placed(opened, notes)
-    source = _joined(folder.resolve().name, parts, notes)
-    found = {
-        int(match[1]): file
-        for file in folder.iterdir()
-        if file.is_file() and (match := FRAME_INDEX.fullmatch(file.name))
-    }
-    used = {number: found[number] for number in opened if number in found}
-    by_name = any(before + len(one.values) != after for (before, one), (after, _) in pairwise(parts.items()))
-    if not used:
-        return replace(source, by_names=(tuple(opened), ()) if by_name else ())
-    nothing = np.full(source.shape[0], -1)
-    times, more = LineTimes(nothing, nothing.copy(), np.full(source.shape[0], np.nan), ()), list[str]()
-    for number, (start, cube) in zip(opened, parts.items(), strict=True):
-        if number not in used:
+    _check_alike(list(opened.values()))
+    parts = [(cube.path.name, number, len(cube.values)) for number, cube in opened.items()]
+    starts = place_parts(parts, MOST_MISSING, notes)
+    notes += [note for cube in opened.values() for note in cube.notes]
+    source = _joined(folder.resolve().name, dict(zip(starts, opened.values(), strict=True)), notes)
+    source = replace(source, root=folder)  # lines and their times follow from the files' names
+    listed = ((FRAME_INDEX.fullmatch(file.name), file) for file in folder.iterdir() if file.is_file())
+    indices = {int(match[1]): file for match, file in listed if match is not None and int(match[1]) in opened}
+    if not indices:
+        return source
+    times, more = LineTimes.unknown(source.shape[0]), list[str]()
+    for start, (number, cube) in zip(starts, opened.items(), strict=True):
+        if number not in indices:
             more.append(f"there is no frame index for {cube.path.name}")
             continue
-        index, lines = load_frame_index(used[number]), len(cube.values)
-        own = times_of_lines(index, number, lines, cube.lost_lines)
-        by_name = by_name or len(index.frame) != lines
-        for name in ("frame", "stamp_us", "exposure_ms"):
-            getattr(times, name)[start : start + lines] = getattr(own, name)
-        more.extend((*index.notes, *(f"{used[number].name}: {note}" for note in own.notes)))
-    by_name = by_name or len(used) < len(opened)
+        index = load_frame_index(indices[number])
+        own = times_of_lines(index, number, len(cube.values), cube.lost_lines)
+        times.put(start, own)
+        more.extend((*index.notes, *(f"{indices[number].name}: {note}" for note in own.notes)))
     return replace(
         source,
-        files=(*source.files, *used.values()),
+        files=(*source.files, *indices.values()),
         lines=_timed(source.lines, times),
         notes=(*source.notes, *more),
-        by_names=(tuple(opened), tuple(used)) if by_name else (),
     )
 
 
@@ -333,8 +331,7 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
     bands = Bands()
     if with_bands is not None:
         header = with_bands.header
-        units, origin = header.fields.get("wavelength units", ""), f"wavelengths from {with_bands.header_path.name}"
-        bands = Bands(header.wavelength_nm, header.fwhm_nm, units, origin)
+        bands = Bands(header.wavelength_nm, header.fwhm_nm, f"wavelengths from {with_bands.header_path.name}")
 
     def read(start: int, stop: int) -> NDArray[Any]:
         """Return some lines (line, sample, band)."""
@@ -368,9 +365,7 @@ def _timed(lines: LineFacts, times: LineTimes) -> LineFacts:
     known = times.stamp_us >= 0
     if not known.any():
         return lines
-    first = int(times.stamp_us[known][0])
-    time_s = np.where(known, (times.stamp_us - first) * 1e-6, np.nan)
-    return replace(lines, time_s=time_s, first_stamp_us=first)
+    return replace(lines, time_s=np.where(known, (times.stamp_us - times.stamp_us[known][0]) * 1e-6, np.nan))
 
 
 def find_reference(folder: Path, kind: str) -> Path | None:
@@ -415,33 +410,15 @@ def _headers(folder: Path) -> dict[int, Path]:
     return headers
 
 
-def _placed(opened: Mapping[int, EnviCube], notes: list[str]) -> dict[int, EnviCube]:
-    """Return the parts by their first lines (SceneError: they are not alike, or too many lines are in none)."""
-    parts: dict[int, EnviCube] = {}
-    end = missing = 0
-    first: EnviCube | None = None
-    for number, cube in opened.items():
-        first = first or cube
-        if cube.values.shape[1:] != first.values.shape[1:] or cube.values.dtype != first.values.dtype:
+def _check_alike(cubes: Sequence[EnviCube]) -> None:
+    """Refuse parts of several cubes (SceneError)."""
+    first = cubes[0]
+    for cube in cubes[1:]:
+        if cube.frames != first.frames:
             raise SceneError(
-                f"{cube.path} has frames of {cube.values.shape[1:]} (sample, band) {cube.values.dtype}, "
-                f"{first.path.name} of {first.values.shape[1:]} {first.values.dtype}; ingest them by themselves"
+                f"{cube.path} has frames of {cube.frames} (sample, band), {first.path.name} of {first.frames}; ingest"
+                " them by themselves"
             )
         ours, theirs = first.header.wavelength_nm, cube.header.wavelength_nm
         if ours is not None and theirs is not None and not np.array_equal(ours, theirs):
             raise SceneError(f"{cube.path} has other wavelengths than {first.path.name}; ingest them by themselves")
-        start = number - min(opened)
-        if start < end:
-            notes.append(f"{cube.path.name} begins {end - start} frames before the part before it ends")
-        elif start > end:
-            missing += start - end
-            notes.append(f"{start - end} lines before {cube.path.name} are in no file")
-        if missing > MOST_MISSING:
-            raise SceneError(
-                f"{missing} lines before {cube.path} are in no file, more than {MOST_MISSING}; ingest the parts by "
-                "themselves"
-            )
-        parts[max(start, end)] = cube
-        end = max(start, end) + len(cube.values)
-        notes.extend(cube.notes)
-    return parts

@@ -286,7 +286,7 @@ _DESCRIBED = re.compile(rf"(?<![\w.])(\d+(?:\.\d+)?)\s*({_LENGTHS})\b", re.IGNOR
 
 def _of_colours(colours_nm: Sequence[float]) -> Bands:
     listed = ", ".join(f"{nm:g}" for nm in colours_nm)
-    return Bands(np.array(colours_nm), None, "nm", f"wavelengths assumed from the file's colours: {listed} nm")
+    return Bands(np.array(colours_nm), None, f"wavelengths assumed from the file's colours: {listed} nm")
 
 
 def _bands_of(file: Any, keep: Sequence[int], kinds: Sequence[str], path: Path) -> tuple[Bands, tuple[str, ...]]:
@@ -308,11 +308,11 @@ def _bands_of(file: Any, keep: Sequence[int], kinds: Sequence[str], path: Path) 
         widths = [finite_number(word) for word in re.split(r"[,\s]+", fields.get("fwhm", "")) if word]
         known = len(widths) == len(keep) and all(width is not None and width > 0 for width in widths)
         fwhm = np.array(widths, np.float64) * scale if known else None
-        return Bands(centres, fwhm, "nm", f"wavelengths from the tags of {path}"), tuple(notes)
+        return Bands(centres, fwhm, f"wavelengths from the tags of {path}"), tuple(notes)
     named = [_DESCRIBED.search(file.descriptions[band] or "") for band in keep]
     if named and None not in named:
         nm = [float(one[1]) * (1.0 if one[2].lower().startswith("n") else 1000.0) for one in named if one is not None]
-        return Bands(np.array(nm), None, "nm", f"wavelengths from the band names of {path}"), tuple(notes)
+        return Bands(np.array(nm), None, f"wavelengths from the band names of {path}"), tuple(notes)
     colours_nm = _COLOURS_NM.get(tuple(kinds))
     return Bands() if colours_nm is None else _of_colours(colours_nm), tuple(notes)
 

@@ -236,7 +236,6 @@ def _attributes(source: CubeSource, files: Sequence[SourceFile], name: str) -> d
         "lost_lines": source.lost_lines,
         "notes": list(source.notes),
         "wavelength_origin": source.bands.origin or "nothing says the wavelengths",
-        "wavelength_units_in_file": source.bands.units,
     }
     if source.nodata is not None and np.isfinite(source.nodata):
         facts["nodata"] = source.nodata
@@ -244,8 +243,6 @@ def _attributes(source: CubeSource, files: Sequence[SourceFile], name: str) -> d
         facts["bad_bands"] = list(source.bad_bands)
     if source.geobox is not None:
         facts |= {**map_attributes(source.geobox), "spatial:dimensions": ["line", "sample"]}
-    if source.lines.first_stamp_us is not None:
-        facts["first_stamp_us"] = source.lines.first_stamp_us
     return facts
 
 

@@ -23,7 +23,7 @@ from flows.publish.run_folder import Published, load_receipt
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from models.weights.files import save_weights
-from pipeline.errors import SceneError, SettingsError
+from pipeline.errors import SceneError
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import RasterScene, raster_from_values

@@ -15,7 +15,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import RigError, SceneError, ShapeError
 from pipeline.readings import SIGMA_OF_MEDIAN
-from pipeline.rig.camera.camera_texts import FRAME_INDEX, LineTimes, parse_frame_index, split_header, times_of_lines
+from pipeline.rig.camera.camera_texts import (
+    FRAME_INDEX,
+    LineTimes,
+    parse_frame_index,
+    place_parts,
+    split_header,
+    times_of_lines,
+)
 from pipeline.signal.detector import find_bad_elements
 from pipeline.source import References
 
@@ -123,18 +130,20 @@ def read_capture(names: Iterable[str], read: Read) -> CapturedLines:
         raise RigError(
             f"parts of one capture have frames of {sorted(sizes)} (sample, band); they are of several captures"
         )
-    placed = _placed(parts, notes)
-    lost = placed[-1][2].lost
+    try:
+        starts = place_parts([(f"raw_{first}", first, len(cube.values)) for first, cube in parts], MOST_MISSING, notes)
+    except SceneError as error:
+        raise RigError(str(error)) from error
+    (first, cube), lost = parts[-1], parts[-1][1].lost
     if lost > MOST_MISSING:
-        notes.append(f"the {lost} lines that raw_{placed[-1][1]} lacks are not filled up")
+        notes.append(f"the {lost} lines that raw_{first} lacks are not filled up")
         lost = 0
-    lines = placed[-1][0] + len(placed[-1][2].values) + lost
-    shape = (lines, *parts[0][1].values.shape[1:])
-    alone = len(placed) == 1 and not lost  # then no copy is made: a capture may have a gigabyte
-    values = parts[0][1].values.astype(np.uint16, copy=False) if alone else np.zeros(shape, np.uint16)
-    valid = np.zeros(lines, np.bool_)
-    times = LineTimes(np.full(lines, -1), np.full(lines, -1), np.full(lines, np.nan), ())
-    for start, first, cube in placed:
+    lines = starts[-1] + len(cube.values) + lost
+    alone = len(parts) == 1 and not lost  # then no copy is made: a capture may have a gigabyte
+    shape = (lines, *cube.values.shape[1:])
+    values = cube.values.astype(np.uint16, copy=False) if alone else np.zeros(shape, np.uint16)
+    valid, times = np.zeros(lines, np.bool_), LineTimes.unknown(lines)
+    for start, (first, cube) in zip(starts, parts, strict=True):
         stop = start + len(cube.values)
         valid[start:stop] = True
         if not alone:
@@ -144,8 +153,7 @@ def read_capture(names: Iterable[str], read: Read) -> CapturedLines:
                 f"raw_{first} is cut off: {len(cube.values)} of {len(cube.values) + cube.lost} lines are whole"
             )
         if (own := _times(by_name, first, cube, read, notes)) is not None:
-            times.frame[start:stop], times.stamp_us[start:stop] = own.frame, own.stamp_us
-            times.exposure_ms[start:stop] = own.exposure_ms
+            times.put(start, own)
     return CapturedLines(values, valid, parts[0][0], times, tuple(notes))
 
 
@@ -181,23 +189,6 @@ def _read_cube(by_name: Mapping[str, str], name: str, read: Read) -> CubeLines:
     if len(data) > promised:
         raise RigError(f"{by_name[name]} has {len(data)} bytes, its header says {promised}; is it another file's?")
     return cube_lines(found, data)
-
-
-def _placed(parts: list[tuple[int, CubeLines]], notes: list[str]) -> list[tuple[int, int, CubeLines]]:
-    """Start line, first frame and lines of each part."""
-    placed: list[tuple[int, int, CubeLines]] = []
-    end = 0
-    for first, cube in parts:
-        start = first - parts[0][0]
-        if start - end > MOST_MISSING:
-            raise RigError(f"{start - end} lines before raw_{first} are in no file; is it of another capture?")
-        if start > end:
-            notes.append(f"{start - end} lines before raw_{first} are in no file")
-        elif start < end:
-            notes.append(f"raw_{first} begins {end - start} frames before the part before it ends")
-        placed.append((max(start, end), first, cube))
-        end = placed[-1][0] + len(cube.values)
-    return placed
 
 
 def _times(by_name: Mapping[str, str], first: int, cube: CubeLines, read: Read, notes: list[str]) -> LineTimes | None:
