@@ -9,6 +9,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, Any
@@ -174,22 +175,17 @@ def read_by_chunks(read: ReadLines, lines: int, chunk_lines: int) -> ReadLines:
     """
     if chunk_lines <= 1:
         return read
-    kept: dict[int, NDArray[Any]] = {}
     lock = Lock()
 
+    @lru_cache(maxsize=1)
     def chunk(number: int) -> NDArray[Any]:
-        if number not in kept:
-            kept.clear()
-            kept[number] = read(number * chunk_lines, min((number + 1) * chunk_lines, lines))
-        return kept[number]
+        return read(number * chunk_lines, min((number + 1) * chunk_lines, lines))
 
     def read_lines(start: int, stop: int) -> NDArray[Any]:
         """Return some lines (line, sample, band)."""
+        numbers = range(start // chunk_lines, -(-stop // chunk_lines))
         with lock:
-            numbers = range(start // chunk_lines, -(-stop // chunk_lines))
-            parts = [
-                chunk(number)[max(start - number * chunk_lines, 0) : stop - number * chunk_lines] for number in numbers
-            ]
+            parts = [chunk(at)[max(start - at * chunk_lines, 0) : stop - at * chunk_lines] for at in numbers]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     return read_lines

@@ -364,13 +364,8 @@ class FileValues:
         """Return rows in the file's numbers and as float32 with NaN, (y, x, band), and which of them are no data."""
         rows = scene_lines(self.source, first, stop)
         picked = rows if self.bands == list(range(rows.shape[2])) else rows[..., self.bands]
-        void = None if self.void is None else self.void[first:stop]
-        if void is not None:
-            picked = np.where(void[..., None], picked.dtype.type(0), picked)  # whatever lies under gaps is no value
         with np.errstate(over="ignore"):
             values = np.array(picked, np.float32, order="C")
-        if void is not None:
-            values[void] = np.nan
         if self.nodata is None:
             return picked, values, None
         # Compared as numbers: -9999 in the numbers of the file would wrap to 55537 where they are uint16.
