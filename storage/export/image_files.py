@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from pipeline.errors import ArchiveError, PoseError, ShapeError
+from pipeline.rig.camera.envi_headers import DATA_TYPES
 from storage.archive.whole_files import make_folder, write_whole, written_aside
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.cubes import RawCube
 from storage.arrays.layout import SHARD_ROWS, AngularGrid
-from storage.readers.envi_files import DATA_TYPES
 
 TILE = 512  # px: rasters within one tile need no overviews
 OUTSIDE = 0.02  # fraction of pixels that a style's colours end before, at either end

@@ -9,20 +9,15 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import RigError, SceneError, ShapeError
 from pipeline.readings import SIGMA_OF_MEDIAN
-from pipeline.rig.camera.camera_texts import (
-    FRAME_INDEX,
-    LineTimes,
-    parse_frame_index,
-    place_parts,
-    split_header,
-    times_of_lines,
-)
+from pipeline.rig.camera.camera_texts import FRAME_INDEX, LineTimes, parse_frame_index, place_parts, times_of_lines
+from pipeline.rig.camera.envi_headers import EnviHeader, parse_envi_header
 from pipeline.signal.detector import find_bad_elements
 from pipeline.source import References
 
@@ -44,22 +39,6 @@ _SAMPLES = 16  # looked at together
 
 
 @dataclass(frozen=True)
-class CubeHeader:
-    """Sizes and layout of 16-bit lines, band after band within each, by a header."""
-
-    samples: int
-    lines: int
-    bands: int
-    dtype: np.dtype[np.uint16]  # with its byte order
-    offset: int
-
-    @property
-    def line_bytes(self) -> int:
-        """Bytes of a line."""
-        return self.samples * self.bands * 2
-
-
-@dataclass(frozen=True)
 class CubeLines:
     """Lines of one file. ``lost`` are those that its header states and it does not hold whole."""
 
@@ -78,40 +57,33 @@ class CapturedLines:
     notes: tuple[str, ...]
 
 
-def parse_cube_header(text: str, where: str) -> CubeHeader:
+def parse_cube_header(text: str, where: str) -> EnviHeader:
     """Read the header of a cube as the camera writes them.
 
     RigError where it is no whole ENVI header, a size is missing, or the numbers are not 16-bit BIL.
     """
-    if not text.lstrip("\ufeff \r\n").upper().startswith("ENVI"):
-        raise RigError(f"{where} begins with {text[:40]!r}, expected ENVI; fetch it again")
     try:
-        fields, _ = split_header(text, where, [])
+        header = parse_envi_header(text, where)
     except SceneError as error:
         raise RigError(f"{error}; fetch it again") from error
-    layout = (fields.get("interleave", "").lower(), fields.get("data type", ""))
-    if layout != ("bil", "12"):
+    kind = header.dtype.str[1:]
+    if (header.interleave, kind) != ("bil", "u2"):
+        raise RigError(f"{where}: interleave {header.interleave!r} of {kind}; expected bil and u2, as cameras write")
+    if header.lines is None:
+        raise RigError(f"{where} does not say lines; fetch it again")
+    if header.samples * header.bands > MOST_NUMBERS:
         raise RigError(
-            f"{where}: interleave {layout[0]!r}, data type {layout[1]!r}; expected bil and 12, as cameras write"
+            f"{where}: {header.samples} samples and {header.bands} bands; no camera has so many, fetch it again"
         )
-    samples, lines, bands = (_whole(fields, key, where) for key in ("samples", "lines", "bands"))
-    if not samples or not bands:
-        raise RigError(f"{where}: {samples} samples and {bands} bands; expected at least one of each")
-    if samples * bands > MOST_NUMBERS:
-        raise RigError(f"{where}: {samples} samples and {bands} bands; no camera has so many, fetch it again")
-    order = _whole(fields, "byte order", where, "0")
-    if order > 1:
-        raise RigError(f"{where}: byte order = {order}, expected 0 or 1")
-    offset = _whole(fields, "header offset", where, "0")
-    return CubeHeader(samples, lines, bands, np.dtype(("<u2", ">u2")[order]), offset)
+    return header
 
 
-def cube_lines(header: CubeHeader, data: bytes) -> CubeLines:
+def cube_lines(header: EnviHeader, data: bytes) -> CubeLines:
     """Return the lines that are whole in ``data``, (line, sample, band)."""
-    held = min(max(len(data) - header.offset, 0) // header.line_bytes, header.lines)
+    held = min(max(len(data) - header.offset, 0) // header.line_bytes, header.lines or 0)
     shape = (held, header.bands, header.samples)
-    values = np.ndarray(shape, header.dtype, data, header.offset if held else 0).transpose(0, 2, 1)
-    return CubeLines(values, header.lines - held)
+    values: NDArray[Any] = np.ndarray(shape, header.dtype, data, header.offset if held else 0)
+    return CubeLines(values.transpose(0, 2, 1), (header.lines or 0) - held)
 
 
 def read_capture(names: Iterable[str], read: Read) -> CapturedLines:
@@ -185,7 +157,7 @@ def _read_cube(by_name: Mapping[str, str], name: str, read: Read) -> CubeLines:
         raise RigError(f"{by_name[name]} has no header {name}.hdr beside it; fetch the folder again")
     found = parse_cube_header(read(by_name[header]).decode("utf-8", errors="replace"), by_name[header])
     data = read(by_name[name])
-    promised = found.offset + found.lines * found.line_bytes
+    promised = found.offset + (found.lines or 0) * found.line_bytes
     if len(data) > promised:
         raise RigError(f"{by_name[name]} has {len(data)} bytes, its header says {promised}; is it another file's?")
     return cube_lines(found, data)
@@ -206,12 +178,6 @@ def _times(by_name: Mapping[str, str], first: int, cube: CubeLines, read: Read, 
     own = times_of_lines(index, first, len(cube.values), cube.lost)
     notes += [*index.notes, *(f"{name}: {note}" for note in own.notes)]
     return own
-
-
-def _whole(fields: Mapping[str, str], key: str, where: str, usual: str = "") -> int:
-    if not re.fullmatch(r"\d{1,12}", fields.get(key, usual)):
-        raise RigError(f"{where}: {key} = {fields.get(key)!r}, expected a whole number; fetch it again")
-    return int(fields.get(key, usual))
 
 
 @dataclass(frozen=True)
