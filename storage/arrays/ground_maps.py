@@ -36,7 +36,6 @@ from storage.arrays.layout import (
     image_spec,
     open_group,
     read_array,
-    read_bands,
     tile_place,
 )
 
@@ -81,14 +80,6 @@ def open_image(path: Path, name: str) -> StoredImage:
     group = open_group(path)
     array = array_of(group, name)
     return StoredImage(group, name, array.shape, array.dtype)
-
-
-def load_bands(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-    """Return the wavelengths and widths [nm] of the store at ``path``.
-
-    Raises IncompleteStoreError where they are damaged.
-    """
-    return read_bands(open_group(path))
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,6 @@ from storage.arrays.layout import (
     write_counts,
     write_image,
 )
-from storage.arrays.quicklooks import Quicklook, write_quicklook
 from storage.arrays.signal_cubes import (
     LARGEST_SHORT,
     check_condensed,
@@ -132,10 +131,6 @@ class MosaicWriter:
         """Store how each pixel was captured: ``number`` (y, x) counts the ``specs``, numbers of the network's input."""
         about = {"long_name": "kind of capture", "units": "1", "kinds": [list(one) for one in specs]}
         write_image(self.group, CAPTURES, ("y", "x"), number, about)
-
-    def write_quicklook(self, image: NDArray[np.uint8]) -> None:
-        """Store a small colour picture, (y, x, 3) uint8, beside the mosaic."""
-        write_quicklook(self.group, Quicklook(image))
 
 
 def nothing_seen(path: Path) -> dict[str, float]:

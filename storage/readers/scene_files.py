@@ -121,7 +121,6 @@ def open_scene_file(
     GeoTIFF, ENVI, Zarr and .npy are read some rows at a time; images, .mat and .npz are whole in memory. Labels that
     were found by their names and cannot be used are left out with a note. Raises what `load_scene_file` does.
     """
-    """Look through all rows of a scene once, and find its labels."""
     file, variable = split_variable(address)
     source, settings = open_cube(address), find_scene_settings(file)
     height, width, count = source.shape
@@ -133,18 +132,13 @@ def open_scene_file(
     if keep:
         check_memory(address, 8 * height * width * count)  # as float32, and once more while the scene is made
     kept = np.empty((height, width, len(chosen)), np.float32) if keep else None
-    counted = ValueCount(file, values)
-    for first in range(0, height, BLOCK_LINES):
-        taken = counted.take(first, min(first + BLOCK_LINES, height))
-        if kept is not None:
-            kept[first : first + len(taken)] = values.scaled(taken)
-    missing_notes = counted.notes()
+    gaps = _look_through(file, values, kept)
     found, label_note, by_name = _labels_of(
         file, source.shape[:2], source.geobox, labels, settings, classes or {}, labels_needed
     )
     content = _content_hash(file, source.files)
     some = () if chosen == list(range(count)) else (f"bands {bands_text(chosen)} of {count}, counted from 0",)
-    how, gaps = values.notes(settings.path)
+    how, of_mask = values.notes(settings.path)
     scene = SceneFile(
         name=file.stem,
         path=file,
@@ -152,11 +146,11 @@ def open_scene_file(
         fwhm_nm=light.fwhm_nm,
         shape=(height, width),
         read=values.read,
-        missing=counted.missing,
-        filled_px=counted.filled_px,
-        light_hash=_light_hash(content, variable, values, light, used=counted.void > 0, stated=settings.nodata),
+        missing=gaps.missing,
+        filled_px=gaps.filled_px,
+        light_hash=_light_hash(content, variable, values, light, used=gaps.void > 0, stated=settings.nodata),
         content=(content if variable is None else _digest(content, variable),),
-        provenance=(*some, *bad_note, *source.notes, *how, light.origin, *gaps, *missing_notes, *label_note),
+        provenance=(*some, *bad_note, *source.notes, *how, light.origin, *of_mask, *gaps.notes, *label_note),
         geobox=source.geobox,
         pixel_m=None if source.geobox is not None else settings.pixel_m,
         kept=kept,
@@ -385,74 +379,69 @@ class FileValues:
         return self.scaled(values)
 
 
-class ValueCount:
-    """Count what is missing among the values of a file, given from the top down."""
+@dataclass(frozen=True)
+class Gaps:
+    """What is missing among the values of a file."""
 
-    def __init__(self, path: Path, values: FileValues) -> None:
-        shape = values.source.shape[:2]
-        self.missing = np.zeros(shape, np.bool_)  # (y, x) pixels without a value in more than half of their bands
-        self.void = 0  # samples that have the no-data value
-        self.filled_px = 0  # pixels without a value in a band
-        self._path, self._values = path, values
-        self._seen = np.zeros(len(values.bands), np.bool_)  # bands with a value somewhere
-        self._infinite = self._absent = 0
+    missing: NDArray[np.bool_]  # (y, x) pixels without a value in more than half of their bands
+    filled_px: int  # pixels without a value in a band
+    void: int  # samples that have the no-data value
+    notes: tuple[str, ...]  # a sentence for each thing that is missing
 
-    def take(self, first: int, stop: int) -> NDArray[np.float32]:
-        """Count the next rows of the file, and return their values (y, x, band), not scaled.
 
-        Raises SceneError: a value is no reading.
-        """
-        picked, values, empty = self._values.converted(first, stop)
-        if empty is not None:
-            self.void += int(np.count_nonzero(empty))
+def _look_through(path: Path, values: FileValues, kept: NDArray[np.float32] | None) -> Gaps:
+    """Look through all values of a file once, and keep them in ``kept`` where it is given.
+
+    Raises SceneError: a value is no reading, a band has no value anywhere, or no value is finite.
+    """
+    height, width, _ = values.source.shape
+    chosen, nodata, notes = values.bands, values.nodata, list[str]()
+    missing, seen = np.zeros((height, width), np.bool_), np.zeros(len(chosen), np.bool_)
+    filled_px = void = infinite = absent = 0
+    for first in range(0, height, BLOCK_LINES):
+        rows = slice(first, min(first + BLOCK_LINES, height))
+        picked, block, empty = values.converted(rows.start, rows.stop)
+        void += 0 if empty is None else int(np.count_nonzero(empty))
         if beyond_range(picked) is not None:
             found = find_beyond(picked if empty is None else np.where(empty, picked.dtype.type(0), picked))
             if found is not None:
                 y, x, band = found.place
                 raise SceneError(
-                    f"{self._path} has {found.value!s} at y {first + y}, x {x}, band {self._values.bands[band]}, beyond"
-                    f" the {MOST_VALUE:g} that readings reach; if it stands for no data, write nodata ="
-                    f" {found.value!s} into a {SETTINGS_NAME} beside the file, else leave the band out with --bands, or"
-                    " give the values in a larger unit"
+                    f"{path} has {found.value!s} at y {first + y}, x {x}, band {chosen[band]}, beyond the"
+                    f" {MOST_VALUE:g} that readings reach; if it stands for no data, write nodata = {found.value!s}"
+                    f" into a {SETTINGS_NAME} beside the file, else leave the band out with --bands, or give the values"
+                    " in a larger unit"
                 )
-            infinite = np.isinf(values)
-            self._infinite += int(np.count_nonzero(infinite))
-            values[infinite] = np.nan
-        known = np.isfinite(values)
-        if not known.all():
-            count = known.sum(axis=2)
-            self._absent += values.size - int(count.sum())
-            self.missing[first:stop] = 2 * count < values.shape[2]
-            self.filled_px += int(np.count_nonzero(count < values.shape[2]))
-        self._seen |= known.any(axis=(0, 1))
-        return values
-
-    def notes(self) -> tuple[str, ...]:
-        """Return a sentence for each thing that is missing, once all rows were taken.
-
-        Raises SceneError: a band has no value anywhere, or no value is finite.
-        """
-        path, chosen, nodata, notes = self._path, self._values.bands, self._values.nodata, list[str]()
-        if nodata is not None and not self._values.assumed:
-            notes.append(f"{self.void} samples have the file's no-data value {nodata:g}")
-        elif self.void:
-            notes.append(
-                f"{self.void} samples are {nodata:g}, which is taken for no data though nothing says so; where it"
-                f" is a reading, state another number as nodata in a {SETTINGS_NAME}"
-            )
-        if self._infinite:
-            notes.append(f"{self._infinite} infinite samples count as missing")
-        if not self._seen.any():
-            raise EmptySceneError(f"{path} holds no finite number in the bands used; choose others")
-        empty = [band for band, seen in zip(chosen, self._seen, strict=True) if not seen]
-        if empty:
-            rest = bands_text([band for band in chosen if band not in set(empty)])
-            raise SceneError(
-                f"{path} has no value anywhere in bands {bands_text(empty)} (from 0); take the others: --bands {rest}"
-            )
-        if self._absent:
-            notes.append(f"{self._absent} of {self.missing.size * len(chosen)} samples are missing")
-        return tuple(notes)
+            infinite += int(np.count_nonzero(np.isinf(block)))
+            block[np.isinf(block)] = np.nan
+        known = np.isfinite(block)
+        count = known.sum(axis=2)
+        absent += block.size - int(count.sum())
+        missing[rows] = 2 * count < len(chosen)
+        filled_px += int(np.count_nonzero(count < len(chosen)))
+        seen |= known.any(axis=(0, 1))
+        if kept is not None:
+            kept[rows] = values.scaled(block)
+    if nodata is not None and not values.assumed:
+        notes.append(f"{void} samples have the file's no-data value {nodata:g}")
+    elif void:
+        notes.append(
+            f"{void} samples are {nodata:g}, which is taken for no data though nothing says so; where it"
+            f" is a reading, state another number as nodata in a {SETTINGS_NAME}"
+        )
+    if infinite:
+        notes.append(f"{infinite} infinite samples count as missing")
+    if not seen.any():
+        raise EmptySceneError(f"{path} holds no finite number in the bands used; choose others")
+    if not seen.all():
+        without, rest = (
+            bands_text([band for band, there in zip(chosen, seen, strict=True) if there == wanted])
+            for wanted in (False, True)
+        )
+        raise SceneError(f"{path} has no value anywhere in bands {without} (from 0); take the others: --bands {rest}")
+    if absent:
+        notes.append(f"{absent} of {missing.size * len(chosen)} samples are missing")
+    return Gaps(missing, filled_px, void, tuple(notes))
 
 
 def bands_text(bands: Sequence[int]) -> str:

@@ -237,7 +237,7 @@ def test_a_header_never_stands_beside_other_numbers(tmp_path: Path, monkeypatch:
 @pytest.mark.parametrize(
     ("blocks", "words"),
     [
-        ([(0, np.zeros((5, 7, 5)))], "5 of 6 lines were given"),
+        ([(0, np.zeros((5, 7, 5)))], "5 of 6 rows were given"),
         ([(0, np.zeros((7, 7, 5)))], "do not follow 0"),
         ([(1, np.zeros((5, 7, 5)))], "do not follow 0"),
         ([(0, np.zeros((6, 5, 7)))], "do not follow 0"),
