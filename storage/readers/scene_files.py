@@ -132,7 +132,7 @@ def open_scene_file(
     if keep:
         check_memory(address, 8 * height * width * count)  # as float32, and once more while the scene is made
     kept = np.empty((height, width, len(chosen)), np.float32) if keep else None
-    gaps = _look_through(file, values, kept)
+    gaps = _find_gaps(file, values, kept)
     found, label_note, by_name = _labels_of(
         file, source.shape[:2], source.geobox, labels, settings, classes or {}, labels_needed
     )
@@ -389,7 +389,7 @@ class Gaps:
     notes: tuple[str, ...]  # a sentence for each thing that is missing
 
 
-def _look_through(path: Path, values: FileValues, kept: NDArray[np.float32] | None) -> Gaps:
+def _find_gaps(path: Path, values: FileValues, kept: NDArray[np.float32] | None) -> Gaps:
     """Look through all values of a file once, and keep them in ``kept`` where it is given.
 
     Raises SceneError: a value is no reading, a band has no value anywhere, or no value is finite.
