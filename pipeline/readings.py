@@ -25,11 +25,10 @@ class Beyond:
     place: tuple[int, ...]  # (y, x, band)
     value: np.number[Any]
 
-    def words(self, bands: NDArray[np.integer] | None = None) -> str:
-        """Count, place and value; ``bands`` are the numbers of the cube's bands in their file."""
+    def words(self) -> str:
+        """Count, place and value."""
         y, x, band = self.place
-        number = band if bands is None else int(bands[band])
-        return f"{self.count} value{'s' * (self.count > 1)}, the first {self.value!s} at y {y}, x {x}, band {number}"
+        return f"{self.count} value{'s' * (self.count > 1)}, the first {self.value!s} at y {y}, x {x}, band {band}"
 
 
 def beyond_range(values: NDArray[Any], most: float = MOST_VALUE) -> NDArray[np.bool_] | None:

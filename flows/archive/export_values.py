@@ -28,8 +28,8 @@ from pipeline.products.indices import SpectralIndex, index_values, pick_bands, w
 from storage.archive.whole_files import write_whole
 from storage.arrays.class_maps import ProbabilityStore
 from storage.arrays.georeference import load_geobox
-from storage.arrays.ground_maps import load_bands, open_image
-from storage.arrays.layout import grid_of
+from storage.arrays.ground_maps import open_image
+from storage.arrays.layout import grid_of, open_group, read_bands
 from storage.arrays.mosaics import Mosaic, open_mosaic
 from storage.export.image_files import CogImage
 
@@ -205,7 +205,7 @@ def spectral_layers(run: ExportedRun, choice: ProductChoice) -> list[Layer]:
 
 
 def _reflectance(view: MosaicView, white: float) -> Layer:
-    wave, width = load_bands(view.run.path("mosaic"))
+    wave, width = read_bands(open_group(view.run.path("mosaic")))
     image = CogImage(
         view.geobox,
         "float32",
@@ -224,7 +224,7 @@ def _format_value(white: float) -> str:
 
 
 def _index(view: MosaicView, index: SpectralIndex, bands: Sequence[int], white: float) -> Layer:
-    wave = load_bands(view.run.path("mosaic"))[0][list(bands)].tolist()
+    wave = read_bands(open_group(view.run.path("mosaic")))[0][list(bands)].tolist()
     taken = ", ".join(f"{band.symbol} {nm:.1f} nm" for band, nm in zip(index.bands, wave, strict=True))
     tags = {"index": index.name, "bands": taken, "reference": index.reference, "pixels": view.words}
     about = layer_tags(view.run, "mosaic", view.geobox) | tags

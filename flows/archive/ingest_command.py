@@ -137,7 +137,7 @@ def _stamps(source: CubeSource) -> list[tuple[int, int]]:
 
 def _key(name: str | None, source: CubeSource, files: Sequence[SourceFile]) -> dict[str, Any]:
     """Return the parameters of the store: content, flags, and wavelengths from elsewhere than the files."""
-    named = source.root is not None  # in a Zarr store names say where a chunk lies
+    named = source.root is not None  # names say where a chunk of a Zarr store, or a part of a cube, lies
     centres, widths = source.bands.wavelength_nm, source.bands.fwhm_nm
     return {
         "files": [[file.name if named else "", file.size, file.sha256] for file in files],
@@ -150,7 +150,6 @@ def _key(name: str | None, source: CubeSource, files: Sequence[SourceFile]) -> d
         **({"scaling": source.scaling} if source.scaling else {}),
         **({"bad_bands": source.bad_bands} if source.bad_bands else {}),
         **({} if source.void is None else {"gaps": True}),
-        **({"numbers_in_names": source.by_names} if source.by_names else {}),
     }
 
 

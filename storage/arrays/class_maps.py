@@ -24,13 +24,14 @@ from storage.arrays.layout import (
     MAP_PACKING,
     SHARD_ROWS,
     AngularGrid,
+    array_of,
     create_array,
     damage_named,
     grid_of,
     image_spec,
     open_group,
     read_array,
-    whole_shards,
+    tile_place,
     write_counts,
     write_image,
 )
@@ -79,14 +80,7 @@ def with_unknown(legend: ClassNames) -> ClassNames:
 def create_class_map(
     path: Path, shape: tuple[int, ...], legend: ClassNames, *, grid: AngularGrid | None = None
 ) -> None:
-    """Create a class map of (y, x) ``shape`` in which no pixel has a class yet.
-
-    Raises ShapeError: there are not as many colours as names.
-    """
-    if len(legend.colours) != len(legend.names):
-        raise ShapeError(
-            f"{len(legend.names)} names and {len(legend.colours)} colours do not fit; give each class both"
-        )
+    """Create a class map of (y, x) ``shape`` in which no pixel has a class yet."""
     names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
     group, place = create_placed_group(path, "class map", grid, shape, names)
     about = {**class_flags(legend.names, legend.colours), **place}
@@ -106,29 +100,15 @@ def write_class_tile(
 ) -> None:
     """Store (y, x) classes and confidence of whole shards from row and column ``origin`` on.
 
-    Threads and processes may write different tiles of one map at once. Raises ShapeError: sizes differ, the tile does
-    not fit the map, or a pixel has a class without a name. ChunkError: the tile splits a shard. IncompleteStoreError:
-    there is no map.
+    Threads and processes may write different tiles of one map at once. Raises ShapeError: a pixel has a class without a
+    name. ChunkError: the tile splits a shard. IncompleteStoreError: there is no map.
     """
-    with damage_named(str(path)):
-        group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
-        arrays = [array for name in ("classes", "confidence") if isinstance(array := group[name], zarr.Array)]
-        count = len(group.attrs["class_names"])  # type: ignore[arg-type]
-    check_named(classes, count)
-    place = tuple(slice(first, first + size) for first, size in zip(origin, classes.shape, strict=True))
-    for word, part, size in zip(("rows", "columns"), place, arrays[0].shape, strict=True):
-        if part.start < 0 or part.stop > size:
-            raise ShapeError(
-                f"{word} {part.start}:{part.stop} are not all in the class map of {arrays[0].shape} (y, x)"
-            )
-    whole_shards("the class map", place, arrays[0].shape, arrays[0].shards or ())
-    if classes.shape != confidence.shape:
-        raise ShapeError(
-            f"classes {classes.shape} and confidence {confidence.shape} do not fit; give both of each pixel"
-        )
+    group = open_group(path, "r+")
+    check_named(classes, len(legend_of(group).names))
     rounded = np.rint(np.asarray(confidence) / CONFIDENCE_STEP) * CONFIDENCE_STEP
-    for array, values in zip(arrays, (classes, rounded), strict=True):
-        array[place] = np.asarray(values, array.dtype)
+    for name, values in (("classes", classes), ("confidence", rounded)):
+        array = array_of(group, name)
+        array[tile_place("the class map", origin, classes.shape, array)] = np.asarray(values, array.dtype)
 
 
 def check_named(classes: NDArray[np.integer], count: int) -> None:
@@ -204,29 +184,22 @@ def write_probabilities_tile(
 
     NaN is what nothing is known of; what is less than `LEAST` becomes `UNLIKELY`.
 
-    Raises ShapeError: they differ in size; ChunkError: the tile splits a shard;
-    IncompleteStoreError: there is no store.
+    Raises ChunkError: the tile splits a shard; IncompleteStoreError: there is no store.
     """
-    if not log_probability.shape[:2] == age_days.shape == light.shape:
-        sizes = f"{log_probability.shape}, ages {age_days.shape} and light {light.shape}"
-        raise ShapeError(f"probabilities {sizes} are not of one tile")
-    with damage_named(str(path)):
-        group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
-        names = ("log_probability", "age", "log2_light")
-        arrays = [array for name in names if isinstance(array := group[name], zarr.Array)]
-    place = tuple(slice(first, first + size) for first, size in zip(origin, age_days.shape, strict=True))
-    whole_shards("the class probabilities", place, arrays[1].shape, arrays[1].shards or ())
+    group = open_group(path, "r+")
+    likelihood, ages, octave = (array_of(group, name) for name in ("log_probability", "age", "log2_light"))
+    place = tile_place("the class probabilities", origin, age_days.shape, ages)
     for top in range(0, len(age_days), SHARD_ROWS):  # what is packed never lies there for all rows at once
         part = log_probability[top : top + SHARD_ROWS]
         likely = np.where(part < LEAST, UNLIKELY, np.minimum(part, 0))
         packed = np.rint((likely - FAINTEST) / STEP)
         rows = slice(place[0].start + top, place[0].start + top + len(part))
-        arrays[0][rows, place[1]] = np.where(np.isnan(part), NOTHING, np.minimum(packed, NOTHING - 1)).astype(np.uint8)
+        likelihood[rows, place[1]] = np.where(np.isnan(part), NOTHING, np.minimum(packed, NOTHING - 1)).astype(np.uint8)
     days = np.rint(np.clip(age_days, 0, DAY_STEP * (NEVER - 1)) / DAY_STEP)
-    arrays[1][place] = np.where(np.isnan(age_days), NEVER, days).astype(np.uint16)
+    ages[place] = np.where(np.isnan(age_days), NEVER, days).astype(np.uint16)
     octaves = np.clip(np.log2(np.maximum(light, 2.0**DARKEST)), DARKEST, DARKEST + OCTAVE_STEP * (DARK - 1))
     packed = np.rint((octaves - DARKEST) / OCTAVE_STEP)
-    arrays[2][place] = np.where(light > 0, packed, DARK).astype(np.uint8)
+    octave[place] = np.where(light > 0, packed, DARK).astype(np.uint8)
 
 
 def write_changes_tile(path: Path, origin: tuple[int, int], old_class: NDArray[np.uint8]) -> None:
@@ -234,25 +207,21 @@ def write_changes_tile(path: Path, origin: tuple[int, int], old_class: NDArray[n
 
     Raises ChunkError: the tile splits a shard; IncompleteStoreError: the store has no earlier visit, or is not there.
     """
-    with damage_named(f"{path}/{OLD_CLASS}"):
-        array = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)[OLD_CLASS]
-        assert isinstance(array, zarr.Array)
-    place = tuple(slice(first, first + size) for first, size in zip(origin, old_class.shape, strict=True))
-    whole_shards("the class probabilities", place, array.shape, array.shards or ())
-    array[place] = old_class
+    array = array_of(open_group(path, "r+"), OLD_CLASS)
+    array[tile_place("the class probabilities", origin, old_class.shape, array)] = old_class
 
 
 def drop_changes(path: Path) -> None:
     """Remove the classes of the earlier visit from stored class probabilities: the visit starts from none."""
+    group = open_group(path, "r+")
     with damage_named(str(path)):
-        del zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)[OLD_CLASS]
+        del group[OLD_CLASS]
 
 
 def write_changes(path: Path, changed: Floats, patch_px: int) -> None:
     """Add (patch_y, patch_x) fractions of changed pixels to stored class probabilities, by patches of ``patch_px``."""
-    with damage_named(str(path)):
-        group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
-    write_image(group, "changed", ("patch_y", "patch_x"), changed, {**CHANGED, "patch_px": patch_px})
+    about = {**CHANGED, "patch_px": patch_px}
+    write_image(open_group(path, "r+"), "changed", ("patch_y", "patch_x"), changed, about)
 
 
 def unpacked_days(packed: NDArray[np.uint16]) -> Floats:

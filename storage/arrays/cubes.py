@@ -12,7 +12,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from pipeline.errors import IncompleteStoreError, ShapeError
+from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.scan import Sweep
 from pipeline.source import Line, References
 from storage.arrays.layout import (
@@ -50,23 +50,6 @@ class SweepHeader:
     def shape(self) -> tuple[int, int, int]:
         """(line, sample, band) of the cube."""
         return self.sweep.lines, self.references.dark.shape[0], len(self.wavelength_nm)
-
-    def __post_init__(self) -> None:
-        frame = self.references.dark.shape
-        bands = len(self.wavelength_nm)
-        if frame != self.references.white.shape or len(frame) != 2 or frame[1] != bands:
-            raise ShapeError(
-                f"sweep {self.sweep.name}: dark {frame} and white {self.references.white.shape} must both be "
-                f"(sample, band) with {bands} bands; calibrate with the sweep's own binning"
-            )
-        if self.references.white_reference.shape != (bands,):
-            raise ShapeError(
-                f"sweep {self.sweep.name}: panel has shape {self.references.white_reference.shape}, not ({bands},)"
-            )
-        for name in ("bad", "flat"):
-            extra = getattr(self.references, name)
-            if extra is not None and extra.shape != frame:
-                raise ShapeError(f"sweep {self.sweep.name}: {name} has shape {extra.shape}, the dark frame {frame}")
 
 
 class RawCubeWriter:
@@ -106,22 +89,8 @@ class RawCubeWriter:
             self.close()
 
     def write(self, lines: Sequence[Line]) -> None:
-        """Take the next lines; any number, in order.
-
-        Raises ShapeError: a line is out of order, too many, or of another size than the references.
-        """
+        """Take the next lines; any number, in order."""
         for line in lines:
-            number = len(self._facts)
-            if line.number != number or number >= self._header.sweep.lines:
-                raise ShapeError(
-                    f"sweep {self._header.sweep.name}: got line {line.number}, expected line {number} of "
-                    f"{self._header.sweep.lines}; lines come in order"
-                )
-            if line.data.shape != self._header.shape[1:]:
-                raise ShapeError(
-                    f"sweep {self._header.sweep.name}, line {number}: shape {line.data.shape}, the references have "
-                    f"{self._header.shape[1:]} (sample, band)"
-                )
             self._waiting.append(line)
             self._facts.append((line.time_s, line.mirror_x, line.mirror_y, line.exposure_ms, line.valid))
             if len(self._waiting) == SHARD_ROWS:

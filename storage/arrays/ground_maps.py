@@ -30,14 +30,13 @@ from storage.arrays.georeference import ON_THE_MAP, geobox_of_group, load_geobox
 from storage.arrays.layout import (
     SHARD_COLUMNS,
     SHARD_ROWS,
+    array_of,
     create_array,
     create_group,
-    damage_named,
     image_spec,
     open_group,
     read_array,
-    read_bands,
-    whole_shards,
+    tile_place,
 )
 
 if TYPE_CHECKING:
@@ -79,19 +78,8 @@ class StoredImage:
 def open_image(path: Path, name: str) -> StoredImage:
     """Open one array of the store at ``path``. Raises IncompleteStoreError where it is missing or damaged."""
     group = open_group(path)
-    with damage_named(f"{group.store_path}/{name}"):
-        array = group[name]
-        if not isinstance(array, zarr.Array):
-            raise KeyError(f"{name} is no array")
-        return StoredImage(group, name, array.shape, array.dtype)
-
-
-def load_bands(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-    """Return the wavelengths and widths [nm] of the store at ``path``.
-
-    Raises IncompleteStoreError where they are damaged.
-    """
-    return read_bands(open_group(path))
+    array = array_of(group, name)
+    return StoredImage(group, name, array.shape, array.dtype)
 
 
 @dataclass(frozen=True)
@@ -138,14 +126,12 @@ class GroundMapWriter:
     def write_block(self, rows: slice, columns: slice, images: Mapping[str, NDArray[np.generic]]) -> None:
         """Store one block of all images, by name.
 
-        Raises ShapeError: an image lacks or does not fit its place, or a class has no name. ChunkError: the block
-        splits a shard.
+        Raises ShapeError: an image lacks, or a class has no name. ChunkError: the block splits a shard.
         """
+        if set(images) != set(self._images):
+            raise ShapeError(f"a block got {', '.join(images)}; give {', '.join(self._images)}, one value a pixel")
         size = (rows.stop - rows.start, columns.stop - columns.start)
-        if set(images) != set(self._images) or any(image.shape[:2] != size for image in images.values()):
-            came = ", ".join(f"{name} {image.shape}" for name, image in images.items())
-            raise ShapeError(f"block {size} (y, x) got {came}; give {', '.join(self._images)}, one value a pixel")
-        whole_shards("the map", (rows, columns), self._shape, (SHARD_ROWS, SHARD_COLUMNS))
+        tile_place("the map", (rows.start, columns.start), size, self._images["classes"])
         for name in NUMBERED & set(images):
             check_named(np.asarray(images[name], np.uint8), len(self._legend.names))
         for name, image in images.items():

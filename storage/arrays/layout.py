@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec, TransposeCodec
 from zarr.storage import MemoryStore
 
-from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError, WavelengthError
+from pipeline.errors import ChunkError, IncompleteStoreError
 from pipeline.geometry.grid import UNLABELLED
 
 if TYPE_CHECKING:
@@ -127,14 +127,21 @@ def _whole_chunks(size: int, chunk: int) -> int:
     return -(-size // chunk) * chunk
 
 
-def whole_shards(what: str, place: Sequence[slice], shape: Sequence[int], shards: Sequence[int]) -> None:
-    """Refuse rows and columns of an image that split its shards, or reach beyond it (ChunkError)."""
-    for word, part, size, shard in zip(("rows", "columns"), place, shape, shards, strict=False):
-        if part.start % shard or (part.stop != size and (part.stop % shard or part.stop > size)):
+def tile_place(what: str, origin: Sequence[int], size: Sequence[int], array: zarr.Array[Any]) -> tuple[slice, slice]:
+    """Return the rows and columns of an image that a tile of (y, x) ``size`` takes from ``origin`` on.
+
+    Raises ChunkError: they split a shard of the image, or reach beyond it.
+    """
+    rows, columns = (slice(first, first + count) for first, count in zip(origin, size, strict=True))
+    for word, part, side, shard in zip(
+        ("rows", "columns"), (rows, columns), array.shape, array.shards or (), strict=False
+    ):
+        if part.start % shard or (part.stop != side and (part.stop % shard or part.stop > side)):
             raise ChunkError(
                 f"{word} {part.start}:{part.stop} split {what}'s shards of {shard} {word}; start and end at multiples "
                 f"of {shard}"
             )
+    return rows, columns
 
 
 def create_array(
@@ -197,18 +204,15 @@ def write_image(
 def write_bands(group: zarr.Group, wavelength_nm: NDArray[np.float64], fwhm_nm: NDArray[np.float64] | None) -> str:
     """Store the coordinates of ``band`` and give their names for a ``coordinates`` attribute."""
     centre = np.asarray(wavelength_nm, np.float64)
-    if centre.ndim != 1 or not centre.size:
-        raise WavelengthError(f"wavelengths have shape {centre.shape}, expected (band,) with at least one band")
     about = {"standard_name": "radiation_wavelength", "long_name": "wavelength at the band's centre", "units": "nm"}
     write_small(group, "wavelength", ("band",), centre, about)
     # the same under the axis's own name: xarray makes an index of it, so that .sel(band=660, method="nearest") works
     write_small(group, "band", ("band",), centre, about)
     if fwhm_nm is None:
         return "wavelength"
-    widths = np.asarray(fwhm_nm, np.float64)
-    if widths.shape != centre.shape:
-        raise ShapeError(f"fwhm has shape {widths.shape}, wavelengths {centre.shape}; give one a band")
-    write_small(group, "fwhm", ("band",), widths, {"long_name": "full width at half maximum", "units": "nm"})
+    write_small(
+        group, "fwhm", ("band",), np.asarray(fwhm_nm), {"long_name": "full width at half maximum", "units": "nm"}
+    )
     return "wavelength fwhm"
 
 
@@ -227,12 +231,19 @@ def consolidate_stores(folder: Path) -> None:
                 zarr.consolidate_metadata(path)
 
 
-def open_group(path: StorePlace) -> zarr.Group:
-    """Open a store for reading (IncompleteStoreError: there is none, or its metadata is damaged)."""
-    try:
-        return zarr.open_group(path, mode="r", zarr_format=3, use_consolidated=False)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise IncompleteStoreError(f"{path} is no readable Zarr store ({error}); run verify on the archive") from error
+def open_group(path: StorePlace, mode: Literal["r", "r+"] = "r") -> zarr.Group:
+    """Open a store (IncompleteStoreError: there is none, or its metadata is damaged)."""
+    with damage_named(str(path)):
+        return zarr.open_group(path, mode=mode, zarr_format=3, use_consolidated=False)
+
+
+def array_of(group: zarr.Group, name: str) -> zarr.Array[Any]:
+    """Return one array of a store, unread (IncompleteStoreError: there is none)."""
+    with damage_named(f"{group.store_path}/{name}"):
+        array = group[name]
+        if not isinstance(array, zarr.Array):
+            raise KeyError(f"{name} is no array")
+        return array
 
 
 def read_array(group: zarr.Group, name: str, selection: Any = ...) -> NDArray[Any]:
@@ -240,10 +251,8 @@ def read_array(group: zarr.Group, name: str, selection: Any = ...) -> NDArray[An
 
     Raises IncompleteStoreError: there is no such array, or a checksum says that its bytes have changed.
     """
+    array = array_of(group, name)
     with damage_named(f"{group.store_path}/{name}"):
-        array = group[name]
-        if not isinstance(array, zarr.Array):
-            raise KeyError(f"{name} is no array")
         return np.asarray(array[selection])
 
 
@@ -281,10 +290,9 @@ def blank_pixels(path: Path, where: NDArray[np.bool_], images: Mapping[str, floa
 
     Raises IncompleteStoreError: an image is missing or damaged.
     """
-    with damage_named(str(path)):
-        group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
-        arrays = {name: array for name in images if isinstance(array := group[name], zarr.Array)}
-    for name, array in arrays.items():
+    group = open_group(path, "r+")
+    for name in images:
+        array = array_of(group, name)
         cubes = array.ndim - 2 if array.metadata.dimension_names[-1] == "x" else 0  # type: ignore[union-attr, index]
         sizes = (array.shards or array.chunks)[cubes : cubes + 2]
         for top, left in product(*(range(0, size, step) for size, step in zip(where.shape, sizes, strict=True))):
@@ -294,11 +302,3 @@ def blank_pixels(path: Path, where: NDArray[np.bool_], images: Mapping[str, floa
                 values = read_array(group, name, place).copy()
                 values[(slice(None),) * cubes + (gaps,)] = images[name]
                 array[place] = values
-
-
-def blank_coarse(missing: NDArray[np.bool_], factor: int) -> NDArray[np.bool_]:
-    """Return (y, x) which coarse pixels of ``factor`` px a side lie less than half on the scene."""
-    starts = [np.arange(0, side, factor) for side in missing.shape]
-    gaps = np.add.reduceat(np.add.reduceat(missing.astype(np.int32), starts[0], axis=0), starts[1], axis=1)
-    down, across = (np.minimum(factor, side - first) for first, side in zip(starts, missing.shape, strict=True))
-    return np.asarray(2 * gaps > down[:, None] * across)

@@ -19,25 +19,25 @@ from storage.arrays.georeference import create_placed_group
 from storage.arrays.layout import (
     SHARD_ROWS,
     AngularGrid,
+    array_of,
     create_array,
     create_group,
-    damage_named,
     grid_of,
     image_spec,
     open_group,
     read_array,
     read_bands,
-    whole_shards,
+    tile_place,
     write_bands,
     write_counts,
     write_image,
 )
-from storage.arrays.quicklooks import Quicklook, write_quicklook
 from storage.arrays.signal_cubes import (
     LARGEST_SHORT,
     check_condensed,
     read_components,
     score_spec,
+    step_of,
     steps_within,
     write_components,
 )
@@ -84,14 +84,9 @@ class MosaicWriter:
         Raises IncompleteStoreError: no mosaic has been begun there.
         """
         writer = cls.__new__(cls)
-        writer.path = path
-        with damage_named(str(path)):
-            writer.group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
-            scores, coverage = (writer.group[name] for name in ("scores", "coverage"))
-            if not isinstance(scores, zarr.Array) or not isinstance(coverage, zarr.Array):
-                raise KeyError("scores and coverage are no arrays")
-            step = float(scores.attrs["scale_factor"])  # type: ignore[arg-type]
-        writer._scores, writer._coverage, writer._step = scores, coverage, step
+        writer.path, writer.group = path, open_group(path, "r+")
+        writer._scores, writer._coverage = (array_of(writer.group, name) for name in ("scores", "coverage"))
+        writer._step = step_of(writer.group)
         return writer
 
     @property
@@ -109,19 +104,13 @@ class MosaicWriter:
     ) -> None:
         """Store (y, x, component) scores, NaN where nothing was seen, and (y, x) coverage of whole shards.
 
-        Threads may write different tiles at once. Raises ChunkError: the tile splits a shard. ShapeError: the tile does
-        not fit the mosaic.
+        Threads may write different tiles at once. Raises ChunkError: the tile splits a shard. ShapeError: scores and
+        coverage are not of one tile.
         """
-        count, *shape = self._scores.shape
-        rows = slice(first_row, first_row + scores.shape[0])
-        columns = slice(first_column, first_column + scores.shape[1])
-        beyond = rows.stop > shape[0] or columns.stop > shape[1]
-        if scores.shape[2:] != (count,) or coverage.shape != scores.shape[:2] or beyond:
-            raise ShapeError(
-                f"the tile at row {first_row}, column {first_column} has shapes {scores.shape} and {coverage.shape}; "
-                f"the mosaic is {(*shape, count)}"
-            )
-        whole_shards("the mosaic", (rows, columns), shape, self.tile_shape)
+        count = self._scores.shape[0]
+        if scores.shape != (*coverage.shape, count):  # Zarr would repeat what is too little
+            raise ShapeError(f"a tile of the mosaic has the shape {scores.shape}, expected {(*coverage.shape, count)}")
+        rows, columns = tile_place("the mosaic", (first_row, first_column), coverage.shape, self._coverage)
         seen = coverage > 0
         if count:
             steps = steps_within(scores, self._step, self._scores.dtype)
@@ -143,16 +132,10 @@ class MosaicWriter:
         about = {"long_name": "kind of capture", "units": "1", "kinds": [list(one) for one in specs]}
         write_image(self.group, CAPTURES, ("y", "x"), number, about)
 
-    def write_quicklook(self, image: NDArray[np.uint8]) -> None:
-        """Store a small colour picture, (y, x, 3) uint8, beside the mosaic."""
-        write_quicklook(self.group, Quicklook(image))
-
 
 def nothing_seen(path: Path) -> dict[str, float]:
     """Return the value of a pixel that shows no scene, by the names of a mosaic's images."""
-    scores = open_group(path)["scores"]
-    assert isinstance(scores, zarr.Array)
-    return {"scores": _unseen(scores.dtype.str), "coverage": 0}
+    return {"scores": _unseen(array_of(open_group(path), "scores").dtype.str), "coverage": 0}
 
 
 def _unseen(dtype: str) -> int:
@@ -215,8 +198,8 @@ class Mosaic:
     @property
     def shape(self) -> tuple[int, int]:
         """(y, x) [px]."""
-        y, x = self.group["coverage"].shape  # type: ignore[union-attr]
-        return int(y), int(x)
+        y, x = array_of(self.group, "coverage").shape
+        return y, x
 
     @property
     def factor(self) -> int:
@@ -321,9 +304,7 @@ def open_mosaic(path: Path) -> Mosaic:
     group = open_group(path)
     check_condensed(group, path)
     wavelength, fwhm = read_bands(group)
-    with damage_named(str(path)):
-        step = float(group["scores"].attrs["scale_factor"])  # type: ignore[arg-type]
-    return Mosaic(group, read_components(group), step, wavelength, fwhm, grid_of(dict(group.attrs)))
+    return Mosaic(group, read_components(group), step_of(group), wavelength, fwhm, grid_of(dict(group.attrs)))
 
 
 @dataclass(frozen=True)
@@ -337,11 +318,7 @@ class Attention:
 
 
 def write_attention(path: Path, attention: Attention) -> None:
-    """Store scores and ranks (ShapeError: they have different shapes)."""
-    if attention.score.shape != attention.rank.shape or attention.score.ndim != 2:
-        raise ShapeError(
-            f"score {attention.score.shape} and rank {attention.rank.shape} must both be (patch_y, patch_x)"
-        )
+    """Store scores and ranks."""
     group = create_group(path, "attention", {"policy": attention.policy})
     write_counts(group, patch_y=attention.score.shape[0], patch_x=attention.score.shape[1])
     dims = ("patch_y", "patch_x")

@@ -41,6 +41,7 @@ from storage.arrays.layout import (
     SHARD_ROWS,
     ArraySpec,
     StorePlace,
+    array_of,
     bytes_held,
     create_array,
     create_group,
@@ -258,15 +259,19 @@ def check_condensed(group: zarr.Group, path: StorePlace) -> None:
         raise OldStoreError(f"{path} holds spectra band by band, as earlier versions stored them; {REPROCESS}")
 
 
+def step_of(group: zarr.Group, said: str = "scale_factor") -> float:
+    """Return a step of the scores of a store, or another number that they say (IncompleteStoreError: damaged)."""
+    scores = array_of(group, "scores")
+    with damage_named(str(group.store_path)):
+        return float(scores.attrs[said])  # type: ignore[arg-type]
+
+
 def score_layout(group: zarr.Group) -> tuple[tuple[int, int], tuple[int, int]]:
     """Return the rows and columns of a store of scores, and of one of its files.
 
     Raises IncompleteStoreError: it is damaged.
     """
-    with damage_named(str(group.store_path)):
-        scores = group["scores"]
-        if not isinstance(scores, zarr.Array):
-            raise TypeError("scores are no array")
+    scores = array_of(group, "scores")
     (_, rows, columns), (_, deep, wide) = scores.shape, scores.shards or scores.chunks
     return (rows, columns), (deep, wide)
 
@@ -288,13 +293,11 @@ def open_signal_cube(path: StorePlace) -> SignalCube:
     """
     group = open_group(path)
     check_condensed(group, path)
-    with damage_named(str(path)):
-        step, largest = (float(group["scores"].attrs[name]) for name in ("scale_factor", "largest"))  # type: ignore[arg-type]
     return SignalCube(
         **read_line_facts(group, path),
         components=read_components(group),
-        step=step,
-        largest=largest,
+        step=step_of(group),
+        largest=step_of(group, "largest"),
         path=path if isinstance(path, Path) else None,
     )
 

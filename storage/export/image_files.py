@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from pipeline.errors import ArchiveError, PoseError, ShapeError
+from pipeline.rig.camera.envi_headers import DATA_TYPES
 from storage.archive.whole_files import make_folder, write_whole, written_aside
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.cubes import RawCube
 from storage.arrays.layout import SHARD_ROWS, AngularGrid
-from storage.readers.envi_files import DATA_TYPES
 
 TILE = 512  # px: rasters within one tile need no overviews
 OUTSIDE = 0.02  # fraction of pixels that a style's colours end before, at either end
@@ -123,15 +123,24 @@ def _write_plain(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> 
             file.update_tags(1, **flags)
             colours = enumerate(image.legend.colours.tolist())
             file.write_colormap(1, {number: (*colour, 255) for number, colour in colours})
-        reached = 0
-        for first, values in blocks:
-            planes = np.moveaxis(values.reshape(*values.shape[:2], -1), -1, 0)
-            if first != reached or planes.shape != (len(image.bands), planes.shape[1], x):
-                raise ShapeError(f"{path.name}: rows from {first} with shape {values.shape} do not follow {reached}")
-            file.write(planes.astype(image.dtype, copy=False), window=((first, first + planes.shape[1]), (0, x)))
-            reached += planes.shape[1]
-    if reached != y:
-        raise ShapeError(f"{path.name}: {reached} of {y} rows were given")
+        for first, values in _in_order(path.name, blocks, (y, x, len(image.bands))):
+            planes = np.moveaxis(values, -1, 0)
+            file.write(planes.astype(image.dtype, copy=False), window=((first, first + len(values)), (0, x)))
+
+
+def _in_order(name: str, blocks: Blocks, shape: tuple[int, int, int]) -> Iterator[tuple[int, NDArray[Any]]]:
+    """Yield the blocks of a file of (row, x, band) ``shape`` (ShapeError: they do not fill it)."""
+    reached = 0
+    for first, values in blocks:
+        block = values.reshape(*values.shape[:2], -1)
+        if first != reached or block.shape[1:] != shape[1:] or first + len(block) > shape[0]:
+            raise ShapeError(
+                f"{name}: rows from {first} with shape {values.shape} do not follow {reached} of a file of {shape}"
+            )
+        yield first, block
+        reached += len(block)
+    if reached != shape[0]:
+        raise ShapeError(f"{name}: {reached} of {shape[0]} rows were given")
 
 
 def _tag_wavelengths(file: Any, image: CogImage) -> None:
@@ -195,17 +204,8 @@ def write_envi(header: Path, file: EnviFile, blocks: Blocks) -> Path:
     text = "".join(["ENVI\n", *(f"{key} = {value}\n" for key, value in _header_fields(file, kind))])
     with written_aside(header.parent, [data.name, header.name]) as aside:
         with (aside / data.name).open("wb") as stream:
-            reached = 0
-            for first, values in blocks:
-                if first != reached or values.shape[1:] != file.shape[1:] or first + len(values) > file.shape[0]:
-                    raise ShapeError(
-                        f"{data.name}: lines from {first} with shape {values.shape} do not follow {reached} of a file "
-                        f"of {file.shape} (line, sample, band)"
-                    )
+            for _, values in _in_order(data.name, blocks, file.shape):
                 stream.write(np.ascontiguousarray(values.transpose(0, 2, 1), kind).data)
-                reached += len(values)
-        if reached != file.shape[0]:
-            raise ShapeError(f"{data.name}: {reached} of {file.shape[0]} lines were given")
         (aside / header.name).write_text(text, encoding="utf-8")
     return data
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Container, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,9 @@ from pipeline.errors import SceneError, SeriesError
 from pipeline.rig.camera.camera_texts import MICROMETRES, NANOMETRES, UNSAID
 from storage.arrays.georeference import find_geobox
 from storage.readers.cube_sources import Bands, CubeSource, unpacked
+
+if TYPE_CHECKING:
+    from odc.geo.geobox import GeoBox
 
 ROWS = ("y", "line", "lines", "row", "rows", "lat", "latitude", "northing", "downtrack", "along_track")
 _ACROSS = ("crosstrack", "across_track")
@@ -135,11 +138,8 @@ def cube_source(
         native = native[..., None] if native.ndim == 2 else native
         return native if plain else unpacked(native, 1.0 if scale is None else scale, offset or 0.0, fill)
 
-    notes, geobox = cube.notes, None
-    try:
-        geobox = find_geobox(attributes, arrays, (sizes[0], sizes[1]), (cube.dims[order[0]], cube.dims[order[1]]))
-    except Exception as error:  # attributes of anyone's may hold anything
-        notes = (*notes, f"its place on the earth cannot be read: {error}")
+    dims = cube.dims[order[0]], cube.dims[order[1]]
+    geobox, notes = place_said(lambda: find_geobox(attributes, arrays, (sizes[0], sizes[1]), dims))
     return CubeSource(
         name=path.name,
         shape=(sizes[0], sizes[1], sizes[2] if len(sizes) == 3 else 1),
@@ -149,8 +149,16 @@ def cube_source(
         bands=_bands_of(cube, arrays, sizes[2] if len(sizes) == 3 else 1),
         nodata=fill if plain else None,
         geobox=geobox,
-        notes=notes,
+        notes=(*cube.notes, *notes),
     )
+
+
+def place_said(find: Callable[[], GeoBox | None]) -> tuple[GeoBox | None, tuple[str, ...]]:
+    """Return a place, or a note on why it cannot be read: attributes of anyone's may hold anything."""
+    try:
+        return find(), ()
+    except Exception as error:  # of PROJ, too
+        return None, (f"its place on the earth cannot be read: {type(error).__name__}: {error}",)
 
 
 def _fill(array: Any) -> float | None:
@@ -176,7 +184,7 @@ def _bands_of(cube: ArrayCube, arrays: Arrays, count: int) -> Bands:
     unit = _unit(arrays[found].attrs)
     scale = _scale(unit, float(centres.max()))
     if scale is None or not (np.isfinite(centres) & (centres > 0)).all():
-        return Bands(units=unit)
+        return Bands()
     stated = f"in {unit}" if unit not in UNSAID else "without a unit, read by their size"
     beside, widths = _vector(arrays, ("fwhm",), count), None
     if beside is not None:
@@ -184,7 +192,7 @@ def _bands_of(cube: ArrayCube, arrays: Arrays, count: int) -> Bands:
         widths = np.asarray(arrays[beside][...], np.float64).ravel()
         widths = widths * (scale if own in UNSAID else _scale(own, 0.0) or np.nan)
         widths = widths if (widths > 0).all() else None
-    return Bands(centres * scale, widths, unit, f"wavelengths from the array {found}, {stated}")
+    return Bands(centres * scale, widths, f"wavelengths from the array {found}, {stated}")
 
 
 _AXES = {(False, False): (3, 4, 2), (True, False): (2, 3), (False, True): (4,), (True, True): (3, 4)}

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.lazy import deferred
-from storage.readers.array_cubes import UNNAMED, ArrayCube, FileArray, cube_source, find_cube, names_beside
+from storage.readers.array_cubes import UNNAMED, ArrayCube, FileArray, cube_source, find_cube, names_beside, place_said
 from storage.readers.cube_sources import (
     BLOCK_LINES,
     DEFLATE_RATIO,
@@ -59,7 +59,6 @@ KIND = "NetCDF or HDF5"
 HDF_ENDINGS = (".nc", ".nc4", ".h5", ".hdf5", ".he5")
 GOOD_BANDS = ("good_wavelengths", "good_bands", "bbl")  # 0 marks a bad band
 NO_UNIT = ("", "1", "unitless", "none", "dimensionless")
-_CLASSIC = b"CDF"  # how NetCDF files of version 3 begin
 _ONLY_A_DIMENSION = "This is a netCDF dimension but not a netCDF variable"
 _PRISMA = "HDFEOS/SWATHS/PRS_L2{}_HCO/Data Fields/{}_Cube"
 _PRISMA_TOP = 65535  # the number that stands for the greatest value
@@ -77,9 +76,7 @@ def open_hdf_cube(path: Path, variable: str | None = None, *, labels: bool = Fal
     y, x and band.
     """
     with reading(path, KIND):
-        with path.open("rb") as file:
-            classic = file.read(3) == _CLASSIC
-        arrays, attributes = _classic_arrays(path) if classic else _hdf_arrays(path)
+        arrays, attributes = _hdf_arrays(path) if h5py.is_hdf5(path) else _classic_arrays(path)
         level = next((one for one in "DCB" if _PRISMA.format(one, "VNIR") in arrays), None)
         if level is not None and variable is None:
             return _prisma_cube(path, level, arrays, attributes)
@@ -123,19 +120,9 @@ def _other_place(
     """Return the place by NEON's map info and EPSG code; else a note where the file has a place that is not read."""
     folder = f"{cube.name.rpartition('/')[0]}/Metadata/Coordinate_System"
     if f"{folder}/Map_Info" in arrays and f"{folder}/EPSG Code" in arrays:
-        told = [
-            np.asarray(arrays[f"{folder}/{name}"][()]).astype(np.str_).reshape(-1)[0]
-            for name in ("Map_Info", "EPSG Code")
-        ]
-        try:
-            words = [word.strip() for word in told[0].split(",")]
-            x, y, east, north, wide, high = map(float, words[1:7])
-            if any(word.lower().startswith("rotation") and float(word.partition("=")[2]) for word in words):
-                raise ValueError("it is turned")
-            corner = Affine(wide, 0, east - (x - 1) * wide, 0, -high, north + (y - 1) * high)
-            return odc_geobox.GeoBox(shape[:2], corner, f"EPSG:{int(told[1])}"), ()
-        except Exception as error:  # of PROJ, too
-            return None, (f"its place on the earth cannot be read: map info {told[0]!r}: {error}",)
+        texts = [arrays[f"{folder}/{name}"][()] for name in ("Map_Info", "EPSG Code")]
+        info, code = (str(np.asarray(text).astype(np.str_).reshape(-1)[0]) for text in texts)
+        return place_said(lambda: _place_of_neon(info, code, shape[:2]))
     names = {name.rpartition("/")[2].lower() for name, array in arrays.items() if array.ndim == 2}
     if "glt_x" in names:
         return None, (
@@ -145,6 +132,15 @@ def _other_place(
     if {"lat", "latitude"} & names:
         return None, ("its place is given by a latitude and longitude of each pixel, which are not read",)
     return None, ()
+
+
+def _place_of_neon(info: str, code: str, shape: tuple[int, int]) -> GeoBox:
+    words = [word.strip() for word in info.split(",")]
+    x, y, east, north, wide, high = map(float, words[1:7])
+    if any(word.lower().startswith("rotation") and float(word.partition("=")[2]) for word in words):
+        raise ValueError(f"map info {info!r} is turned")
+    corner = Affine(wide, 0, east - (x - 1) * wide, 0, -high, north + (y - 1) * high)
+    return odc_geobox.GeoBox(shape, corner, f"EPSG:{int(code)}")
 
 
 def _prisma_cube(path: Path, level: str, arrays: Mapping[str, FileArray], about: Mapping[str, Any]) -> CubeSource:
@@ -186,7 +182,9 @@ def _prisma_cube(path: Path, level: str, arrays: Mapping[str, FileArray], about:
 
     chunk = max((array.chunks or (1,))[0] for array, _, _ in parts)
     check_memory(path, max(chunk, BLOCK_LINES) * samples * len(centres) * 8)
-    geobox, notes = _prisma_place(about, (lines, samples)) if level == "D" else (None, ("it has no map grid",))
+    geobox, notes = None, tuple[str, ...](["it has no map grid"])
+    if level == "D":
+        geobox, notes = place_said(lambda: _place_of_prisma(about, (lines, samples)))
     unused = len(centres) - len(order)
     return CubeSource(
         name=path.name,
@@ -194,24 +192,20 @@ def _prisma_cube(path: Path, level: str, arrays: Mapping[str, FileArray], about:
         dtype=np.dtype(np.float32),
         read=read_by_chunks(read, lines, chunk),
         files=(path,),
-        bands=Bands(np.array(centres)[order], np.array(widths)[order], "nm", "wavelengths from List_Cw of the file"),
+        bands=Bands(np.array(centres)[order], np.array(widths)[order], "wavelengths from List_Cw of the file"),
         geobox=geobox,
         notes=(f"a PRISMA product of level 2{level}; {unused} bands without a wavelength are left out", *notes),
     )
 
 
-def _prisma_place(about: Mapping[str, Any], shape: tuple[int, int]) -> tuple[GeoBox | None, tuple[str, ...]]:
+def _place_of_prisma(about: Mapping[str, Any], shape: tuple[int, int]) -> GeoBox:
     """Return the grid between the centres of the upper left and the lower right pixel."""
-    try:
-        (west, north), (east, south) = (
-            [float(about[f"Product_{corner}corner_{axis}"]) for axis in ("easting", "northing")]
-            for corner in ("UL", "LR")
-        )
-        wide, high = (east - west) / (shape[1] - 1), (north - south) / (shape[0] - 1)
-        corner = Affine(wide, 0, west - wide / 2, 0, -high, north + high / 2)
-        return odc_geobox.GeoBox(shape, corner, f"EPSG:{int(about['Epsg_Code'])}"), ()
-    except Exception as error:  # attributes may be missing or hold anything; of PROJ, too
-        return None, (f"its place on the earth cannot be read: {type(error).__name__}: {error}",)
+    (west, north), (east, south) = (
+        [float(about[f"Product_{corner}corner_{axis}"]) for axis in ("easting", "northing")] for corner in ("UL", "LR")
+    )
+    wide, high = (east - west) / (shape[1] - 1), (north - south) / (shape[0] - 1)
+    corner = Affine(wide, 0, west - wide / 2, 0, -high, north + high / 2)
+    return odc_geobox.GeoBox(shape, corner, f"EPSG:{int(about['Epsg_Code'])}")
 
 
 def _in_scope(arrays: Mapping[str, Any], name: str) -> dict[str, Any]:
@@ -335,7 +329,7 @@ def open_array_file(path: Path, variable: str | None = None, *, labels: bool = F
         elif path.suffix.lower() == ".npz":
             arrays = _npz_arrays(path)
         else:
-            arrays = _mat73_arrays(path) if _is_hdf(path) else _mat_arrays(path)
+            arrays = _mat73_arrays(path) if h5py.is_hdf5(path) else _mat_arrays(path)
         tables = find_tables(arrays)
         cube = find_cube(
             arrays | {name: table.shaped(arrays[name]) for name, table in tables.items()}, variable, path, labels=labels
@@ -388,13 +382,6 @@ def _member(path: Path, member: zipfile.ZipInfo, claimed: int) -> NDArray[Any]:
     check_memory(where, member.file_size)
     with zipfile.ZipFile(path) as pack, pack.open(member) as stream:
         return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
-
-
-def _is_hdf(path: Path) -> bool:
-    """Return whether a .mat file is of version 7.3, which is HDF5 behind 512 bytes of MATLAB's own."""
-    with path.open("rb") as file:
-        head = file.read(520)
-    return b"\x89HDF\r\n\x1a\n" in (head[:8], head[512:])
 
 
 def _mat_arrays(path: Path) -> dict[str, FileArray]:

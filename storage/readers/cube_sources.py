@@ -9,6 +9,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, Any
@@ -93,7 +94,6 @@ class LineFacts:
     time_s: NDArray[np.float64] | None = None  # (line,) since the first stamp; NaN where not known
     exposure_ms: NDArray[np.float64] | None = None  # (line,)
     frame: NDArray[np.int64] | None = None  # (line,) as the camera counts; -1 where not known
-    first_stamp_us: int | None = None
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,6 @@ class Bands:
 
     wavelength_nm: NDArray[np.float64] | None = None  # (band,)
     fwhm_nm: NDArray[np.float64] | None = None  # (band,)
-    units: str = ""  # of wavelengths, as the file says them
     origin: str = ""  # one sentence
 
 
@@ -125,8 +124,7 @@ class CubeSource:
     void: NDArray[np.bool_] | None = None  # (line, sample) transparent or masked, which have no value
     scaling: str = ""  # scale and offset that were applied to the file's numbers, for hashes
     headers: Mapping[str, str] = field(default_factory=dict)  # file name -> its text
-    root: Path | None = None  # of a store whose files' names count, too
-    by_names: tuple[tuple[int, ...], ...] = ()  # numbers in the files' names, where lines or times follow from them
+    root: Path | None = None  # of a store or folder whose files' names count, too
     notes: tuple[str, ...] = ()
 
     @property
@@ -177,22 +175,17 @@ def read_by_chunks(read: ReadLines, lines: int, chunk_lines: int) -> ReadLines:
     """
     if chunk_lines <= 1:
         return read
-    kept: dict[int, NDArray[Any]] = {}
     lock = Lock()
 
+    @lru_cache(maxsize=1)
     def chunk(number: int) -> NDArray[Any]:
-        if number not in kept:
-            kept.clear()
-            kept[number] = read(number * chunk_lines, min((number + 1) * chunk_lines, lines))
-        return kept[number]
+        return read(number * chunk_lines, min((number + 1) * chunk_lines, lines))
 
     def read_lines(start: int, stop: int) -> NDArray[Any]:
         """Return some lines (line, sample, band)."""
+        numbers = range(start // chunk_lines, -(-stop // chunk_lines))
         with lock:
-            numbers = range(start // chunk_lines, -(-stop // chunk_lines))
-            parts = [
-                chunk(number)[max(start - number * chunk_lines, 0) : stop - number * chunk_lines] for number in numbers
-            ]
+            parts = [chunk(at)[max(start - at * chunk_lines, 0) : stop - at * chunk_lines] for at in numbers]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     return read_lines

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -106,8 +106,10 @@ class DataSet:
             return scene
         train, rest = split_labels(scene, self.train_mask, self.mask_classes)
         if part == "train":
-            return scene.with_labels(train, f"labels only where {self.train_mask} says so: training")
-        return scene.with_labels(rest, f"labels only where {self.train_mask} does not train: test")
+            chosen, note = train, f"labels only where {self.train_mask} says so: training"
+        else:
+            chosen, note = rest, f"labels only where {self.train_mask} does not train: test"
+        return replace(scene, labels=chosen, provenance=(*scene.provenance, note))
 
 
 def load_data_set(

@@ -14,9 +14,8 @@ references of a real MV.X.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -30,45 +29,18 @@ from pipeline.rig.camera.camera_texts import (
     FrameIndex,
     LineTimes,
     finite_number,
-    listed_numbers,
     parse_frame_index,
-    split_header,
+    place_parts,
     times_of_lines,
-    wavelengths_nm,
 )
+from pipeline.rig.camera.envi_headers import EnviHeader, parse_envi_header
 from storage.readers.cube_sources import MOST_MISSING, Bands, CubeSource, LineFacts
 from storage.readers.image_files import bad_bands, place_of_envi, rescaled
 
-LARGEST_HEADER = 1 << 22  # bytes; the largest seen holds 33 thousand
-INTERLEAVES = ("bil", "bip", "bsq")
-# data type codes of the format's description
-_CODES = (1, 2, 3, 4, 5, 6, 9, 12, 13, 14, 15)
-DATA_TYPES = dict(zip(_CODES, ("u1", "i2", "i4", "f4", "f8", "c8", "c16", "u2", "u4", "i8", "u8"), strict=True))
-# of these a header describes another kind of file than plain numbers
-OTHER_FILES = ("tiff", "jpeg", "jp2", "png", "bmp", "hdf", "netcdf", "nitf", "virtual", "meta")
 # where a data file's name may differ from its header's
 DATA_ENDINGS = ("", ".bin", ".dat", ".img", ".raw", ".bil", ".bip", ".bsq", ".cube")
 _PART = re.compile(r"raw_(\d{1,12})(\.[A-Za-z]{1,4})?", re.IGNORECASE)
 _EXPOSURE = "exposure (ms)"  # a setting in the comments of Headwall's headers
-
-
-@dataclass(frozen=True)
-class EnviHeader:
-    """The content of one header; what it leaves out is None."""
-
-    samples: int
-    lines: int | None  # None: as many as the data file holds
-    bands: int
-    dtype: np.dtype[np.generic]  # with its byte order
-    interleave: str  # bil, bip or bsq
-    offset: int  # bytes before the numbers
-    kind: str  # file type, such as ENVI Standard or ENVI Spectral Library
-    wavelength_nm: NDArray[np.float64] | None  # (band,)
-    fwhm_nm: NDArray[np.float64] | None  # (band,)
-    nodata: float | None
-    fields: Mapping[str, str]  # all of them as written, keys in lower case, the outer braces taken off
-    settings: Mapping[str, str]  # of the lines that begin with ;
-    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -82,6 +54,11 @@ class EnviCube:
     lost_lines: int  # that the header states and the file does not hold whole
     notes: tuple[str, ...]
 
+    @property
+    def frames(self) -> tuple[Any, ...]:
+        """Return the size and type of a frame, which all of one cube have."""
+        return self.values.shape[1:], self.values.dtype
+
 
 def open_envi_cube(path: str | Path) -> EnviCube:
     """Open a cube by its header or its data file, of any interleave, type, byte order and header offset.
@@ -94,7 +71,7 @@ def open_envi_cube(path: str | Path) -> EnviCube:
     if "spectral library" in header.kind.lower():
         raise SceneError(f"{header_path} describes a spectral library, expected a cube (line, sample, band)")
     size, item = data_path.stat().st_size - header.offset, header.dtype.itemsize
-    samples, bands, line_bytes = header.samples, header.bands, header.samples * header.bands * item
+    samples, bands, line_bytes = header.samples, header.bands, header.line_bytes
     promised = size // line_bytes if header.lines is None else header.lines
     whole = size // line_bytes
     if header.interleave == "bsq":  # band after band: the last one says how far all of them reach
@@ -145,94 +122,17 @@ def find_envi_pair(path: Path) -> tuple[Path, Path]:
 
 def load_envi_header(path: Path) -> EnviHeader:
     """Read one header file (SceneError: there is no such file, or it is no ENVI header that can be used)."""
+    if path.exists() and not path.is_file():  # reading a pipe may never end
+        raise SceneError(f"{path} is no file; name an ENVI header")
     try:
-        if path.exists() and not path.is_file():
-            raise SceneError(f"{path} is no file; name an ENVI header")
-        if path.stat().st_size > LARGEST_HEADER:
-            raise SceneError(f"{path} has {path.stat().st_size} bytes, too many for a header; name the .hdr file")
         content = path.read_bytes()
     except OSError as error:
         raise SceneError(f"{path} cannot be read: {error}; name an ENVI header") from error
-    if b"\0" in content:
-        raise SceneError(f"{path} holds binary data, expected the text of an ENVI header; name the .hdr file")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
         text = content.decode("latin-1")
     return parse_envi_header(text, str(path))
-
-
-def parse_envi_header(text: str, where: str = "the header") -> EnviHeader:
-    """Read a header's text; messages call it ``where``.
-
-    Wavelengths come out in nm. Without a unit they are read as nm or micrometres by their size, and a note says so.
-    Wavelengths that do not fit the bands are left out with a note. Raises SceneError: it does not begin with ENVI
-    (ArcGIS headers do not), or a size, type or interleave is missing or impossible. So does a file that holds more than
-    plain numbers (compressed, with bytes between frames).
-    """
-    notes: list[str] = []
-    fields, settings = split_header(text, where, notes)
-    samples, bands = (_whole(fields, key, where, least=1) for key in ("samples", "bands"))
-    kind = fields.get("file type", "ENVI Standard")
-    _refuse_layouts(fields, kind, where)
-    channels = samples if "spectral library" in kind.lower() else bands
-    wavelength, scale = wavelengths_nm(fields, channels, notes)
-    code = _whole(fields, "data type", where, least=1)
-    if code not in DATA_TYPES:
-        raise SceneError(f"{where}: data type = {code} is none of ENVI's {', '.join(map(str, DATA_TYPES))}; correct it")
-    if "byte order" not in fields and np.dtype(DATA_TYPES[code]).itemsize > 1:
-        notes.append("the byte order is not said, taken as little endian")
-    order = _whole(fields, "byte order", where, least=0, otherwise=0)
-    if order > 1:
-        raise SceneError(f"{where}: byte order = {order}, expected 0 (little endian) or 1 (big endian); correct it")
-    interleave = fields.get("interleave", "").strip().lower()
-    if "interleave" not in fields and bands == 1:
-        notes.append("the interleave is not said, and with one band does not matter")
-        interleave = "bsq"
-    if interleave not in INTERLEAVES:
-        says = f"interleave = {interleave!r}" if interleave else "no interleave"
-        raise SceneError(f"{where}: {says}, expected one of {', '.join(INTERLEAVES)}; correct it")
-    widths = None if wavelength is None else listed_numbers(fields, "fwhm", channels, notes)
-    return EnviHeader(
-        samples=samples,
-        lines=_whole(fields, "lines", where, least=0) if "lines" in fields else None,
-        bands=bands,
-        dtype=np.dtype(("<", ">")[order] + DATA_TYPES[code]),
-        interleave=interleave,
-        offset=_whole(fields, "header offset", where, least=0, otherwise=0),
-        kind=kind,
-        wavelength_nm=wavelength,
-        fwhm_nm=None if widths is None or not (widths > 0).all() else widths * scale,
-        nodata=finite_number(fields.get("data ignore value", "")),
-        fields=fields,
-        settings=settings,
-        notes=tuple(notes),
-    )
-
-
-def _whole(fields: Mapping[str, str], key: str, where: str, *, least: int, otherwise: int | None = None) -> int:
-    if key not in fields and otherwise is not None:
-        return otherwise
-    if key not in fields:
-        raise SceneError(f"{where} does not say {key}; add the line '{key} = ...'")
-    number = finite_number(fields[key])
-    if number is None or number != int(number) or number < least:
-        raise SceneError(f"{where}: {key} = {fields[key]!r}, expected a whole number from {least}; correct it")
-    return int(number)
-
-
-def _refuse_layouts(fields: Mapping[str, str], kind: str, where: str) -> None:
-    """Refuse files whose numbers do not simply follow each other: they would be read as other numbers (SceneError)."""
-    if finite_number(fields.get("file compression", "0")) != 0:
-        raise SceneError(f"{where}: file compression = {fields['file compression']!r}, expected 0; unpack the file")
-    for key in ("major frame offsets", "minor frame offsets"):
-        words = [word for word in re.split(r"[,\s]+", fields.get(key, "")) if word]
-        if any(finite_number(word) != 0 for word in words):
-            raise SceneError(
-                f"{where}: {key} = {fields[key]!r} puts bytes between frames, which is not read; store them without"
-            )
-    if any(word in kind.lower() for word in OTHER_FILES):
-        raise SceneError(f"{where}: file type = {kind!r}, expected plain numbers (ENVI Standard); name the file itself")
 
 
 # --- cubes of one file or several -------------------------------------------------------------------------------------
@@ -265,51 +165,44 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     cut off. A part without any byte is left out. Raises SceneError: a part cannot be used, parts differ in their
     frames, or too many lines between them are missing.
     """
-    headers, notes = _headers(folder), list[str]()
+    headers, notes, opened = _headers(folder), list[str](), dict[int, EnviCube]()
     if not headers:
         raise SceneError(
             f"{folder} is a folder, expected a file, a Zarr store, or a folder with raw_<frame> files of a Headwall "
             "camera; name one of the files in it"
         )
-    opened: dict[int, EnviCube] = {}
     for number, header in headers.items():
-        _, data = find_envi_pair(header)
+        data = find_envi_pair(header)[1]
         if data.stat().st_size == 0:
             notes.append(f"{data.name} is empty and left out")
         else:
             opened[number] = open_envi_cube(header)
     if not opened:
         raise SceneError(f"every part of {folder} is empty; copy the folder again")
-    parts = _placed(opened, notes)
-    source = _joined(folder.resolve().name, parts, notes)
-    found = {
-        int(match[1]): file
-        for file in folder.iterdir()
-        if file.is_file() and (match := FRAME_INDEX.fullmatch(file.name))
-    }
-    used = {number: found[number] for number in opened if number in found}
-    by_name = any(before + len(one.values) != after for (before, one), (after, _) in pairwise(parts.items()))
-    if not used:
-        return replace(source, by_names=(tuple(opened), ()) if by_name else ())
-    nothing = np.full(source.shape[0], -1)
-    times, more = LineTimes(nothing, nothing.copy(), np.full(source.shape[0], np.nan), ()), list[str]()
-    for number, (start, cube) in zip(opened, parts.items(), strict=True):
-        if number not in used:
+    _check_alike(list(opened.values()))
+    parts = [(cube.path.name, number, len(cube.values)) for number, cube in opened.items()]
+    starts = place_parts(parts, MOST_MISSING, notes)
+    notes += [note for cube in opened.values() for note in cube.notes]
+    source = _joined(folder.resolve().name, dict(zip(starts, opened.values(), strict=True)), notes)
+    source = replace(source, root=folder)  # lines and their times follow from the files' names
+    listed = ((FRAME_INDEX.fullmatch(file.name), file) for file in folder.iterdir() if file.is_file())
+    indices = {int(match[1]): file for match, file in listed if match is not None and int(match[1]) in opened}
+    if not indices:
+        return source
+    times, more = LineTimes.unknown(source.shape[0]), list[str]()
+    for start, (number, cube) in zip(starts, opened.items(), strict=True):
+        if number not in indices:
             more.append(f"there is no frame index for {cube.path.name}")
             continue
-        index, lines = load_frame_index(used[number]), len(cube.values)
-        own = times_of_lines(index, number, lines, cube.lost_lines)
-        by_name = by_name or len(index.frame) != lines
-        for name in ("frame", "stamp_us", "exposure_ms"):
-            getattr(times, name)[start : start + lines] = getattr(own, name)
-        more.extend((*index.notes, *(f"{used[number].name}: {note}" for note in own.notes)))
-    by_name = by_name or len(used) < len(opened)
+        index = load_frame_index(indices[number])
+        own = times_of_lines(index, number, len(cube.values), cube.lost_lines)
+        times.put(start, own)
+        more.extend((*index.notes, *(f"{indices[number].name}: {note}" for note in own.notes)))
     return replace(
         source,
-        files=(*source.files, *used.values()),
+        files=(*source.files, *indices.values()),
         lines=_timed(source.lines, times),
         notes=(*source.notes, *more),
-        by_names=(tuple(opened), tuple(used)) if by_name else (),
     )
 
 
@@ -333,8 +226,7 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
     bands = Bands()
     if with_bands is not None:
         header = with_bands.header
-        units, origin = header.fields.get("wavelength units", ""), f"wavelengths from {with_bands.header_path.name}"
-        bands = Bands(header.wavelength_nm, header.fwhm_nm, units, origin)
+        bands = Bands(header.wavelength_nm, header.fwhm_nm, f"wavelengths from {with_bands.header_path.name}")
 
     def read(start: int, stop: int) -> NDArray[Any]:
         """Return some lines (line, sample, band)."""
@@ -368,9 +260,7 @@ def _timed(lines: LineFacts, times: LineTimes) -> LineFacts:
     known = times.stamp_us >= 0
     if not known.any():
         return lines
-    first = int(times.stamp_us[known][0])
-    time_s = np.where(known, (times.stamp_us - first) * 1e-6, np.nan)
-    return replace(lines, time_s=time_s, first_stamp_us=first)
+    return replace(lines, time_s=np.where(known, (times.stamp_us - times.stamp_us[known][0]) * 1e-6, np.nan))
 
 
 def find_reference(folder: Path, kind: str) -> Path | None:
@@ -415,33 +305,15 @@ def _headers(folder: Path) -> dict[int, Path]:
     return headers
 
 
-def _placed(opened: Mapping[int, EnviCube], notes: list[str]) -> dict[int, EnviCube]:
-    """Return the parts by their first lines (SceneError: they are not alike, or too many lines are in none)."""
-    parts: dict[int, EnviCube] = {}
-    end = missing = 0
-    first: EnviCube | None = None
-    for number, cube in opened.items():
-        first = first or cube
-        if cube.values.shape[1:] != first.values.shape[1:] or cube.values.dtype != first.values.dtype:
+def _check_alike(cubes: Sequence[EnviCube]) -> None:
+    """Refuse parts of several cubes (SceneError)."""
+    first = cubes[0]
+    for cube in cubes[1:]:
+        if cube.frames != first.frames:
             raise SceneError(
-                f"{cube.path} has frames of {cube.values.shape[1:]} (sample, band) {cube.values.dtype}, "
-                f"{first.path.name} of {first.values.shape[1:]} {first.values.dtype}; ingest them by themselves"
+                f"{cube.path} has frames of {cube.frames} (sample, band), {first.path.name} of {first.frames}; ingest"
+                " them by themselves"
             )
         ours, theirs = first.header.wavelength_nm, cube.header.wavelength_nm
         if ours is not None and theirs is not None and not np.array_equal(ours, theirs):
             raise SceneError(f"{cube.path} has other wavelengths than {first.path.name}; ingest them by themselves")
-        start = number - min(opened)
-        if start < end:
-            notes.append(f"{cube.path.name} begins {end - start} frames before the part before it ends")
-        elif start > end:
-            missing += start - end
-            notes.append(f"{start - end} lines before {cube.path.name} are in no file")
-        if missing > MOST_MISSING:
-            raise SceneError(
-                f"{missing} lines before {cube.path} are in no file, more than {MOST_MISSING}; ingest the parts by "
-                "themselves"
-            )
-        parts[max(start, end)] = cube
-        end = max(start, end) + len(cube.values)
-        notes.extend(cube.notes)
-    return parts

@@ -14,7 +14,6 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +29,6 @@ from storage.readers.cube_sources import (
     MOST_RATIO,
     Bands,
     CubeSource,
-    ReadLines,
     check_claim,
     check_memory,
     read_by_chunks,
@@ -107,7 +105,17 @@ def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> Cub
                 colours[number] = colour[:3]
             known, notes = _of_colours(RGB_NM), ["colours looked up in the image's palette"]
 
-        read = _reader(path, pages, [band + 1 for band in keep], (height, width), kind, picture, colours)
+        def read_rows(first: int, last: int) -> NDArray[Any]:
+            """Return some rows, (y, x, band) (SceneError: they are damaged)."""
+            planes = []
+            for page in pages:
+                with _opened(path, page) as opened:
+                    planes.append(opened.read([band + 1 for band in keep], window=((first, last), (0, width))))
+            numbers = np.ascontiguousarray(np.moveaxis(np.concatenate(planes), 0, -1), kind)
+            return numbers if colours is None else colours[numbers[..., 0]]
+
+        at_once = height if picture else block[0] if driver == "JP2OpenJPEG" else 1
+        read = read_by_chunks(read_rows, height, at_once)
         source = CubeSource(
             name=path.name,
             shape=(height, width, count),
@@ -131,35 +139,7 @@ def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> Cub
         )
     if scaled and not ((scale == 1).all() and (offset == 0).all()):
         source = rescaled(source, scale, offset, source.nodata)
-    return replace(source, read=read_by_chunks(source.read, height, block[0] if driver == "JP2OpenJPEG" else 1))
-
-
-def _reader(
-    path: Path,
-    pages: Sequence[str],
-    bands: list[int],
-    shape: tuple[int, int],
-    kind: np.dtype[Any],
-    picture: bool,
-    colours: NDArray[np.uint8] | None,
-) -> ReadLines:
-    """Return a reader of rows of some bands, from 1, of all pages; a picture is read once, as a whole."""
-
-    def read_window(first: int, last: int) -> NDArray[Any]:
-        planes = []
-        for page in pages:
-            with _opened(path, page) as opened:
-                planes.append(opened.read(bands, window=((first, last), (0, shape[1]))))
-        return np.ascontiguousarray(np.moveaxis(np.concatenate(planes), 0, -1), kind)
-
-    whole = cache(lambda: read_window(0, shape[0]))
-
-    def read(first: int, last: int) -> NDArray[Any]:
-        """Return some rows, (y, x, band) (SceneError: they are damaged)."""
-        numbers = whole()[first:last] if picture else read_window(first, last)
-        return numbers if colours is None else colours[numbers[..., 0]]
-
-    return read
+    return source
 
 
 def rescaled(
@@ -286,7 +266,7 @@ _DESCRIBED = re.compile(rf"(?<![\w.])(\d+(?:\.\d+)?)\s*({_LENGTHS})\b", re.IGNOR
 
 def _of_colours(colours_nm: Sequence[float]) -> Bands:
     listed = ", ".join(f"{nm:g}" for nm in colours_nm)
-    return Bands(np.array(colours_nm), None, "nm", f"wavelengths assumed from the file's colours: {listed} nm")
+    return Bands(np.array(colours_nm), None, f"wavelengths assumed from the file's colours: {listed} nm")
 
 
 def _bands_of(file: Any, keep: Sequence[int], kinds: Sequence[str], path: Path) -> tuple[Bands, tuple[str, ...]]:
@@ -308,11 +288,11 @@ def _bands_of(file: Any, keep: Sequence[int], kinds: Sequence[str], path: Path) 
         widths = [finite_number(word) for word in re.split(r"[,\s]+", fields.get("fwhm", "")) if word]
         known = len(widths) == len(keep) and all(width is not None and width > 0 for width in widths)
         fwhm = np.array(widths, np.float64) * scale if known else None
-        return Bands(centres, fwhm, "nm", f"wavelengths from the tags of {path}"), tuple(notes)
+        return Bands(centres, fwhm, f"wavelengths from the tags of {path}"), tuple(notes)
     named = [_DESCRIBED.search(file.descriptions[band] or "") for band in keep]
     if named and None not in named:
         nm = [float(one[1]) * (1.0 if one[2].lower().startswith("n") else 1000.0) for one in named if one is not None]
-        return Bands(np.array(nm), None, "nm", f"wavelengths from the band names of {path}"), tuple(notes)
+        return Bands(np.array(nm), None, f"wavelengths from the band names of {path}"), tuple(notes)
     colours_nm = _COLOURS_NM.get(tuple(kinds))
     return Bands() if colours_nm is None else _of_colours(colours_nm), tuple(notes)
 

@@ -57,7 +57,6 @@ ACCEPTED = (*BESIDE, *(name for names in KINDS.values() for name in names))
 TABLE_ENDINGS = (".csv", ".tsv", ".txt", ".parquet")
 ENDINGS = (*TABLE_ENDINGS, ".toml")
 WORDS = {"": math.nan, "none": math.nan, "true": 1.0, "false": 0.0}
-LARGEST_TABLE = 1 << 28  # bytes; a row has about 60
 
 
 @dataclass(frozen=True)
@@ -248,10 +247,6 @@ def _csv_cells(path: Path) -> tuple[list[str], list[list[str]]]:
 
 def _text(path: Path) -> str:
     try:
-        if path.stat().st_size > LARGEST_TABLE:
-            raise SceneError(
-                f"{path} has {path.stat().st_size} bytes, too many for a pointing table; name another file"
-            )
         return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise SceneError(f"{path} cannot be read as a pointing table: {error}; name a text file (CSV)") from error

@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.capture.recorded import sum_references
 from pipeline.errors import SceneError, WavelengthError
 from pipeline.geometry.camera import LineCamera
 from pipeline.rig.camera.camera_texts import listed_numbers
 from pipeline.signal.detector import find_bad_elements
 from pipeline.source import References
 from storage.readers.cube_sources import CubeSource
-from storage.readers.envi_files import DATA_ENDINGS, INTERLEAVES, find_envi_pair, find_reference, load_envi_header
+from storage.readers.envi_files import DATA_ENDINGS, find_envi_pair, find_reference, load_envi_header
 from storage.readers.open_cubes import load_frame, open_cube, reader_of, with_wavelengths
 from storage.readers.zarr_files import find_zarr_store
 
@@ -73,14 +72,6 @@ def _stem(path: Path) -> str:
 def open_recorded_cube(path: Path, wavelengths: Sequence[float] | None) -> RecordedFile:
     """Open one cube of whole numbers with wavelengths."""
     source = open_cube(path)
-    if reader_of(path) == "envi":
-        header, data = find_envi_pair(path)
-        said, ending = load_envi_header(header).interleave, data.suffix.lower().removeprefix(".")
-        if ending in INTERLEAVES and ending != said and source.shape[2] > 1:
-            raise SceneError(
-                f"{header} says interleave = {said}, and the name of {data.name} says {ending}; correct the header, or "
-                "rename the file"
-            )
     if source.dtype not in (np.uint8, np.uint16, np.int16):
         raise SceneError(
             f"{path} holds {source.dtype}, expected a camera's own numbers (whole, 8 or 16 bits); a cube of "
@@ -138,14 +129,12 @@ def find_references(
     *,
     stated: dict[str, Path | None],
     white_reference: NDArray[np.float32],
-    at_rest: bool,
 ) -> References:
     """Return the reference frames of a cube whose companions are called ``stem.dark.hdr`` and the like.
 
     ``stated`` files come first, then those of the cube's name, then the folder's only dark and white frame.
-    ``white_reference`` is the value of the white reference, one or (band,), where nothing else says it; ``at_rest``
-    says that the white frame was taken with the mirror at rest. Raises SceneError: a frame has other samples or bands
-    than the cube.
+    ``white_reference`` is the value of the white reference, one or (band,), where nothing else says it. Raises
+    SceneError: a frame has other samples or bands than the cube.
     """
     name, frame = stem.name, source.shape[1:]
     white_dn = camera.full_scale_dn * max(camera.samples // frame[0], 1)
@@ -154,7 +143,16 @@ def find_references(
         beside = [stem.with_name(f"{name}.{kind}{ending}") for ending in (".hdr", ".npy")]
         file = stated.get(kind) or next((one for one in beside if one.is_file()), None)
         files[kind] = find_reference(stem.parent, kind) if file is None and kind in ("dark", "white") else file
-    found = {kind: _load_fitting(file, frame, kind, notes) for kind, file in files.items() if file is not None}
+    found: dict[str, NDArray[np.float32]] = {}
+    for kind, file in files.items():
+        if file is not None:
+            found[kind] = load_frame(file)[0]
+            notes.append(f"{kind} frame from {file.name}")
+            if found[kind].shape != frame:
+                raise SceneError(
+                    f"the {kind} frame {file} is {found[kind].shape} (sample, band), the cube {frame}; give one taken "
+                    "with the cube's own samples and bands"
+                )
     dark, white = found.get("dark", source.dark), found.get("white", source.white)
     measured = dark is not None and white is not None
     if dark is None:
@@ -174,32 +172,12 @@ def find_references(
         raise SceneError(
             f"the white reference has {white_reference.shape} values, the cube {bands} bands; give one or one a band"
         )
-    by_mirror, file = at_rest, files["white"]
+    by_mirror, file = False, files["white"]
     if file is not None and reader_of(file) == "envi":
         fields = load_envi_header(find_envi_pair(file)[0]).fields
         listed = listed_numbers(fields, "white_reference", bands, [])
         white_reference = white_reference if listed is None else listed.astype(np.float32)
-        by_mirror = by_mirror or fields.get("mirror at rest", "0").strip() == "1"
+        by_mirror = fields.get("mirror at rest", "0").strip() == "1"
     bad = None if bad is None or not np.any(bad) else np.asarray(bad, np.bool_)
     white_reference = np.broadcast_to(white_reference, bands).copy()
     return References(dark, white, white_reference, bad, found.get("flat"), by_mirror)
-
-
-def _load_fitting(file: Path, frame: tuple[int, ...], kind: str, notes: list[str]) -> NDArray[np.float32]:
-    """Return a frame (sample, band), summed to a cube's binning where it has more samples.
-
-    Raises SceneError: it does not fit.
-    """
-    values, _ = load_frame(file)
-    notes.append(f"{kind} frame from {file.name}")
-    parts = values.shape[0] // frame[0]
-    if parts < 1 or values.shape != (parts * frame[0], frame[1]):
-        raise SceneError(
-            f"the {kind} frame {file} is {values.shape} (sample, band), the cube {frame}; give one taken with the "
-            "cube's own samples and bands"
-        )
-    if parts == 1:
-        return values
-    whole = References(values, values, np.ones(frame[1], np.float32), values > 0, values)
-    summed = sum_references(whole, parts)
-    return {"bad": np.asarray(summed.bad, np.float32), "flat": np.asarray(summed.flat)}.get(kind, summed.dark)

@@ -31,7 +31,6 @@ from pipeline.errors import ArchiveError, IncompleteStoreError, SceneError, Sett
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import STRAIGHT, Mounting
 from pipeline.geometry.scan import Axis, Sweep
-from pipeline.source import References
 from storage.archive.archive import Archive
 from storage.archive.keys import array_digest
 from storage.archive.manifests import manifest_sha256
@@ -93,11 +92,12 @@ class Recording:
 
         Its place and name are not among them.
         """
-        arrays = [
-            array
-            for one in self.sweeps
-            for array in (one.position, one.time_s, one.exposure_ms, one.valid_line, *_frames(one.references))
-        ]
+        arrays = list[NDArray[Any]]()
+        for one in self.sweeps:
+            known = one.references
+            frames = (known.dark, known.white, known.white_reference, known.bad, known.flat)
+            arrays += [one.position, one.time_s, one.exposure_ms, one.valid_line]
+            arrays += [np.zeros(0) if frame is None else frame for frame in frames]
         return {
             "light": list(self.light),
             "sweeps": [asdict(one.sweep) for one in self.sweeps],
@@ -126,10 +126,7 @@ class RecordedWith:
     white: Path | None = None
     wavelengths: Sequence[float] | None = None  # of all bands [nm]
     white_reference: ArrayLike = 1.0  # value of the white reference, one or (band,)
-    white_at_rest: bool = False  # the white frame was taken with the mirror at rest
     mounting: Mounting = STRAIGHT  # of the device whose positions the pointing has
-    pixel_m: float | None = None  # metres a pixel on the ground, for positions in metres
-    samples: int | None = None  # of a line that is not binned; None takes those of the widest cube
 
 
 def open_recording(
@@ -162,8 +159,6 @@ def open_recording(
         )
         for cube in cubes
     )
-    if given.samples is not None:
-        camera = replace(camera, samples=given.samples)
     light = tuple(
         f"{path.name} {manifest_sha256(path.parent)}"
         if (path.parent / MANIFEST_NAME).is_file()
@@ -171,11 +166,6 @@ def open_recording(
         for path in stores
     )
     return Recording(str(address), sweeps, first.wavelength_nm, first.fwhm_nm, camera, (), light)
-
-
-def _frames(references: References) -> list[NDArray[Any]]:
-    frames = (references.dark, references.white, references.white_reference, references.bad, references.flat)
-    return [np.zeros(0) if frame is None else frame for frame in frames]
 
 
 def _stamps(files: Iterable[Path]) -> list[str]:
@@ -192,7 +182,7 @@ def _open_files(path: Path, camera: LineCamera, given: RecordedWith) -> Recordin
         if not np.array_equal(np.asarray(cube.source.bands.wavelength_nm), bands.wavelength_nm):
             raise SceneError(f"{cube.path} has other wavelengths than {cubes[0].path}; survey them one by one")
     notes = [note for cube in cubes for note in (*cube.source.notes, cube.source.bands.origin) if note]
-    samples = given.samples or max(cube.source.shape[1] for cube in cubes)
+    samples = max(cube.source.shape[1] for cube in cubes)  # the widest are not binned
     camera = with_bits(replace(camera, samples=samples), cubes, notes)
     pointing = [_point(cube, camera, given, notes, alone=len(cubes) == 1) for cube in cubes]
     without = [one is None or one.kind in WITHOUT_MIRROR for one in pointing]
@@ -204,7 +194,7 @@ def _open_files(path: Path, camera: LineCamera, given: RecordedWith) -> Recordin
             "positions or viewing angles for each cube, or name one cube"
         )
     if any(without):
-        camera, pointing = _without_mirror(cubes[0], pointing[0], camera, given.pixel_m, notes)
+        camera, pointing = _without_mirror(cubes[0], pointing[0], camera, notes)
     camera = _timed(camera, cubes, pointing, notes)
     sweeps = [
         sweep
@@ -244,7 +234,7 @@ def _point(
 
 
 def _without_mirror(
-    cube: RecordedFile, pointing: LinePointing | None, camera: LineCamera, pixel_m: float | None, notes: list[str]
+    cube: RecordedFile, pointing: LinePointing | None, camera: LineCamera, notes: list[str]
 ) -> tuple[LineCamera, list[LinePointing | None]]:
     """Return the camera and pointing of a straight scan without a mirror: its middle is the field's centre."""
     lines = cube.source.shape[0]
@@ -255,11 +245,10 @@ def _without_mirror(
     if pointing.kind == "m":
         apart = np.diff(scan_px[pointing.valid]) / np.diff(np.flatnonzero(pointing.valid))
         line_m = abs(float(np.median(apart))) if len(apart) else 0.0
-        if pixel_m is None and not line_m:
+        if not line_m:
             raise SceneError(f"the lines of {cube.name} do not move; give the positions of a scan")
-        if pixel_m is None:
-            notes.append(f"{cube.name}: a pixel is taken to be as long as lines are apart, {line_m:g} m")
-        scan_px = scan_px / (line_m if pixel_m is None else pixel_m)
+        notes.append(f"{cube.name}: a pixel is taken to be as long as lines are apart, {line_m:g} m")
+        scan_px = scan_px / line_m
     scan_px = scan_px - (scan_px.min() + scan_px.max()) / 2
     camera = flat_camera(camera, float(np.abs(scan_px).max()))
     return camera, [replace(pointing, position=flat_positions(scan_px, camera))]
@@ -307,7 +296,6 @@ def _sweeps_of(
         notes,
         stated={"dark": given.dark, "white": given.white},
         white_reference=np.asarray(given.white_reference, np.float32),
-        at_rest=given.white_at_rest,
     )
     names = (cube.name,) if pointing.part is None else tuple(name for name in dict.fromkeys(pointing.part) if name)
     along: Axis = "x"

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import EmptySceneError, SceneError
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.readings import MOST_STEPS, MOST_VALUE, Beyond, beyond_range, find_beyond
-from pipeline.simulator.scenes.scene import BRIGHT_PERCENTILE
+from pipeline.readings import MOST_VALUE, beyond_range, find_beyond
 from storage.archive.staging import file_hash
 from storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, check_memory, scene_lines, unpacked
 from storage.readers.label_files import label_file
@@ -29,7 +28,6 @@ if TYPE_CHECKING:
 
 ReadRows = Callable[[int, int], NDArray[np.float32]]
 USUAL_NODATA = -9999.0  # what programs write for no data, and no sensor reads
-_SAMPLED = 1 << 20  # values, evenly spread, from which the range of a scene is estimated
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,10 +74,6 @@ class SceneFile:
             regridded=found.regridded,
         )
 
-    def with_labels(self, labels: NDArray[np.uint8], note: str) -> SceneFile:
-        """Return the same scene with other labels; its provenance has the note."""
-        return replace(self, labels=labels, provenance=(*self.provenance, note))
-
 
 def load_scene_file(
     path: str | Path,
@@ -101,35 +95,32 @@ def load_scene_file(
     SceneError: a file is missing, damaged, of a kind or shape that cannot be used, or the labels do not fit.
     WavelengthError: wavelengths are missing, or their number, unit or range is wrong.
     """
-    return _open(path, labels, bands, wavelengths, classes or {}, labels_needed, keep=True)
+    return open_scene_file(
+        path,
+        labels=labels,
+        bands=bands,
+        wavelengths=wavelengths,
+        classes=classes,
+        labels_needed=labels_needed,
+        keep=True,
+    )
 
 
 def open_scene_file(
-    path: str | Path,
+    address: str | Path,
     *,
     labels: str | Path | None = None,
     bands: Sequence[int] | None = None,
     wavelengths: Sequence[float] | None = None,
+    classes: Mapping[str, ClassValue] | None = None,
+    labels_needed: bool = False,
+    keep: bool = False,
 ) -> SceneFile:
     """Open a scene as `load_scene_file` reads it, whose numbers are looked through once and not kept.
 
     GeoTIFF, ENVI, Zarr and .npy are read some rows at a time; images, .mat and .npz are whole in memory. Labels that
     were found by their names and cannot be used are left out with a note. Raises what `load_scene_file` does.
     """
-    return _open(path, labels, bands, wavelengths, {}, False, keep=False)
-
-
-def _open(
-    address: str | Path,
-    labels: str | Path | None,
-    bands: Sequence[int] | None,
-    wavelengths: Sequence[float] | None,
-    classes: Mapping[str, ClassValue],
-    labels_needed: bool,
-    *,
-    keep: bool,
-) -> SceneFile:
-    """Look through all rows of a scene once, and find its labels."""
     file, variable = split_variable(address)
     source, settings = open_cube(address), find_scene_settings(file)
     height, width, count = source.shape
@@ -141,18 +132,13 @@ def _open(
     if keep:
         check_memory(address, 8 * height * width * count)  # as float32, and once more while the scene is made
     kept = np.empty((height, width, len(chosen)), np.float32) if keep else None
-    counted = ValueCount(file, values)
-    for first in range(0, height, BLOCK_LINES):
-        taken = counted.take(first, min(first + BLOCK_LINES, height))
-        if kept is not None:
-            kept[first : first + len(taken)] = values.scaled(taken)
-    missing_notes = counted.notes()
+    gaps = _find_gaps(file, values, kept)
     found, label_note, by_name = _labels_of(
-        file, source.shape[:2], source.geobox, labels, settings, classes, labels_needed
+        file, source.shape[:2], source.geobox, labels, settings, classes or {}, labels_needed
     )
     content = _content_hash(file, source.files)
     some = () if chosen == list(range(count)) else (f"bands {bands_text(chosen)} of {count}, counted from 0",)
-    how, gaps = values.notes(settings.path)
+    how, of_mask = values.notes(settings.path)
     scene = SceneFile(
         name=file.stem,
         path=file,
@@ -160,11 +146,11 @@ def _open(
         fwhm_nm=light.fwhm_nm,
         shape=(height, width),
         read=values.read,
-        missing=counted.missing,
-        filled_px=counted.filled_px,
-        light_hash=_light_hash(content, variable, values, light, used=counted.void > 0, stated=settings.nodata),
+        missing=gaps.missing,
+        filled_px=gaps.filled_px,
+        light_hash=_light_hash(content, variable, values, light, used=gaps.void > 0, stated=settings.nodata),
         content=(content if variable is None else _digest(content, variable),),
-        provenance=(*some, *bad_note, *source.notes, *how, light.origin, *gaps, *missing_notes, *label_note),
+        provenance=(*some, *bad_note, *source.notes, *how, light.origin, *of_mask, *gaps.notes, *label_note),
         geobox=source.geobox,
         pixel_m=None if source.geobox is not None else settings.pixel_m,
         kept=kept,
@@ -372,13 +358,8 @@ class FileValues:
         """Return rows in the file's numbers and as float32 with NaN, (y, x, band), and which of them are no data."""
         rows = scene_lines(self.source, first, stop)
         picked = rows if self.bands == list(range(rows.shape[2])) else rows[..., self.bands]
-        void = None if self.void is None else self.void[first:stop]
-        if void is not None:
-            picked = np.where(void[..., None], picked.dtype.type(0), picked)  # whatever lies under gaps is no value
         with np.errstate(over="ignore"):
             values = np.array(picked, np.float32, order="C")
-        if void is not None:
-            values[void] = np.nan
         if self.nodata is None:
             return picked, values, None
         # Compared as numbers: -9999 in the numbers of the file would wrap to 55537 where they are uint16.
@@ -398,103 +379,69 @@ class FileValues:
         return self.scaled(values)
 
 
-class ValueCount:
-    """Count what is missing or no reading among the values of a file, given from the top down."""
+@dataclass(frozen=True)
+class Gaps:
+    """What is missing among the values of a file."""
 
-    def __init__(self, path: Path, values: FileValues) -> None:
-        shape, chosen = values.source.shape[:2], values.bands
-        self.missing = np.zeros(shape, np.bool_)  # (y, x) pixels without a value in more than half of their bands
-        self.void = 0  # samples that have the no-data value
-        self.filled_px = 0  # pixels without a value in a band
-        self._path, self._values, self._chosen = path, values, chosen
-        self._every = max(1, shape[0] * shape[1] * len(chosen) // _SAMPLED)
-        self._seen = np.zeros(len(chosen), np.bool_)  # bands with a value somewhere
-        self._infinite = self._absent = self._size = self._row = self._beyond = 0
-        self._first_beyond: Beyond | None = None
-        self._first_infinite = ""
-        self._lit: list[NDArray[np.float32]] = []
+    missing: NDArray[np.bool_]  # (y, x) pixels without a value in more than half of their bands
+    filled_px: int  # pixels without a value in a band
+    void: int  # samples that have the no-data value
+    notes: tuple[str, ...]  # a sentence for each thing that is missing
 
-    def take(self, first: int, stop: int) -> NDArray[np.float32]:
-        """Count the next rows of the file, and return their values (y, x, band), not scaled."""
-        picked, values, empty = self._values.converted(first, stop)
-        if (out_of_range := beyond_range(picked)) is not None and empty is not None:
-            picked = np.where(empty, picked.dtype.type(0), picked)
-        self.void += 0 if empty is None else int(np.count_nonzero(empty))
-        if out_of_range is not None:
-            self._note_out_of_range(picked, values)
-        values[np.isinf(values)] = np.nan
-        known = np.isfinite(values)
-        if not known.all():
-            count = known.sum(axis=2)
-            self._absent += values.size - int(count.sum())
-            self.missing[self._row : self._row + len(values)] = 2 * count < values.shape[2]
-            self.filled_px += int(np.count_nonzero(count < values.shape[2]))
-        self._seen |= known.any(axis=(0, 1))
-        some = values.reshape(-1)[-self._size % self._every :: self._every]
-        self._lit.append(some[some > 0])  # no NaN
-        self._size += values.size
-        self._row += len(values)
-        return values
 
-    def _note_out_of_range(self, picked: NDArray[Any], values: NDArray[np.float32]) -> None:
-        infinite = np.isinf(values)
-        if infinite.any() and not self._infinite:
-            place = [int(at) for at in np.unravel_index(int(infinite.argmax()), infinite.shape)]
-            self._first_infinite = f"y {self._row + place[0]}, x {place[1]}, band {self._chosen[place[2]]}"
-        self._infinite += int(np.count_nonzero(infinite))
-        if (found := find_beyond(picked)) is not None:
-            self._beyond += found.count
-            if self._first_beyond is None:
+def _find_gaps(path: Path, values: FileValues, kept: NDArray[np.float32] | None) -> Gaps:
+    """Look through all values of a file once, and keep them in ``kept`` where it is given.
+
+    Raises SceneError: a value is no reading, a band has no value anywhere, or no value is finite.
+    """
+    height, width, _ = values.source.shape
+    chosen, nodata, notes = values.bands, values.nodata, list[str]()
+    missing, seen = np.zeros((height, width), np.bool_), np.zeros(len(chosen), np.bool_)
+    filled_px = void = infinite = absent = 0
+    for first in range(0, height, BLOCK_LINES):
+        rows = slice(first, min(first + BLOCK_LINES, height))
+        picked, block, empty = values.converted(rows.start, rows.stop)
+        void += 0 if empty is None else int(np.count_nonzero(empty))
+        if beyond_range(picked) is not None:
+            found = find_beyond(picked if empty is None else np.where(empty, picked.dtype.type(0), picked))
+            if found is not None:
                 y, x, band = found.place
-                self._first_beyond = Beyond(found.count, (self._row + y, x, band), found.value)
-
-    def notes(self) -> tuple[str, ...]:
-        """Return a sentence for each thing that is missing, once all rows were taken.
-
-        Raises SceneError: a value is no reading, a band has no value anywhere, or no value is finite.
-        """
-        path, first, nodata, notes = self._path, self._first_beyond, self._values.nodata, list[str]()
-        if first is not None:
-            found = Beyond(self._beyond, first.place, first.value)
-            raise SceneError(
-                f"{path} has {found.words(np.array(self._chosen))}, beyond the {MOST_VALUE:g} that readings reach; if "
-                f"it stands for no data, write nodata = {found.value!s} into a {SETTINGS_NAME} beside the file, else "
-                "leave the band out with --bands, or give the values in a larger unit"
-            )
-        if nodata is not None and not self._values.assumed:
-            notes.append(f"{self.void} samples have the file's no-data value {nodata:g}")
-        elif self.void:
-            notes.append(
-                f"{self.void} samples are {nodata:g}, which is taken for no data though nothing says so; where it"
-                f" is a reading, state another number as nodata in a {SETTINGS_NAME}"
-            )
-        if self._infinite:
-            notes.append(f"{self._infinite} infinite samples count as missing, the first at {self._first_infinite}")
-        if self._absent == self._size:
-            raise EmptySceneError(f"{path} holds no finite number in the bands used; choose others")
-        empty = [band for band, seen in zip(self._chosen, self._seen, strict=True) if not seen]
-        if empty:
-            rest = bands_text([band for band in self._chosen if band not in set(empty)])
-            raise SceneError(
-                f"{path} has no value anywhere in bands {bands_text(empty)} (from 0); take the others: --bands {rest}"
-            )
-        if self._absent:
-            notes.append(f"{self._absent} of {self._size} samples are missing")
-        return (*notes, *self._dark_note())
-
-    def _dark_note(self) -> tuple[str, ...]:
-        """Return a note where the bright end is so far above all else that hardly any light is left for it."""
-        lit = np.concatenate(self._lit) if self._lit else np.empty(0, np.float32)
-        if not lit.size:
-            return ()
-        middle, bright = (float(value) for value in np.percentile(lit, (50, BRIGHT_PERCENTILE)))
-        if bright <= MOST_STEPS * middle:
-            return ()
-        return (
-            f"the brightest values, {bright:.3g}, are more than {MOST_STEPS} times the middle one, {middle:.3g}, and "
-            f"all else is dark beside them; if they stand for no data, write nodata = {float(lit.max())!r} into a"
-            f" {SETTINGS_NAME}",
+                raise SceneError(
+                    f"{path} has {found.value!s} at y {first + y}, x {x}, band {chosen[band]}, beyond the"
+                    f" {MOST_VALUE:g} that readings reach; if it stands for no data, write nodata = {found.value!s}"
+                    f" into a {SETTINGS_NAME} beside the file, else leave the band out with --bands, or give the values"
+                    " in a larger unit"
+                )
+            infinite += int(np.count_nonzero(np.isinf(block)))
+            block[np.isinf(block)] = np.nan
+        known = np.isfinite(block)
+        count = known.sum(axis=2)
+        absent += block.size - int(count.sum())
+        missing[rows] = 2 * count < len(chosen)
+        filled_px += int(np.count_nonzero(count < len(chosen)))
+        seen |= known.any(axis=(0, 1))
+        if kept is not None:
+            kept[rows] = values.scaled(block)
+    if nodata is not None and not values.assumed:
+        notes.append(f"{void} samples have the file's no-data value {nodata:g}")
+    elif void:
+        notes.append(
+            f"{void} samples are {nodata:g}, which is taken for no data though nothing says so; where it"
+            f" is a reading, state another number as nodata in a {SETTINGS_NAME}"
         )
+    if infinite:
+        notes.append(f"{infinite} infinite samples count as missing")
+    if not seen.any():
+        raise EmptySceneError(f"{path} holds no finite number in the bands used; choose others")
+    if not seen.all():
+        without, rest = (
+            bands_text([band for band, there in zip(chosen, seen, strict=True) if there == wanted])
+            for wanted in (False, True)
+        )
+        raise SceneError(f"{path} has no value anywhere in bands {without} (from 0); take the others: --bands {rest}")
+    if absent:
+        notes.append(f"{absent} of {missing.size * len(chosen)} samples are missing")
+    return Gaps(missing, filled_px, void, tuple(notes))
 
 
 def bands_text(bands: Sequence[int]) -> str:

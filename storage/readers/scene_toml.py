@@ -158,17 +158,17 @@ def settle_wavelengths(
     if stated is not None:
         values = check_wavelengths(stated, "--wavelengths")
         fitting = _fit(values, chosen, file_bands, chosen, f"--wavelengths for {path}")
-        return Bands(fitting, None, "nm", f"wavelengths stated: {_listed(fitting)} nm")
+        return Bands(fitting, None, f"wavelengths stated: {_listed(fitting)} nm")
     if settings.wavelengths_nm is not None:
         values = check_wavelengths(settings.wavelengths_nm, f"{settings.path}: wavelengths_nm")
         own = list(range(file_bands)) if settings.bands is None else list(settings.bands)
         fitting = _fit(values, chosen, file_bands, own, f"{settings.path}: wavelengths_nm for {path}")
-        return Bands(fitting, None, "nm", f"wavelengths from {settings.path}")
+        return Bands(fitting, None, f"wavelengths from {settings.path}")
     if settings.wavelengths_file is not None and settings.path is not None:
         return _from_file(settings.path.parent / settings.wavelengths_file, settings.dropped_bands, chosen, file_bands)
     if known.wavelength_nm is not None and len(known.wavelength_nm) == file_bands:
         centre = check_wavelengths(known.wavelength_nm, str(path))[chosen]
-        return Bands(centre, None if known.fwhm_nm is None else known.fwhm_nm[chosen], known.units, known.origin)
+        return Bands(centre, None if known.fwhm_nm is None else known.fwhm_nm[chosen], known.origin)
     raise WavelengthError(
         f"{path} has {file_bands} bands and nothing says their wavelengths; give --wavelengths in nm, or write "
         f"wavelengths_nm or wavelengths_file into a scene.toml beside it (axes are y, x, band)"
@@ -206,7 +206,7 @@ def _from_file(path: Path, dropped: Sequence[int], chosen: list[int], file_bands
     widths = kept[:, 1] if kept.shape[1] > 1 else None
     known = widths is not None and bool((np.isfinite(widths) & (widths > 0)).all())
     fwhm = widths[chosen] if known and widths is not None else None
-    return Bands(centre, fwhm, "nm", f"wavelengths from {path}")
+    return Bands(centre, fwhm, f"wavelengths from {path}")
 
 
 def _table(path: Path) -> NDArray[np.float64]:

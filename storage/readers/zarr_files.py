@@ -41,7 +41,6 @@ KIND = "ingested cube"  # of this project
 FRAMES = ("dark", "white")
 OF_LINES = ("valid_line", "time", "exposure_ms", "frame")
 METADATA = ("zarr.json", ".zarray", ".zgroup")
-LARGEST_METADATA = 1 << 24  # bytes
 _CHECKSUMS = {"crc32", "crc32c", "adler32", "fletcher32", "jenkins_lookup3"}
 _PACKERS = {"blosc", "zstd", "gzip", "zlib", "bz2", "lzma", "lz4", "pcodec", "zfpy", "packbits"}
 _ORDERS = {"bytes", "transpose", "sharding_indexed", "shuffle"}
@@ -146,8 +145,6 @@ def _check_store(path: Path) -> None:
 
 
 def _read_json(path: Path) -> Mapping[str, Any]:
-    if path.stat().st_size > LARGEST_METADATA:
-        raise SceneError(f"{path} has {path.stat().st_size} bytes, too many for metadata; copy the store again")
     content = json.loads(path.read_bytes())
     if not isinstance(content, dict):
         raise SceneError(f"{path} holds no table; copy the store again")
@@ -236,7 +233,6 @@ def _attributes(source: CubeSource, files: Sequence[SourceFile], name: str) -> d
         "lost_lines": source.lost_lines,
         "notes": list(source.notes),
         "wavelength_origin": source.bands.origin or "nothing says the wavelengths",
-        "wavelength_units_in_file": source.bands.units,
     }
     if source.nodata is not None and np.isfinite(source.nodata):
         facts["nodata"] = source.nodata
@@ -244,8 +240,6 @@ def _attributes(source: CubeSource, files: Sequence[SourceFile], name: str) -> d
         facts["bad_bands"] = list(source.bad_bands)
     if source.geobox is not None:
         facts |= {**map_attributes(source.geobox), "spatial:dimensions": ["line", "sample"]}
-    if source.lines.first_stamp_us is not None:
-        facts["first_stamp_us"] = source.lines.first_stamp_us
     return facts
 
 

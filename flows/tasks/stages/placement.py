@@ -29,7 +29,7 @@ from storage.archive.manifests import read_table, write_table
 from storage.arrays.geolocation import path_digest, write_geolocation
 from storage.arrays.layout import blank_pixels
 from storage.arrays.mosaics import MosaicWriter, nothing_seen, open_mosaic
-from storage.arrays.quicklooks import choose_bands, stretched
+from storage.arrays.quicklooks import Quicklook, choose_bands, stretched, write_quicklook
 from storage.arrays.signal_cubes import open_signal_cubes
 from storage.parallel.pool import WorkerPool
 
@@ -272,7 +272,7 @@ def finish_mosaic(writer: MosaicWriter, frame: FieldFrame) -> None:
         blank_pixels(writer.path, frame.missing, nothing_seen(writer.path))
     mosaic = open_mosaic(writer.path)
     step, bands = -(-max(mosaic.shape) // QUICKLOOK_PX), choose_bands(frame.wavelength_nm)[0]
-    writer.write_quicklook(stretched(mosaic.thinned(step, bands)).image)
+    write_quicklook(writer.group, Quicklook(stretched(mosaic.thinned(step, bands)).image))
 
 
 def _there(registration: StageRef | None) -> list[StageRef]:

@@ -9,13 +9,15 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import RigError, SceneError, ShapeError
 from pipeline.readings import SIGMA_OF_MEDIAN
-from pipeline.rig.camera.camera_texts import FRAME_INDEX, LineTimes, parse_frame_index, split_header, times_of_lines
+from pipeline.rig.camera.camera_texts import FRAME_INDEX, LineTimes, parse_frame_index, place_parts, times_of_lines
+from pipeline.rig.camera.envi_headers import EnviHeader, parse_envi_header
 from pipeline.signal.detector import find_bad_elements
 from pipeline.source import References
 
@@ -37,22 +39,6 @@ _SAMPLES = 16  # looked at together
 
 
 @dataclass(frozen=True)
-class CubeHeader:
-    """Sizes and layout of 16-bit lines, band after band within each, by a header."""
-
-    samples: int
-    lines: int
-    bands: int
-    dtype: np.dtype[np.uint16]  # with its byte order
-    offset: int
-
-    @property
-    def line_bytes(self) -> int:
-        """Bytes of a line."""
-        return self.samples * self.bands * 2
-
-
-@dataclass(frozen=True)
 class CubeLines:
     """Lines of one file. ``lost`` are those that its header states and it does not hold whole."""
 
@@ -71,40 +57,33 @@ class CapturedLines:
     notes: tuple[str, ...]
 
 
-def parse_cube_header(text: str, where: str) -> CubeHeader:
+def parse_cube_header(text: str, where: str) -> EnviHeader:
     """Read the header of a cube as the camera writes them.
 
     RigError where it is no whole ENVI header, a size is missing, or the numbers are not 16-bit BIL.
     """
-    if not text.lstrip("\ufeff \r\n").upper().startswith("ENVI"):
-        raise RigError(f"{where} begins with {text[:40]!r}, expected ENVI; fetch it again")
     try:
-        fields, _ = split_header(text, where, [])
+        header = parse_envi_header(text, where)
     except SceneError as error:
         raise RigError(f"{error}; fetch it again") from error
-    layout = (fields.get("interleave", "").lower(), fields.get("data type", ""))
-    if layout != ("bil", "12"):
+    kind = header.dtype.str[1:]
+    if (header.interleave, kind) != ("bil", "u2"):
+        raise RigError(f"{where}: interleave {header.interleave!r} of {kind}; expected bil and u2, as cameras write")
+    if header.lines is None:
+        raise RigError(f"{where} does not say lines; fetch it again")
+    if header.samples * header.bands > MOST_NUMBERS:
         raise RigError(
-            f"{where}: interleave {layout[0]!r}, data type {layout[1]!r}; expected bil and 12, as cameras write"
+            f"{where}: {header.samples} samples and {header.bands} bands; no camera has so many, fetch it again"
         )
-    samples, lines, bands = (_whole(fields, key, where) for key in ("samples", "lines", "bands"))
-    if not samples or not bands:
-        raise RigError(f"{where}: {samples} samples and {bands} bands; expected at least one of each")
-    if samples * bands > MOST_NUMBERS:
-        raise RigError(f"{where}: {samples} samples and {bands} bands; no camera has so many, fetch it again")
-    order = _whole(fields, "byte order", where, "0")
-    if order > 1:
-        raise RigError(f"{where}: byte order = {order}, expected 0 or 1")
-    offset = _whole(fields, "header offset", where, "0")
-    return CubeHeader(samples, lines, bands, np.dtype(("<u2", ">u2")[order]), offset)
+    return header
 
 
-def cube_lines(header: CubeHeader, data: bytes) -> CubeLines:
+def cube_lines(header: EnviHeader, data: bytes) -> CubeLines:
     """Return the lines that are whole in ``data``, (line, sample, band)."""
-    held = min(max(len(data) - header.offset, 0) // header.line_bytes, header.lines)
+    held = min(max(len(data) - header.offset, 0) // header.line_bytes, header.lines or 0)
     shape = (held, header.bands, header.samples)
-    values = np.ndarray(shape, header.dtype, data, header.offset if held else 0).transpose(0, 2, 1)
-    return CubeLines(values, header.lines - held)
+    values: NDArray[Any] = np.ndarray(shape, header.dtype, data, header.offset if held else 0)
+    return CubeLines(values.transpose(0, 2, 1), (header.lines or 0) - held)
 
 
 def read_capture(names: Iterable[str], read: Read) -> CapturedLines:
@@ -123,18 +102,20 @@ def read_capture(names: Iterable[str], read: Read) -> CapturedLines:
         raise RigError(
             f"parts of one capture have frames of {sorted(sizes)} (sample, band); they are of several captures"
         )
-    placed = _placed(parts, notes)
-    lost = placed[-1][2].lost
+    try:
+        starts = place_parts([(f"raw_{first}", first, len(cube.values)) for first, cube in parts], MOST_MISSING, notes)
+    except SceneError as error:
+        raise RigError(str(error)) from error
+    (first, cube), lost = parts[-1], parts[-1][1].lost
     if lost > MOST_MISSING:
-        notes.append(f"the {lost} lines that raw_{placed[-1][1]} lacks are not filled up")
+        notes.append(f"the {lost} lines that raw_{first} lacks are not filled up")
         lost = 0
-    lines = placed[-1][0] + len(placed[-1][2].values) + lost
-    shape = (lines, *parts[0][1].values.shape[1:])
-    alone = len(placed) == 1 and not lost  # then no copy is made: a capture may have a gigabyte
-    values = parts[0][1].values.astype(np.uint16, copy=False) if alone else np.zeros(shape, np.uint16)
-    valid = np.zeros(lines, np.bool_)
-    times = LineTimes(np.full(lines, -1), np.full(lines, -1), np.full(lines, np.nan), ())
-    for start, first, cube in placed:
+    lines = starts[-1] + len(cube.values) + lost
+    alone = len(parts) == 1 and not lost  # then no copy is made: a capture may have a gigabyte
+    shape = (lines, *cube.values.shape[1:])
+    values = cube.values.astype(np.uint16, copy=False) if alone else np.zeros(shape, np.uint16)
+    valid, times = np.zeros(lines, np.bool_), LineTimes.unknown(lines)
+    for start, (first, cube) in zip(starts, parts, strict=True):
         stop = start + len(cube.values)
         valid[start:stop] = True
         if not alone:
@@ -144,8 +125,7 @@ def read_capture(names: Iterable[str], read: Read) -> CapturedLines:
                 f"raw_{first} is cut off: {len(cube.values)} of {len(cube.values) + cube.lost} lines are whole"
             )
         if (own := _times(by_name, first, cube, read, notes)) is not None:
-            times.frame[start:stop], times.stamp_us[start:stop] = own.frame, own.stamp_us
-            times.exposure_ms[start:stop] = own.exposure_ms
+            times.put(start, own)
     return CapturedLines(values, valid, parts[0][0], times, tuple(notes))
 
 
@@ -177,27 +157,10 @@ def _read_cube(by_name: Mapping[str, str], name: str, read: Read) -> CubeLines:
         raise RigError(f"{by_name[name]} has no header {name}.hdr beside it; fetch the folder again")
     found = parse_cube_header(read(by_name[header]).decode("utf-8", errors="replace"), by_name[header])
     data = read(by_name[name])
-    promised = found.offset + found.lines * found.line_bytes
+    promised = found.offset + (found.lines or 0) * found.line_bytes
     if len(data) > promised:
         raise RigError(f"{by_name[name]} has {len(data)} bytes, its header says {promised}; is it another file's?")
     return cube_lines(found, data)
-
-
-def _placed(parts: list[tuple[int, CubeLines]], notes: list[str]) -> list[tuple[int, int, CubeLines]]:
-    """Start line, first frame and lines of each part."""
-    placed: list[tuple[int, int, CubeLines]] = []
-    end = 0
-    for first, cube in parts:
-        start = first - parts[0][0]
-        if start - end > MOST_MISSING:
-            raise RigError(f"{start - end} lines before raw_{first} are in no file; is it of another capture?")
-        if start > end:
-            notes.append(f"{start - end} lines before raw_{first} are in no file")
-        elif start < end:
-            notes.append(f"raw_{first} begins {end - start} frames before the part before it ends")
-        placed.append((max(start, end), first, cube))
-        end = placed[-1][0] + len(cube.values)
-    return placed
 
 
 def _times(by_name: Mapping[str, str], first: int, cube: CubeLines, read: Read, notes: list[str]) -> LineTimes | None:
@@ -215,12 +178,6 @@ def _times(by_name: Mapping[str, str], first: int, cube: CubeLines, read: Read, 
     own = times_of_lines(index, first, len(cube.values), cube.lost)
     notes += [*index.notes, *(f"{name}: {note}" for note in own.notes)]
     return own
-
-
-def _whole(fields: Mapping[str, str], key: str, where: str, usual: str = "") -> int:
-    if not re.fullmatch(r"\d{1,12}", fields.get(key, usual)):
-        raise RigError(f"{where}: {key} = {fields.get(key)!r}, expected a whole number; fetch it again")
-    return int(fields.get(key, usual))
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import re
 from array import array
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -175,7 +175,37 @@ class LineTimes:
     frame: NDArray[np.int64]  # (line,)
     stamp_us: NDArray[np.int64]  # (line,)
     exposure_ms: NDArray[np.float64]  # (line,)
-    notes: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+
+    @classmethod
+    def unknown(cls, lines: int) -> LineTimes:
+        """Return so many lines of which nothing is known."""
+        return cls(np.full(lines, -1), np.full(lines, -1), np.full(lines, np.nan))
+
+    def put(self, start: int, own: LineTimes) -> None:
+        """Fill in what is known of the lines of one file, of which the first is line ``start``."""
+        for name in ("frame", "stamp_us", "exposure_ms"):
+            getattr(self, name)[start : start + len(own.frame)] = getattr(own, name)
+
+
+def place_parts(parts: Sequence[tuple[str, int, int]], most: int, notes: list[str]) -> list[int]:
+    """Return the first line of each part of a cube, by the parts' names, first frames and numbers of lines.
+
+    Raises SceneError: more than ``most`` lines are in no part.
+    """
+    starts, end, missing = list[int](), 0, 0
+    for name, frame, lines in parts:
+        start = frame - parts[0][1]
+        missing += max(start - end, 0)
+        if missing > most:
+            raise SceneError(f"{missing} lines before {name} are in no file, more than {most}; is it of another cube?")
+        if start > end:
+            notes.append(f"{start - end} lines before {name} are in no file")
+        elif start < end:
+            notes.append(f"{name} begins {end - start} frames before the part before it ends")
+        starts.append(max(start, end))
+        end = starts[-1] + lines
+    return starts
 
 
 @dataclass
@@ -223,7 +253,7 @@ def times_of_lines(index: FrameIndex, first_frame: int, lines: int, lost: int = 
         notes = (f"{dropped} frames between the first and the last were dropped by the camera",) if dropped else ()
         return LineTimes(index.frame[:lines], index.stamp_us[:lines], exposure, notes)
     origin = 0 if index.frame[0] == 0 else first_frame
-    found = LineTimes(np.full(lines, -1), np.full(lines, -1), np.full(lines, np.nan), ())
+    found = LineTimes.unknown(lines)
     place = index.frame - origin
     inside = (place >= 0) & (place < lines)
     found.frame[place[inside]] = index.frame[inside]

@@ -126,7 +126,7 @@ def test_memory_says_how_many_tiles_at_a_time(tmp_path: Path, cubes: list[Signal
 def test_an_error_in_a_tile_ends_the_work(tmp_path: Path, cubes: list[SignalCube]) -> None:
     """What goes wrong in a worker is raised where the work was asked for."""
     other = plain_writer(tmp_path / "m.zarr", GRID.shape, BANDS[:2])
-    with pytest.raises(ShapeError, match="the mosaic is"):
+    with pytest.raises(ShapeError, match="a tile of the mosaic has the shape"):
         write_mosaic(recipe_of(cubes), other, memory=PLENTY, pool=TWO)
 
 

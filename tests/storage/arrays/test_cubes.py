@@ -12,7 +12,7 @@ import xarray as xr
 import zarr
 from numpy.typing import NDArray
 
-from pipeline.errors import IncompleteStoreError, ShapeError
+from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.scan import Sweep
 from pipeline.source import Line, References
 from storage.archive.archive import Archive
@@ -74,20 +74,13 @@ def test_raw_cube_opens_with_plain_xarray(tmp_path: Path) -> None:
         assert float(near["wavelength"]) == 700.0
 
 
-def test_raw_cube_refuses_what_does_not_fit(tmp_path: Path) -> None:
-    """Lines out of order, of another size, too many or too few are named."""
+def test_raw_cube_refuses_to_end_early(tmp_path: Path) -> None:
+    """Lines that are missing are counted."""
     header = _header(3, 4, 2)
-    lines = _lines(header)
     cube = RawCubeWriter(tmp_path / "raw.zarr", header)
-    with pytest.raises(ShapeError, match="got line 1, expected line 0 of 3"):
-        cube.write(lines[1:])
-    with pytest.raises(ShapeError, match=r"line 0: shape \(3, 2\)"):
-        cube.write([Line(0, lines[0].data[:3], 0, 0, 0, 1)])
-    cube.write(lines[:2])
+    cube.write(_lines(header)[:2])
     with pytest.raises(IncompleteStoreError, match="2 of 3 lines"):
         cube.close()
-    with pytest.raises(ShapeError, match="calibrate with the sweep's own binning"):
-        SweepHeader(header.sweep, header.references, np.arange(3.0))
 
 
 def _calibrated(tmp_path: Path) -> tuple[Path, SweepHeader, list[Line]]:
@@ -117,8 +110,6 @@ def test_bad_flat_and_mirror_come_back(tmp_path: Path) -> None:
     assert not {"bad", "flat"} & {path.name for path in (tmp_path / "plain.zarr").iterdir()}
     found = open_raw_cube(tmp_path / "plain.zarr").references
     assert (found.bad, found.flat, found.by_mirror) == (None, None, False)
-    with pytest.raises(ShapeError, match=r"bad has shape \(9, 3\), the dark frame \(9, 4\)"):
-        replace(plain, references=replace(plain.references, bad=np.zeros((9, 3), np.bool_)))
 
 
 def test_lines_are_read_as_they_are_asked_for(tmp_path: Path) -> None:
@@ -219,7 +210,7 @@ def test_a_flipped_bit_is_an_error_and_is_named(archive: Archive) -> None:
 
 def test_what_is_no_store(tmp_path: Path) -> None:
     """A missing folder and one without the arrays are incomplete stores."""
-    with pytest.raises(IncompleteStoreError, match="no readable Zarr store"):
+    with pytest.raises(IncompleteStoreError, match="cannot be read"):
         open_mosaic(tmp_path / "none.zarr")
     write_attention(tmp_path / "a.zarr", Attention(np.zeros((1, 1)), np.zeros((1, 1), np.int32), "x"))
     with pytest.raises(IncompleteStoreError, match="wavelength cannot be read"):

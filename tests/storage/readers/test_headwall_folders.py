@@ -55,7 +55,6 @@ def test_parts_in_order_of_their_frames(tmp_path: Path, lines: NDArray[np.uint16
     np.testing.assert_array_equal(source.lines.exposure_ms, np.full(30, 4.5))
     np.testing.assert_array_equal(source.bands.wavelength_nm, [400, 500, 600])
     assert len(source.files) == 9
-    assert source.lines.first_stamp_us == 1000
 
 
 def test_lines_in_no_file_are_flagged(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
@@ -159,19 +158,6 @@ def test_times_of_a_part_that_is_cut_off(tmp_path: Path, lines: NDArray[np.uint1
     source = open_cube(tmp_path)
     assert source.lines.frame is not None
     assert source.lines.frame.tolist() == [0, 1, 4, 5, 6, 7, -1, -1]
-
-
-def test_numbers_in_names_count_where_lines_follow_from_them(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
-    """Parts that follow each other are what they hold; a gap, or a frame looked up by number, is where names say."""
-    for folder, names in (("whole", (0, 5, 10)), ("early", (0, 7, 12)), ("late", (0, 5, 12))):
-        for number, first in zip(names, (0, 5, 10), strict=True):
-            write_part(tmp_path / folder, f"raw_{number}", lines[first : first + 5])
-    found = {name: open_cube(tmp_path / name) for name in ("whole", "early", "late")}
-    assert found["whole"].by_names == ()
-    assert found["early"].shape == found["late"].shape
-    assert found["early"].by_names != found["late"].by_names
-    (tmp_path / "whole" / "frameIndex_5.txt").write_text("f\tt\n" + "".join(f"{n}\t{n}\n" for n in range(5)))
-    assert open_cube(tmp_path / "whole").by_names == ((0, 5, 10), (5,))
 
 
 def test_what_is_no_file_is_no_part(tmp_path: Path, lines: NDArray[np.uint16]) -> None:

@@ -61,7 +61,7 @@ def test_missing_values_stay_missing(tmp_path: Path) -> None:
     values[0, 0, 0], values[1, 1, 1] = np.nan, np.inf
     scene = load_scene_file(_save(tmp_path / "a.npy", values), wavelengths=[500, 600])
     assert np.isnan(scene.values).sum() == 2
-    assert "1 infinite samples count as missing, the first at y 1, x 1, band 1" in scene.provenance
+    assert "1 infinite samples count as missing" in scene.provenance
 
 
 @pytest.mark.parametrize(
@@ -266,7 +266,7 @@ def test_a_fill_value_that_nobody_stated_is_refused_with_its_place(tmp_path: Pat
     with pytest.raises(SceneError) as refused:
         load_scene_file(path, bands=[1, 3], wavelengths=[500, 600])
     told = str(refused.value)
-    assert f"a.npy has 3 values, the first {np.float32(value)!s} at y 2, x 3, band 1, beyond" in told
+    assert f"a.npy has {np.float32(value)!s} at y 2, x 3, band 1, beyond" in told
     (tmp_path / "scene.toml").write_text(told[told.index("nodata =") : told.index(" into a scene.toml")] + "\n")
     found = load_scene_file(path, wavelengths=NM[:4])
     np.testing.assert_array_equal(found.values, holes)
@@ -280,7 +280,7 @@ def test_fill_values_of_any_type_are_refused(tmp_path: Path, kind: Any) -> None:
     """Also those that float32 would make infinite, and the ends of whole numbers; infinities themselves are missing."""
     values = np.ones((3, 3, 1), kind)
     values[1, 2, 0] = 1e300 if kind is np.float64 else np.iinfo(kind).max
-    with pytest.raises(SceneError, match=r"has 1 value, the first \S+ at y 1, x 2, band 0, beyond"):
+    with pytest.raises(SceneError, match=r"has \S+ at y 1, x 2, band 0, beyond"):
         load_scene_file(_save(tmp_path / "a.npy", values), wavelengths=[500])
 
 
@@ -293,17 +293,6 @@ def test_another_no_data_value_is_another_scene(tmp_path: Path) -> None:
         found.append(load_scene_file(path, wavelengths=[500, 600]).light_hash)
     assert len(set(found)) == 3
     assert found[2] == found[3]
-
-
-def test_values_that_leave_all_else_in_the_dark_are_told(tmp_path: Path) -> None:
-    """A fill value that could be a reading: one note with the number to write; a bright scene has none."""
-    values = np.random.default_rng(0).uniform(0.1, 0.5, (40, 50, 2))
-    plain = load_scene_file(_save(tmp_path / "a.npy", values), wavelengths=[500, 600])
-    assert not any("all else is dark" in note for note in plain.provenance)
-    values[:2] = 1e6
-    dark = load_scene_file(_save(tmp_path / "a.npy", values), wavelengths=[500, 600])
-    (note,) = (note for note in dark.provenance if "all else is dark" in note)
-    assert note.endswith("if they stand for no data, write nodata = 1000000.0 into a scene.toml")
 
 
 def _scene(folder: Path, cube: NDArray[np.uint16], toml: str) -> Path:

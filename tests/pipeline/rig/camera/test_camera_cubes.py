@@ -67,12 +67,12 @@ def test_big_endian_with_an_offset() -> None:
     ("old", "new", "words"),
     [
         ("ENVI", "EVNI", "begins with 'EVNI"),
-        ("bil", "bsq", "expected bil and 12"),
-        ("type = 12", "type = 4", "expected bil and 12"),
+        ("bil", "bsq", "expected bil and u2"),
+        ("type = 12", "type = 4", "expected bil and u2"),
         ("samples = 5", "samples = x", "samples = 'x', expected"),
-        ("samples = 5\n", "", "samples = None"),
-        ("order = 0", "order = 2", "expected 0 or 1"),
-        ("bands = 3", "bands = 0", "at least one of each"),
+        ("samples = 5\n", "", "does not say samples"),
+        ("order = 0", "order = 2", "expected 0 .little endian. or 1"),
+        ("bands = 3", "bands = 0", "expected a whole number from 1"),
         ("\n}\n", "\n", "never closed; .* fetch it again"),
     ],
 )
