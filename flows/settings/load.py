@@ -225,7 +225,16 @@ def load_settings(
     passes |= asked.get("zoom") == ALWAYS and asked.get("seconds") is None
     if passes and not _is_map(asked) and not any(asked.get(name) is not None for name in (*UNIFORM, "budget")):
         asked["budget"] = USUAL_BUDGET
+    if "prior" in given and "extent" not in given and _may_look_at_a_part(asked):
+        asked["extent"] = EXTENT_PART
     return parse_settings(asked, origin)
+
+
+def _may_look_at_a_part(asked: Mapping[str, object]) -> bool:
+    """Return whether a revisit that is bounded by its seconds alone can choose its lines by the prior map."""
+    others = {"sweeps", "kept_bytes", "pointing_px", *UNIFORM, *SPARING} - {"seconds"}
+    chosen = any(asked.get(name) is not None for name in others) or asked.get("zoom") == ALWAYS
+    return asked.get("seconds") is not None and asked["prior"] != "none" and not chosen and not _is_map(asked)
 
 
 def _is_usual(value: object, declared: Declared | None, origin: str | None) -> bool:

@@ -163,7 +163,8 @@ class Settings:
     extent: Extent = stated(
         "whole",
         "What a uniform scan looks at: whole (the field), part (with --seconds, of a field that is remembered: the "
-        "lines that promise most there), or lines by hand, as a receipt tells them: 0:12-310,1:0-40",
+        "lines that promise most there; what --prior and --seconds ask for together), or lines by hand, as a receipt "
+        "tells them: 0:12-310,1:0-40",
     )
     max_age: Refresh | None = stated(
         None,
