@@ -225,12 +225,12 @@ def load_settings(
     passes |= asked.get("zoom") == ALWAYS and asked.get("seconds") is None
     if passes and not _is_map(asked) and not any(asked.get(name) is not None for name in (*UNIFORM, "budget")):
         asked["budget"] = USUAL_BUDGET
-    if "prior" in given and "extent" not in given and _may_look_at_a_part(asked):
+    if "prior" in given and "extent" not in given and _may_choose_a_part(asked):
         asked["extent"] = EXTENT_PART
     return parse_settings(asked, origin)
 
 
-def _may_look_at_a_part(asked: Mapping[str, object]) -> bool:
+def _may_choose_a_part(asked: Mapping[str, object]) -> bool:
     """Return whether a revisit that is bounded by its seconds alone can choose its lines by the prior map."""
     others = {"sweeps", "kept_bytes", "pointing_px", *UNIFORM, *SPARING} - {"seconds"}
     chosen = any(asked.get(name) is not None for name in others) or asked.get("zoom") == ALWAYS

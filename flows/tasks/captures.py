@@ -118,7 +118,7 @@ def captured_signal(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRe
         raw = archive.ref(stage.product.name, stage.key(stage.wants(plan.run, *inputs)))
         found = condense.find(archive, condense.wants(plan.run, raw, *before))
     if found is None:
-        if before and archive.find(before[0].stage, before[0].key) is None:  # cleared after an earlier plan
+        if before and not archive.is_there(before[0].uri):  # cleared after an earlier plan
             capture_pass(plan, "coarse", inputs[-1])
         return condense(plan, capture_pass(plan, sweeps, *inputs), *before)
     if archive.is_known(raw):

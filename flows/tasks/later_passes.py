@@ -107,11 +107,11 @@ class LaterPasses:
         errors: PatchExpectedErrors,
         record: ScanPerformance,
         class_names: tuple[str, ...],
-        worth: Callable[[Scores], Scores],
+        value: Callable[[Scores], Scores],
     ) -> FinePlan:
         """Return the plan that is expected to add most to the mIoU, by the record of uniform scans.
 
-        ``errors`` are those of the first pass's map; ``worth`` leaves of (patch,) gains what the survey is after.
+        ``errors`` are those of the first pass's map; ``value`` leaves of (patch,) gains what the survey is after.
         """
         first, steps = exposing(self.camera, self.plan.coarse[0]), [one for one in record.steps if one < self._apart]
         gains: dict[tuple[int, float], Scores] = {}
@@ -121,7 +121,7 @@ class LaterPasses:
                 mean_ms = merged_ms(first.exposure_ms, exposure_ms, again)  # of the lines that a run then has
                 expected = record.expected(step, float(np.clip(mean_ms, *record.offered_ms(self.camera))))
                 iou = np.array([expected.get(name, expected[MIOU]) for name in class_names])
-                gains[step, exposure_ms] = worth(errors.expected_gain((1 - iou) / (1 + iou)))
+                gains[step, exposure_ms] = value(errors.expected_gain((1 - iou) / (1 + iou)))
         ranked = sorted(gains, key=lambda one: -self._most_gain(gains[one], *one))
         plans: list[tuple[tuple[int, float], FinePlan]] = []
         for one in ranked[:PLANNED]:

@@ -381,7 +381,7 @@ class FileValues:
 
 @dataclass(frozen=True)
 class Gaps:
-    """What is missing among the values of a file."""
+    """Values missing among the values of a file."""
 
     missing: NDArray[np.bool_]  # (y, x) pixels without a value in more than half of their bands
     filled_px: int  # pixels without a value in a band

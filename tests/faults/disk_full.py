@@ -34,7 +34,7 @@ PAGE = 4096
 IN_NAMESPACE = "SPECTRALZOOM_FAULTS_IN_NAMESPACE"
 QUICK = ("spool", "segment manifest", "run")  # kinds for the quick part
 FULL = "disk is full"
-WHERE = {"spool": "spool.", "manifest": "manifests.write_manifest", "run": "run_folder.publish_run"}  # in our functions
+WHERE = {"spool": "capture._capture", "manifest": "manifests.write_manifest", "run": "run_folder.publish_run"}  # in our functions
 STAGES = ("capture", "locate", "rectify", "score", "patches", "segment")
 EVERYWHERE = {"spool", "run", "run manifest", *STAGES, *(f"{stage} manifest" for stage in STAGES)}
 

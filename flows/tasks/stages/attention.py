@@ -70,9 +70,9 @@ def score(
         else:
             nothing = np.empty((0, 0, 0), np.float32)
             scores = score_patches(policy, CoarsePrediction(grid, nothing, nothing), seed=seed, mask=mask)
-        return worth(scores)
+        return value(scores)
 
-    def worth(scores: Scores) -> Scores:
+    def value(scores: Scores) -> Scores:
         """Return scores by the fraction of each patch that zones leave; a patch beside the scene is worth nothing."""
         if frame.missing is not None:
             void = patch_pixels(grid, frame.missing).mean(axis=(1, 2)) >= grid.valid_fraction().ravel()
@@ -87,7 +87,7 @@ def score(
                 scores = expected_gain()
                 return scores, later.within(scores)
             errors = work.expected_errors(mosaic.path / "mosaic.zarr", capture, lambda done: report(0.5 * done))
-            found = later.best(errors, scan_record, work.weights.load().class_names, worth)
+            found = later.best(errors, scan_record, work.weights.load().class_names, value)
             return errors.expected_wrong_pixels(), found
         seen = all_seen(grid, () if raster is not None else plan.coarse, camera, part=part)
         if budget is None:

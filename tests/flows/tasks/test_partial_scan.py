@@ -223,7 +223,7 @@ def test_what_is_beyond_another_fields_part_has_no_class(
             "at sweep 7, the scan has sweeps 0 to 0",
         ),
         ({"pointing_px": "4"}, SettingsError, "ties its sweeps by what they share"),
-        ({"extent": None, "max_age": "14d"}, SettingsError, "--max-age says how old a place may become"),
+        ({"extent": "whole", "max_age": "14d"}, SettingsError, "--max-age says how old a place may become"),
         ({"max_age": "a while"}, SettingsError, "must be a time of 1h to 3660d, such as 14d"),
         ({"seconds": "1"}, BudgetError, r"no look at any part of the field ends in time; the least takes 1\.\d s"),
     ],

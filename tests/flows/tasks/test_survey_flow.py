@@ -34,6 +34,8 @@ pytestmark = pytest.mark.usefixtures("no_effects")
 class UnmadeRef(StageRef):
     """Address of a store that nobody made: it has no key."""
 
+    uri = ""
+
     def __getattribute__(self, name: str) -> Any:
         """Refuse the key."""
         if name == "key":
@@ -45,7 +47,7 @@ class Noted:
     """An opened survey of an empty archive that notes which stage is asked for with which inputs."""
 
     capture_deployment = None
-    run = SimpleNamespace(archive=SimpleNamespace(ref=UnmadeRef))
+    run = SimpleNamespace(archive=SimpleNamespace(ref=UnmadeRef, is_there=lambda uri: True))
 
     def __init__(self, **facts: bool) -> None:
         self.uniform = self.registers = self.on_the_ground = self.is_map = False
