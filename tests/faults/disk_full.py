@@ -34,7 +34,8 @@ PAGE = 4096
 IN_NAMESPACE = "SPECTRALZOOM_FAULTS_IN_NAMESPACE"
 QUICK = ("spool", "segment manifest", "run")  # kinds for the quick part
 FULL = "disk is full"
-WHERE = {"spool": "capture._capture", "manifest": "manifests.write_manifest", "run": "run_folder.publish_run"}  # in our functions
+# Functions of ours that a full disk is met in.
+WHERE = {"spool": "capture._capture", "manifest": "manifests.write_manifest", "run": "run_folder.publish_run"}
 STAGES = ("capture", "locate", "rectify", "score", "patches", "segment")
 EVERYWHERE = {"spool", "run", "run manifest", *STAGES, *(f"{stage} manifest" for stage in STAGES)}
 
