@@ -127,7 +127,7 @@ def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: Prio
         patch_index.ravel()[plan.patch_index] = 1
         table = np.array([(0, 0, 0, 0), (*PATCH_RGB, 255)], np.uint8)
         layers.append(
-            MapLayer("Looked at twice", layer_address(_on_field(run, patch_index)[thin, thin], table), opacity=0.6)
+            MapLayer("Captured again", layer_address(_on_field(run, patch_index)[thin, thin], table), opacity=0.6)
         )
     counts = np.bincount(shown.class_map.ravel(), minlength=256) / max(shown.class_map.size, 1)
     covered = [*counts[: len(shown.class_names)].tolist(), float(counts[len(shown.class_names) :].sum())]

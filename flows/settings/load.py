@@ -476,12 +476,12 @@ def _extent_errors(settings: Settings, origin: Mapping[str, str]) -> Iterator[st
 
 
 def _sparing_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
-    """Budgets of patches where none are chosen: in two passes seconds buy them, and of a part all is read."""
+    """Budgets of patches where none are chosen: zoomed, seconds buy them, and of a part all is read."""
     given = [place_of(name, origin.get(name)) for name in SPARING if getattr(settings, name) is not None]
     if given and not settings.plain:
         yield (
             f"{given[0]} is for a raster or a uniform scan, of which a part is kept and read in detail: give "
-            "--seconds or --scan-step too; what a survey in two passes looks at in detail, its --budget says"
+            "--seconds or --scan-step too; what a zoomed survey reads in detail, its --budget says"
         )
     if given and settings.extent != EXTENT_WHOLE:
         place = place_of("extent", origin.get("extent"))

@@ -56,7 +56,7 @@ RIG_FIELD = "field"  # the scene of which only the rig, or a recording, knows mo
 OF_THE_MACHINE = ("scheduler", "workers", "device")  # what of that day need not be there today
 OF_A_PART = ("max_age", "skip_below_error")  # of what a field that is remembered is looked at by
 OF_RECORDINGS = ("sweeps", "pointing", "dark", "white", "scan")
-USUAL_BUDGET = 0.5  # of two passes
+USUAL_BUDGET = 0.5  # of a zoomed survey
 MOST_STEP = 8  # pixels from line to line of a uniform scan
 UNIFORM = ("seconds", "bytes_raw", "goal", "scan_step", "scan")  # settings of which one asks for a uniform scan
 SPARING = ("macs", "least_gain")  # by which a uniform scan is read in detail in part
@@ -76,7 +76,7 @@ OF_A_CAMERA = (
 )
 OF_A_VIEW = ("camera.pitch_um", "camera.focal_length_mm")  # how large a pixel is seen, which a [pose] asks for
 ALL_OF_IT = "leave it out to read all of the scan in detail"
-INSTEAD = "leave it out for a survey in two passes"
+INSTEAD = "leave it out to zoom by --budget"
 WORKERS = "one process or thread each; leave it out for one a core"
 EPSG = "the number after EPSG:, such as 32632"
 

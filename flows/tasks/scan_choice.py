@@ -36,7 +36,7 @@ class ScanChoice:
     """The scan that a survey takes, if it takes a plain one, and those that the weights' record tells of."""
 
     offered: tuple[UniformScan, ...] = ()  # none without a record
-    chosen: UniformScan | None = None  # None of a survey in two passes, and of what the record does not tell of
+    chosen: UniformScan | None = None  # None of a zoomed survey, and of what the record does not tell of
 
     def best_within(self, seconds: float) -> UniformScan | None:
         """The scan that is likely to score most in so many seconds; None where there is none."""

@@ -66,7 +66,7 @@ def write_survey_draft(draft: SweepsDraft, *, force: bool = False) -> dict[str, 
             if draft.has_wavelengths
             else [f"# wavelengths = [450.0, ...]   # nothing says those of the {draft.bands} bands: write them [nm]"],
             [
-                "# budget = 0.5   # two passes in half of the seconds of a full scan; without it every line is read",
+                "# budget = 0.5   # zoom in half of the seconds of a full scan; without it every line is read",
                 '# weights = "WEIGHTS.safetensors"   # of a network that was trained on such data; "farm" is built in',
             ],
         ]

@@ -39,7 +39,7 @@ class RecordedPasses:
             words = "; ".join(f"along {along}, step {step}, binning {binning}" for along, step, binning in self._kinds)
             raise SceneError(
                 f"the recording holds lines of {len(self._kinds)} kinds ({words}), which are not one uniform scan; "
-                "give the --budget of a survey in two passes, or name sweeps of one kind"
+                "give the --budget of a zoomed survey, or name sweeps of one kind"
             )
         return sweeps
 

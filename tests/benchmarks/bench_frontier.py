@@ -2,7 +2,7 @@
 
 A uniform scan takes every line, every second or every fourth, not binned, with one exposure; its whole picture is read.
 `survey --seconds` takes the one that the weights' record promises most of: it stands beside all that were tried.
-Surveys in two passes have the coarse pass as long exposed as the fine one or a quarter as long. Farms that training
+Zoomed surveys have the first pass as long exposed as the later one or a quarter as long. Farms that training
 never saw, each with noise of its own. Below stands how far what each map says of itself lies from what it scores.
 
 `python tests/benchmarks/bench_frontier.py 1280x1024` draws the map of `survey --seconds` alone, on larger farms;

@@ -28,7 +28,7 @@ SEEDS, DAYS, SIZE = (21, 22, 23), (120, 172, 250), "640x512"
 PROBES: dict[str, dict[str, Any]] = {
     "every line, 100 ms": {"scan_step": 1},
     "survey --seconds 25": {"seconds": 25},
-    "two passes, budget 0.5": {"budget": 0.5},
+    "zoomed, budget 0.5": {"budget": 0.5},
     "every line, 5 ms": {"scan_step": 1, "scan_exposure_ms": 5},
 }
 WEIGHTS = shipped_weights()

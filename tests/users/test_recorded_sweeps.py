@@ -156,7 +156,7 @@ def test_raw_cubes_of_a_simulated_survey_give_its_map(tmp_path: Path, full_scan:
 
 @pytest.fixture(scope="module")
 def two_passes(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> tuple[Path, Published]:
-    """A simulated survey in two passes, the first one binned: its archive and its run."""
+    """A simulated survey that zooms: its archive and its run."""
     out = tmp_path_factory.mktemp("two_passes") / "sim"
     with without_effects():
         return out, survey_png(out, budget=0.8, policy="entropy", keep="raw", **NARROW)

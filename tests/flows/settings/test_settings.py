@@ -347,3 +347,18 @@ def test_receipt_settings_read_back_the_same(budget, seed, bands, memory, exposu
     )
     assert parse_settings(settings.to_dict()) == settings
     assert parse_settings(json.loads(to_json(settings.to_dict()))) == settings
+
+
+@pytest.mark.parametrize(
+    ("more", "extent"),
+    [
+        ({}, "part"),
+        ({"extent": "whole"}, "whole"),
+        ({"macs": "40%"}, "whole"),
+        ({"zoom": "always"}, "whole"),
+        ({"prior": "none"}, "whole"),
+    ],
+)
+def test_a_revisit_within_seconds_chooses_a_part(more: dict[str, str], extent: str) -> None:
+    """Another choice of lines, or none of the memory, leaves it the whole field."""
+    assert load_settings(None, {"scene": "farm", "seconds": "8", "prior": "latest", **more}).extent == extent

@@ -62,7 +62,7 @@ def test_a_line_that_is_missing_is_named() -> None:
 def test_a_uniform_scan_is_of_one_kind() -> None:
     """A recording of a coarse and a fine pass is no uniform scan, and its fine runs are no full scan."""
     passes = passes_over(replace(COARSE, start_px=-39.5, lines=20), replace(FULL, name="fine-0", lines=30))
-    with pytest.raises(SceneError, match=r"lines of 2 kinds .*give the --budget of a survey in two passes"):
+    with pytest.raises(SceneError, match=r"lines of 2 kinds .*give the --budget of a zoomed survey"):
         passes.uniform_scan()
     assert passes.full_scan([replace(FULL, name="full-0")]) == [replace(FULL, name="full-0")]
 
