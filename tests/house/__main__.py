@@ -1,6 +1,7 @@
-"""Print the house as it is: python tests/house [--journey], the figures that design rules are held against.
+"""Print the figures that design rules are held against: python tests/house [--journey | --language [PATH]].
 
 With --journey a small survey is run as well, to find the files that a simulated line passes; it takes half a minute.
+With --language every sentence is printed that breaks a rule of plain English, in all files or those below PATH.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 sys.path[0] = str(Path(__file__).resolve().parents[2])  # not this folder: its modules go by their full names
 
 from tests.benchmarks.measure import aligned  # noqa: E402
+from tests.house.language import violations  # noqa: E402
 from tests.house.source_tree import (  # noqa: E402
     ROOMS,
     circles,
@@ -38,7 +40,11 @@ SURVEY = ("survey", "--scene", "farm", "--size", "192x160", "--seconds", "6", "-
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Print the table, and below it the files that a line passes where they are asked for."""
+    """Print the table, and below it the files that a line passes where they are asked for; or the broken rules."""
+    if "--language" in arguments:
+        for sentence, rule in violations("".join(arguments[1:2])):
+            print(f"{sentence.path}:{sentence.line}: {sentence.kind}, rule {rule}\n    {sentence.text}")
+        return 0
     print(aligned([("what", "is", "where"), *figures()], (52, 10, 60)))
     if "--journey" in arguments:
         passed = journey()
