@@ -13,7 +13,6 @@ ROOT = Path(__file__).resolve().parents[2]
 ROOMS = ("pipeline", "models", "storage", "flows", "spectralzoom")
 Trees = Mapping[Path, ast.Module]
 Documented = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
-UNCLEAR = ("what", "of", "where", "by", "beside", "which", "how", "whether", "who", "whoever", "with", "in", "as")
 
 
 @cache
@@ -133,16 +132,6 @@ def parameters_of_type(trees: Trees, name: str) -> int:
 def public(tree: ast.AST) -> Iterator[Documented]:
     """Functions and classes whose names begin with no underscore, wherever they stand: in others too."""
     return (node for node in nodes(tree) if isinstance(node, Documented) and not node.name.startswith("_"))
-
-
-def unclear_docstrings(trees: Trees) -> Counter[str]:
-    """Return how many docstrings of each file begin with a word that hides what the code does: `UNCLEAR`."""
-    found = Counter[str]()
-    for path, tree in trees.items():
-        documented = [tree, *(node for node in nodes(tree) if isinstance(node, Documented))]
-        firsts = ((ast.get_docstring(node) or " ").partition(" ")[0].lower() for node in documented)
-        found[path.as_posix()] = sum(first in UNCLEAR for first in firsts)
-    return +found
 
 
 def lines_of(path: Path) -> list[str]:

@@ -1,0 +1,86 @@
+"""Pages, docstrings and messages keep the rules of plain English, and the check finds each broken rule."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+from tests.house import language
+from tests.house.language import (
+    Sentence,
+    broken_rules,
+    names_without_unit,
+    sentences_of_code,
+    sentences_of_page,
+    violations,
+)
+
+EXCEPTIONS: set[tuple[str, str]] = set()  # (path, beginning of the sentence) that may break a rule
+MOST_EXCEPTIONS = 30
+
+
+def rules_of(text: str, kind: str = "page") -> list[str]:
+    """Return the numbers of the rules that a sentence breaks."""
+    return [rule[0] for rule in broken_rules(Sentence(Path("one.md"), 1, kind, text))]
+
+
+@pytest.mark.parametrize(
+    ("text", "rules"),
+    [
+        ("The planner selects a scan.", []),
+        ("Of all scans it takes the cheapest.", ["1"]),
+        ("Which scans exist?", []),
+        (f"The planner {'very ' * 24}slowly ends.", ["2"]),
+        ("It took 3 s, 4 s and 5 s.", ["4"]),
+        ("A field of 1280 x 1024 px takes 3 to 100 ms.", []),
+        ("Codes such as `1 2 3 4` are no numbers.", []),
+        ("Nobody reads it.", ["6"]),
+        ("The survey goes on.", ["6"]),
+        ("The weights before had 94.2.", ["7"]),
+        ("It is no longer there, as on 2026-01-02.", ["7"]),
+    ],
+)
+def test_a_broken_rule_is_found(text: str, rules: list[str]) -> None:
+    """Each rule by a sentence that breaks it, and by one that seems to."""
+    assert rules_of(text) == rules
+
+
+def test_a_message_may_be_a_fragment() -> None:
+    """The end of a message that begins in lower case is no sentence; one that begins in upper case is."""
+    assert rules_of("of {} rows", "message") == []
+    assert rules_of("Of {} rows", "message") == ["1"]
+
+
+def test_sentences_of_a_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Code, tables, headings and comments have none; items of a list are apart; links are their text."""
+    prose = "# Of it\n<!-- Of it -->\nOne [two](three.md) four. Five\nsix.\n\n- Seven.\n- Eight,\n  nine.\n"
+    (tmp_path / "page.md").write_text(f"{prose}\n| Of it |\n```sh\nOf it\n```\n")
+    monkeypatch.setattr(language, "ROOT", tmp_path)
+    found = [(one.line, one.text) for one in sentences_of_page(Path("page.md"))]
+    assert found == [(3, "One two four."), (3, "Five six."), (6, "Seven."), (7, "Eight, nine.")]
+
+
+def test_sentences_of_code() -> None:
+    """Docstrings, strings of four words or more, and f-strings with their gaps."""
+    code = 'def f(n):\n    """Return it.\n\n    None.\n    """\n    raise E(f"got {n} lines of sweeps", "one")\n'
+    found = [(one.kind, one.text) for one in sentences_of_code(Path("one.py"), ast.parse(code))]
+    assert found == [("docstring", "Return it."), ("docstring", "None."), ("message", "got {} lines of sweeps")]
+
+
+def test_numbers_have_units() -> None:
+    """A plain number of a known quantity ends with its unit; arrays and other names are free."""
+    tree = ast.parse("def f(exposure: float, exposure_ms: float, wavelength: NDArray, timeout: float | None): ...")
+    assert [name for _, name in names_without_unit(Path("one.py"), tree)] == ["exposure", "timeout"]
+
+
+def test_all_texts_keep_the_rules() -> None:
+    """`python tests/house --language` prints nothing but the few sentences that are listed here."""
+    assert len(EXCEPTIONS) <= MOST_EXCEPTIONS
+    wrong = [
+        f"{one.path}:{one.line}: rule {rule}: {one.text}"
+        for one, rule in violations()
+        if not any(one.path.as_posix() == path and one.text.startswith(begin) for path, begin in EXCEPTIONS)
+    ]
+    assert wrong == []
