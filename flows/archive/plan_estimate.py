@@ -32,8 +32,8 @@ LABELS: Mapping[str, tuple[str, Callable[[float | None], str]]] = {
     "miou": ("mIoU", lambda score: format_prediction(score, None) or DASH),
     "cpu_s": ("processor time", format_seconds),
 }
-# Bytes kept, fitted to seven surveys (docs/kept.md): receipt and report, their pictures for a pixel of a side, the map
-# for a pixel, and the scores of a spectrum, which follow the bands of a file.
+# Bytes kept, fitted to seven surveys (docs/background/signal.md): receipt and report, their pictures for a pixel of a
+# side, the map for a pixel, and the scores of a spectrum, which follow the bands of a file.
 PAGE, PICTURE_SIDE, MAP_PIXEL = 300_000, 1600.0, 5.0
 FARM_SCORES, LARGE_FARM_SCORES, FILE_SCORES, BANDS_POWER = 17.0, 4.5, 2.4, 0.57
 KEPT_FROM = "pixels, spectra and bands, by surveys of seven fields, which kept 0.5 to 2 times as much"

@@ -3,7 +3,7 @@
 Attention is global, so what a token sees has to end somewhere. A field of up to 640 x 640 px is one region and is read
 whole. A larger one is cut; each part is read with a halo of pixels around it, of which nothing is kept. Attention
 takes multiply-adds quadratic in a region: three farms of 1280 x 1024 px, cut, score within .1 points of one region, for
-84 % of its multiply-adds (docs/benchmarks.md).
+84 % of its multiply-adds (docs/measurements/benchmarks.md).
 """
 
 from __future__ import annotations

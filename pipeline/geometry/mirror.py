@@ -5,7 +5,7 @@ of the plane of incidence. Scene tangents are xi = o_y / o_x (along the line) an
 reports the point, in units of tan 50 deg, where a ray falling along the rest normal would go (position (0, 0) is rest).
 
 float32 arrays stay float32, as devices keep them; everything else is worked out in float64. What the paper prints
-instead is in ``tests/pipeline/geometry/paper_equations.py``, and docs/errata.md lists the errata E1 to E18.
+instead is in ``tests/pipeline/geometry/paper_equations.py``, and docs/background/errata.md lists the errata E1 to E18.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The camera that architecture.md builds takes a sweep beside the emulated mirror, and implements its protocol."""
+"""The camera that how-to/second-rig.md builds takes a sweep beside the emulated mirror, and implements its protocol."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class Program:
 @pytest.fixture
 def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """The page's code as a file that can be imported."""
-    (block,) = (block for block in blocks_of(DOCS / "architecture.md") if block.file == f"{MODULE}.py")
+    (block,) = (block for block in blocks_of(DOCS / "how-to" / "second-rig.md") if block.file == f"{MODULE}.py")
     path = tmp_path / "code" / f"{MODULE}.py"
     path.parent.mkdir()
     path.write_text(block.text)

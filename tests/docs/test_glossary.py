@@ -1,4 +1,4 @@
-"""Code and pages use the terms of docs/glossary.md, and none of the words that it bans."""
+"""Code and pages use the terms of docs/reference/glossary.md, and none of the words that it bans."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 from tests.docs.pages import DOCS, PAGES, ROOT
 
-GLOSSARY = DOCS / "glossary.md"
+GLOSSARY = DOCS / "reference" / "glossary.md"
 ROOMS = ("pipeline", "models", "storage", "flows", "spectralzoom")
 SOURCES = sorted(path for room in ROOMS for path in (ROOT / room).rglob("*.py"))
 OTHERS = {  # words that mean something else in these files

@@ -18,7 +18,7 @@ from pipeline.ground.view import GroundView, RigPose
 from pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M, farm_scene
 from tests.conftest import Survey
 
-PAGE = Path(__file__).parents[2] / "docs" / "ground.md"
+PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "ground-and-zones.md"
 
 
 def test_the_example_of_a_pose_shows_the_farm_as_large_as_it_says() -> None:

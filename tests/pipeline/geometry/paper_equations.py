@@ -1,7 +1,7 @@
 """Five models of where a line's samples look, from no rotation to exact rays, the paper's own among them.
 
-For comparison only, never for computing; errata in brackets, docs/errata.md tells each with its figure. Normals and
-directions are in the frame of :mod:`pipeline.geometry.mirror`.
+For comparison only, never for computing; errata in brackets, docs/background/errata.md has each with its figure.
+Normals and directions are in the frame of :mod:`pipeline.geometry.mirror`.
 """
 
 from __future__ import annotations
