@@ -10,7 +10,7 @@ BENCH ?=
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install -q --no-compile --disable-pip-version-check -c constraints.txt
 
-# The tools beneath are asked to send no analytics.
+# Ask the tools to send no analytics.
 export DO_NOT_TRACK = 1
 
 .PHONY: setup survey survey-rig test lint docs notebooks bench paper faults soak lock
@@ -18,31 +18,31 @@ export DO_NOT_TRACK = 1
 
 setup: $(BIN)/.ok
 
-# Debian without python3-venv has no ensurepip: make the environment bare, then let the system's pip fill it.
+# Debian without python3-venv has no ensurepip: create a bare environment, then install pip with the system's pip.
 $(BIN)/.ok: pyproject.toml constraints.txt
 	$(PY) -m venv $(VENV) 2>/dev/null || { $(PY) -m venv --without-pip $(VENV) \
 		&& $(PY) -m pip --python $(BIN)/python install -q pip; }
 	$(PIP) -e .
 	touch $@
 
-# What tests, lint, pages and benchmarks need on top.
+# Additional packages for tests, lint, pages and benchmarks.
 $(BIN)/.ok-dev: $(BIN)/.ok
 	$(PIP) -e '.[dev,s3,bench]'
 	touch $@
 
-# A visit, and of the built-in farm the visit a week later, which goes on from the map of the first.
+# Surveys the scene; surveys the built-in farm again a week later, with the first map as prior map.
 survey: $(BIN)/.ok
 	$(BIN)/spectralzoom survey --scene $(SCENE) --seconds $(SECONDS) --out $(ARCHIVE)
 ifeq ($(SCENE),farm)
 	$(BIN)/spectralzoom survey --scene farm --day 179 --seconds 8 --prior latest --no-controls --out $(ARCHIVE)
 endif
 
-# A rig emulated behind a pty and sockets, a whole survey through it, and the simulated one beside it. About a minute.
+# Runs a survey through a rig emulated behind a pty and sockets, and compares it with the simulated one. One minute.
 survey-rig: $(BIN)/.ok-dev
 	OMP_NUM_THREADS=1 $(BIN)/python tests/soak survey-rig
 
-# Laws draw the same cases each time; PYTEST_ARGS="-n 3 --hypothesis-profile=anew" draws others.
-# Tests start hundreds of processes: bytecode is kept between them, also where the environment says otherwise.
+# Property tests draw the same cases each time; PYTEST_ARGS="-n 3 --hypothesis-profile=anew" draws new ones.
+# Tests start hundreds of processes, so they write bytecode even if the environment disables it.
 test: $(BIN)/.ok-dev
 	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q $(PYTEST_ARGS)
 
@@ -51,43 +51,43 @@ lint: $(BIN)/.ok-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# The pages of docs/ as docs/_build/index.html. A dead link, anchor or reference fails; nothing is fetched.
+# Builds docs/_build/index.html. A dead link, anchor or reference is an error. Nothing is downloaded.
 docs: $(BIN)/.ok-dev
 	$(BIN)/python -m sphinx -q -E -W --keep-going -n -d docs/_build/.doctrees docs docs/_build
 
-# The notebooks of docs/, run from top to bottom and kept with what they gave. The tests run them without a kernel.
+# Runs the notebooks of docs/ and stores their outputs. The tests run them without a kernel.
 notebooks: $(BIN)/.ok
 	$(PIP) nbclient ipykernel
 	$(BIN)/python -c "$$RENDER" docs/notebooks/*.ipynb
 
-# Every goal with the peers beside it (BENCH="geometry lookup" for some), then what accuracy costs in time.
+# Compares every goal with its peers (BENCH="geometry planning" selects some), then prints error against time.
 bench: $(BIN)/.ok-dev
 	OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks $(BENCH); crashed=$$?; \
 		OMP_NUM_THREADS=1 $(BIN)/spectralzoom tradeoff && exit $$crashed
 
 PAPER ?=
 
-# Ten minutes: tables II and III of the paper, and whether 35 % of the patches score as much as all of them
-# (PAPER="--data FOLDER" for images and labels of your own, PAPER="--steps 1200" for longer training).
+# Prints tables II and III of the paper and checks its claim on 35 % of the patches. Ten minutes.
+# PAPER="--data FOLDER" reads your own images and labels, PAPER="--steps 1200" trains longer.
 paper: $(BIN)/.ok-dev
 	OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/bench_paper.py $(PAPER)
 
 FAULTS ?=
 
-# Half an hour: everything that may go wrong with an archive, by the hundred (FAULTS="disk_full clocks" for some);
-# the tests hold a quick part of each.
+# Runs the fault-injection tests of the archive (FAULTS="disk_full clocks" selects some). Half an hour.
+# `make test` runs a quick part of each.
 faults: $(BIN)/.ok-dev
 	OMP_NUM_THREADS=1 $(BIN)/python tests/faults $(FAULTS)
 
 SOAK ?=
 
-# Under an hour: a day of 72 surveys with kills, cables and full disks, and a week on Prefect's schedules
-# (SOAK="day --quick").
+# Runs a day of 72 surveys with kills, unplugged cables and full disks, and a week of Prefect schedules
+# (SOAK="day --quick"). Under an hour.
 soak: $(BIN)/.ok-dev
 	OMP_NUM_THREADS=1 $(BIN)/python tests/soak $(SOAK)
 
-# Names and versions only. A machine that is offered a CPU wheel of torch does not resolve the accelerator's packages:
-# their lines are kept as they are.
+# Writes names and versions to constraints.txt. With a CPU wheel of torch, pip does not resolve the accelerator's
+# packages; their lines stay unchanged.
 lock:
 	$(PY) -m venv $(VENV)-lock 2>/dev/null || { $(PY) -m venv --without-pip $(VENV)-lock \
 		&& $(PY) -m pip --python $(VENV)-lock/bin/python install -q pip; }
