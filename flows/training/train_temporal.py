@@ -1,7 +1,7 @@
-"""`spectralzoom train --train-temporal`: train the reader of prior maps on lands through days.
+"""`spectralzoom train --train-temporal`: train the temporal reader on lands over several days.
 
-Built-in lands are scanned on several days; by the law of noise each scan is shown as shorter exposures and wider steps
-would have shown it, and read by the weights that the memory is for. Other lands then say what the memory is worth.
+Built-in lands are scanned on several days. The noise model turns each scan into scans of shorter exposure and wider
+line spacing, which the weights segment. Other lands then measure what the prior map gains.
 """
 
 from __future__ import annotations
@@ -36,20 +36,20 @@ from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES, farm_scene
 
 SHAPE = (512, 640)  # (y, x) of a land
 LANDS, FIRST_SEED, JUDGED_SEED = 48, 200_000, 300_000
-VISITS = 5  # to each land
+VISITS = 5  # of each land
 DAYS, LAST_DAY = (95, 290), 318  # of the year: of first visits, and of any
 GAPS = (0, 1, 1, 2, 3, 3, 5, 6, 6, 7, 7, 10, 14)  # days between two
 HOURS = (9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0)
-SPACINGS = {1: 0.3, 2: 0.5, 4: 0.2}  # how often lines are so many pixels apart
+SPACINGS = {1: 0.3, 2: 0.5, 4: 0.2}  # line spacing [px] -> fraction of the passes
 DARKEST_MS, BRIGHTEST_MS = 3.0, 50.0
 PASSES = 2  # of each visit
 JUDGED_DAY, JUDGED_AFTER, JUDGED_LANDS = 172, (1, 3, 7), 3
-BEFORE, NOW = (1, 25.0), (2, 5.0)  # step and exposure [ms] of the looks that are judged
+BEFORE, NOW = (1, 25.0), (2, 5.0)  # line spacing [px] and exposure [ms] of the judged scans
 
 
 @dataclass(frozen=True)
 class TemporalRequest:
-    """For which weights, where to, and how."""
+    """Weights, output file and settings of a training."""
 
     dataset: str
     weights: Path
@@ -62,15 +62,15 @@ class TemporalRequest:
 
 
 def train_temporal(request: TemporalRequest, report: Report = lambda what, done, figure: None) -> dict[str, Any]:
-    """Train a reader for some weights, judge it on other lands and save it; give the record that stands in the file.
+    """Train a temporal reader for weights, judge it on other lands, save it, and return the record of its file.
 
-    Raises SettingsError: no built-in farm, or a place that cannot be written to; WeightsError: the weights cannot be
-    read; SettingsError: they are not of the farm's classes.
+    Raises SettingsError: the dataset is not the built-in farm, its classes are not those of the weights, or the file
+    cannot be written; WeightsError: the weights cannot be read.
     """
     if request.dataset not in FARM_NAMES:
         raise SettingsError(
-            "--train-temporal trains on one land at several days, which only the built-in farm gives: expected "
-            f"farm, got {request.dataset}; without a reader surveys go on from a memory by the surer of two looks"
+            f"--train-temporal {request.dataset}: expected farm, the only data set with several days of one land. "
+            "Weights without a temporal reader use the more confident of prior map and visit"
         )
     if not request.out.parent.is_dir() or request.out.is_dir():
         raise SettingsError(f"-o {request.out}: expected the name of a file in a folder that exists")
@@ -103,7 +103,7 @@ def train_temporal(request: TemporalRequest, report: Report = lambda what, done,
 
 
 def _moments(rng: np.random.Generator) -> list[tuple[int, float]]:
-    """Days of the year, each later than the one before, and hours."""
+    """Draw days of the year in ascending order, with hours."""
     days = [int(rng.integers(*DAYS))]
     while len(days) < VISITS:
         days.append(min(days[-1] + max(int(rng.choice(GAPS)), 0), LAST_DAY))
@@ -119,7 +119,7 @@ def _visit(
     hour: float,
     rng: np.random.Generator,
 ) -> Visit:
-    """A land on a day, as looks drawn by chance show it."""
+    """Return a land on a day, as scans drawn at random show it."""
     seen = _Land.observed(weights, shape, seed, day, hour)
     drawn = []
     for _ in range(PASSES):
@@ -158,7 +158,7 @@ class _Land:
         exposure_ms: float,
         rng: np.random.Generator,
     ) -> CurrentVisit:
-        """Return what a uniform scan would have shown, read by the weights."""
+        """Return a visit by a uniform scan, segmented by the weights."""
         light = exposure_ms / REFERENCE_MS
         scan = augmentation.scan(self.columns, self.noise, light=light, step=step, rng=rng)[..., :-PLANES]
         _, every_class = map_of_columns(weights, scan, self.grid, LineSpec(light, step))
@@ -172,10 +172,10 @@ def judge_temporal(
     request: TemporalRequest,
     report: Report,
 ) -> list[dict[str, float]] | None:
-    """Return what maps score some days after a first visit, mIoU in the mean of lands that training did not see.
+    """Return the mean mIoU of maps some days after a first visit, on lands that training did not see.
 
-    ``kept``: the map of before; ``observe``: today's look alone; ``prior_map``: both by the reader; ``surer``: without
-    it; ``anew``: the field scanned again as it was at first. None without a land to judge on.
+    ``kept`` is the first map and ``extent`` the later visit alone. ``prior_map`` is their fusion by the reader,
+    ``surer`` without it. ``anew`` is a second scan like the first. Returns None without a land to judge.
     """
     rows: dict[int, list[dict[str, float]]] = {days: [] for days in JUDGED_AFTER}
     for number in range(request.judged):
@@ -210,16 +210,16 @@ def judge_temporal(
 
 
 def run_remember(request: TemporalRequest, console: Console) -> dict[str, Any]:
-    """Train with a progress bar on ``console``; give the record kept in the file."""
+    """Train with a progress bar on ``console``, and return the record of the file."""
     with one_after_the_other(console) as report:
         record = train_temporal(request, report)
     console.print(
-        f"weights with a reader of memories: {request.out}, {record['steps']} steps", markup=False, soft_wrap=True
+        f"weights with a temporal reader: {request.out}, {record['steps']} steps", markup=False, soft_wrap=True
     )
     if record["validation"]:
         rows = record["validation"]
         title = f"mIoU on {request.judged} lands that training did not see"
-        table = Table("days later", "kept", "look alone", "the surer", "prior_map", "scanned anew", title=title)
+        table = Table("days later", "first map", "visit alone", "more confident", "fused", "new full scan", title=title)
         for row in rows:
             figures = (f"{row[name]:.1%}" for name in ("kept", "extent", "surer", "prior_map", "anew"))
             table.add_row(f"{row['days']:g}", *figures)

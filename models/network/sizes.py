@@ -13,7 +13,7 @@ from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
 
 MOST_CLASSES = 255  # maps are uint8 and 255 stands for unlabelled
-# What nobody builds: sizes beyond these are damage, or an attempt to have memory filled.
+# Larger sizes in a file are damage, or an attempt to fill the memory.
 MOST = {
     "columns": 4096,
     "patch": 1024,
@@ -26,14 +26,14 @@ MOST = {
 }
 BOTTOM = 4  # pixels a side at the lowest level of a patch
 PATCHES_AT_ONCE = 64  # their features fit the caches; larger chunks go to memory and back at every layer
-CELL_PX = 2  # pixels a side of the spectral features that a reader of prior maps sees
+CELL_PX = 2  # pixels a side of the spectral features of the temporal reader
 AROUND_PX = 5  # pixels a side whose mean spectrum the spectral classifier reads
 TOKEN_PX = 32  # pixels a side that a token stands for
 PLANES = 3  # beside the spectral features of a pixel: exposure, line spacing, binned samples
 SCORER_WIDTH = 16  # channels of the network that scores patches
 MOST_GAIN = 5.0  # gains are clipped to this [nat per px]; one confident error would outweigh a field
-OTHERS = 5  # images that a reader of memories reads beside probabilities: seen, age, lights, step
-GATES = 3  # of its own: how far the memory, and the look, are believed; how far both together replace the memory
+OTHERS = 5  # inputs of the temporal reader beside probabilities: seen, age, light before, light, line spacing
+GATES = 3  # of the temporal reader: weight of prior map, weight of visit, weight of both against the prior map
 
 
 def level_widths(width: int, patch: int) -> list[int]:

@@ -1,7 +1,7 @@
-"""The network that reads a field's memory beside today's look: an update of class probabilities, pixel by pixel.
+"""The temporal reader: a network that fuses a prior map with the current visit, pixel by pixel.
 
-A Bayes filter would take two looks for independent witnesses; they err at the same edges, and classes change where
-spectra do. This network sees both, how long ago the memory is, how the new look was taken, and both coarse passes.
+A Bayes filter assumes independent observations, but visits err at the same edges. The network reads both class
+probabilities, the age of the prior map, exposure and line spacing of the visit, and the spectral features of both.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from torch import Tensor, nn
 
 from models.network.sizes import CELL_PX, GATES, OTHERS, TemporalSizes
 
-FAINT = 10.0  # logarithms of probabilities are read down to minus this
-STARTS = (2.2, 0.0, -1.0)  # of the gates, before anything is learned
-LEAST_LIGHT = 1e-4  # of a memory, in reference exposures
+FAINT = 10.0  # least log-probability of the inputs, negated
+STARTS = (2.2, 0.0, -1.0)  # of the gates, before training
+LEAST_LIGHT = 1e-4  # of a prior map, in reference exposures
 
 
 class TemporalReader(nn.Module):
-    """Log-probabilities of classes today, from remembered ones and those of today's look."""
+    """Compute log-probabilities of today from those of a prior map and of the current visit."""
 
     def __init__(self, sizes: TemporalSizes) -> None:
         super().__init__()
@@ -46,13 +46,13 @@ class TemporalReader(nn.Module):
         coarse_now: Tensor,
         comparable: Tensor,
     ) -> Tensor:
-        """Give log-probabilities (B, class, y, x).
+        """Return log-probabilities (B, class, y, x) of today.
 
-        ``prior_map`` and ``observation`` are such; ``seen`` (B, 1, y, x) is 1 where there was a look today, ``age`` (B,
-        1, y, x) days since the memory's last look there, ``rests_on`` (B, 1, y, x) the light that the memory was made
-        by, in reference exposures a pixel. ``light`` (B,) is today's exposure as a fraction of the reference, ``step``
-        (B,) pixels between its lines. The coarse passes are normalised columns (B, J, y / s, x / s), ``comparable`` (B,
-        1, y / s, x / s) is 1 where they may be compared.
+        ``prior_map`` and ``observation`` are log-probabilities too. ``seen`` (B, 1, y, x) is 1 where the visit captured
+        a pixel. ``age`` (B, 1, y, x) is the time since the last capture before it [days]. ``rests_on`` (B, 1, y, x) is
+        the exposure of the prior map, in reference exposures a pixel. ``light`` (B,) is the visit's exposure as a
+        fraction of the reference, ``step`` (B,) its line spacing [px]. ``coarse_before`` and ``coarse_now`` (B, column,
+        y / s, x / s) are spectral features. ``comparable`` (B, 1, y / s, x / s) is 1 where both may be compared.
         """
         size = prior_map.shape[-2:]
         change = (coarse_now - coarse_before) * comparable

@@ -1,8 +1,7 @@
-"""Training of a reader of memories: visits to one land in a row, each weighed against what those before left.
+"""Train the temporal reader on sequences of visits to one land.
 
-A memory is what the reader itself made of earlier visits, so that training sees what surveys will give it: class
-probabilities that were brought forward several times. Some visits see a part of the land alone; some memories are of
-another land, or lie beside it, and have to be seen through.
+The prior map of each visit is the reader's own output for the visits before, as in surveys. Some visits capture a part
+of the land. Some prior maps are of another land, or shifted, and the reader learns to reject them.
 """
 
 from __future__ import annotations
@@ -26,20 +25,20 @@ from models.training.objective import class_weights, map_loss
 from models.training.train import Progress
 from pipeline.geometry.grid import UNLABELLED
 
-FAINT = 1e-5  # least probability of a look
-PARTLY_SEEN = 0.3  # how often a visit after the first sees a part of the land alone
-INCOMPARABLE = 0.1  # how often the coarse passes of two visits cannot be compared
-OTHER_LAND, BESIDE = 0.06, 0.06  # how often some memories of a batch are of another land, or lie beside it
-WRONG = 0.4  # of the batch's memories, then
+FAINT = 1e-5  # least probability of a pass
+PARTLY_SEEN = 0.3  # fraction of later visits that capture a part of the land
+INCOMPARABLE = 0.1  # fraction of visits whose spectral features are not comparable
+OTHER_LAND, BESIDE = 0.06, 0.06  # fraction of batches with prior maps of another land, or shifted
+WRONG = 0.4  # fraction of the prior maps of such a batch
 BESIDE_CELLS = 6  # at most, in coarse pixels
 WARM_UP = 50  # steps
 
 
 @dataclass(frozen=True)
 class PastPass:
-    """Class probabilities of a land by one scan of a day, from the weights that the reader is for."""
+    """Class probabilities of a land by one scan of a day, from the weights of the reader."""
 
-    step: int  # pixels between its lines
+    step: int  # line spacing [px]
     light: float  # exposure as a fraction of the reference
     probability: NDArray[np.float16]  # (y, x, class)
     coarse: NDArray[np.float16]  # (y / s, x / s, column) normalised
@@ -47,7 +46,7 @@ class PastPass:
 
 @dataclass(frozen=True)
 class Visit:
-    """A land on a day, as several looks would show it."""
+    """A land on a day, as several scans show it."""
 
     moment: float  # days
     labels: NDArray[np.uint8]
@@ -87,7 +86,7 @@ class _Batch:
 def train_reader(
     lands: Sequence[Sequence[Visit]], settings: TemporalTraining, report: Callable[[Progress], None] = lambda now: None
 ) -> tuple[TemporalReader, int]:
-    """Train on visits to lands, each land's in the order of its days; give the averaged reader and the steps taken."""
+    """Train on visits to lands in the order of their days; return the averaged reader and the number of steps."""
     first = lands[0][0].scan_passes[0]
     sizes = TemporalSizes(first.probability.shape[-1], first.coarse.shape[-1])
     with torch.random.fork_rng(devices=[]):
@@ -118,7 +117,7 @@ def train_reader(
 
 
 def _learn(reader: TemporalReader, visits: Sequence[_Batch], weight: Tensor, rng: np.random.Generator) -> float:
-    """Bring memories through visits, and learn at each but the first from its labels, as maps do; the mean loss."""
+    """Carry prior maps through visits, learn from the labels of each but the first, and return the mean loss."""
     start, factor = visits[0], CELL_PX
     state, coarse = start.observation, start.coarse
     age = torch.zeros_like(start.seen)
@@ -127,9 +126,9 @@ def _learn(reader: TemporalReader, visits: Sequence[_Batch], weight: Tensor, rng
     for now in visits[1:]:
         age, rests_on = age + now.days, rests_on * torch.exp(-now.days / LIGHT_FADES_DAYS)
         small = now.seen[:, :, factor // 2 :: factor, factor // 2 :: factor]
-        disagrees, told_coarse = _wrong(state, coarse, factor, rng)
-        images = disagrees, now.observation, now.seen, age, rests_on
-        found = reader(*images, now.light, now.step, told_coarse, now.coarse, small * now.comparable)
+        before_map, coarse_before = _wrong(state, coarse, factor, rng)
+        images = before_map, now.observation, now.seen, age, rests_on
+        found = reader(*images, now.light, now.step, coarse_before, now.coarse, small * now.comparable)
         losses = F.nll_loss(found, now.labels.where(now.labels != UNLABELLED, 0), reduction="none")
         loss = map_loss(found, losses, now.labels, weight, soft_dice=True)
         torch.autograd.backward(loss)
@@ -147,7 +146,7 @@ def _light_a_pixel(visit: _Batch) -> Tensor:
 
 
 def _wrong(state: Tensor, coarse: Tensor, factor: int, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-    """Put the memory of another land, or one that lies beside it, in the place of some, now and then."""
+    """Replace some prior maps by those of another land, or shift them, in a fraction of the batches."""
     drawn = rng.random()
     if drawn >= OTHER_LAND + BESIDE:
         return state, coarse
@@ -161,7 +160,7 @@ def _wrong(state: Tensor, coarse: Tensor, factor: int, rng: np.random.Generator)
 
 
 def _sequences(lands: Sequence[Sequence[Visit]], settings: TemporalTraining, rng: np.random.Generator) -> list[_Batch]:
-    """Crops of lands through several visits, turned and mirrored alike."""
+    """Draw crops of lands through several visits, rotated and mirrored alike."""
     drawn = [_sequence(lands[int(rng.integers(len(lands)))], settings, rng) for _ in range(settings.batch)]
     batches = []
     for number in range(settings.visits):
@@ -177,7 +176,7 @@ def _sequences(lands: Sequence[Sequence[Visit]], settings: TemporalTraining, rng
 def _sequence(
     land: Sequence[Visit], settings: TemporalTraining, rng: np.random.Generator
 ) -> list[tuple[NDArray[np.generic] | float, ...]]:
-    """One crop through visits of a land, the last again where there are too few."""
+    """Return one crop through visits of a land; the last visit is repeated if there are too few."""
     side, shape = settings.crop, land[0].labels.shape
     first = int(rng.integers(0, max(len(land) - settings.visits, 0) + 1))
     factor, visits = CELL_PX, [land[min(first + number, len(land) - 1)] for number in range(settings.visits)]
@@ -189,7 +188,7 @@ def _sequence(
     before = visits[0].moment
     for number, visit in enumerate(visits):
         coarse_pass = visit.scan_passes[int(rng.integers(len(visit.scan_passes)))]
-        if number == 0 and rng.random() < 0.5:  # memories are often of the best look there was
+        if number == 0 and rng.random() < 0.5:  # prior maps are often of the best scan
             coarse_pass = max(visit.scan_passes, key=lambda one: one.light / one.step**2)
         images = (
             np.log(np.maximum(coarse_pass.probability[fine].astype(np.float32), FAINT)),
@@ -209,7 +208,7 @@ def _sequence(
 
 
 def _seen(side: int, partly: bool, factor: int, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Draw the captured part of a visit, (y, x, 1): everything, a block of rows, or all beside it."""
+    """Draw the captured part of a visit, (y, x, 1): everything, a block of rows, or all other rows."""
     seen = np.ones((side, side, 1), np.float32)
     if partly:
         cell = 4 * factor

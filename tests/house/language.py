@@ -58,7 +58,7 @@ class Sentence:
 def broken_rules(sentence: Sentence) -> Iterator[str]:
     """Yield the rules that a sentence breaks, each in a few words."""
     text = sentence.text
-    words = re.findall(r"[^\W_]+(?:['.-][^\W_]+)*", re.sub(r"`[^`]*`", "code", text))
+    words = re.findall(r"[^\W_]+(?:['.-][^\W_]+)*", re.sub(r"`[^`]*`|\{[^}]*\}", "code", text))
     fragment = sentence.kind == "message" and text[:1].islower()
     if words and words[0].lower() in OPENERS.split() and not fragment and not text.rstrip().endswith("?"):
         yield f"1: begins with {words[0]}"
