@@ -22,11 +22,11 @@ from storage.arrays.class_maps import ProbabilityStore
 from storage.arrays.mosaics import Mosaic, open_mosaic
 
 NONE, LATEST, AUTO = "none", "latest", "auto"
-NEWEST_RUNS = 60  # newest runs of a field among which the visit before is looked for
-MOST_EARLIER = 12  # by which a field is known that is looked at in parts
+NEWEST_RUNS = 60  # newest runs of a field that are searched for the previous visit
+MOST_EARLIER = 12  # earlier visits that show a field which was captured in parts
 PROBABILITIES = "class_probabilities"  # a product of runs
-MEMORY = "prior_map.json"  # beside a map with a prior map: what became of that
-OF_THE_LIGHT = (  # settings that the same light has alike
+MEMORY = "prior_map.json"  # beside a map: the figures of its prior map
+OF_THE_LIGHT = (  # settings that two runs of the same captured light share
     *("scene", "source", "seed", "size", "visit", "day", "hour", "effects", "pointing_px"),
     *("extent", "scan_step", "scan_exposure_ms", "coarse_exposure_ms", "budget", "policy"),
 )
@@ -38,7 +38,7 @@ class EarlierRun:
 
     mosaic: StageRef
     factor: int  # fine px to a pixel of it, along either axis
-    shift_px: tuple[int, int] = (0, 0)  # down and to the right, that brings it onto the newest
+    shift_px: tuple[int, int] = (0, 0)  # (down, right) to the newest visit
 
 
 @dataclass(frozen=True)
@@ -46,21 +46,21 @@ class Prior:
     """The earlier run whose class probabilities a visit starts from."""
 
     run: str
-    probabilities: StageRef  # the store that holds class probabilities.zarr
-    scan_passes: tuple[EarlierRun, ...]  # that run's, then what it had not seen itself, the newest first
-    days: float  # between that look and this one
-    classes: tuple[
-        int, ...
-    ]  # for each class of the weights its number in the class probabilities; -1 where that lacks it
+    probabilities: StageRef  # the store with class_probabilities.zarr
+    scan_passes: tuple[
+        EarlierRun, ...
+    ]  # that run's, then the earlier visits of what it did not capture, the newest first
+    days: float  # between that visit and this one
+    classes: tuple[int, ...]  # of each class of the weights the number in the class probabilities; -1 for a new class
 
 
 def find_prior(
     archive: Archive, settings: Settings, name: str, grid: SceneGrid, class_names: tuple[str, ...]
 ) -> tuple[Prior | None, tuple[str, ...]]:
-    """Return the run of the prior map of a survey of ``name``, and notes; None where there is none.
+    """Return the run of the prior map of a survey of ``name``, or None, and notes.
 
-    Of the newest runs of the field it is the one looked at last before this visit: one that was taken later, and
-    published earlier, is no memory of it. Raises SettingsError: a run that is named cannot be gone on from.
+    It is the run with the last capture before this visit, among the newest runs of the field. The time of publication
+    does not count. Raises SettingsError: the named run cannot be a prior map.
     """
     if settings.prior in (NONE, AUTO):
         return None, ()
@@ -77,16 +77,16 @@ def find_prior(
     for run in _before(archive, settings, name):
         found = _usable(archive, run, settings, grid, class_names)
         if isinstance(found, Prior):
-            return found, (*notes, f"goes on from what {run.folder.name} left, {found.days:.3g} days earlier")
-        notes.append(f"the memory of {run.folder.name} cannot be used: {found}")
-    return None, (*notes, f"nothing is remembered of {name}: this look is its first")
+            return found, (*notes, f"prior map: {run.folder.name}, {found.days:.3g} days earlier")
+        notes.append(f"{run.folder.name} cannot be the prior map: {found}")
+    return None, (*notes, f"{name} has no prior map: this is its first visit")
 
 
 def _before(archive: Archive, settings: Settings, name: str) -> Iterator[Run]:
     """Return the newest runs of a field with class probabilities, the last captured before this visit first."""
     found: list[tuple[float, int, Run]] = []
     part, asked = run_stem(name), anchor_paths(settings.to_dict(), Path.cwd())
-    # A survey may leave it to the prior map where to look: that choice says nothing of its light.
+    # The prior map may choose the extent: then the extent does not identify the light.
     chosen = ("extent", "scan_step", "scan_exposure_ms") if settings.extent == EXTENT_PART else ()
     light = [key for key in OF_THE_LIGHT if key not in chosen]
     for number, folder in enumerate(reversed(published_runs(archive.root))):
@@ -96,7 +96,7 @@ def _before(archive: Archive, settings: Settings, name: str) -> Iterator[Run]:
         if run.receipt.get("survey") == name and PROBABILITIES in run.products:
             before = {"extent": EXTENT_WHOLE, **run.settings}
             if all(before.get(key) == asked[key] for key in light):
-                continue  # made of the very light that is asked for: what it saw is no earlier look
+                continue  # made of the requested light itself: no earlier visit
             days = _days_since(run, settings.visit, settings.moment)
             if days >= 0:
                 found.append((days, number, run))
@@ -108,7 +108,7 @@ def _before(archive: Archive, settings: Settings, name: str) -> Iterator[Run]:
 def _usable(
     archive: Archive, run: Run, settings: Settings, grid: SceneGrid, class_names: tuple[str, ...]
 ) -> Prior | str:
-    """The run as a prior, or why it cannot be one."""
+    """Return the run as a prior, or the reason why it cannot be one."""
     if run.problem is not None:
         return run.problem
     places = [run.products.get(name, "").split("/") for name in (PROBABILITIES, "mosaic")]
@@ -117,32 +117,34 @@ def _usable(
     try:
         probabilities, mosaic = (archive.find(parts[1], parts[2]) for parts in places)
         if probabilities is None or mosaic is None:
-            return "what it left was cleared; reprocess makes it again"
+            return "its stores were cleared; reprocess computes them again"
         store = ProbabilityStore(probabilities.path / "class_probabilities.zarr")
         names, seen = store.legend.names, open_mosaic(mosaic.path / "mosaic.zarr")
     except IncompleteStoreError as error:
         return f"{error}"
     if store.shape != (grid.height, grid.width):
-        return f"it is of {store.shape[1]} x {store.shape[0]} px, this field has {grid.width} x {grid.height}"
+        return f"it has {store.shape[1]} x {store.shape[0]} px, this field has {grid.width} x {grid.height}"
     factor = _factor(seen, grid)
     if factor is None:
-        return f"its first pass has {seen.shape[1]} x {seen.shape[0]} px, no division of {grid.width} x {grid.height}"
+        return (
+            f"its mosaic has {seen.shape[1]} x {seen.shape[0]} px, which does not divide {grid.width} x {grid.height}"
+        )
     camera = run.settings.get("camera")
     same = not isinstance(camera, Mapping) or all(
         camera.get(part) == getattr(settings.camera, part) for part in ("pitch_um", "focal_length_mm")
     )
     if not same:
-        return "its camera had other pixels"
+        return "its camera has another pitch or focal length"
     classes = tuple(names.index(one) if one in names else -1 for one in class_names)
     if all(number < 0 for number in classes):
-        return f"it knows none of the classes of these weights, but {', '.join(names)}"
+        return f"it has none of the classes of these weights, but {', '.join(names)}"
     days = max(_days_since(run, settings.visit, settings.moment), 0.0)
     earlier = (EarlierRun(mosaic, factor), *_earlier_runs(archive, run, grid))
     return Prior(run.folder.name, probabilities, earlier, days, classes)
 
 
 def _factor(seen: Mosaic, grid: SceneGrid) -> int | None:
-    """Return how many fine px a pixel of an earlier mosaic is wide; None where the field has no such grid."""
+    """Return the fine px along a side of an earlier mosaic's pixel; None if they do not divide the field."""
     fits = grid.patch % seen.factor == 0
     rows, columns = (-(-size // seen.factor) for size in (grid.height, grid.width))
     return (
@@ -153,7 +155,7 @@ def _factor(seen: Mosaic, grid: SceneGrid) -> int | None:
 
 
 def _earlier_runs(archive: Archive, run: Run, grid: SceneGrid) -> Iterator[EarlierRun]:
-    """Yield what earlier runs saw of the rest of a field, where a run looked at a part of it and went on from them."""
+    """Yield the earlier visits of a run that captured a part of the field, with their shifts."""
     down, across = 0, 0
     for _ in range(MOST_EARLIER - 1):
         memory = run.receipt.get("memory")
@@ -179,9 +181,9 @@ def _earlier_runs(archive: Archive, run: Run, grid: SceneGrid) -> Iterator[Earli
 
 
 def _days_since(run: Run, visit: str | None, moment: tuple[int, float] | None) -> float:
-    """Return the days from a run's look to a later one, below 0 where that came first.
+    """Return the days from a run's visit to another one; negative if that came first.
 
-    By the moments that both visits are called by, else by day and hour of a farm, else by the clock, in whole days.
+    The dates of both visits count, else day and hour of a built-in scene, else whole days of the clock.
     """
     then, now = (_called_moment(one) for one in (run.settings.get("visit"), visit))
     if then is not None and now is not None:
@@ -198,13 +200,13 @@ def _days_since(run: Run, visit: str | None, moment: tuple[int, float] | None) -
 
 
 def prior_map_figures(store: Path) -> dict[str, Any] | None:
-    """Return what became of the prior map of a stored map; None of a field's first visit."""
+    """Return the figures of the prior map of a stored map; None for a first visit."""
     record = store / MEMORY
     return dict(read_table(record)) if record.is_file() else None
 
 
 def _called_moment(text: Any) -> datetime | None:
-    """A moment in ISO 8601 that a visit is called by; None where it is called otherwise."""
+    """Return the date of a visit that is named in ISO 8601; None for other names."""
     try:
         found = datetime.fromisoformat(text) if isinstance(text, str) else None
     except ValueError:
