@@ -73,7 +73,7 @@ def test_a_first_look_has_nothing_to_go_on_from(twice: tuple[Path, Any, Any]) ->
     out, first, _ = twice
     assert "memory" not in first.receipt
     assert first.receipt["settings"]["prior"] == "none"
-    assert "nothing is remembered of north: this look is its first" in first.receipt["settings"]["notes"]
+    assert "north has no prior map: this is its first visit" in first.receipt["settings"]["notes"]
     probabilities = xr.open_zarr(out / first.receipt["products"]["class_probabilities"], consolidated=False)
     assert float(probabilities.age.max()) == 0.0
     assert "changed" not in probabilities
@@ -130,8 +130,8 @@ def test_a_field_of_another_size_is_no_memory(visited: Path, survey_png: Survey,
     Image.fromarray(patchy_scene((64, 96), 3, seed=1)[0].astype(np.uint8)).save(tmp_path / "small.png")
     flags = {"scene": str(tmp_path / "small.png"), "labels": None, "visit": "2026-06-07T10:00:00Z", "prior": "latest"}
     words, published = words_of(visited, survey_png, **flags)
-    assert "cannot be used: it is of 128 x 96 px, this field has 96 x 64" in words
-    assert "nothing is remembered of north" in words
+    assert "cannot be the prior map: it has 128 x 96 px, this field has 96 x 64" in words
+    assert "north has no prior map" in words
     assert "memory" not in published.receipt
 
 
@@ -159,7 +159,7 @@ def test_what_was_cleared_is_gone_on_without(visited: Path, twice: Any, survey_p
     shutil.rmtree((visited / first.receipt["products"]["class_probabilities"]).parent)
     shutil.rmtree((visited / published.receipt["products"]["class_probabilities"]).parent)
     words, published = words_of(visited, survey_png, visit="2026-06-08T10:00:00Z", prior="latest")
-    assert "nothing is remembered of north: this look is its first" in words
+    assert "north has no prior map: this is its first visit" in words
 
 
 def test_other_classes_are_found_by_their_names(visited: Path, survey_png: Survey, make_weights: WeightsMaker) -> None:
@@ -172,7 +172,7 @@ def test_other_classes_are_found_by_their_names(visited: Path, survey_png: Surve
     words, published = words_of(
         visited, survey_png, **{**flags, "weights": str(strangers), "visit": "2026-06-06T10:00:00Z"}
     )
-    assert "it knows none of the classes of these weights, but class_0, class_1, class_2" in words
+    assert "it has none of the classes of these weights, but class_0, class_1, class_2" in words
 
 
 def test_what_runs_rest_on_is_kept(visited: Path, twice: Any) -> None:
