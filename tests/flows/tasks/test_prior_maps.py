@@ -154,7 +154,7 @@ def test_what_was_cleared_is_gone_on_without(visited: Path, twice: Any, survey_p
     _, first, later = twice
     shutil.rmtree((visited / later.receipt["products"]["class_probabilities"]).parent)
     words, published = words_of(visited, survey_png, visit="2026-06-07T10:00:00Z", prior="latest")
-    assert f"the memory of {later.folder.name} cannot be used: what it left was cleared" in words
+    assert f"{later.folder.name} cannot be the prior map: its stores were cleared" in words
     assert published.receipt["memory"]["run"] == first.folder.name
     shutil.rmtree((visited / first.receipt["products"]["class_probabilities"]).parent)
     shutil.rmtree((visited / published.receipt["products"]["class_probabilities"]).parent)
