@@ -1,4 +1,4 @@
-"""Choice of the lines that are captured after a first pass: where, how close, and how long each is exposed."""
+"""Choose the lines of the second pass: their places, spacing and exposure."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from pipeline.planning.fine_pass import FinePlan, plan_fine
 from pipeline.planning.interlaced import lines_between, merged_ms, most_within
 from pipeline.planning.uniform_scans import MIOU, ScanPerformance, format_scan, longest_exposure
 
-LEAST_GAIN = 1e-3  # of mIoU that later lines are expected to add; for less none are captured
-EXPOSURES = 7  # that are tried, evenly by their logarithm
-PLANNED = 2  # of the kinds of lines that could gain most
-TRIES = 5  # to fit runs into the seconds that are left
+LEAST_GAIN = 1e-3  # of mIoU; below it there is no second pass
+EXPOSURES = 7  # that are tried, equally spaced by logarithm
+PLANNED = 2  # spacings and exposures with the highest bound of gain, of which plans are made
+TRIES = 5  # to fit runs into the time
 Scores = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class LaterPasses:
-    """Plans the lines after a first pass within the seconds that are left."""
+    """Planner of the second pass within the time that the first leaves."""
 
     grid: SceneGrid
     camera: LineCamera
@@ -38,16 +38,16 @@ class LaterPasses:
 
     @property
     def interlaces(self) -> bool:
-        """Return whether lines can lie between others: not where the mirror may look beside the plan."""
+        """Return whether new lines lie between those of the first pass: not with pointing errors."""
         return not self.plan.margin_px
 
     @property
     def _apart(self) -> int:
-        """Return the distance of the first pass's lines [px]."""
+        """Return the line spacing of the first pass [px]."""
         return self.plan.coarse[0].step
 
     def _exposures(self, record: ScanPerformance, step: int) -> list[float]:
-        """Return the exposures to try, that which takes all of the field in time among them [ms]."""
+        """Return the exposures to try [ms], including the longest one for which the whole field fits the time."""
         shortest, longest = record.offered_ms(self.camera)
         tried = np.geomspace(shortest, longest, EXPOSURES).round(1).tolist()
         between = lines_between(self.plan.full, self.plan.coarse if self.interlaces else [], step=step)
@@ -55,7 +55,7 @@ class LaterPasses:
         return sorted({*tried, *([] if last is None else [last])})
 
     def _most_gain(self, gain: Scores, step: int, exposure_ms: float) -> float:
-        """Return what lines of a distance and an exposure could gain at most in the seconds left."""
+        """Return an upper bound of the gain of a line spacing and an exposure."""
         field = self.grid, self.plan.coarse, self.camera, self.cost
         return most_within(
             self.plan.fine_s, gain, *field, step=step, exposure_ms=exposure_ms, interlaced=self.interlaces
@@ -64,10 +64,10 @@ class LaterPasses:
     def within(
         self, gain: Scores, *, step: int = 1, exposure_ms: float | None = None, own_swaths: bool = True
     ) -> FinePlan:
-        """Return the runs of lines ``step`` px apart that show most of the (patch,) ``gain`` in the seconds left.
+        """Return the runs of lines with a spacing of ``step`` px that have the highest sum of (patch,) ``gain``.
 
-        With ``own_swaths`` runs lie on the swaths of the first pass, and take the lines that are missing there; else
-        swaths are free, and runs take all of their lines.
+        With ``own_swaths``, runs lie on the swaths of the first pass and consist of the lines between. Otherwise swaths
+        are free, and runs consist of all lines.
         """
         plan, interlaced = self.plan, own_swaths and self.interlaces
         exposed = self.camera if exposure_ms is None else replace(self.camera, exposure_ms=exposure_ms)
@@ -77,7 +77,7 @@ class LaterPasses:
             Sweep(f"fine-{number:03d}", "fine", plan.along, place, start, 0)
             for number, place in enumerate(sorted({sweep.swath_px for sweep in first_pass}))
         ]
-        missing = 1 / step - 1 / first_pass[0].step if first_pass else 1 / step  # lines to a line of the full scan
+        missing = 1 / step - 1 / first_pass[0].step if first_pass else 1 / step  # new lines per line of the full scan
         budget_s, found = plan.fine_s / missing, None
         for _ in range(TRIES):
             found = plan_fine(
@@ -94,7 +94,7 @@ class LaterPasses:
             sweeps = lines_between(found.sweeps, first_pass, step=step, exposure_ms=exposure_ms)
             seconds = self.cost.seconds(sweeps, self.camera)
             if seconds <= plan.fine_s:
-                if self.recorded is not None:  # of its lines, those that there are
+                if self.recorded is not None:  # only its lines exist
                     sweeps = self.recorded.fine_pass(sweeps)
                     seconds = self.cost.seconds(sweeps, self.camera)
                 return replace(found, sweeps=sweeps, seconds=seconds)
@@ -109,16 +109,16 @@ class LaterPasses:
         class_names: tuple[str, ...],
         value: Callable[[Scores], Scores],
     ) -> FinePlan:
-        """Return the plan that is expected to add most to the mIoU, by the record of uniform scans.
+        """Return the plan with the highest expected gain in mIoU, by the scan performance table.
 
-        ``errors`` are those of the first pass's map; ``value`` leaves of (patch,) gains what the survey is after.
+        ``errors`` are the expected errors after the first pass; ``value`` weights (patch,) gains by zones.
         """
         first, steps = exposing(self.camera, self.plan.coarse[0]), [one for one in record.steps if one < self._apart]
         gains: dict[tuple[int, float], Scores] = {}
         for step in steps:
             for exposure_ms in self._exposures(record, step):
                 again = step / self._apart if self.interlaces else 0.0
-                mean_ms = merged_ms(first.exposure_ms, exposure_ms, again)  # of the lines that a run then has
+                mean_ms = merged_ms(first.exposure_ms, exposure_ms, again)  # mean exposure of old and new lines
                 expected = record.expected(step, float(np.clip(mean_ms, *record.offered_ms(self.camera))))
                 iou = np.array([expected.get(name, expected[MIOU]) for name in class_names])
                 gains[step, exposure_ms] = value(errors.expected_gain((1 - iou) / (1 + iou)))
@@ -131,7 +131,7 @@ class LaterPasses:
             plans.append((one, self.within(gains[one], step=one[0], exposure_ms=one[1], own_swaths=False)))
         (step, exposure_ms), plan = max(plans, key=lambda made: (made[1].expected_gain, -made[1].seconds))
         if plan.expected_gain < LEAST_GAIN:
-            nothing = f"later lines are expected to add {100 * plan.expected_gain:.2f} points; none are captured"
+            nothing = f"no second pass: its expected gain is {100 * plan.expected_gain:.2f} points"
             return replace(plan, sweeps=[], patch_index=np.empty(0, np.intp), seconds=0.0, reason=nothing)
         what = "the whole field" if plan.kind == "full" else f"{len(plan.patch_index)} patches"
         return replace(plan, reason=f"captured again: {what}, {format_scan(step, exposure_ms)}")

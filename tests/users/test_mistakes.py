@@ -133,7 +133,6 @@ CASES = {
     "settings missing": (2, "survey none.toml", "none.toml"),
     "budget 0": (2, SURVEY + "field.png --budget 0", "above 0 and at most 1, got '0'"),
     "budget 2": (2, SURVEY + "field.png --budget 2", "above 0 and at most 1, got '2'"),
-    "budget in percent": (2, SURVEY + "field.png --budget 50%", "got '50%'; for 50 % write 0.5"),
     "budget NaN": (2, SURVEY + "field.png --budget nan", "got 'nan'"),
     "negative seed": (2, SURVEY + "field.png --seed=-1", "seed must be .* from 0"),
     "unknown flag": (2, SURVEY + "field.png --budgets 1", "Unknown option"),

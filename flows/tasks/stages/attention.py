@@ -1,4 +1,4 @@
-"""The stage of attention: a score for every patch, and the sweeps that show most of it."""
+"""Define the stage that scores patches and plans the second pass."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.survey_settings import SPARING
 from flows.tasks.capture_plan import CapturePlan
 from flows.tasks.field_work import FieldWork, region_params
 from flows.tasks.later_passes import LaterPasses
@@ -32,7 +31,7 @@ from storage.archive.manifests import read_table, write_table
 from storage.arrays.mosaics import Attention, chosen_patches, open_mosaic, write_attention
 from storage.readers.raster_fields import RasterPixels
 
-READING = "attention.zarr"  # beside a map, where patches were chosen while it was drawn
+READING = "attention.zarr"  # beside a class map whose drawing chose the patches
 ATTENTION = Product("score", version=10, files=("attention.zarr", "plan.json"), by_weights=True)
 Scores = NDArray[np.float64]
 
@@ -60,11 +59,11 @@ def score(
     model_key: dict[str, Any],
     report: Report,
 ) -> Wanted:
-    """Score every patch by the coarse mosaic, and plan the sweeps that show the most score in the time left."""
+    """Score every patch by the coarse mosaic, and plan the sweeps with the highest total score in the time left."""
     grid, fractions = frame.grid, zones.fractions
 
     def expected_gain() -> Scores:
-        """Return the (patch,) gain that the policy expects of each patch."""
+        """Return the (patch,) expected gain by the policy."""
         if policy in SEEING_POLICIES:
             scores = work.score(policy, mosaic.path / "mosaic.zarr", capture, lambda done: report(0.5 * done)).ravel()
         else:
@@ -73,14 +72,14 @@ def score(
         return value(scores)
 
     def value(scores: Scores) -> Scores:
-        """Return scores by the fraction of each patch that zones leave; a patch beside the scene is worth nothing."""
+        """Return scores times the fraction of each patch that zones leave; 0 outside of the scene."""
         if frame.missing is not None:
             void = patch_pixels(grid, frame.missing).mean(axis=(1, 2)) >= grid.valid_fraction().ravel()
             scores = np.where(void, 0.0, scores)
         return scores if fractions is None else np.where(fractions > 0, scores, 0.0) * fractions
 
     def planned() -> tuple[Scores, FinePlan]:
-        """Return the scores where patches are chosen, and the lines that are captured later."""
+        """Return the scores, and the plan of the second pass."""
         if not plan.plain:
             later = LaterPasses(grid, camera, cost, plan, recorded)
             if scan_record is None or policy != "gain" or not plan.by_record:
@@ -96,15 +95,17 @@ def score(
         return scores, kept_within(budget, scores, seen)
 
     def build(path: Path) -> None:
-        """Write every patch's score and rank, and the plan of sweeps; refuse a map that does not fit."""
+        """Write score and rank of every patch, and the plan; raise an error if the map will not fit the memory."""
         scores, found = planned()
-        if fractions is not None:  # patches of which zones leave something
+        if fractions is not None:
             found = replace(found, patch_index=found.patch_index[fractions[found.patch_index] > 0])
         read = found.patch_index
         if not plan.plain and (least_gain is not None or found.kind == "full" or not found.sweeps):
-            read = grid.valid_patches()  # of which the reading chooses
+            read = grid.valid_patches()  # the segmentation chooses among them
             read = read if fractions is None else read[fractions[read] > 0]
-        work.pool_for(read, len(open_mosaic(mosaic.path / "mosaic.zarr").components))  # before the rig goes back
+        work.pool_for(
+            read, len(open_mosaic(mosaic.path / "mosaic.zarr").components)
+        )  # raises an error before the second pass
         rank = np.full(scores.shape, -1, np.int32)
         rank[read[np.argsort(-scores[read], kind="stable")]] = np.arange(len(read))
         shape = grid.patch_shape
@@ -129,35 +130,35 @@ def score(
         **(captures if raster is None else {}),
         **(region_params(grid) | {"capture": list(capture)} if policy in SEEING_POLICIES else {}),
         **({"plain": True} if plan.plain else {"by_record": plan.by_record, "least_gain": least_gain}),
-        **({} if budget is None else {"patches": {name: getattr(budget, name) for name in SPARING}}),
+        **({} if budget is None else {"macs": budget.macs}),
         **zones.key,
     }
     return Wanted(build, params, [mosaic])
 
 
 def all_seen(grid: SceneGrid, sweeps: Sequence[Sweep], camera: LineCamera, *, part: bool) -> FinePlan:
-    """Return the plan of a uniform scan, or of a raster without sweeps: the patches seen, nothing to go back for."""
+    """Return the plan of a uniform scan, or of a raster without sweeps: the captured patches, and no second pass."""
     patch_index = grid.valid_patches()
     if not sweeps:
-        return FinePlan([], patch_index, 0.0, 0.0, "raster", "the pixels of the raster were taken as they are")
-    words = format_scan(sweeps[0].step, exposing(camera, sweeps[0]).exposure_ms)
+        return FinePlan([], patch_index, 0.0, 0.0, "raster", "the pixels of the raster are used as they are")
+    scan = format_scan(sweeps[0].step, exposing(camera, sweeps[0]).exposure_ms)
     if part:
         patch_index = np.flatnonzero(patches_shown(list(sweeps), grid, camera))
     what = "a part of the field was" if part else "the field was"
-    return FinePlan([], patch_index, 0.0, 0.0, "scan", f"{what} scanned once: {words}")
+    return FinePlan([], patch_index, 0.0, 0.0, "scan", f"{what} scanned once: {scan}")
 
 
 def kept_within(budget: PatchBudget, scores: Scores, seen: FinePlan) -> FinePlan:
-    """Return the plan of a uniform scan with the patches that the budget pays for; all patches were seen."""
-    bought = budget.choose(scores)
-    reason = f"{seen.reason}; {len(bought)} of {len(budget.patch_index)} patches are read in full"
+    """Return the plan of a uniform scan with the patches that the budget pays for."""
+    chosen = budget.choose(scores)
+    reason = f"{seen.reason}; the full network reads {len(chosen)} of {len(budget.patch_index)} patches"
     finite = np.where(np.isfinite(scores), scores, 0.0)
-    expected_gain, wanted = float(finite[bought].sum()), float(np.maximum(finite, 0.0).sum())
-    return replace(seen, patch_index=np.sort(bought), reason=reason, expected_gain=expected_gain, wanted_gain=wanted)
+    expected_gain, wanted = float(finite[chosen].sum()), float(np.maximum(finite, 0.0).sum())
+    return replace(seen, patch_index=np.sort(chosen), reason=reason, expected_gain=expected_gain, wanted_gain=wanted)
 
 
 def load_plan(attention: StageRef) -> FinePlan:
-    """Read the plan of an attention store: the lines captured later, and the patches that they show."""
+    """Read the plan of the second pass: sweeps, and the patches that they cover."""
     plan = read_table(attention.path / "plan.json")
     plan.pop("read", None)
     sweeps = [Sweep(**sweep) for sweep in plan.pop("sweeps")]
@@ -165,6 +166,6 @@ def load_plan(attention: StageRef) -> FinePlan:
 
 
 def read_in_full(attention: StageRef, class_map: StageRef) -> NDArray[np.intp]:
-    """Return the patches (patch,) that were read in full, as they were chosen before or while a map was drawn."""
+    """Return the patches (patch,) that the full network read, chosen before or during segmentation."""
     store = class_map.path / READING
     return chosen_patches(store if store.exists() else attention.path / "attention.zarr")

@@ -1,4 +1,4 @@
-"""The stage that draws the class map, from the mosaics of a field and from what is remembered of the field."""
+"""Define the stage that segments the mosaic, with the prior map of the field."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ from storage.arrays.layout import NO_CLASS, blank_pixels
 from storage.arrays.mosaics import Attention, write_attention
 
 CLASS_MAP = Product("segment", version=14, files=("class_map.zarr", "class_probabilities.zarr"), by_weights=True)
-OUT_OF_RANGE = "out_of_range.json"  # beside a map, where values were no readings
-LEFT_OUT = "left_out.npy"  # beside a map while it is drawn: the pixels of which none is
-MOST_TURN_PX = 12.0  # that a field's corners may lie off by, as it is turned, so that its memory is of use
+OUT_OF_RANGE = "out_of_range.json"  # beside a map with values out of range
+LEFT_OUT = "left_out.npy"  # pixels outside of zones, while the map is drawn
+MOST_TURN_PX = 12.0  # greatest offset of the corners by rotation, at which a prior map is used
 
 
 @stage("segment", "class map", CLASS_MAP)
@@ -62,15 +62,15 @@ def segment(
     model_key: dict[str, Any],
     report: Report,
 ) -> Wanted:
-    """Draw the class map region by region, in detail where patches were chosen; no class where the scene has no value.
+    """Segment the mosaic region by region, at full resolution where patches were chosen; nodata pixels have no class.
 
-    ``capture`` says how the mosaic's pixels were captured, where it does not say so itself. With ``least_gain`` patches
-    are chosen region by region, by what the policy expects of them.
+    ``capture`` is the capture of pixels for which the mosaic has none. With ``least_gain``, patches are chosen here,
+    by their expected gain.
     """
     grid, left_out, inputs = frame.grid, zones.left_out, [mosaic, attention]
 
     def build(path: Path) -> None:
-        """Draw the map and what is believed; once more without the memory, where that is put aside."""
+        """Write class map and class probabilities; again without the prior map if it does not agree."""
         out, probabilities = path / "class_map.zarr", path / "class_probabilities.zarr"
         lies = FieldShift() if prior is None else prior_map_lies(prior.scan_passes, mosaic.path / "mosaic.zarr")
         memory = None if prior is None else memory_of(prior, lies, grid)
@@ -140,7 +140,7 @@ def segment(
 
 
 def memory_of(prior: Prior, lies: FieldShift, grid: SceneGrid) -> FieldPriorMap | None:
-    """Return where the memory of a field lies and how it is read; None of a field that was turned too far."""
+    """Return the prior map with its shift; None where the field is rotated too far."""
     if lies.edge_px((grid.height, grid.width)) > MOST_TURN_PX:
         return None
     last, probabilities = prior.scan_passes[0], (prior.probabilities.path / "class_probabilities.zarr").resolve()
@@ -155,15 +155,14 @@ def _prior_map_figures(
     lies: FieldShift,
     comparison: TemporalAgreement | None,
 ) -> dict[str, Any]:
-    """Return what became of a memory: agreement with today's look, and pixels that changed from class to class.
+    """Return the figures of a prior map: agreement with this visit, and pixels that changed from class to class.
 
-    Those changed that are more than two maps of the same ground differ by; all that differ are counted beside them.
+    Changed pixels exceed the expected difference of two maps of the same ground; all differing pixels are counted too.
     """
     agreement = None if comparison is None or np.isnan(comparison.agreement) else comparison.agreement
     put_aside = "turned" if comparison is None else "another field" if comparison.is_of_another_field else None
-    compared, differing, expected, pairs = 0, 0, 0.0, list[tuple[int, int, str, str]]()
-    if comparison is not None:
-        compared = int(comparison.changed.sum())
+    compared = 0 if comparison is None else int(comparison.changed.sum())
+    differing, expected, pairs = 0, 0.0, list[tuple[int, int, str, str]]()
     if comparison is not None and put_aside is None:
         beyond = comparison.beyond
         differing = compared - int(np.trace(comparison.changed))

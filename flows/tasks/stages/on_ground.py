@@ -1,4 +1,4 @@
-"""The stage that draws a posed survey's map on the ground: classes, picture, how old and what changed, hectares."""
+"""Define the stage that projects the map to the ground: classes, picture, age, changes and areas."""
 
 from __future__ import annotations
 
@@ -27,26 +27,24 @@ GROUND = Product("ground", version=4, files=(STORE,))
 def ground(
     class_map: StageRef, mosaic: StageRef, *, ground_grid: GroundGrid, map_choice: MapChoice, report: Report
 ) -> Wanted:
-    """Draw the class map, its memory and the coarse picture on the ground, by the settings' pose."""
+    """Project class map, ages, changes and picture to the ground, by the pose of the rig."""
     grid = ground_grid
 
     def build(path: Path) -> None:
-        """Write the map block by block, then the area of each class."""
+        """Write the map in blocks, then the area of each class."""
         found = load_class_map(class_map.path / "class_map.zarr")
-        probabilities, colours = (
-            ProbabilityStore(class_map.path / "class_probabilities.zarr"),
-            coarse_colours(mosaic, None),
-        )
+        probabilities = ProbabilityStore(class_map.path / "class_probabilities.zarr")
+        colours = coarse_colours(mosaic, None)
         unsure, age_days = np.isnan(found.confidence), probabilities.age()
-        fractions, old_class = probabilities.changed(), probabilities.old_class()  # none of a first look
+        fractions, old_class = probabilities.changed(), probabilities.old_class()  # None for a first visit
 
         def shown(pixels: NDArray[np.float64]) -> dict[str, NDArray[np.generic]]:
-            """Return the images of a block, by name, at places (row, column, 2); 255, NaN and 0 where nothing is seen.
+            """Return the images of a block by name, at places (row, column, 2); nodata is 255, NaN and 0.
 
-            Each place shows the nearest pixel, but confidence and picture lie between pixels.
+            Confidence and picture are interpolated, other images have the nearest pixel.
             """
             confidence = image_at(found.confidence[..., None], pixels)[..., 0]
-            confidence[nearest_at(unsure, pixels, False)] = np.nan  # of the class unknown, whatever lies beside it
+            confidence[nearest_at(unsure, pixels, False)] = np.nan  # class unknown
             picture = np.nan_to_num(np.rint(image_at(colours, pixels, factor=1))).astype(np.uint8)
             images: dict[str, NDArray[np.generic]] = {
                 "classes": nearest_at(found.classes, pixels, UNLABELLED),
@@ -79,9 +77,9 @@ def ground(
 
 
 def coarse_colours(mosaic: StageRef, factor: int | None) -> NDArray[np.float32]:
-    """Three bands of a mosaic in a photograph's tones, (y, x, 3) in 1..255; NaN where nothing was captured.
+    """Return three bands of a mosaic as a picture (y, x, 3) in 1..255; NaN where nothing was captured.
 
-    Its pixels have ``factor`` fine ones a side; None: those of the mosaic.
+    Its pixels consist of ``factor`` x ``factor`` fine ones; None: pixels of the mosaic.
     """
     seen = open_mosaic(mosaic.path / "mosaic.zarr")
     bands, words = choose_bands(seen.wavelength_nm)

@@ -93,7 +93,7 @@ REFUSED = {
     "policy mask without one": (2, "--policy mask", "needs a mask file"),
     "unknown flag": (2, "--budgets 1", "Unknown option"),
     "unknown source": (2, "--source rigg", "--source must be one of auto, sim, rig, raster, recorded; got 'rigg'"),
-    "exposure in seconds": (2, "--exposure-ms 0.1", "--exposure-ms must be a number from 0.5.*then write 100"),
+    "exposure in seconds": (2, "--exposure-ms 0.1", "--exposure-ms must be a number from 0.5 to 10000 ms, got"),
     "farm beyond memory": (2, "--scene farm --size 60000x60000", "takes about .* GB of memory, this machine has"),
     "memory for no tile": (
         2,
@@ -208,7 +208,7 @@ def test_interrupted_survey_says_how_to_go_on(
     words = survey_words("--budget 0.7", str(tmp_path / "archive"))
     ended = command_line(*words)
     assert (ended.code, ended.out) == (130, "")
-    assert "interrupted; the same command goes on from here" in ended.err
+    assert "interrupted; run the same command to resume" in ended.err
     monkeypatch.setitem(STAGES, "score", real)
     ended = command_line(*words)
     assert ended.code == 0

@@ -100,7 +100,6 @@ def test_a_survey_is_told_beside_the_best_uniform_reading(judged: Path, survey_p
         ({"expected_loss": "0.1"}, 0.05),
         ({"expected_loss": "0"}, None),
         ({"expected_loss": "50"}, 0.2),
-        ({"least_gain": "0.1"}, 0.1),
         ({"macs": "90%"}, None),
     ],
 )

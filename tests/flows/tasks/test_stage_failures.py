@@ -252,21 +252,6 @@ def test_a_stage_that_fails_by_prefect(
     assert problems(tmp_path) == []
 
 
-def test_a_served_field_of_which_a_stage_fails(
-    server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, field_file: Callable[..., Path]
-) -> None:
-    """The flow ends Failed with the stage's words alone, and no run is published."""
-    from flows.settings.parameters import SurveySettings
-    from flows.survey import survey
-
-    out, file = tmp_path / "archive", field_file("north")
-    with monkeypatch.context() as broken:
-        broken.setitem(STAGES, "rectify", failing("rectify", refusal("rectify")))
-        state = survey(SurveySettings(settings_file=str(file), name="north"), return_state=True)
-    assert (state.is_failed(), FULL_DISK in str(state.message)) == (True, True)
-    assert (Archive.open(out).runs(), problems(out)) == ([], [])
-
-
 def test_a_reprocessing_of_which_a_stage_fails(
     server: str, walk: Walk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

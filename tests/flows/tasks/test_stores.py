@@ -43,7 +43,7 @@ def _survey_farm(root: Path) -> Published:
     """A small farm in as many bands as light with a spectrum needs."""
     flags = {
         "scene": "farm",
-        "size": "384x288",
+        "size": "192x160",
         "bands": ",".join(map(str, range(5, 265, 10))),
         "engine": "plain",
         "controls": False,

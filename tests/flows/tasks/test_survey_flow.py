@@ -18,11 +18,10 @@ from flows.publish import survey_command
 from flows.settings.load import load_settings
 from flows.settings.parameters import SurveySettings
 from flows.survey import draw_class_map
-from flows.tasks import prefect_tasks
 from flows.tasks.local_server import ServerUnavailable
 from flows.tasks.open_survey import STAGES, Products
 from flows.tasks.stages import accuracy as evaluation
-from pipeline.errors import IncompleteStoreError, RigError, SettingsError
+from pipeline.errors import IncompleteStoreError, SettingsError
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from tests.flows.conftest import CommandLine, act_instead, problems
@@ -256,26 +255,6 @@ def test_a_survey_has_a_server_of_its_own(survey_png: Any, tmp_path: Path, monke
     assert dict(os.environ) == before
 
 
-def test_a_device_that_answers_the_second_time_is_asked_again(
-    survey_png: Any, tmp_path: Path, server: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A capture that failed for its device is tried again, and the survey ends well."""
-    real, tries = STAGES["capture_coarse"], []
-
-    def shaky(*given: Any) -> Any:
-        tries.append("capture")
-        if len(tries) == 1:
-            raise RigError("no reply from the camera after 2 s; is it on?")
-        return real.wants(*given)
-
-    act_instead(monkeypatch, "capture_coarse", shaky)
-    monkeypatch.setattr(prefect_tasks, "RETRY_DELAY_S", 0.0)
-    prefect_tasks._task.cache_clear()
-    states = {stage["name"]: stage["state"] for stage in survey_png(tmp_path, engine="prefect").receipt["stages"]}
-    assert tries == ["capture", "capture"]
-    assert set(states.values()) == {"ran"}
-
-
 def test_without_a_server_the_survey_runs_plain(
     survey_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -346,7 +325,7 @@ def test_sigterm_in_a_stage(
     act_instead(monkeypatch, "rectify", terminated)
     ended = command_line(*words)
     assert (ended.code, ended.out, ended.errors) == (143, "", [])
-    assert ended.err.splitlines()[-1] == "terminated; the same command goes on from here"
+    assert ended.err.splitlines()[-1] == "terminated; run the same command to resume"
     monkeypatch.setitem(STAGES, "rectify", real)
     assert command_line(*words).code == 0
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
