@@ -23,8 +23,7 @@ from flows.tasks.stages.accuracy import evaluate
 from flows.tasks.stages.attention import score
 from flows.tasks.stages.condense import condense_raster
 from flows.tasks.stages.effects import choose_effects
-from flows.tasks.stages.maps import segment
-from flows.tasks.stages.on_ground import ground
+from flows.tasks.stages.maps import ground, segment
 from flows.tasks.stages.placement import locate, rectify, rectify_fine, register_coarse, register_fine
 from storage.archive.keys import StageRef
 

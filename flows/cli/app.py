@@ -62,8 +62,8 @@ def build_app(*, listed: bool) -> App:
     )
     rig = App(name="rig", help="Check the hardware, or emulate it.")
     app.command(rig)
-    for words, module in VERBS.items():
-        group, name = (rig if words.startswith("rig ") else app), words.split()[-1]
+    for verb, module in VERBS.items():
+        group, name = (rig if verb.startswith("rig ") else app), verb.split()[-1]
         summary = {"help": _summary(module, name)} if listed else {}  # replaces all of the verb's own help
         group.command(f"{module}:{name}", name=name, **summary)
     return app

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from flows.cli.app import AsJson, OutFolder, Switch, stderr
-from flows.settings.documents import about, shown
+from flows.settings.documents import about, toml_value
 from flows.settings.load import SURVEY, TABLES, load_settings
 from flows.terminal.progress import print_json
 from pipeline.errors import NothingToMend
@@ -40,8 +40,8 @@ def _flags(names: Iterable[str]) -> Any:
     for name in names:
         one = _DECLARED[name]
         kind: Any = bool if one.kind is bool else str
-        words = about(one) + ("" if one.item.default is None else f"; default: {shown(one).strip(chr(34))}")
-        made.append((name, Annotated[kind | None, Parameter(help=words)], None))
+        help_text = about(one) + ("" if one.item.default is None else f"; default: {toml_value(one).strip(chr(34))}")
+        made.append((name, Annotated[kind | None, Parameter(help=help_text)], None))
     return make_dataclass("Flags", made, frozen=True, kw_only=True)
 
 
@@ -84,9 +84,9 @@ def survey(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_js
     settings
         Settings file (TOML); flags override it. Default: none.
     """
-    asked = load_settings(settings, by_setting(flags))
+    requested = load_settings(settings, by_setting(flags))
     try:
-        published = survey_command.run_survey(asked, stderr)
+        published = survey_command.run_survey(requested, stderr)
     except NothingToMend as skipped:
         if as_json:
             print_json({"captured": False, "run": skipped.run, "why": str(skipped)})
@@ -123,8 +123,8 @@ def simulate(
         Settings file (TOML) with the tables [camera], [optics], [mirror], [detector], [air] and [sky]. Flags override
         it.
     """
-    given = {"scene": scene, "out": out, "source": "sim", **by_setting(flags)}
-    record = simulate_command.run_simulate(load_settings(settings, given), stderr, coarse=coarse)
+    values = {"scene": scene, "out": out, "source": "sim", **by_setting(flags)}
+    record = simulate_command.run_simulate(load_settings(settings, values), stderr, coarse=coarse)
     if as_json:
         print_json(record)
     return 0
@@ -187,6 +187,6 @@ def emulate(
     out
         Settings file (TOML) to write, for `survey` and `rig check`.
     """
-    given = {"scene": scene, "size": size, **by_setting(flags)}
-    asked = rig_commands.emulated_settings(settings, given)
-    return rig_commands.run_emulate(asked, stderr, baud=baud, speed=speed, out=out, as_json=as_json)
+    values = {"scene": scene, "size": size, **by_setting(flags)}
+    requested = rig_commands.emulated_settings(settings, values)
+    return rig_commands.run_emulate(requested, stderr, baud=baud, speed=speed, out=out, as_json=as_json)

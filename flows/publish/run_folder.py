@@ -34,7 +34,7 @@ from flows.tasks.scene import seen_in_training
 from flows.tasks.stages.accuracy import load_accuracy
 from flows.tasks.stages.attention import READING, load_plan, read_in_full
 from flows.tasks.stages.effects import load_manifest
-from flows.tasks.stages.on_ground import STORE
+from flows.tasks.stages.maps import STORE
 from flows.tasks.stages.placement import load_registration
 from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.errors import IncompleteStoreError

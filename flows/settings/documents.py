@@ -23,12 +23,12 @@ HEAD = """\
 def about(one: Declared, *, choices: bool = True) -> str:
     """Return the help of a setting, with its unit, its choices, and the source of its default."""
     unit = f" [{one.about['unit']}]" if one.about["unit"] else ""
-    words = f" ({one.listed})" if one.choices and choices else ""
+    listed = f" ({one.listed})" if one.choices and choices else ""
     source = f"; {one.about['source']}" if one.about["source"] else ""
-    return f"{one.item.metadata['description']}{unit}{words}{source}"
+    return f"{one.item.metadata['description']}{unit}{listed}{source}"
 
 
-def shown(one: Declared) -> str:
+def toml_value(one: Declared) -> str:
     """Return the default of a setting, or an example value, as TOML."""
     default, example = one.item.default, one.about["example"]
     value = default if example is None else example
@@ -52,9 +52,9 @@ def example_toml() -> str:
 
 def _example_lines(name: str, one: Declared, *, off: bool = False) -> Iterator[str]:
     sign = "# " if off or one.item.default in (None, MISSING, "") else ""
-    words = textwrap.wrap(about(one), WIDTH - COLUMN - 2, break_on_hyphens=False)
-    yield f"{sign}{name} = {shown(one)}".ljust(COLUMN - 1) + f" # {words[0]}"
-    yield from (" " * COLUMN + f"# {more}" for more in words[1:])
+    help_lines = textwrap.wrap(about(one), WIDTH - COLUMN - 2, break_on_hyphens=False)
+    yield f"{sign}{name} = {toml_value(one)}".ljust(COLUMN - 1) + f" # {help_lines[0]}"
+    yield from (" " * COLUMN + f"# {more}" for more in help_lines[1:])
 
 
 def settings_table() -> str:
@@ -75,7 +75,7 @@ def settings_table() -> str:
 def _default(one: Declared) -> str:
     if one.item.default is MISSING:
         return "to be given"
-    return "" if one.item.default in (None, "") else f"`{shown(one)}`"
+    return "" if one.item.default in (None, "") else f"`{toml_value(one)}`"
 
 
 if __name__ == "__main__":

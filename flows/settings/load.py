@@ -75,8 +75,12 @@ class Declared:
         low, high = span_of(self.item)
         if self.kind is float:
             return format_number(low, high, self.about["unit"], endless=self.item.default == math.inf)
-        words = {int: f"a whole number from {low} to {high}", bool: "true or false", str: "text that is not empty"}
-        return words.get(self.kind, "")
+        expected_by_kind = {
+            int: f"a whole number from {low} to {high}",
+            bool: "true or false",
+            str: "text that is not empty",
+        }
+        return expected_by_kind.get(self.kind, "")
 
     @cached_property
     def _adapter(self) -> TypeAdapter[Any]:
@@ -151,19 +155,19 @@ def usual_of_recording(table: Mapping[str, object]) -> dict[str, Any]:
     if table.get("source", RECORDED) != RECORDED:
         return {}
     usual: dict[str, Any] = {"source": RECORDED, "scene": RIG_FIELD}
-    asked = {name for name in OF_THE_PLAN if table.get(name) is not None}
+    requested = {name for name in OF_THE_PLAN if table.get(name) is not None}
     found = find_recorded_run(str(table["sweeps"]))
     if found is not None:
         run, shape = found
         uniform = any(run.settings.get(name) is not None for name in UNIFORM)
-        another_plan = asked if uniform else asked & set(UNIFORM)
+        another_plan = requested if uniform else requested & set(UNIFORM)
         names = OF_THE_RUN if another_plan else (*OF_THE_RUN, *OF_THE_PLAN)
         usual |= {name: run.settings[name] for name in names if run.settings.get(name) is not None}
         usual |= {"name": str(run.receipt.get("survey") or run.folder.name)}
         usual |= {} if shape is None else {"size": shape[::-1]}
         if run.settings.get("weights") is None and run.settings.get("scene") in BUILT_IN_SCENES:
             usual["weights"] = BUILT_IN_WEIGHTS
-    elif not asked:
+    elif not requested:
         usual["scan"] = RECORDED
     return usual
 
@@ -183,22 +187,27 @@ def load_settings(
     table, origin = _read_table(path, flags or {})
     if table.get("source") == SURVEY["source"].item.default:
         del table["source"]
-    given = {key for key, value in table.items() if value is not None}
-    recorded = usual_of_recording(table) if "sweeps" in given else {}
+    stated = {key for key, value in table.items() if value is not None}
+    recorded = usual_of_recording(table) if "sweeps" in stated else {}
     for name in TABLES:
         inner = table.get(name)
         if isinstance(inner, Mapping):
             table[name] = {**recorded.pop(name, {}), **inner}
-    asked = {**(usual or {}), **recorded, **table}
-    for wrong in (*_camera_of_a_map(asked, origin), *_contradictions(given, origin, zooms=asked.get("zoom") == ALWAYS)):
+    requested = {**(usual or {}), **recorded, **table}
+    for wrong in (
+        *_camera_of_a_map(requested, origin),
+        *_contradictions(stated, origin, zooms=requested.get("zoom") == ALWAYS),
+    ):
         raise SettingsError(wrong)
-    passes = any(name in given and not _is_usual(table[name], SURVEY[name], origin.get(name)) for name in OF_TWO_PASSES)
-    passes |= asked.get("zoom") == ALWAYS and asked.get("seconds") is None
-    if passes and not _is_map(asked) and not any(asked.get(name) is not None for name in (*UNIFORM, "budget")):
-        asked["budget"] = USUAL_BUDGET
-    if "prior" in given and "extent" not in given and _may_choose_a_part(asked):
-        asked["extent"] = EXTENT_PART
-    return parse_settings(asked, origin)
+    passes = any(
+        name in stated and not _is_usual(table[name], SURVEY[name], origin.get(name)) for name in OF_TWO_PASSES
+    )
+    passes |= requested.get("zoom") == ALWAYS and requested.get("seconds") is None
+    if passes and not _is_map(requested) and not any(requested.get(name) is not None for name in (*UNIFORM, "budget")):
+        requested["budget"] = USUAL_BUDGET
+    if "prior" in stated and "extent" not in stated and _may_choose_a_part(requested):
+        requested["extent"] = EXTENT_PART
+    return parse_settings(requested, origin)
 
 
 def _read_table(path: str | Path | None, flags: Mapping[str, object]) -> tuple[dict[str, Any], dict[str, str]]:
@@ -223,11 +232,13 @@ def _read_table(path: str | Path | None, flags: Mapping[str, object]) -> tuple[d
     return table, origin
 
 
-def _may_choose_a_part(asked: Mapping[str, object]) -> bool:
+def _may_choose_a_part(requested: Mapping[str, object]) -> bool:
     """Return whether a revisit with a time budget and no other limit can choose its lines by the prior map."""
     others = {"sweeps", "kept_bytes", "pointing_px", "macs", *UNIFORM} - {"seconds"}
-    chosen = any(asked.get(name) is not None for name in others) or asked.get("zoom") == ALWAYS
-    return asked.get("seconds") is not None and asked["prior"] != "none" and not chosen and not _is_map(asked)
+    chosen = any(requested.get(name) is not None for name in others) or requested.get("zoom") == ALWAYS
+    return (
+        requested.get("seconds") is not None and requested["prior"] != "none" and not chosen and not _is_map(requested)
+    )
 
 
 def _is_usual(value: object, declared: Declared | None, origin: str | None) -> bool:
@@ -300,12 +311,12 @@ def _check_table(
 def _parse_table(key: str, value: object, place: str, origin: Mapping[str, str]) -> object:
     if not isinstance(value, Mapping):
         raise SettingsError(f"{place} must be a table, [{key}] with keys below it; got {value!r}")
-    given = _check_table(value, TABLES[key], f"{key}.", origin)
-    missing = [name for name, one in TABLES[key].items() if one.item.default is MISSING and name not in given]
+    stated = _check_table(value, TABLES[key], f"{key}.", origin)
+    missing = [name for name, one in TABLES[key].items() if one.item.default is MISSING and name not in stated]
     if missing:
         raise SettingsError(f"[{key}] lacks {', '.join(missing)}; give every one, or leave the table out")
     try:
-        return SURVEY[key].kind(**given)
+        return SURVEY[key].kind(**stated)
     except PoseError as error:
         raise SettingsError(f"[{key}]: {error}") from None
 
@@ -338,25 +349,25 @@ def anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:
     return anchored
 
 
-def _contradictions(given: set[str], origin: Mapping[str, str], *, zooms: bool) -> Iterator[str]:
+def _contradictions(stated: set[str], origin: Mapping[str, str], *, zooms: bool) -> Iterator[str]:
     """Yield errors: settings that choose different scans."""
 
     def named(names: Iterable[str]) -> list[str]:
-        return [place_of(key, origin.get(key)) for key in names if key in given]
+        return [place_of(key, origin.get(key)) for key in names if key in stated]
 
     uniform = named(key for key in UNIFORM if not (zooms and key in OF_ZOOM))
     if zooms and uniform:
         yield f"{uniform[0]} selects one uniform scan of the field, --zoom always two passes; leave one out"
-    passes = named(key for key in OF_TWO_PASSES if not (key in OF_CHOOSING and "macs" in given))
+    passes = named(key for key in OF_TWO_PASSES if not (key in OF_CHOOSING and "macs" in stated))
     if uniform and passes:
         yield (
             f"{uniform[0]} asks for one uniform scan of the field, and {passes[0]} is for a survey that captures "
             "again; leave one of them out"
         )
     by_hand = named(("scan_step", "scan_exposure_ms", "scan"))
-    if by_hand and not zooms and given & {"seconds", "goal"}:
+    if by_hand and not zooms and stated & {"seconds", "goal"}:
         yield f"{uniform[0]} leaves the choice of the scan to the weights' record, {by_hand[0]} makes it: leave one out"
-    if "scan_exposure_ms" in given and "scan_step" not in given:
+    if "scan_exposure_ms" in stated and "scan_step" not in stated:
         yield f"{by_hand[0]} is for a uniform scan: give --scan-step too (1 for every line), or --coarse-exposure-ms"
 
 

@@ -9,7 +9,7 @@ from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, model_validator
 
-from flows.settings.documents import about, shown
+from flows.settings.documents import about, toml_value
 from flows.settings.load import SURVEY, TABLES, Declared, anchor_paths, load_settings
 from flows.settings.survey_settings import AUTO, BUILT_IN_SCENES, Settings
 from pipeline.errors import PipelineError, SettingsError
@@ -38,7 +38,7 @@ def _schema(schema: dict[str, Any]) -> None:
 
 def _described(name: str, one: Declared) -> dict[str, Any]:
     default = one.item.default
-    usual = "" if default is None or default is MISSING else f"; {shown(one)} by default"
+    usual = "" if default is None or default is MISSING else f"; {toml_value(one)} by default"
     kind: dict[str, Any] = {"type": KINDS.get(one.kind, ["string", "number"])}  # such as 0.5 or 50%
     if one.choices:
         kind = {"enum": list(one.choices)}
@@ -88,8 +88,8 @@ class SurveySettings(BaseModel):
         """Return settings as parameters; within this process they keep the password."""
         table = anchor_paths(settings.to_dict(), Path.cwd())
         usual = Settings().to_dict() | {"source": AUTO}
-        given = {name: _changed(value, usual.get(name)) for name, value in table.items() if value != usual.get(name)}
-        made: SurveySettings = cls.model_construct(**given)
+        changed = {name: _changed(value, usual.get(name)) for name, value in table.items() if value != usual.get(name)}
+        made: SurveySettings = cls.model_construct(**changed)
         made._settings = settings
         return made
 
@@ -100,8 +100,8 @@ class SurveySettings(BaseModel):
     @property
     def name_of_run(self) -> str:
         """Return the field's name, or its scene's."""
-        asked = self.settings()
-        return asked.name or Path(asked.scene).stem
+        requested = self.settings()
+        return requested.name or Path(requested.scene).stem
 
 
 def _changed(value: Any, usual: Any) -> Any:
@@ -117,7 +117,7 @@ def at_due_time(settings: Settings, due: datetime) -> Settings:
     The farm has the day of the due time in this machine's time zone. Stated values of visit, day and prior are kept.
     """
     visit = settings.visit or due.astimezone(UTC).isoformat().replace("+00:00", "Z")
-    asked = replace(settings, visit=visit, prior="latest" if settings.prior == "auto" else settings.prior)
-    if asked.source == "sim" and asked.scene in BUILT_IN_SCENES and asked.day is None:
-        return replace(asked, day=due.astimezone().timetuple().tm_yday)
-    return asked
+    requested = replace(settings, visit=visit, prior="latest" if settings.prior == "auto" else settings.prior)
+    if requested.source == "sim" and requested.scene in BUILT_IN_SCENES and requested.day is None:
+        return replace(requested, day=due.astimezone().timetuple().tm_yday)
+    return requested

@@ -64,16 +64,18 @@ def opened_first(settings: Settings) -> Iterator[None]:
 
 
 def _plan_capture(settings: SurveySettings) -> OpenSurvey | RunRef:
-    observer, asked, due = current_observer(), settings.settings(), _due_time()
+    observer, requested, due = current_observer(), settings.settings(), _due_time()
     first, run = _opened.get() or (None, None)
-    if run is None or first is not asked:
+    if run is None or first is not requested:
         try:
             if due is not None:
-                asked = scene_of_visit(at_due_time(asked, due), due.astimezone())
-            run = open_run(asked)
+                requested = scene_of_visit(at_due_time(requested, due), due.astimezone())
+            run = open_run(requested)
         except NothingToMend as known:
             observer.log(str(known))
-            return RunRef(f"runs/{known.run}", open_archive(asked.out).root / "runs" / known.run, unchanged=str(known))
+            return RunRef(
+                f"runs/{known.run}", open_archive(requested.out).root / "runs" / known.run, unchanged=str(known)
+            )
     run.archive.reclaim()  # remove incomplete stores of killed runs
     for note in run.notes:
         observer.note(note)

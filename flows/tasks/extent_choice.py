@@ -42,8 +42,8 @@ class ExtentChoice:
     @property
     def sentence(self) -> str:
         """Return the choice in a sentence."""
-        seen = self.due - self.due_left
-        due = f"; patches beyond --max-age: {seen} of {self.due} included" if self.due else ""
+        captured = self.due - self.due_left
+        due = f"; patches beyond --max-age: {captured} of {self.due} included" if self.due else ""
         return (
             f"captures the lines of highest expected gain in {self.seconds:.1f} s; the prior map's expected error is"
             f" {self.expected_wrong:.1%}{due}"
@@ -97,7 +97,7 @@ def choose_extent(
             f"the weights {path.name} have no record of uniform scans to choose a part of the field by: leave --extent "
             "out, or train weights with --min-exposure-ms 3 and validation scenes"
         )
-    there = grid.valid_fraction().ravel() > 0 if layout.shown is None else layout.shown
+    available = grid.valid_fraction().ravel() > 0 if layout.shown is None else layout.shown
     swaths, classes = _swaths(prior, grid, weights, path), len(weights.class_names)
     expected_errors = PatchExpectedErrors.of(
         swaths, grid, classes, come_true=1.0 if weights.reader is None else COME_TRUE
@@ -106,30 +106,36 @@ def choose_extent(
     if max_age is not None:  # after an equally long time without a capture
         due = np.asarray(expected_errors.age_days + prior.days > max_age)
     record = ScanPerformance.read(content, light_fraction)
-    wanted = ExtentGains(record, weights.class_names, expected_errors, there & due, there)
-    if skip_below_error is not None and expected_errors.expected_wrong() < skip_below_error and not wanted.due.any():
+    extent_gains = ExtentGains(record, weights.class_names, expected_errors, available & due, available)
+    if (
+        skip_below_error is not None
+        and expected_errors.expected_wrong() < skip_below_error
+        and not extent_gains.due.any()
+    ):
         raise NothingToMend(
             prior.run,
             f"nothing is captured: the prior map's expected error is {expected_errors.expected_wrong():.1%}, below "
             f"--skip-below-error {skip_below_error:.1%}; the map of {prior.run} remains",
         )
     free = replace(layout, recorded=None)
-    step, exposure_ms, extent = _best_extent(free, wanted, seconds)
-    seen = patches_shown(sweeps_of_runs(free.uniform(step, exposure_ms).sweeps()[1], extent.runs), grid, layout.camera)
+    step, exposure_ms, extent = _best_extent(free, extent_gains, seconds)
+    captured = patches_shown(
+        sweeps_of_runs(free.uniform(step, exposure_ms).sweeps()[1], extent.runs), grid, layout.camera
+    )
     choice = ExtentChoice(
         seconds=extent.seconds,
-        expected_gain=float(wanted.gains(step, exposure_ms)[seen].sum()),
+        expected_gain=float(extent_gains.gains(step, exposure_ms)[captured].sum()),
         expected_wrong=expected_errors.expected_wrong(),
-        due=int(np.count_nonzero(wanted.due)),
-        due_left=int(np.count_nonzero(wanted.due & ~seen)),
+        due=int(np.count_nonzero(extent_gains.due)),
+        due_left=int(np.count_nonzero(extent_gains.due & ~captured)),
     )
     chosen = replace(layout, extent=format_extent(extent.runs), step=step, exposure_ms=exposure_ms)
     return chosen, choice, f"{choice.sentence} ({format_scan(step, exposure_ms)})"
 
 
-def _best_extent(layout: PassLayout, wanted: ExtentGains, seconds: float) -> tuple[int, float, PartialScan]:
+def _best_extent(layout: PassLayout, extent_gains: ExtentGains, seconds: float) -> tuple[int, float, PartialScan]:
     """Return step, exposure and lines of the scan with the highest gain, or of the cheapest within `LOSS` of it."""
-    record, camera, cost = wanted.record, layout.camera, layout.cost
+    record, camera, cost = extent_gains.record, layout.camera, layout.cost
     found: list[tuple[int, float, PartialScan]] = []
     least: list[float] = []
     enough = float(record.scores[MIOU].max()) - POORER
@@ -139,7 +145,7 @@ def _best_extent(layout: PassLayout, wanted: ExtentGains, seconds: float) -> tup
         for exposure_ms in exposures_between(shortest, longest):
             if record.expected(step, exposure_ms)[MIOU] < enough:
                 continue
-            expected_gain = wanted.expected_gain(wanted.gains(step, exposure_ms))
+            expected_gain = extent_gains.expected_gain(extent_gains.gains(step, exposure_ms))
             extent = partial_scan(rows, expected_gain, camera, cost, exposure_ms=exposure_ms, seconds=seconds)
             found += [] if extent is None else [(step, exposure_ms, extent)]
             least.append(cheapest_row_seconds(rows, camera, cost, exposure_ms))

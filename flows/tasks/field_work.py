@@ -83,12 +83,12 @@ class Scoring:
         weights = self.weights.load()
         scan_pass = coarse_region(weights, self.mosaic, region, self.capture)
         if self.policy in GLANCING_POLICIES:
-            seen = read_coarse_prediction(weights, scan_pass)
+            coarse = read_coarse_prediction(weights, scan_pass)
         else:  # the policy needs only the coarse image
-            seen = CoarsePrediction(
+            coarse = CoarsePrediction(
                 scan_pass.grid, scan_pass.columns, np.empty((0, 0, 0), np.float32), origin=scan_pass.origin
             )
-        return region.crop_patches(score_patches(self.policy, seen))
+        return region.crop_patches(score_patches(self.policy, coarse))
 
 
 @dataclass(frozen=True)
@@ -103,9 +103,9 @@ class ExpectedErrors:
         """Return the errors of the region's own patches."""
         let_tiles_go()
         weights = self.weights.load()
-        seen = read_coarse_prediction(weights, coarse_region(weights, self.mosaic, region, self.capture))
+        coarse = read_coarse_prediction(weights, coarse_region(weights, self.mosaic, region, self.capture))
         with np.errstate(divide="ignore"):
-            sure = np.log(seen.probability[: region.grid.height, : region.grid.width])
+            sure = np.log(coarse.probability[: region.grid.height, : region.grid.width])
         ages = np.zeros(sure.shape[:2], np.float32)
         found = PatchExpectedErrors.of([(sure, ages)], region.grid, len(weights.class_names))
         pixels = found.pixels.reshape(*region.grid.patch_shape, *found.pixels.shape[1:])
@@ -119,22 +119,22 @@ def coarse_region(weights: Weights, mosaic: Path, region: Region, capture: LineS
 
     ``capture`` is the capture of pixels for which the mosaic has none.
     """
-    seen, window = open_mosaic(mosaic), (region.read.rows, region.read.columns)
-    mixed = seen.captures(*window)
+    coarse, window = open_mosaic(mosaic), (region.read.rows, region.read.columns)
+    mixed = coarse.captures(*window)
     how: Capture = capture if mixed is None else CaptureMap(tuple(LineSpec(*one) for one in mixed[0]), mixed[1])
     return read_coarse_pass(
         weights,
-        seen.row_blocks(None, *window),
-        seen.wavelength_nm,
+        coarse.row_blocks(None, *window),
+        coarse.wavelength_nm,
         region.grid,
         capture=how,
         origin=region.origin,
-        components=seen.components,
+        components=coarse.components,
     )
 
 
 def seen_patches(
-    field_index: NDArray[np.integer], seen: CoarsePass, region: Region
+    field_index: NDArray[np.integer], coarse: CoarsePass, region: Region
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Return numbers and spectral features (patch, p, p, column) of the chosen patches in a region.
 
@@ -142,9 +142,9 @@ def seen_patches(
     """
     numbers = region.numbers_here(field_index)
     numbers = numbers[numbers >= 0]
-    if seen.filled is not None:
-        numbers = numbers[~patches_of(seen.filled, region.grid.patch)[numbers].all(axis=(1, 2))]
-    return numbers, seen.patches(numbers)
+    if coarse.filled is not None:
+        numbers = numbers[~patches_of(coarse.filled, region.grid.patch)[numbers].all(axis=(1, 2))]
+    return numbers, coarse.patches(numbers)
 
 
 def region_params(grid: SceneGrid) -> dict[str, Any]:

@@ -19,8 +19,7 @@ from flows.tasks.stages.attention import load_plan, score
 from flows.tasks.stages.capture import capture_coarse, capture_fine
 from flows.tasks.stages.condense import condense_coarse, condense_fine, condense_raster
 from flows.tasks.stages.effects import choose_effects
-from flows.tasks.stages.maps import segment
-from flows.tasks.stages.on_ground import ground
+from flows.tasks.stages.maps import ground, segment
 from flows.tasks.stages.placement import locate, rectify, rectify_fine, register_coarse, register_fine
 from pipeline.lazy import deferred
 from storage.archive.keys import StageRef

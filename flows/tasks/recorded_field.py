@@ -90,7 +90,7 @@ def open_recorded(settings: Settings) -> OpenedRecording:
     Raises SceneError, WavelengthError, SettingsError, ArchiveError, PoseError: as `open_recording`, or its lines are
     too far apart.
     """
-    given = RecordedWith(
+    files = RecordedWith(
         pointing=None if settings.pointing is None else Path(settings.pointing),
         dark=None if settings.dark is None else Path(settings.dark),
         white=None if settings.white is None else Path(settings.white),
@@ -98,7 +98,7 @@ def open_recorded(settings: Settings) -> OpenedRecording:
         white_reference=settings.rig.white_reference,
         mounting=settings.rig.mounting,
     )
-    recording = open_recording(str(settings.sweeps), settings.camera, given)
+    recording = open_recording(str(settings.sweeps), settings.camera, files)
     shape, notes = _field_shape(recording, settings.shape, settings.sweeps)
     source = recording.source(shape)
     settings = replace(settings, camera=recording.camera, size=shape[::-1])

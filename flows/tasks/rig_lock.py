@@ -37,7 +37,7 @@ def rig_to_oneself(port: str, holder: str) -> Iterator[None]:
                     f"the rig is in use by {_holder(name)}; wait until that survey has ended, or end it"
                 ) from error
             raise RigError(
-                f"cannot lock the rig by {name}: {error.strerror}; surveys of a rig need abstract sockets of Linux"
+                f"cannot lock the rig by {name}: {error.strerror}; surveys of a rig need Linux's abstract sockets"
             ) from error
         with suppress(OSError):  # the description is in use
             text = re.sub(r"[^ -~]", "?", f"{holder} (process {os.getpid()})")

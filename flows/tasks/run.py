@@ -303,10 +303,10 @@ class SurveyRun(CaptureRun):
     def reading_figures(self, patch_index: NDArray[np.integer]) -> dict[str, Any]:
         """Return limits, patches and multiply-adds of the full network, for receipts."""
         settings, everything = self.settings, self.kept_patches
-        asked = {"macs": settings.macs, "least_gain": self.least_gain, "expected_loss": settings.expected_loss}
+        limits = {"macs": settings.macs, "least_gain": self.least_gain, "expected_loss": settings.expected_loss}
         costs = {"done": self.work_done(patch_index).total, "everything": self.costs.of_map(everything).total}
         figures = {"patches": len(patch_index), "of_patches": len(everything), "multiply_adds": costs}
-        return {"asked": asked, **figures}
+        return {"asked": limits, **figures}
 
     @property
     def kept_patches(self) -> NDArray[np.intp]:
@@ -363,13 +363,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     costs = ReadingCosts(described.config, grid, read)
     shown = None if zones.fractions is None else zones.fractions > 0
     budget = None if settings.macs is None else PatchBudget.asked(costs, shown, settings.policy, settings.macs)
-    simulated, sweeps = make_source(scene, settings), (*plan.coarse, *plan.full)
-    source = field_source(scene, settings, simulated, sweeps) if recorded is None else recorded.field
-    raster = None if pixels is None else RasterPixels(pixels.read, pixels.missing, bands, grid)
-    if raster is None:
-        check_memory(simulated, grid, plan, settings.memory, settings.pool)
-    else:
-        raster.rows_at_once(settings.memory)  # raises an error where one row of patches does not fit
+    source, simulated, raster = _open_source(settings, scene, grid, plan, recorded, pixels)
     archive = open_archive(settings.out) if archive is None else archive
     prior, prior_notes = found or find_prior(archive, settings, name, grid, described.class_names)
     if settings.prior != AUTO:  # a receipt names the run
@@ -380,7 +374,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         source=source,
         simulated=simulated,
         scene=scene,
-        planned=sweeps,
+        planned=(*plan.coarse, *plan.full),
         described=described,
         load=model.load,
         grid=grid,
@@ -397,6 +391,28 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         notes=(*notes, *zones.notes, *planned.notes, *prior_notes, *outside, *label_notes),
         refused=refused,
     )
+
+
+def _open_source(
+    settings: Settings,
+    scene: RasterScene,
+    grid: SceneGrid,
+    plan: CapturePlan,
+    recorded: OpenedRecording | None,
+    pixels: SceneFile | None,
+) -> tuple[FieldSource, SimulatedSource, RasterPixels | None]:
+    """Return the source of lines, the simulated rig, and the pixels of a raster; all fit the memory."""
+    simulated = make_source(scene, settings)
+    if recorded is not None:
+        source: FieldSource = recorded.field
+    else:
+        source = field_source(scene, settings, simulated, (*plan.coarse, *plan.full))
+    if pixels is None:
+        check_memory(simulated, grid, plan, settings.memory, settings.pool)
+        return source, simulated, None
+    raster = RasterPixels(pixels.read, pixels.missing, len(scene.wavelength_nm), grid)
+    raster.rows_at_once(settings.memory)  # raises an error where one row of patches does not fit
+    return source, simulated, raster
 
 
 @dataclass(frozen=True)

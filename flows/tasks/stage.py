@@ -146,6 +146,7 @@ def stage(
     """Return a decorator that makes a function of `flows.tasks.stages` a stage; see `Stage` for the parameters."""
 
     def record(function: Callable[..., Wanted]) -> Stage:
+        """Return the stage of a function."""
         needs = needs_of(function)
 
         @wraps(function)

@@ -91,8 +91,8 @@ def evaluate(
         result["none"] = map_figures(names, _confusion_of_overview(weights, image, grid, capture, judged))
         result |= {"all": {"miou": None, "per_class_iou": {}}, "gap_closed": None, "controls": {}}
         if controls:
-            seen = coarse_region(weights, image, whole_field(grid), capture)
-            columns = seen.patches(np.arange(int(np.prod(grid.patch_shape))))
+            coarse = coarse_region(weights, image, whole_field(grid), capture)
+            columns = coarse.patches(np.arange(int(np.prod(grid.patch_shape))))
             fraction, valid = CONTROL_FRACTION, grid.valid_fraction().ravel() > 0
             among = valid if zones.fractions is None else valid & (zones.fractions > 0)
             if chooses:
@@ -101,7 +101,7 @@ def evaluate(
             rows = count(1)
             found = run_controls(
                 weights,
-                read_coarse_prediction(weights, seen),
+                read_coarse_prediction(weights, coarse),
                 columns,
                 judged,
                 fraction=fraction,
@@ -111,8 +111,8 @@ def evaluate(
             )
             figures = map_figures(names, found.every)
             gap = gap_closed(result["miou"], result["none"]["miou"], figures["miou"])
-            shown = {"controls": found.as_dict(), "controls_fraction": found.fraction}
-            result |= {"all": figures, "gap_closed": gap, **shown}
+            compared = {"controls": found.as_dict(), "controls_fraction": found.fraction}
+            result |= {"all": figures, "gap_closed": gap, **compared}
         (path / RECORD).write_text(to_json(result), encoding="utf-8")  # JSON without NaN
 
     params = {**model_key, "labels": array_digest(labels), "controls": controls, **source_key}

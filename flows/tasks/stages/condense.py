@@ -46,37 +46,6 @@ SAMPLED_BLOCKS = 8  # of lines, to estimate bytes
 MOST_RARE = 0.05  # fraction of spectra, above which raw lines are kept
 
 
-@stage("condense_coarse", "signal of the sweeps", SIGNAL, named="signal_coarse")
-def condense_coarse(
-    raw: StageRef,
-    *,
-    camera: LineCamera,
-    signal: SignalChoice,
-    kept_bytes: int | None,
-    frame: FieldFrame,
-    report: Report,
-) -> Wanted:
-    """Compress the sweeps of the first pass or of the uniform scan; scores and mosaic take at most ``kept_bytes``."""
-    limit = None if kept_bytes is None else KeptBytes(kept_bytes, frame.grid.height * frame.grid.width)
-    return _condensed([raw], camera, signal, report, limit)
-
-
-@stage("condense_fine", "signal of all passes", SIGNAL_FINE, named="signal_fine")
-def condense_fine(
-    raw: StageRef,
-    raw_first: StageRef,
-    *,
-    camera: LineCamera,
-    signal: SignalChoice,
-    kept_bytes: int | None,
-    frame: FieldFrame,
-    report: Report,
-) -> Wanted:
-    """Compress the sweeps of both passes with common components, so that lines merge."""
-    limit = None if kept_bytes is None else KeptBytes(kept_bytes, frame.grid.height * frame.grid.width)
-    return _condensed([raw, raw_first], camera, signal, report, limit)
-
-
 @dataclass(frozen=True)
 class KeptBytes:
     """Limit of bytes for the scores of lines and mosaic."""
@@ -114,20 +83,26 @@ class KeptBytes:
         )
 
 
-def _condensed(
-    passes: Sequence[StageRef], camera: LineCamera, choice: SignalChoice, report: Report, limit: KeptBytes | None
+def condense(
+    *passes: StageRef,
+    camera: LineCamera,
+    signal: SignalChoice,
+    kept_bytes: int | None,
+    frame: FieldFrame,
+    report: Report,
 ) -> Wanted:
-    """Request the compressed sweeps of some captures."""
+    """Compress the sweeps of all passes with common components; scores and mosaic take at most ``kept_bytes``."""
+    limit = None if kept_bytes is None else KeptBytes(kept_bytes, frame.grid.height * frame.grid.width)
 
     def build(path: Path) -> None:
         """Compute the components, and write the scores of every sweep; again if rare spectra share components."""
         captured = [(open_raw_cubes(raw.path), read_statistics(raw.path)) for raw in passes]
         cubes = [cube for of_pass, _ in captured for cube in of_pass]
         found = reduce(SignalStatistics.merged, (statistics for _, statistics in captured))
-        components = components_of(found, cubes, choice)
-        step = choice.step if limit is None else limit.step(cubes, components, camera, choice.step)
+        components = components_of(found, cubes, signal)
+        step = signal.step if limit is None else limit.step(cubes, components, camera, signal.step)
         law = ResidualLaw.learned(found.spectra, components)
-        condenser = Condenser(components, law, camera, choice.rare_spectra, step)
+        condenser = Condenser(components, law, camera, signal.rare_spectra, step)
 
         def written(condenser: Condenser) -> list[CondensedSweep]:
             """Write every sweep with the noise model of its own pass, since exposures differ."""
@@ -138,16 +113,20 @@ def _condensed(
             return _write_sweeps(path, of_passes, found, report)
 
         done = written(condenser)
-        better = with_shared_directions(condenser, done, found, choice.false_alarm)
+        better = with_shared_directions(condenser, done, found, signal.false_alarm)
         if better is not None:
             condenser, components, done = better, better.components, written(better)
         write_table(path / RECORD, _record(condenser, done))
-        for raw in passes[:1]:
-            if (raw.path / RIG_RECORD).is_file():  # raw lines may be deleted
-                shutil.copyfile(raw.path / RIG_RECORD, path / RIG_RECORD)
+        rig_record = passes[0].path / RIG_RECORD
+        if rig_record.is_file():  # the raw lines may be deleted
+            shutil.copyfile(rig_record, path / RIG_RECORD)
 
-    key = {"camera": {"bits": camera.bits}, **asdict(choice)}  # scores depend on the saturation of the camera
+    key = {"camera": {"bits": camera.bits}, **asdict(signal)}  # scores depend on the saturation of the camera
     return Wanted(build, key if limit is None else {**key, "kept": asdict(limit)}, list(passes))
+
+
+condense_coarse = stage("condense_coarse", "signal of the sweeps", SIGNAL, named="signal_coarse")(condense)
+condense_fine = stage("condense_fine", "signal of all passes", SIGNAL_FINE, named="signal_fine")(condense)
 
 
 def with_shared_directions(
@@ -295,8 +274,8 @@ def condense_raster(
             grid=frame.angular_grid(),
         )
         for first, values, valid in blocks():
-            seen = score_lines(values, valid, components)
-            writer.write_rows(first, seen.scores, seen.quality != UNUSABLE)
+            scored = score_lines(values, valid, components)
+            writer.write_rows(first, scored.scores, scored.quality != UNUSABLE)
             report(0.5 + 0.5 * (first + len(values)) / frame.grid.height)
         finish_mosaic(writer, frame)
 
