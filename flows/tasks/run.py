@@ -348,7 +348,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     outside = beyond_training(settings, scene, described, model.trained_on, path)
     ood_detector = model.asked_ood(settings.unknown)
     name, found = settings.name or Path(scene.name).stem, None
-    if planning:
+    if planning:  # also if a survey would be skipped
         settings = replace(settings, skip_below_error=None)
     if settings.extent == EXTENT_PART:  # the prior map chooses the lines
         archive = open_archive(settings.out) if archive is None and is_archive(settings.out) else archive

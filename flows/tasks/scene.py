@@ -54,7 +54,7 @@ def scene_of_visit(settings: Settings, moment: datetime) -> Settings:
         named = settings.scene.format(date=moment, new=NEW)
     except (KeyError, IndexError, ValueError) as error:
         raise SettingsError(
-            f"--scene {settings.scene}: {error} is not allowed in braces; use {{date:%Y-%m-%d}} or {NEW}"
+            f"--scene {settings.scene}: {error} is not allowed; braces are {{date:%Y-%m-%d}} or {NEW}"
         ) from None
     found = _newest_unseen(settings, named) if NEW in named else named
     if not is_glob(found) and not split_variable(found)[0].exists():

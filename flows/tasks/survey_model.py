@@ -86,7 +86,7 @@ def weights_path(settings: Settings) -> Path:
     if settings.weights is None and settings.scene not in BUILT_IN_SCENES:
         raise SettingsError(
             f"--weights is missing: the weights that come with SpectralZoom know the built-in farm only;"
-            f" train weights for {settings.scene} with: spectralzoom train DATASET -o my.safetensors"
+            f" train some for {settings.scene} with: spectralzoom train DATASET -o my.safetensors"
         )
     return shipped_weights()
 

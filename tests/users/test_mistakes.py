@@ -92,7 +92,6 @@ CASES = {
     # wavelengths and bands
     "no wavelengths": (1, SURVEY + "cube.npy", "nothing says their wavelengths; give --wavelengths"),
     "too few wavelengths": (1, SURVEY + "cube.npy --wavelengths 460,550", "expected 5 wavelengths.* got 2"),
-    "micrometres": (2, SURVEY + "cube.npy --wavelengths .46,.55,.64,.7,.8", "micrometres"),
     "metres": (2, SURVEY + "cube.npy --wavelengths 4.6e-7,5e-7,6e-7,7e-7,8e-7", "from 150 to 30000 nm"),
     "wavelengths as words": (2, SURVEY + "cube.npy --wavelengths red,green", "got 'red'"),
     "band that is not there": (1, SURVEY + "cube.npy --bands 0,5 --wavelengths 460,550", "band 5, but .*0..4"),

@@ -378,8 +378,7 @@ def test_what_is_no_port(command_line: CommandLine, tmp_path: Path, port: str, w
 
 
 @pytest.mark.parametrize(
-    ("fault", "words"),
-    [("wrong-firmware", "firmware not known on /dev/"), ("modem", "is this the mirror"), ("mute", "no answer to")],
+    ("fault", "words"), [("wrong-firmware", "firmware not known on /dev/"), ("mute", "no answer to")]
 )
 def test_another_device_is_not_moved(command_line: CommandLine, tmp_path: Path, fault: str, words: str):
     """What answers as no mirror controller does, or as none that is known, is told nothing but who it should say."""
