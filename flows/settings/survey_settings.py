@@ -263,7 +263,7 @@ class Settings:
     coarse_exposure_ms: float | None = stated(
         None, "Exposure of the first pass; default: the camera's, or optimised", "ms", 0.5, 10_000, example=25.0
     )
-    policy: Policy = stated("gain", "Policy that ranks patches for the second pass")
+    policy: Policy = stated("gain", "Policy that ranks patches, for the second pass or --macs")
     mask: str | None = stated(None, "Image of patches to capture again, for policy mask", example="mask.png")
     weights: str | None = stated(
         None,
