@@ -237,7 +237,7 @@ def test_a_stage_that_fails_by_prefect(
     monkeypatch.setattr(prefect_tasks, "RETRY_DELAY_S", 0.0)
     prefect_tasks._task.cache_clear()
     with pytest.raises(type(error), match=str(error)[:20]):
-        survey_png(tmp_path, engine="prefect")
+        survey_png(tmp_path, engine="prefect", **{"camera.samples": 160})
     before = list(OF_THIS)[: list(OF_THIS).index(stage)]
     run, tasks = newest_run("survey", len(before) + 2)
     assert (run.name, run.state.type.value) == ("survey-scene", "FAILED")

@@ -28,6 +28,7 @@ from tests.flows.conftest import CommandLine, act_instead, problems
 from tests.prior_work import with_effects
 
 pytestmark = pytest.mark.usefixtures("no_effects")
+NARROW: dict[str, Any] = {"camera.samples": 160}  # few beside the field
 
 
 class UnmadeRef(StageRef):
@@ -250,7 +251,7 @@ def test_a_survey_has_a_server_of_its_own(survey_png: Any, tmp_path: Path, monke
     """Its files lie in the archive, and nothing of it is left in the environment."""
     monkeypatch.delenv("PREFECT_API_URL", raising=False)
     before = dict(os.environ)
-    survey_png(tmp_path, engine="prefect")
+    survey_png(tmp_path, engine="prefect", **NARROW)
     assert (tmp_path / ".prefect" / "prefect.db").exists()
     assert dict(os.environ) == before
 
@@ -264,7 +265,7 @@ def test_without_a_server_the_survey_runs_plain(
         raise ServerUnavailable("the Prefect server did not start (no port)")
 
     monkeypatch.setattr(survey_command, "_prefect_server", refuse)
-    found = survey_png(tmp_path, engine="prefect").receipt
+    found = survey_png(tmp_path, engine="prefect", **NARROW).receipt
     assert {stage["state"] for stage in found["stages"]} == {"ran"}
 
 
@@ -287,10 +288,10 @@ def test_the_run_is_published_before_its_map_is_judged(
     with monkeypatch.context() as patch:
         patch.setattr(evaluation, "load_class_map", interrupt)
         with pytest.raises(KeyboardInterrupt):
-            survey_png(tmp_path, engine="prefect")
+            survey_png(tmp_path, engine="prefect", **NARROW)
     (run,) = Archive.open(tmp_path).runs()
     assert json.loads((run / "receipt.json").read_text())["accuracy_is"] == "pending"
-    published = survey_png(tmp_path, engine="prefect")
+    published = survey_png(tmp_path, engine="prefect", **NARROW)
     assert published.folder == run
     assert published.receipt["accuracy_is"] == "judged"
     assert problems(tmp_path) == []

@@ -28,6 +28,7 @@ from tests.conftest import CLASSES, RGB_NM, Survey
 
 SEEN = TrainedOn(3, (460.0, 640.0), (3.0, 100.0), 2, CLASSES, (96, 300), (24.0, 60.0), 0.12)
 Maker = Callable[[float], Path]
+NARROW: dict[str, Any] = {"effects": "none", "camera.samples": 160}  # fewer samples beside the field
 
 
 @pytest.fixture(scope="module")
@@ -62,8 +63,8 @@ def both(
 ) -> tuple[Path, Path, dict[str, Any]]:
     """The same survey with the class unknown and without; the receipt of the first."""
     path, out, plain = judging(0.5), tmp_path_factory.mktemp("with"), tmp_path_factory.mktemp("without")
-    receipt = survey_png(out, weights=str(path), effects="none").receipt
-    survey_png(plain, weights=str(path), unknown="off", effects="none")
+    receipt = survey_png(out, weights=str(path), **NARROW).receipt
+    survey_png(plain, weights=str(path), unknown="off", **NARROW)
     return out, plain, dict(receipt)
 
 
@@ -96,7 +97,7 @@ def test_without_it_every_bit_is_kept(
     both: tuple[Path, Path, dict[str, Any]], survey_png: Survey, weights: Path, tmp_path: Path
 ) -> None:
     """Switched off, and by weights without a record of familiar spectra: the same keys, and the same bytes."""
-    survey_png(tmp_path, weights=str(weights), effects="none")
+    survey_png(tmp_path, weights=str(weights), **NARROW)
     assert _files(tmp_path, "segment") == _files(both[1], "segment")
     assert not set(_files(both[0], "segment")) & set(_files(both[1], "segment"))
 
@@ -114,7 +115,7 @@ def test_a_later_visit_goes_on_from_such_a_map(
     """What is unknown today is so whatever is remembered there, and its memory stays."""
     shutil.copytree(both[0], tmp_path, dirs_exist_ok=True)
     before = set(tmp_path.glob("stages/segment/*"))
-    flags = {"visit": "later", "seed": "1", "prior": "latest", "effects": "none"}
+    flags = {"visit": "later", "seed": "1", "prior": "latest", **NARROW}
     receipt = survey_png(tmp_path, weights=str(judging(0.5)), **flags).receipt
     assert receipt["memory"]["put_aside"] is None
     (store,) = set(tmp_path.glob("stages/segment/*")) - before
@@ -126,7 +127,7 @@ def test_a_map_of_nothing_known_is_published_and_says_what_to_do(
     survey_png: Survey, judging: Maker, tmp_path: Path
 ) -> None:
     """Receipt, report, quicklook and accuracy; the sentence names the way out."""
-    published = survey_png(tmp_path, weights=str(judging(1e-6)), effects="none")
+    published = survey_png(tmp_path, weights=str(judging(1e-6)), **NARROW)
     receipt: Any = published.receipt
     assert receipt["unknown"]["fraction"] == 1
     assert receipt["accuracy"]["miou"] == 0
@@ -145,7 +146,7 @@ def test_pixels_without_a_value_have_no_class_rather_than_an_unknown_one(
     values[:8, :8] = np.nan
     np.save(tmp_path / "holes.npy", values)
     flags = {"scene": str(tmp_path / "holes.npy"), "labels": None, "wavelengths": ",".join(map(str, RGB_NM))}
-    survey_png(tmp_path / "out", weights=str(judging(1e-6)), effects="none", **flags)
+    survey_png(tmp_path / "out", weights=str(judging(1e-6)), **NARROW, **flags)
     classes = _stored(tmp_path / "out", "class_map")["classes"].values
     assert (classes[:8, :8] == UNLABELLED).all()
     assert (classes[8:, 8:] == 3).all()
