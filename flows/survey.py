@@ -1,4 +1,4 @@
-"""The survey as a Prefect flow: from raw sweeps to a class map and its receipt, in the order of the mission.
+"""Define the survey as a Prefect flow: from raw sweeps to a class map and its receipt.
 
     from flows.settings.parameters import SurveySettings
     from flows.survey import survey
@@ -6,8 +6,8 @@
     survey(SurveySettings(scene="farm", seconds=25))                              # once, now
     survey.serve("north", cron="0 6 * * *", parameters={"settings": {...}})       # every day at six
 
-Every step is a task that takes and returns addresses of stores, never arrays. A store that is there is not made again,
-so that a survey that was stopped continues where it stopped. `survey.fn` runs the same steps without a server.
+Every step is a task that takes and returns addresses of stores, not arrays. Existing stores are not computed again, so
+that a stopped survey resumes. `survey.fn` runs the same steps without a server.
 
 No ``from __future__ import annotations`` here: Prefect reads the signatures.
 """
@@ -21,37 +21,36 @@ from flows.tasks.open_survey import OpenSurvey, RunRef
 from flows.tasks.prefect_tasks import as_task
 from flows.tasks.stages.accuracy import evaluate
 from flows.tasks.stages.attention import score
+from flows.tasks.stages.condense import condense_raster
 from flows.tasks.stages.effects import choose_effects
-from flows.tasks.stages.maps import segment
-from flows.tasks.stages.on_ground import ground
+from flows.tasks.stages.maps import ground, segment
 from flows.tasks.stages.placement import locate, rectify, rectify_fine, register_coarse, register_fine
-from flows.tasks.stages.raster import condense_raster
 from storage.archive.keys import StageRef
 
 
 @flow(name="survey", flow_run_name="survey-{settings.name_of_run}", validate_parameters=True, persist_result=False)
 def survey(settings: SurveySettings, capture_deployment: str | None = None) -> RunRef:
-    """Survey a field: capture, rectify, decide where detail changes the map, capture again, segment and publish.
+    """Survey a field: capture, rectify, score, capture again, segment and publish.
 
     Parameters
     ----------
     settings
-        What a settings file may say, each checked; all have defaults. A run of a deployment is a visit named by its
-        due time, and starts from what the field's newest run left.
+        Settings of the survey; all have defaults. A run of a deployment is a visit named by its due time, with the
+        newest prior map of the field.
     capture_deployment
-        Deployment of the flow `capture` on the rig's machine, such as ``capture/rig``, which takes the sweeps into the
-        archive of the settings. Without one this machine takes them.
+        Deployment of the flow `capture` on the rig's machine, such as ``capture/rig``, which captures into the archive
+        of the settings. By default, this machine captures.
 
     Returns
     -------
-    The address of the published run; of an earlier one where its map is sure enough that nothing was captured.
+    The address of the published run; of an earlier one where nothing had to be captured.
 
     Raises
     ------
-    PipelineError : a message for the user: what is wrong, what is allowed, what to do.
+    PipelineError : what is wrong, what is allowed, and what to do.
     """
     plan = plan_capture(settings)
-    if isinstance(plan, RunRef):  # an earlier map is sure enough
+    if isinstance(plan, RunRef):  # nothing has to be captured
         return plan
     plan.capture_deployment = capture_deployment
     with plan.at_work():
@@ -60,8 +59,8 @@ def survey(settings: SurveySettings, capture_deployment: str | None = None) -> R
 
 
 def draw_class_map(plan: OpenSurvey) -> None:
-    """Run the stages from the first pass to the class map; their stores are the products of the plan."""
-    if plan.is_map:  # the scene's own pixels: nothing is captured
+    """Run the stages from the first pass to the class map, and store their products in the plan."""
+    if plan.is_map:  # no capture
         mosaic = condense_raster(plan)
         class_map = segment(plan, mosaic, score(plan, mosaic))
     else:
@@ -71,13 +70,13 @@ def draw_class_map(plan: OpenSurvey) -> None:
 
 
 def _draw_captured(plan: OpenSurvey) -> tuple[StageRef, StageRef]:
-    """Capture the field, go back for what the plan requests, and draw its map; return mosaic and map."""
+    """Capture the field in one or two passes, and segment it; return mosaic and class map."""
     effects = choose_effects(plan)
     signal = captured_signal(plan, "coarse", effects)
     seams = register_coarse(plan, signal) if plan.registers else None
     mosaic = rectify(plan, signal, locate(plan, signal, seams), seams)
     request = score(plan, mosaic)
-    if plan.goes_back(request):  # take the lines between, where they promise most
+    if plan.goes_back(request):  # second pass
         signal = captured_signal(plan, "fine", request, effects)
         seams = register_fine(plan, signal, mosaic) if plan.registers else None
         mosaic = rectify_fine(plan, signal, seams)
@@ -85,7 +84,7 @@ def _draw_captured(plan: OpenSurvey) -> tuple[StageRef, StageRef]:
 
 
 def judge(plan: OpenSurvey, run: RunRef) -> RunRef:
-    """Judge a published class map by the labels, where there are any; none of it counts as the survey's cost."""
+    """Evaluate a published class map if there are labels; this is not part of the survey's cost."""
     if not run.pending:
         return run
     return as_task(add_accuracy, "add_accuracy")(plan, run, evaluate(plan, *plan.products.judged))
@@ -95,19 +94,19 @@ def judge(plan: OpenSurvey, run: RunRef) -> RunRef:
 def capture(
     settings: SurveySettings, sweeps: str = "coarse", inputs: list[str] | None = None, rig_file: str | None = None
 ) -> str:
-    """Take the sweeps of one pass into the archive of the settings: what the rig's machine is asked for.
+    """Capture the sweeps of one pass into the archive of the settings, on the rig's machine.
 
     Parameters
     ----------
     settings
-        Those of the survey.
+        Settings of the survey.
     sweeps
-        ``coarse``, the first pass or all of a uniform scan, or ``fine``.
+        ``coarse`` (the first pass or a uniform scan) or ``fine`` (the second pass).
     inputs
-        Addresses of the stores that the pass follows from; those of a first pass are made here.
+        Addresses of the input stores of the pass; those of a first pass are computed here.
     rig_file
-        A settings file on the rig's machine whose [rig] says where its devices are. It is a parameter of the
-        deployment: the survey that asks for the pass knows neither ports nor passwords.
+        Settings file on the rig's machine whose table [rig] has the addresses of its devices. It is a parameter of the
+        deployment, so that the survey needs neither ports nor passwords.
 
     Returns
     -------

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from flows.publish.receipt import Receipt, check_receipt
-from flows.tasks.stages.on_ground import coarse_colours
+from flows.tasks.stages.maps import coarse_colours
 from pipeline.errors import IncompleteStoreError, SettingsError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.georeference import zoomed_out

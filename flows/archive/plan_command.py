@@ -20,9 +20,9 @@ from flows.publish.findings import field_figures
 from flows.publish.receipt_table import finding_rows
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
+from flows.tasks.capture_plan import ScanChoice, as_figures
 from flows.tasks.open_survey import STAGES, OpenSurvey
 from flows.tasks.run import SurveyRun, open_run
-from flows.tasks.scan_choice import ScanChoice, as_figures
 from flows.tasks.scores import MOST_ERROR, format_prediction
 from flows.tasks.stage import Stage, Wanted
 from flows.tasks.stages.accuracy import evaluate

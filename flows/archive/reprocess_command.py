@@ -22,8 +22,8 @@ from flows.publish.receipt import Receipt
 from flows.publish.run_folder import extend_with_accuracy, load_receipt
 from flows.publish.survey_command import run_survey, show_published
 from flows.settings.survey_settings import Settings
-from flows.tasks.observer import Observer
 from flows.tasks.open_survey import STAGES, TITLES, OpenSurvey, Products, versions
+from flows.tasks.prefect_tasks import Observer
 from flows.tasks.run import SurveyRun, open_run
 from flows.tasks.scene import for_rig
 from flows.tasks.scores import score_of

@@ -1,4 +1,4 @@
-"""The application of the command line: where each verb stands, what they share, how they read lists; completion."""
+"""Build the command line: its verbs, shared parameters, parsers of lists, and shell completion."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from flows.terminal.progress import on_stderr
 from pipeline.errors import SettingsError
 from pipeline.setting_fields import numbers_of
 
-VERBS = {  # by what is typed: the module of the function, loaded once it is asked for
+VERBS = {  # verb: module of its function, loaded on demand
     "survey": "flows.cli.survey_verbs",
     "simulate": "flows.cli.survey_verbs",
     "rig check": "flows.cli.survey_verbs",
@@ -38,39 +38,39 @@ VERBS = {  # by what is typed: the module of the function, loaded once it is ask
     "tradeoff": "flows.cli.model_verbs",
     "completion": "flows.cli.app",
 }
-GOES_ON = ("survey", "train", "evaluate", "export", "reprocess", "simulate", "serve")  # verbs that keep what is done
+GOES_ON = ("survey", "train", "evaluate", "export", "reprocess", "simulate", "serve")  # verbs that resume
 stderr = on_stderr()
 
 ArchiveName = Annotated[str, Parameter(help="The archive's folder, or s3://bucket/prefix.")]
 AsJson = Annotated[bool, Parameter(name="--json", negative="", help="Print one JSON object on stdout.")]
-Switch = Annotated[bool, Parameter(negative="")]  # off unless given
+Switch = Annotated[bool, Parameter(negative="")]  # without a --no- form
 OutFile = Annotated[Path, Parameter(name=("--out", "-o"))]
 OutFolder = Annotated[Path | None, Parameter(name=("--out", "-o"))]
 Scheduler = Annotated[
-    str, Parameter(help="Who works: `threads`, `processes`, or a dask scheduler elsewhere, tcp://host:port")
+    str, Parameter(help="Worker pool: `threads`, `processes`, or the address of a dask scheduler, tcp://host:port.")
 ]
-Workers = Annotated[int | None, Parameter(help="Blocks of the field at a time; one a core by default.")]
+Workers = Annotated[int | None, Parameter(help="Number of workers; default: one per core.")]
 
 
 def build_app(*, listed: bool) -> App:
-    """The application; with ``listed`` its help has a line for each verb, read without loading what the verb needs."""
+    """Return the application; with ``listed`` its help has a line for each verb, read without importing the verb."""
     app = App(
         name="spectralzoom",
         version=lambda: importlib.metadata.version("spectralzoom"),
-        help="Survey a field: the best map for the seconds, by one scan or by a second pass where it changes the map.",
-        suppress_keyboard_interrupt=False,  # main says what an interrupted survey leaves
+        help="Survey a field with a hyperspectral line scanner: class map, receipt and report.",
+        suppress_keyboard_interrupt=False,  # main reports it
     )
-    rig = App(name="rig", help="Check a rig before a survey, or emulate one to try surveys on.")
+    rig = App(name="rig", help="Check the hardware, or emulate it.")
     app.command(rig)
-    for words, module in VERBS.items():
-        group, name = (rig if words.startswith("rig ") else app), words.split()[-1]
-        summary = {"help": _summary(module, name)} if listed else {}  # given here, it is all that the verb's help says
+    for verb, module in VERBS.items():
+        group, name = (rig if verb.startswith("rig ") else app), verb.split()[-1]
+        summary = {"help": _summary(module, name)} if listed else {}  # replaces all of the verb's own help
         group.command(f"{module}:{name}", name=name, **summary)
     return app
 
 
 def _summary(module: str, function: str) -> str:
-    """The first paragraph of a function's docstring, from the source."""
+    """Return the first paragraph of a function's docstring, from the source."""
     found = importlib.util.find_spec(module)
     assert found is not None
     assert found.origin is not None
@@ -85,7 +85,7 @@ def say(message: str) -> None:
 
 
 def check_outside(out: Path, root: Path) -> Path:
-    """The folder ``out`` whole, if it does not lie in the archive at ``root`` (SettingsError)."""
+    """Return the absolute folder ``out``. Raises SettingsError: it lies in the archive at ``root``."""
     folder = out.resolve()
     if folder.is_relative_to(root.resolve()):
         raise SettingsError(f"--out {folder} lies in the archive, where nothing else belongs; choose another folder")
@@ -93,12 +93,12 @@ def check_outside(out: Path, root: Path) -> Path:
 
 
 def split_list(text: str | None) -> tuple[str, ...]:
-    """Parts of a list with commas; none without one."""
+    """Return the parts of a list with commas."""
     return tuple(part.strip() for part in text.split(",") if part.strip()) if text else ()
 
 
 def parse_numbers(text: str | None, flag: str) -> list[float] | None:
-    """Numbers with commas; SettingsError naming the flag."""
+    """Return numbers with commas. Raises SettingsError: names the flag."""
     try:
         return None if text is None else [float(part) for part in split_list(text)]
     except ValueError:
@@ -106,7 +106,7 @@ def parse_numbers(text: str | None, flag: str) -> list[float] | None:
 
 
 def parse_wholes(text: str | None, flag: str) -> list[int] | None:
-    """Whole numbers with commas, of which 4-7 is a run; SettingsError naming the flag."""
+    """Return whole numbers with commas; 4-7 is a range. Raises SettingsError: names the flag."""
     try:
         return None if text is None else [int(str(one)) for part in split_list(text) for one in numbers_of(part)]
     except ValueError:
@@ -114,14 +114,14 @@ def parse_wholes(text: str | None, flag: str) -> list[int] | None:
 
 
 def completion(shell: Literal["bash", "zsh", "fish"]) -> int:
-    """Print a script by which SHELL completes verbs, flags and choices of spectralzoom.
+    """Print a completion script for SHELL.
 
     For bash: spectralzoom completion bash > ~/.local/share/bash-completion/completions/spectralzoom
 
     Parameters
     ----------
     shell
-        bash, zsh (as _spectralzoom in a folder of its fpath) or fish (in ~/.config/fish/completions).
+        bash, zsh (save as _spectralzoom in a folder of fpath) or fish (save in ~/.config/fish/completions).
     """
     sys.stdout.write(build_app(listed=False).generate_completion(prog_name="spectralzoom", shell=shell))
     return 0

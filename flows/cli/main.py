@@ -1,4 +1,4 @@
-"""The command line: one verb a function; errors become one message and an exit code."""
+"""Run the command line; errors become one message and an exit code."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ import sys
 import tempfile
 import traceback
 
-from cyclopts import CycloptsError, UnknownOptionError
+from cyclopts import CycloptsError
 
 from flows.cli.app import GOES_ON, VERBS, build_app, say, stderr
-from flows.settings.renamed import FLAGS
 from flows.terminal.processes import TERMINATED, Terminated, format_refusal, place_caches, terminable
 from pipeline.errors import PipelineError, SettingsError
 
@@ -18,18 +17,18 @@ INTERRUPTED = 130
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line and exit with its code; an error that the user should read is one message on stderr."""
-    # Read when numpy is first imported, which the verbs do. Split among threads, sums are rounded otherwise: the raw
-    # light behind one key, and so the receipt of one seed, would differ with the number of cores.
+    """Run the command line and exit with its code; an error is one message on stderr."""
+    # Sums that are split among threads round differently: results of one seed would depend on the number of cores.
+    # numpy reads the variable when a verb first imports it.
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     with terminable(last=arguments is None):
         sys.exit(_run(sys.argv[1:] if arguments is None else arguments))
 
 
 def _run(arguments: list[str]) -> int:
-    """Run the verb; gives the exit code, once what went wrong has been said."""
+    """Run the verb, print its error if there is one, and return the exit code."""
     try:
-        place_caches()  # read when numba and matplotlib are first imported
+        place_caches()  # before numba and matplotlib are imported
         app = build_app(listed={" ".join(arguments[:1]), " ".join(arguments[:2])}.isdisjoint(VERBS))
         code = app(arguments, result_action="return_value", exit_on_error=False, print_error=False)
     except CycloptsError as error:
@@ -40,8 +39,8 @@ def _run(arguments: list[str]) -> int:
         return error.exit_code
     except KeyboardInterrupt as error:
         what, code = ("terminated", TERMINATED) if isinstance(error, Terminated) else ("interrupted", INTERRUPTED)
-        goes_on = "; the same command goes on from here" if next(iter(arguments), "") in GOES_ON else ""
-        stderr.print(f"{what}{goes_on}", highlight=False)
+        resume = "; run the same command to resume" if next(iter(arguments), "") in GOES_ON else ""
+        stderr.print(f"{what}{resume}", highlight=False)
         return code
     except BrokenPipeError:
         return 1
@@ -57,13 +56,9 @@ def _run(arguments: list[str]) -> int:
 
 
 def _usage(error: CycloptsError) -> str:
-    what = str(error).partition(" Available commands:")[0]  # cut off in the middle: the help has them all
-    verb = " ".join(("spectralzoom", *(error.command_chain or ())))
-    if isinstance(error, UnknownOptionError):
-        word = (error.token.keyword or error.token.value).partition("=")[0]
-        now = FLAGS.get(word.removeprefix("--"))
-        what = what if now is None else f"Unknown option: {word}; {now}"
-    return f"{what.rstrip('.')}; see {verb} --help"
+    """Return the message of a wrong command line, with the help to read."""
+    what = str(error).partition(" Available commands:")[0].rstrip(".")  # the help lists all commands
+    return f"{what}; see {' '.join(('spectralzoom', *(error.command_chain or ())))} --help"
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Verbs on weights: train them, say how good they are, and what accuracy costs in time."""
+"""Define the verbs on weights: train, evaluate and tradeoff."""
 
 from __future__ import annotations
 
@@ -36,23 +36,23 @@ def tradeoff(
     seed: int = 0,
     as_json: AsJson = False,
 ) -> int:
-    """Measure what accuracy costs in time, or in bytes, for STAGE or for every stage that has a choice.
+    """Measure accuracy against time or bytes, for STAGE or for all stages with a choice.
 
     Parameters
     ----------
     stage
-        rectify, segment, simulate, store or survey; all without one.
+        rectify, segment, simulate, store or survey. Default: all.
     scene
-        A labelled scene in place of a farm: for segment, whose pixels are taken as they are, for survey, at which the
-        simulated rig looks, and for store, a cube of raw numbers. Without a stage segment and survey.
+        Labelled scene instead of a farm: a raster for segment, a scene of the simulated rig for survey, a cube of raw
+        numbers for store. Without a stage: segment and survey.
     weights
-        Weights that know its classes; for store they may be missing, and no map is drawn.
+        Weights for the classes of the scene; optional for store, which then draws no map.
     out
-        Folder for tradeoff.json and tradeoff.png.
+        Folder of tradeoff.json and tradeoff.png.
     repeats
-        Rounds in which every setting is timed once; without it 5, for store 1.
+        Rounds that time every setting once. Default: 5, for store 1.
     seed
-        Of the scenes that are measured on.
+        Random seed of the scenes.
     """
 
     content = run_tradeoff(stage, out, repeats, seed, stderr, scene=scene, weights=weights)
@@ -95,79 +95,72 @@ def train(
 ) -> int:
     """Train weights on DATASET: `farm`, `scouting`, a folder of labelled scenes, or one scene file.
 
-    The state of the run is kept beside the weights, in OUT.checkpoint: the same command goes on where it was stopped.
-    `spectralzoom evaluate` then says how good the weights are on scenes that they were not trained on.
+    The training saves its state in OUT.checkpoint; the same command resumes it.
+    `spectralzoom evaluate` measures the accuracy on scenes that were not used for training.
 
     Parameters
     ----------
     dataset
-        `farm` (`farm@2`), `scouting` (`scouting@1`), both with a comma between them, a folder of images with their
-        labels (`init` writes a scene.toml for it), or a file.
+        `farm` or `scouting` (with a seed: `farm@2`), both with a comma, a folder of images with labels (`init` writes
+        a scene.toml for it), or a file.
     out
-        File of weights to write (.safetensors).
+        Weights to write (.safetensors).
     hold_out
-        Names of scenes never to be trained on, with commas: 059,060. The split is kept in the weights.
+        Names of scenes to exclude from training, with commas: 059,060. The weights record the split.
     validation
-        How many scenes to keep from training, for the figures at its end; by default 3 of a built-in scene, one in
-        eight of a folder, 4 at most.
+        Number of validation scenes. Default: 3 built-in scenes, or one in eight of a folder, at most 4.
     seed
-        Of all that is drawn by chance: first weights, crops, noise.
+        Random seed of initial weights, crops and noise.
     steps
-        Training ends after so many steps or after --minutes, whichever comes first; the learning rate falls with it.
+        Maximum number of steps; training stops at --steps or --minutes, whichever comes first.
     minutes
-        The longest that the steps may take; looking at the scenes before and validating after come on top.
+        Time limit of the steps [min]; reading scenes and validation are not included.
     scenes
-        How many built-in scenes, on days from April to October (`scouting`: May to July); 48 by default.
+        Number of built-in scenes, on days from April to October (`scouting`: May to July). Default: 48.
     patch
-        Size of a patch [px]; by default 16 for the farm, 8 to 32 for files, by their size.
+        Size of a patch [px]. Default: 16 for the farm, 8 to 32 for files, by their size.
     width
-        Channels of the full network at a patch's own pixels.
+        Channels of the full network at full resolution.
     overview_width
-        Channels of the overview, which reads every pixel.
+        Channels of the overview network.
     columns
-        How many numbers a pixel's spectrum is brought to, whatever bands a camera has.
+        Number of spectral features per pixel, for any camera.
     init
-        Weights to begin from, which this command made. What is taken is said, and kept in the weights.
+        Initial weights, from this command. The output and the weights list what was taken from them.
     train_temporal
-        Weights to train a reader of prior maps for, and nothing else: it weighs what earlier visits left against a
-        later one. OUT has the weights with it, and surveys with --prior use it. It takes --scenes, --steps, --minutes,
-        --seed and --validation, and continues where it was stopped. It needs 4 GB; reading the training scenes takes
-        half an hour on top of --minutes.
+        Weights to which only a temporal reader is added, for surveys with --prior. It takes --scenes, --steps,
+        --minutes, --seed and --validation, and resumes. It needs 4 GB of memory, and half an hour for reading the
+        scenes besides --minutes.
     fit_ood
-        Weights to fit the detector of unknown pixels for, and nothing else: it reads the scenes of their training
-        again, which DATASET has to be. OUT has the weights with it; surveys call pixels unknown that are unlike all of
-        them. New weights have it from their training, if scenes were kept for validation.
+        Weights to which only an out-of-distribution detector is added. DATASET must be the data set of their training.
+        Surveys then label out-of-distribution pixels `unknown`. Training with validation scenes adds it by default.
     dim
-        Width of the transformer, the numbers that a patch becomes.
+        Token width of the transformer.
     layers
-        Layers of the transformer.
+        Number of transformer layers.
     heads
-        Heads of its attention; --dim must be divisible by them.
+        Number of attention heads; a divisor of --dim.
     mlp_ratio
-        How many times wider the middle of its MLPs is.
+        Hidden width of the MLPs, as a multiple of --dim.
     crop
-        Size of the crops [px]; by default 256 for the farm, 384 for files.
+        Size of the crops [px]. Default: 256 for the farm, 384 for files.
     batch
-        Crops a step; half as many in the last 30 % of the run, where crops have twice the area if scenes are large
-        enough.
+        Crops per step; half as many, of twice the area, in the last 30 % of the steps.
     min_exposure_ms
-        Shortest exposure that the weights are to read: crops are shown with exposures from here to 100 ms, and lines 1,
-        2 or 4 px apart; where scenes are kept for validation the file then has a record of uniform scans on them, by
-        which `survey --seconds` plans.
+        Shortest exposure [ms]: augments training with simulated noise of exposures up to 100 ms and line spacings of
+        1, 2 and 4 px. With validation scenes, the weights record the scan performance, which `survey --seconds` needs.
     device
-        Where the network computes: `cpu`, `cuda`, `mps`, or `auto`, the first of the last two that torch can use here,
-        else the processor.
+        Device of the network: `cpu`, `cuda`, `mps`, or `auto` (cuda or mps if available, else cpu).
     labels
-        For one scene: the file of its labels.
+        For one scene: label file.
     bands
-        For one scene: numbers of the bands to use, from 0, with commas.
+        For one scene: band numbers to use, counted from 0, with commas.
     wavelengths
-        For one scene: wavelengths of its bands [nm], with commas.
+        For one scene: centre wavelengths of its bands [nm], with commas.
     train_mask
-        For one scene: an image of its size that says where to train; 0 is nowhere.
+        For one scene: mask image of the training pixels; 0 excludes a pixel.
     mask_classes
-        For one scene whose mask numbers classes in another way: the label file's class of its number 1, 2, ..., with
-        commas.
+        For one scene: classes of the label file that the mask's numbers 1, 2, ... stand for, with commas.
     """
 
     choices = {
@@ -229,67 +222,66 @@ def evaluate(
     device: Device = PROCESSOR,
     as_json: AsJson = False,
 ) -> int:
-    """Judge WEIGHTS on the frames of DATASET that they were not trained on: accuracy, intervals, placement, costs.
+    """Evaluate WEIGHTS on the frames of DATASET that they were not trained on: accuracy, intervals, policies, costs.
 
-    With --out, frames that were judged are kept there: the same command goes on where it was stopped.
+    With --out, the same command resumes a stopped evaluation.
 
-    `evaluate ARCHIVE RUN`, without weights, adds its accuracy to a run that was published without; of the flags below
-    it takes --labels, --controls and --json.
+    `evaluate ARCHIVE RUN`, without weights, adds the accuracy to a published run; it takes only --labels, --controls
+    and --json.
 
     Parameters
     ----------
     dataset
-        `farm`, `scouting`, a folder of labelled scenes, or one scene file; with RUN, an archive.
+        `farm`, `scouting`, a folder of labelled scenes, one scene file, or an archive with RUN.
     run
-        A run of the archive: its name, `latest` or `previous`. `evaluate archive/runs/NAME` is the same.
+        Run of the archive: its name, `latest` or `previous`. `evaluate archive/runs/NAME` is equivalent.
     weights
-        A file of weights. Several are seeds of one training, or of frames left out in turn: each frame is judged by
-        those that never saw it.
+        Weights; repeat the flag for several seeds or folds. Each frame is evaluated by the weights that were not
+        trained on it.
     out
-        Folder for evaluation.json and its plot, evaluation.png.
+        Folder of evaluation.json and evaluation.png.
     fractions
-        Fractions of the patches to read in detail, with commas; 0.05,0.1,0.15,0.2,0.35 by default. No patch
-        (none) and every patch (all) are always tried.
+        Fractions of the patches to read at full resolution, with commas. Default: 0.05,0.1,0.15,0.2,0.35; none and all
+        are always included.
     policies
-        Ways to choose the patches, with commas; gain,entropy,sobel,random by default. The oracle, which chooses by the
-        labels, is always there.
+        Policies that choose the patches, with commas. Default: gain,entropy,sobel,random; an oracle that uses the
+        labels is always included.
     frames
-        Names of the frames to judge on, with commas; all by default.
+        Names of the frames, with commas. Default: all.
     scenes
-        How many built-in scenes; 4 by default.
+        Number of built-in scenes. Default: 4.
     seed
-        Of noise, random placements and the bootstrap.
+        Random seed of noise, random policy and bootstrap.
     draws
-        How often frames are drawn anew for the intervals (bootstrap).
+        Bootstrap samples for the intervals.
     labels
-        For one scene, or a run: the file of its labels.
+        For one scene or a run: label file.
     bands
-        For one scene: numbers of the bands to use, from 0, with commas.
+        For one scene: band numbers to use, counted from 0, with commas.
     wavelengths
-        For one scene: wavelengths of its bands [nm], with commas.
+        For one scene: centre wavelengths of its bands [nm], with commas.
     device
-        Where the networks of WEIGHTS compute: `cpu`, `cuda`, `mps`, or `auto`, the first of the last two that torch can
-        use here, else the processor.
+        Device of the networks: `cpu`, `cuda`, `mps`, or `auto` (cuda or mps if available, else cpu).
     controls
-        For a run: also judge other placements of the same number of patches; as its survey was asked for by default.
+        For a run: also compare other placements of as many patches. Default: as in its survey.
     """
     flags = {name: value for name, value in locals().items() if name not in ("dataset", "run")}
-    address = _run_address(dataset, run, given=bool(weights))
+    address = _run_address(dataset, run, weights=bool(weights))
     if address is not None:
         return _evaluate_run(*address, flags)
     if controls is not None:
-        raise SettingsError("--controls is for a run of an archive; leave it out where weights are judged")
+        raise SettingsError("--controls is for a run of an archive, not for weights; leave it out")
     choices = {
         "labels": labels,
         "bands": parse_wholes(bands, "--bands"),
         "wavelengths": parse_numbers(wavelengths, "--wavelengths"),
     }
-    given = parse_numbers(fractions, "--fractions")
+    chosen = parse_numbers(fractions, "--fractions")
     request = EvaluateRequest(
         dataset,
         weights,
         out,
-        FRACTIONS if given is None else tuple(given),
+        FRACTIONS if chosen is None else tuple(chosen),
         split_list(policies) or USUAL,
         split_list(frames),
         scenes,
@@ -302,11 +294,11 @@ def evaluate(
     return 0
 
 
-def _run_address(dataset: str, run: str | None, *, given: bool) -> tuple[str, str] | None:
-    """Archive and run, where a run is to be judged; None where weights are (SettingsError: neither can be meant)."""
+def _run_address(dataset: str, run: str | None, *, weights: bool) -> tuple[str, str] | None:
+    """Return archive and run, or None for an evaluation of weights. Raises SettingsError: neither is given."""
     if run is not None:
         return dataset, run
-    if given:
+    if weights:
         return None
     found = re.fullmatch(r"(.+)/runs/([^/]+)/?", dataset)
     if found is None:
@@ -318,13 +310,12 @@ def _run_address(dataset: str, run: str | None, *, given: bool) -> tuple[str, st
 
 
 def _evaluate_run(archive: str, run: str, flags: Mapping[str, Any]) -> int:
-    """Judge the map of a run; ``flags`` are all that `evaluate` has, of which some are for weights alone."""
-    usual = inspect.signature(evaluate).parameters
+    """Evaluate the map of a run. Raises SettingsError: ``flags`` has a flag that is for weights only."""
+    parameters = inspect.signature(evaluate).parameters
     for name, value in flags.items():
-        if name not in ("labels", "controls", "as_json") and value != usual[name].default:
+        if name not in ("labels", "controls", "as_json") and value != parameters[name].default:
             raise SettingsError(
-                f"--{name.replace('_', '-')} is for weights that are judged on a data set; the run {run} is judged as "
-                "it was surveyed: leave it out"
+                f"--{name.replace('_', '-')} is for weights that are judged on a data set, not for a run; leave it out"
             )
     receipt = run_judge(archive, run, stderr, controls=flags["controls"], labels=flags["labels"])
     if flags["as_json"]:

@@ -1,4 +1,4 @@
-"""Verbs that take a survey's settings: survey, simulate, and check or emulate a rig."""
+"""Define the verbs that take the settings of a survey: survey, simulate, rig check and rig emulate."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from flows.cli.app import AsJson, OutFolder, Switch, stderr
-from flows.settings.documents import about, shown
+from flows.settings.documents import about, toml_value
 from flows.settings.load import SURVEY, TABLES, load_settings
 from flows.terminal.progress import print_json
 from pipeline.errors import NothingToMend
@@ -27,7 +27,7 @@ else:
     rig_commands = deferred("flows.simulate.rig_commands")
 
 OF_ZONES = ("area", "no_go", "plots", "plots_name")
-# flags of what a settings file has in a table
+# flag: setting in a table
 IN_TABLES = {"exposure_ms": "camera.exposure_ms", "sky": "sky.light", "light_fraction": "sky.light_fraction"}
 IN_TABLES |= {name: f"zones.{name}" for name in OF_ZONES}
 _IN_TABLES = {name: place.partition(".") for name, place in IN_TABLES.items()}
@@ -35,14 +35,14 @@ _DECLARED = SURVEY | {name: TABLES[table][key] for name, (table, _, key) in _IN_
 
 
 def _flags(names: Iterable[str]) -> Any:
-    """A dataclass of such flags, all of them None where nothing was given."""
-    given = []
+    """Return a dataclass of flags for these settings; None stands for a flag that is not given."""
+    made = []
     for name in names:
         one = _DECLARED[name]
         kind: Any = bool if one.kind is bool else str
-        said = about(one) + ("" if one.item.default is None else f"; {shown(one).strip(chr(34))} by default")
-        given.append((name, Annotated[kind | None, Parameter(help=said)], None))
-    return make_dataclass("Flags", given, frozen=True, kw_only=True)
+        help_text = about(one) + ("" if one.item.default is None else f"; default: {toml_value(one).strip(chr(34))}")
+        made.append((name, Annotated[kind | None, Parameter(help=help_text)], None))
+    return make_dataclass("Flags", made, frozen=True, kw_only=True)
 
 
 _RENDERING = ("effects", "seed", "day", "hour", "interest", "sky", "light_fraction", "bands", "wavelengths")
@@ -53,21 +53,21 @@ _OfSimulation: Any = _flags((*_RENDERING, "tol", "size", "exposure_ms", "workers
 
 @Parameter(name="*")
 class SurveyFlags(_Every):  # type: ignore[misc]
-    """Flags of a survey's settings; None where none was given."""
+    """Flags of all settings of a survey."""
 
 
 @Parameter(name="*")
 class RenderingFlags(_OfRendering):  # type: ignore[misc]
-    """Flags of how a simulated rig sees its scene."""
+    """Flags of the simulated rig and its light."""
 
 
 @Parameter(name="*")
 class SimulationFlags(_OfSimulation):  # type: ignore[misc]
-    """The same, and how it is computed."""
+    """Flags of a simulated scan."""
 
 
 def by_setting(flags: Any) -> dict[str, object]:
-    """Values of flags by the settings that they are of, as `load_settings` takes them."""
+    """Return the values of flags by setting, for `load_settings`."""
     return {IN_TABLES.get(name, name): value for name, value in asdict(flags).items()}
 
 
@@ -77,20 +77,20 @@ NO_RENDERING_FLAGS = RenderingFlags()
 
 
 def survey(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = False) -> int:
-    """Survey a field: by the scan that promises most for the seconds, or coarsely, then finely where that changes it.
+    """Survey a field: capture it in one or two passes, map its classes, and publish a receipt and a report.
 
     Parameters
     ----------
     settings
-        A survey's TOML file; flags win over it. Without one, flags and defaults alone.
+        Settings file (TOML); flags override it. Default: none.
     """
-    asked = load_settings(settings, by_setting(flags))
+    requested = load_settings(settings, by_setting(flags))
     try:
-        published = survey_command.run_survey(asked, stderr)
-    except NothingToMend as said:
+        published = survey_command.run_survey(requested, stderr)
+    except NothingToMend as skipped:
         if as_json:
-            print_json({"captured": False, "run": said.run, "why": str(said)})
-        stderr.print(f"{said}", markup=False, soft_wrap=True)
+            print_json({"captured": False, "run": skipped.run, "why": str(skipped)})
+        stderr.print(f"{skipped}", markup=False, soft_wrap=True)
         return 0
     if as_json:
         print_json(published.receipt)
@@ -106,25 +106,25 @@ def simulate(
     flags: SimulationFlags = NO_SIMULATION_FLAGS,
     as_json: AsJson = False,
 ) -> int:
-    """Simulate a scan of all of SCENE with the effects that matter to it, and tell which were left out and why.
+    """Simulate a full scan of SCENE, and list the effects that were simulated or omitted, with reasons.
 
-    The same command goes on where it was stopped; a scan that is there is not made again.
+    The same command resumes a stopped scan; a finished scan is not repeated.
 
     Parameters
     ----------
     scene
-        `farm` or `scouting` (built in; `farm@2`, `scouting@1`), or an image or cube file: PNG, JPEG, BMP, GeoTIFF,
+        `farm` or `scouting` (built in; with a seed: `farm@2`), or an image or cube file: PNG, JPEG, BMP, GeoTIFF,
         .npy, .npz, .mat, ENVI, Zarr.
     out
         Archive for the raw cubes: a folder, or s3://bucket/prefix.
     coarse
-        Take the coarse sweep instead: every fourth line, samples summed by four.
+        Simulate the coarse sweep instead: every fourth line, samples summed by four.
     settings
-        A survey's TOML file, for what the rig, the air and the light are like: [camera], [optics], [mirror],
-        [detector], [air], [sky]. Flags win over it.
+        Settings file (TOML) with the tables [camera], [optics], [mirror], [detector], [air] and [sky]. Flags override
+        it.
     """
-    given = {"scene": scene, "out": out, "source": "sim", **by_setting(flags)}
-    record = simulate_command.run_simulate(load_settings(settings, given), stderr, coarse=coarse)
+    values = {"scene": scene, "out": out, "source": "sim", **by_setting(flags)}
+    record = simulate_command.run_simulate(load_settings(settings, values), stderr, coarse=coarse)
     if as_json:
         print_json(record)
     return 0
@@ -138,21 +138,21 @@ def check(
     move: Switch = False,
     as_json: AsJson = False,
 ) -> int:
-    """Connect to mirror and camera, read what they are and how they are, and tell what to mend. Nothing moves.
+    """Connect to mirror and camera, read their state, and report problems with remedies. Nothing moves.
 
-    The exit code is 0 where nothing failed, 3 where one of two devices works, else 1.
+    Exit code: 0 without problems, 3 if one of two devices works, else 1.
 
     Parameters
     ----------
     settings
-        A survey's TOML file; its table [rig] says where both devices are. Flags win over it.
+        Settings file (TOML) whose table [rig] has the addresses of both devices. Flags override it.
     port
-        Port of the mirror controller, /dev/ttyACM0 or COM3. Without a file only what is named is checked.
+        Port of the mirror controller: /dev/ttyACM0 or COM3. Without a settings file, only named devices are checked.
     camera
         Address of the camera: 10.0.65.50, HOST:PORT or HOST:PORT:FILE_PORT.
     move
-        Also send the mirror round a small square, within 0.05 of the middle of its range, and read back where it went.
-        It ends at 0; 0.
+        Also move the mirror along a small square, within 0.05 of the middle of its range, and read its positions back.
+        It stops at 0; 0.
     """
     return rig_commands.run_check(settings, port, camera, stderr, move=move, as_json=as_json)
 
@@ -168,26 +168,25 @@ def emulate(
     out: OutFolder = None,
     as_json: AsJson = False,
 ) -> int:
-    """Emulate a rig that looks at a simulated scene, until Ctrl-C: a serial port and a camera's sockets.
+    """Emulate a rig in front of a simulated scene, until Ctrl-C: a serial port and the sockets of a camera.
 
-    They speak the bytes of the documented protocols. The lines of a settings file that reach them are printed.
+    Both use the documented protocols. The command prints the lines of a settings file that connect to them.
 
     Parameters
     ----------
     scene
-        What it looks at: `farm` (by default; `farm@2`), or an image or cube file.
+        Scene: `farm` (with a seed: `farm@2`), or an image or cube file. Default: `farm`.
     size
-        Of the scene `farm`, width x height [px]: 256x256 by default.
+        Size of the scene `farm`, width x height [px]. Default: 256x256.
     settings
-        A survey's TOML file, for what camera, optics and light are like, and how the mirror is mounted. Flags win over
-        it.
+        Settings file (TOML) for camera, optics, light and the mounting of the mirror. Flags override it.
     baud
-        Speed of the serial port's bytes; 0 lets them through as they come, as USB does.
+        Speed of the serial port [baud]; 0: no limit, like USB.
     speed
-        How many times as fast as the clock on the wall the rig's time goes.
+        Speed of the rig's clock, as a multiple of real time.
     out
-        A survey's TOML file to write, ready for `survey` and `rig check`.
+        Settings file (TOML) to write, for `survey` and `rig check`.
     """
-    given = {"scene": scene, "size": size, **by_setting(flags)}
-    asked = rig_commands.emulated_settings(settings, given)
-    return rig_commands.run_emulate(asked, stderr, baud=baud, speed=speed, out=out, as_json=as_json)
+    values = {"scene": scene, "size": size, **by_setting(flags)}
+    requested = rig_commands.emulated_settings(settings, values)
+    return rig_commands.run_emulate(requested, stderr, baud=baud, speed=speed, out=out, as_json=as_json)

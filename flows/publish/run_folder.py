@@ -26,15 +26,15 @@ from flows.publish.report import Picture, render_report
 from flows.publish.spectra import draw_spectra
 from flows.settings.load import anchor_paths
 from flows.settings.values import EXTENT_WHOLE
+from flows.tasks.capture_plan import as_figures
 from flows.tasks.open_survey import STAGES, OpenSurvey, Products
 from flows.tasks.prior_maps import prior_map_figures
 from flows.tasks.run import SurveyRun, now
-from flows.tasks.scan_choice import as_figures
 from flows.tasks.scene import seen_in_training
 from flows.tasks.stages.accuracy import load_accuracy
 from flows.tasks.stages.attention import READING, load_plan, read_in_full
 from flows.tasks.stages.effects import load_manifest
-from flows.tasks.stages.on_ground import STORE
+from flows.tasks.stages.maps import STORE
 from flows.tasks.stages.placement import load_registration
 from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.errors import IncompleteStoreError

@@ -23,9 +23,8 @@ from flows.tasks.local_server import (
     quiet_environment,
     wait_until_recorded,
 )
-from flows.tasks.observer import Observer, observed_by
 from flows.tasks.open_survey import TITLES, RunRef
-from flows.tasks.prefect_tasks import inside_flow
+from flows.tasks.prefect_tasks import Observer, inside_flow, observed_by
 from flows.terminal.progress import StageProgress
 from models.network.machine import keep_freed_memory, use_one_thread
 from pipeline.lazy import deferred

@@ -1,4 +1,4 @@
-"""The declared settings in words: `survey.example.toml`, the table of the documents, and a flag's help.
+"""Write the declared settings as `survey.example.toml`, as the manual's table, and as the help of flags.
 
 `python -m flows.settings.documents > survey.example.toml` writes the example anew.
 """
@@ -13,23 +13,23 @@ from dataclasses import MISSING
 from flows.settings.load import SURVEY, TABLES, Declared
 
 WIDTH = 120
-COLUMN = 38  # where the words of a line of the example begin
+COLUMN = 38  # of the help in the example
 HEAD = """\
 # Settings of one survey: spectralzoom survey survey.example.toml
-# Every line says the default; a flag of the same name wins. Relative paths start at this file's folder.
+# Each line states the default. Flags of the same name override it. Relative paths start at this file's folder.
 """
 
 
 def about(one: Declared, *, choices: bool = True) -> str:
-    """The line of help of a setting, with its unit, its choices, and whether its default is assumed."""
+    """Return the help of a setting, with its unit, its choices, and the source of its default."""
     unit = f" [{one.about['unit']}]" if one.about["unit"] else ""
-    words = f" ({one.listed})" if one.choices and choices else ""
+    listed = f" ({one.listed})" if one.choices and choices else ""
     source = f"; {one.about['source']}" if one.about["source"] else ""
-    return f"{one.item.metadata['description']}{unit}{words}{source}"
+    return f"{one.item.metadata['description']}{unit}{listed}{source}"
 
 
-def shown(one: Declared) -> str:
-    """A setting's default, or an example of it, as TOML writes it."""
+def toml_value(one: Declared) -> str:
+    """Return the default of a setting, or an example value, as TOML."""
     default, example = one.item.default, one.about["example"]
     value = default if example is None else example
     if isinstance(value, bool):
@@ -40,7 +40,7 @@ def shown(one: Declared) -> str:
 
 
 def example_toml() -> str:
-    """The settings' example: every key with its default (in a comment where it has none) and its line of help."""
+    """Return the example file: each key with its default, commented out where it has none, and its help."""
     lines = [HEAD, *(line for name, one in SURVEY.items() if name not in TABLES for line in _example_lines(name, one))]
     for name, keys in TABLES.items():
         off = SURVEY[name].item.default is None or all(one.item.default is None for one in keys.values())
@@ -52,28 +52,30 @@ def example_toml() -> str:
 
 def _example_lines(name: str, one: Declared, *, off: bool = False) -> Iterator[str]:
     sign = "# " if off or one.item.default in (None, MISSING, "") else ""
-    words = textwrap.wrap(about(one), WIDTH - COLUMN - 2, break_on_hyphens=False)
-    yield f"{sign}{name} = {shown(one)}".ljust(COLUMN - 1) + f" # {words[0]}"
-    yield from (" " * COLUMN + f"# {more}" for more in words[1:])
+    help_lines = textwrap.wrap(about(one), WIDTH - COLUMN - 2, break_on_hyphens=False)
+    yield f"{sign}{name} = {toml_value(one)}".ljust(COLUMN - 1) + f" # {help_lines[0]}"
+    yield from (" " * COLUMN + f"# {more}" for more in help_lines[1:])
 
 
 def settings_table() -> str:
-    """Markdown: every setting of every table with its default, what it may be, and its line of help."""
+    """Return the settings of every table as Markdown: default, allowed values and help."""
     parts = []
     for title, keys in {"": {k: v for k, v in SURVEY.items() if k not in TABLES}, **TABLES}.items():
-        said = f"## [{title}]\n\n{SURVEY[title].item.metadata['description']}\n\n" if title else ""
+        heading = f"## [{title}]\n\n{SURVEY[title].item.metadata['description']}\n\n" if title else ""
         rows = [
             f"| `{name}` | {_default(one)} | {'' if one.kind is str else one.expected} | {about(one, choices=False)} |"
             for name, one in keys.items()
         ]
-        parts.append(said + "\n".join(["| key | default | may be | what it is |", "|---|---|---|---|", *rows]) + "\n")
+        parts.append(
+            heading + "\n".join(["| key | default | allowed values | meaning |", "|---|---|---|---|", *rows]) + "\n"
+        )
     return "\n".join(parts)
 
 
 def _default(one: Declared) -> str:
     if one.item.default is MISSING:
         return "to be given"
-    return "" if one.item.default in (None, "") else f"`{shown(one)}`"
+    return "" if one.item.default in (None, "") else f"`{toml_value(one)}`"
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A survey's settings as the parameters of a flow: the declared settings, for Prefect's form and checks."""
+"""Define the parameters of the survey flow from the declared settings, for Prefect's form and validation."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, model_validator
 
-from flows.settings.documents import about, shown
+from flows.settings.documents import about, toml_value
 from flows.settings.load import SURVEY, TABLES, Declared, anchor_paths, load_settings
 from flows.settings.survey_settings import AUTO, BUILT_IN_SCENES, Settings
 from pipeline.errors import PipelineError, SettingsError
 
 OF_LISTS = {"bands": "integer", "wavelengths": "number", "size": "integer"}  # also as text: 0-3,7
-SECRET = "password"  # is read from the settings file alone: a server keeps parameters
+SECRET = "password"  # only from a settings file, since a server stores parameters
 KINDS = {bool: "boolean", int: "integer", float: "number", str: "string"}
 
 
 def _schema(schema: dict[str, Any]) -> None:
-    """Add every declared setting to the schema of the parameters: type, choices, default and line of help."""
-    schema["additionalProperties"] = False  # a server refuses what is no setting
+    """Add the type, choices, default and help of every setting to the schema of the parameters."""
+    schema["additionalProperties"] = False
     for name, one in SURVEY.items():
         schema["properties"][name] = (
             {
@@ -38,7 +38,7 @@ def _schema(schema: dict[str, Any]) -> None:
 
 def _described(name: str, one: Declared) -> dict[str, Any]:
     default = one.item.default
-    usual = "" if default is None or default is MISSING else f"; {shown(one)} by default"
+    usual = "" if default is None or default is MISSING else f"; {toml_value(one)} by default"
     kind: dict[str, Any] = {"type": KINDS.get(one.kind, ["string", "number"])}  # such as 0.5 or 50%
     if one.choices:
         kind = {"enum": list(one.choices)}
@@ -48,19 +48,21 @@ def _described(name: str, one: Declared) -> dict[str, Any]:
 
 
 class SurveySettings(BaseModel):
-    """All that a survey is asked for, by the names of the settings file; what is left out has its default.
+    """Settings of a survey, with the names of the settings file; all have defaults.
 
-    ``settings_file`` is a survey's TOML file on the machine that runs the flow; the other parameters win over it.
+    ``settings_file`` is a TOML file on the machine that runs the flow; the other parameters override it.
     """
 
     model_config = ConfigDict(extra="allow", protected_namespaces=(), json_schema_extra=_schema)
 
-    settings_file: str | None = Field(default=None, description="A survey's TOML file, on the machine that surveys")
+    settings_file: str | None = Field(
+        default=None, description="Settings file (TOML) on the machine that runs the flow"
+    )
     _settings: Settings | None = PrivateAttr(default=None)
 
     @model_validator(mode="after")
     def check(self) -> Self:
-        """Check the settings as the command line does; its message is the parameter's."""
+        """Check the settings as the command line does, with the same messages."""
         try:
             self.settings()
         except PipelineError as error:
@@ -68,52 +70,54 @@ class SurveySettings(BaseModel):
         return self
 
     def settings(self) -> Settings:
-        """Return the checked settings (SettingsError: the first that cannot be used)."""
+        """Return the checked settings. Raises SettingsError: the first that is not allowed."""
         if self._settings is None:
             flags: dict[str, object] = {}
             for name, value in (self.model_extra or {}).items():
                 table = value if name in TABLES and isinstance(value, dict) else None
                 flags |= {name: value} if table is None else {f"{name}.{key}": one for key, one in table.items()}
             if flags.get(f"rig.{SECRET}") is not None:
-                raise SettingsError(f"rig.{SECRET} is no parameter, which a server keeps: write it into settings_file")
+                raise SettingsError(
+                    f"rig.{SECRET} is not allowed as a parameter, since a server stores it; write it into settings_file"
+                )
             self._settings = load_settings(self.settings_file, flags)
         return self._settings
 
     @classmethod
     def of(cls, settings: Settings) -> SurveySettings:
-        """Return the parameters of settings; within this process they are these very settings, passwords too."""
+        """Return settings as parameters; within this process they keep the password."""
         table = anchor_paths(settings.to_dict(), Path.cwd())
-        usual = Settings().to_dict() | {"source": AUTO}  # another machine needs its name
-        given = {name: _changed(value, usual.get(name)) for name, value in table.items() if value != usual.get(name)}
-        made: SurveySettings = cls.model_construct(**given)
+        usual = Settings().to_dict() | {"source": AUTO}
+        changed = {name: _changed(value, usual.get(name)) for name, value in table.items() if value != usual.get(name)}
+        made: SurveySettings = cls.model_construct(**changed)
         made._settings = settings
         return made
 
     def with_rig_of(self, file: str) -> SurveySettings:
-        """Return the same with the table [rig] of another settings file (SettingsError: it cannot be used)."""
+        """Return the settings with the table [rig] of another file. Raises SettingsError: the file is not valid."""
         return SurveySettings.of(replace(self.settings(), rig=load_settings(file).rig))
 
     @property
     def name_of_run(self) -> str:
         """Return the field's name, or its scene's."""
-        asked = self.settings()
-        return asked.name or Path(asked.scene).stem
+        requested = self.settings()
+        return requested.name or Path(requested.scene).stem
 
 
 def _changed(value: Any, usual: Any) -> Any:
-    """Return what of a table differs from the defaults; anything else as it is."""
+    """Return the keys of a table that differ from the defaults; other values unchanged."""
     if not isinstance(value, dict) or not isinstance(usual, dict):
         return value
     return {key: one for key, one in value.items() if one != usual.get(key)}
 
 
 def at_due_time(settings: Settings, due: datetime) -> Settings:
-    """Return the settings of a scheduled visit: named by its due time, after what the field's newest run left.
+    """Return the settings of a scheduled visit: it has the due time as its name and starts from the newest prior map.
 
-    The farm is as on that day by this machine's clock. What the settings say of visit, day and prior stays.
+    The farm has the day of the due time in this machine's time zone. Stated values of visit, day and prior are kept.
     """
     visit = settings.visit or due.astimezone(UTC).isoformat().replace("+00:00", "Z")
-    asked = replace(settings, visit=visit, prior="latest" if settings.prior == "auto" else settings.prior)
-    if asked.source == "sim" and asked.scene in BUILT_IN_SCENES and asked.day is None:
-        return replace(asked, day=due.astimezone().timetuple().tm_yday)
-    return asked
+    requested = replace(settings, visit=visit, prior="latest" if settings.prior == "auto" else settings.prior)
+    if requested.source == "sim" and requested.scene in BUILT_IN_SCENES and requested.day is None:
+        return replace(requested, day=due.astimezone().timetuple().tm_yday)
+    return requested

@@ -1,6 +1,6 @@
-"""Settings of a survey, each declared once: type, default, range, unit and one line of help.
+"""Define the settings of a survey, each once: type, default, range, unit and one line of help.
 
-`flows.settings.load` reads them; the example file, the flags and the table of the documents are made from this.
+`flows.settings.load` reads them. The example file, the flags and the manual's table are made from this module.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ from flows.settings.values import (
     Memory,
     Name,
     Refresh,
-    SceneName,
     Scheduler,
     Size,
     Tolerance,
@@ -52,363 +51,295 @@ from storage.parallel.pool import WorkerPool
 
 BUILT_IN_SCENES = BUILT_IN_NAMES
 USUAL_SIZE = f"{FARM_SHAPE[1]}x{FARM_SHAPE[0]}"
-RIG_FIELD = "field"  # the scene of which only the rig, or a recording, knows more than size and bands
-OF_THE_MACHINE = ("scheduler", "workers", "device")  # what of that day need not be there today
-OF_A_PART = ("max_age", "skip_below_error")  # of what a field that is remembered is looked at by
+RIG_FIELD = "field"  # scene in front of a rig or in a recording: only its size and bands are known
+OF_THE_MACHINE = ("scheduler", "workers", "device")  # settings that depend on the machine of the survey
+OF_A_PART = ("max_age", "skip_below_error")  # settings of a partial scan
 OF_RECORDINGS = ("sweeps", "pointing", "dark", "white", "scan")
 USUAL_BUDGET = 0.5  # of a zoomed survey
-MOST_STEP = 8  # pixels from line to line of a uniform scan
-UNIFORM = ("seconds", "bytes_raw", "goal", "scan_step", "scan")  # settings of which one asks for a uniform scan
-SPARING = ("macs", "least_gain")  # by which a uniform scan is read in detail in part
-OF_TWO_PASSES = ("budget", "coarse_exposure_ms", "policy", "mask")  # and of which none may
-OF_CHOOSING = ("policy", "mask")  # but for these where a part of the scan is chosen
+MOST_STEP = 8  # greatest line spacing [px]
+UNIFORM = ("seconds", "goal", "scan_step", "scan")  # each of these requests a uniform scan
+OF_TWO_PASSES = ("budget", "coarse_exposure_ms", "policy", "mask")  # each of these requests two passes
+OF_CHOOSING = ("policy", "mask")  # also valid for a uniform scan with --macs
 PATHS = (
     *("scene", "labels", "sweeps", "pointing", "dark", "white", "out", "mask", "weights"),
     *("zones.area", "zones.no_go", "zones.plots"),
 )
-ALWAYS: Literal["always"] = "always"  # a first pass, and lines between where they promise most
-AUTO, SIM, RIG, RASTER = "auto", "sim", "rig", "raster"  # where pixels come from
-RECORDED = "recorded"  # likewise, and the uniform scan that takes a recording's own lines
-# of a camera alone: tables, and settings beside them
+ALWAYS: Literal["always"] = "always"  # value of the setting `zoom`
+AUTO, SIM, RIG, RASTER, RECORDED = "auto", "sim", "rig", "raster", "recorded"  # values of the setting `source`
+# settings and tables that only a camera has
 OF_A_CAMERA = (
     *("camera", "optics", "mirror", "detector", "air", "sky", "cost", "rig", *UNIFORM, "scan_exposure_ms"),
     *("coarse_exposure_ms", "budget", "zoom", "effects", "tol", "resampling", "pointing_px", "extent", *OF_A_PART),
 )
-OF_A_VIEW = ("camera.pitch_um", "camera.focal_length_mm")  # how large a pixel is seen, which a [pose] asks for
-ALL_OF_IT = "leave it out to read all of the scan in detail"
-INSTEAD = "leave it out to zoom by --budget"
-WORKERS = "one process or thread each; leave it out for one a core"
-EPSG = "the number after EPSG:, such as 32632"
+OF_A_VIEW = ("camera.pitch_um", "camera.focal_length_mm")  # these give the IFOV, which a [pose] needs
 
 
 @dataclass(frozen=True)
 class MapChoice:
-    """Choice of the map of a posed survey; None leaves it to the pose."""
+    """Grid of the map on the ground; None derives a value from the pose."""
 
     epsg: int | None = stated(
-        None, "Projected CRS in metres; the rig's UTM zone by default", "", 1024, 32_767, example=32632, why=EPSG
+        None, "EPSG number of a projected CRS in metres; default: UTM zone of the rig", "", 1024, 32_767, example=32632
     )
-    resolution_m: float | None = stated(
-        None, "By default the median footprint of a pixel", "m", 1e-4, 1000, example=0.12
-    )
+    resolution_m: float | None = stated(None, "Pixel size; default: median GSD", "m", 1e-4, 1000, example=0.12)
 
 
 @dataclass(frozen=True)
 class SignalChoice:
-    """Choice of what is kept of spectra: scores of the components that rise above the noise."""
+    """Limits of the spectral compression into components that exceed the noise."""
 
-    step: float = stated(1.0, "Step in which scores are rounded, in standard deviations of the noise", "", 0.01, 10)
-    false_alarm: float = stated(
-        0.01, "Probability that noise alone gives a component, by a test over the whole field", "", 1e-6, 0.2
-    )
+    step: float = stated(1.0, "Quantisation step of the scores, in standard deviations of the noise", "", 0.01, 10)
+    false_alarm: float = stated(0.01, "Probability that noise alone yields a component in a field", "", 1e-6, 0.2)
     rare_spectra: float = stated(
-        1.0, "Spectra of a sweep that noise alone may mark as rare; rare ones keep what components leave", "", 1e-6, 1e6
+        1.0, "Spectra per sweep that noise alone may mark as rare; rare spectra keep their residuals", "", 1e-6, 1e6
     )
-    least: int = stated(4, "Components that are kept at any rate", "", 1, 270)
+    least: int = stated(4, "Minimum number of components", "", 1, 270)
 
 
 @dataclass(frozen=True)
 class ZoneChoice:
-    """Files of polygons that a survey keeps to, or tells of."""
+    """Polygon files: area of interest, no-go zones and plots."""
 
     area: str | None = stated(
         None,
-        "Area of interest, polygons as GeoJSON, GeoPackage (FILE.gpkg:LAYER) or shapefile: lines, scores, map, accuracy"
-        " and areas keep to it",
+        "Area of interest: polygons as GeoJSON, GeoPackage (FILE.gpkg:LAYER) or shapefile; limits capture, map and"
+        " accuracy",
         example="area.geojson",
     )
     no_go: str | None = stated(
-        None, "Zones that are left out: no detail is asked for there, and no map drawn", example="no_go.geojson"
+        None, "No-go zones, same formats; never captured again and not mapped", example="no_go.geojson"
     )
     plots: str | None = stated(
-        None, "Plots with names: the receipt has area, classes and confidence of each", example="plots.gpkg:plots"
+        None, "Plots, same formats; the receipt has area, classes and confidence of each", example="plots.gpkg:plots"
     )
     plots_name: str | None = stated(
-        None, "Attribute that names the plots; name, plot, plot_id, id or label by default", example="name"
+        None, "Attribute with the plot names; default: name, plot, plot_id, id or label", example="name"
     )
 
 
 def source_of(scene: str) -> str:
-    """Return where the pixels of a scene come from by default; see the setting ``source``."""
+    """Return the default of the setting ``source`` for a scene."""
     if scene == RIG_FIELD:
         return RIG
     return SIM if scene in BUILT_IN_SCENES else RASTER
 
 
 def table(about: str, make: type[Any] | None) -> Any:
-    """A table of settings that stand for a part of the rig or of the map; None where there is none by default."""
+    """Declare a table of settings; it is absent by default where ``make`` is None."""
     metadata = {"description": about}
     return field(default=None, metadata=metadata) if make is None else field(default_factory=make, metadata=metadata)
 
 
 @dataclass(frozen=True)
 class Settings:
-    """All that one survey needs to know. Made by `load_settings` or `parse_settings`: they check; this does not.
+    """Settings of one survey. `load_settings` and `parse_settings` check them; the constructor does not.
 
-    The source ``auto`` becomes what it stands for, so that receipts hold that.
+    The source ``auto`` is resolved on construction, so that receipts name the actual source.
     """
 
-    name: Name | None = stated(None, "What the field is called; as its scene by default", example="north")
+    name: Name | None = stated(None, "Field name; default: the scene's", example="north")
     visit: VisitName | None = stated(
         None,
-        "Which look at the field, by its date (2026-06-01) or in any words: another one is captured anew, the same one"
-        " gone on with",
+        "Visit: a date as YYYY-MM-DD, or any text. A new visit captures again; the same visit resumes",
         example="first of June",
     )
     prior: str = stated(
         "auto",
-        "What of the field is remembered: latest (what its newest run left), the name of a run, or none; auto is latest"
-        " for surveys that are served, else none",
+        "Prior map of the field: latest (newest run), a run's name, or none; auto: latest under `serve`, else none",
     )
     extent: Extent = stated(
         "whole",
-        "What a uniform scan looks at: whole (the field), part (with --seconds, of a field that is remembered: the "
-        "lines that promise most there; what --prior and --seconds ask for together), or lines by hand, as a receipt "
-        "tells them: 0:12-310,1:0-40",
+        "Extent of a uniform scan: whole; part (lines of the highest expected gain; needs --seconds and a prior map;"
+        " default for a revisit with --seconds); or lines as SWEEP:FIRST-STOP, such as 0:12-310,1:0-40",
     )
     max_age: Refresh | None = stated(
         None,
-        "With --extent part: how old what is remembered of any place may become, such as 14d or 36h; what would be "
-        "older is looked at before all else",
+        "With --extent part: maximum age of any place in the prior map, such as 14d or 36h; older places are captured"
+        " first",
         "d",
         example="14d",
     )
     skip_below_error: ExpectedError | None = stated(
         None,
-        "With --extent part: look at nothing, and leave the map as it is, where less than this fraction of what is "
-        "remembered is expected to be wrong, and nothing is too old",
+        "With --extent part: skip the visit if the prior map's expected error is lower and no place exceeds --max-age",
         example="2%",
     )
-    scene: SceneName = stated(
+    scene: str = stated(
         "farm",
-        "`farm` or `scouting` (built in; `farm@2`, `scouting@1`), or a file: PNG, JPEG, BMP, GeoTIFF, .npy, .npz,"
-        " .mat, ENVI, Zarr; as source raster also a folder or a glob of georeferenced tiles; a pattern that each visit"
-        " fills in, {date:%Y-%m-%d}.tif or {new}.tif (the newest that was not surveyed)",
+        "Scene: farm or scouting (built in; with a seed: farm@2), or a file: PNG, JPEG, BMP, GeoTIFF, .npy, .npz, .mat,"
+        " ENVI, Zarr; for source raster also a folder or glob of georeferenced tiles. Patterns for repeated visits:"
+        " {date:%Y-%m-%d}.tif, {new}.tif (newest file that was not surveyed)",
     )
     labels: str | None = stated(
-        None, "Class colours or numbers on the scene's pixels; accuracy is reported then", example="labels.png"
+        None, "Label image on the scene's pixels (class colours or numbers); enables accuracy", example="labels.png"
     )
-    bands: Bands | None = stated(None, "Bands of the file (or of the farm's 270) to use, from 0: 0,1", example=(0, 1))
-    wavelengths: Wavelengths | None = stated(None, "Their centre wavelengths: 660,800", "nm", example=(660.0, 800.0))
+    bands: Bands | None = stated(None, "Band numbers to use, counted from 0: 0,1 or 0-3; default: all", example=(0, 1))
+    wavelengths: Wavelengths | None = stated(
+        None, "Centre wavelengths of these bands: 660,800", "nm", example=(660.0, 800.0)
+    )
     source: Literal["auto", "sim", "rig", "raster", "recorded"] = stated(
         "auto",
-        "Where pixels come from: sim (the simulated rig looks at the scene), rig (the one that the table [rig] names), "
-        "raster (the file is a map already: its pixels are taken as they are), recorded (the sweeps of --sweeps); auto "
-        "is recorded where there are sweeps, raster for files, sim for built-in scenes, rig for the scene `field`",
+        "Pixel source: sim (simulated rig), rig (hardware of table [rig]), raster (pixels of the file as they are),"
+        " recorded (the sweeps of --sweeps); auto: recorded with --sweeps, raster for files, sim for built-in scenes,"
+        " rig for the scene `field`",
     )
     sweeps: str | None = stated(
         None,
-        "Recorded sweeps: an archive, ARCHIVE/runs/NAME or s3://bucket/prefix, a folder of ENVI cubes or of a Headwall"
-        " camera, one ENVI or Zarr cube",
+        "Recorded sweeps: an archive, ARCHIVE/runs/NAME, s3://bucket/prefix, a folder of ENVI cubes or of a Headwall"
+        " camera, or one ENVI or Zarr cube",
         example="sweeps",
     )
     pointing: str | None = stated(
         None,
-        "Where their lines looked: a table with a row a line (CSV, Parquet), a TOML file of a vector that the mirror "
-        "played, or a folder with one for each cube; NAME.pointing.csv beside a cube NAME by default",
+        "Pointing of the recorded lines: a table with one row per line (CSV, Parquet), a TOML file of the mirror's"
+        " position vector, or a folder with one file per cube; default: NAME.pointing.csv beside each cube",
         example="pointing.csv",
     )
     dark: str | None = stated(
-        None, "Their dark frame, ENVI or .npy; NAME.dark.hdr or dark*.hdr beside them by default", example="dark.hdr"
+        None, "Dark frame of recorded sweeps, ENVI or .npy; default: NAME.dark.hdr or dark*.hdr", example="dark.hdr"
     )
     white: str | None = stated(
-        None, "Their white frame, likewise; NAME.white.hdr or white*.hdr by default", example="white.hdr"
+        None, "White frame of recorded sweeps, likewise; default: NAME.white.hdr or white*.hdr", example="white.hdr"
     )
     scan: Literal["recorded"] | None = stated(
         None,
-        "One uniform scan of a recording's own lines, each as it was taken; of a recording the default where no budget "
-        "and no other scan is asked for",
+        "Use every recorded line as it was taken, as one uniform scan; default for recordings without another scan or"
+        " budget",
         example="recorded",
     )
     out: str = stated("archive", "Archive: a folder, or s3://bucket/prefix")
     keep: Keep = stated(
         "signal",
-        "What stays of captured lines: signal (raw lines are cleared away once each was compared with what was "
-        "condensed from it), raw (they stay too), or for how long they stay: raw 7d",
+        "Captured data to keep: signal (raw lines are deleted once the compressed signal is verified), raw, or raw for"
+        " a limited time: raw 7d",
     )
     kept_bytes: Bytes | None = stated(
         None,
-        "What the scores of a uniform scan's lines and mosaic may take, most of what a run keeps: they are rounded in "
-        "coarser steps than [signal] says where they take more",
+        "Byte limit for a uniform scan's scores of lines and mosaic; uses coarser quantisation than [signal] if needed",
         example="8MB",
-        why="leave it out for steps of the noise",
     )
     budget: Budget | None = stated(
         None,
-        "Zoom within this fraction of the full scan's seconds, in the camera's exposure and by the policy: every 4th "
-        "line first, then lines between where the policy says",
+        "Time budget of a two-pass survey, as a fraction of the full scan's time: every 4th line first, then lines"
+        " chosen by the policy",
         example=0.5,
     )
     zoom: Literal["never", "always"] = stated(
-        "never",
-        "Capture every 4th or 8th line first, then the lines between where they promise most in the seconds that are "
-        "left: always, or never (one uniform scan, which scored more in the same seconds where both were measured)",
+        "never", "Two-pass survey: every 4th or 8th line first, then the lines of highest expected gain"
     )
     seconds: float | None = stated(
         None,
-        "The camera's seconds that the capture may take: one uniform scan, the one whose map is likely to score most "
-        "by the weights' record, or with zoom a first pass and lines between",
+        "Time budget of the capture; selects the uniform scan with the highest expected mIoU within it, or with --zoom"
+        " the two passes",
         "s",
         0.1,
         1e6,
         example=30.0,
-        why=INSTEAD,
     )
-    bytes_raw: Bytes | None = stated(None, "The same with no more raw data than this", example="2GiB", why=INSTEAD)
     goal: Goal | None = stated(
         None,
-        "One uniform scan: the cheapest whose map is likely to have this mIoU in percent, or IoU of classes: "
-        "92,weed=70",
+        "Selects the cheapest uniform scan with this expected mIoU in percent, or IoU of classes: 92,weed=70",
         example="92",
-        why=INSTEAD,
     )
     scan_step: int | None = stated(
-        None,
-        "One uniform scan with lines so far apart, chosen by hand; with zoom the lines of the first pass",
-        "px",
-        1,
-        MOST_STEP,
-        example=2,
-        why=INSTEAD,
+        None, "Line spacing of the uniform scan; with --zoom that of the first pass", "px", 1, MOST_STEP, example=2
     )
     scan_exposure_ms: float | None = stated(
-        None, "Exposure of that scan's lines; by default the camera's", "ms", 0.5, 10_000, example=25.0, why=INSTEAD
+        None, "Exposure of the uniform scan; default: the camera's", "ms", 0.5, 10_000, example=25.0
     )
     macs: Compute | None = stated(
         None,
-        "Of a uniform scan or a raster read in detail what promises most for so much of the multiply-adds of reading "
-        "everything, 25%, or for so many, 4e9; the rest is read from its coarse means",
+        "MAC budget, as a fraction of full-resolution inference (25%) or as a number (4e9); regions with the highest"
+        " expected gain come first, the rest is segmented from binned pixels",
         example="25%",
-        why=ALL_OF_IT,
-    )
-    least_gain: float | None = stated(
-        None,
-        "Of a uniform scan or a raster read in detail only patches that promise at least so much, for the "
-        "policies gain and entropy",
-        "nat per px",
-        0,
-        100,
-        example=0.02,
-        why=ALL_OF_IT,
     )
     expected_loss: float = stated(
         0.3,
-        "Points of mIoU that reading a part of the patches in full may lose, by the weights' record; 0 reads all of "
-        "them, as weights without that record do",
+        "Accepted mIoU loss by reading only a part of the patches at full resolution; 0 reads all patches",
         "points",
         0,
         100,
     )
     coarse_exposure_ms: float | None = stated(
-        None,
-        "Exposure of the first pass; by default the camera's, or as the record says",
-        "ms",
-        0.5,
-        10_000,
-        example=25.0,
+        None, "Exposure of the first pass; default: the camera's, or optimised", "ms", 0.5, 10_000, example=25.0
     )
-    policy: Policy = stated("gain", "Where to capture again")
-    mask: str | None = stated(None, "Image of where to capture again, for the policy mask", example="mask.png")
+    policy: Policy = stated("gain", "Policy that ranks patches, for the second pass or --macs")
+    mask: str | None = stated(None, "Image of patches to capture again, for policy mask", example="mask.png")
     weights: str | None = stated(
         None,
-        "Model weights (.safetensors); those for `farm` are built in: `farm` names them for another source's field",
+        "Model weights (.safetensors); farm: the built-in weights, the default for built-in scenes",
         example="weights.safetensors",
     )
     unknown: Unknown = stated(
         "auto",
-        "Pixels unlike all that the weights were trained on get the class unknown: auto (where the weights know "
-        "what is familiar to them, at 0.1%), off, or the fraction of known pixels that may be called unknown: 0.5%",
+        "Label out-of-distribution pixels `unknown`: auto (false-alarm rate 0.1% if the weights have a detector), off,"
+        " or a false-alarm rate: 0.5%",
     )
-    seed: int = stated(0, "Seed of a built-in scene and of all noise", "", 0, 2**63 - 1)
+    seed: int = stated(0, "Random seed of built-in scenes and of all noise", "", 0, 2**63 - 1)
     effects: Effects = stated(
         "auto",
-        "Effects of the simulated rig: auto (those that change a number by more than tol), all, none, or names with "
-        "commas: rotation,slit,smear,vignetting,shot,read-noise",
+        "Effects of the simulated rig: auto (those that exceed tol), all, none, or names:"
+        " rotation,slit,smear,vignetting,shot,read-noise",
     )
     tol: Annotated[Tolerance, PlainValidator(parse_tolerance)] = stated(
         Tolerance(),
-        "What leaving effects out may change any number by: sigmas of its noise, or 0.5dn in DN; 0 computes all "
-        "exactly, inf leaves out all that can be",
+        "Maximum simulation error from omitted effects: in noise sigmas (0.1) or DN (0.5dn); 0: exact; inf: no limit",
         example=Tolerance().value,
     )
-    accuracy: bool = stated(
-        True, "Judge the published map by the labels; without it, `evaluate ARCHIVE RUN` does so later"
-    )
-    controls: bool = stated(True, "Also judge other placements of the same number of patches (needs labels)")
-    engine: Literal["prefect", "plain"] = stated("prefect", "Who runs the stages; plain where no server can start")
-    memory: Memory = stated(4 * 1024**3, "How much the work on tiles and regions of the field may take", example="4GiB")
+    accuracy: bool = stated(True, "Compute the accuracy if there are labels; later with `evaluate ARCHIVE RUN`")
+    controls: bool = stated(True, "With the accuracy, also compare other placements of as many patches")
+    engine: Literal["prefect", "plain"] = stated("prefect", "Workflow engine; plain runs without a server")
+    memory: Memory = stated(4 * 1024**3, "Memory limit for tiles and regions", example="4GiB")
     scheduler: Scheduler = stated(
-        "threads", "Who does that work: threads, processes, or a dask scheduler elsewhere, tcp://host:port"
+        "threads", "Worker pool: threads, processes, or the address of a dask scheduler, tcp://host:port"
     )
-    workers: int | None = stated(
-        None,
-        "Tiles, regions or blocks of simulated lines at a time; one a core by default",
-        "",
-        1,
-        1024,
-        example=2,
-        why=WORKERS,
-    )
+    workers: int | None = stated(None, "Number of workers; default: one per core", "", 1, 1024, example=2)
     device: Device = stated(
         PROCESSOR,
-        "Where the network computes; auto is cuda or mps where torch can use one here, else the processor. A map of "
-        "another device is another store: it may differ by rounding",
+        "Device of the network; auto: cuda or mps if available, else cpu. Maps of different devices may differ by"
+        " rounding",
     )
-    resampling: Kernel = stated("catmull-rom", "How lines are read between samples; nearest mixes no spectra")
+    resampling: Kernel = stated("catmull-rom", "Resampling kernel; nearest does not mix spectra")
     pointing_px: float = stated(
-        0.0, "How far off the mirror may point; above 0 sweeps overlap, seams are registered", "px", 0, 300
+        0.0, "Maximum pointing error of the mirror; above 0 sweeps overlap and are registered", "px", 0, 300
     )
     size: Size | None = stated(
-        None, f"Size of a built-in scene, width x height; {USUAL_SIZE} by default", "px", example=USUAL_SIZE
+        None, f"Size of a built-in scene, width x height; default: {USUAL_SIZE}", "px", example=USUAL_SIZE
     )
     day: int | None = stated(
-        None,
-        f"Day of the year, for built-in scenes; {USUAL_DAY} by default, the 21st of June",
-        "",
-        1,
-        366,
-        example=USUAL_DAY,
+        None, f"Day of the year of a built-in scene; default: {USUAL_DAY} (21 June)", "", 1, 366, example=USUAL_DAY
     )
     hour: float | None = stated(
-        None,
-        f"True solar time, for built-in scenes; {USUAL_HOUR:g} by default, noon is 12",
-        "h",
-        0,
-        24,
-        example=USUAL_HOUR,
+        None, f"True solar time of a built-in scene; default: {USUAL_HOUR:g}", "h", 0, 24, example=USUAL_HOUR
     )
     interest: float | None = stated(
         None,
-        "Share of the scene `scouting` in patches of weeds, bare ground, poor growth or lodging; 0.02 to 0.1 by the"
-        " seed by default",
+        "Fraction of the scene scouting with weeds, bare ground, poor growth or lodging; default: 0.02 to 0.1 by seed",
         "",
         0,
         1,
         example=0.0625,
     )
-    camera: LineCamera = table("The line camera.", LineCamera)
-    optics: Optics = table(
-        "The simulated rig beyond its camera: nothing of it was measured on a unit. First its optics.", Optics
+    camera: LineCamera = table("Line camera.", LineCamera)
+    optics: Optics = table("Optics of the simulated rig. No value was measured on a unit.", Optics)
+    mirror: MirrorMotion = table("Dynamics and coating of the simulated mirror.", MirrorMotion)
+    detector: Detector = table(
+        "Detector of the simulated rig, beyond the camera's gain, read noise and bits.", Detector
     )
-    mirror: MirrorMotion = table("How the simulated mirror follows its commands, and what coats it.", MirrorMotion)
-    detector: Detector = table("What the sensor adds to the camera's own read noise, gain and well.", Detector)
-    air: Air = table("Between rig and scene; without a distance the scene is light at the aperture.", Air)
-    sky: Sky = table("The light; without a moment the sun stands still.", Sky)
-    signal: SignalChoice = table("What of the spectra is kept.", SignalChoice)
-    cost: CostModel = table("What captures cost in time.", CostModel)
+    air: Air = table("Air between rig and scene. Without a distance, the scene is light at the aperture.", Air)
+    sky: Sky = table("Illumination. Without a start time, the sun does not move.", Sky)
+    signal: SignalChoice = table("Spectral compression.", SignalChoice)
+    cost: CostModel = table("Time model of captures.", CostModel)
     rig: SurveyRig = table(
-        'The rig, for source = "rig". Written for documented protocols and tested against emulators, never run on '
-        "hardware: whatever is called assumed, try it on yours and say so in provenance. The scene is then what "
-        'results are judged by, or "field", of which only name, size and wavelengths are given.',
+        'Hardware, for source = "rig". The drivers follow the documented protocols and are tested against emulators, '
+        "never on hardware: verify values marked assumed, and record it in provenance. The scene is then the "
+        'reference for accuracy, or "field" with name, size and wavelengths.',
         SurveyRig,
     )
-    pose: RigPose | None = table(
-        "Where the rig stands: with it the map is also drawn on the ground, with hectares of each class.", None
-    )
-    map: MapChoice = table("What map to draw on the ground, for a survey with [pose].", MapChoice)
+    pose: RigPose | None = table("Pose of the rig; adds a map on the ground with the area of each class.", None)
+    map: MapChoice = table("Grid of the map on the ground; needs [pose].", MapChoice)
     zones: ZoneChoice = table(
-        "Polygons on the field, in any CRS where the survey has a [pose] or a georeferenced scene, else in pixels.",
-        ZoneChoice,
+        "Polygons on the field: in any CRS with a [pose] or a georeferenced scene, else in pixels.", ZoneChoice
     )
 
     def __post_init__(self) -> None:
@@ -417,60 +348,61 @@ class Settings:
 
     @property
     def plain(self) -> bool:
-        """Return whether a uniform scan is asked for, or a raster: all of the field is there at once."""
+        """Return whether the field is captured in one pass: by a uniform scan, or as a raster."""
         return self.is_map or (not self.zooms and any(getattr(self, name) is not None for name in UNIFORM))
 
     @property
     def zooms(self) -> bool:
-        """Return whether a first pass is asked for, and lines between."""
+        """Return whether the field is captured in two passes."""
         return not self.is_map and (self.budget is not None or self.zoom == ALWAYS)
 
     @property
     def undecided(self) -> bool:
-        """True where no setting says how the field is captured: the record of the weights decides."""
+        """Return whether the scan performance table of the weights chooses the scan."""
         return not self.plain and self.budget is None
 
     @property
     def is_map(self) -> bool:
-        """Return whether the scene is a raster whose pixels are taken as they are: no camera looks at it."""
+        """Return whether the scene is a raster whose pixels are used as they are, without a camera."""
         return self.source == RASTER
 
     @property
     def unknown_rate(self) -> float | None:
-        """Fraction of known pixels that may be called unknown; None where none is to be."""
+        """Return the false-alarm rate of the class unknown; None where it is off."""
         usual = {UNKNOWN_AUTO: RATE, UNKNOWN_OFF: None}
         return usual[self.unknown] if self.unknown in usual else float(self.unknown.removesuffix("%")) / 100
 
     @property
     def pool(self) -> WorkerPool:
+        """Return the worker pool."""
         return WorkerPool(self.scheduler, self.workers)
 
     @property
     def shape(self) -> tuple[int, int] | None:
-        """(y, x) of the built-in scene [px], None for its default."""
+        """Return (y, x) of the built-in scene [px]; None for its default."""
         return None if self.size is None else (self.size[1], self.size[0])
 
     @property
     def moment(self) -> tuple[int, float] | None:
-        """Day of the year and true solar time [h] of the built-in scene; None of a scene that has none."""
+        """Return day of the year and true solar time [h] of a built-in scene; None for other scenes."""
         if self.scene not in BUILT_IN_SCENES:
             return None
         return USUAL_DAY if self.day is None else self.day, USUAL_HOUR if self.hour is None else self.hour
 
     @property
     def simulated_rig(self) -> Rig:
-        """All that the simulator knows of the rig; SettingsError where its parts do not go together."""
+        """Return the model of the rig for the simulator. Raises SettingsError: its parts contradict each other."""
         return Rig(self.camera, self.optics, self.mirror, self.detector, self.air, self.sky)
 
     def to_dict(self) -> dict[str, object]:
-        """Plain values for the receipt, no password; `parse_settings` reads them back to the same settings."""
+        """Return plain values for the receipt, without the password; `parse_settings` reads them back."""
         plain = {key: plain_value(value) for key, value in (asdict(self) | {"tol": str(self.tol)}).items()}
-        cast("dict[str, object]", plain["rig"]).pop("password")  # receipts are passed on
+        cast("dict[str, object]", plain["rig"]).pop("password")  # receipts are shared
         return plain
 
 
 def plain_value(value: object) -> object:
-    """A value of the settings as JSON knows it: lists, and text for a moment."""
+    """Return a value of the settings as JSON represents it."""
     if isinstance(value, Mapping):
         return {key: plain_value(item) for key, item in value.items()}
     if isinstance(value, datetime):

@@ -1,66 +1,82 @@
-"""Captures that every survey of a field plans: its first pass, the scan of everything, and their seconds."""
+"""Plan the captures of a survey: the uniform scan, or the first of two passes, and their time."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from contextlib import nullcontext, suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flows.settings.survey_settings import RECORDED, Settings
-from flows.settings.values import EXTENT_WHOLE, parse_extent_runs
+from flows.settings.values import EXTENT_WHOLE, parse_extent_runs, parse_goals
+from models.weights.files import Description
 from pipeline.capture.recorded_passes import RecordedPasses
-from pipeline.errors import BudgetError, SettingsError
+from pipeline.errors import BudgetError, NotRecordedError, SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, CostModel, Sweep
 from pipeline.planning.coverage import cheapest_full, full_sweeps, sweeps_over, uniform_sweeps, with_margin
-from pipeline.planning.interlaced import FIRST_STEP, every_nth
+from pipeline.planning.interlaced import FIRST_STEP, FIRST_STEPS, every_nth, lines_between, merged_ms
 from pipeline.planning.partial_scans import sweeps_of_runs
 from pipeline.planning.prices import check_budget
+from pipeline.planning.uniform_scans import (
+    LOSS,
+    MIOU,
+    ScanLimits,
+    ScanPerformance,
+    UniformScan,
+    choose_scan,
+    exposures_between,
+    frontier,
+    longest_exposure,
+    priced_scan,
+    reference_scan,
+    uniform_scans,
+)
 from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX
 
 
 @dataclass(frozen=True)
 class CapturePlan:
-    """Plan that every survey of this field has in common: orientation, coarse and full sweeps, and their seconds.
-
-    ``coarse`` are the sweeps of the first pass; of a uniform scan they are all that is captured.
-    """
+    """Sweeps of the first pass, or of the uniform scan, and of the full scan, with their time."""
 
     along: Axis
-    coarse: list[Sweep]
+    coarse: list[Sweep]  # first pass, or uniform scan
     full: list[Sweep]
     coarse_s: float
     full_s: float
-    fine_s: float  # left for later passes
-    overlap_px: float  # of neighbouring coarse strips, at least
-    margin_px: float  # by which sweeps begin earlier and end later
+    fine_s: float  # left for the second pass
+    overlap_px: float  # least overlap of neighbouring coarse swaths
+    margin_px: float  # extension of sweeps at both ends
     plain: bool = False  # one uniform scan, or a raster
-    by_record: bool = False  # later lines are chosen by the weights' record of scans
+    by_record: bool = False  # scan performance chooses the lines of the second pass
 
     @staticmethod
     def of_map() -> CapturePlan:
-        """Return the plan of a raster: no sweeps and no seconds, since all of its pixels are there."""
+        """Return the plan of a raster, without sweeps."""
         return CapturePlan("x", [], [], 0.0, 0.0, 0.0, 0.0, 0.0, plain=True)
 
 
 @dataclass(frozen=True)
 class PassLayout:
-    """Lays out the passes over a field: its grid, the camera, and what was asked of their lines."""
+    """Layout of passes over a field: grid, camera, line spacing and exposure."""
 
     grid: SceneGrid
     camera: LineCamera
     cost: CostModel
-    pointing_px: float = 0.0  # by which the mirror may look beside the plan
-    step: int | None = None  # pixels from line to line of a uniform scan; None: several passes
+    pointing_px: float = 0.0  # maximum pointing error
+    step: int | None = None  # line spacing of a uniform scan; None: two passes
     exposure_ms: float | None = None  # of a uniform scan; None: the camera's
     coarse_exposure_ms: float | None = None
-    extent: str = EXTENT_WHOLE  # the lines of a uniform scan that are looked at
-    first_step: int = FIRST_STEP  # pixels from line to line of the first of several passes
-    as_taken: bool = False  # the uniform scan that a recording is
-    shown: NDArray[np.bool_] | None = None  # (patch,) that lines show; None: all
-    recorded: RecordedPasses | None = None  # whose lines the passes take
+    extent: str = EXTENT_WHOLE  # of a uniform scan
+    first_step: int = FIRST_STEP  # line spacing of the first of two passes
+    as_taken: bool = False  # use all lines of a recording
+    shown: NDArray[np.bool_] | None = None  # (patch,) to capture; None: all
+    recorded: RecordedPasses | None = None  # recording that has the lines
 
     @classmethod
     def of(
@@ -70,7 +86,7 @@ class PassLayout:
         shown: NDArray[np.bool_] | None = None,
         recorded: RecordedPasses | None = None,
     ) -> PassLayout:
-        """Take from the settings what they ask of the passes."""
+        """Return the layout that the settings request."""
         return cls(
             grid,
             settings.camera,
@@ -91,10 +107,10 @@ class PassLayout:
         return replace(self, step=step, exposure_ms=exposure_ms, extent=EXTENT_WHOLE, as_taken=False)
 
     def plan(self, budget: float | None, seconds: float | None = None) -> CapturePlan:
-        """Lay out the first pass and the full scan; where the mirror may look beside the plan, overlapping and longer.
+        """Return the first pass and the full scan; with pointing errors, sweeps overlap and are longer.
 
-        All passes may take ``seconds``, or ``budget``, a fraction of the full scan's; without either there is one
-        uniform scan. Raises as `sweeps`; BudgetError: the first pass is not paid for.
+        Both passes together take ``seconds``, or ``budget``, a fraction of the full scan. Without either there is one
+        uniform scan. Raises as `sweeps`; BudgetError: the first pass takes longer.
         """
         along, coarse, full = self.sweeps()
         full_s, coarse_s = self.cost.seconds(full, self.camera), self.cost.seconds(coarse, self.camera)
@@ -104,7 +120,7 @@ class PassLayout:
         elif seconds is not None:
             if seconds < coarse_s:
                 raise BudgetError(
-                    f"--seconds {seconds:g} does not pay for the first pass of every {self.first_step}th line, "
+                    f"--seconds {seconds:g} is below the time of the first pass of every {self.first_step}th line, "
                     f"{coarse_s:.1f} s; give more, a shorter --coarse-exposure-ms, or --zoom never"
                 )
             fine_s = seconds - coarse_s
@@ -116,12 +132,11 @@ class PassLayout:
         )
 
     def sweeps(self) -> tuple[Axis, list[Sweep], list[Sweep]]:
-        """Give the axis that lines lie along, the coarse sweeps or those of a uniform scan, and those of the full scan.
+        """Return the axis of the lines, the sweeps of the first pass or uniform scan, and those of the full scan.
 
-        Lines that show none of the ``shown`` patches are left out, but for a mirror that may look beside the plan: its
-        sweeps are tied together by what they share. Raises SettingsError: the mirror may be so far off that overlaps
-        take whole lines, or lines are named that the scan does not have; PoseError: the field is beyond the mirror's
-        range; NotRecordedError: a line of a recording was never taken.
+        Lines that show none of the ``shown`` patches are left out, except with pointing errors: registration needs
+        whole sweeps. Raises SettingsError: overlaps would take whole lines, or the extent names lines that do not
+        exist; PoseError: the field exceeds the mirror's range; NotRecordedError: a recording lacks a line.
         """
         grid, camera, cost, apart = self.grid, self.camera, self.cost, 2 * self.pointing_px
         shown, recorded = self.shown, self.recorded
@@ -147,7 +162,7 @@ class PassLayout:
         return along, taken, recorded.full_scan(full)
 
     def _overlap(self, step: int) -> float:
-        """Return what neighbouring sweeps have to share, so that 64 pixels are left when they lie apart [px]."""
+        """Return the overlap of neighbouring sweeps that leaves 64 pixels at the greatest pointing error [px]."""
         off, samples = self.pointing_px, self.camera.samples
         if not off:
             return 0.0
@@ -155,8 +170,156 @@ class PassLayout:
         overlap = 2 * off + rest
         if overlap >= line:
             raise SettingsError(
-                f"--pointing-px {off:g}: sweeps would have to overlap by {overlap:g} px (twice that, and "
-                f"{LEAST_OVERLAP_PX:.0f} pixels of {step} px), all of a line of {line} px; "
+                f"--pointing-px {off:g}: sweeps would have to overlap by {overlap:g} px of a line of {line} px; "
                 f"give less than {(line - rest) / 2:g}"
             )
         return overlap
+
+
+@dataclass(frozen=True)
+class ScanChoice:
+    """Uniform scans of the scan performance table, and the one that the survey takes."""
+
+    offered: tuple[UniformScan, ...] = ()  # empty without a table
+    chosen: UniformScan | None = None  # None of two passes, or beyond the table
+
+    def best_within(self, seconds: float) -> UniformScan | None:
+        """Return the scan with the highest expected mIoU within a time; None where there is none."""
+        try:
+            return choose_scan(self.offered, ScanLimits(seconds)) if self.offered else None
+        except BudgetError:
+            return None
+
+    @property
+    def reference(self) -> UniformScan | None:
+        """Return the reference: the cheapest scan that is nearly as good as the best; None without a table."""
+        return reference_scan(self.offered) if self.offered else None
+
+    @property
+    def frontier(self) -> list[UniformScan]:
+        """Return the scans on the Pareto front of time and mIoU, by ascending time."""
+        return frontier(self.offered)
+
+
+def choose_uniform_scan(
+    layout: PassLayout, weights: Description, path: Path, bands: int, settings: Settings
+) -> ScanChoice:
+    """Choose line spacing and exposure of the uniform scan, by the scan performance of the weights in ``path``.
+
+    A scan with limits or goals is the best within them. Without any setting it is the reference scan. A line spacing in
+    the layout is kept. A recording offers the scans that its lines contain, with their exposure.
+    Raises WeightsError: the weights lack the table; BudgetError: no scan is within the limits or reaches the goals;
+    SettingsError: the weights lack the class of a goal, or the table starts at longer exposures than the camera's;
+    PoseError: the field exceeds the mirror's range.
+    """
+    plain, limits = settings.plain, ScanLimits(settings.seconds)
+    content = weights.record.get("scans")
+    if content is None:
+        if layout.step is None and plain:
+            raise WeightsError(
+                f"the weights {path.name} have no record of uniform scans to choose by: give --scan-step and "
+                "--scan-exposure-ms, or train weights with --min-exposure-ms 3 and validation scenes"
+            )
+        return ScanChoice()
+    record = ScanPerformance.read(content, settings.sky.fraction_of_clear)
+    goals = {} if settings.goal is None else parse_goals(settings.goal)
+    for name in goals:
+        if name not in record.scores:
+            known = ", ".join(one for one in record.scores if one != MIOU)
+            raise SettingsError(f"--goal {name}={100 * goals[name]:g}: no class of the weights; give one of {known}")
+    camera, cost = layout.camera, layout.cost
+    sweeps: dict[int, list[Sweep]] = {}  # by line spacing; of a recording, those that its lines contain
+    taken_ms = None if layout.recorded is None else [camera.exposure_ms]
+    for step in record.steps:
+        with nullcontext() if layout.recorded is None else suppress(NotRecordedError):
+            sweeps[step] = layout.uniform(step, layout.exposure_ms).sweeps()[1]
+    scans = uniform_scans(record, sweeps, camera, cost, bands, seconds=limits.seconds, exposures_ms=taken_ms)
+    chosen, exposure_ms = None, layout.exposure_ms or camera.exposure_ms
+    if layout.extent != EXTENT_WHOLE:  # the table is for whole fields
+        pass
+    elif layout.step in sweeps and layout.step in record.steps and record.knows(exposure_ms):
+        chosen = priced_scan(record, sweeps[layout.step], camera, cost, bands, exposure_ms)
+    elif plain and layout.step is None:
+        if not scans:
+            raise SettingsError(
+                f"camera.exposure_ms = {camera.exposure_ms:g}: the scan performance of the weights starts at "
+                f"{record.exposures_ms[0]:g} ms; choose the scan with --scan-step"
+            )
+        chosen = choose_scan(scans, replace(limits, goals=goals))
+    elif settings.undecided and scans and not settings.zooms:
+        chosen = reference_scan(scans)
+    return ScanChoice(tuple(scans), chosen)
+
+
+def lay_out_passes(
+    layout: PassLayout, scans: ScanChoice, weights: Description, settings: Settings
+) -> tuple[PassLayout, CapturePlan, Settings, tuple[str, ...]]:
+    """Lay out the chosen uniform scan, or the first of two passes.
+
+    Returns layout, plan, settings that request exactly this plan, and notes. Without settings or a table, every line
+    is captured. Raises what `PassLayout.plan` raises.
+    """
+    chosen, content = scans.chosen, weights.record.get("scans")
+    if settings.zooms:
+        layout = replace(layout, first_step=settings.scan_step or FIRST_STEP, step=None)
+        if content is not None and settings.seconds is not None and settings.coarse_exposure_ms is None:
+            record = ScanPerformance.read(content, settings.sky.fraction_of_clear)
+            first = choose_first_pass(layout, record, settings.seconds)
+            if first is not None:
+                layout = replace(layout, first_step=first.step, coarse_exposure_ms=first.exposure_ms)
+                settings = replace(settings, coarse_exposure_ms=first.exposure_ms)
+        settings = replace(settings, scan_step=None if settings.budget is not None else layout.first_step)
+        return layout, layout.plan(settings.budget, settings.seconds), settings, ()
+    if chosen is not None and layout.step is None:
+        layout = replace(layout, step=chosen.step, exposure_ms=chosen.exposure_ms)
+    settings = replace(settings, scan_step=layout.step, scan_exposure_ms=layout.exposure_ms)
+    if layout.step is not None or settings.plain:
+        return layout, layout.plan(None), settings, ()
+    every = layout.uniform(1)
+    note = "every line is captured: the weights have no record of scans to choose by"
+    return every, every.plan(None), replace(settings, scan_step=1), (note,)
+
+
+@dataclass(frozen=True)
+class FirstPass:
+    """Lines of a first pass, and the expected mIoU if the second pass covers the whole field."""
+
+    step: int
+    exposure_ms: float
+    expected: float
+
+
+def choose_first_pass(layout: PassLayout, record: ScanPerformance, seconds: float) -> FirstPass | None:
+    """Choose the lines of a first pass within the time; None where none fits.
+
+    The criterion is the expected mIoU if the second pass covers the whole field. Among nearly equal choices, the
+    closest lines are taken, then the longest exposure.
+    """
+    camera, cost, full = layout.camera, layout.cost, layout.sweeps()[2]
+    shortest, longest = record.offered_ms(camera)
+    found: list[FirstPass] = []
+    for first_step in (step for step in FIRST_STEPS if step in record.steps):
+        for first_ms in exposures_between(shortest, longest):
+            first = every_nth(full, first_step, first_ms)
+            left_s = seconds - cost.seconds(first, camera)
+            if left_s < 0:
+                break
+            scores = [0.0]
+            for step in (step for step in record.steps if step < first_step):
+                rest = lines_between(full, first, step=step)
+                rest_ms = longest_exposure(left_s, rest, camera, cost, shortest, longest)
+                if rest_ms is not None:
+                    scores.append(record.expected(step, merged_ms(first_ms, rest_ms, step / first_step))[MIOU])
+            found.append(FirstPass(first_step, first_ms, max(scores)))
+    best = max((one.expected for one in found), default=0.0)
+    good = [one for one in found if one.expected >= best - LOSS]
+    return max(good, key=lambda one: (-one.step, one.exposure_ms), default=None)
+
+
+def as_figures(scan: UniformScan | None) -> dict[str, Any] | None:
+    """Return a scan for receipts, with its expected mIoU."""
+    if scan is None:
+        return None
+    fields: Mapping[str, Any] = asdict(scan)
+    figures = {"expected_miou": scan.expected[MIOU], "expected_spread": scan.spread}
+    return {name: value for name, value in fields.items() if name not in ("expected", "spread")} | figures

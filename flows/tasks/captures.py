@@ -1,4 +1,4 @@
-"""The tasks that begin a survey: open and plan it, and take the sweeps of a pass, here or on the rig's machine.
+"""Define the first tasks of a survey: open and plan it, and capture a pass, here or on the rig's machine.
 
 No ``from __future__ import annotations`` here: Prefect reads signatures.
 """
@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from flows.settings.parameters import SurveySettings, at_due_time
 from flows.settings.survey_settings import Settings
-from flows.tasks.observer import current_observer
 from flows.tasks.open_survey import OpenSurvey, RunRef
-from flows.tasks.prefect_tasks import as_task, inside_flow
+from flows.tasks.prefect_tasks import as_task, current_observer, inside_flow
 from flows.tasks.run import SurveyRun, open_run
 from flows.tasks.scene import scene_of_visit
 from flows.tasks.stages.capture import capture_coarse, capture_fine
@@ -38,20 +37,17 @@ CONDENSED = {"coarse": condense_coarse, "fine": condense_fine}
 
 
 def plan_capture(settings: SurveySettings) -> OpenSurvey | RunRef:
-    """Open scene, weights and archive, and plan the first pass; in a flow as a task.
+    """Open scene, weights and archive, and plan the first pass; a task inside a flow.
 
-    Returns an earlier run where its map is sure enough that the settings ask for no capture. Raises PipelineError: the
-    first thing that cannot be used, before anything is captured.
+    Returns an earlier run if its expected error is low enough for the settings. Raises PipelineError: the first error,
+    before anything is captured.
     """
     return as_task(_plan_capture, "plan_capture")(settings)
 
 
 @contextmanager
 def opened_first(settings: Settings) -> Iterator[None]:
-    """Open a survey before its flow begins: bad input is refused before a server starts or an archive is made.
-
-    Raises PipelineError, NothingToMend as `plan_capture` finds them.
-    """
+    """Open a survey before its flow begins, so that errors precede the start of a server. Raises as `open_run`."""
     watch = current_observer().watch
     watch(OPENING, "running", 0.0)
     try:
@@ -68,24 +64,26 @@ def opened_first(settings: Settings) -> Iterator[None]:
 
 
 def _plan_capture(settings: SurveySettings) -> OpenSurvey | RunRef:
-    observer, asked, due = current_observer(), settings.settings(), _due_time()
+    observer, requested, due = current_observer(), settings.settings(), _due_time()
     first, run = _opened.get() or (None, None)
-    if run is None or first is not asked:
+    if run is None or first is not requested:
         try:
             if due is not None:
-                asked = scene_of_visit(at_due_time(asked, due), due.astimezone())
-            run = open_run(asked)
+                requested = scene_of_visit(at_due_time(requested, due), due.astimezone())
+            run = open_run(requested)
         except NothingToMend as known:
             observer.log(str(known))
-            return RunRef(f"runs/{known.run}", open_archive(asked.out).root / "runs" / known.run, unchanged=str(known))
-    run.archive.reclaim()  # what a killed run left half made
+            return RunRef(
+                f"runs/{known.run}", open_archive(requested.out).root / "runs" / known.run, unchanged=str(known)
+            )
+    run.archive.reclaim()  # remove incomplete stores of killed runs
     for note in run.notes:
         observer.note(note)
     return OpenSurvey(replace(run, source=run.source.saying(observer.say)), observer)
 
 
 def _due_time() -> datetime | None:
-    """Return when a deployment's run was due; None of a run that no deployment asked for."""
+    """Return the due time of a run of a deployment; None for other runs."""
     context = prefect_context.FlowRunContext.get() if inside_flow() else None
     flow_run = None if context is None else context.flow_run
     if flow_run is None or flow_run.deployment_id is None or flow_run.expected_start_time is None:
@@ -94,10 +92,10 @@ def _due_time() -> datetime | None:
 
 
 def capture_pass(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRef:
-    """Return the stored sweeps of a pass, ``coarse`` or ``fine``, taken where the archive does not have them.
+    """Return the stored sweeps of a pass, ``coarse`` or ``fine``; capture them if the archive lacks them.
 
-    A deployment for captures takes them, on the rig's machine, where the plan names one, else the settings' source.
-    Raises SettingsError: there is no such pass; RigError, ArchiveError: the deployment did not take it.
+    The deployment that the plan names captures them, else this machine. Raises SettingsError: there is no such pass;
+    RigError, ArchiveError: the deployment failed.
     """
     if sweeps not in PASSES:
         raise SettingsError(f"there is no pass {sweeps!r}: expected {' or '.join(PASSES)}")
@@ -107,18 +105,15 @@ def capture_pass(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRef:
 
 
 def captured_signal(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRef:
-    """Return the condensed sweeps of a pass; where the archive has them, nothing is captured.
-
-    Raises as `capture_pass`.
-    """
+    """Return the condensed sweeps of a pass; capture only what the archive lacks. Raises as `capture_pass`."""
     condense, stage, archive = CONDENSED[sweeps], PASSES[sweeps], plan.run.archive
-    before = plan.products.there("capture_coarse") if sweeps == "fine" else []  # lines that later ones lie between
+    before = plan.products.there("capture_coarse") if sweeps == "fine" else []
     found = None
-    with suppress(IncompleteStoreError):  # of an input, which the capture itself names
+    with suppress(IncompleteStoreError):  # an incomplete input is an error of the capture
         raw = archive.ref(stage.product.name, stage.key(stage.wants(plan.run, *inputs)))
         found = condense.find(archive, condense.wants(plan.run, raw, *before))
     if found is None:
-        if before and not archive.is_there(before[0].uri):  # cleared after an earlier plan
+        if before and not archive.is_there(before[0].uri):  # raw lines were deleted
             capture_pass(plan, "coarse", inputs[-1])
         return condense(plan, capture_pass(plan, sweeps, *inputs), *before)
     if archive.is_known(raw):
@@ -127,7 +122,7 @@ def captured_signal(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRe
 
 
 def _captured_elsewhere(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> str:
-    """Have the deployment for captures take a pass, and return the address of the stored sweeps."""
+    """Run the deployment for captures, and return the address of the stored sweeps."""
     assert plan.capture_deployment is not None
     parameters: dict[str, Any] = {
         "settings": SurveySettings.of(plan.run.settings).model_dump(exclude_none=True),
@@ -136,14 +131,14 @@ def _captured_elsewhere(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> str
     }
     run: Any = prefect_deployments.run_deployment(plan.capture_deployment, parameters=parameters)
     if run.state is None or not run.state.is_completed():
-        why = "it has not ended" if run.state is None else run.state.message or run.state.name
-        raise RigError(f"the deployment {plan.capture_deployment} did not take the {sweeps} pass: {why}")
+        why = "it did not end" if run.state is None else run.state.message or run.state.name
+        raise RigError(f"the deployment {plan.capture_deployment} did not capture the {sweeps} pass: {why}")
     stage = PASSES[sweeps]
     wanted = stage.wants(plan.run, *inputs)
     ref = plan.run.archive.ref(stage.product.name, stage.key(wanted))
     if stage.find(plan.run.archive, wanted) is None:
         raise ArchiveError(
-            f"the deployment {plan.capture_deployment} took the {sweeps} pass, and {ref.uri} is not in "
+            f"the deployment {plan.capture_deployment} captured the {sweeps} pass, but {ref.uri} is not in "
             f"{plan.run.archive.name}: both machines need the same archive and settings"
         )
     return ref.uri

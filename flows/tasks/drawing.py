@@ -36,7 +36,7 @@ from storage.arrays.class_maps import write_changes_tile, write_class_tile, writ
 from storage.arrays.mosaics import Mosaic, chosen_patches, open_mosaic
 from storage.parallel.pool import run_blocks
 
-ENOUGH_SEEN = 0.5  # of a patch at the edge of a look at a part, so that what it shows is read
+ENOUGH_SEEN = 0.5  # least covered fraction of a patch at the edge of a partial scan
 
 
 @dataclass(frozen=True)
@@ -122,10 +122,10 @@ class Drawing:
         return CurrentVisit(log_probability, shown, pooled(seen.seen_columns), light, int(step))
 
     def _shown(self, region: Region, mosaic: Mosaic, patch_index: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """(y, x) pixels of a region that were looked at in detail.
+        """Return the pixels (y, x) of a region that were captured.
 
-        Of a look at a part only what lines reached, in patches of which they reached enough: what is filled in beside
-        the part is no look, and would stand where something better is remembered.
+        In a partial scan, these are pixels that lines cover, in patches with enough of them. Filled pixels beside them
+        would replace better values of the prior map.
         """
         grid, p = region.grid, region.grid.patch
         detailed = np.ones((int(np.prod(grid.patch_shape)), p, p), np.bool_)
@@ -139,13 +139,13 @@ class Drawing:
 
 @dataclass(frozen=True)
 class UnknownRule:
-    """Rule for pixels that are called unknown: at which rate, and by which number."""
+    """Rule for the class unknown: its number and the false-alarm rate."""
 
     number: int  # of the class, after those of the weights
-    rate: float  # of known pixels that may be
+    rate: float  # false-alarm rate
 
     def pixels(self, ood_detector: OodDetector, seen: CoarsePass, bands: int) -> NDArray[np.bool_]:
-        """Return the unknown pixels of a region's scene, (y, x), each by how it was captured."""
+        """Return the unknown pixels of a region, (y, x), each by its own capture."""
         found = np.zeros(seen.grid.padded_shape, np.bool_)
         for spec in seen.capture.specs:
             here = seen.capture.where(spec)
@@ -158,20 +158,20 @@ class UnknownRule:
 
 @dataclass(frozen=True)
 class FullReading:
-    """Patches that the full network could read and did, (patch_y, patch_x) each."""
+    """Patches and the full network, (patch_y, patch_x) each."""
 
-    gain: NDArray[np.float64]  # that the policy expected
+    gain: NDArray[np.float64]  # expected gain by the policy
     read: NDArray[np.bool_]  # patches that it read
     changed: NDArray[np.float32]  # fraction of their pixels whose class it changed
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """Findings while a region, or a field, was drawn."""
+    """Result of segmenting a region, or a field."""
 
-    unread_px: int  # pixels that were seen, with values that the weights take for no reading
-    comparison: TemporalAgreement | None  # with what was remembered; None of a field's first visit
-    reading: FullReading | None = None  # where patches were chosen on the way
+    unread_px: int  # captured pixels with values out of range
+    comparison: TemporalAgreement | None  # with the prior map; None without one
+    reading: FullReading | None = None  # None where patches were chosen before
 
 
 def draw_field(field: FieldWork, work: Drawing, report: Callable[[float], None]) -> Drawn:

@@ -1,4 +1,4 @@
-"""Prior map of a field as its stores hold it, read region by region where it lies by today's look."""
+"""Read the stored prior map of a field, region by region, registered to the current visit."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from pipeline.rectify.registration.alignment import FieldShift, field_shift
 from storage.arrays.class_maps import ProbabilityStore
 from storage.arrays.mosaics import open_mosaic
 
-REACH_PX = 64.0  # within which a memory that lies beside today's look is found
-LEAST_SHIFT_PX = 2.0  # less is how well two looks can be laid on each other
-Gap = tuple[int, int]  # what lies before the first and behind the last
+REACH_PX = 64.0  # greatest shift of a prior map that is found
+LEAST_SHIFT_PX = 2.0  # accuracy of the registration of two visits
+Gap = tuple[int, int]  # pixels before the first and after the last
 
 
 @dataclass(frozen=True)
 class FieldPriorMap:
-    """Address of the prior map of a field, and how it is read."""
+    """Paths of the prior map of a field, its age and shift."""
 
     probabilities: Path
-    mosaic: Path | None  # of the last look alone, whose days these are; None where its pixels have another size
+    mosaic: Path | None  # of the last visit; None where its pixels have another size
     days: float
     classes: tuple[int, ...]  # see `flows.tasks.prior_maps.Prior`
-    shift_px: tuple[int, int] = (0, 0)  # down and to the right, that brings it onto today's look
+    shift_px: tuple[int, int] = (0, 0)  # down and right, to the current visit
 
     def of(self, region: Region, weights: Weights) -> PriorMap:
-        """Read what is remembered of a region, in the classes of the weights."""
+        """Read the prior map of a region, in the classes of the weights."""
         store = ProbabilityStore(self.probabilities)
         rows, columns = (
             _moved(part, by, size)
@@ -55,7 +55,7 @@ class FieldPriorMap:
 
 
 def laid_together(images: Iterable[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """One image (y, x, ...) out of several of one size: at each pixel the first that is no NaN there."""
+    """Return one image (y, x, ...) from several of one size: the first that is not NaN, by pixel."""
     whole: NDArray[np.float32] | None = None
     for image in images:
         if whole is None:
@@ -70,15 +70,15 @@ def laid_together(images: Iterable[NDArray[np.float32]]) -> NDArray[np.float32]:
 
 
 def shifted(image: NDArray[np.float32], by: tuple[int, int]) -> NDArray[np.float32]:
-    """An image (y, x, ...) moved down and to the right, with NaN where nothing lies."""
+    """Return an image (y, x, ...) shifted down and right, with NaN at its edges."""
     parts = [_moved(slice(0, size), one, size) for size, one in zip(image.shape, by, strict=False)]
     return _framed(image[parts[0][0], parts[1][0]], (parts[0][1], parts[1][1]))
 
 
 def prior_map_lies(before: Sequence[EarlierRun], now: Path) -> FieldShift:
-    """Return how the field of stored coarse passes, the newest first, lies beside that of another, in fine px.
+    """Return the shift of earlier coarse passes, the newest first, against the present one [fine px].
 
-    All are compared in pixels that each of theirs divides.
+    They are compared in pixels that are multiples of all of theirs.
     """
     cell = math.lcm(CELL_PX, open_mosaic(now).factor, *(scan_pass.factor for scan_pass in before))
 
@@ -94,19 +94,19 @@ def prior_map_lies(before: Sequence[EarlierRun], now: Path) -> FieldShift:
 
 
 def whole_pixels(lies: FieldShift) -> tuple[int, int]:
-    """Rows and columns to move a memory by; none where it lies as well as looks can be laid on each other."""
+    """Return the shift of a prior map in rows and columns; 0 within the accuracy of the registration."""
     down, across = lies.shift
     return (0, 0) if math.hypot(down, across) < LEAST_SHIFT_PX else (round(down), round(across))
 
 
 def _cells(shift_px: ArrayLike, factor: int) -> tuple[int, int]:
-    """The shift of a coarse image that is nearest to one in fine px."""
+    """Return the nearest shift of a coarse image to one in fine px."""
     down, across = np.rint(np.divide(shift_px, factor)).astype(int).tolist()
     return down, across
 
 
 def _moved(part: slice, by: int, size: int) -> tuple[slice, Gap]:
-    """Return where a part of an axis of ``size`` lies before it is moved ``by``, and its part beyond the ends."""
+    """Return the part of an axis of ``size`` before a shift ``by``, and the pixels beyond its ends."""
     start, stop = part.start - by, part.stop - by
     first, last = min(max(start, 0), size), min(max(stop, 0), size)
     whole = stop - start
@@ -115,7 +115,7 @@ def _moved(part: slice, by: int, size: int) -> tuple[slice, Gap]:
 
 
 def _framed(values: NDArray[np.float32], gaps: tuple[Gap, Gap]) -> NDArray[np.float32]:
-    """Images (y, x, ...) with NaN where nothing lies."""
+    """Return images (y, x, ...) padded with NaN."""
     if not any(map(any, gaps)):
         return values
     return np.pad(values, [*gaps, *[(0, 0)] * (values.ndim - 2)], constant_values=np.nan)

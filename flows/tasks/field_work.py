@@ -1,6 +1,6 @@
-"""The model over a field on disk: its scores and its map, region by region, by whatever worker pool there is.
+"""Compute the model over a field on disk, region by region, with any worker pool.
 
-A worker gets paths and numbers, opens what it needs, and keeps one region in memory: arrays never travel.
+A worker gets paths and numbers, opens its inputs, and holds one region in memory. No arrays are sent.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class WeightsFile:
-    """Weights by their path, and the seal of the file when the survey began; each part is read once a process.
+    """Path of weights and the hash of the file at the start of the survey; each process reads a part once.
 
-    Reading raises WeightsError where the file has changed since.
+    Reading raises WeightsError: the file has changed.
     """
 
     path: Path
     seal: str
-    device: str = PROCESSOR  # where the network computes
+    device: str = PROCESSOR  # of the network
 
     def _check(self) -> None:
         if describe_weights(self.path).about[SEAL] != self.seal:
@@ -51,13 +51,13 @@ class WeightsFile:
 
     @lru_cache(maxsize=1)  # noqa: B019 - the record is a value
     def load_reader(self) -> TemporalReader | None:
-        """Read the reader of prior maps; None where the weights have none."""
+        """Read the temporal reader; None where the weights have none."""
         self._check()
         return None if describe_weights(self.path).reader is None else load_reader(self.path)
 
     @lru_cache(maxsize=1)  # noqa: B019 - the record is a value
     def load_ood(self) -> OodDetector:
-        """Read what is familiar to them."""
+        """Read the out-of-distribution detector."""
         self._check()
         return load_ood(self.path)
 
@@ -70,7 +70,7 @@ class WeightsFile:
 
 @dataclass(frozen=True)
 class Scoring:
-    """Scores patches by the coarse prediction at a region: what a worker needs for that."""
+    """Worker that scores the patches of a region by the coarse prediction."""
 
     weights: WeightsFile
     mosaic: Path
@@ -78,34 +78,34 @@ class Scoring:
     capture: LineSpec
 
     def __call__(self, region: Region) -> NDArray[np.float64]:
-        """Scores of the patches that are kept, (patch_y, patch_x)."""
+        """Return the scores of the region's own patches, (patch_y, patch_x)."""
         let_tiles_go()
         weights = self.weights.load()
         scan_pass = coarse_region(weights, self.mosaic, region, self.capture)
         if self.policy in GLANCING_POLICIES:
-            seen = read_coarse_prediction(weights, scan_pass)
-        else:  # nothing but the coarse image is asked for
-            seen = CoarsePrediction(
+            coarse = read_coarse_prediction(weights, scan_pass)
+        else:  # the policy needs only the coarse image
+            coarse = CoarsePrediction(
                 scan_pass.grid, scan_pass.columns, np.empty((0, 0, 0), np.float32), origin=scan_pass.origin
             )
-        return region.crop_patches(score_patches(self.policy, seen))
+        return region.crop_patches(score_patches(self.policy, coarse))
 
 
 @dataclass(frozen=True)
 class ExpectedErrors:
-    """Finds the errors that the overview expects of itself at a region."""
+    """Worker that computes the expected errors of the overview at a region."""
 
     weights: WeightsFile
     mosaic: Path
     capture: LineSpec
 
     def __call__(self, region: Region) -> PatchExpectedErrors:
-        """Return the errors of the patches that are kept."""
+        """Return the errors of the region's own patches."""
         let_tiles_go()
         weights = self.weights.load()
-        seen = read_coarse_prediction(weights, coarse_region(weights, self.mosaic, region, self.capture))
+        coarse = read_coarse_prediction(weights, coarse_region(weights, self.mosaic, region, self.capture))
         with np.errstate(divide="ignore"):
-            sure = np.log(seen.probability[: region.grid.height, : region.grid.width])
+            sure = np.log(coarse.probability[: region.grid.height, : region.grid.width])
         ages = np.zeros(sure.shape[:2], np.float32)
         found = PatchExpectedErrors.of([(sure, ages)], region.grid, len(weights.class_names))
         pixels = found.pixels.reshape(*region.grid.patch_shape, *found.pixels.shape[1:])
@@ -115,58 +115,58 @@ class ExpectedErrors:
 
 
 def coarse_region(weights: Weights, mosaic: Path, region: Region, capture: LineSpec) -> CoarsePass:
-    """Read the part of a stored mosaic that a region needs, some rows at a time.
+    """Read a region of a stored mosaic, in blocks of rows.
 
-    ``capture`` says how its pixels were captured, where the mosaic itself does not.
+    ``capture`` is the capture of pixels for which the mosaic has none.
     """
-    seen, window = open_mosaic(mosaic), (region.read.rows, region.read.columns)
-    mixed = seen.captures(*window)
+    coarse, window = open_mosaic(mosaic), (region.read.rows, region.read.columns)
+    mixed = coarse.captures(*window)
     how: Capture = capture if mixed is None else CaptureMap(tuple(LineSpec(*one) for one in mixed[0]), mixed[1])
     return read_coarse_pass(
         weights,
-        seen.row_blocks(None, *window),
-        seen.wavelength_nm,
+        coarse.row_blocks(None, *window),
+        coarse.wavelength_nm,
         region.grid,
         capture=how,
         origin=region.origin,
-        components=seen.components,
+        components=coarse.components,
     )
 
 
 def seen_patches(
-    field_index: NDArray[np.integer], seen: CoarsePass, region: Region
+    field_index: NDArray[np.integer], coarse: CoarsePass, region: Region
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Numbers and columns (patch, p, p, column) of the field's chosen patches that the overview's capture shows.
+    """Return numbers and spectral features (patch, p, p, column) of the chosen patches in a region.
 
-    A patch of which nothing was seen is left out.
+    Patches without captured pixels are left out.
     """
     numbers = region.numbers_here(field_index)
     numbers = numbers[numbers >= 0]
-    if seen.filled is not None:
-        numbers = numbers[~patches_of(seen.filled, region.grid.patch)[numbers].all(axis=(1, 2))]
-    return numbers, seen.patches(numbers)
+    if coarse.filled is not None:
+        numbers = numbers[~patches_of(coarse.filled, region.grid.patch)[numbers].all(axis=(1, 2))]
+    return numbers, coarse.patches(numbers)
 
 
 def region_params(grid: SceneGrid) -> dict[str, Any]:
-    """Return what the result depends on where a field is cut: nothing where it is read whole."""
+    """Return the parameters of the division into regions; empty for a single region."""
     return {} if len(plan_regions(grid, SHARD)) == 1 else {"regions": {"most_px": REGION_PX, "halo_px": HALO_PX}}
 
 
 @dataclass(frozen=True)
 class FieldWork:
-    """The model over one field: with which weights, in which regions, by whom, and within which memory."""
+    """Computation of the model over one field: weights, regions, worker pool and memory."""
 
     weights: WeightsFile
     regions: Sequence[Region]
     pool: WorkerPool
-    memory: int  # of this process and those that it starts, together [bytes]
+    memory: int  # of this process and its workers [bytes]
 
     def score(
         self, policy: str, mosaic: Path, capture: LineSpec, report: Callable[[float], None]
     ) -> NDArray[np.float64]:
-        """Score every patch of the padded grid by the first mosaic alone, (patch_y, patch_x).
+        """Return the scores of all patches of the padded grid, (patch_y, patch_x).
 
-        Raises SettingsError: not even one region at a time fits the memory.
+        Raises SettingsError: one region does not fit the memory.
         """
         pool = self.pool_for(np.empty(0, np.int64), len(open_mosaic(mosaic).components))
         path = mosaic.resolve()
@@ -179,9 +179,9 @@ class FieldWork:
         return scores
 
     def expected_errors(self, mosaic: Path, capture: LineSpec, report: Callable[[float], None]) -> PatchExpectedErrors:
-        """Return the errors that the overview of a mosaic expects of itself, patch by patch.
+        """Return the expected errors of the overview of a mosaic, by patch.
 
-        Raises SettingsError: not even one region at a time fits the memory.
+        Raises SettingsError: one region does not fit the memory.
         """
         pool = self.pool_for(np.empty(0, np.int64), len(open_mosaic(mosaic).components))
         path, field = mosaic.resolve(), self.regions[0].field
@@ -194,9 +194,9 @@ class FieldWork:
         return PatchExpectedErrors(pixels.reshape(-1, *pixels.shape[2:]), parts[0].expected_error, nothing_older)
 
     def pool_for(self, patch_index: NDArray[np.integer], bands: int) -> WorkerPool:
-        """Give the worker pool, no larger than memory holds regions with their parts of these patches of the field.
+        """Return the worker pool, limited by the memory of regions with these fine patches.
 
-        Raises SettingsError: not even one region at a time fits the memory; names the least that does.
+        Raises SettingsError: one region does not fit the memory; names the least memory.
         """
         if self.pool.elsewhere:
             return self.pool
@@ -209,7 +209,7 @@ class FieldWork:
             raise memory_refusal(
                 least,
                 self.memory,
-                f"reading a region of {y} x {x} px and {bands} components with the fine patches that lie there takes "
+                f"reading a region of {y} x {x} px and {bands} components with its fine patches takes "
                 f"{mib(region)}, {'each of two processes' if apart else 'the process itself'} {mib(RESERVED_BYTES)}",
             )
         fits = (self.memory - RESERVED_BYTES) // each

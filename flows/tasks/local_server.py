@@ -1,7 +1,6 @@
-"""A Prefect server in this process: for this machine alone, gone with the process, its files in a folder.
+"""Run a Prefect server in a thread of this process, for this machine only, with its files in a folder.
 
-A server in a thread needs no second set of imports, and no guard that ends it when its parent was killed. It wants a
-password, which no page of another origin knows.
+A thread needs no second import of Prefect, and ends with the process. A password protects it against other origins.
 """
 
 from __future__ import annotations
@@ -46,13 +45,13 @@ else:
 
 HOST = "127.0.0.1"
 STARTED_WITHIN_S, ENDED_WITHIN_S = 120.0, 10.0
-PATIENCE_S = 10.0  # with a server that is named
-RECORDED_WITHIN_S = 5.0  # the states of a flow's last tasks
+PATIENCE_S = 10.0  # timeout of a named server
+RECORDED_WITHIN_S = 5.0  # timeout for the states of the last tasks
 OF_SCHEDULES = (  # services that a single survey does not use
     *("CANCELLATION_CLEANUP", "CLEANUP_RECONCILER", "DB_VACUUM", "EVENT_LOGGER", "FOREMAN", "LATE_RUNS"),
     *("PAUSE_EXPIRATIONS", "REPOSSESSOR", "SCHEDULER", "TRIGGERS"),
 )
-QUIET = {  # nothing outside this machine is asked; the terminal is left to the survey, run logs go to the server
+QUIET = {  # no requests to other machines, no output on the terminal; run logs go to the server
     "DO_NOT_SCAN_PATH": "1",
     "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
     "PREFECT_SERVER_UI_V2_ENABLED": "false",
@@ -65,13 +64,13 @@ QUIET = {  # nothing outside this machine is asked; the terminal is left to the 
 }
 
 
-class ServerUnavailable(RuntimeError):  # noqa: N818 - a state of affairs: a survey runs without it
-    """No Prefect server could be started or reached."""
+class ServerUnavailable(RuntimeError):  # noqa: N818 - a survey runs without it
+    """No Prefect server can be started or reached."""
 
 
 @contextmanager
 def quiet_environment(home: Path) -> Iterator[None]:
-    """Name Prefect's folder and quiet settings in the environment; what the user set there stays."""
+    """Set Prefect's folder and quiet settings in the environment; variables of the user are kept."""
     added = {name: value for name, value in {**QUIET, "PREFECT_HOME": str(home)}.items() if name not in os.environ}
     os.environ.update(added)
     try:
@@ -83,20 +82,11 @@ def quiet_environment(home: Path) -> Iterator[None]:
 
 @contextmanager
 def local_server(home: Path, port: int = 0, *, schedules: bool = False) -> Iterator[str]:
-    """Run a server while the block runs, give the address of its API, and have Prefect use it.
+    """Run a server for the block, yield the address of its API, and configure Prefect to use it.
 
-    Parameters
-    ----------
-    home
-        Folder for its database and its password.
-    port
-        Of this machine; any that is free where it is 0.
-    schedules
-        Whether it plans and watches the runs of deployments, and shows its pages.
-
-    Raises
-    ------
-    ServerUnavailable : it does not start; SettingsError : the port is taken.
+    ``home`` is the folder of database and password; ``port`` 0 is any free port. With ``schedules``, the server
+    schedules the runs of deployments and serves its pages. Raises ServerUnavailable: it does not start;
+    SettingsError: the port is in use.
     """
     with _listening(port) as listening, _using(home, listening.getsockname()[1], schedules=schedules) as api:
         server, thread = _start(listening, schedules=schedules)
@@ -110,7 +100,7 @@ def local_server(home: Path, port: int = 0, *, schedules: bool = False) -> Itera
 
 @contextmanager
 def _using(home: Path, port: int, *, schedules: bool) -> Iterator[str]:
-    """Have clients and server of this process, and processes that it starts, use a server of this port."""
+    """Configure clients and server of this process and its children for a server of this port."""
     password = password_in(home / "password") if schedules else f"spectralzoom:{secrets.token_urlsafe(24)}"
     create_database(home / "prefect.db")
     services = {} if schedules else {f"PREFECT_SERVER_SERVICES_{name}_ENABLED": "false" for name in OF_SCHEDULES}
@@ -143,9 +133,9 @@ def _using(home: Path, port: int, *, schedules: bool) -> Iterator[str]:
 
 
 def _start(listening: socket.socket, *, schedules: bool) -> tuple[uvicorn.Server, threading.Thread]:
-    """Start the server in a thread and wait until it answers (ServerUnavailable)."""
+    """Start the server in a thread and wait for it. Raises ServerUnavailable."""
     collects = gc.isenabled()
-    gc.disable()  # the 2000 modules of the server make no garbage, which is looked for a third of their time
+    gc.disable()  # garbage collection takes a third of the import time of the server's 2000 modules
     try:
         made: Any = prefect_server.create_app(final=schedules, ephemeral=not schedules)
     finally:
@@ -165,9 +155,9 @@ def _start(listening: socket.socket, *, schedules: bool) -> tuple[uvicorn.Server
 
 
 def create_database(path: Path) -> None:
-    """Create the server's database with the tables of the pinned version; one that is there is left as it is.
+    """Create the database of the server with the tables of the pinned version, unless it exists.
 
-    Prefect would make it by 90 migrations, in 9 s. A newer version migrates it on from here.
+    Prefect would run 90 migrations, in 9 s. Newer versions of Prefect migrate the database.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     schema = resources.files("flows.tasks").joinpath("prefect_schema.sql").read_text(encoding="utf-8")
@@ -175,7 +165,7 @@ def create_database(path: Path) -> None:
         return
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
     with sqlite3.connect(part) as made:
-        made.execute("PRAGMA page_size = 1024")  # most of its 229 tables and indices are empty, and take a page each
+        made.execute("PRAGMA page_size = 1024")  # small pages for 229 almost empty tables and indices
         made.execute("PRAGMA journal_mode = WAL")
         made.executescript(schema)
     made.close()
@@ -190,28 +180,28 @@ def _listening(port: int) -> Iterator[socket.socket]:
             found.bind((HOST, port))
         except (OSError, OverflowError) as error:
             raise SettingsError(
-                f"--port {port} cannot be used ({error}): give another, or name the server there in PREFECT_API_URL"
+                f"--port {port} cannot be used ({error}): give another, or name its server in PREFECT_API_URL"
             ) from error
         yield found
 
 
 def check_answers(url: str) -> None:
-    """Refuse a server that is named and does not answer (ServerUnavailable)."""
+    """Check that a server answers. Raises ServerUnavailable."""
     try:
-        with suppress(urllib.error.HTTPError):  # it is there, and wants to know who asks
+        with suppress(urllib.error.HTTPError):  # it requires a password
             urllib.request.urlopen(f"{url.rstrip('/')}/health", timeout=PATIENCE_S).close()
     except (OSError, ValueError, HTTPException) as error:
         raise ServerUnavailable(f"no Prefect server answers at {url}, which PREFECT_API_URL names ({error})") from error
 
 
 def wait_until_recorded(flow_run: Any) -> None:
-    """Wait until the server has heard how the tasks of a flow run ended, for 5 s at most.
+    """Wait until the server has the final states of the tasks of a flow run, for 5 s at most.
 
-    Tasks report to it in batches, which would be lost with a process that ends at once.
+    Tasks report in batches, which would be lost if the process ended before.
     """
     of_run = prefect_filters.FlowRunFilter(id=prefect_filters.FlowRunFilterId(any_=[flow_run]))
     end = time.monotonic() + RECORDED_WITHIN_S
-    with suppress(Exception), prefect_client.get_client(sync_client=True) as client:  # a server that is gone
+    with suppress(Exception), prefect_client.get_client(sync_client=True) as client:  # the server may have stopped
         while time.monotonic() < end:
             states = [run.state for run in client.read_task_runs(flow_run_filter=of_run)]
             if all(state is not None and state.is_final() for state in states):
@@ -220,7 +210,7 @@ def wait_until_recorded(flow_run: Any) -> None:
 
 
 def password_in(path: Path) -> str:
-    """Return the password that a file keeps for this user alone; make one where there is none (SettingsError)."""
+    """Return the password in a private file, which is created if needed. Raises SettingsError: it is not readable."""
     why = "is empty"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -231,4 +221,4 @@ def password_in(path: Path) -> str:
             return text
     except (OSError, ValueError) as error:
         why = f"cannot be read ({error})"
-    raise SettingsError(f"{path}, the password of Prefect's pages, {why}: remove it, a new one is made")
+    raise SettingsError(f"{path}, the password of Prefect's pages, {why}: delete it to create a new one")

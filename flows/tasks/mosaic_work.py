@@ -1,6 +1,6 @@
-"""Mosaics from sweeps on disk to tiles on disk: several at a time, within a bound of memory.
+"""Compute mosaics from stored sweeps, several tiles at a time, within a limit of memory.
 
-A tile is a shard of the mosaic. `pipeline.rectify.tiles` makes it as arrays, `storage.arrays.mosaics` stores it.
+A tile is a shard of the mosaic: `pipeline.rectify.tiles` computes it, `storage.arrays.mosaics` stores it.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from storage.parallel.pool import RESERVED_BYTES, THREADS, WorkerPool, memory_re
 
 
 def open_sweeps(signal: Path, registration: Path | None, camera: LineCamera) -> list[SweepPath]:
-    """Open the condensed sweeps of a folder, by name, with the corrections that registration recorded."""
+    """Open the compressed sweeps of a folder, by name, with the corrections of a registration."""
     found = None if registration is None else read_table(registration)["sweeps"]
     return sweep_paths(open_signal_cubes(signal), camera, found)
 
 
 @dataclass(frozen=True)
 class MosaicRecipe:
-    """Recipe of a mosaic, by absolute paths: small, hashable, and good in every process that sees them."""
+    """Recipe of a mosaic: absolute paths and parameters, valid in every process that sees the paths."""
 
-    signal: Path  # folder of condensed sweeps
+    signal: Path  # folder of compressed sweeps
     camera: LineCamera
     grid: PixelGrid
     kernel: Kernel = "catmull-rom"
-    geolocation: Path | None = None  # tables of the sweeps; None makes them anew
-    interlaced: bool = False  # sweeps of several passes, of which some lie between the lines of others
+    geolocation: Path | None = None  # tie points of the sweeps; None computes them
+    interlaced: bool = False  # sweeps of two passes with lines between each other
     registration: Path | None = None  # record of the corrections
 
     @property
@@ -48,13 +48,13 @@ class MosaicRecipe:
         return [path for path in given if path is not None]
 
     def sweeps(self) -> list[SweepPath]:
-        """Open the sweeps, in the order of their names (IncompleteStoreError: one is missing or damaged)."""
+        """Open the sweeps, in the order of their names. Raises IncompleteStoreError: one is missing or damaged."""
         return open_sweeps(self.signal, self.registration, self.camera)
 
     def open(self) -> MosaicWork:
-        """Open the sweeps and find where their lines lie, from stored tables where there are some.
+        """Open the sweeps and locate their lines, with stored tie points if there are any.
 
-        Raises IncompleteStoreError: a sweep or the tables are missing or damaged.
+        Raises IncompleteStoreError: a sweep or the tie points are missing or damaged.
         """
         if self.interlaced:
             return MosaicWork(
@@ -62,7 +62,7 @@ class MosaicRecipe:
             )
         tables: Tables = {} if self.geolocation is None else open_geolocation(self.geolocation)
         placed = []
-        for one in self.sweeps():  # without tables where its lines lie too unevenly for one
+        for one in self.sweeps():  # no stored tie points if lines are too uneven
             stored = tables.get(one.lines.sweep.name)
             placed.append(Placed(one.lines, tuple(stored), one.gain) if stored else one.placed(self.camera))
         return MosaicWork(placed, self.camera, self.grid, self.kernel)
@@ -70,16 +70,16 @@ class MosaicRecipe:
 
 @dataclass(frozen=True)
 class TileBudget:
-    """Number of tiles made at a time, and the memory that this takes [bytes]."""
+    """Number of tiles at a time, and their memory [bytes]."""
 
     workers: int
-    cache: int  # lines kept; by each process where there are several
-    tile: int  # one tile in the making
+    cache: int  # cached lines, per process
+    tile: int  # one tile
     processes: bool = False
 
     @property
     def projected(self) -> int:
-        """Highest memory of the process, of all processes together where there are several [bytes]."""
+        """Return the peak memory of all processes together [bytes]."""
         if self.processes:
             return RESERVED_BYTES + self.workers * (RESERVED_BYTES + self.cache + self.tile)
         return RESERVED_BYTES + self.cache + self.workers * self.tile
@@ -93,19 +93,17 @@ def write_mosaic(
     pool: WorkerPool = THREADS,
     report: Callable[[float], None] = lambda done: None,
 ) -> TileBudget:
-    """Rectify and blend sweeps into a stored mosaic; return how. Any worker's tiles give the same bytes.
+    """Rectify and blend sweeps into a stored mosaic; return the budget of tiles. All worker pools give the same bytes.
 
-    Fewer tiles are made at a time where ``memory``
-    [bytes] of this process and those that it starts, not of workers elsewhere, holds fewer. Raises SettingsError: not
-    even one tile fits the memory, or the worker pool cannot work here. WorkerError: processes that made tiles were
-    lost.
+    ``memory`` [bytes] limits this process and its workers, not workers on other machines. Raises SettingsError: one
+    tile does not fit the memory, or the worker pool cannot run; WorkerError: a worker process died.
     """
     work = opened_work(recipe.open)
     tiles = plan_tiles(work.placed, work.camera, work.grid, writer.tile_shape)
     budget = tile_budget(work, tiles, writer.tile_shape, memory=memory, pool=pool)
     maker = TileMaker(recipe.open, budget.cache)
     if pool.shares_memory:
-        opened_tiles(maker)  # before several threads ask for it
+        opened_tiles(maker)  # before threads use it
     if not pool.elsewhere and budget.workers < min(pool.count, len(tiles)):
         pool = WorkerPool(pool.scheduler, budget.workers)
     places = [(tile.rows, tile.columns) for tile in tiles]
@@ -117,9 +115,9 @@ def write_mosaic(
 def tile_budget(
     work: MosaicWork, tiles: Sequence[Tile], tile_shape: tuple[int, int], *, memory: int, pool: WorkerPool = THREADS
 ) -> TileBudget:
-    """Choose how many tiles to make at a time: as many as are allowed and memory holds; elsewhere memory is no matter.
+    """Choose the number of tiles at a time: the greatest that workers and memory allow.
 
-    Raises SettingsError: not even one tile at a time fits the memory.
+    Raises SettingsError: one tile does not fit the memory.
     """
     processes = not pool.shares_memory
     most = max(1, min(1 if pool.elsewhere else pool.count, len(tiles)))

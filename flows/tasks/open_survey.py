@@ -1,29 +1,26 @@
-"""An opened survey: what its stages look at, and a record of each stage that ran."""
+"""Run the stages of an opened survey, and record each."""
 
 from __future__ import annotations
 
 import resource
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from flows.tasks.observer import Observer, current_observer
-from flows.tasks.prefect_tasks import inside_flow
+from flows.tasks.prefect_tasks import Observer, current_observer, inside_flow
 from flows.tasks.rig_lock import rig_to_oneself
 from flows.tasks.run import SurveyRun, now
 from flows.tasks.stage import Stage
 from flows.tasks.stages.accuracy import evaluate
 from flows.tasks.stages.attention import load_plan, score
 from flows.tasks.stages.capture import capture_coarse, capture_fine
-from flows.tasks.stages.condense import condense_coarse, condense_fine
+from flows.tasks.stages.condense import condense_coarse, condense_fine, condense_raster
 from flows.tasks.stages.effects import choose_effects
-from flows.tasks.stages.maps import segment
-from flows.tasks.stages.on_ground import ground
+from flows.tasks.stages.maps import ground, segment
 from flows.tasks.stages.placement import locate, rectify, rectify_fine, register_coarse, register_fine
-from flows.tasks.stages.raster import condense_raster
 from pipeline.lazy import deferred
 from storage.archive.keys import StageRef
 from storage.archive.records import StageRecord
@@ -39,13 +36,12 @@ OF_THE_SURVEY = (
     *(choose_effects, capture_coarse, condense_coarse, register_coarse, locate, rectify, condense_raster, score),
     *(capture_fine, condense_fine, register_fine, rectify_fine, segment, ground, evaluate),
 )
-FIRST = ("rectify", "condense_raster")  # of a capture, of a raster
 STAGES: dict[str, Stage] = {one.name: one for one in OF_THE_SURVEY}
 TITLES = {"plan": "scene, weights and plan", **{name: one.title for name, one in STAGES.items()}}
 
 
 def versions() -> dict[str, int]:
-    """Return the present version of every product."""
+    """Return the version of every product."""
     return {one.product.name: one.product.version for one in STAGES.values()}
 
 
@@ -55,9 +51,9 @@ class RunRef:
 
     uri: str  # relative to the archive
     folder: Path
-    captured_again: float | None = None  # fraction of the field's patches; None of a uniform scan
-    pending: bool = False  # its map is judged next
-    unchanged: str | None = None  # why nothing was captured: the run is an earlier one
+    captured_again: float | None = None  # fraction of the patches; None after a uniform scan
+    pending: bool = False  # whether its accuracy is computed next
+    unchanged: str | None = None  # reason for no capture; the run is an earlier one
 
     @property
     def name(self) -> str:
@@ -66,69 +62,69 @@ class RunRef:
 
 
 class Products(dict[str, StageRef]):
-    """The stores of a survey, by the stages that left them."""
+    """Stores of a survey by stage."""
 
     @property
     def mosaic(self) -> StageRef:
-        """Return the store of the mosaic of all passes, or of the raster's."""
-        return self.there("rectify_fine", *FIRST)[0]
+        """Return the mosaic of all passes, or of the raster."""
+        return self.there("rectify_fine", "rectify", "condense_raster")[0]
 
     @property
     def signals(self) -> list[StageRef]:
-        """Return the store of all condensed lines; none of a raster."""
+        """Return the store of all condensed lines; empty for a raster."""
         return self.there("condense_fine", "condense_coarse")[:1]
 
     @property
     def judged(self) -> list[StageRef]:
-        """Return the stores by which the map is judged."""
+        """Return the inputs of the evaluation."""
         return [self.mosaic, *self.there("score", "segment", "choose_effects", "register_coarse")]
 
     def there(self, *stages: str) -> list[StageRef]:
-        """Return the stores of those of these stages that ran."""
+        """Return the stores of those stages that ran."""
         return [self[name] for name in stages if name in self]
 
 
 class OpenSurvey:
-    """Run a survey's stages in this process, and keep a record of each. No dataclass: Prefect passes it as it is."""
+    """Opened survey: runs its stages in this process, and records them. No dataclass, which Prefect would copy."""
 
     def __init__(self, run: SurveyRun, observer: Observer | None = None) -> None:
         self.run, self.started = run, now()
         self.observer = current_observer() if observer is None else observer
-        self.capture_deployment: str | None = None  # which takes the sweeps, on the rig's machine
+        self.capture_deployment: str | None = None  # that captures on the rig's machine
         self.products = Products()
         self.records: dict[str, StageRecord] = {}
         self._written = 0
 
     @property
     def name_of_run(self) -> str:
-        """Return the field's name, by which Prefect's runs are called."""
+        """Return the name of the field, for names of Prefect runs."""
         return self.run.name
 
     def goes_back(self, request: StageRef) -> bool:
-        """Return whether the plan of a first pass asks for more lines."""
+        """Return whether the plan requests a second pass."""
         return not self.run.plan.plain and bool(load_plan(request).sweeps)
 
     @property
     def is_map(self) -> bool:
-        """Return whether the scene is a raster whose pixels are taken as they are, so that nothing is captured."""
+        """Return whether the scene is a raster, so that nothing is captured."""
         return self.run.raster is not None
 
     @property
     def registers(self) -> bool:
-        """Return whether the mirror may look beside the plan, so that sweeps are laid onto each other."""
+        """Return whether sweeps are registered to correct pointing errors."""
         return self.run.settings.pointing_px > 0
 
     @property
     def on_the_ground(self) -> bool:
-        """Return whether the map is drawn on the ground too."""
+        """Return whether there is also a map on the ground."""
         return self.run.settings.pose is not None
 
     @contextmanager
     def at_work(self, *, captures: bool = True) -> Iterator[None]:
-        """Hold the archive against cleaning, the workers open, and the rig where this machine ``captures``.
+        """Lock archive, worker pool and, if this machine ``captures``, the rig.
 
-        Raises RigError: another survey of this machine holds the rig. In a flow the survey waits before that for its
-        turn, where Prefect's server has a global concurrency limit ``rig``.
+        Inside a flow, the survey first waits for the global concurrency limit ``rig`` of the Prefect server, if there
+        is one. Raises RigError: another survey uses the rig.
         """
         with ExitStack() as held:
             if captures and self.run.settings.source == "rig" and self.capture_deployment is None:
@@ -140,7 +136,7 @@ class OpenSurvey:
             yield
 
     def __call__(self, stage: str, /, *inputs: StageRef) -> StageRef:
-        """Return the store of a stage, found or built."""
+        """Return the store of a stage, from the archive or built."""
 
         def watch(stage: str, state: str, done: float) -> None:
             self.observer.watch(stage, state, done)
@@ -161,11 +157,7 @@ class OpenSurvey:
             watch(stage, "failed", reached)
             raise
         state: Literal["ran", "cached"] = "ran" if built else "cached"
-        wall, cpu, peak = meter.read() if built else (None, None, None)
-        size, known = self.run.archive.stored_bytes, self.run.archive.manifest_hash(ref)
-        bytes_in = sum(size(given) for given in inputs)
-        self.records[stage] = StageRecord(stage, ref.key, state, wall, cpu, peak, bytes_in, size(ref), known)
-        self.products[stage] = ref
+        self._record(stage, ref, inputs, state, *(meter.read() if built else ()))
         if built:
             self._written += bytes_below(self.run.archive.root / ref.uri)
         watch(stage, state, 1.0)
@@ -173,15 +165,27 @@ class OpenSurvey:
         return ref
 
     def take_as_found(self, stage: str, ref: StageRef, *inputs: StageRef) -> None:
-        """Note a store made of ``inputs`` before, whose files may have been cleared once what followed was made."""
-        size, known = self.run.archive.stored_bytes, self.run.archive.manifest_hash(ref)
-        bytes_in = sum(size(given) for given in inputs)
-        self.records[stage] = StageRecord(stage, ref.key, "cached", None, None, None, bytes_in, size(ref), known)
-        self.products[stage] = ref
+        """Record an existing store of ``inputs``, whose files may have been deleted."""
+        self._record(stage, ref, inputs, "cached")
         self.observer.watch(stage, "cached", 1.0)
 
+    def _record(
+        self,
+        stage: str,
+        ref: StageRef,
+        inputs: Sequence[StageRef],
+        state: Literal["ran", "cached"],
+        wall: float | None = None,
+        cpu: float | None = None,
+        peak: int | None = None,
+    ) -> None:
+        size, known = self.run.archive.stored_bytes, self.run.archive.manifest_hash(ref)
+        bytes_in = sum(size(one) for one in inputs)
+        self.records[stage] = StageRecord(stage, ref.key, state, wall, cpu, peak, bytes_in, size(ref), known)
+        self.products[stage] = ref
+
     def take_written(self) -> int:
-        """Return bytes of the stores built, and of the spools of their lines, since this was asked last."""
+        """Return the bytes of stores and spools that were written since the last call."""
         taken, self._written = self._written + self.run.archive.take_spooled(), 0
         return taken
 
@@ -192,10 +196,10 @@ class OpenSurvey:
 
 
 class _Meter:
-    """Wall and CPU seconds and the highest memory since it was made."""
+    """Meter of wall time, processor time and peak memory since its construction."""
 
     def __init__(self) -> None:
-        with suppress(OSError):  # Linux: start the peak anew
+        with suppress(OSError):  # Linux: reset the peak
             Path("/proc/self/clear_refs").write_text("5")
         self._wall, self._cpu = time.perf_counter(), time.process_time()
 
@@ -204,7 +208,7 @@ class _Meter:
 
 
 def peak_bytes() -> int:
-    """Return the highest resident memory of this process [bytes]."""
+    """Return the peak resident memory of this process [bytes]."""
     with suppress(OSError, ValueError):
         for line in Path("/proc/self/status").read_text().splitlines():
             if line.startswith("VmHWM:"):

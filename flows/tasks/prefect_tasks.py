@@ -1,10 +1,14 @@
-"""Functions as Prefect tasks: inside a flow they are run by Prefect, elsewhere they are called.
+"""Run functions as Prefect tasks inside a flow, and report the progress of a survey to the terminal and to Prefect.
 
 No ``from __future__ import annotations`` here: Prefect reads signatures.
 """
 
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -12,29 +16,32 @@ from pipeline.lazy import deferred
 
 if TYPE_CHECKING:
     import prefect
+    import prefect.artifacts as prefect_artifacts
     import prefect.cache_policies as prefect_cache_policies
     import prefect.context as prefect_context
     import prefect.runtime.task_run as prefect_task_run
 else:
     prefect = deferred("prefect")
+    prefect_artifacts = deferred("prefect.artifacts")
     prefect_cache_policies = deferred("prefect.cache_policies")
     prefect_context = deferred("prefect.context")
     prefect_task_run = deferred("prefect.runtime.task_run")
 
 RETRY_DELAY_S = 2.0
+PROGRESS_EVERY_S = 2.0
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def inside_flow() -> bool:
-    """Return whether a Prefect flow is being run, here and now."""
+    """Return whether a Prefect flow is running."""
     return "prefect.context" in sys.modules and prefect_context.FlowRunContext.get() is not None
 
 
 def as_task(function: Function, name: str, *, retries: int = 0) -> Function:
-    """Return the function as a Prefect task where a flow runs, else as it is.
+    """Return the function as a Prefect task inside a flow, else unchanged.
 
-    An OSError is tried again ``retries`` times, 2 s apart: a device or a disk may answer then. Other errors stand.
-    A task run is called by task and field, ``rectify-north``: by the ``name_of_run`` of its first argument.
+    An OSError is retried ``retries`` times, 2 s apart; other errors are not. The task run is named by the task and by
+    the ``name_of_run`` of its first argument: ``rectify-north``.
     """
     return _task(function, name, retries) if inside_flow() else function
 
@@ -49,9 +56,72 @@ def _task(function: Any, name: str, retries: int) -> Any:
         function,
         name=name,
         task_run_name=run_name,
-        cache_policy=prefect_cache_policies.NO_CACHE,  # the archive knows what is there, by content
+        cache_policy=prefect_cache_policies.NO_CACHE,  # the archive finds stores by their content
         persist_result=False,
         retries=retries,
         retry_delay_seconds=RETRY_DELAY_S,
         retry_condition_fn=lambda task, run, state: isinstance(state.result(raise_on_failure=False), OSError),
     )
+
+
+@dataclass(frozen=True)
+class Observer:
+    """Callbacks that report what a survey does."""
+
+    watch: Callable[[str, str, float], None] = lambda stage, state, done: None  # progress of a stage, 0..1
+    note: Callable[[str], None] = lambda text: None  # assumptions and warnings
+    say: Callable[[str], None] = lambda text: None  # state of a device before its first line
+    log: Callable[[str], None] = lambda text: None  # one line for each finished stage
+    progress: Callable[[str, float], None] = lambda title, fraction: None  # progress of the survey, 0..1
+
+
+_terminal: ContextVar[Observer | None] = ContextVar("observer", default=None)
+
+
+@contextmanager
+def observed_by(observer: Observer) -> Iterator[None]:
+    """Report the surveys of the block to ``observer`` as well as to Prefect."""
+    before = _terminal.set(observer)
+    try:
+        yield
+    finally:
+        _terminal.reset(before)
+
+
+def current_observer() -> Observer:
+    """Return the observer of a survey that is opened now."""
+    terminal = _terminal.get() or Observer()
+    if not inside_flow():
+        return terminal
+
+    def note(text: str) -> None:
+        terminal.note(text)
+        log_to_run(text)
+
+    return replace(terminal, note=note, log=log_to_run, progress=_ProgressPage().show)
+
+
+def log_to_run(text: str) -> None:
+    """Write a line into the log of the Prefect run; errors of the server are ignored."""
+    with suppress(Exception):
+        prefect.get_run_logger().info(text)
+
+
+class _ProgressPage:
+    """Progress artifact of a Prefect run, updated every two seconds at most."""
+
+    def __init__(self) -> None:
+        self._artifact: Any = None
+        self._last = -PROGRESS_EVERY_S
+
+    def show(self, title: str, fraction: float) -> None:
+        """Create or update the artifact; errors of the server are ignored."""
+        now = time.monotonic()
+        if now - self._last < PROGRESS_EVERY_S and fraction < 1:
+            return
+        self._last, percent = now, round(100 * fraction, 1)
+        with suppress(Exception):
+            if self._artifact is None:
+                self._artifact = prefect_artifacts.create_progress_artifact(percent, description=title)
+            else:
+                prefect_artifacts.update_progress_artifact(self._artifact, progress=percent, description=title)

@@ -1,4 +1,4 @@
-"""The recording that the settings name, as the field of a survey: source, scene, and what a plan may ask of it."""
+"""Open the recording of a survey: source of lines, scene, and available passes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from flows.settings.survey_settings import RECORDED, Settings
+from flows.settings.survey_settings import MOST_STEP, RECORDED, Settings
 from flows.tasks.scene import FieldSource
 from pipeline.capture.recorded import RecordedSource
 from pipeline.capture.recorded_passes import RecordedPasses
@@ -23,16 +23,15 @@ from storage.archive.keys import stage_key
 from storage.readers.recordings import RecordedWith, Recording, open_recording
 from storage.readers.scene_files import load_field_labels
 
-MOST_STEP = 8  # pixels from line to line of a uniform scan, as the setting scan_step has them
-OFF_CENTRE_PX = 0.5  # of a recorded field, from which on the run says so
+OFF_CENTRE_PX = 0.5  # least offset of a recorded field that is noted
 
 
 @dataclass(frozen=True)
 class RecordedField(FieldSource):
-    """A recording, whose lines were taken before."""
+    """Recording as the source of a survey."""
 
     source: RecordedSource
-    content: Mapping[str, Any]  # what its lines depend on
+    content: Mapping[str, Any]  # identifies its lines
     name = RECORDED
 
     def key(self, field: str) -> dict[str, Any]:
@@ -44,7 +43,7 @@ class RecordedField(FieldSource):
 
 @dataclass(frozen=True)
 class OpenedRecording:
-    """A recording with the settings of its survey: camera, size and step are those that it has."""
+    """Recording, and settings with its camera, size and line spacing."""
 
     settings: Settings
     recording: Recording
@@ -53,13 +52,13 @@ class OpenedRecording:
 
     @property
     def passes(self) -> RecordedPasses:
-        """Return what the passes of a plan can ask of it."""
+        """Return the passes that its lines contain."""
         return RecordedPasses(self.field.source)
 
     def scene(self) -> tuple[RasterScene, tuple[str, ...]]:
-        """Return the field as a scene of which size and bands are known, with the labels that the settings name.
+        """Return the field as a scene with size, bands and the labels of the settings, and notes.
 
-        Raises SceneError: the labels cannot be used.
+        Raises SceneError: the labels are not valid.
         """
         height, width = self.field.source.field_shape
         wavelength_nm = self.recording.wavelength_nm
@@ -86,12 +85,12 @@ class OpenedRecording:
 
 
 def open_recorded(settings: Settings) -> OpenedRecording:
-    """Open the recording that the settings name; no line is read.
+    """Open the recording of the settings, without reading lines.
 
-    Raises SceneError, WavelengthError, SettingsError, ArchiveError, PoseError: as `open_recording`, or its field cannot
-    be surveyed.
+    Raises SceneError, WavelengthError, SettingsError, ArchiveError, PoseError: as `open_recording`, or its lines are
+    too far apart.
     """
-    given = RecordedWith(
+    files = RecordedWith(
         pointing=None if settings.pointing is None else Path(settings.pointing),
         dark=None if settings.dark is None else Path(settings.dark),
         white=None if settings.white is None else Path(settings.white),
@@ -99,7 +98,7 @@ def open_recorded(settings: Settings) -> OpenedRecording:
         white_reference=settings.rig.white_reference,
         mounting=settings.rig.mounting,
     )
-    recording = open_recording(str(settings.sweeps), settings.camera, given)
+    recording = open_recording(str(settings.sweeps), settings.camera, files)
     shape, notes = _field_shape(recording, settings.shape, settings.sweeps)
     source = recording.source(shape)
     settings = replace(settings, camera=recording.camera, size=shape[::-1])
@@ -119,7 +118,7 @@ def open_recorded(settings: Settings) -> OpenedRecording:
 def _field_shape(
     recording: Recording, stated: tuple[int, int] | None, where: str | None
 ) -> tuple[tuple[int, int], tuple[str, ...]]:
-    """(y, x) size of the field, centred on the undeflected direction: as stated, or what all strips show."""
+    """Return the size (y, x) of the field around the direction at rest, as stated or covered; and notes."""
     if stated is not None:
         return stated, ()
     sweeps, tangents = [one.sweep for one in recording.sweeps], [one.tangents for one in recording.sweeps]
@@ -130,13 +129,13 @@ def _field_shape(
     y, x = covered.centre_px
     if min(height, width) < 1:
         raise SceneError(
-            f"the field of {where} lies {x:.4g} px across and {y:.4g} px along the scan beside the direction "
-            "at rest, so that nothing of it lies around that; correct the pointing, or state --size WIDTHxHEIGHT"
+            f"the field of {where} lies {x:.4g} px across and {y:.4g} px along the scan beside the direction at rest, "
+            "and does not include it; correct the pointing, or give --size WIDTHxHEIGHT"
         )
     if max(abs(y), abs(x)) < OFF_CENTRE_PX:
         return (height, width), ()
     note = (
         f"the recorded field lies {x:.4g} px across and {y:.4g} px along the scan beside the direction at rest: "
-        f"{width} x {height} px around that are surveyed; --size states more"
+        f"{width} x {height} px around it are surveyed; --size extends them"
     )
     return (height, width), (note,)

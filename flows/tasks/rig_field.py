@@ -1,4 +1,4 @@
-"""The rig that the settings name, before its field. Loaded for surveys through a rig alone: drivers load pyserial."""
+"""Open the rig of a survey. Imported only for a rig, since drivers import pyserial."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FETCHED = "camera"  # folder within a capture's spool
 
 @dataclass(frozen=True)
 class RigField(FieldSource):
-    """The rig that the settings name. What its camera gives is kept beside the lines and goes with them."""
+    """Rig of the settings; files of its camera are kept beside the lines."""
 
     rig: RigSource
     name = RIG
@@ -47,12 +47,10 @@ class RigField(FieldSource):
 
 
 def rig_field(scene: RasterScene, settings: Settings, planned: Sequence[Sweep]) -> RigField:
-    """The rig, not yet connected.
+    """Return the rig, not connected.
 
-    Raises
-    ------
-    SettingsError : the camera does not take such times, or a driver of another make cannot be imported.
-    PoseError : the mirror, as it is mounted, does not reach the field.
+    Raises SettingsError: the camera does not allow the exposure or frame time, or a driver cannot be imported;
+    PoseError: the field exceeds the mirror's range.
     """
     camera, rig = settings.camera, settings.rig
     opening.factory_of(rig, "mirror_driver")
@@ -75,6 +73,6 @@ def rig_field(scene: RasterScene, settings: Settings, planned: Sequence[Sweep]) 
 
 
 def open_devices(settings: Settings, clock: Clock = SYSTEM_CLOCK) -> RigDevices:
-    """Connect to mirror and camera, as `pipeline.rig.opening.open_devices` does. Nothing moves."""
+    """Connect to mirror and camera; see `pipeline.rig.opening.open_devices`. Nothing moves."""
     limits = CameraLimits(most_rate_hz=settings.camera.max_rate_hz)
     return opening.open_devices(settings.rig, settings.cost.vector_pairs, limits, clock)

@@ -1,9 +1,7 @@
-"""One rig, one survey at a time: a lock by the rig's port that the kernel holds, free when its holder is gone.
+"""Lock the rig for one survey at a time, by its port; the kernel releases the lock when its process ends.
 
-It is a name in the kernel itself (an abstract socket of Linux, unix(7)): no folder has to be writable, no file can be
-linked, removed or left behind, and every user of the machine has the same one. It belongs to the network that a process
-sees, which is the one it reaches the camera by. A serial port is also held by its driver, on the device itself. A
-Prefect concurrency limit may show who waits; this lock alone decides.
+The lock is an abstract socket of Linux (unix(7)): it needs no file, and is the same for all users of the machine. It
+belongs to the network namespace of the process. Drivers also lock a serial port itself.
 """
 
 from __future__ import annotations
@@ -19,15 +17,15 @@ from pathlib import Path
 
 from pipeline.errors import RigError
 
-_LONGEST_NAME = 60  # of the 107 bytes that a name in the kernel may have; the rest is for its holder's words
+_LONGEST_NAME = 60  # of the 107 bytes of a socket name; the rest describes the holder
 _NAMES = Path("/proc/net/unix")
 
 
 @contextmanager
-def rig_to_oneself(port: str, words: str) -> Iterator[None]:
-    """Hold the rig at a port while the block runs; ``words`` say who holds it.
+def rig_to_oneself(port: str, holder: str) -> Iterator[None]:
+    """Lock the rig at a port for the block; ``holder`` describes the survey.
 
-    Raises RigError: another survey holds it, or the kernel refuses the lock.
+    Raises RigError: another survey has the lock, or the kernel does not support it.
     """
     name = lock_name(port)
     with ExitStack() as held:
@@ -41,14 +39,14 @@ def rig_to_oneself(port: str, words: str) -> Iterator[None]:
             raise RigError(
                 f"cannot lock the rig by {name}: {error.strerror}; surveys of a rig need Linux's abstract sockets"
             ) from error
-        with suppress(OSError):  # words that are held already
-            said = re.sub(r"[^ -~]", "?", f"{words} (process {os.getpid()})")
-            _bind(held, f"{name}/{said[: 106 - len(name)]}")  # below the name, for others to read
+        with suppress(OSError):  # the description is in use
+            text = re.sub(r"[^ -~]", "?", f"{holder} (process {os.getpid()})")
+            _bind(held, f"{name}/{text[: 106 - len(name)]}")  # for messages of other surveys
         yield
 
 
 def lock_name(port: str) -> str:
-    """Return the name of the lock of the rig at a port; two names of one device give one."""
+    """Return the name of the lock of the rig at a port, the same for all names of one device."""
     whole = os.path.realpath(port) if port.startswith("/") else port.lower()
     name = re.sub(r"[^A-Za-z0-9.-]+", "-", whole).strip("-") or "rig"
     if len(name) > _LONGEST_NAME - 17:
@@ -62,7 +60,7 @@ def _bind(held: ExitStack, name: str) -> None:
 
 
 def _holder(name: str) -> str:
-    """Return the words of the survey that holds a name."""
+    """Return the description of the survey that has the lock."""
     with suppress(OSError):
         names = re.findall(rf" @{re.escape(name)}/(.+)$", _NAMES.read_text(errors="replace"), re.MULTILINE)
         return str(next(iter(names), "another process"))

@@ -1,4 +1,4 @@
-"""One survey's context: scene, source, weights, grid, plan of captures and archive, checked before anything runs."""
+"""Open a survey: scene, source, weights, grid, plan of captures and archive, all checked before anything runs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from flows.settings.survey_settings import RECORDED, RIG, MapChoice, Settings
 from flows.settings.values import EXTENT_PART, EXTENT_WHOLE
-from flows.tasks.capture_plan import CapturePlan, PassLayout
+from flows.tasks.capture_plan import CapturePlan, PassLayout, ScanChoice, choose_uniform_scan, lay_out_passes
 from flows.tasks.drawing import UnknownRule
 from flows.tasks.extent_choice import ExtentChoice, choose_extent
 from flows.tasks.field_work import FieldWork, WeightsFile
@@ -23,7 +23,6 @@ from flows.tasks.mosaic_work import tile_budget
 from flows.tasks.patch_budget import SHARD, PatchBudget, ReadingCosts
 from flows.tasks.prior_maps import AUTO, NONE, Prior, find_prior
 from flows.tasks.recorded_field import OpenedRecording, open_recorded
-from flows.tasks.scan_choice import ScanChoice, choose_uniform_scan, lay_out_passes
 from flows.tasks.scene import (
     FieldSource,
     SimulatedField,
@@ -80,11 +79,11 @@ else:
     rig_field = deferred("flows.tasks.rig_field")
 
 
-USUAL_COMPONENTS = 32  # of condensed lines, before they are known
+USUAL_COMPONENTS = 32  # of condensed lines, before they are computed
 
 
 def check_memory(source: SimulatedSource, grid: SceneGrid, plan: CapturePlan, memory: int, pool: WorkerPool) -> None:
-    """Refuse a memory below one tile of the mosaic before anything is captured (SettingsError, with the least)."""
+    """Check that one tile of the mosaic fits the memory. Raises SettingsError: it does not; names the least memory."""
     pixels = PixelGrid.of_scene(grid, 1)
     placed = [place(_PlannedSweep(source, sweep), source.camera) for sweep in plan.coarse]
     rows, columns = image_spec(("y", "x"), pixels.shape, "<f4").shard or pixels.shape
@@ -94,11 +93,11 @@ def check_memory(source: SimulatedSource, grid: SceneGrid, plan: CapturePlan, me
 
 
 class _PlannedSweep(SimulatedSweep):
-    """The path of a sweep and the size of its lines, which is all that memory depends on; no light is asked for."""
+    """Path of a sweep and size of its lines, without light: they determine the memory."""
 
     @property
     def references(self) -> References:
-        """Frames of a detector without a fault, as the simulated one is."""
+        """Return frames of a detector without faults."""
         components = min(len(self.source.wavelength_nm), USUAL_COMPONENTS)
         white = np.ones((self.source.camera.samples // self.sweep.binning, components), np.float32)
         return References(dark=np.zeros_like(white), white=white, white_reference=white[0])
@@ -106,34 +105,29 @@ class _PlannedSweep(SimulatedSweep):
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureRun:
-    """Needs of deciding on effects and of capturing."""
+    """Opened scene, source and archive of a capture."""
 
     settings: Settings
     archive: Archive
-    source: FieldSource  # who takes the lines
-    simulated: SimulatedSource  # without effects; beside a rig it stands for the plan: sizes, paths and memory
+    source: FieldSource
+    simulated: SimulatedSource  # without effects; for a rig, a model of its sizes, paths and memory
     scene: RasterScene
-    planned: tuple[Sweep, ...]  # that stand for all the rig may take: the coarse pass and the scan of everything
+    planned: tuple[Sweep, ...]  # the coarse pass and the full scan, which represent all sweeps
     report: Report = field(default=lambda done: None)
 
     @property
     def camera(self) -> LineCamera:
-        """The camera of the settings."""
+        """Return the camera of the settings."""
         return self.settings.camera
 
     @property
-    def scene_key(self) -> str:
-        """Names what the scene holds."""
-        return self.scene.key
-
-    @property
     def name(self) -> str:
-        """Return what the survey is called: its field, or its scene."""
+        """Return the name of the field, or of its scene."""
         return self.settings.name or Path(self.scene.name).stem
 
     @property
     def source_key(self) -> dict[str, Any]:
-        """Return what the captured light depends on, beside the sweeps and the effects."""
+        """Return the parameters of the captured light, without sweeps and effects."""
         return {
             "source": self.source.name,
             "scene": self.scene.key,
@@ -146,7 +140,7 @@ class CaptureRun:
 
     @property
     def recorder(self) -> SweepRecorder:
-        """Return what takes the sweeps into the archive."""
+        """Return the recorder of sweeps."""
         scene, settings = self.scene, self.settings
         bands = scene.wavelength_nm, scene.fwhm_nm
         return SweepRecorder(
@@ -156,114 +150,109 @@ class CaptureRun:
 
 @dataclass(frozen=True, kw_only=True)
 class SurveyRun(CaptureRun):
-    """Everything a stage may look at. Made by `open_run`, which refuses what cannot work."""
+    """Opened survey, as stages take their arguments from it; see `open_run`."""
 
-    described: Description  # what the weights say of themselves
+    described: Description  # record of the weights
     load: Once[Weights]
     grid: SceneGrid
     costs: ReadingCosts  # multiply-adds of reading the field
     plan: CapturePlan
     scans: ScanChoice
-    zones: SurveyZones  # what the survey keeps to, and plots
-    recorded: RecordedPasses | None = None  # the recording whose lines the passes take
-    raster: RasterPixels | None = None  # the pixels of a scene that is a map already: nothing is captured of it
-    budget: PatchBudget | None = None  # of patches of a uniform scan, where a part of them alone is kept and read
-    extent: ExtentChoice | None = None  # the part of a remembered field that is looked at, where one was chosen
-    prior: Prior | None = None  # the run whose class probabilities the visit starts from
-    ood_detector: OodPart | None = None  # what is familiar to the weights, where pixels may be called unknown
+    zones: SurveyZones
+    recorded: RecordedPasses | None = None  # of recorded sweeps
+    raster: RasterPixels | None = None  # of a scene that needs no capture
+    budget: PatchBudget | None = None  # None: no limit of multiply-adds
+    extent: ExtentChoice | None = None  # of a partial scan
+    prior: Prior | None = None  # prior map
+    ood_detector: OodPart | None = None  # None: no class unknown
     notes: tuple[str, ...] = ()
-    refused: str | None = None  # why this machine would refuse the survey; it is planned nevertheless
+    refused: str | None = None  # why this machine cannot run a survey that is only planned
 
     @property
     def weights(self) -> Weights:
-        """The weights, read when they are first asked for."""
+        """Return the weights, which are read on first use."""
         return self.load()
 
     @property
     def weights_key(self) -> str:
-        """Names what the weights hold."""
+        """Return the hash of the weights."""
         return self.described.key
 
     @property
     def reader(self) -> ReaderPart | None:
-        """The reader of prior maps that the weights have, if any."""
+        """Return the temporal reader of the weights; None where they have none."""
         return self.described.reader
 
     @property
     def map_scores(self) -> MapScores | None:
-        """Return how what maps expect of themselves came true, where that was measured."""
+        """Return the calibration of expected scores; None where the weights have none."""
         return None if self.described.ood_detector is None else self.described.ood_detector.map_scores
 
     @property
-    def device(self) -> str:
-        """Return where the network computes."""
-        return self.settings.device
-
-    @property
     def model_key(self) -> dict[str, Any]:
-        """Return the parameters of stages that use the weights: their key, and a device other than the processor."""
-        return {"weights": self.weights_key, **({} if self.device == PROCESSOR else {"device": self.device})}
+        """Return the parameters of stages that use the weights."""
+        return {
+            "weights": self.weights_key,
+            **({} if self.settings.device == PROCESSOR else {"device": self.settings.device}),
+        }
 
     @property
     def least_gain(self) -> float | None:
-        """Expected gain from which on patches of a uniform scan or a raster are read in full; None where all are.
+        """Return the least expected gain of patches that are read at full resolution; None where all are read.
 
-        It follows from the loss that the settings allow where they name neither gain nor multiply-adds.
+        It follows from the accepted loss, unless the settings limit multiply-adds.
         """
-        settings, allowed = self.settings, self.cascade
-        if settings.macs is not None or self.part:
-            return None
-        if settings.least_gain is not None:
-            return settings.least_gain
-        return None if allowed is None or settings.policy != "gain" else allowed[0]
+        settings, cascade = self.settings, self.cascade
+        chosen = cascade is not None and settings.macs is None and settings.policy == "gain" and not self.part
+        return cascade[0] if cascade is not None and chosen else None
 
     @property
     def cascade(self) -> tuple[float, float] | None:
-        """Least gain and fraction of patches that lose what the settings allow; None without a table of losses."""
+        """Return least gain and fraction of patches for the accepted loss; None without a table of losses."""
         content = self.described.record.get(CASCADE)
         return None if content is None else CascadeTable.read(content).within(self.settings.expected_loss / 100)
 
     @property
     def chooses(self) -> bool:
-        """Return whether patches are chosen by their scores; where all are seen and read there is nothing to choose."""
+        """Return whether scores choose patches; not where all are captured and read at full resolution."""
         return not self.plan.plain or self.budget is not None or self.least_gain is not None
 
     @property
     def controls(self) -> bool:
-        """Return whether other placements of patches are judged too; a uniform scan that is read whole places none."""
+        """Return whether the evaluation compares other placements of patches."""
         return self.settings.controls and (self.chooses or self.raster is not None)
 
     @cached_property
     def labels(self) -> NDArray[np.uint8] | None:
-        """Return what to judge by, (y, x) in the weights' classes: trained pixels taken out. Draws the scene."""
+        """Return labels (y, x) in the classes of the weights, without pixels of their training. Draws the scene."""
         return judged_labels(self.scene, self.described)
 
     @cached_property
     def mask(self) -> NDArray[np.generic] | None:
-        """The mask of policy ``mask``, (y, x) or (y, x, channel)."""
+        """Return the mask of policy ``mask``, (y, x) or (y, x, channel)."""
         return None if self.settings.mask is None else load_labels_array(self.settings.mask)
 
     @property
     def frame(self) -> FieldFrame:
-        """The frame of all images of the survey."""
+        """Return the frame of all images of the survey."""
         scene = self.scene
         bands = scene.wavelength_nm, scene.fwhm_nm
         return FieldFrame(self.grid, self.camera.ifov_rad, *bands, scene.missing, scene.geobox)
 
     @property
     def work(self) -> FieldWork:
-        """The model over the field, region by region."""
-        file = WeightsFile(weights_path(self.settings).resolve(), self.described.about[SEAL], self.device)
+        """Return the computation of the model over the field, region by region."""
+        file = WeightsFile(weights_path(self.settings).resolve(), self.described.about[SEAL], self.settings.device)
         return FieldWork(file, plan_regions(self.grid, SHARD), self.settings.pool, self.settings.memory)
 
     @property
     def part(self) -> bool:
-        """Return whether a part of the field alone is looked at."""
+        """Return whether the capture is a partial scan."""
         return self.settings.extent != EXTENT_WHOLE
 
     @property
     def capture(self) -> LineSpec:
-        """Return how the pixels of the first pass, or of the uniform scan, were captured."""
+        """Return line spacing and light of the first pass or of the uniform scan."""
         settings, light = self.settings, self.light.light
         exposure_ms, step = settings.scan_exposure_ms, settings.scan_step or 1
         if not self.plan.plain:
@@ -272,18 +261,18 @@ class SurveyRun(CaptureRun):
 
     @property
     def light(self) -> LineSpec:
-        """Return how every line in the camera's own exposure is captured."""
+        """Return line spacing and light of a full scan in the camera's exposure."""
         return LineSpec(self.camera.exposure_ms * self.scene.light_fraction / DEFAULT_EXPOSURE_MS)
 
     @property
     def scan_record(self) -> ScanPerformance | None:
-        """Return what the weights record of uniform scans, if anything."""
+        """Return the scan performance table of the weights; None where they have none."""
         content = self.described.record.get("scans")
         return None if content is None else ScanPerformance.read(content, self.scene.light_fraction)
 
     @property
     def unknown(self) -> UnknownRule | None:
-        """Return which pixels are called unknown; None where the weights cannot tell, or the settings ask for none."""
+        """Return the rule for unknown pixels; None without a detector, or where the settings turn it off."""
         rate = self.settings.unknown_rate
         if self.ood_detector is None or rate is None:
             return None
@@ -291,19 +280,19 @@ class SurveyRun(CaptureRun):
 
     @property
     def ground_grid(self) -> GroundGrid:
-        """The grid of the map on the ground, of a survey with a pose."""
+        """Return the grid of the map on the ground; the survey has a pose."""
         assert isinstance(self.zones.place, PosedField)
         return self.zones.place.grid
 
     @property
     def map_choice(self) -> MapChoice:
-        """Return what map to draw on the ground."""
+        """Return the settings of the map on the ground."""
         return self.settings.map
 
     def work_done(self, patch_index: NDArray[np.integer]) -> MultiplyAdds:
-        """Count the scores of the field, unless all is read, and the map with fine patches at these patches."""
+        """Count multiply-adds of the map with these patches at full resolution, and of the scores if used."""
         done = self.costs.of_map(patch_index)
-        if self.least_gain is not None:  # as the map is drawn: the overview is read once
+        if self.least_gain is not None:  # while the map is drawn, which reads the overview once
             done = replace(done, score=self.costs.score(self.settings.policy))
         elif self.chooses:
             done = self.costs.with_scores(patch_index, self.settings.policy)
@@ -312,39 +301,34 @@ class SurveyRun(CaptureRun):
         return replace(done, detail=done.detail + self.reader.sizes.multiply_adds(self.grid.height * self.grid.width))
 
     def reading_figures(self, patch_index: NDArray[np.integer]) -> dict[str, Any]:
-        """Return what was asked of a full reading, its patches, and its multiply-adds beside those of everything."""
+        """Return limits, patches and multiply-adds of the full network, for receipts."""
         settings, everything = self.settings, self.kept_patches
-        asked = {"macs": settings.macs, "least_gain": self.least_gain, "expected_loss": settings.expected_loss}
+        limits = {"macs": settings.macs, "least_gain": self.least_gain, "expected_loss": settings.expected_loss}
         costs = {"done": self.work_done(patch_index).total, "everything": self.costs.of_map(everything).total}
         figures = {"patches": len(patch_index), "of_patches": len(everything), "multiply_adds": costs}
-        return {"asked": asked, **figures}
+        return {"asked": limits, **figures}
 
     @property
     def kept_patches(self) -> NDArray[np.intp]:
-        """Numbers of the patches that zones leave."""
+        """Return the patches that zones leave."""
         valid, fractions = self.grid.valid_patches(), self.zones.fractions
         return valid if fractions is None else valid[fractions[valid] > 0]
 
     @property
     def likely_patches(self) -> NDArray[np.intp]:
-        """Return how many patches are likely to be read in full, by the record of the weights.
-
-        With a limit of multiply-adds these are the most that it pays for; with a gain that nothing is recorded of, all.
-        """
+        """Return as many patches as are expected to be read at full resolution, or as the budget pays for."""
         if self.budget is not None:
             return self.budget.most_patches
-        allowed, every = self.cascade, self.kept_patches
-        if allowed is None or self.least_gain is None or self.settings.least_gain is not None:
-            return every
-        return every[: round(allowed[1] * len(every))]
+        cascade, every = self.cascade, self.kept_patches
+        return every if cascade is None or self.least_gain is None else every[: round(cascade[1] * len(every))]
 
 
 def open_run(settings: Settings, *, planning: bool = False, archive: Archive | None = None) -> SurveyRun:
-    """Open everything that a survey needs; the archive last, so that bad input leaves no trace of itself.
+    """Open and check everything that a survey needs; the archive last, so that bad input creates none.
 
-    With ``planning`` a scene that this machine cannot hold is no error: ``refused`` of the run says so. Without an
-    ``archive`` that of the settings is opened. Raises PipelineError: the first thing that cannot be used; see
-    `pipeline.errors` for the kinds; NothingToMend: what is remembered is sure enough.
+    With ``planning``, no pixels are drawn, and a scene that exceeds the memory is no error but ``refused`` of the run.
+    ``archive`` is that of the settings by default. Raises PipelineError: the first error; NothingToMend: the expected
+    error of the prior map is low enough.
     """
     settings = scene_of_visit(for_rig(settings), datetime.now().astimezone())
     check_scene_there(settings.scene, is_map=settings.is_map)
@@ -364,9 +348,9 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     outside = beyond_training(settings, scene, described, model.trained_on, path)
     ood_detector = model.asked_ood(settings.unknown)
     name, found = settings.name or Path(scene.name).stem, None
-    if planning:  # what a look would be, were there one
+    if planning:  # also if a survey would be skipped
         settings = replace(settings, skip_below_error=None)
-    if settings.extent == EXTENT_PART:  # what is remembered says where to look: nothing else is asked for so early
+    if settings.extent == EXTENT_PART:  # the prior map chooses the lines
         archive = open_archive(settings.out) if archive is None and is_archive(settings.out) else archive
         found = (None, ()) if archive is None else find_prior(archive, settings, name, grid, described.class_names)
     passes = None if recorded is None else recorded.passes
@@ -375,21 +359,14 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         prior = None if found is None else found[0]
         planned = _plan_capture(settings, grid, bands, path, described, prior, shown=zones.shown, passes=passes)
     settings, plan = planned.settings, planned.plan
-    read = min(bands, SMOOTH)  # the network reads components, as many as smooth directions or fewer
+    read = min(bands, SMOOTH)  # components that the network reads, at most
     costs = ReadingCosts(described.config, grid, read)
-    spending = settings.policy, settings.macs, settings.least_gain
     shown = None if zones.fractions is None else zones.fractions > 0
-    budget = None if settings.macs is None else PatchBudget.asked(costs, shown, *spending)
-    simulated, sweeps = make_source(scene, settings), (*plan.coarse, *plan.full)
-    source = field_source(scene, settings, simulated, sweeps) if recorded is None else recorded.field
-    raster = None if pixels is None else RasterPixels(pixels.read, pixels.missing, bands, grid)
-    if raster is None:
-        check_memory(simulated, grid, plan, settings.memory, settings.pool)
-    else:
-        raster.rows_at_once(settings.memory)  # refuses memory for not one row of patches
+    budget = None if settings.macs is None else PatchBudget.asked(costs, shown, settings.policy, settings.macs)
+    source, simulated, raster = _open_source(settings, scene, grid, plan, recorded, pixels)
     archive = open_archive(settings.out) if archive is None else archive
     prior, prior_notes = found or find_prior(archive, settings, name, grid, described.class_names)
-    if settings.prior != AUTO:  # what is meant when it is asked for again
+    if settings.prior != AUTO:  # a receipt names the run
         settings = replace(settings, prior=NONE if prior is None else prior.run)
     return SurveyRun(
         settings=settings,
@@ -397,7 +374,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         source=source,
         simulated=simulated,
         scene=scene,
-        planned=sweeps,
+        planned=(*plan.coarse, *plan.full),
         described=described,
         load=model.load,
         grid=grid,
@@ -416,9 +393,31 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     )
 
 
+def _open_source(
+    settings: Settings,
+    scene: RasterScene,
+    grid: SceneGrid,
+    plan: CapturePlan,
+    recorded: OpenedRecording | None,
+    pixels: SceneFile | None,
+) -> tuple[FieldSource, SimulatedSource, RasterPixels | None]:
+    """Return the source of lines, the simulated rig, and the pixels of a raster; all fit the memory."""
+    simulated = make_source(scene, settings)
+    if recorded is not None:
+        source: FieldSource = recorded.field
+    else:
+        source = field_source(scene, settings, simulated, (*plan.coarse, *plan.full))
+    if pixels is None:
+        check_memory(simulated, grid, plan, settings.memory, settings.pool)
+        return source, simulated, None
+    raster = RasterPixels(pixels.read, pixels.missing, len(scene.wavelength_nm), grid)
+    raster.rows_at_once(settings.memory)  # raises an error where one row of patches does not fit
+    return source, simulated, raster
+
+
 @dataclass(frozen=True)
 class _PlannedCapture:
-    """The lines of a survey, the choices that led to them, and the settings that ask for just these."""
+    """Planned lines of a survey, the choices behind them, and settings that request exactly these lines."""
 
     settings: Settings
     plan: CapturePlan = field(default_factory=CapturePlan.of_map)
@@ -438,21 +437,21 @@ def _plan_capture(
     shown: NDArray[np.bool_] | None,
     passes: RecordedPasses | None,
 ) -> _PlannedCapture:
-    """Choose the part of the field, then the uniform scan or two passes, for the weights of the file ``path``.
+    """Choose the extent, then the uniform scan or two passes, for the weights of the file ``path``.
 
     Raises what `choose_extent`, `choose_uniform_scan` and `lay_out_passes` raise.
     """
     extent, extent_notes, is_part = None, tuple[str, ...](), settings.extent == EXTENT_PART
-    if is_part and prior is None:  # as it can be asked for again
+    if is_part and prior is None:
         settings = replace(settings, extent=EXTENT_WHOLE, max_age=None, skip_below_error=None)
-        extent_notes = ("nothing is remembered: the whole field is looked at",)
+        extent_notes = ("there is no prior map: the whole field is captured",)
     layout = PassLayout.of(settings, grid, shown, passes)
     if is_part and prior is not None:
         assert settings.seconds is not None  # checked with the settings
         limits = {"max_age": settings.max_age, "skip_below_error": settings.skip_below_error}
         light = settings.sky.fraction_of_clear
-        layout, extent, words = choose_extent(layout, prior, described, path, light, seconds=settings.seconds, **limits)
-        extent_notes = (words,)
+        layout, extent, note = choose_extent(layout, prior, described, path, light, seconds=settings.seconds, **limits)
+        extent_notes = (note,)
     scans = choose_uniform_scan(layout, described, path, bands, settings)
     layout, plan, settings, plan_notes = lay_out_passes(layout, scans, described, settings)
     settings = replace(settings, extent=layout.extent)
@@ -462,9 +461,9 @@ def _plan_capture(
 def _scene_for(
     model: SurveyModel, settings: Settings, recorded: OpenedRecording | None, *, planning: bool
 ) -> tuple[SceneFile | None, RasterScene, tuple[str, ...], tuple[str, ...]]:
-    """Open a scene that the weights can read, drawn unless for ``planning``; what to say of it and of its labels.
+    """Open a scene that the weights can read; drawn unless for ``planning``.
 
-    The first value is the scene's file where its pixels are taken as they are.
+    Returns the file of a raster or None, the scene, notes on it, and notes on its labels.
     """
     pixels = None
     if recorded is not None:
@@ -474,7 +473,7 @@ def _scene_for(
         pixels, scene, notes = open_map(settings, model.described.class_names)
     else:
         scene, notes = open_scene(settings, model.described.class_names)
-    if not planning:  # what the rig would find there: no stage's work
+    if not planning:  # before the stages, whose time is measured
         scene.raster.drawn()
         scene.light()
     model.check_bands(scene.wavelength_nm)
@@ -490,7 +489,7 @@ def _scene_for(
 def field_source(
     scene: RasterScene, settings: Settings, simulated: SimulatedSource, planned: Sequence[Sweep]
 ) -> FieldSource:
-    """Give who looks, as the settings say; raises what `flows.tasks.rig_field.rig_field` does."""
+    """Return the source of lines. Raises what `flows.tasks.rig_field.rig_field` raises."""
     if settings.is_map:
         return FieldSource()
     if settings.source != RIG:
@@ -499,7 +498,7 @@ def field_source(
 
 
 def make_source(scene: RasterScene, settings: Settings) -> SimulatedSource:
-    """The simulated rig before a scene, without effects; beside a rig it stands for the plan: sizes, paths, memory."""
+    """Return the simulated rig in front of a scene, without effects."""
     pointing = None
     if settings.source == "sim" and settings.pointing_px:
         pointing = PointingErrors(offset_px=settings.pointing_px, jitter_px=0.0, seed=settings.seed)
@@ -507,5 +506,5 @@ def make_source(scene: RasterScene, settings: Settings) -> SimulatedSource:
 
 
 def now() -> str:
-    """The time in ISO 8601, UTC."""
+    """Return the present time in ISO 8601, UTC."""
     return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())

@@ -1,4 +1,4 @@
-"""Scene of a survey, with labels and mask on its pixels, and its source: the simulator or a rig."""
+"""Open the scene of a survey with its labels, and define its source of lines."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,6 @@ from pipeline.errors import NoSceneYet, NothingToMend, SceneError, SettingsError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import Once
 from pipeline.simulator.effects.effect import Effect
-from pipeline.simulator.rig_model import Sky
 from pipeline.simulator.scenes.built_in import built_in_scene
 from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
@@ -38,19 +37,16 @@ from storage.remote.opening import is_archive, open_archive
 
 # Peak of a survey of the farm without controls: 1.69 GB for 1280 x 1024 px, 3.10 GB for 2560 x 2560 px
 FARM_BYTES, FARM_BYTES_PER_PX = 1_350_000_000, 270
-POSE_WINS = "the scene's own place on the earth is set aside: [pose] says where it lies; leave [pose] out to keep it"
-SAME_HOUR = 0.5  # by which true solar time is at most off mean solar time, and rounding of both [h]
-
-
+POSE_WINS = "[pose] replaces the georeference of the scene; leave [pose] out to keep it"
 DATE, NEW = "{date", "{new}"
 
 
 def scene_of_visit(settings: Settings, moment: datetime) -> Settings:
-    """Return the settings with the file that a pattern stands for at a moment; those of any other scene as they are.
+    """Return the settings with the file that a scene pattern stands for; other settings unchanged.
 
-    ``{date:%Y-%m-%d}`` is the date, in any form of strftime. ``{new}`` is any text: of the files so named it is the
-    newest, by the time it was written, that no run of the archive surveyed. Raises SettingsError: braces that say
-    neither; NoSceneYet: there is no such file; NothingToMend: all of them were surveyed.
+    ``{date:%Y-%m-%d}`` is the date of ``moment``, in any strftime format. ``{new}`` is any text, and selects the newest
+    file that no run of the archive surveyed. Raises SettingsError: other braces; NoSceneYet: there is no such file;
+    NothingToMend: all files were surveyed.
     """
     if DATE not in settings.scene and NEW not in settings.scene:
         return settings
@@ -58,7 +54,7 @@ def scene_of_visit(settings: Settings, moment: datetime) -> Settings:
         named = settings.scene.format(date=moment, new=NEW)
     except (KeyError, IndexError, ValueError) as error:
         raise SettingsError(
-            f"--scene {settings.scene}: {error} cannot be filled in; braces are {{date:%Y-%m-%d}} or {NEW}"
+            f"--scene {settings.scene}: {error} is not allowed; braces are {{date:%Y-%m-%d}} or {NEW}"
         ) from None
     found = _newest_unseen(settings, named) if NEW in named else named
     if not is_glob(found) and not split_variable(found)[0].exists():
@@ -67,7 +63,7 @@ def scene_of_visit(settings: Settings, moment: datetime) -> Settings:
 
 
 def _newest_unseen(settings: Settings, pattern: str) -> str:
-    """Return the newest file of a pattern that no run of the archive surveyed; raises what `scene_of_visit` does."""
+    """Return the newest file of a pattern that no run of the archive surveyed; raises as `scene_of_visit`."""
     there = [Path(one) for one in glob.glob("*".join(map(glob.escape, pattern.split(NEW))))]  # noqa: PTH207 - escaped
     there = [one for one in there if reader_of(one) != "none" and not is_label_name(one)]
     if not there:
@@ -85,7 +81,7 @@ def _newest_unseen(settings: Settings, pattern: str) -> str:
 
 
 def check_scene_there(scene: str, *, is_map: bool) -> None:
-    """Refuse a scene file that is not there, before anything else is asked for (SceneError)."""
+    """Check that the file of a scene exists. Raises SceneError: it does not."""
     path, _ = split_variable(scene)
     if scene in (RIG_FIELD, *BUILT_IN_SCENES) or (is_map and is_glob(scene)):
         return
@@ -98,15 +94,16 @@ def check_scene_there(scene: str, *, is_map: bool) -> None:
 
 
 def open_scene(settings: Settings, known: Sequence[str] | None = None) -> tuple[RasterScene, tuple[str, ...]]:
-    """Open the scene in the light of the settings' sky; arguments, notes and errors are those of `_in_clear_light`."""
+    """Open the scene in the light of the settings' sky; arguments, notes and errors as in `_in_clear_light`."""
     scene, notes = _in_clear_light(settings, known)
     return scene.in_light(settings.sky.fraction_of_clear), notes
 
 
 def _in_clear_light(settings: Settings, known: Sequence[str] | None) -> tuple[RasterScene, tuple[str, ...]]:
-    """Open the scene, say what was assumed; SceneError, WavelengthError: its file, SettingsError: not for a farm.
+    """Open the scene, and return it with notes on assumptions.
 
-    Labels that no setting names, but that lie beside the scene, count where their classes are among the ``known`` ones.
+    Labels that were found beside the scene are used if all of their classes are ``known``. Raises SceneError,
+    WavelengthError: the file is not valid; SettingsError: a setting is not for a built-in scene.
     """
     if settings.scene == RIG_FIELD:
         return _field_before_rig(settings), ()
@@ -118,9 +115,7 @@ def _in_clear_light(settings: Settings, known: Sequence[str] | None) -> tuple[Ra
         more: dict[str, Any] = {} if settings.interest is None else {"interest": settings.interest}
         moment = {"day": settings.day, "hour": settings.hour}
         farm = built_in_scene(settings.scene, settings.seed, shape, camera=settings.camera, **moment, **more)
-        return farm if settings.bands is None else _some_bands(farm, settings.bands), _notes_of_moment(
-            settings.sky, settings.moment
-        )
+        return farm if settings.bands is None else _some_bands(farm, settings.bands), ()
     file = load_scene_file(
         settings.scene,
         labels=settings.labels,
@@ -134,9 +129,9 @@ def _in_clear_light(settings: Settings, known: Sequence[str] | None) -> tuple[Ra
 
 
 def open_map(settings: Settings, known: Sequence[str] | None = None) -> tuple[SceneFile, RasterScene, tuple[str, ...]]:
-    """Open a raster whose pixels are taken as they are; its scene holds all but light, which no camera looks at.
+    """Open a raster: its file, a scene without light, and notes. Labels beside it are used as in `open_scene`.
 
-    Raises SceneError, WavelengthError: its files. Labels found by their name count as in `open_scene`.
+    Raises SceneError, WavelengthError: a file is not valid.
     """
     file = open_raster(settings.scene, labels=settings.labels, bands=settings.bands, wavelengths=settings.wavelengths)
     file = _judged_by_known(file, known)
@@ -165,25 +160,27 @@ def open_map(settings: Settings, known: Sequence[str] | None = None) -> tuple[Sc
 
 
 def _judged_by_known(file: SceneFile, known: Sequence[str] | None) -> SceneFile:
-    """Leave labels out that were found by their name and have a class beside the ``known`` ones."""
+    """Return the file without labels that were found beside it and have a class that is not ``known``."""
     out_of_range = [name for name in file.class_names if known is not None and name not in known]
     if not (file.labels_found and out_of_range):
         return file
-    hint = f"of the class {out_of_range[0]!r}, which the weights do not know: name its classes in a scene.toml to judge"
-    note = f"the labels beside the scene are left out: they are {hint} by them"
+    note = (
+        f"the labels beside the scene are left out: the weights do not know their class {out_of_range[0]!r}; name the "
+        "classes in a scene.toml to use them"
+    )
     nothing: dict[str, Any] = {"labels": None, "class_names": (), "class_values": ()}
     return replace(file, **nothing, class_colours=file.class_colours[:0], provenance=(*file.provenance, note))
 
 
 def _placed_once(scene: RasterScene, notes: tuple[str, ...], *, posed: bool) -> tuple[RasterScene, tuple[str, ...]]:
-    """Set the scene's own place aside where a pose says another, and say so."""
+    """Return the scene without its georeference where a pose replaces it, with a note."""
     if scene.geobox is None or not posed:
         return scene, notes
     return replace(scene, geobox=None), (*notes, POSE_WINS)
 
 
 def _gap_note(scene: RasterScene, became: str) -> tuple[str, ...]:
-    """Say what became of pixels without a value in some band."""
+    """Return a note on pixels without a value in some band."""
     if not scene.filled_px:
         return ()
     void = 0 if scene.missing is None else int(np.count_nonzero(scene.missing))
@@ -192,12 +189,10 @@ def _gap_note(scene: RasterScene, became: str) -> tuple[str, ...]:
 
 
 def _field_before_rig(settings: Settings) -> RasterScene:
-    """Give a field of which only size and bands are known. Raises SettingsError: they are not given."""
+    """Return a field of which only size and bands are known. Raises SettingsError: they are not given."""
     for name, value in {"size": settings.size, "wavelengths": settings.wavelengths}.items():
         if value is None:
-            raise SettingsError(
-                f"scene {RIG_FIELD!r} is what stands before the rig: give its {name}, which no file tells"
-            )
+            raise SettingsError(f"scene {RIG_FIELD!r} has no file: give its {name}")
     assert settings.size is not None
     assert settings.wavelengths is not None
     width, height = settings.size
@@ -215,24 +210,8 @@ def _field_before_rig(settings: Settings) -> RasterScene:
     )
 
 
-def _notes_of_moment(sky: Sky, moment: tuple[int, float] | None) -> tuple[str, ...]:
-    """Say where plants and shadows are not those of the moment at which the sky's light begins."""
-    started = sky.started
-    if started is None or moment is None:
-        return ()
-    sun = started.astimezone(UTC) + timedelta(hours=sky.longitude_deg / 15)
-    day, hour = moment
-    at = sun.hour + sun.minute / 60
-    if day == sun.timetuple().tm_yday and abs(hour - at) < SAME_HOUR:
-        return ()
-    return (
-        f"plants and shadows are of day {day}, {hour:g} h, while the light drifts as from sky.started, day "
-        f"{sun.timetuple().tm_yday}, {at:.1f} h solar time",
-    )
-
-
 def farm_refusal(settings: Settings) -> str | None:
-    """Why this machine cannot hold the farm of the settings, before it tries; None where it can."""
+    """Return why the farm of the settings exceeds the memory of this machine; None where it fits."""
     if settings.scene not in BUILT_IN_SCENES or settings.shape is None:
         return None
     height, width = settings.shape
@@ -247,7 +226,7 @@ def farm_refusal(settings: Settings) -> str | None:
 
 
 def _some_bands(scene: RasterScene, bands: tuple[int, ...]) -> RasterScene:
-    """The same field seen by a camera with some of the bands."""
+    """Return the scene with some of its bands. Raises SettingsError: it has no such band."""
     count, chosen = len(scene.wavelength_nm), list(bands)
     if not all(0 <= band < count for band in bands):
         raise SettingsError(f"--bands {','.join(map(str, bands))}: the built-in farm has bands 0 to {count - 1}")
@@ -262,7 +241,7 @@ def _some_bands(scene: RasterScene, bands: tuple[int, ...]) -> RasterScene:
 
 
 def check_labels(scene: RasterScene, weights: Description) -> tuple[str, ...]:
-    """Refuse labels of classes that the weights do not know (SceneError); say what judging by the others is worth."""
+    """Check that the weights know the classes of the labels; return notes. Raises SceneError: they do not."""
     if not scene.labelled:
         return ()
     missing = [name for name in scene.class_names if name not in weights.class_names]
@@ -277,20 +256,20 @@ def check_labels(scene: RasterScene, weights: Description) -> tuple[str, ...]:
             )
         raise SceneError(f"the labels have the class {missing[0]!r}, the weights know {known}; {hint}")
     seen = seen_in_training(scene, weights)
-    return () if seen is None else (f"accuracy is counted on {TRAINING_SCENE[seen]}",)
+    return () if seen is None else (f"the accuracy refers to {TRAINING_SCENE[seen]}",)
 
 
-TRAINING_SCENE = {  # what a score on a scene of the training is a score of
-    "all": "a scene of the training, which says nothing of other fields",
-    "tiles": "a field some tiles of which are scenes of the training, which says little of other fields",
-    "other pixels": "those pixels of a scene of the training whose labels were left out of it",
+TRAINING_SCENE = {
+    "all": "a training scene (not valid for other fields)",
+    "tiles": "a field with tiles of the training (may not be valid for other fields)",
+    "other pixels": "pixels of a training scene whose labels were not used in training",
 }
 
 
 def seen_in_training(scene: RasterScene, weights: Description) -> str | None:
-    """Return how much of a scene the weights were trained on, a key of `TRAINING_SCENE`; None for nothing.
+    """Return which part of a scene the weights were trained on, a key of `TRAINING_SCENE`; None for no part.
 
-    Files are identified by what they hold, whatever their names and whatever bands are read of them.
+    Files are identified by their content, not by name or by the bands that are read.
     """
     split = weights.record.get("split", {})
     if scene.clear_key in split.get("pixels", {}):
@@ -302,7 +281,7 @@ def seen_in_training(scene: RasterScene, weights: Description) -> str | None:
 
 
 def judged_labels(scene: RasterScene, weights: Description) -> NDArray[np.uint8] | None:
-    """Labels in the order of the weights' classes, without the pixels that the weights were trained on."""
+    """Return labels in the order of the weights' classes, without pixels of their training."""
     if scene.labels is None:
         return None
     order = np.full(256, UNLABELLED, np.uint8)
@@ -315,56 +294,47 @@ def judged_labels(scene: RasterScene, weights: Description) -> NDArray[np.uint8]
 
 
 class FieldSource:
-    """Source of a survey's lines: the one seam between what is simulated and what is there.
+    """Source of the lines of a survey; the base class is that of a raster, which has no lines."""
 
-    As it stands a raster, which no camera looks at: its pixels are read from the file.
-    """
-
-    name = RASTER  # what the receipt calls it
-    simulates = False  # whether effects are chosen for it, which then stand in what is stored of its lines
+    name = RASTER  # in receipts
+    simulates = False  # whether effects are chosen for it
 
     def key(self, field: str) -> dict[str, Any]:
-        """Return what its light depends on, beside scene, camera, seed, sweeps and effects."""
+        """Return parameters of its light besides scene, camera, seed, sweeps and effects."""
         return {}
 
     def saying(self, say: Callable[[str], None]) -> FieldSource:
-        """The same, reporting what it is at while no line comes."""
+        """Return the source with a callback for its state before the first line."""
         return self
 
     def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> FieldSource:
-        """The same with the effects that were decided, and when sweeps start by name [s]."""
+        """Return the source with chosen effects, and the start of each sweep by name [s]."""
         return self
 
     def opened(self, spool: Path) -> AbstractContextManager[Source]:
-        """Return what lines come from, held on to; what it keeps on the way goes beside the lines in ``spool``.
-
-        Raises SettingsError: it has no lines.
-        """
-        raise SettingsError("a raster is not captured: its pixels are in its file; give --source sim for lines of it")
+        """Open the source; files of the device are kept in ``spool``. Raises SettingsError: it has no lines."""
+        raise SettingsError("a raster has no lines to capture; give --source sim for a simulated capture")
 
 
 @dataclass(frozen=True)
 class SimulatedField(FieldSource):
-    """The simulated rig before a scene."""
+    """Simulated rig in front of a scene."""
 
     source: SimulatedSource
     name = SIM
     simulates = True
 
     def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> SimulatedField:
-        """The same with these effects."""
+        """Return the source with these effects."""
         return SimulatedField(replace(self.source, chosen=chosen, clock=clock))
 
     def opened(self, spool: Path) -> AbstractContextManager[Source]:
-        """The simulated source itself."""
+        """Return the simulated source."""
         return nullcontext(self.source)
 
 
 def for_rig(settings: Settings) -> Settings:
-    """Give the settings of a survey through a rig: this look at the field has a name, and no control is simulated.
-
-    Of a recording no control is simulated either.
-    """
+    """Return settings without simulated controls for a rig or a recording; a visit of a rig has a name."""
     if settings.source == RECORDED:
         return replace(settings, controls=False)
     if settings.source != RIG:

@@ -1,4 +1,4 @@
-"""Scores of a run's map, read from its receipt: those that may be compared, the worst class, false classes."""
+"""Read the scores of a run's map from its receipt: mIoU, worst class, false classes, error matrix."""
 
 from __future__ import annotations
 
@@ -8,21 +8,19 @@ from typing import Any, NamedTuple
 from flows.terminal.figures import format_count, format_points, known_number
 
 JUDGING = "evaluate"  # the stage that judges the map
-MOST_ERROR = (
-    0.1  # a standard deviation of a predicted mIoU from which on nothing is predicted: 40 points lie within two
-)
-MAPS = {"this survey": None, "none": "none", "all": "all"}  # as they are called; where a receipt's accuracy has them
+MOST_ERROR = 0.1  # standard deviation of an expected mIoU, above which it is not shown
+MAPS = {"this survey": None, "none": "none", "all": "all"}  # name: key in a receipt's accuracy
 
 
 def format_prediction(miou: float | None, error: float | None) -> str:
-    """Return a predicted mIoU with its standard deviation, 0..1; empty where there is none, or where it may be any."""
+    """Return an expected mIoU with its standard deviation as text; empty where it is missing or too uncertain."""
     if miou is None or (error is not None and error > MOST_ERROR):
         return ""
     return format_points(miou) if error is None else f"{format_points(miou)} ± {format_points(error)}"
 
 
 class WorstClass(NamedTuple):
-    """The class of the truth that this map shows worst, and its IoU in the three maps; None for one not judged."""
+    """Class with the lowest IoU, and its IoU in the three maps; None where there is none."""
 
     name: str
     none: float | None
@@ -31,7 +29,7 @@ class WorstClass(NamedTuple):
 
 
 def score_of(receipt: Mapping[str, Any]) -> dict[str, float | None]:
-    """``miou`` and ``overall_accuracy`` of a run's map, 0..1; None where nothing was judged."""
+    """Return ``miou`` and ``overall_accuracy`` of a run's map, 0..1; None without labels."""
     accuracy = receipt.get("accuracy")
     if not isinstance(accuracy, Mapping):
         return {"miou": None, "overall_accuracy": None}
@@ -44,7 +42,7 @@ def _by_class(one: Mapping[str, Any]) -> dict[str, float | None]:
 
 
 def worst_class(accuracy: Mapping[str, Any]) -> WorstClass | None:
-    """The class of the truth with the lowest IoU in this map; None where no class was judged."""
+    """Return the class with the lowest IoU; None without labels."""
     this, none, every = (_by_class(one or {}) for one in (accuracy, accuracy.get("none"), accuracy.get("all")))
     known = {name: iou for name, iou in this.items() if iou is not None}
     if not known:
@@ -54,7 +52,7 @@ def worst_class(accuracy: Mapping[str, Any]) -> WorstClass | None:
 
 
 def format_worst_class(accuracy: Mapping[str, Any], *, alone: bool = False) -> str:
-    """The worst class in a sentence, ``alone`` without what other looks give; empty where there is none."""
+    """Return the worst class in a sentence, ``alone`` without other maps; empty without labels."""
     worst = worst_class(accuracy)
     if worst is None:
         return ""
@@ -69,7 +67,7 @@ def format_worst_class(accuracy: Mapping[str, Any], *, alone: bool = False) -> s
 
 
 def format_false_classes(accuracy: Mapping[str, Any]) -> str:
-    """Classes that a map shows and the truth lacks, with their pixels; empty where there are none."""
+    """Return the classes of a map that the labels lack, with their pixels; empty where there are none."""
     parts = []
     for name, key in MAPS.items():
         one = accuracy if key is None else accuracy.get(key)
@@ -80,7 +78,7 @@ def format_false_classes(accuracy: Mapping[str, Any]) -> str:
 
 
 class ErrorMatrix(NamedTuple):
-    """A confusion matrix in words, over the classes that map or labels have."""
+    """Confusion matrix as text, for the classes of map or labels."""
 
     labels: list[str]  # of the columns
     rows: list[list[str]]  # mapped class, pixels by label, user's accuracy [%]; last the producer's accuracies [%]

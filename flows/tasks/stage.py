@@ -1,14 +1,13 @@
-"""A stage of the survey as one record: its name, title and version, and what it stores.
+"""Define a survey stage: name, inputs, outputs, store key and description.
 
-A stage says which store it wants; the archive makes the key, finds the store, or has it built. Arrays stay inside the
-stage. The record is made where the function is, in a module of `flows.tasks.stages`:
+A stage function returns the store that it wants; the archive computes its key, finds it, or has it built. Arrays stay
+inside the stage. The decorator of the function, in a module of `flows.tasks.stages`, holds name, title and product:
 
     @stage("rectify", "mosaic", MOSAIC)
     def rectify(raw, geolocation, *, frame, camera, resampling): ...
 
-The function takes the stores that it is made of, and behind the star by name what it needs of the opened survey: an
-attribute of the run, or a setting. The order of the stages stands in `flows.survey`, which calls them with the opened
-survey and the stores.
+Positional arguments are its input stores. Keyword arguments are attributes of the opened survey, or settings.
+`flows.survey` calls the stages in order, with the opened survey and the stores.
 """
 
 from __future__ import annotations
@@ -34,98 +33,95 @@ from storage.arrays.layout import AngularGrid
 if TYPE_CHECKING:
     from odc.geo.geobox import GeoBox
 
-Report = Callable[[float], None]  # how far a stage is, 0..1
+Report = Callable[[float], None]  # progress of a stage, 0..1
 Build = Callable[[Path], None]
 
 
 @dataclass(frozen=True)
 class FieldFrame:
-    """The frame of a survey's images: their pixels and bands, where they lie, and which pixels are no scene."""
+    """Frame of the images of a survey: pixels, bands, georeference and nodata."""
 
     grid: SceneGrid
     ifov_rad: float
     wavelength_nm: NDArray[np.float64]  # (band,)
     fwhm_nm: NDArray[np.float64] | None
-    missing: NDArray[np.bool_] | None  # (y, x) of which the scene has no value; None: of all it has
-    geobox: GeoBox | None  # of the fine grid, where the scene's file says it
+    missing: NDArray[np.bool_] | None  # (y, x) nodata; None: no pixel
+    geobox: GeoBox | None  # of the fine grid; None: no georeference
 
     @property
     def key(self) -> dict[str, Any]:
-        """Return what images depend on beside what was seen: where they lie, and what is no scene."""
+        """Return the parameters of images besides their inputs: georeference and nodata."""
         gaps = {} if self.missing is None else {"missing": array_digest(self.missing)}
         return {**georeference_record(self.geobox), **gaps}
 
     def angular_grid(self, factor: int = 1) -> AngularGrid:
-        """Return where pixels of ``factor`` fine px lie."""
+        """Return the grid of pixels of ``factor`` fine px."""
         return AngularGrid(self.ifov_rad, (self.grid.height, self.grid.width), factor, self.geobox)
 
 
 @dataclass(frozen=True)
 class Product:
-    """Product of a stage: the folder of such stores, and the version of what is written, raised when that changes."""
+    """Product of a stage: the folder of its stores, and a version that is raised when their content changes."""
 
     name: str
     version: int
-    files: tuple[str, ...] = ()  # in a store, that receipts name, by their stems
-    by_weights: bool = False  # the weights are one of its parameters
+    files: tuple[str, ...] = ()  # of a store, named in receipts by their stems
+    by_weights: bool = False  # whether it depends on the weights
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """A store that a stage wants: what it depends on, and what makes it where it is not there."""
+    """Request for a store: its parameters and inputs, and the function that builds it."""
 
-    build: Build  # writes into the folder that it is given
+    build: Build  # writes into a given folder
     params: Mapping[str, Any]
     inputs: Sequence[StageRef] = ()
-    then: Callable[[], object] = field(default=lambda: None)  # once the store is there
+    then: Callable[[], object] = field(default=lambda: None)  # called once the store exists
 
 
 class Survey(Protocol):
-    """An opened survey, which runs a stage of a name: in this process, or only to see what it would do."""
+    """Opened survey that runs a stage by name, or only plans it."""
 
     def __call__(self, stage: str, /, *inputs: StageRef) -> StageRef:
-        """Return the store of a stage that is made of these stores."""
+        """Return the store of a stage with these inputs."""
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage. ``wants`` takes the run and the stores that it is made of, and returns what is to be stored.
-
-    What the stage needs is taken from the run once the keys of all its stores are known.
-    """
+    """One stage; ``wants`` takes the run and the input stores, and returns the request for its store."""
 
     name: str
-    title: str  # on terminals and pages
+    title: str  # for terminals and reports
     product: Product
     wants: Callable[..., Wanted]
-    inputs: int | None  # of its stores, where another stage has the same product
-    retries: int  # by Prefect, where a device or a disk failed
-    named: str | None  # what receipts call its store, or the file in it, where another stage has the same product
+    inputs: int | None  # number of inputs, where another stage has the same product
+    retries: int  # by Prefect, after an OSError
+    named: str | None  # name in receipts, where another stage has the same product
 
     def __call__(self, survey: Survey, *inputs: StageRef | None) -> StageRef:
-        """Return the stage's store, found or built; inside a Prefect flow as a task. Inputs that are None do not count.
+        """Return the store of the stage, from the archive or built; a task inside a Prefect flow.
 
-        An OSError inside a flow is tried again ``retries`` times: a device or a disk may answer then.
+        Inputs that are None are ignored. Inside a flow, an OSError is retried ``retries`` times.
         """
         run = as_task(run_stage, self.name, retries=self.retries)
         return run(survey, self.name, *(ref for ref in inputs if ref is not None))
 
     def addresses(self, ref: StageRef) -> dict[str, str]:
-        """Return where its store lies, or the files in it, by the names in receipts: the stage's own by default."""
+        """Return the addresses of its store, or of the files in it, by their names in receipts."""
         if self.named is not None or not self.product.files:
             return {self.named or self.name: "/".join((ref.uri, *self.product.files))}
         return {Path(file).stem: f"{ref.uri}/{file}" for file in self.product.files}
 
     def key(self, wanted: Wanted) -> str:
-        """The address of what is wanted: a hash of the version, the parameters and the inputs' keys."""
+        """Return the key of a request: a hash of version, parameters and the keys of the inputs."""
         return stage_key(self.product.name, self.product.version, wanted.params, [ref.key for ref in wanted.inputs])
 
     def find(self, archive: Archive, wanted: Wanted) -> StageRef | None:
-        """The store, where the archive has it."""
+        """Return the requested store; None where the archive lacks it."""
         return archive.find(self.product.name, self.key(wanted))
 
     def produce(self, archive: Archive, wanted: Wanted) -> tuple[StageRef, bool]:
-        """Find the store, or have it built; the second value says whether it was built."""
+        """Find or build the requested store; return it, and whether it was built."""
         ref, built = archive.produce(
             self.product.name,
             wanted.build,
@@ -140,24 +136,24 @@ class Stage:
 
 
 def run_stage(survey: Survey, stage: str, *inputs: StageRef) -> StageRef:
-    """Run a stage of a survey by its name."""
+    """Run a stage of a survey by name."""
     return survey(stage, *inputs)
 
 
 def stage(
     name: str, title: str, product: Product, *, inputs: int | None = None, retries: int = 0, named: str | None = None
 ) -> Callable[[Callable[..., Wanted]], Stage]:
-    """Make a function a stage; see `Stage` for the parameters. Its module lies in `flows.tasks.stages`."""
+    """Return a decorator that makes a function of `flows.tasks.stages` a stage; see `Stage` for the parameters."""
 
     def record(function: Callable[..., Wanted]) -> Stage:
-        """Make the record of one function."""
+        """Return the stage of a function."""
         needs = needs_of(function)
 
         @wraps(function)
-        def wants(run: Any, *given: StageRef) -> Wanted:
-            for ref in given:
-                _ = ref.key  # where one is not known yet nothing is opened
-            return function(*given, **{name: needed(run, name) for name in needs})
+        def wants(run: Any, *stores: StageRef) -> Wanted:
+            for ref in stores:
+                _ = ref.key  # raises an error in a plan, where inputs are not known yet
+            return function(*stores, **{name: needed(run, name) for name in needs})
 
         return Stage(name, title, product, wants, inputs, retries, named)
 
@@ -165,10 +161,10 @@ def stage(
 
 
 def needs_of(function: Callable[..., Any]) -> list[str]:
-    """Return the names behind the star of a stage's function."""
+    """Return the names of the keyword arguments of a stage function."""
     return [one.name for one in inspect.signature(function).parameters.values() if one.kind is one.KEYWORD_ONLY]
 
 
 def needed(run: Any, name: str) -> Any:
-    """Return what a stage needs: the run's own attribute of that name, else the setting."""
+    """Return the attribute of the run, else the setting, with this name."""
     return getattr(run if hasattr(type(run), name) or name in vars(run) else run.settings, name)

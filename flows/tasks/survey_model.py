@@ -1,4 +1,4 @@
-"""The weights that a survey reads with: opened, and refused where they do not fit."""
+"""Open the weights of a survey, and check that they suit its scene."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from pipeline.simulator.scenes.scene import RasterScene
 
 @dataclass(frozen=True)
 class SurveyModel:
-    """The weights of a survey."""
+    """Weights of a survey."""
 
     path: Path
     described: Description
@@ -34,10 +34,9 @@ class SurveyModel:
 
     @staticmethod
     def open(path: Path, device: str, unknown: str, *, planning: bool) -> SurveyModel:
-        """Open the weights of a file; unless for ``planning`` all tensors are read.
+        """Open the weights of a file; all tensors are read unless for ``planning``.
 
-        Raises WeightsError: what is missing, does not go together, or is not as it was written; SettingsError: the
-        machine lacks the device.
+        Raises WeightsError: the file is missing, damaged or inconsistent; SettingsError: the machine lacks the device.
         """
         described, load = describe_weights(path), Once(lambda: load_weights(path).on(choose_device(device)))
         model = SurveyModel(path, described, load)
@@ -50,7 +49,7 @@ class SurveyModel:
         return model
 
     def check_bands(self, wavelength_nm: NDArray[np.floating]) -> None:
-        """Refuse weights of which no spectral column is reached by a band (WeightsError)."""
+        """Check that the bands overlap the spectral range of the weights. Raises WeightsError: they do not."""
         weights = self.described
         _, reached = weights.basis.matrix(wavelength_nm)
         if not reached.any():
@@ -62,25 +61,25 @@ class SurveyModel:
 
     @property
     def trained_on(self) -> TrainedOn | None:
-        """Return the training data of the weights, by their record or their out-of-distribution part, else None."""
+        """Return the record of the training data; None where the weights have none."""
         if TRAINED_ON in self.described.record:
             return TrainedOn.read(self.described.record[TRAINED_ON])
         return None if self.described.ood_detector is None else self.described.ood_detector.trained_on
 
     def asked_ood(self, unknown: str) -> OodPart | None:
-        """Return the out-of-distribution detector if unknown pixels are asked for (WeightsError: it is missing)."""
+        """Return the out-of-distribution detector if ``unknown`` requests one. Raises WeightsError: it is missing."""
         if unknown not in (UNKNOWN_AUTO, UNKNOWN_OFF) and self.described.ood_detector is None:
             raise WeightsError(
-                f"--unknown {unknown}: {self.path.name} has no record of familiar spectra; add one with: "
+                f"--unknown {unknown}: {self.path.name} has no out-of-distribution detector; add one with: "
                 f"spectralzoom train DATASET --fit-ood {self.path} -o {self.path}, or leave --unknown out"
             )
         return None if unknown == UNKNOWN_OFF else self.described.ood_detector
 
 
 def weights_path(settings: Settings) -> Path:
-    """Return the file of weights that a survey is read with: one of its own, or the one that comes with SpectralZoom.
+    """Return the file of weights: that of the settings, or the shipped one for built-in scenes.
 
-    Raises SettingsError: none is given for one's own scene.
+    Raises SettingsError: there is none for another scene.
     """
     if settings.weights not in (None, *BUILT_IN_SCENES):
         return Path(str(settings.weights))
@@ -93,61 +92,61 @@ def weights_path(settings: Settings) -> Path:
 
 
 def shipped_weights() -> Path:
-    """Return the weights that come with SpectralZoom."""
+    """Return the file of the shipped weights."""
     return Path(str(resources.files("models") / "shipped" / "farm.safetensors"))
 
 
-DAYS, SUN_DEG, DARKER, SCALE, BAND_NM = 10, 3.0, 0.9, 1.5, 25.0  # as much beside its ranges is still within training
+DAYS, SUN_DEG, DARKER, SCALE, BAND_NM = 10, 3.0, 0.9, 1.5, 25.0  # tolerances of the ranges of training
 
 
 def beyond_training(
     settings: Settings, scene: RasterScene, described: Description, trained: TrainedOn | None, path: Path
 ) -> tuple[str, ...]:
-    """One note of all that training did not see, or none; ``trained`` is None where what it saw is unknown."""
+    """Return a note on conditions outside of the training data, or nothing; ``trained`` is None if they are unknown."""
     _, reached = described.basis.matrix(scene.wavelength_nm)
-    known = np.ones_like(reached)  # columns that training reached
+    known = np.ones_like(reached)  # spectral features that training covered
     if trained is not None and trained.bands_nm is not None:
         _, known = described.basis.matrix(np.array(trained.bands_nm))
     found = []
     if (known & ~reached).any():
-        found.append(f"the bands reach {(known & reached).sum()} of the weights' {known.sum()} spectral columns")
+        found.append(f"the bands cover {(known & reached).sum()} of the weights' {known.sum()} spectral features")
     if trained is not None:
         low, high = trained.wavelength_nm
         beyond = (scene.wavelength_nm < low - BAND_NM) | (scene.wavelength_nm > high + BAND_NM)
         if 2 * beyond.sum() > len(beyond):
-            found.append(f"{beyond.sum()} of {len(beyond)} bands, which lie outside of its {low:.0f}-{high:.0f} nm")
+            found.append(f"bands outside of {low:.0f}-{high:.0f} nm: {beyond.sum()} of {len(beyond)}")
         found += _season(settings.moment, trained, now=settings.source == "rig")
         usual, least = settings.camera.exposure_ms, trained.exposure_ms[0]
         one, other = settings.scan_exposure_ms or usual, settings.coarse_exposure_ms or usual
         shortest = (one if settings.plain else min(usual, other)) * scene.light_fraction
         if shortest < DARKER * least and not settings.is_map:  # a raster has no exposures
             under = "" if scene.light_fraction == 1 else " under a clear sky, by their light"
-            found.append(f"lines of {shortest:g} ms{under} (it saw {least:g} ms and more)")
+            found.append(f"exposures of {shortest:g} ms{under} (training: {least:g} ms and more)")
         pixel_m, known_m = None, trained.ground_pixel_m
         if settings.scene in BUILT_IN_SCENES:
-            pixel_m = FARM_PIXEL_M  # as it is drawn, wherever the rig is said to stand
+            pixel_m = FARM_PIXEL_M  # independent of the pose
         elif settings.pose is not None:
             pixel_m = median_footprint_m(GroundView(settings.pose, settings.camera.ifov_rad), scene.shape)
         if pixel_m is not None and known_m is not None and not 1 / SCALE <= pixel_m / known_m <= SCALE:
-            found.append(f"pixels of {100 * pixel_m:.3g} cm of the ground (it saw {100 * known_m:.3g} cm)")
+            found.append(f"GSD of {100 * pixel_m:.3g} cm (training: {100 * known_m:.3g} cm)")
     if not found:
         return ()
     return (
-        f"outside of what {path.name} was trained on: {'; '.join(found)}. Expect a poorer map; weights that know this"
-        f" are trained on labelled scenes of it: spectralzoom train DATASET --init {path.name} -o my.safetensors",
+        f"outside of the training data of {path.name}: {'; '.join(found)}. Expect a poorer map; train on such labelled"
+        f" scenes: spectralzoom train DATASET --init {path.name} -o my.safetensors",
     )
 
 
 def _season(moment: tuple[int, float] | None, trained: TrainedOn, *, now: bool) -> list[str]:
-    """Say what day of the look, that of ``now`` before a rig, and height of the sun training did not see."""
+    """Return notes on day (of a rig: today) and sun elevation outside of the training data."""
     found, day = [], moment[0] if moment else datetime.now(UTC).timetuple().tm_yday if now else None
     if day is not None and trained.day is not None:
         first, last = trained.day
         if not first - DAYS <= day <= last + DAYS:
             of_day, *seen = [f"{date(2025, 1, 1) + timedelta(days=one - 1):%B}" for one in (day, first, last)]
-            found.append(f"day {day} of the year ({of_day}; it saw {' to '.join(seen)})")
+            found.append(f"day {day} of the year ({of_day}; training: {' to '.join(seen)})")
     if moment is not None and trained.sun_elevation_deg is not None:
         height, (low, _) = sun_over_farm(*moment).elevation_deg, trained.sun_elevation_deg
         if height < low - SUN_DEG:
-            found.append(f"a sun {height:.0f} degrees high (it saw {low:.0f} and more)")
+            found.append(f"a sun elevation of {height:.0f} degrees (training: {low:.0f} and more)")
     return found

@@ -1,4 +1,4 @@
-"""Area of interest, no-go zones and plots of a survey: read from their files and brought onto the field's pixels."""
+"""Read area of interest, no-go zones and plots, and transform them to the pixels of the field."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ if TYPE_CHECKING:
 else:
     pyproj = deferred("pyproj")
 
-WGS84 = 4326  # what GeoJSON without a CRS is in (RFC 7946), on a field of which the place is known
+WGS84 = 4326  # CRS of GeoJSON (RFC 7946), on a georeferenced field
 
 
 @dataclass(frozen=True)
 class SurveyZones:
-    """Zones that a survey keeps to, and the plots that it tells of, on the pixels of its field."""
+    """Zones and plots on the pixels of a field."""
 
     place: FieldPlace
     grid: SceneGrid
@@ -45,22 +45,22 @@ class SurveyZones:
 
     @cached_property
     def shown(self) -> NDArray[np.bool_] | None:
-        """(patch,) that lines have to show; None for all."""
+        """Return the patches (patch,) to capture; None for all."""
         return None if self.kept is None else self.kept.shown_patches(self.grid)
 
     @cached_property
     def fractions(self) -> NDArray[np.float64] | None:
-        """(patch,) fraction of what a fine look at each patch is worth; None: all of it."""
+        """Return the fraction of each patch inside zones (patch,); None: all of it."""
         return None if self.kept is None else self.kept.patch_fractions(self.grid)
 
     @cached_property
     def left_out(self) -> NDArray[np.bool_] | None:
-        """(y, x) pixels of which no map is drawn; None where all are."""
+        """Return the pixels (y, x) outside of zones; None where there are none."""
         return None if self.kept is None else self.kept.left_out
 
     @cached_property
     def key(self) -> dict[str, str]:
-        """Return what results depend on, for the keys of stages; nothing where nothing is left out."""
+        """Return the parameters of zones for store keys; empty without zones."""
         if self.kept is None:
             return {}
         no_go = {} if self.kept.no_go is None else {"no_go": array_digest(self.kept.no_go)}
@@ -68,9 +68,9 @@ class SurveyZones:
 
 
 def place_of_field(settings: Settings, scene: RasterScene) -> FieldPlace:
-    """Return the place of the field: before a rig with a pose, on the grid of a georeferenced scene, or none.
+    """Return the georeference of the field: by a pose, by the scene, or none.
 
-    Raises PoseError: from the pose no ground is seen, or the map's CRS does not suit it.
+    Raises PoseError: no ground is visible from the pose, or the CRS does not suit it.
     """
     if settings.pose is None:
         return NoPlace(scene.shape, scene.pixel_m) if scene.geobox is None else PlacedPicture(scene.geobox)
@@ -79,16 +79,16 @@ def place_of_field(settings: Settings, scene: RasterScene) -> FieldPlace:
 
 
 def open_zones(files: ZoneChoice, place: FieldPlace, grid: SceneGrid) -> SurveyZones:
-    """Read the ``files`` that the settings name, and bring their polygons onto the field.
+    """Read the ``files`` of the settings, and transform their polygons to the field.
 
-    Raises ZoneError: a file cannot be used, its area or its plots do not lie on the field, or zones leave nothing.
+    Raises ZoneError: a file is not valid, area or plots lie outside of the field, or zones leave no pixel.
     """
     if files.area is None and files.no_go is None and files.plots is None:
         return SurveyZones(place, grid)
     notes: list[str] = []
     shape = grid.height, grid.width
 
-    def placed(source: str, *, named_by: str | None = None, needed: bool = True) -> dict[str, BaseGeometry]:
+    def read(source: str, *, named_by: str | None = None, needed: bool = True) -> dict[str, BaseGeometry]:
         found = _read(source, place, notes, named_by)
         shapes = {name: on_field(one, found.crs, place) for name, one in found.shapes.items()}
         if all(one.is_empty for one in shapes.values()):
@@ -97,13 +97,13 @@ def open_zones(files: ZoneChoice, place: FieldPlace, grid: SceneGrid) -> SurveyZ
             notes.append(_format_beside(found, place))
         return shapes
 
-    area = None if files.area is None else tuple(placed(files.area).values())
-    no_go = None if files.no_go is None else tuple(placed(files.no_go, needed=False).values())
-    plots = None if files.plots is None else placed(files.plots, named_by=files.plots_name)
+    area = None if files.area is None else tuple(read(files.area).values())
+    no_go = None if files.no_go is None else tuple(read(files.no_go, needed=False).values())
+    plots = None if files.plots is None else read(files.plots, named_by=files.plots_name)
     inside = None if area is None else pixels_inside(area, shape)
     if inside is not None and not inside.any():
         raise ZoneError(
-            f"the area of {files.area} holds no pixel's centre: it is smaller than a pixel of this field"
+            f"the area of {files.area} contains no pixel centre: it is smaller than a pixel of this field"
             f"{_format_pixels(place)}; give a larger one, or leave it out"
         )
     kept = field_zones(inside, None if no_go is None else pixels_inside(no_go, shape, touched=True))
@@ -114,25 +114,25 @@ def open_zones(files: ZoneChoice, place: FieldPlace, grid: SceneGrid) -> SurveyZ
 
 
 def _read(source: str, place: FieldPlace, notes: list[str], named_by: str | None) -> ZoneFile:
-    """Read a file of polygons with the CRS that they are meant in; pixels where nothing else is known."""
+    """Read a file of polygons with its CRS; pixels on a field without georeference."""
     found = read_zones(source, named_by=named_by)
     notes += found.notes
     if place.crs is None and found.crs is not None:
         raise ZoneError(
-            f"{source} is in {found.crs.name}, and this field has no place: give the rig's [pose], a "
+            f"{source} is in {found.crs.name}, and this field has no georeference: give the rig's [pose], a "
             "georeferenced scene, or polygons in pixels of the scene as GeoJSON without a CRS"
         )
     if place.crs is None:
-        notes.append(f"{source} is taken in pixels of the scene, x to the right and y down from its upper left corner")
+        notes.append(f"{source} is in pixels of the scene, x to the right and y down from its upper left corner")
     elif found.crs is None and not source.lower().endswith(GEOJSON):
-        raise ZoneError(f"{source} does not say its CRS; save it with one (a shapefile has it in a .prj beside it)")
+        raise ZoneError(f"{source} has no CRS; save it with one (a shapefile needs a .prj file)")
     elif found.crs is None:
         return ZoneFile(source, pyproj.CRS.from_epsg(WGS84), found.shapes, found.notes)
     return found
 
 
 def _format_beside(found: ZoneFile, place: FieldPlace) -> str:
-    """Return where polygons and field lie, of which none lies on it."""
+    """Return a message on polygons that do not overlap the field, with the bounds of both."""
     if found.crs is None or place.crs is None:
         unit, here, there = "px", _bounds([one.bounds for one in found.shapes.values()]), place.outline.bounds
         spans = [
@@ -151,7 +151,7 @@ def _format_beside(found: ZoneFile, place: FieldPlace) -> str:
 
 
 def _bounds(of_each: Sequence[tuple[float, float, float, float]]) -> tuple[float, float, float, float]:
-    """Return west, south, east and north of all polygons by those of each."""
+    """Return west, south, east and north of all polygons together."""
     each = np.array(of_each)
     west, south = each[:, :2].min(axis=0).tolist()
     east, north = each[:, 2:].max(axis=0).tolist()
@@ -159,7 +159,7 @@ def _bounds(of_each: Sequence[tuple[float, float, float, float]]) -> tuple[float
 
 
 def _format_pixels(place: FieldPlace) -> str:
-    """Return how large a pixel is, where that is known."""
+    """Return the pixel size as text; empty where it is unknown."""
     rows, columns = place.shape
     middle = place.pixel_areas_m2(slice(rows // 2, rows // 2 + 1), slice(columns // 2, columns // 2 + 1))
     return "" if middle is None else f" ({float(np.sqrt(middle[0, 0])):.3g} m)"

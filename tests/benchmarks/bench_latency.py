@@ -118,8 +118,8 @@ def _watched(moments: Moments) -> Iterator[None]:
 
 def _survey(stack: ExitStack, settings: Settings, moments: Moments) -> None:
     from flows.survey import draw_class_map
-    from flows.tasks.observer import Observer
     from flows.tasks.open_survey import OpenSurvey
+    from flows.tasks.prefect_tasks import Observer
     from flows.tasks.run import make_source, open_run
     from flows.tasks.stages.effects import chosen_effects
     from pipeline.rig.emulator.emulated_rig import EmulatedRig

@@ -23,7 +23,7 @@ from rich.console import Console
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.tasks import scene as scenes
-from flows.tasks.later_passes import LaterPasses
+from flows.tasks.stages.attention import LaterPasses
 from pipeline.geometry.grid import patch_pixels
 from pipeline.planning.fine_pass import FinePlan
 from pipeline.simulator.scenes.farm.farm_plan import CLASSES

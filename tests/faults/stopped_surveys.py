@@ -33,7 +33,7 @@ from tests.receipts import comparable
 
 BANDS = ",".join(str(band) for band in range(4, 268, 8))
 SURVEY = f"survey --scene farm --size 256x256 --bands {BANDS} --seed 5 --budget 0.8 --keep raw"
-GOING_ON = "terminated; the same command goes on from here"
+GOING_ON = "terminated; run the same command to resume"
 IMPORTING_S = 0.5  # in which nothing has begun, and nobody hears
 ENDS_WITHIN_S = 60.0
 KILLS = (100, 3)  # in full and quickly

@@ -29,7 +29,7 @@ from tests.faults.small_survey import Subject, problems, stored, words, wrong_af
 from tests.flows.small_fields import write_field, write_weights
 from tests.receipts import comparable
 
-GOING_ON = "terminated; the same command goes on from here"
+GOING_ON = "terminated; run the same command to resume"
 SYNCS = (2, 60)  # of a survey's files, before which it is stopped
 TAKEN = 9  # lines of a sweep
 CODES = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: TERMINATED}

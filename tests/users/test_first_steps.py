@@ -198,7 +198,7 @@ def test_init_says_why_it_cannot_write(
 @pytest.mark.parametrize("visit", ["01.06.2026", "6/1/2026", "2026.06.01", "2026-6-1", "01-06-26", "01.06.2026 noon"])
 def test_a_date_in_another_form_is_no_word(visit: str) -> None:
     """Days between visits are counted by dates in one form, which the message shows."""
-    with pytest.raises(SettingsError, match=r"visit must be words, or a date as year-month-day \(2026-06-01\)"):
+    with pytest.raises(SettingsError, match=r"visit must be text, or a date as YYYY-MM-DD"):
         load_settings(None, {"scene": "farm", "visit": visit})
 
 

@@ -242,7 +242,7 @@ def test_a_pose_is_the_one_place_of_a_run(tmp_path: Path, weights: Path) -> None
     }
     with without_effects():
         run = run_survey(load_settings(words, {**flags, "budget": 0.8, "accuracy": False, "controls": False}), QUIET)
-    assert any("set aside: [pose] says where it lies" in note for note in run.receipt["settings"]["notes"])
+    assert any("[pose] replaces the georeference" in note for note in run.receipt["settings"]["notes"])
     assert "spatial_ref" not in opened(run, "class_map")
     assert "spatial_ref" in opened(run, "ground_map")
 

@@ -79,7 +79,7 @@ def test_a_score_on_a_scene_of_the_training_says_so_in_its_sentence(
     labels = ["--labels", str(made / "field" / "labels" / "t1.tif")]
     for words in ([], ["--bands", "0-8"]):
         said, receipt = survey(command_line, made, scene, tmp_path / "a", *labels, *words)
-        sentence = "of 100 against the truth on a scene of the training, which says nothing of other fields ("
+        sentence = "of 100 against the truth on a training scene (not valid for other fields) ("
         assert sentence in said
         assert receipt["training_scene"] == "all"
         page = (open_archive(tmp_path / "a").latest.folder / "report.html").read_text()
@@ -96,7 +96,7 @@ def test_a_field_of_tiles_tells_that_some_are_scenes_of_the_training(
 ) -> None:
     """Three of the four tiles taught the weights."""
     said, receipt = survey(command_line, made, made / "field" / "images", tmp_path / "a")
-    assert "against the truth on a field some tiles of which are scenes of the training" in said
+    assert "against the truth on a field with tiles of the training" in said
     assert receipt["training_scene"] == "tiles"
 
 
@@ -111,9 +111,9 @@ def test_what_training_writes_of_13_bands_opens(made: Path) -> None:
 def test_the_bands_of_the_training_are_within_the_training(made: Path, tmp_path: Path, command_line: Any) -> None:
     """No note of columns that training itself did not reach; other bands still bring one, of those that it did."""
     said, _ = survey(command_line, made, made / "field" / "images" / "t0.tif", tmp_path / "a")
-    assert "spectral columns" not in said
+    assert "spectral features" not in said
     said, _ = survey(command_line, made, made / "field" / "images" / "t0.tif", tmp_path / "a", "--bands", "0-8")
-    assert "the bands reach 5 of the weights' 12 spectral columns" in said
+    assert "the bands cover 5 of the weights' 12 spectral features" in said
 
 
 def test_what_a_run_left_is_written_as_netcdf_and_zarr(made: Path, tmp_path: Path, command_line: Any) -> None:

@@ -315,7 +315,7 @@ BAD: dict[str, tuple[Fault, list[str], str]] = {
     "a part of the field": (
         lambda at: None,
         ["--extent", "part", "--seconds", "5"],
-        "--extent = 'part' chooses lines and exposures for a camera that looks again",
+        "--extent = 'part' chooses lines to capture",
     ),
     "two scans": (
         lambda at: None,

@@ -1,7 +1,6 @@
-"""Judging a map by labels: its own accuracy, and what no detail, all detail and other placements would have given.
+"""Define the stage that evaluates a map by labels: its accuracy, and that of no, all and other fine patches.
 
-A stage like the others, but outside the survey's savings: it looks at the whole scene in full and needs labels. Labels
-come with simulated fields alone, which memory holds as well. Controls read the whole field as one region.
+It needs labels and does not count as cost of the survey. Controls read the whole field as one region.
 """
 
 from __future__ import annotations
@@ -74,35 +73,35 @@ def evaluate(
     seed: int,
     report: Report,
 ) -> Wanted:
-    """Judge the map by the labels, and other placements, with the survey's effects; no part of the survey's cost.
+    """Evaluate the map by the labels, and with controls other placements of fine patches.
 
-    ``sources`` are the effects of what was captured and where its sweeps lie; a raster has neither.
+    ``sources`` are the effects and the registration of the capture; a raster has neither.
     """
     off = map_offset(simulated, sources[1:])
     labels = moved_labels(labels, off, plan.along)
 
     def build(path: Path) -> None:
-        """Write the figures of the map, of the coarse pass alone and, where asked for, of other placements."""
+        """Write the figures of the map, of the overview alone and, with controls, of other placements."""
         weights, grid, drawn = load(), frame.grid, load_class_map(class_map.path / "class_map.zarr")
         names, classes = weights.class_names, drawn.classes
-        judged = np.where(classes == UNLABELLED, np.uint8(UNLABELLED), labels)  # what has no class is not
-        counts = confusion(judged, classes, len(drawn.names))  # with the class unknown, which no label has
+        judged = np.where(classes == UNLABELLED, np.uint8(UNLABELLED), labels)  # only pixels with a class
+        counts = confusion(judged, classes, len(drawn.names))  # includes the class unknown
         result: dict[str, Any] = map_figures(names, counts) | {"confusion": counts.tolist()}
         image = mosaic.path / "mosaic.zarr"
         result["none"] = map_figures(names, _confusion_of_overview(weights, image, grid, capture, judged))
         result |= {"all": {"miou": None, "per_class_iou": {}}, "gap_closed": None, "controls": {}}
         if controls:
-            seen = coarse_region(weights, image, whole_field(grid), capture)
-            columns = seen.patches(np.arange(int(np.prod(grid.patch_shape))))
+            coarse = coarse_region(weights, image, whole_field(grid), capture)
+            columns = coarse.patches(np.arange(int(np.prod(grid.patch_shape))))
             fraction, valid = CONTROL_FRACTION, grid.valid_fraction().ravel() > 0
             among = valid if zones.fractions is None else valid & (zones.fractions > 0)
-            if chooses:  # as many as were read
+            if chooses:
                 read = len(read_in_full(attention, class_map))
                 fraction = read / max(int(among.sum()), 1)
             rows = count(1)
             found = run_controls(
                 weights,
-                read_coarse_prediction(weights, seen),
+                read_coarse_prediction(weights, coarse),
                 columns,
                 judged,
                 fraction=fraction,
@@ -112,9 +111,9 @@ def evaluate(
             )
             figures = map_figures(names, found.every)
             gap = gap_closed(result["miou"], result["none"]["miou"], figures["miou"])
-            shown = {"controls": found.as_dict(), "controls_fraction": found.fraction}
-            result |= {"all": figures, "gap_closed": gap, **shown}
-        (path / RECORD).write_text(to_json(result), encoding="utf-8")  # no NaN, which JSON does not know
+            compared = {"controls": found.as_dict(), "controls_fraction": found.fraction}
+            result |= {"all": figures, "gap_closed": gap, **compared}
+        (path / RECORD).write_text(to_json(result), encoding="utf-8")  # JSON without NaN
 
     params = {**model_key, "labels": array_digest(labels), "controls": controls, **source_key}
     return Wanted(build, params, [mosaic, attention, class_map, *sources])
@@ -123,7 +122,7 @@ def evaluate(
 def _confusion_of_overview(
     weights: Weights, mosaic: Path, grid: SceneGrid, capture: LineSpec, labels: NDArray[np.uint8]
 ) -> NDArray[np.int64]:
-    """Count (class, class) pixels of the map that the overview alone gives, region by region as surveys draw it."""
+    """Return the confusion matrix (class, class) of the overview alone, region by region as in surveys."""
     empty = np.empty((0, grid.patch, grid.patch, weights.basis.columns), np.float32)
     counts = np.zeros((weights.config.classes,) * 2, np.int64)
     for region in plan_regions(grid, SHARD):
@@ -134,9 +133,9 @@ def _confusion_of_overview(
 
 
 def map_offset(simulated: SimulatedSource, pointing: Sequence[StageRef]) -> NDArray[np.float64]:
-    """Return how far the map lies beside the scene, (along, scan) px: what the sweep that registration held is off by.
+    """Return the offset of the map from the scene, (along, scan) px: the pointing error of the reference sweep.
 
-    Overlaps tie sweeps to each other and not to the ground. Only the simulator knows the rest.
+    Registration corrects relative errors only. The simulator knows the absolute one.
     """
     errors = simulated.pointing
     if not isinstance(errors, PointingErrors) or not pointing:
@@ -145,7 +144,7 @@ def map_offset(simulated: SimulatedSource, pointing: Sequence[StageRef]) -> NDAr
 
 
 def moved_labels(labels: NDArray[np.uint8], off: NDArray[np.float64], along: Axis) -> NDArray[np.uint8]:
-    """Return labels as the map shows the scene, to the nearest pixel; what it shows beyond them is unlabelled."""
+    """Return labels shifted to the map, to the nearest pixel; pixels beyond them are unlabelled."""
     down, across = np.rint(off[::-1] if along == "x" else off).astype(int)
     rows, columns = (np.arange(size) + by for size, by in zip(labels.shape, (down, across), strict=True))
     inside = ((rows >= 0) & (rows < labels.shape[0]))[:, None] & ((columns >= 0) & (columns < labels.shape[1]))
@@ -154,7 +153,7 @@ def moved_labels(labels: NDArray[np.uint8], off: NDArray[np.float64], along: Axi
 
 
 def map_figures(names: Sequence[str], counts: NDArray[np.int64]) -> dict[str, Any]:
-    """Return what is said of a map; every map of a run is judged by the same labels, so over the same classes."""
+    """Return the figures of a map from its confusion matrix."""
     known = len(names)
     false = zip(names, false_pixels(counts)[:known].tolist(), strict=True)
     unknown = {} if len(counts) == known else {"unknown_px": int(counts[:, known].sum())}
@@ -182,10 +181,9 @@ def columns_of_raster(
     memory: int,
     report: Report = lambda done: None,
 ) -> NDArray[np.float32]:
-    """Read all pixels of a raster some rows at a time, and keep the normalised columns only.
+    """Return the normalised spectral features of all pixels of a raster, read in blocks of rows.
 
-    Gives (patch, p, p, column) float32 of the padded grid; patches beyond the raster, and pixels without a value, are
-    0. ``memory`` is in bytes.
+    The shape is (patch, p, p, column), float32, of the padded grid; nodata is 0. ``memory`` is in bytes.
     """
     p, valid, done = raster.grid.patch, raster.grid.valid_patches(), 0
     columns = np.zeros((int(np.prod(raster.grid.patch_shape)), p, p, weights.basis.columns), np.float32)
@@ -197,7 +195,7 @@ def columns_of_raster(
     return columns
 
 
-MEMORY_FRACTION = 32  # a band of patches may take this part of the memory
+MEMORY_FRACTION = 32  # of the memory for a band of patches
 
 
 def columns_of_all_patches(
@@ -210,9 +208,10 @@ def columns_of_all_patches(
     resampling: Kernel,
     report: Report = lambda done: None,
 ) -> NDArray[np.float32]:
-    """Scan the scene in full, a band of patches at a time, and keep the normalised columns only.
+    """Return the normalised spectral features of a full scan, computed in bands of patches.
 
-    Gives (patch, p, p, column) float32 of the padded grid; patches beyond the scene are 0. ``memory`` is in bytes.
+    The shape is (patch, p, p, column), float32, of the padded grid; patches beyond the scene are 0. ``memory`` is in
+    bytes.
     """
     sweeps = [SimulatedSweep(source, sweep) for sweep in full]
     bands = source.wavelength_nm
@@ -232,11 +231,11 @@ def columns_of_sweeps(
     resampling: Kernel,
     report: Report = lambda done: None,
 ) -> NDArray[np.float32]:
-    """Rectify sweeps over a whole scene, a band of patches at a time; see `columns_of_all_patches`."""
+    """Return the normalised spectral features of sweeps over a whole scene; see `columns_of_all_patches`."""
     p, valid = grid.patch, grid.valid_patches()
     columns = np.zeros((int(np.prod(grid.patch_shape)), p, p, weights.basis.columns), np.float32)
     row, column = np.divmod(valid, grid.patch_shape[1])
-    place = row if sweeps[0].sweep.along == "x" else column  # bands lie across the scan, as deep as fits
+    place = row if sweeps[0].sweep.along == "x" else column
     one = int(np.count_nonzero(place == 0)) * p**2 * len(wavelength_nm) * 4
     deep = max(1, memory // MEMORY_FRACTION // one)
     done = 0

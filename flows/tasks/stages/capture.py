@@ -1,4 +1,4 @@
-"""The stages that take sweeps: lines into the spool as they come, and from there into one cube a sweep."""
+"""Define the stages that capture sweeps: lines go to a spool, and to one raw cube per sweep."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ from storage.arrays.statistics import write_statistics
 from storage.parallel.pool import WorkerPool
 
 RAW = Product("capture", version=12)
-RIG_RECORD = "rig.json"  # beside the cubes: what a rig's captures were like
+RIG_RECORD = "rig.json"  # record of a rig's captures, beside the cubes
 
 
 @stage("capture_coarse", "coarse sweep", RAW, inputs=1, retries=2, named="raw_coarse")
 def capture_coarse(effects: StageRef, *, plan: CapturePlan, recorder: SweepRecorder, report: Report) -> Wanted:
-    """Sweep the whole field once, fast."""
+    """Capture the first pass, or the uniform scan."""
     return recorder.wanted(plan.coarse, [effects], report)
 
 
@@ -47,17 +47,17 @@ def capture_coarse(effects: StageRef, *, plan: CapturePlan, recorder: SweepRecor
 def capture_fine(
     attention: StageRef, effects: StageRef, *, plan: CapturePlan, recorder: SweepRecorder, report: Report
 ) -> Wanted:
-    """Go back for the places that the plan chose."""
+    """Capture the second pass."""
     return recorder.wanted(load_plan(attention).sweeps, [attention, effects], report, begins_s=plan.coarse_s)
 
 
 @dataclass(frozen=True)
 class SweepRecorder:
-    """Takes sweeps of a field into an archive: who takes the lines, and what is known of them before."""
+    """Recorder of sweeps of a field: archive, source and parameters of the lines."""
 
     archive: Archive
     source: FieldSource
-    source_key: Mapping[str, Any]  # what the captured light depends on, beside the sweeps and the effects
+    source_key: Mapping[str, Any]  # parameters of the captured light, without sweeps and effects
     wavelength_nm: NDArray[np.float64]
     fwhm_nm: NDArray[np.float64] | None
     camera: LineCamera
@@ -67,17 +67,17 @@ class SweepRecorder:
     def wanted(
         self, sweeps: Sequence[Sweep], inputs: Sequence[StageRef], report: Report, *, begins_s: float = 0.0
     ) -> Wanted:
-        """Want some sweeps, one after the other from ``begins_s`` on, with the effects of the last of the inputs."""
+        """Request sweeps, one after the other from ``begins_s`` on, with the effects of the last input."""
         clock = sweep_starts(sweeps, self.camera, self.cost, after_s=begins_s)
         params = {**self.source_key, "sweeps": [asdict(sweep) for sweep in sweeps], "starts_s": list(clock.values())}
         key = stage_key(RAW.name, RAW.version, params, [ref.key for ref in inputs])
         total = sum(sweep.lines for sweep in sweeps) or 1
 
         def build(path: Path) -> None:
-            """Take the sweeps one after the other, and write what the source recorded beside their cubes."""
+            """Capture the sweeps one after the other, and write the record of the source beside their cubes."""
             found = SignalStatistics(len(self.wavelength_nm), sum(one.lines for one in sweeps) * self.camera.samples)
             before, manifest = 0, load_manifest(inputs[-1]) if self.source.simulates else None
-            report(0.0)  # a rig is at work long before its first line is here
+            report(0.0)  # before the first line, which takes a rig some time
             folder, lit = self.archive.spool_folder(key), self.source.lit(chosen_effects(inputs[-1]), clock)
             with lit.opened(folder) as source:
                 for sweep in sweeps:
@@ -103,10 +103,9 @@ class SweepRecorder:
         found: SignalStatistics,
         taken: Callable[[int], None],
     ) -> None:
-        """Take lines into the spool and then the cube, one by one, from where a broken capture stopped.
+        """Write lines into spool and cube, one by one, and resume a stopped capture.
 
-        Lines that were lost since are asked for again; a rig captures nothing for them, and what it cannot give is
-        invalid.
+        Damaged lines of the spool are requested again; a rig reads them from its files, or marks them invalid.
         """
         references = source.references(sweep)
         header = SweepHeader(sweep, references, self.wavelength_nm, self.fwhm_nm, source.name, simulation=effects)
@@ -140,16 +139,13 @@ Take = Callable[[Line], None]
 def take_lines(
     source: Source, sweep: Sweep, take: Take, pool: WorkerPool, *, first: int = 0, at_once: int = BLOCK_LINES
 ) -> None:
-    """Give ``take`` the sweep's lines one by one, in order, from line ``first`` on.
+    """Call ``take`` with the lines of a sweep, in order, from line ``first`` on.
 
-    ``take`` is called in this thread while others render. Beside one block of ``at_once`` lines for each worker there
-    is one more, so that nobody waits while lines are taken. Where ``take`` raises, what was rendered ahead is lost;
-    what the first block that cannot be rendered raises comes once the lines before it are taken. A source that is no
-    simulation gives its lines when it has them. Neither the number of workers nor the size of blocks changes a line.
+    Worker threads render a simulated sweep in blocks of ``at_once`` lines, one block more than there are workers;
+    ``take`` runs in this thread. Errors of ``take`` discard the lines rendered ahead. An error of a block is raised
+    after the lines before it. The number of workers and the size of blocks do not change the lines.
     """
-    workers = WorkerPool(
-        "threads", pool.workers
-    ).count  # whoever else makes blocks: the scene lies in this process's memory
+    workers = WorkerPool("threads", pool.workers).count  # the scene is in the memory of this process
     if workers == 1 or not isinstance(source, SimulatedSource):
         for line in source.lines(sweep, first):
             take(line)

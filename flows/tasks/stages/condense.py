@@ -1,88 +1,62 @@
-"""The stage that condenses lines: to the components of the field's spectra that rise above the noise."""
+"""Define the stages that compress lines, or a raster, into components of spectra that exceed the noise."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import reduce
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from flows.settings.survey_settings import SignalChoice
+from flows.settings.survey_settings import RASTER, SignalChoice
 from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
 from flows.tasks.stages.capture import RIG_RECORD
-from flows.tasks.stages.placement import MOSAIC_STEP
+from flows.tasks.stages.placement import MOSAIC, MOSAIC_STEP, finish_mosaic
 from flows.terminal.figures import format_bytes
 from pipeline.errors import BudgetError, IncompleteStoreError
 from pipeline.geometry.camera import LineCamera
+from pipeline.readings import MOST_VALUE, readings_alone
 from pipeline.signal.calibrate import number_values
 from pipeline.signal.components import Components
-from pipeline.signal.condense import RESIDUAL_STEP, ResidualLaw, score_lines, whole_steps
+from pipeline.signal.condense import RESIDUAL_STEP, UNUSABLE, ResidualLaw, score_lines, whole_steps
 from pipeline.signal.lines import BLOCK_LINES
 from pipeline.signal.subspace import FEW_BANDS, SignalStatistics, bands_alone, components_of_field, with_shared
 from pipeline.signal.sweep_signal import CondensedSweep, Condenser, calibrated_blocks, differing_lines
+from pipeline.simulator.scenes.scene import RasterScene
 from storage.archive.keys import StageRef
 from storage.archive.manifests import check_files, read_table, write_table
 from storage.arrays.cubes import RawCube, SweepHeader, open_raw_cubes
-from storage.arrays.layout import numbers_in_memory
+from storage.arrays.layout import SHARD_ROWS, numbers_in_memory
+from storage.arrays.mosaics import MosaicWriter
 from storage.arrays.signal_cubes import LineRows, SignalCubeWriter, open_signal_cubes
 from storage.arrays.spool import line_values
 from storage.arrays.statistics import read_statistics
+from storage.readers.raster_fields import RasterPixels
 
 SIGNAL = Product("condense", version=1)
 SIGNAL_FINE = Product("condense_fine", version=2)
 RECORD = "signal.json"
-SHARED_FRACTION = 2e-3  # of all spectra: of more rare ones, a component is cheaper than their residuals
-COARSER = (1.5, 2.0, 3.0, 4.0, 6.0)  # steps that a limit of bytes may ask for [noise's deviations]
-SAMPLED_BLOCKS = 8  # of lines, by which bytes are foretold
-MOST_RARE = 0.05  # of spectra: more are no exceptions, and raw lines stay
-
-
-@stage("condense_coarse", "signal of the sweeps", SIGNAL, named="signal_coarse")
-def condense_coarse(
-    raw: StageRef,
-    *,
-    camera: LineCamera,
-    signal: SignalChoice,
-    kept_bytes: int | None,
-    frame: FieldFrame,
-    report: Report,
-) -> Wanted:
-    """Condense the sweeps of the first pass, or of a uniform scan, with its mosaic in at most ``kept_bytes``."""
-    limit = None if kept_bytes is None else KeptBytes(kept_bytes, frame.grid.height * frame.grid.width)
-    return _condensed([raw], camera, signal, report, limit)
-
-
-@stage("condense_fine", "signal of all passes", SIGNAL_FINE, named="signal_fine")
-def condense_fine(
-    raw: StageRef,
-    raw_first: StageRef,
-    *,
-    camera: LineCamera,
-    signal: SignalChoice,
-    kept_bytes: int | None,
-    frame: FieldFrame,
-    report: Report,
-) -> Wanted:
-    """Condense the sweeps of the later passes and those of the first by common components, so that lines merge."""
-    limit = None if kept_bytes is None else KeptBytes(kept_bytes, frame.grid.height * frame.grid.width)
-    return _condensed([raw, raw_first], camera, signal, report, limit)
+SHARED_FRACTION = 2e-3  # of rare spectra, from which on a component takes less space than residuals
+COARSER = (1.5, 2.0, 3.0, 4.0, 6.0)  # quantisation steps for a limit of bytes [standard deviations of the noise]
+SAMPLED_BLOCKS = 8  # of lines, to estimate bytes
+MOST_RARE = 0.05  # fraction of spectra, above which raw lines are kept
 
 
 @dataclass(frozen=True)
 class KeptBytes:
-    """Limit of bytes for the scores of lines and of the mosaic made of them."""
+    """Limit of bytes for the scores of lines and mosaic."""
 
     most: int
     mosaic_px: int
 
     def step(self, cubes: Sequence[RawCube], components: Components, camera: LineCamera, finest: float) -> float:
-        """Return the finest step in which they fit, by lines here and there from all sweeps.
+        """Return the finest quantisation step that fits, estimated from samples of all sweeps.
 
-        Raises BudgetError: not even the coarsest does; names the least that is enough.
+        Raises BudgetError: the coarsest step does not fit; names its bytes.
         """
         blocks = [(cube, block) for cube in cubes for block in range(-(-cube.shape[0] // BLOCK_LINES))]
         some = blocks[:: max(1, len(blocks) // SAMPLED_BLOCKS)]
@@ -104,28 +78,34 @@ class KeptBytes:
             if least <= self.most:
                 return step
         raise BudgetError(
-            f"--kept-bytes {self.most} does not hold the scores of lines and mosaic: in the coarsest steps they take "
-            f"{format_bytes(least)}; raw lines stay until a larger one is given"
+            f"--kept-bytes {self.most} is too small for the scores of lines and mosaic, which take at least "
+            f"{format_bytes(least)}; give more"
         )
 
 
-def _condensed(
-    passes: Sequence[StageRef], camera: LineCamera, choice: SignalChoice, report: Report, limit: KeptBytes | None
+def condense(
+    *passes: StageRef,
+    camera: LineCamera,
+    signal: SignalChoice,
+    kept_bytes: int | None,
+    frame: FieldFrame,
+    report: Report,
 ) -> Wanted:
-    """Want the condensed sweeps of some captures."""
+    """Compress the sweeps of all passes with common components; scores and mosaic take at most ``kept_bytes``."""
+    limit = None if kept_bytes is None else KeptBytes(kept_bytes, frame.grid.height * frame.grid.width)
 
     def build(path: Path) -> None:
-        """Find the components of all lines, and write every sweep's scores; once more where rare spectra share some."""
+        """Compute the components, and write the scores of every sweep; again if rare spectra share components."""
         captured = [(open_raw_cubes(raw.path), read_statistics(raw.path)) for raw in passes]
         cubes = [cube for of_pass, _ in captured for cube in of_pass]
         found = reduce(SignalStatistics.merged, (statistics for _, statistics in captured))
-        components = components_of(found, cubes, choice)
-        step = choice.step if limit is None else limit.step(cubes, components, camera, choice.step)
+        components = components_of(found, cubes, signal)
+        step = signal.step if limit is None else limit.step(cubes, components, camera, signal.step)
         law = ResidualLaw.learned(found.spectra, components)
-        condenser = Condenser(components, law, camera, choice.rare_spectra, step)
+        condenser = Condenser(components, law, camera, signal.rare_spectra, step)
 
         def written(condenser: Condenser) -> list[CondensedSweep]:
-            """Write every sweep, by the noise of its own pass: exposures differ."""
+            """Write every sweep with the noise model of its own pass, since exposures differ."""
             of_passes = []
             for of_pass, statistics in captured:
                 law = condenser.law if len(passes) == 1 else ResidualLaw.learned(statistics.spectra, components)
@@ -133,22 +113,26 @@ def _condensed(
             return _write_sweeps(path, of_passes, found, report)
 
         done = written(condenser)
-        better = with_shared_directions(condenser, done, found, choice.false_alarm)
+        better = with_shared_directions(condenser, done, found, signal.false_alarm)
         if better is not None:
             condenser, components, done = better, better.components, written(better)
         write_table(path / RECORD, _record(condenser, done))
-        for raw in passes[:1]:
-            if (raw.path / RIG_RECORD).is_file():  # raw lines may go
-                shutil.copyfile(raw.path / RIG_RECORD, path / RIG_RECORD)
+        rig_record = passes[0].path / RIG_RECORD
+        if rig_record.is_file():  # the raw lines may be deleted
+            shutil.copyfile(rig_record, path / RIG_RECORD)
 
-    key = {"camera": {"bits": camera.bits}, **asdict(choice)}  # of a camera scores depend on where it saturates
+    key = {"camera": {"bits": camera.bits}, **asdict(signal)}  # scores depend on the saturation of the camera
     return Wanted(build, key if limit is None else {**key, "kept": asdict(limit)}, list(passes))
+
+
+condense_coarse = stage("condense_coarse", "signal of the sweeps", SIGNAL, named="signal_coarse")(condense)
+condense_fine = stage("condense_fine", "signal of all passes", SIGNAL_FINE, named="signal_fine")(condense)
 
 
 def with_shared_directions(
     condenser: Condenser, done: Sequence[CondensedSweep], found: SignalStatistics, false_alarm: float
 ) -> Condenser | None:
-    """Return a condenser with the directions too that many rare spectra share; None where there are none."""
+    """Return a condenser with additional components that many rare spectra share; None where there are none."""
     rare, spectra = sum(len(one.rare) for one in done), sum(one.known for one in done)
     components = condenser.components
     if rare <= max(2 * components.bands, SHARED_FRACTION * spectra):
@@ -161,14 +145,14 @@ def with_shared_directions(
 
 
 def camera_of(params: Mapping[str, Any]) -> LineCamera:
-    """Return a camera with those values of which the scores of a condensed pass depend, by the pass's parameters."""
+    """Return a camera with the values that scores depend on, from the parameters of a compressed pass."""
     return LineCamera(**params["camera"])
 
 
 def components_of(found: SignalStatistics, cubes: Sequence[RawCube], choice: SignalChoice) -> Components:
-    """Find the components of a pass; few bands are kept as they are, in steps of one number of the camera."""
+    """Return the components of a pass; few bands are kept as they are, in steps of one DN."""
     if found.bands > FEW_BANDS or not found.count:
-        bands = cubes[0].wavelength_nm if cubes else np.zeros(found.bands)  # a pass may have no sweep
+        bands = cubes[0].wavelength_nm if cubes else np.zeros(found.bands)  # a pass without sweeps
         return components_of_field(found, bands, false_alarm=choice.false_alarm, least=choice.least)
     return bands_alone(found, number_values(cubes[0].references))
 
@@ -176,7 +160,7 @@ def components_of(found: SignalStatistics, cubes: Sequence[RawCube], choice: Sig
 def _write_sweeps(
     path: Path, sweeps: Sequence[tuple[RawCube, Condenser]], found: SignalStatistics, report: Report
 ) -> list[CondensedSweep]:
-    """Store the scores of every sweep, and what components do not hold."""
+    """Write scores and residuals of every sweep."""
     origin = np.zeros(found.bands) if found.origin is None else found.origin
     done = []
     for number, (cube, condenser) in enumerate(sweeps):
@@ -200,13 +184,13 @@ def _write_sweeps(
 
 
 def header_of(cube: RawCube) -> SweepHeader:
-    """Return what was known of a stored sweep before its first line."""
+    """Return the header of a stored sweep."""
     bands = cube.wavelength_nm, cube.fwhm_nm
     return SweepHeader(cube.sweep, cube.references, *bands, cube.source, cube.started, cube.simulation)
 
 
 def _record(condenser: Condenser, done: Sequence[CondensedSweep]) -> dict[str, Any]:
-    """Return what receipts and checks want to know of a condensed pass."""
+    """Return the figures of a compressed pass, for receipts and checks."""
     return {
         "components": len(condenser.components),
         "bands": condenser.components.bands,
@@ -217,11 +201,9 @@ def _record(condenser: Condenser, done: Sequence[CondensedSweep]) -> dict[str, A
 
 
 def raw_differs(passes: Sequence[StageRef], signal: StageRef, camera: LineCamera) -> str | None:
-    """Compare every raw line with what was condensed from it; say why raw lines are to stay, None where they may go.
+    """Return why raw lines must be kept, or None if they can be deleted: every line is compared with its scores.
 
-    ``passes`` are the captures in the order in which they were condensed.
-
-    Every byte of the condensed store is read again before, so that rare spectra and components are as published.
+    ``passes`` are the captures in the order of their compression. Before, every byte of the store is verified.
     """
     try:
         check_files(signal.path, hashes=True)
@@ -234,13 +216,13 @@ def _lines_differ(passes: Sequence[StageRef], signal: StageRef, camera: LineCame
     record = read_table(signal.path / RECORD)
     if record["rare"] > MOST_RARE * max(record["spectra"], 1):
         fraction = 100 * record["rare"] / record["spectra"]
-        return f"{fraction:.1f} % of the spectra have more than noise beside {record['components']} components"
+        return f"{record['components']} components leave {fraction:.1f} % of the spectra with residuals above the noise"
     cubes = [cube for raw in passes for cube in open_raw_cubes(raw.path)]
     of_sweep = {stored.sweep: stored for stored in open_signal_cubes(signal.path)}
     if any(cube.sweep not in of_sweep for cube in cubes):
         return "the sweeps of the signal are not those of the raw lines"
     found = reduce(SignalStatistics.merged, (read_statistics(raw.path) for raw in passes))
-    whole = len(cubes) == len(of_sweep)  # else the stored components are all that is known
+    whole = len(cubes) == len(of_sweep)
     few = components_of(found, cubes, SignalChoice()) if found.bands <= FEW_BANDS and whole else None
     for cube in cubes:
         stored = of_sweep[cube.sweep]
@@ -248,3 +230,54 @@ def _lines_differ(passes: Sequence[StageRef], signal: StageRef, camera: LineCame
         if wrong:
             return f"sweep {cube.sweep.name}: {line_values(wrong)} of the signal are not those of the raw lines"
     return None
+
+
+Rows = tuple[int, NDArray[np.float32], NDArray[np.bool_]]
+
+
+@stage("condense_raster", "signal of the raster", MOSAIC, inputs=0)
+def condense_raster(
+    *, raster: RasterPixels, frame: FieldFrame, signal: SignalChoice, scene: RasterScene, memory: int, report: Report
+) -> Wanted:
+    """Compress the pixels of a raster into its mosaic."""
+
+    def blocks() -> Iterator[Rows]:
+        """Yield blocks of rows: first row, values, validity."""
+        deep = max(raster.rows_at_once(memory) // SHARD_ROWS, 1) * SHARD_ROWS
+        for first in range(0, frame.grid.height, deep):
+            values = readings_alone(raster.rows(first, min(first + deep, frame.grid.height)), MOST_VALUE)
+            valid = np.isfinite(values)
+            yield first, values, valid.all(axis=2) if valid.all() else valid
+
+    def build(path: Path) -> None:
+        """Read the raster twice: for components, and for scores."""
+        found, whole = SignalStatistics(raster.bands, frame.grid.height * frame.grid.width), True
+        for first, values, valid in blocks():
+            found.add(values, valid)
+            whole = whole and not np.nanmax(np.abs(values - np.rint(values)), initial=0)
+            report(0.5 * first / frame.grid.height)
+        if raster.bands <= FEW_BANDS and found.count:
+            components = bands_alone(found, 1.0 if whole else None)
+        else:
+            components = components_of_field(
+                found, frame.wavelength_nm, false_alarm=signal.false_alarm, least=signal.least
+            )
+        origin = np.zeros(raster.bands) if found.origin is None else found.origin
+        writer = MosaicWriter(
+            path / "mosaic.zarr",
+            (frame.grid.height, frame.grid.width),
+            components,
+            frame.wavelength_nm,
+            step=signal.step,
+            largest=components.largest(found.largest + np.abs(origin - np.nan_to_num(components.mean))),
+            fwhm_nm=frame.fwhm_nm,
+            grid=frame.angular_grid(),
+        )
+        for first, values, valid in blocks():
+            scored = score_lines(values, valid, components)
+            writer.write_rows(first, scored.scores, scored.quality != UNUSABLE)
+            report(0.5 + 0.5 * (first + len(values)) / frame.grid.height)
+        finish_mosaic(writer, frame)
+
+    params = {"source": RASTER, "scene": scene.key, "grid": asdict(frame.grid), **asdict(signal), **frame.key}
+    return Wanted(build, params | {"bands": raster.bands})

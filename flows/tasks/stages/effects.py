@@ -1,7 +1,7 @@
-"""The stage that decides which effects of the rig are simulated, and how: probed, decided and verified once, then kept.
+"""Define the stage that chooses the simulated effects: it probes, decides and verifies.
 
-Its store is one small table, the manifest: what was computed, what was left out, and why. The captures follow from it,
-and nothing of the scene is drawn to read it. The coarse pass and the scan of everything stand for all sweeps.
+Its store is a table of simulated and omitted effects, with reasons. Captures depend on it. The coarse pass and the full
+scan represent all sweeps.
 """
 
 from __future__ import annotations
@@ -33,10 +33,7 @@ from storage.archive.whole_files import to_json
 
 RECORD = "effects.json"
 MANIFEST = Product("effects", version=9, files=(RECORD,))
-FOOTPRINT = {
-    ROTATION: ROTATION.variants[0],
-    SLIT: SLIT.variants[-1],
-}  # what lines are chosen by: the footprint alone, where lines really lie
+FOOTPRINT = {ROTATION: ROTATION.variants[0], SLIT: SLIT.variants[-1]}  # effects that choose lines for verification
 DRAFT, VERIFIED = 0.3, 1.0
 
 
@@ -53,10 +50,10 @@ def choose_effects(
     tol: Tolerance,
     report: Report,
 ) -> Wanted:
-    """Decide for scene and rig which effects to simulate, and check it on the worst lines of the scene.
+    """Choose the effects to simulate for scene and rig, and verify the choice on the worst lines of the scene.
 
-    Where a rig takes the lines there is nothing to decide. Raises BoundError: what would be left out changes light by
-    more than its bound says; SceneError: the scene holds a number that is not finite.
+    A real rig has no choice. Raises BoundError: omitted effects change light by more than their bound; SceneError: the
+    scene has a value that is not finite.
     """
 
     def write(path: Path, manifest: dict[str, Any]) -> None:
@@ -65,49 +62,47 @@ def choose_effects(
     if not source.simulates:
         return Wanted(lambda path: write(path, {"effects": [], "total": None}), {"source": source.name})
 
-    rig = simulated_rig
-
     def build(path: Path) -> None:
-        """Look at the scene, choose and check."""
-        probes = probe_survey(scene, rig, planned, tol.unit)
-        decision = decide(probes, rig, EFFECTS, tol.value, effects)
+        """Probe the scene, choose effects, and verify them."""
+        probes = probe_survey(scene, simulated_rig, planned, tol.unit)
+        decision = decide(probes, simulated_rig, EFFECTS, tol.value, effects)
         report(DRAFT)
-        measured = {TOTAL: 0.0}  # of everything nothing is left out
+        measured = {TOTAL: 0.0}
         if decision.chosen != decision.exact:
-            clock = sweep_starts(planned, rig.camera, cost)
-            whole = [  # every sweep as one block, each after those before it
-                sweep_block(scene, rig, sweep, range(sweep.lines), seed=seed, started_s=clock[sweep.name])
+            clock = sweep_starts(planned, simulated_rig.camera, cost)
+            whole = [  # each sweep as one block
+                sweep_block(scene, simulated_rig, sweep, range(sweep.lines), seed=seed, started_s=clock[sweep.name])
                 for sweep in planned
             ]
-            measured = _verified(scene, rig, decision, probes, whole, report)
+            measured = _verified(scene, simulated_rig, decision, probes, whole, report)
         write(path, {"effects": list_effects(decision, measured), "total": sum_up(decision, measured)})
         report(VERIFIED)
 
     params = {
         "scene": scene.key,
-        "seed": seed,  # of what is drawn for the lines
+        "seed": seed,
         "asked": effects,
         "tol": str(tol),
-        "camera": asdict(rig.camera),
-        "rig": {name: plain_value(part) for name, part in _parts(rig).items() if name != "camera"},
+        "camera": asdict(simulated_rig.camera),
+        "rig": {name: plain_value(part) for name, part in _parts(simulated_rig).items() if name != "camera"},
         "sweeps": [asdict(sweep) for sweep in planned],
     }
     return Wanted(build, params)
 
 
 def _parts(rig: Rig) -> dict[str, Any]:
-    """Return the rig as tables, without the light that the scene's key has."""
+    """Return the rig as tables, without the light, which is in the key of the scene."""
     parts = asdict(rig)
     return parts | {"sky": {name: value for name, value in parts["sky"].items() if name not in OF_THE_SCENE}}
 
 
 def load_manifest(effects: StageRef) -> dict[str, Any]:
-    """Read what was decided: ``effects``, a row for each, and ``total``."""
+    """Read the table of effects: ``effects``, a row for each, and ``total``."""
     return read_table(effects.path / RECORD)
 
 
 def chosen_effects(effects: StageRef) -> dict[Effect, str]:
-    """Effects that are on, with variants, in the chain's order (IncompleteStoreError: one that is not known here)."""
+    """Return the chosen effects with their variants. Raises IncompleteStoreError: this version lacks one."""
     chosen: dict[Effect, str] = {}
     for row in load_manifest(effects)["effects"]:
         if row["state"] != "on":
@@ -115,7 +110,7 @@ def chosen_effects(effects: StageRef) -> dict[Effect, str]:
         if row["name"] not in BY_NAME or row["variant"] not in BY_NAME[row["name"]].variants:
             raise IncompleteStoreError(
                 f"{effects.uri} has the effect {row['name']}, {row['variant']}, which this version does not know;"
-                " discard the store to have it made again"
+                " delete the store to compute it again"
             )
         chosen[BY_NAME[row["name"]]] = row["variant"]
     return chosen
@@ -124,7 +119,7 @@ def chosen_effects(effects: StageRef) -> dict[Effect, str]:
 def source_with(
     source: SimulatedSource, effects: StageRef, clock: Mapping[str, float] | None = None
 ) -> SimulatedSource:
-    """Give the source with the effects that were decided; ``clock`` says when its sweeps start, by name [s]."""
+    """Return the source with the chosen effects; ``clock`` has the start of each sweep by name [s]."""
     return replace(source, chosen=chosen_effects(effects), clock=clock)
 
 
@@ -136,7 +131,7 @@ def _verified(
     whole: Sequence[SweepBlock],
     report: Report,
 ) -> dict[str, float]:
-    """Measure what is left out on the worst lines of the ``whole`` sweeps, in the unit of the tolerance."""
+    """Measure the error of omitted effects on the worst lines of the sweeps, in the unit of the tolerance."""
 
     def units(light: Radiance, binning: int) -> Radiance:
         return unit_at(light, rig, decision.unit, binning)
@@ -146,7 +141,7 @@ def _verified(
     def render(block: SweepBlock, chosen: Mapping[Effect, str]) -> Radiance:
         nonlocal renders
         renders += 1
-        report(DRAFT + (VERIFIED - DRAFT) * renders / (renders + len(EFFECTS)))  # how many there will be is open
+        report(DRAFT + (VERIFIED - DRAFT) * renders / (renders + len(EFFECTS)))  # their number is not known before
         return expected_light(scene, block, chosen)
 
     candidates = [

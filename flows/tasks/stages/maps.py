@@ -1,4 +1,4 @@
-"""The stage that draws the class map, from the mosaics of a field and from what is remembered of the field."""
+"""Define the stages that segment the mosaic, with the prior map of the field, and project the map to the ground."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from flows.settings.survey_settings import MapChoice
 from flows.tasks.drawing import Drawing, UnknownRule, draw_field
 from flows.tasks.field_prior_map import FieldPriorMap, prior_map_lies, whole_pixels
 from flows.tasks.field_work import FieldWork, region_params
@@ -20,6 +22,8 @@ from models.network.spectral import LineSpec
 from models.reading.prior_map import TemporalAgreement, changed_fractions
 from models.weights.parts import OodPart, ReaderPart
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
+from pipeline.ground.field_places import PosedField, areas_by_number
+from pipeline.ground.map_grid import GroundGrid, image_at, map_blocks, nearest_at
 from pipeline.rectify.registration.alignment import FieldShift
 from storage.archive.keys import StageRef
 from storage.archive.manifests import write_table
@@ -31,16 +35,19 @@ from storage.arrays.class_maps import (
     create_class_map,
     create_probabilities,
     drop_changes,
+    load_class_map,
     with_unknown,
     write_changes,
 )
+from storage.arrays.ground_maps import BLOCK, GroundMapWriter
 from storage.arrays.layout import NO_CLASS, blank_pixels
-from storage.arrays.mosaics import Attention, write_attention
+from storage.arrays.mosaics import Attention, open_mosaic, write_attention
+from storage.arrays.quicklooks import choose_bands, develop, stretch
 
 CLASS_MAP = Product("segment", version=14, files=("class_map.zarr", "class_probabilities.zarr"), by_weights=True)
-OUT_OF_RANGE = "out_of_range.json"  # beside a map, where values were no readings
-LEFT_OUT = "left_out.npy"  # beside a map while it is drawn: the pixels of which none is
-MOST_TURN_PX = 12.0  # that a field's corners may lie off by, as it is turned, so that its memory is of use
+OUT_OF_RANGE = "out_of_range.json"  # beside a map with values out of range
+LEFT_OUT = "left_out.npy"  # pixels outside of zones, while the map is drawn
+MOST_TURN_PX = 12.0  # greatest offset of the corners by rotation, at which a prior map is used
 
 
 @stage("segment", "class map", CLASS_MAP)
@@ -62,15 +69,15 @@ def segment(
     model_key: dict[str, Any],
     report: Report,
 ) -> Wanted:
-    """Draw the class map region by region, in detail where patches were chosen; no class where the scene has no value.
+    """Segment the mosaic region by region, at full resolution where patches were chosen; nodata pixels have no class.
 
-    ``capture`` says how the mosaic's pixels were captured, where it does not say so itself. With ``least_gain`` patches
-    are chosen region by region, by what the policy expects of them.
+    ``capture`` is the capture of pixels for which the mosaic has none. With ``least_gain``, patches are chosen here,
+    by their expected gain.
     """
     grid, left_out, inputs = frame.grid, zones.left_out, [mosaic, attention]
 
     def build(path: Path) -> None:
-        """Draw the map and what is believed; once more without the memory, where that is put aside."""
+        """Write class map and class probabilities; again without the prior map if it does not agree."""
         out, probabilities = path / "class_map.zarr", path / "class_probabilities.zarr"
         lies = FieldShift() if prior is None else prior_map_lies(prior.scan_passes, mosaic.path / "mosaic.zarr")
         memory = None if prior is None else memory_of(prior, lies, grid)
@@ -140,7 +147,7 @@ def segment(
 
 
 def memory_of(prior: Prior, lies: FieldShift, grid: SceneGrid) -> FieldPriorMap | None:
-    """Return where the memory of a field lies and how it is read; None of a field that was turned too far."""
+    """Return the prior map with its shift; None where the field is rotated too far."""
     if lies.edge_px((grid.height, grid.width)) > MOST_TURN_PX:
         return None
     last, probabilities = prior.scan_passes[0], (prior.probabilities.path / "class_probabilities.zarr").resolve()
@@ -155,15 +162,14 @@ def _prior_map_figures(
     lies: FieldShift,
     comparison: TemporalAgreement | None,
 ) -> dict[str, Any]:
-    """Return what became of a memory: agreement with today's look, and pixels that changed from class to class.
+    """Return the figures of a prior map: agreement with this visit, and pixels that changed from class to class.
 
-    Those changed that are more than two maps of the same ground differ by; all that differ are counted beside them.
+    Changed pixels exceed the expected difference of two maps of the same ground; all differing pixels are counted too.
     """
     agreement = None if comparison is None or np.isnan(comparison.agreement) else comparison.agreement
     put_aside = "turned" if comparison is None else "another field" if comparison.is_of_another_field else None
-    compared, differing, expected, pairs = 0, 0, 0.0, list[tuple[int, int, str, str]]()
-    if comparison is not None:
-        compared = int(comparison.changed.sum())
+    compared = 0 if comparison is None else int(comparison.changed.sum())
+    differing, expected, pairs = 0, 0.0, list[tuple[int, int, str, str]]()
     if comparison is not None and put_aside is None:
         beyond = comparison.beyond
         differing = compared - int(np.trace(comparison.changed))
@@ -186,3 +192,73 @@ def _prior_map_figures(
         "changed_px": sum(beyond for beyond, _, _, _ in pairs),
         "changes": [list(pair) for pair in sorted(pairs, reverse=True)],
     }
+
+
+STORE = "ground_map.zarr"
+GROUND = Product("ground", version=4, files=(STORE,))
+
+
+@stage("ground", "map on the ground", GROUND)
+def ground(
+    class_map: StageRef, mosaic: StageRef, *, ground_grid: GroundGrid, map_choice: MapChoice, report: Report
+) -> Wanted:
+    """Project class map, ages, changes and picture to the ground, by the pose of the rig."""
+    grid = ground_grid
+
+    def build(path: Path) -> None:
+        """Write the map in blocks, then the area of each class."""
+        found = load_class_map(class_map.path / "class_map.zarr")
+        probabilities = ProbabilityStore(class_map.path / "class_probabilities.zarr")
+        colours = coarse_colours(mosaic, None)
+        unsure, age_days = np.isnan(found.confidence), probabilities.age()
+        fractions, old_class = probabilities.changed(), probabilities.old_class()  # None for a first visit
+
+        def shown(pixels: NDArray[np.float64]) -> dict[str, NDArray[np.generic]]:
+            """Return the images of a block by name, at places (row, column, 2); nodata is 255, NaN and 0.
+
+            Confidence and picture are interpolated, other images have the nearest pixel.
+            """
+            confidence = image_at(found.confidence[..., None], pixels)[..., 0]
+            confidence[nearest_at(unsure, pixels, False)] = np.nan  # class unknown
+            picture = np.nan_to_num(np.rint(image_at(colours, pixels, factor=1))).astype(np.uint8)
+            images: dict[str, NDArray[np.generic]] = {
+                "classes": nearest_at(found.classes, pixels, UNLABELLED),
+                "confidence": confidence,
+                "picture": picture,
+                "age": nearest_at(age_days, pixels, np.nan),
+            }
+            if fractions is not None and old_class is not None:
+                images["changed"] = nearest_at(fractions, pixels, np.nan, factor=probabilities.patch_px)
+                images[OLD_CLASS] = nearest_at(old_class, pixels, UNLABELLED)
+            return images
+
+        legend, goes_on = ClassNames(found.names, found.colours), fractions is not None and old_class is not None
+        about = {"rig_pose": asdict(grid.frame.view.pose), "scene_pixels": grid.counts()}
+        writer = GroundMapWriter(path / STORE, grid.geobox, legend, about=about, goes_on=goes_on)
+        for rows, columns in map_blocks(grid.shape, BLOCK):
+            writer.write_block(rows, columns, shown(grid.scene_pixels(rows, columns)))
+            report(rows.stop / grid.shape[0])
+        areas = areas_by_number(PosedField(grid), found.classes, len(found.names))
+        assert areas is not None
+        writer.finish(areas)
+
+    params = {
+        "pose": asdict(grid.frame.view.pose),
+        "map": asdict(map_choice),
+        "ifov_rad": grid.frame.view.ifov_rad,
+        "scene_shape": grid.scene_shape,
+    }
+    return Wanted(build, params, [class_map, mosaic])
+
+
+def coarse_colours(mosaic: StageRef, factor: int | None) -> NDArray[np.float32]:
+    """Return three bands of a mosaic as a picture (y, x, 3) in 1..255; NaN where nothing was captured.
+
+    Its pixels consist of ``factor`` x ``factor`` fine ones; None: pixels of the mosaic.
+    """
+    seen = open_mosaic(mosaic.path / "mosaic.zarr")
+    bands, band_choice = choose_bands(seen.wavelength_nm)
+    values = np.concatenate([seen.spectra(strip, bands) for strip in seen.row_blocks(factor)])
+    tones = develop(values, values) if band_choice.startswith("true colour") else stretch(values)
+    picture: NDArray[np.float32] = np.where(np.isfinite(values), 1 + 254 * tones, np.nan).astype(np.float32)
+    return picture

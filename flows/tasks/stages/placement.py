@@ -1,4 +1,4 @@
-"""The stages that place lines: registration (where the mirror may err), geolocation grid, mosaic, patches."""
+"""Define the stages registration, geolocation grid and mosaic."""
 
 from __future__ import annotations
 
@@ -35,18 +35,16 @@ from storage.parallel.pool import WorkerPool
 
 RECORD = "registration.json"
 POINTING = Product("register", version=2, files=(RECORD,))
-
-
 GEOLOCATION = Product("locate", version=3, files=("geolocation.zarr",))
 MOSAIC = Product("rectify", version=5, files=("mosaic.zarr",))
 DETAIL = Product("rectify_fine", version=2, files=("mosaic.zarr",))
 QUICKLOOK_PX = 512
-MOSAIC_STEP = 0.5  # of resampled scores, over that of the sweeps: what is read between samples is less noisy
-KERNEL_GAIN = 2.0  # by which kernels overshoot, at most
+MOSAIC_STEP = 0.5  # quantisation step, relative to the sweeps: resampled scores have less noise
+KERNEL_GAIN = 2.0  # greatest overshoot of the kernels
 
 
 def record_of(registration: StageRef | None) -> Path | None:
-    """Return where a registration wrote what it found."""
+    """Return the path of the record of a registration."""
     return None if registration is None else registration.path / RECORD
 
 
@@ -54,10 +52,10 @@ def record_of(registration: StageRef | None) -> Path | None:
 def register_coarse(
     signal: StageRef, *, camera: LineCamera, pointing_px: float, frame: FieldFrame, report: Report
 ) -> Wanted:
-    """Find pointing and light of the coarse sweeps from what neighbours show twice."""
+    """Estimate pointing and radiometric gain of the coarse sweeps from the overlaps of neighbours."""
 
     def build(path: Path) -> None:
-        """Register the sweeps by their seams, and write shifts and gains."""
+        """Register the sweeps by their overlaps, and write shifts and gains."""
         sweeps = open_sweeps(signal.path, None, camera)
         broad = [BroadSweep.read(one.lines, camera, usable=one.usable) for one in sweeps]
         report(0.4)
@@ -81,7 +79,7 @@ def register_coarse(
 def light_gains(
     found: Registration, placed: Sequence[Placed], camera: LineCamera, wavelength_nm: NDArray[np.float64]
 ) -> dict[str, list[float]]:
-    """Return what each sweep's values are to be multiplied by, band by band, so that neighbours agree."""
+    """Return the gain of each sweep by band that makes neighbours agree."""
     windows = [seen.window for seen in found.windows if seen.measured is not None]
     if not windows:
         return {}
@@ -112,10 +110,10 @@ def _window_record(seen: SeamWindow, names: Sequence[str]) -> dict[str, Any]:
 def register_fine(
     signal: StageRef, mosaic: StageRef, *, camera: LineCamera, pointing_px: float, frame: FieldFrame, report: Report
 ) -> Wanted:
-    """Find where each fine sweep lies on the coarse mosaic, which itself may be off by as much."""
+    """Register each fine sweep on the coarse mosaic, which has pointing errors itself."""
 
     def build(path: Path) -> None:
-        """Lay each sweep onto the mean of the mosaic's bands, and write where it lies."""
+        """Register each sweep on the mean of the mosaic's bands, and write its shift."""
         sweeps = open_sweeps(signal.path, None, camera)
         anchors: list[Anchor] = []
         seen = open_mosaic(mosaic.path / "mosaic.zarr")
@@ -138,7 +136,7 @@ def register_fine(
 
 
 def load_registration(registration: StageRef) -> dict[str, Any]:
-    """Read what was found: by sweep the offset, drift and gain; the held sweep, those untied, and every window."""
+    """Read a registration: offset, drift and gain by sweep; reference, sweeps without overlap, and windows."""
     return read_table(registration.path / RECORD)
 
 
@@ -146,7 +144,7 @@ def load_registration(registration: StageRef) -> dict[str, Any]:
 def locate(
     signal: StageRef, registration: StageRef | None = None, *, camera: LineCamera, frame: FieldFrame, report: Report
 ) -> Wanted:
-    """Look up where each pixel was seen: a table that every survey along the same path shares."""
+    """Compute the geolocation grid, which all surveys along the same path share."""
     grid = PixelGrid.of_scene(frame.grid, 1)
     sweeps = open_sweeps(signal.path, record_of(registration), camera)
     params = {
@@ -162,17 +160,17 @@ def locate(
     }
 
     def build(path: Path) -> None:
-        """Write the tie tables of each sweep; of one that ties cannot follow, none."""
+        """Write the tie points of each sweep; none where they are not accurate enough."""
         tables: dict[str, list[tuple[ScanPath, TieTable]]] = {}
         for number, one in enumerate(sweeps):
             made = one.placed(camera, grid).scan_paths
             whole = [(scan_path, table) for scan_path, table in made if table is not None]
-            # Where lines lie too unevenly for ties there is nothing to keep: such a sweep is looked up directly.
+            # a sweep whose lines are too uneven for tie points is located directly
             tables[one.lines.sweep.name] = whole if len(whole) == len(made) else []
             report((number + 1) / len(sweeps))
         write_geolocation(path / "geolocation.zarr", tables, params)
 
-    return Wanted(build, params)  # keyed by the paths, not by what was seen along them
+    return Wanted(build, params)  # the key depends on the paths, not on the values
 
 
 @stage("rectify", "mosaic", MOSAIC)
@@ -188,10 +186,10 @@ def rectify(
     pool: WorkerPool,
     report: Report,
 ) -> Wanted:
-    """Bring the sweeps of the first pass onto the scene grid and blend them into one mosaic, tile by tile."""
+    """Resample the sweeps of the first pass to the scene grid, and blend them into one mosaic, tile by tile."""
 
     def build(path: Path) -> None:
-        """Write mosaic and quicklook, and what became of each sweep's lines."""
+        """Write mosaic, quicklook and the record of each sweep's lines."""
         recipe = MosaicRecipe(
             signal.path,
             camera,
@@ -222,10 +220,10 @@ def rectify_fine(
     pool: WorkerPool,
     report: Report,
 ) -> Wanted:
-    """Bring the lines of all passes onto the scene grid, merged by position; each pixel is of the closest lines."""
+    """Resample the lines of both passes to the scene grid, merged by position; each pixel is from the closest lines."""
 
     def build(path: Path) -> None:
-        """Write mosaic, quicklook, how each pixel was captured, and what became of each sweep's lines."""
+        """Write mosaic, quicklook, the capture of each pixel, and the record of each sweep's lines."""
         grid = PixelGrid.of_scene(frame.grid, 1)
         recipe = MosaicRecipe(
             signal.path, camera, grid, resampling, registration=record_of(registration), interlaced=True
@@ -244,13 +242,13 @@ def rectify_fine(
 
 
 def spec_of(sweep: Sweep, camera: LineCamera, light: LineSpec) -> LineSpec:
-    """Return how a sweep's lines were captured; ``light`` is the capture of every line in the camera's exposure."""
+    """Return line spacing and light of a sweep; ``light`` is that of a full scan in the camera's exposure."""
     exposed = exposing(camera, sweep).exposure_ms / camera.exposure_ms
     return LineSpec(light.light * exposed, sweep.step)
 
 
 def mosaic_of_sweeps(path: Path, signal: StageRef, frame: FieldFrame) -> MosaicWriter:
-    """Begin the mosaic of condensed sweeps, in the scene's own pixels."""
+    """Create the mosaic of compressed sweeps, in the pixels of the scene."""
     sweeps = open_signal_cubes(signal.path)
     components = sweeps[0].components if sweeps else Components.empty(len(frame.wavelength_nm))
     return MosaicWriter(
@@ -267,7 +265,7 @@ def mosaic_of_sweeps(path: Path, signal: StageRef, frame: FieldFrame) -> MosaicW
 
 
 def finish_mosaic(writer: MosaicWriter, frame: FieldFrame) -> None:
-    """Take out what is no scene, and store a picture of the rest."""
+    """Set nodata pixels, and write the quicklook."""
     if frame.missing is not None:
         blank_pixels(writer.path, frame.missing, nothing_seen(writer.path))
     mosaic = open_mosaic(writer.path)

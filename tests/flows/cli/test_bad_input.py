@@ -93,7 +93,7 @@ REFUSED = {
     "policy mask without one": (2, "--policy mask", "needs a mask file"),
     "unknown flag": (2, "--budgets 1", "Unknown option"),
     "unknown source": (2, "--source rigg", "--source must be one of auto, sim, rig, raster, recorded; got 'rigg'"),
-    "exposure in seconds": (2, "--exposure-ms 0.1", "--exposure-ms must be a number from 0.5.*then write 100"),
+    "exposure in seconds": (2, "--exposure-ms 0.1", "--exposure-ms must be a number from 0.5 to 10000 ms, got"),
     "farm beyond memory": (2, "--scene farm --size 60000x60000", "takes about .* GB of memory, this machine has"),
     "memory for no tile": (
         2,
@@ -170,7 +170,8 @@ def test_unusual_input_works(
     """The survey ends with 0, says what it assumed, every pixel with a value has a class, the archive verifies."""
     words, says = WORKS[case]
     monkeypatch.chdir(folder)
-    ended = command_line(*survey_words(words, str(tmp_path / "archive")), "--settings", "camera.toml")
+    flags = "--effects", "rotation,shot", "--settings", "camera.toml"
+    ended = command_line(*survey_words(words, str(tmp_path / "archive")), *flags)
     assert (ended.code, ended.errors) == (0, [])
     assert says in " ".join(ended.err.split())
     archive = Archive.open(tmp_path / "archive", create=False)
@@ -205,10 +206,10 @@ def test_interrupted_survey_says_how_to_go_on(
 
     monkeypatch.chdir(folder)
     act_instead(monkeypatch, "score", interrupted)
-    words = survey_words("--budget 0.7", str(tmp_path / "archive"))
+    words = survey_words("--budget 0.7 --effects none", str(tmp_path / "archive"))
     ended = command_line(*words)
     assert (ended.code, ended.out) == (130, "")
-    assert "interrupted; the same command goes on from here" in ended.err
+    assert "interrupted; run the same command to resume" in ended.err
     monkeypatch.setitem(STAGES, "score", real)
     ended = command_line(*words)
     assert ended.code == 0
@@ -296,7 +297,7 @@ class FullDisk:
         self._patches.close()
 
 
-FULL_WORDS = "--labels labels.png --budget 0.7 --keep raw"
+FULL_WORDS = "--labels labels.png --budget 0.7 --keep raw --effects none"
 
 
 @pytest.fixture(scope="module")
@@ -305,7 +306,12 @@ def undisturbed(folder: Path, tmp_path_factory: pytest.TempPathFactory, survey_p
     out = tmp_path_factory.mktemp("undisturbed")
     with FullDisk(out, np.inf) as disk:
         survey_png(
-            out, keep="raw", budget="0.7", scene=str(folder / "scene.png"), weights=str(folder / "w.safetensors")
+            out,
+            keep="raw",
+            budget="0.7",
+            effects="none",
+            scene=str(folder / "scene.png"),
+            weights=str(folder / "w.safetensors"),
         )
     return disk.writes, class_map(Archive.open(out))
 

@@ -53,7 +53,7 @@ def test_help_lists_every_verb_and_loads_none(capsys: pytest.CaptureFixture[str]
     of_verbs = {*VERBS.values()} - {"flows.cli.app"}  # which lists them, and completes them
     assert not {"numpy", "torch", "prefect", "matplotlib", *of_verbs} & set(loaded)
     assert all(verb.split()[0] in shown for verb in VERBS)
-    assert "that they were not" in shown  # of evaluate
+    assert "that they were not" in " ".join(shown.split())  # of evaluate
     with pytest.raises(SystemExit):
         cli.main(["train", "--help"])
     assert "OUT.checkpoint" in capsys.readouterr().out
@@ -71,18 +71,10 @@ def test_every_flag_says_what_it_is(verb: str) -> None:
     assert [name for name, words in _flags(verb).items() if not words] == []
 
 
-DARKEST = "Unknown option: --darkest-ms; it is called --min-exposure-ms now"
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (["survy"], 'Unknown command "survy". Did you mean "survey"?; see spectralzoom --help'),
-        (
-            ["survey", "--compute", "25%"],
-            "Unknown option: --compute; it is called --macs now; see spectralzoom survey --help",
-        ),
-        (["train", "farm", "-o", "a.safetensors", "--darkest-ms", "3"], f"{DARKEST}; see spectralzoom train --help"),
         (["survey", "--budgt", "1"], "Unknown option: --budgt. Did you mean --budget?; see spectralzoom survey --help"),
     ],
 )
@@ -115,7 +107,7 @@ def test_sigterm_ends_every_verb(
     before = signal.getsignal(signal.SIGTERM)
     with pytest.raises(SystemExit) as left:
         cli.main(verb.split())
-    goes_on = "; the same command goes on from here" if verb in GOES_ON else ""
+    goes_on = "; run the same command to resume" if verb in GOES_ON else ""
     assert (left.value.code, capsys.readouterr().err.strip()) == (143, f"terminated{goes_on}")
     assert signal.getsignal(signal.SIGTERM) is before
 

@@ -107,7 +107,7 @@ def test_a_broken_scan_goes_on_where_it_was(
     monkeypatch.setattr(SimulatedSource, "lines", breaking)
     ended = command_line(*words(scene_files, tmp_path, "--workers", "1"))
     assert ended.code == 130
-    assert "the same command goes on from here" in ended.err
+    assert "run the same command to resume" in ended.err
     again = json.loads(command_line(*words(scene_files, tmp_path, "--workers", workers, "--json")).out)
     assert firsts == ([0, 7] if workers == "1" else [0])
     one, other = (

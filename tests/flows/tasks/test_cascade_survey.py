@@ -17,7 +17,7 @@ from models.weights.files import CASCADE, save_weights
 from tests.conftest import RGB_NM, Survey, random_weights
 from tests.prior_work import without_effects
 
-SCAN: dict[str, Any] = {"budget": None, "scan_step": "1"}
+SCAN: dict[str, Any] = {"budget": None, "scan_step": "1", "camera.samples": 160}  # few beside the field
 TABLE = CascadeTable((0.05, 0.15, 0.2), (0.001, 0.003, 0.2), (0.8, 0.4, 0.1))
 
 pytestmark = pytest.mark.usefixtures("no_effects")
@@ -100,7 +100,6 @@ def test_a_survey_is_told_beside_the_best_uniform_reading(judged: Path, survey_p
         ({"expected_loss": "0.1"}, 0.05),
         ({"expected_loss": "0"}, None),
         ({"expected_loss": "50"}, 0.2),
-        ({"least_gain": "0.1"}, 0.1),
         ({"macs": "90%"}, None),
     ],
 )

@@ -101,10 +101,3 @@ def test_a_receipt_gives_its_own_figures():
     assert format_false_classes(accuracy) == words
     accuracy["false_classes"] = accuracy["none"]["false_classes"] = {}
     assert format_false_classes(accuracy) == ""
-
-
-@pytest.mark.parametrize("accuracy", [None, 3, {}, {"miou": "x"}, {"per_class_iou": [1], "none": 2, "all": None}])
-def test_what_was_not_judged_has_no_score(accuracy: object):
-    """No labels, or a receipt that somebody has damaged."""
-    assert score_of({"accuracy": accuracy}) == {"miou": None, "overall_accuracy": None}
-    assert score_of({}) == {"miou": None, "overall_accuracy": None}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from flows.tasks.field_work import FieldWork, Scoring, WeightsFile, region_param
 from flows.tasks.patch_budget import SHARD
 from flows.tasks.run import SurveyRun, open_run
 from models.network.sizes import CELL_PX
-from models.reading.regions import Region, plan_regions, whole_field
+from models.reading.regions import plan_regions, whole_field
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from storage.arrays.class_maps import ClassNames, create_class_map, create_probabilities, load_class_map
@@ -131,28 +131,6 @@ def test_edges_need_one_patch_of_halo_and_work_travels_as_paths(surveyed: tuple[
     there, region = pickle.loads(sent)
     assert len(sent) < 2000
     assert (there(region) == scoring(work.regions[0])).all()
-
-
-def test_a_worker_goes_region_by_region(
-    surveyed: tuple[SurveyRun, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What it held for the mosaic is given back before a region is read; each region moves the bar."""
-    run, stages = surveyed
-    let_go: list[bool] = []
-    for module in ("field_work", "drawing"):
-        monkeypatch.setattr(f"flows.tasks.{module}.let_tiles_go", lambda: let_go.append(True))
-    work = _work(run, WorkerPool(workers=1), 32)
-    work.score("entropy", _mosaics(stages)[0], run.capture, lambda done: None)
-    assert len(let_go) == 2
-    _draw(work, run, stages, tmp_path / "m.zarr")
-    assert len(let_go) == 4
-    run, stages = surveyed
-    told: list[float] = []
-    work = _work(run, WorkerPool(workers=1), 32)
-    work.score("entropy", _mosaics(stages)[0], run.capture, told.append)
-    assert told == [0.5, 1.0]
-    regions: Sequence[Region] = work.regions
-    assert sum(region.kept.shape[0] for region in regions) == 96
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import pytest
 import xarray as xr
 
 from flows.settings.survey_settings import MapChoice, Settings
-from flows.tasks.stages.on_ground import STORE, coarse_colours, ground
+from flows.tasks.stages.maps import STORE, coarse_colours, ground
 from flows.tasks.zones import place_of_field
 from pipeline.errors import PoseError
 from pipeline.geometry.grid import UNLABELLED

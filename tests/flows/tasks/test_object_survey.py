@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ pytestmark = pytest.mark.usefixtures("no_effects")
 
 SMALL = ("--size", "96x64", "--bands", FEW_BANDS, "--no-controls", "--engine", "plain")
 CACHED = {"cached"}
+NARROW: dict[str, Any] = {"camera.samples": 160}  # few beside the field
 OF_THIS = set(STAGES) - {"register_coarse", "register_fine", "ground", "condense_raster"}
 
 
@@ -79,7 +81,7 @@ def test_another_machine_clears_outlived_raw_lines_in_a_bucket(
     bucket: str, survey_png: Survey, command_line: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """They stay for their days; then gc compares and clears them, counts bytes again; no survey sends them."""
-    kept = survey_png(bucket, keep="raw 7d").receipt["data_bytes"]["kept"]
+    kept = survey_png(bucket, keep="raw 7d", **NARROW).receipt["data_bytes"]["kept"]
 
     def raw() -> set[str]:
         archive = open_archive(bucket)
@@ -96,15 +98,15 @@ def test_another_machine_clears_outlived_raw_lines_in_a_bucket(
     assert raw() == {"manifest.json"}
     assert spectralzoom.open(bucket).latest.receipt["data_bytes"]["kept"] < kept
     monkeypatch.delenv("SPECTRALZOOM_WORK")
-    assert states(survey_png(bucket, keep="raw 7d").receipt) <= CACHED
+    assert states(survey_png(bucket, keep="raw 7d", **NARROW).receipt) <= CACHED
     assert raw() == {"manifest.json"}
     assert command_line("verify", bucket).code == 0
 
 
 def test_verbs_read_an_archive_in_a_bucket(
-    bucket: str, command_line: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    bucket: str, command_line: CommandLine, scene_files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """survey, plan, ls, explain, verify, compare, reprocess and gc take s3://bucket/prefix where they take a folder."""
+    """Every verb on archives takes s3://bucket/prefix in place of a folder."""
     monkeypatch.chdir(tmp_path)
     assert command_line("plan", "--out", bucket, *SMALL[:5]).code == 0
     ended = command_line("survey", "--out", bucket, *SMALL, "--json")
@@ -128,6 +130,12 @@ def test_verbs_read_an_archive_in_a_bucket(
     assert [row["state"] for row in again["fields"]] == ["skipped"]
     cleared = json.loads(command_line("gc", bucket, "--keep-days", "0", "--json").out)
     assert (cleared["removals"], cleared["obstacle"]) == ([], None)
+    words = ("ingest", scene_files / "cube.npy", bucket, "--wavelengths", "450,500,550,600,650,700", "--json")
+    records = [json.loads(command_line(*words).out) for _ in range(2)]
+    assert [record["cached"] for record in records] == [False, True]
+    ended = command_line("export", bucket, "-o", tmp_path / "export", "--json")
+    assert (ended.code, ended.errors) == (0, [])
+    assert json.loads((tmp_path / "export" / "collection.json").read_text())["id"] == bucket.rpartition("/")[2]
     assert receipt["settings"]["out"] == bucket
 
 
@@ -141,9 +149,15 @@ def rot_mosaic(address: str) -> None:
     archive.objects.write(name, bytes(content))
 
 
-def test_a_flipped_bit_is_named_and_written_again(bucket: str, survey_png: Survey, command_line: CommandLine) -> None:
-    """verify names store and array, exit code 1; --repair writes the file again from this machine's working copy."""
-    survey_png(bucket)
+def test_a_flipped_bit_is_named_and_made_again(
+    bucket: str, survey_png: Survey, command_line: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """verify names store and array, exit code 1; --repair writes the file again from this machine's working copy.
+
+    Another machine surveys again what it lacks; where that fails it is missing, until the scene is there again.
+    """
+    published = survey_png(bucket, **NARROW)
+    before = map_of(open_archive(bucket), published)
     rot_mosaic(bucket)
     ended = command_line("verify", bucket, "--json")
     (problem,) = json.loads(ended.out)["problems"]
@@ -153,14 +167,6 @@ def test_a_flipped_bit_is_named_and_written_again(bucket: str, survey_png: Surve
     assert repaired.code == 0
     assert json.loads(repaired.out)["repair"]["remade"] == [problem["uri"]]
     assert command_line("verify", bucket).code == 0
-
-
-def test_a_broken_store_is_made_again_where_no_copy_is(
-    bucket: str, survey_png: Survey, command_line: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Another machine surveys again what it lacks; where that fails it is missing, until the scene is there again."""
-    published = survey_png(bucket)
-    before = map_of(open_archive(bucket), published)
     rot_mosaic(bucket)
     monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / "elsewhere"))
     with monkeypatch.context() as patch:
@@ -177,21 +183,6 @@ def test_a_broken_store_is_made_again_where_no_copy_is(
 
 def _refuse(*given: object, **more: object) -> None:
     raise SceneError("the scene is gone")
-
-
-def test_cubes_go_into_a_bucket_and_exports_come_out(
-    bucket: str, survey_png: Survey, tmp_path: Path, command_line: CommandLine, scene_files: Path
-) -> None:
-    """Ingested once and found again; the catalogue is that of a folder, called after the prefix."""
-    words = ("ingest", scene_files / "cube.npy", bucket, "--wavelengths", "450,500,550,600,650,700", "--json")
-    records = [json.loads(command_line(*words).out) for _ in range(2)]
-    assert [record["cached"] for record in records] == [False, True]
-    assert records[0]["uri"] == records[1]["uri"]
-    survey_png(bucket)
-    ended = command_line("export", bucket, "-o", tmp_path / "export", "--json")
-    assert (ended.code, ended.errors) == (0, [])
-    assert "class_map" in json.loads(ended.out)["files"]
-    assert json.loads((tmp_path / "export" / "collection.json").read_text())["id"] == bucket.rpartition("/")[2]
 
 
 def test_a_bucket_that_cannot_be_reached_is_one_error(

@@ -98,7 +98,7 @@ def test_receipt_and_page_say_what_was_looked_at(visits: tuple[Path, Any, Any]) 
     assert "a part of the field was scanned once: every" in part.receipt["plan"]["reason"]
     assert "this one: " not in page  # the record tells of scans of all, which remember nothing
     assert any(
-        "where most is to be mended" in note and "is expected to be wrong" in note
+        "lines of highest expected gain" in note and "expected error is" in note
         for note in part.receipt["settings"]["notes"]
     )
 
@@ -126,7 +126,7 @@ def test_of_a_field_that_nobody_knows_all_is_looked_at(survey_png: Survey, recor
     text = io.StringIO()
     flags = {**PART, "seconds": "5", "weights": str(recorded), "max_age": "14d", "skip_below_error": "2%"}
     first = survey_png(tmp_path / "archive", console=Console(file=text, width=300), **flags)
-    assert "nothing is remembered: the whole field is looked at" in text.getvalue()
+    assert "there is no prior map: the whole field is captured" in text.getvalue()
     assert "extent" not in first.receipt
     assert first.receipt["settings"]["extent"] == "whole"
     again = Path(shutil.copy(recorded, tmp_path / "same.safetensors"))
@@ -142,8 +142,7 @@ def test_what_is_due_is_looked_at_first(visited: Path, visits: Any, survey_png: 
     assert 0 < scan_pass["due"] - scan_pass["due_left"] < scan_pass["due"]
     notes = " ".join(part.receipt["settings"]["notes"])
     assert (
-        f"{scan_pass['due'] - scan_pass['due_left']} of the {scan_pass['due']} patches that were due are among them"
-        in notes
+        f"patches beyond --max-age: {scan_pass['due'] - scan_pass['due_left']} of {scan_pass['due']} included" in notes
     )
     page = " ".join((part.folder / "report.html").read_text(encoding="utf-8").split())
     assert f"{scan_pass['due_left']} places that were due had to wait" in page
@@ -160,7 +159,7 @@ def test_of_what_is_sure_enough_nothing_is_looked_at(
         **{"scene": str(scene_files / "scene.png"), "source": "sim", "out": str(visited)},
         **{"engine": "plain", "skip_below_error": "50%"},
     }
-    with pytest.raises(NothingToMend, match=f"the map of {runs[-1].name} stands"):
+    with pytest.raises(NothingToMend, match=f"the map of {runs[-1].name} remains"):
         survey_png(visited, **{**flags, "skip_below_error": "50%"})
     assert sorted(visited.glob("runs/*")) == runs
     words = [word for name, value in asked.items() for word in (f"--{name.replace('_', '-')}", str(value))]
@@ -209,23 +208,23 @@ def test_what_is_beyond_another_fields_part_has_no_class(
 @pytest.mark.parametrize(
     ("flags", "error", "told"),
     [
-        ({"seconds": None, "scan_step": "2"}, SettingsError, "'part' looks where the seconds are worth most: give"),
+        ({"seconds": None, "scan_step": "2"}, SettingsError, "'part' needs a time budget: give --seconds"),
         (
             {"extent": "0:5-9", "seconds": None},
             SettingsError,
             "names lines of a uniform scan: give its --scan-step too",
         ),
-        ({"extent": "0:9-5"}, SettingsError, "must be whole, part, or runs of lines as receipts tell them"),
-        ({"extent": "somewhere"}, SettingsError, "must be whole, part, or runs of lines"),
+        ({"extent": "0:9-5"}, SettingsError, "must be whole, part, or lines as in receipts"),
+        ({"extent": "somewhere"}, SettingsError, "must be whole, part, or lines"),
         (
             {"extent": "7:0-5", "seconds": None, "scan_step": "2"},
             SettingsError,
             "at sweep 7, the scan has sweeps 0 to 0",
         ),
-        ({"pointing_px": "4"}, SettingsError, "ties its sweeps by what they share"),
-        ({"extent": "whole", "max_age": "14d"}, SettingsError, "--max-age says how old a place may become"),
+        ({"pointing_px": "4"}, SettingsError, "registration .* needs all"),
+        ({"extent": "whole", "max_age": "14d"}, SettingsError, "--max-age is for a partial scan"),
         ({"max_age": "a while"}, SettingsError, "must be a time of 1h to 3660d, such as 14d"),
-        ({"seconds": "1"}, BudgetError, r"no look at any part of the field ends in time; the least takes 1\.\d s"),
+        ({"seconds": "1"}, BudgetError, r"is below the minimum scan time of 1\.\d s"),
     ],
 )
 def test_what_cannot_be_looked_at_is_refused_in_a_sentence(

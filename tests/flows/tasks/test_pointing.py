@@ -34,7 +34,7 @@ def surveyed(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], 
     archive = tmp_path_factory.mktemp("pointing")
     flags = {
         "scene": "farm",
-        "size": "768x512",
+        "size": "768x448",
         "bands": FEW_BANDS,
         "effects": "rotation,slit,smear,vignetting,shot,read-noise",  # without blur, lines far apart are not alike
         "seed": str(SEED),
@@ -55,7 +55,7 @@ def test_sweeps_are_put_right_by_seams_and_on_the_mosaic(surveyed: tuple[dict[st
     coarse = pointing["coarse"]
     assert len(coarse["sweeps"]) > 1
     for name, offset in coarse["sweeps"].items():
-        assert np.abs(errors.offset(name) - errors.offset(coarse["held"]) - offset).max() < 0.4
+        assert np.abs(errors.offset(name) - errors.offset(coarse["held"]) - offset).max() < 0.5
     assert coarse["residual_rms_px"] is None  # windows are no more than unknowns: that they fit says nothing
     held = errors.offset(coarse["held"])
     told = {

@@ -84,30 +84,6 @@ def test_receipt_and_pages_tell_a_scan(scanned: tuple[Path, Any]) -> None:
     assert "about 91.0 ± 3.0" in page
 
 
-def test_what_is_read_in_part_is_not_promised_what_reading_everything_scores(
-    survey_png: Survey, recorded: Path, tmp_path: Path
-):
-    """The record tells of scans that are read whole, and the sentence says so."""
-    published = survey_png(tmp_path, weights=str(recorded), budget=None, scan_step="2", macs="40%", policy="sobel")
-    page = (published.folder / "report.html").read_text(encoding="utf-8")
-    assert "this one, read whole: " in page
-    assert "this one: " not in page
-
-
-def test_a_survey_in_two_passes_stands_beside_the_best_plain_scan(
-    survey_png: Survey, recorded: Path, tmp_path: Path
-) -> None:
-    """Its receipt and its page name the scan that the record promises most of in the same seconds."""
-    published = survey_png(tmp_path, weights=str(recorded))
-    best, done = published.receipt["scans"]["best_in_time"], published.receipt["savings"]["capture_s"]["done"]
-    assert best["seconds"] <= done
-    assert best["expected_miou"] > 0.9
-    page = (published.folder / "report.html").read_text(encoding="utf-8")
-    told = f"{100 * best['expected_miou']:.1f} ± {100 * best['expected_spread']:.1f}"
-    assert f"{best['seconds']:.1f} s, about {told}" in page
-    assert "taken" not in published.receipt["scans"]
-
-
 def test_seconds_choose_the_scan_and_are_kept(
     survey_png: Survey, recorded: Path, make_weights: WeightsMaker, tmp_path: Path
 ) -> None:
@@ -127,17 +103,6 @@ def test_seconds_choose_the_scan_and_are_kept(
         name: settings[name] for name in ("scan_step", "scan_exposure_ms")
     }
     assert {one["name"]: one["state"] for one in again["stages"]}["capture_coarse"] == "cached"
-
-
-def test_a_mirror_off_the_plan_is_put_right_in_a_scan_too(survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
-    """Sweeps overlap and are registered by what neighbours show twice; every patch is seen in the seconds asked."""
-    flags = {"budget": None, "seconds": "12", "pointing_px": "3", "weights": str(recorded)}
-    published = survey_png(tmp_path, **flags)
-    assert published.receipt["savings"]["capture_s"]["done"] <= 12
-    states = {one["name"]: one["state"] for one in published.receipt["stages"]}
-    assert states["register_coarse"] == "ran"
-    seen = _store(tmp_path, "mosaic")["coverage"].values > 0
-    assert seen.mean() > 0.95
 
 
 def test_plan_shows_what_seconds_buy(scene_files: Path, recorded: Path, tmp_path: Path) -> None:
@@ -162,15 +127,14 @@ def test_plan_shows_what_seconds_buy(scene_files: Path, recorded: Path, tmp_path
     ("given", "error", "words"),
     [
         ({"seconds": "0.5"}, BudgetError, r"--seconds 0\.5; the least is \d"),
-        ({"bytes_raw": "1kB"}, BudgetError, r"--bytes-raw 1000; the least is"),
         ({"goal": "99"}, BudgetError, r"--goal 99: the most that these weights' scans reached is 94\.0"),
-        ({"goal": "weed=50"}, SettingsError, r"--goal weed=50: the weights tell apart class_1"),
+        ({"goal": "weed=50"}, SettingsError, r"--goal weed=50: no class of the weights; give one of class_1"),
         ({"goal": "many"}, SettingsError, r"--goal must be the least mIoU of the map in percent"),
         ({"goal": "0"}, SettingsError, r"above 0 and at most 100"),
         ({"seconds": "nan"}, SettingsError, r"--seconds must be a number from 0\.1"),
         ({"seconds": "5", "budget": "0.5"}, SettingsError, r"--seconds asks for one uniform scan .* --budget is for"),
         ({"seconds": "5", "scan_step": "2"}, SettingsError, r"--scan-step makes it: leave one out"),
-        ({"seconds": "5", "camera.exposure_ms": "5"}, SettingsError, r"tells of exposures from 6 ms.*--scan-step"),
+        ({"seconds": "5", "camera.exposure_ms": "5"}, SettingsError, r"starts at 6 ms.*--scan-step"),
         ({"scan_exposure_ms": "25"}, SettingsError, r"give --scan-step too"),
         ({"scan_step": "0"}, SettingsError, r"--scan-step must be a whole number from 1 to 8"),
     ],
@@ -197,7 +161,7 @@ def test_nothing_is_expected_of_a_scan_beyond_the_record(
 def test_weights_without_a_record_scan_by_hand_alone(survey_png: Survey, tmp_path: Path) -> None:
     """Old weights: seconds are refused with what to do instead, and a scan by hand has no expectation."""
     with pytest.raises(
-        WeightsError, match=r"no record of uniform scans.*--scan-step and --scan-exposure-ms.*for validation"
+        WeightsError, match=r"no record of uniform scans.*--scan-step and --scan-exposure-ms.*validation scenes"
     ):
         survey_png(tmp_path / "none", budget=None, seconds="5")
     published = survey_png(tmp_path / "by hand", budget=None, scan_step="4")
@@ -237,7 +201,7 @@ def test_scores_keep_to_a_limit_of_bytes(
 def test_a_limit_that_nothing_fits_leaves_the_raw_lines(survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
     """What was captured stays, and the message says the least."""
     flags = {"budget": None, "scan_step": "4", "weights": str(recorded), "kept_bytes": "1kB"}
-    with pytest.raises(BudgetError, match=r"--kept-bytes 1000 does not hold .* in the coarsest steps they take \d"):
+    with pytest.raises(BudgetError, match=r"--kept-bytes 1000 is too small .* at least \d"):
         survey_png(tmp_path, **flags)
     assert list(tmp_path.glob("stages/capture/*/*.zarr"))
 
@@ -245,7 +209,7 @@ def test_a_limit_that_nothing_fits_leaves_the_raw_lines(survey_png: Survey, reco
 @pytest.mark.parametrize("given", [{}, {"source": "raster"}])
 def test_a_limit_without_lines_of_a_uniform_scan_is_refused(given: dict[str, str]) -> None:
     """Two passes and rasters are kept otherwise."""
-    with pytest.raises(SettingsError, match="--kept-bytes is for the lines of a uniform scan: give --seconds"):
+    with pytest.raises(SettingsError, match="--kept-bytes is for a uniform scan: give --seconds"):
         load_settings(None, {"scene": "field.png", "kept_bytes": "8MB", **given})
 
 
@@ -262,14 +226,6 @@ def test_without_a_flag_the_cheapest_scan_nearly_as_good_as_any_is_taken(
     assert taken["expected_miou"] >= 0.94 - 0.005
 
 
-def test_without_a_flag_and_a_record_every_line_is_captured(survey_png: Survey, tmp_path: Path) -> None:
-    """No record says what fewer lines would score; a note says so."""
-    receipt = survey_png(tmp_path, budget=None).receipt
-    assert (receipt["settings"]["budget"], receipt["settings"]["scan_step"]) == (None, 1)
-    assert receipt["savings"]["capture_s"]["ratio"] == 1
-    assert any("every line is captured" in note for note in receipt["settings"]["notes"])
-
-
 @pytest.mark.parametrize(("name", "value"), [("policy", "gain"), ("coarse_exposure_ms", "20")])
 def test_what_only_two_passes_have_asks_for_them(recorded: Path, name: str, value: str) -> None:
     """A flag that a uniform scan would not use is not passed over in silence."""
@@ -278,7 +234,7 @@ def test_what_only_two_passes_have_asks_for_them(recorded: Path, name: str, valu
     assert load_settings(None, flags).undecided
 
 
-@pytest.mark.parametrize("shape", [(32, 32, 3), (8, 8, 3), (1, 40, 3), (1, 1, 3), (32, 32)])
+@pytest.mark.parametrize("shape", [(32, 32, 3), (1, 40, 3), (1, 1, 3), (32, 32)])
 @pytest.mark.parametrize("source", ["raster", "sim"])
 def test_any_scene_is_surveyed_without_a_flag(
     weights: Path, tmp_path: Path, shape: tuple[int, ...], source: str
