@@ -134,16 +134,6 @@ def test_folders_that_are_none(tmp_path: Path, lines: NDArray[np.uint16]) -> Non
         open_cube(tmp_path)
 
 
-def test_times_of_a_part_that_is_cut_off(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
-    """Frames that the camera dropped do not shift the times of a file that lost its end afterwards."""
-    write_part(tmp_path, "raw_0", lines[:6], lines=8)
-    frames = [0, 1, 4, 5, 6, 7, 8, 9]
-    (tmp_path / "frameIndex_0.txt").write_text("f\tt\n" + "".join(f"{frame}\t{10 * frame}\n" for frame in frames))
-    source = open_cube(tmp_path)
-    assert source.lines.frame is not None
-    assert source.lines.frame.tolist() == [0, 1, 4, 5, 6, 7, -1, -1]
-
-
 def test_what_is_no_file_is_no_part(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
     """Folders and pipes with the names of parts and indices are passed over; none of them is waited for."""
     write_part(tmp_path, "raw_0", lines[:5])
