@@ -1,9 +1,9 @@
-"""The verbs `ls`, `explain`, `verify` and `gc`: storage does the work, this shows it, and gives exit codes."""
+"""List, explain, verify and clear up archives: the verbs `ls`, `explain`, `verify` and `gc`."""
 
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path, PurePath
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 else:
     survey_command = deferred("flows.publish.survey_command")
 
-DEEPEST = 60  # levels of a lineage that are shown
 SHORT_KEY = 12
 WHOLE = ("when", "key", "seed", "budget", "mIoU", "size", "own", "state", "age", "stage", "what")  # never folded
 MOST_ROWS = 20  # stores of a stage, changes, removals
@@ -46,13 +45,13 @@ DAY_S = 86400.0
 
 
 def ls(archive: ArchiveName, *, as_json: AsJson = False) -> int:
-    """List the runs and stores of an archive: when, what of, how good, how large."""
+    """List the runs and stores of an archive with their age, scene, score and size."""
     put_out(contents(open_archive(archive, create=False, write=False)), show_contents, as_json=as_json)
     return DONE
 
 
 def explain(archive: ArchiveName, product: str, *, as_json: AsJson = False) -> int:
-    """Show how a product came about, and what changed since the version before it.
+    """Show the lineage of a product, and the changes since the version before it.
 
     Parameters
     ----------
@@ -66,12 +65,12 @@ def explain(archive: ArchiveName, product: str, *, as_json: AsJson = False) -> i
 
 
 def verify(archive: ArchiveName, *, repair: Switch = False, as_json: AsJson = False) -> int:
-    """Read every byte of an archive again and compare it with what was published.
+    """Read every byte of an archive again and compare it with its manifests.
 
     Parameters
     ----------
     repair
-        Take away what is broken and make it anew, by running the surveys again that name it.
+        Remove broken stores and make them anew, by running the surveys again that name them.
     """
     return run_verify(archive, stderr, remake=repair, as_json=as_json)
 
@@ -84,19 +83,19 @@ def gc(
     dry_run: Switch = False,
     as_json: AsJson = False,
 ) -> int:
-    """Remove what no run names and no named product rests on, and raw lines that no run keeps any longer.
+    """Remove stores that no run rests on, and raw lines that no run keeps.
 
-    Raw lines of published runs go by the setting `keep` of these runs, once each line was compared with what was
-    condensed from it.
+    Raw lines of published runs are removed by the setting `keep` of these runs, once each line was compared with its
+    condensed line.
 
     Parameters
     ----------
     keep_days
-        Stores younger than this stay: a survey may be about to name them.
+        Stores younger than this stay: an unfinished survey may need them.
     raw_too
-        Also raw lines of a rig, or ingested, that no run names; they cannot be had again.
+        Also remove raw lines of a rig, and ingested cubes, that no run names; they cannot be captured again.
     dry_run
-        Only say what would go, and how many bytes.
+        Only print what would be removed, and its size.
     """
     opened = open_archive(archive, create=False, write=not dry_run)
     with StageProgress(stderr, {"gc": "clearing up"}) as bars:
@@ -125,7 +124,7 @@ def gc(
 
 
 def run_verify(archive: str | Path, console: Console, *, remake: bool = False, as_json: bool = False) -> int:
-    """Read an archive again; with ``remake`` survey again what is broken."""
+    """Verify an archive; with ``remake`` run the surveys of broken stores again."""
     opened = open_archive(archive, create=False, write=remake)
     with StageProgress(console, {"verify": "reading again"}) as bars:
         findings = verify_archive(opened, lambda uri, fraction: bars.show("verify", fraction, uri))
@@ -138,26 +137,21 @@ def run_verify(archive: str | Path, console: Console, *, remake: bool = False, a
     if not as_json:
         show_verdict(content, console)
 
-    def survey_again(settings: dict[str, Any]) -> None:  # on this machine's own terms
+    def survey_again(settings: dict[str, Any]) -> None:  # with the settings of this machine
         here = {**of_this_version(settings), "out": opened.name, **dict.fromkeys(OF_THE_MACHINE)}
         survey_command.run_survey(parse_settings(here), console)
 
     done = repair(opened, bad, survey_again, versions=versions())
-    content["repair"] = {
-        "remade": done.remade,
-        "dropped": done.dropped,
-        "failed": done.failed,
-        "hopeless": done.plan.hopeless,
-        "complete": done.complete,
-    }
+    kept = {name: getattr(done, name) for name in ("remade", "dropped", "failed", "complete")}
+    content["repair"] = {**kept, "hopeless": done.plan.hopeless}
     put_out(content, show_repair, as_json=as_json)
     stray = any(finding.kind in ("stray", "growing") for finding in bad)
     return DONE if done.complete and not stray else PARTLY if done.remade or done.dropped else FAILED
 
 
 def contents(archive: Archive, now: datetime | None = None) -> dict[str, Any]:
-    """Return the runs, newest last, and stores by stage, oldest first, of an archive."""
-    catalogue, moment = Catalogue.read(archive.root), now or datetime.now(UTC)
+    """Return the runs of an archive, newest last, and its stores by stage, oldest first."""
+    catalogue, now = Catalogue.read(archive.root), now or datetime.now(UTC)
     sizes = archive.all_sizes(catalogue)
     kept, own = catalogue.kept_by_runs(sizes), catalogue.own_by_runs(sizes)
     stages: dict[str, list[dict[str, Any]]] = {}
@@ -166,7 +160,7 @@ def contents(archive: Archive, now: datetime | None = None) -> dict[str, Any]:
             "key": store.ref.key,
             "version": store.version,
             "created": store.created,
-            "age_s": _age_s(store.created, moment),
+            "age_s": _age_s(store.created, now),
             "bytes": store.size,
             "cleared": store.cleared,
             "runs": len(catalogue.named_by(store.ref.uri)),
@@ -176,7 +170,7 @@ def contents(archive: Archive, now: datetime | None = None) -> dict[str, Any]:
     return {
         "archive": archive.name,
         "runs": [
-            _run_row(catalogue, run, kept[run.uri]) | {"own_bytes": own[run.uri], "age_s": _age_s(run.created, moment)}
+            _run_row(catalogue, run, kept[run.uri]) | {"own_bytes": own[run.uri], "age_s": _age_s(run.created, now)}
             for run in catalogue.runs
         ],
         "stages": stages,
@@ -187,28 +181,24 @@ def contents(archive: Archive, now: datetime | None = None) -> dict[str, Any]:
 
 
 def _run_row(catalogue: Catalogue, run: Run, kept: int) -> dict[str, Any]:
-    receipt, settings = run.receipt, run.settings
-    below = catalogue.named_and_below[run.uri]
+    receipt = run.receipt
     return {
         "id": run.folder.name,
         "created": run.created,
         "survey": receipt.get("survey", run.facts.get("survey")),
-        "scene": settings.get("scene"),
-        "seed": settings.get("seed"),
-        "budget": settings.get("budget"),
+        **{name: run.settings.get(name) for name in ("scene", "seed", "budget")},
         **score_of(receipt),
-        "accuracy_is": receipt.get("accuracy_is"),
-        "training_scene": receipt.get("training_scene"),
+        **{name: receipt.get(name) for name in ("accuracy_is", "training_scene")},
         "bytes": kept,
-        "state": _run_state(catalogue, run, below),
+        "state": _run_state(catalogue, run),
     }
 
 
-def _run_state(catalogue: Catalogue, run: Run, below: Iterable[str]) -> str:
-    """Return the state of a run by its manifests alone; `verify` reads every byte."""
+def _run_state(catalogue: Catalogue, run: Run) -> str:
+    """Return the state of a run by its manifests alone."""
     if run.problem is not None:
         return "damaged"
-    stores = [catalogue.stores.get(uri) for uri in below]
+    stores = [catalogue.stores.get(uri) for uri in catalogue.named_and_below[run.uri]]
     damaged = sum(store is not None and store.problem is not None for store in stores)
     counts = ((stores.count(None), "missing"), (damaged, "damaged"))
     return " and ".join(f"{count} {word}" for count, word in counts if count) or "there"
@@ -222,41 +212,37 @@ def _age_s(created: str, now: datetime) -> float | None:
 
 
 def explanation(archive: Archive, product: str) -> dict[str, Any]:
-    """Return the lineage of a product as nested tables, and the changes since its earlier version.
+    """Return the lineage of a product as nested tables, and the changes since the version before it.
 
-    Raises ArchiveError: none.
+    Raises ArchiveError: there is no such product.
     """
     catalogue = Catalogue.read(archive.root)
     found = find_product(catalogue, product)
     if isinstance(found, Run):
         below = set[str]().union(*(catalogue.ancestors([uri]) for uri in found.names))
-        shown: set[str] = set()
-        trees = [_tree(catalogue, uri, shown, ()) for uri in sorted(found.names - below)]
-        kept = archive.kept_bytes(found, catalogue)
-        row = {
-            **_run_row(catalogue, found, kept),
-            "problem": found.problem,
-            "command": command(found.settings, archive.name),
-        }
+        shown = set[str]()
+        row = _run_row(catalogue, found, archive.kept_bytes(found, catalogue))
+        row |= {"problem": found.problem, "command": command(found.settings, archive.name)}
+        trees = [_tree(catalogue, uri, shown) for uri in sorted(found.names - below)]
         return {"archive": archive.name, "product": found.uri, "run": row, "lineage": trees}
     this, before = catalogue.stores[found], version_before(catalogue, found)
     return {
         "archive": archive.name,
         "product": found,
         "runs": [run.uri for run in catalogue.named_by(found)],
-        "lineage": [_tree(catalogue, found, set(), ())],
+        "lineage": [_tree(catalogue, found, set())],
         "before": None if before is None else before.ref.uri,
         "changes": [] if before is None else [asdict(one) for one in changes_between(catalogue, before, this)],
     }
 
 
-def _tree(catalogue: Catalogue, uri: str, shown: set[str], path: tuple[str, ...]) -> dict[str, Any]:
-    """Return one store and below it its inputs; a store already shown is not opened again."""
+def _tree(catalogue: Catalogue, uri: str, shown: set[str]) -> dict[str, Any]:
+    """Return a store and its inputs; the inputs of a store in ``shown`` are left out."""
     store = catalogue.stores.get(uri)
     if store is None:
         return {"uri": uri, "problem": "is not there", "inputs": []}
-    made = [row for run in catalogue.runs for row in run.stages if row.get("key") == store.ref.key]
-    ran = next((row for row in made if row.get("state") == "ran"), {})  # by the receipt of the run that made it
+    made = (row for run in catalogue.runs for row in run.stages if row.get("key") == store.ref.key)
+    ran = next((row for row in made if row.get("state") == "ran"), {})
     node = {
         "uri": uri,
         "stage": store.ref.stage,
@@ -266,19 +252,18 @@ def _tree(catalogue: Catalogue, uri: str, shown: set[str], path: tuple[str, ...]
         "called": sorted(catalogue.roles(uri)),
         "created": store.created,
         "bytes": store.size,
-        "wall_s": known_number(ran.get("wall_s")),
-        "cpu_s": known_number(ran.get("cpu_s")),
+        **{name: known_number(ran.get(name)) for name in ("wall_s", "cpu_s")},
         "problem": store.problem,
         "inputs": [],
     }
-    if uri in shown or uri in path or len(path) >= DEEPEST:
-        return node | {"see": "in a circle" if uri in path else "above" if uri in shown else "too deep"}
+    if uri in shown:
+        return node | {"see": "above"}
     shown.add(uri)
-    return node | {"inputs": [_tree(catalogue, one, shown, (*path, uri)) for one in catalogue.inputs_of(uri)]}
+    return node | {"inputs": [_tree(catalogue, one, shown) for one in catalogue.inputs_of(uri)]}
 
 
 def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
-    """Return the summary of a verification, with the repair of what is broken."""
+    """Return the summary of a verification, with the surveys that would repair the archive."""
     bad = [finding for finding in findings if finding.problem is not None]
     places = {finding.uri for finding in findings if finding.kind in ("whole", "broken")}
     broken = {finding.uri for finding in bad if finding.kind == "broken"}
@@ -290,40 +275,34 @@ def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
     }
     if bad:
         plan = plan_repair(archive, bad, versions=versions())
-        content["to_remake"] = list(plan.remade)
-        content["hopeless"] = plan.hopeless
-        content["surveys"] = [
-            {"run": run.uri, "command": command(settings, archive.name)} for run, settings in plan.surveys
-        ]
+        surveys = [{"run": run.uri, "command": command(settings, archive.name)} for run, settings in plan.surveys]
+        content |= {"to_remake": list(plan.remade), "hopeless": plan.hopeless, "surveys": surveys}
     return content
 
 
 def command(settings: Mapping[str, Any], out: str) -> str:
-    """Return the command for these settings into the archive ``out``, as far as flags can say it.
-
-    The archive may have moved since.
-    """
+    """Return the command line of these settings into the archive ``out``; tables are only named."""
     if not settings:
         return ""
     asked, defaults = {**settings, "out": out}, Settings().to_dict()
-    words = ["spectralzoom", "survey"]
+    parts, tables = ["spectralzoom", "survey"], list[str]()
     for name, usual in defaults.items():
         value, flag = asked.get(name, usual), name.replace("_", "-")
-        if value == usual or isinstance(value, dict) or value is None:
+        if value is None or value == usual:
             continue
-        if isinstance(value, bool):
-            words.append(f"--{flag}" if value else f"--no-{flag}")
+        if isinstance(value, dict):
+            tables.append(f"[{name}]")
+        elif isinstance(value, bool):
+            parts.append(f"--{flag}" if value else f"--no-{flag}")
         elif isinstance(value, list):
-            words += [f"--{flag}", ("x" if name == "size" else ",").join(map(str, value))]
+            parts += [f"--{flag}", ("x" if name == "size" else ",").join(map(str, value))]
         else:
-            words += [f"--{flag}", str(value)]
-    tables = [name for name, value in asked.items() if isinstance(value, dict) and value != defaults.get(name)]
-    more = [f"with [{'], ['.join(tables)}] as in its receipt"] if tables else []
-    return shlex.join(words) + (f"  ({'; '.join(more)})" if more else "")
+            parts += [f"--{flag}", str(value)]
+    return shlex.join(parts) + (f"  (with {', '.join(tables)} as in its receipt)" if tables else "")
 
 
 def show_contents(content: dict[str, Any], console: Console) -> None:
-    """Print what `ls` found."""
+    """Print the content of an archive."""
     columns: Sequence[str] = ("run", "scene", "seed", "budget", "mIoU", "own", "age", "state")
     runs = map(_shown_run, content["runs"])
     console.print(table(columns, runs, title="Runs", left=2, whole=WHOLE) if content["runs"] else "no runs")
@@ -335,7 +314,7 @@ def show_contents(content: dict[str, Any], console: Console) -> None:
     for uri in content["lost"]:
         console.print(f"[bold red]{escape(uri)} has lost its manifest; run verify[/]", soft_wrap=True)
     count = counted(sum(map(len, content["stages"].values())), "store")
-    shared = f", {format_bytes(content['shared_bytes'])} of it in several runs" if content["shared_bytes"] else ""
+    shared = f", {format_bytes(content['shared_bytes'])} shared by several runs" if content["shared_bytes"] else ""
     _say(console, f"{counted(len(content['runs']), 'run')}, {count}, {format_bytes(content['bytes'])}{shared}")
 
 
@@ -380,7 +359,7 @@ def show_clearance(content: dict[str, Any], console: Console) -> None:
 
 
 def show_explanation(content: dict[str, Any], console: Console) -> None:
-    """Print a product's lineage, and what changed since the version before."""
+    """Print a product's lineage, and the changes since the version before."""
     run = content.get("run")
     if run is not None:
         where = f"{content['product']}: {run['scene']}, seed {run['seed']}, budget {run['budget']}, {run['state']}"
@@ -396,7 +375,7 @@ def show_explanation(content: dict[str, Any], console: Console) -> None:
 
 def _show_changes(content: dict[str, Any], console: Console) -> None:
     if content["before"] is None:
-        _say(console, "there is no earlier version of it in this archive")
+        _say(console, "this archive has no other version of it before this one")
         return
     shown, more = content["changes"][:MOST_ROWS], len(content["changes"]) - MOST_ROWS
     parts = ([one["where"], one["kind"], one["name"], *(_short(one[when]) for when in ("old", "new"))] for one in shown)
@@ -407,10 +386,10 @@ def _show_changes(content: dict[str, Any], console: Console) -> None:
 
 
 def _branch(node: Mapping[str, Any], parent: Tree | None) -> Tree:
-    words = _format_node(node)
-    tree = Tree(words) if parent is None else parent.add(words)
-    for given in node["inputs"]:
-        _branch(given, tree)
+    text = _format_node(node)
+    tree = Tree(text) if parent is None else parent.add(text)
+    for one in node["inputs"]:
+        _branch(one, tree)
     return tree
 
 
@@ -426,12 +405,12 @@ def _format_node(node: Mapping[str, Any]) -> str:
         return f"{name} [dim]{node['see']}[/]"
     took = "" if node["wall_s"] is None else f", took {format_seconds(node['wall_s'])}"
     when = escape(node["created"][:16].replace("T", " ")) or DASH
-    size = "cleared away, made again when it is asked for" if node["cleared"] else format_bytes(node["bytes"])
+    size = "cleared away, made again if needed" if node["cleared"] else format_bytes(node["bytes"])
     return f"{name} version {escape(node['version'])}, {when}, {size}{took}"
 
 
 def show_verdict(content: dict[str, Any], console: Console) -> None:
-    """Print what `verify` found, and what would remake it."""
+    """Print the summary of a verification, and the surveys that would repair the archive."""
     for finding in content["problems"]:
         console.print(f"[bold red]{escape(finding['uri'])}[/]: {escape(finding['problem'])}", soft_wrap=True)
     for uri, why in content.get("hopeless", {}).items():
@@ -441,17 +420,17 @@ def show_verdict(content: dict[str, Any], console: Console) -> None:
         _say(console, f"verify --repair makes {count} broken stores anew by:")
         for survey in content["surveys"]:
             _say(console, f"  {survey['run']}: {survey['command']}")
-    _say(console, f"{content['whole']} of {content['checked']} stores and runs are as published")
+    _say(console, f"{content['whole']} stores and runs are as published, out of {content['checked']}")
 
 
 def show_repair(content: dict[str, Any], console: Console) -> None:
-    """Print what a repair did."""
+    """Print the summary of a repair."""
     done = content["repair"]
     for title, part in (("failed", done["failed"]), ("left as it is", done["hopeless"])):
         for uri, why in part.items():
             console.print(f"[bold yellow]{title}[/] {escape(uri)}: {escape(why)}", soft_wrap=True)
     left = "nothing broken is left" if done["complete"] else "some could not be made anew"
-    _say(console, f"{len(done['remade'])} remade, {len(done['dropped'])} that no run named removed; {left}")
+    _say(console, f"{len(done['remade'])} remade, {len(done['dropped'])} that no run names removed; {left}")
 
 
 def _say(console: Console, text: str) -> None:
@@ -459,12 +438,9 @@ def _say(console: Console, text: str) -> None:
 
 
 def _age(seconds: float | None) -> str:
-    if seconds is None:
-        return DASH
-    for unit, word in ((DAY_S, "days"), (3600.0, "h"), (60.0, "min")):
-        if seconds >= 2 * unit:
-            return f"{seconds // unit:.0f} {word}"
-    return format_seconds(max(seconds, 0))
+    if seconds is not None and seconds >= 2 * DAY_S:
+        return f"{seconds // DAY_S:.0f} days"
+    return DASH if seconds is None else format_seconds(max(seconds, 0))
 
 
 def _short(value: object) -> str:

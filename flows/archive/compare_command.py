@@ -1,7 +1,8 @@
-"""The verb `compare`: two runs of one field side by side, and a picture of where they differ."""
+"""Compare two runs of one field: the verb `compare`."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -44,11 +45,11 @@ else:
 
 MOST_CHANGES = 10
 NOT_ASKED = ("notes", "out")  # of a receipt's settings
-NO_FILES = (None, *BUILT_IN_SCENES)  # scenes of runs that are no file's
+NO_FILES = (None, *BUILT_IN_SCENES)  # scenes that are no files
 
 
 def compare(archive: ArchiveName, old: str, new: str, *, out: OutFolder = None, as_json: AsJson = False) -> int:
-    """Compare two runs of one field: classes, where they differ, what was asked and spent, and a picture.
+    """Compare two runs of one field: classes, settings and costs, and a picture of the differences.
 
     Parameters
     ----------
@@ -68,7 +69,7 @@ def compare(archive: ArchiveName, old: str, new: str, *, out: OutFolder = None, 
             raise ArchiveError(f"{run.uri} has no class map to compare: {run.problem or 'it left none'}; see verify")
     if not _is_same_field(*runs):
         scenes = ((run, run.settings.get("scene")) for run in runs)
-        fields = (f"{run.uri} is of {_field_key(run) if scene in NO_FILES else scene}" for run, scene in scenes)
+        fields = (f"{run.uri} shows {_field_key(run) if scene in NO_FILES else scene}" for run, scene in scenes)
         raise SceneError(f"these runs are of different fields: {', '.join(fields)}; give two runs of one field")
     maps = _by_one_list([_class_map(catalogue, opened, run) for run in runs])
     content = _comparison(runs, maps)
@@ -86,17 +87,17 @@ def compare(archive: ArchiveName, old: str, new: str, *, out: OutFolder = None, 
 
 
 def find_run(catalogue: Catalogue, text: str) -> Run:
-    """Return a run by its id, `latest` or `previous`. Raises ArchiveError: there is none.
+    """Return a run by its id, `latest` (the newest with a map) or `previous` (the one of the same field before it).
 
-    `latest` is the newest with a map, `previous` the one of the same field before it.
+    Raises ArchiveError: there is no such run.
     """
-    mapped = [run for run in catalogue.runs if "class_map" in run.products]
     if text not in ("latest", "previous"):
         found = find_product(catalogue, f"runs/{text.rstrip('/').removeprefix('runs/')}")
         assert isinstance(found, Run)
         return found
+    mapped = [run for run in catalogue.runs if "class_map" in run.products]
     if not mapped:
-        raise ArchiveError("no run of this archive has left a class map that can be read; see ls")
+        raise ArchiveError("no run of this archive has a class map that can be read; see ls")
     if text == "latest":
         return mapped[-1]
     before = [run for run in mapped[:-1] if _is_same_field(run, mapped[-1])]
@@ -106,31 +107,31 @@ def find_run(catalogue: Catalogue, text: str) -> Run:
 
 
 def _is_same_field(old: Run, new: Run) -> bool:
-    """Compare scenes by key without bands, by file, or by the survey's name: a later file may show the same field."""
-    files, names = ([run.settings.get(what) for run in (old, new)] for what in ("scene", "name"))
-    same_file = files[0] == files[1] and files[0] not in NO_FILES
-    same_name = names[0] == names[1] is not None and not set(files) & set(NO_FILES)
-    return _field_key(old) == _field_key(new) or same_file or same_name
+    """Return whether two runs have the same scene by its key, the same scene file, or files and the same name."""
+    (old_file, new_file), (old_name, new_name) = (
+        [run.settings.get(what) for run in (old, new)] for what in ("scene", "name")
+    )
+    of_files = old_file not in NO_FILES and new_file not in NO_FILES
+    same = of_files and (old_file == new_file or (old_name is not None and old_name == new_name))
+    return same or _field_key(old) == _field_key(new)
 
 
 def _field_key(run: Run) -> str:
-    """Return a key of the land, which has neither the bands nor the day and hour at which a farm was captured."""
-    key = str(run.receipt.get("scene", run.uri)).split("/light=")[0].split("/bands=")[0].split("/only=")[0]
-    if not is_built_in_key(key):
-        return key
-    return "/".join(part for part in key.split("/") if not part.startswith(("day=", "hour=")))
+    """Return the key of a run's scene without light, bands, and the day and hour of a farm."""
+    key = re.split("/(?:light|bands|only)=", str(run.receipt.get("scene", run.uri)))[0]
+    return re.sub("/(?:day|hour)=[^/]*", "", key) if is_built_in_key(key) else key
 
 
 def _class_map(catalogue: Catalogue, archive: Archive, run: Run) -> ClassMap:
     address = run.products["class_map"]
-    store = in_text(address)
-    if store not in catalogue.stores or catalogue.stores[store].problem is not None:
+    store = catalogue.stores.get(in_text(address) or "")
+    if store is None or store.problem is not None:
         raise ArchiveError(f"the class map {address} of {run.uri} is missing or damaged; run verify --repair")
     return load_class_map(archive.locate(address))
 
 
 def _by_one_list(found: list[ClassMap]) -> list[ClassMap]:
-    """Number the classes of both maps by one list, matched by name; 255 stays no class."""
+    """Return both maps with their classes numbered by one list of names; 255 stays no class."""
     shapes = [one.classes.shape for one in found]
     if shapes[0] != shapes[1]:
         raise ShapeError(f"the maps are {shapes[0]} and {shapes[1]} px (y, x); give two runs of one field and size")
@@ -139,38 +140,37 @@ def _by_one_list(found: list[ClassMap]) -> list[ClassMap]:
     palette = np.array([colours[name] for name in names], np.uint8).reshape(-1, 3)
     numbered = []
     for one in found:
-        table = np.full(256, UNLABELLED, np.uint8)
-        table[: len(one.names)] = [names.index(name) for name in one.names]
-        numbered.append(ClassMap(table[one.classes], one.confidence, names, palette))
+        number = np.full(256, UNLABELLED, np.uint8)
+        number[: len(one.names)] = [names.index(name) for name in one.names]
+        numbered.append(ClassMap(number[one.classes], one.confidence, names, palette))
     return numbered
 
 
 def _comparison(runs: tuple[Run, Run], maps: list[ClassMap]) -> dict[str, Any]:
-    old, new = (one.classes for one in maps)
     names = [*(name.replace("_", " ") for name in maps[0].names), "no class"]
-    joint = np.zeros((len(names),) * 2, np.int64)  # (class of A, class of B), last: none
-    np.add.at(joint, tuple(np.minimum(one, len(names) - 1).ravel().astype(np.intp) for one in (old, new)), 1)
+    old, new = (np.minimum(one.classes, len(names) - 1).ravel().astype(np.intp) for one in maps)
+    joint = np.bincount(old * len(names) + new, minlength=len(names) ** 2).reshape(len(names), -1)  # (class A, class B)
     changed = joint - np.diag(np.diag(joint))
     order = np.argsort(-changed, axis=None, kind="stable")[: min(np.count_nonzero(changed), MOST_CHANGES)]
-    pairs = [divmod(int(one), len(names)) for one in order]
-    differing = int(changed.sum())
-    asked = [flatten({name: one for name, one in run.settings.items() if name not in NOT_ASKED}) for run in runs]
-    keys = [{f"stage.{row.get('name')}": row.get("key") for row in run.stages} for run in runs]  # equal: the same store
-    versions = [one if isinstance(one := run.receipt.get("versions"), dict) else {} for run in runs]
-    made = [{**one, **own} for one, own in zip(versions, keys, strict=True)]
-    sides = [
-        {
+    settings = [flatten({name: one for name, one in run.settings.items() if name not in NOT_ASKED}) for run in runs]
+    made = [
+        {**part_of(run.receipt, "versions"), **{f"stage.{row.get('name')}": row.get("key") for row in run.stages}}
+        for run in runs
+    ]
+    sides = {
+        side: {
+            "run": run.folder.name,
             **{name: run.settings.get(name) for name in ("scene", "seed")},
             "created": run.created,
             "training_scene": run.receipt.get("training_scene"),
             **score_of(run.receipt),
         }
-        for run in runs
-    ]
+        for side, run in zip("ab", runs, strict=True)
+    }
     return {
-        **{side: {"run": run.folder.name, **one} for side, run, one in zip("ab", runs, sides, strict=True)},
+        **sides,
         "classes": _classes(runs, joint, names),
-        "differing": {"pixels": differing, "fraction": differing / old.size},
+        "differing": {"pixels": int(changed.sum()), "fraction": float(changed.sum() / old.size)},
         "largest": [
             {
                 "from": names[i],
@@ -178,22 +178,24 @@ def _comparison(runs: tuple[Run, Run], maps: list[ClassMap]) -> dict[str, Any]:
                 "pixels": int(changed[i, j]),
                 "fraction": float(changed[i, j] / old.size),
             }
-            for i, j in pairs
+            for i, j in (divmod(int(one), len(names)) for one in order)
         ],
-        "settings": _changes(*asked),
+        "settings": _changes(*settings),
         "made": _changes(*made),
-        "savings": {name: [_known(run.receipt, "savings", name, "done") for run in runs] for name in COST_LABELS},
-        "data_bytes": {name: [_known(run.receipt, "data_bytes", name) for run in runs] for name in BYTE_LABELS},
+        "savings": {
+            name: [known_number(part_of(run.receipt, "savings", name).get("done")) for run in runs]
+            for name in COST_LABELS
+        },
+        "data_bytes": {
+            name: [known_number(part_of(run.receipt, "data_bytes").get(name)) for run in runs] for name in BYTE_LABELS
+        },
     }
 
 
 def _classes(runs: tuple[Run, Run], joint: NDArray[np.int64], names: list[str]) -> list[dict[str, Any]]:
-    """Return each class's area in both maps and their agreement, in hectares where both maps know them.
-
-    Classes that neither map has are left out.
-    """
+    """Return the area of each class in both maps and their agreement; hectares where both maps have them."""
     areas = [known for run in runs if (known := hectares_of_classes(run.receipt)) is not None]
-    hectares = [{str(name).replace("_", " "): area for name, area in one.items()} for one in areas]
+    hectares = [{str(name).replace("_", " "): float(area) for name, area in one.items()} for one in areas]
     found = []
     for number, name in enumerate(names):
         both, pixels = int(joint[number, number]), [int(joint[number].sum()), int(joint[:, number].sum())]
@@ -201,7 +203,7 @@ def _classes(runs: tuple[Run, Run], joint: NDArray[np.int64], names: list[str]) 
             row: dict[str, Any] = {"name": name, "pixels": pixels, "iou": both / either}
             row["fraction"] = [count / int(joint.sum()) for count in pixels]
             if len(hectares) == 2 and number < len(names) - 1:
-                row["ha"] = [float(area.get(name, 0.0)) for area in hectares]
+                row["ha"] = [area.get(name, 0.0) for area in hectares]
             found.append(row)
     return found
 
@@ -211,16 +213,16 @@ def _changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[dict[str, A
     return [{"name": name, "old": before, "new": after} for name, before, after in both if before != after]
 
 
-def _known(receipt: Mapping[str, Any], *path: str) -> float | None:
-    """Return the number at a path of tables in a receipt; None where there is none."""
+def part_of(receipt: Mapping[str, Any], *path: str) -> Mapping[str, Any]:
+    """Return a table within a receipt; an empty one where there is none."""
     found: Any = receipt
     for name in path:
         found = found.get(name) if isinstance(found, Mapping) else None
-    return known_number(found)
+    return found if isinstance(found, Mapping) else {}
 
 
 def show_comparison(content: dict[str, Any], console: Console) -> None:
-    """Print what `compare` found."""
+    """Print a comparison."""
     figures = (("run", str), ("miou", format_points), ("overall_accuracy", format_points))
     rows = [[name.replace("_", " "), *(escape(show(content[side][name])) for side in "ab")] for name, show in figures]
     if any(content[side]["training_scene"] for side in "ab"):
@@ -232,11 +234,11 @@ def show_comparison(content: dict[str, Any], console: Console) -> None:
     console.print(table(("", "A", "B"), rows))
     rows = []
     for row in content["classes"]:
-        cells = [*map(format_area, row["ha"])] if "ha" in row else [*map(format_count, row["pixels"])]
+        cells = map(format_area, row["ha"]) if "ha" in row else map(format_count, row["pixels"])
         rows.append([escape(row["name"]), *cells, *map(format_percent, row["fraction"]), format_points(row["iou"])])
     console.print(table(("class", "px in A", "px in B", "in A", "in B", "IoU of A and B"), rows))
-    figures = content["differing"]
-    console.print(f"{format_count(figures['pixels'])} px, {format_percent(figures['fraction'])} differ")
+    differing = content["differing"]
+    console.print(f"{format_count(differing['pixels'])} px, {format_percent(differing['fraction'])} differ")
     for row in content["largest"]:
         console.print(escape(f"  {row['from']} to {row['to']}: {format_count(row['pixels'])} px"), soft_wrap=True)
     console.print(escape(f"  {content['picture']}"), soft_wrap=True)

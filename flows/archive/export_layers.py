@@ -1,4 +1,4 @@
-"""Sources of an export: a run's images for map programs, its cubes for ENVI, its stores for the catalogue."""
+"""Open a published run for export, and list its images for map programs."""
 
 from __future__ import annotations
 
@@ -25,15 +25,13 @@ from storage.arrays.class_maps import OLD_CLASS, ClassNames, legend_of, unpacked
 from storage.arrays.georeference import load_geobox
 from storage.arrays.ground_maps import StoredImage, open_image
 from storage.arrays.layout import grid_of, open_group
-from storage.arrays.quicklooks import choose_bands
-from storage.export.image_files import ANGULAR, CogImage, angular_geobox, value_span
-from storage.export.map_files import GREENS, GREYS, write_class_style, write_colour_style, write_ramp_style
+from storage.export.image_files import ANGULAR, CogImage, angular_geobox
 from storage.readers.recordings import stores_of_lines
 
 Rows = Iterator[tuple[int, NDArray[Any]]]
 RGB = ("red", "green", "blue")
 LATEST = "latest"
-PROBABILITIES, GROUND = "class_probabilities", "ground_map"
+PROBABILITIES = "class_probabilities"
 
 
 @dataclass(frozen=True)
@@ -49,9 +47,9 @@ class ExportedRun:
         return self.folder.name
 
     def store(self, product: str) -> StageRef | None:
-        """Return the store of a product; None without one, or where its files were cleared away.
+        """Return the store of a product; None if there is none, or if its files were cleared away.
 
-        Raises IncompleteStoreError: the archive has lost it, or a part of it.
+        Raises IncompleteStoreError: the archive has lost the store or a part of it.
         """
         uri = self.receipt["products"].get(product)
         if uri is None:
@@ -68,23 +66,24 @@ class ExportedRun:
         return ref
 
     def path(self, product: str) -> Path:
-        """Return the path of a product that every finished run has. Raises IncompleteStoreError: this one has not."""
+        """Return the path of a product that every finished run has. Raises IncompleteStoreError: this run lacks it."""
         if self.store(product) is None:
             raise IncompleteStoreError(f"the run {self.id} has no {product}: it did not finish; export another run")
         return self.archive.locate(self.receipt["products"][product])
 
     def sweeps(self) -> list[Path]:
+        """Return the cubes of lines: raw ones, or condensed ones where raw ones were cleared away."""
         stores = [self.archive.locate(uri) for uri in stores_of_lines(self.receipt["products"], self.archive.is_there)]
         return [path for store in stores for path in sorted(store.glob("*.zarr"))]
 
     @cached_property
     def geobox(self) -> GeoBox | None:
-        """Return the grid of the run's map on the earth, by its pose or its scene's file; None where neither has it."""
+        """Return the grid of the run's map on the earth, by its pose or its scene; None if neither has one."""
         return load_geobox(self.path(self.map_product))
 
     @property
     def map_product(self) -> str:
-        """The map that is exported: the one on the ground, where there is a pose."""
+        """Return the map that is exported: the one on the ground if there is a pose."""
         return "class_map" if self.store("ground_map") is None else "ground_map"
 
 
@@ -124,23 +123,15 @@ class Layer:
 
 
 def map_layers(run: ExportedRun) -> list[Layer]:
-    """Return the class map, confidence, attention (on its patches) and picture.
-
-    They are on the map where there is one, else on angles.
-    """
+    """Return the class map, its confidence, the expected gain of the patches, and a picture."""
     product = run.map_product
-    about = open_image(run.path(product), "classes").about
-    colours = np.array(about.get("class_colours", ()), np.uint8).reshape(-1, 3)
-    legend = ClassNames(tuple(about.get("class_names", ())), colours)
-    drawn = image_layer(run, product, "classes", ("class",), nodata=UNLABELLED, legend=legend)
-    sure = image_layer(run, product, "confidence", ("confidence",), nodata=np.nan)
-    seen = _picture(run) if product == "class_map" else image_layer(run, product, "picture", RGB, nodata=0)
-    score = patch_layer(run, "attention", "score", ("score",))
+    legend = legend_of(open_group(run.path(product)))
+    roles = ("data", "confidence")
     return [
-        Layer("class_map", "Class map", ("data",), *drawn),
-        Layer("confidence", "Probability of the class given", ("data", "confidence"), *sure, "1"),
-        Layer("attention", "Worth of a fine look, by patch", ("data",), *score, "1"),
-        Layer("rgb", "Picture of the coarse pass", ("visual", "overview"), *seen),
+        image_layer(run, product, "classes", "class_map", "Class map", nodata=UNLABELLED, legend=legend, band="class"),
+        image_layer(run, product, "confidence", "confidence", "Probability of the class given", roles=roles, unit="1"),
+        patch_layer(run, "attention", "score", "attention", "Expected gain of a fine pass, by patch"),
+        _picture(run),
     ]
 
 
@@ -156,7 +147,7 @@ def layer_tags(run: ExportedRun, product: str, geobox: GeoBox) -> dict[str, str]
 
 
 def geobox_of(run: ExportedRun, stored: StoredImage) -> GeoBox:
-    """Return the grid of a store's images, as the store itself says; in angles without a CRS."""
+    """Return the grid of a store's images; in angles without a CRS."""
     if stored.geobox is not None:
         return stored.geobox
     transform = stored.about.get("spatial:transform")
@@ -169,25 +160,28 @@ def image_layer(
     run: ExportedRun,
     product: str,
     array: str,
-    bands: tuple[str, ...],
+    name: str,
+    title: str,
     *,
-    nodata: float,
+    roles: tuple[str, ...] = ("data",),
+    band: str | None = None,
+    nodata: float = np.nan,
+    unit: str | None = None,
     legend: ClassNames | None = None,
-) -> tuple[CogImage, Callable[[], Rows]]:
+) -> Layer:
     """Return an image of a store on the store's own grid."""
     stored = open_image(run.path(product), array)
     geobox = geobox_of(run, stored)
-    image = CogImage(geobox, stored.dtype.name, bands, nodata, legend, layer_tags(run, product, geobox))
-    return image, stored.rows
+    tags = layer_tags(run, product, geobox)
+    image = CogImage(geobox, stored.dtype.name, (band or array,), nodata, legend, tags)
+    return Layer(name, title, roles, image, stored.rows, unit)
 
 
-def patch_layer(
-    run: ExportedRun, product: str, array: str, bands: tuple[str, ...]
-) -> tuple[CogImage, Callable[[], Rows]]:
-    """Return a figure of each patch, on the scene's grid by their size in pixels."""
-    stored, drawn = open_image(run.path(product), array), run.store("class_map")
-    assert drawn is not None
-    patch = int(run.archive.manifest(drawn)["params"]["grid"]["patch"])
+def patch_layer(run: ExportedRun, product: str, array: str, name: str, title: str) -> Layer:
+    """Return an image with one pixel a patch, on the grid of the class map."""
+    stored, class_map = open_image(run.path(product), array), run.store("class_map")
+    assert class_map is not None
+    patch = int(run.archive.manifest(class_map)["params"]["grid"]["patch"])
     scene = grid_of(open_image(run.path("class_map"), "classes").about)
     if scene is None:
         raise IncompleteStoreError(f"the class map of run {run.id} does not say its grid; run its survey again")
@@ -196,11 +190,17 @@ def patch_layer(
     geobox = angular_geobox(replace(scene, factor=patch), shape) if fine is None else zoomed_out(fine, patch, shape)
     policy = {"policy": str(stored.about.get("policy", ""))} if product == "attention" else {}
     tags = {**layer_tags(run, product, geobox), **policy, "patch_px": str(patch)}
-    return CogImage(geobox, stored.dtype.name, bands, np.nan, tags=tags), stored.rows
+    return Layer(
+        name, title, ("data",), CogImage(geobox, stored.dtype.name, (array,), np.nan, tags=tags), stored.rows, "1"
+    )
 
 
-def _picture(run: ExportedRun) -> tuple[CogImage, Callable[[], Rows]]:
-    """Yield the coarse mosaic in a photograph's tones, 1 to 255, and 0 where nothing was captured."""
+def _picture(run: ExportedRun) -> Layer:
+    """Return the picture on the ground, else the coarse mosaic in a photograph's tones: 1 to 255, 0 without a value."""
+    title, roles = "Picture of the coarse pass", ("visual", "overview")
+    if run.map_product == "ground_map":
+        drawn = image_layer(run, "ground_map", "picture", "rgb", title, roles=roles, nodata=0)
+        return replace(drawn, image=replace(drawn.image, bands=RGB))
     stored, ref = open_image(run.path("mosaic"), "coverage"), run.store("mosaic")
     assert ref is not None
     geobox = geobox_of(run, stored)
@@ -209,69 +209,36 @@ def _picture(run: ExportedRun) -> tuple[CogImage, Callable[[], Rows]]:
     def rows() -> Rows:
         yield 0, np.nan_to_num(np.rint(coarse_colours(ref, None))).astype(np.uint8)
 
-    return image, rows
-
-
-def seen_rows(run: ExportedRun) -> Iterator[tuple[int, NDArray[np.bool_]]]:
-    """Yield where a run's map shows anything, some rows at a time."""
-    if run.map_product == "class_map":
-        yield from (
-            (first, found != UNLABELLED) for first, found in open_image(run.path("class_map"), "classes").rows()
-        )
-        return
-    found, pictures = (open_image(run.path("ground_map"), name).rows() for name in ("classes", "picture"))
-    for (first, numbers), (_, picture) in zip(found, pictures, strict=True):
-        yield first, (numbers != UNLABELLED) | (picture.max(axis=2) > 0)
+    return Layer("rgb", title, roles, image, rows)
 
 
 def prior_map_layers(run: ExportedRun) -> list[Layer]:
-    """Return the days since each pixel was captured; for a run with a prior map also the changes and earlier classes.
-
-    On the map where there is a pose.
-    """
+    """Return the days since each pixel was captured, and what a prior map adds: changes, and earlier classes."""
     layers = []
     if (product := _product_with(run, "age")) is not None:
-        seen = _ages(run) if product == PROBABILITIES else image_layer(run, product, "age", ("age",), nodata=np.nan)
-        layers.append(Layer("age", "Days since the pixel was looked at", ("data",), *seen, "days"))
+        layer = image_layer(run, product, "age", "age", "Days since the pixel was captured", unit="days")
+        layers.append(layer if product == "ground_map" else _in_days(layer))
     if (product := _product_with(run, "changed")) is not None:
-        title = "Fraction of the patch's pixels with another class than remembered"
-        if product == PROBABILITIES:
-            changed = patch_layer(run, PROBABILITIES, "changed", ("changed",))
-        else:
-            changed = image_layer(run, product, "changed", ("changed",), nodata=np.nan)
-        layers.append(Layer("changed", title, ("data",), *changed, "1"))
+        title = "Fraction of the patch's pixels with another class than in the prior map"
+        of_pixels = product == "ground_map"
+        make = image_layer if of_pixels else patch_layer
+        layers.append(replace(make(run, product, "changed", "changed", title), unit="1"))
     if (product := _product_with(run, OLD_CLASS)) is not None:
         legend = legend_of(open_group(run.path(product)))
-        was = image_layer(run, product, OLD_CLASS, ("class",), nodata=UNLABELLED, legend=legend)
-        title = "Class remembered, where the map is sure of another one"
-        layers.append(Layer(OLD_CLASS, title, ("data",), *was))
+        title = "Class of the prior map, where the map is sure of another one"
+        layers.append(
+            image_layer(run, product, OLD_CLASS, OLD_CLASS, title, nodata=UNLABELLED, legend=legend, band="class")
+        )
     return layers
 
 
 def _product_with(run: ExportedRun, array: str) -> str | None:
-    """Return the product that holds an image: the map on the ground, else class probabilities, else None."""
-    products = (name for name in (GROUND, PROBABILITIES) if run.store(name) is not None)
+    """Return the product that has an image: the map on the ground, else class probabilities."""
+    products = (name for name in ("ground_map", PROBABILITIES) if run.store(name) is not None)
     return next((name for name in products if array in open_group(run.path(name))), None)
 
 
-def _ages(run: ExportedRun) -> tuple[CogImage, Callable[[], Rows]]:
-    """Return the ages of the field's own pixels, unpacked: few readers of GeoTIFF know of scales."""
-    image, packed = image_layer(run, PROBABILITIES, "age", ("age",), nodata=np.nan)
-    return replace(image, dtype="float32"), lambda: ((first, unpacked_days(rows)) for first, rows in packed())
-
-
-def write_layer_style(layer: Layer, image: Path) -> Path:
-    """Write the style of a layer beside its image, which is there already; gives its path."""
-    path, about = image.with_suffix(".qml"), layer.image
-    if about.legend is not None:
-        named = zip(about.legend.names, about.legend.colours.tolist(), strict=True)
-        write_class_style(path, [(number, name, tuple(colour)) for number, (name, colour) in enumerate(named)])
-    elif about.bands == RGB:
-        write_colour_style(path, (1, 2, 3), 1, 255)
-    elif about.wavelength_nm is not None:
-        red_green_blue = [band + 1 for band in choose_bands(np.array(about.wavelength_nm))[0]]
-        write_colour_style(path, red_green_blue, *value_span(image, red_green_blue))
-    else:
-        ramp = GREENS if "index" in about.tags else GREYS
-        write_ramp_style(path, *value_span(image, [1]), ramp)
-    return path
+def _in_days(layer: Layer) -> Layer:
+    """Return a layer of packed ages in float32, as few readers of GeoTIFF apply a scale."""
+    image = replace(layer.image, dtype="float32")
+    return replace(layer, image=image, rows=lambda: ((first, unpacked_days(rows)) for first, rows in layer.rows()))

@@ -1,7 +1,4 @@
-"""Exported values of a run: the table of its classes' areas, and layers of the mosaic's bands and indices.
-
-Areas say how surely they are known. Layers lie on the map where the run has one.
-"""
+"""Export values of a run: the table of its classes' areas, and layers of the mosaic's bands and indices."""
 
 from __future__ import annotations
 
@@ -41,12 +38,12 @@ COLUMNS = (
 DIGITS = 6
 BYTES_AT_ONCE = 1 << 27
 COLUMNS_AT_ONCE = 640
-SAMPLED = 4  # every so many pixels a side say what is white
+SAMPLED = 4  # step in pixels for finding the white level
 Floats = NDArray[np.float32]
 
 
 def write_areas(run: ExportedRun, path: Path) -> None:
-    """Write the table, a row a class; empty where something is not known, as hectares of pixels of any size."""
+    """Write the table with a row for each class; unknown values are empty."""
     path_of_map = run.path(run.map_product)
     names = tuple(open_image(path_of_map, "classes").about["class_names"])
     pixels, confidence = _counted(path_of_map, len(names))
@@ -68,7 +65,7 @@ def write_areas(run: ExportedRun, path: Path) -> None:
 
 
 def _counted(path: Path, count: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return (class,) pixels and mean confidence of the exported map; NaN for a class of which no pixel has one."""
+    """Return (class,) pixels and mean confidence of the exported map; NaN without any."""
     pixels, sums, sure_pixels = np.zeros(256, np.int64), np.zeros(256), np.zeros(256, np.int64)
     for (_, classes), (_, sure) in zip(
         open_image(path, "classes").rows(), open_image(path, "confidence").rows(), strict=True
@@ -81,10 +78,9 @@ def _counted(path: Path, count: int) -> tuple[NDArray[np.int64], NDArray[np.floa
 
 
 def _estimate(run: ExportedRun, fraction: NDArray[np.float64]) -> tuple[FractionEstimate, list[str]]:
-    """Return the fractions with errors, and the pixels behind each class; empty for a class without any.
+    """Return the fractions with errors, and the source of each class: labels, probabilities or none.
 
-    Pixels that are mapped as a class with judged ones count by the receipt's confusion matrix, others by their
-    probabilities.
+    Classes with enough judged pixels use the receipt's confusion matrix, others the probabilities.
     """
     count, confusion = len(fraction), run.receipt.get("accuracy", {}).get("confusion")
     judged = np.zeros(count, np.bool_) if confusion is None else judged_enough(confusion)
@@ -98,7 +94,7 @@ def _estimate(run: ExportedRun, fraction: NDArray[np.float64]) -> tuple[Fraction
 
 
 def _probabilities(run: ExportedRun, count: int, mapped: NDArray[np.intp]) -> Iterator[NDArray[np.float32]]:
-    """Yield (y, x, class) probabilities of the pixels mapped as some classes; 1 where the class is unknown."""
+    """Yield (y, x, class) probabilities of the pixels mapped as some classes; NaN elsewhere."""
     store = ProbabilityStore(run.path("class_probabilities"))
     for first, drawn in open_image(run.path("class_map"), "classes").rows():
         values = np.exp(store.read(slice(first, first + len(drawn)))[0])
@@ -112,30 +108,30 @@ def _probabilities(run: ExportedRun, count: int, mapped: NDArray[np.intp]) -> It
 
 @dataclass(frozen=True)
 class MosaicView:
-    """A run's mosaic, as an image on the map where the run has a pose, else on its own grid."""
+    """A run's mosaic as an image, on the map if the run has a pose, else on its own grid."""
 
     run: ExportedRun
 
     @cached_property
     def mosaic(self) -> Mosaic:
-        """The stored mosaic."""
+        """Return the stored mosaic."""
         return open_mosaic(self.run.path("mosaic"))
 
     @property
-    def words(self) -> str:
-        """Return the size of its pixels, in words."""
+    def pixels(self) -> str:
+        """Return the size of its pixels as a text."""
         return "Pixels of the field" if self.factor == 1 else f"Pixels of {self.factor} x {self.factor} px"
 
     @cached_property
     def geobox(self) -> GeoBox:
-        """Return the image's grid; in angles without a CRS."""
+        """Return the image's grid, in angles without a CRS."""
         if self.ground is not None:
             return self.ground.geobox
         return geobox_of(self.run, open_image(self.run.path("mosaic"), "coverage"))
 
     @cached_property
     def ground(self) -> GroundGrid | None:
-        """The map's grid in coarse pixels, with its rays, from what the map's store says of its pose; None without."""
+        """Return the map's grid in coarse pixels with its rays, by the pose in the map's store; None without one."""
         if self.run.store("ground_map") is None:
             return None
         path, scene = self.run.path("ground_map"), grid_of(open_image(self.run.path("class_map"), "classes").about)
@@ -143,16 +139,16 @@ class MosaicView:
         assert scene is not None
         assert geobox is not None
         pose = RigPose(**open_image(path, "classes").about["rig_pose"])
-        coarse = geobox.zoom_out(self.factor)  # finer the mosaic knows nothing
+        coarse = geobox.zoom_out(self.factor)
         return grid_of_map(GroundView(pose, scene.ifov_rad), scene.scene_shape, coarse)
 
     @property
     def factor(self) -> int:
-        """Fine pixels to a side of the mosaic's."""
+        """Return the side of a pixel in fine pixels."""
         return self.mosaic.factor
 
     def rows(self, bands: Sequence[int]) -> Rows:
-        """Yield the number of the first row and values (row, x, band) of some bands, from the top down."""
+        """Yield the first row and the values (row, x, band) of some bands, from the top down."""
         if self.ground is None:
             first = 0
             for block in self.mosaic.row_blocks():
@@ -171,7 +167,7 @@ class MosaicView:
 
 
 def _window_at(mosaic: Mosaic, pixels: NDArray[np.float64], factor: int, bands: Sequence[int]) -> Floats:
-    """Return the values at scene places (row, column, 2); only the rows and columns around them are read."""
+    """Return the values at scene places (row, column, 2), reading only the window around them."""
     known = pixels[np.isfinite(pixels).all(axis=-1)]
     if not len(known):
         return np.full((*pixels.shape[:2], len(bands)), np.nan, np.float32)
@@ -185,8 +181,8 @@ def _window_at(mosaic: Mosaic, pixels: NDArray[np.float64], factor: int, bands: 
 def spectral_layers(run: ExportedRun, choice: ProductChoice) -> list[Layer]:
     """Return the reflectance and indices to export.
 
-    Raises WavelengthError: the cube lacks bands of an index. SettingsError: an index wants reflectance, and the cube's
-    values are none.
+    Raises WavelengthError: the cube lacks bands of an index; SettingsError: an index needs reflectance, and the cube
+    has other values.
     """
     if not (choice.flags.reflectance or choice.indices):
         return []
@@ -197,8 +193,8 @@ def spectral_layers(run: ExportedRun, choice: ProductChoice) -> list[Layer]:
         if index.wants_reflectance and white != 1.0:
             raise SettingsError(
                 f"{index.name} wants reflectance (0 to 1), and the values of run {run.id} reach {white:.3g}; choose "
-                "an index of ratios, such as NDVI or PRI, or write the factor that makes them reflectance into the "
-                "scene.toml beside the scene (scale = 0.0001 where 10000 is white) and survey it again"
+                "an index of ratios, such as NDVI or PRI, or write the factor to reflectance into the scene.toml "
+                "beside the scene (scale = 0.0001 if 10000 is white) and survey it again"
             )
     layers = [_reflectance(view, white)] if choice.flags.reflectance else []
     return layers + [_index(view, index, bands, white) for index, bands in zip(choice.indices, picked, strict=True)]
@@ -211,11 +207,11 @@ def _reflectance(view: MosaicView, white: float) -> Layer:
         "float32",
         tuple(f"{centre:.1f} nm" for centre in wave.tolist()),
         np.nan,
-        tags={**layer_tags(view.run, "mosaic", view.geobox), "values": _format_value(white), "pixels": view.words},
+        tags={**layer_tags(view.run, "mosaic", view.geobox), "values": _format_value(white), "pixels": view.pixels},
         wavelength_nm=wave.tolist(),
         fwhm_nm=None if width is None else width.tolist(),
     )
-    title = f"{view.words}, {len(wave)} bands: {_format_value(white)}"
+    title = f"{view.pixels}, {len(wave)} bands: {_format_value(white)}"
     return Layer("reflectance", title, ("data", "reflectance"), image, lambda: view.rows(range(len(wave))), "1")
 
 
@@ -226,7 +222,7 @@ def _format_value(white: float) -> str:
 def _index(view: MosaicView, index: SpectralIndex, bands: Sequence[int], white: float) -> Layer:
     wave = read_bands(open_group(view.run.path("mosaic")))[0][list(bands)].tolist()
     taken = ", ".join(f"{band.symbol} {nm:.1f} nm" for band, nm in zip(index.bands, wave, strict=True))
-    tags = {"index": index.name, "bands": taken, "reference": index.reference, "pixels": view.words}
+    tags = {"index": index.name, "bands": taken, "reference": index.reference, "pixels": view.pixels}
     about = layer_tags(view.run, "mosaic", view.geobox) | tags
     image = CogImage(view.geobox, "float32", (index.name,), np.nan, tags=about)
 

@@ -1,4 +1,4 @@
-"""Products of a run's classes that are no images: polygons, and prescriptions as shapefile and task data."""
+"""Export a run's classes as polygons, and as prescriptions in a shapefile and ISOXML task data."""
 
 from __future__ import annotations
 
@@ -46,17 +46,17 @@ if TYPE_CHECKING:
 else:
     shapely = deferred("shapely")
 
-FINER = 0.99  # of a pixel's side: cells below it are finer than pixels
-CELL_M = 3.0  # of a prescription, where no side is given and pixels are smaller
+FINER = 0.99  # of a pixel's side: smaller cells are finer than pixels
+CELL_M = 3.0  # default of a prescription, if pixels are smaller
 IN_DEGREES = {"proj:code": "EPSG:4326"}
-NEEDS_PLACE = "the run does not say where on earth it was; survey with a [pose], or a scene with a CRS"
+NEEDS_PLACE = "the run has no place on the earth; survey with a [pose], or a scene with a CRS"
 Floats = NDArray[np.float64]
-Add = Callable[..., None]  # names a file to the catalogue: key, path, title, media type, roles, fields of STAC's
+Add = Callable[..., None]  # adds a file to the catalogue: key, path, title, media type, roles, STAC fields
 
 
 @dataclass(frozen=True)
 class ClassRaster:
-    """A run's classes as they are exported, whole."""
+    """A run's whole class map as it is exported."""
 
     classes: NDArray[np.uint8]  # (y, x)
     legend: ClassNames
@@ -65,7 +65,7 @@ class ClassRaster:
 
     @classmethod
     def of(cls, run: ExportedRun) -> ClassRaster:
-        """Read them from the map's store."""
+        """Read the classes of the map's store."""
         stored = open_image(run.path(run.map_product), "classes")
         names, colours = stored.about["class_names"], np.array(stored.about["class_colours"], np.uint8)
         classes = np.concatenate([rows for _, rows in stored.rows()])
@@ -74,14 +74,11 @@ class ClassRaster:
 
     @cached_property
     def pixel_m(self) -> float | None:
-        """Side of a square as large as the middle pixel; None without a CRS."""
+        """Return the side of a square as large as the middle pixel; None without a CRS."""
         return None if self.geobox is None else pixel_side_m(self.geobox)
 
     def shaped(self, choice: ProductChoice) -> ClassRaster:
-        """Return the raster with small regions given to a neighbour, and its classes grown in their order.
-
-        Regions that growing cuts off are given away again.
-        """
+        """Return the raster with small regions merged into a neighbour, and classes grown by their buffers."""
         if self.pixel_m is None:
             return self
         buffers = class_numbers(self.legend.names, choice.buffers_m, "--buffer")
@@ -93,7 +90,7 @@ class ClassRaster:
 
 
 def check_zones(run: ExportedRun, choice: ProductChoice) -> None:
-    """Refuse what the run's classes or its place do not give (SettingsError)."""
+    """Refuse products that need other classes or a place (SettingsError)."""
     names = open_image(run.path(run.map_product), "classes").about["class_names"]
     class_numbers(names, choice.buffers_m, "--buffer")
     class_numbers(names, choice.doses, "--prescription")
@@ -105,20 +102,19 @@ def check_zones(run: ExportedRun, choice: ProductChoice) -> None:
 
 
 def zone_notes(run: ExportedRun, choice: ProductChoice) -> list[str]:
-    """Return notes for readers of a prescription: cells that are finer than the map's pixels."""
+    """Return a note if the cells of a prescription are finer than the map's pixels."""
     if not choice.doses or run.geobox is None or choice.flags.cell is None:
         return []
     cell_m, pixel_m = choice.flags.cell, plane_pixel_m(run.geobox)
     if cell_m > FINER * pixel_m:
         return []
     return [
-        f"cells of {cell_m:g} m are finer than the map's pixels of {pixel_m:.3g} m, and show no more than these; "
-        f"--cell {pixel_m:.3g} makes fewer"
+        f"cells of {cell_m:g} m are finer than the map's pixels of {pixel_m:.3g} m; --cell {pixel_m:.3g} gives fewer"
     ]
 
 
 def write_zones(run: ExportedRun, folder: Path, choice: ProductChoice, add: Add) -> None:
-    """Write polygons and prescriptions that were asked for into ``folder``, each with its style, and ``add`` them."""
+    """Write the chosen polygons and prescriptions into ``folder``, each with its style, and ``add`` them."""
     if choice.flags.polygons or choice.doses:
         raster = ClassRaster.of(run).shaped(choice)
         if choice.flags.polygons:
@@ -157,24 +153,24 @@ def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, cho
     numbers = class_numbers(raster.legend.names, choice.doses, "--prescription")
     areas = areas_by_number(PlacedPicture(raster.geobox), raster.classes, len(raster.legend.names))
     assert areas is not None
-    words = ", ".join(f"{name} {dose:g} {choice.unit.name}" for name, dose in choice.doses.items())
+    text = ", ".join(f"{name} {dose:g} {choice.unit.name}" for name, dose in choice.doses.items())
     assert run.geobox is not None
     side_m = choice.flags.cell or max(CELL_M, round(plane_pixel_m(run.geobox), 3))  # no smaller than a pixel
-    field = DosedField(raster, numbers, choice.flags.least_fraction, side_m, float(areas.sum()), words)
+    field = DosedField(raster, numbers, choice.flags.least_fraction, side_m, float(areas.sum()), text)
     _write_cells(field, folder, choice, add)
     down, across = (round(field.cell_m / metres, DEGREE_DIGITS) for metres in degree_m(raster.geobox))
     grid, _, doses = field.dosed((down, across), to_degrees(raster.geobox))
     survey, version = run.receipt["survey"], str(run.receipt["versions"].get("spectralzoom", "unknown"))
     task = TaskGrid(*grid.corner, *grid.step, doses, choice.unit)
-    files = write_task_data(folder, task, TaskText(survey, survey, words, version, field.area_m2))
-    title = f"Prescription ({words}) as ISOXML task data, cells along north"
+    files = write_task_data(folder, task, TaskText(survey, survey, text, version, field.area_m2))
+    title = f"Prescription ({text}) as ISOXML task data, cells along north"
     kinds = (("task_data", "application/xml"), ("task_grid", "application/octet-stream"))
     for (key, kind), file in zip(kinds, files, strict=True):
         add(key, file, title, kind, ["data"], **IN_DEGREES)
 
 
 def _write_cells(field: DosedField, folder: Path, choice: ProductChoice, add: Add) -> None:
-    """Write the shapefile of cells along the heading, each as far as the field reaches, and its style."""
+    """Write the shapefile of cells along the heading, clipped to the field, and its style."""
     assert field.raster.geobox is not None
     unit, heading, (plane, to_own) = choice.unit, Heading(choice.flags.heading % 360), to_plane(field.raster.geobox)
 
@@ -190,7 +186,7 @@ def _write_cells(field: DosedField, folder: Path, choice: ProductChoice, add: Ad
     path = folder / "prescription.shp"
     write_polygons(path, outlines, columns | {"hectares": hectares}, to_own)
     cells = f"in cells of {field.cell_m:g} m along {heading.degrees:g} degrees; .shx, .dbf, .prj and .cpg beside it"
-    add("prescription", path, f"Prescription ({field.words}) {cells}", SHAPEFILE, ["data"])
+    add("prescription", path, f"Prescription ({field.text}) {cells}", SHAPEFILE, ["data"])
     most, levels = max(choice.doses.values()), np.unique([0.0, *doses[seen]]).tolist()
     shown = [(d, f"{d:g} {unit.name}", ramp_colour(d / most, REDS) if d else NONE) for d in levels]
     _add_style(path, "dose", shown, add)
@@ -198,17 +194,17 @@ def _write_cells(field: DosedField, folder: Path, choice: ProductChoice, add: Ad
 
 @dataclass(frozen=True)
 class DosedField:
-    """A map of classes with doses, and the cells that these are given in."""
+    """A map of classes with doses, and the size of their cells."""
 
     raster: ClassRaster
     doses: dict[int, float]  # by number of the class
     least_fraction: float
     cell_m: float
-    area_m2: float  # of all that has a class, on the ellipsoid
-    words: str
+    area_m2: float  # of all pixels with a class, on the ellipsoid
+    text: str  # of the doses
 
     def dosed(self, step: tuple[float, float], to_axes: ToAxes) -> tuple[CellGrid, Floats, Floats]:
-        """Lay cells over all that has a class: the grid, the fraction of each that is covered, and their doses.
+        """Return the grid of cells over all pixels with a class, the covered fraction of each, and their doses.
 
         Raises SettingsError: no pixel has a class, or there are too many cells.
         """
@@ -227,7 +223,7 @@ class DosedField:
         return grid, covered, dose_cells(covered, treated, self.least_fraction)
 
     def outlines(self, plane: Places) -> NDArray[Any]:
-        """Return the outlines of all that has a class, in metres of a plane, with a vertex at every pixel's corner."""
+        """Return the outlines of all pixels with a class in metres of a plane, with a vertex at every corner."""
         known = np.where(self.raster.classes == UNLABELLED, UNLABELLED, 0).astype(np.uint8)
         regions = outline_regions(known).of_classes()
         stepped = Coverage(regions.classes, shapely.segmentize(regions.polygons, 1.0)).moved(self.raster.transform)

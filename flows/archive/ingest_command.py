@@ -1,4 +1,4 @@
-"""The verb `ingest`: one file or folder becomes one immutable store of an archive."""
+"""Store a file or folder as one immutable cube of an archive: the verb `ingest`."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ def ingest(
     source
         ENVI header or data file, folder of a Headwall camera, GeoTIFF, .mat, .npy, .npz, PNG, JPEG, BMP, or Zarr store.
     name
-        What the cube is called; the file's or folder's name by default.
+        Name of the cube; the file's or folder's name by default.
     dark
         Dark frame, ENVI or .npy, averaged over its lines; a Headwall folder's own by default.
     white
         White frame, likewise.
     wavelengths
-        Centre wavelengths of all bands [nm], where the files do not say them: 660,800
+        Centre wavelengths of all bands [nm], if the files lack them: 660,800
     """
     nm = parse_numbers(wavelengths, "--wavelengths")
     record = run_ingest(source, archive, stderr, name=name, dark=dark, white=white, wavelengths=nm)
@@ -74,12 +74,11 @@ def run_ingest(
     white: str | None = None,
     wavelengths: Sequence[float] | None = None,
 ) -> dict[str, Any]:
-    """Store a source in an archive, with progress on ``console``; give the record that --json prints.
+    """Store a source in an archive, with progress on ``console``; return the record that --json prints.
 
-    The key of the store comes from the files' content and the flags. The same content is stored once, whatever its name
-    and place. Killed anywhere it leaves nothing under that key. Raises SceneError, WavelengthError: the source cannot
-    be used, or changed while it was read; ArchiveError: the name cannot be one in an archive, or the archive cannot be
-    written to.
+    The key of the store is a hash of the files' content and the flags, so the same content is stored once. Raises
+    SceneError, WavelengthError: the source cannot be used, or changed while it was read; ArchiveError: the name is not
+    allowed, or the archive cannot be written to.
     """
     if name is not None:
         check_name(name)
@@ -87,7 +86,7 @@ def run_ingest(
         found = with_wavelengths(open_cube(source, dark=dark, white=white), source, wavelengths)
         cube = with_stated_values(found, source)
         opened = open_archive(archive)
-        opened.reclaim()  # what a killed ingest left half made
+        opened.reclaim()  # of a killed ingest
     with opened.in_use(), StageProgress(console, TITLES) as progress:
         before = _stamps(cube)
         files = hash_files(cube, lambda done: progress.show("read", done))
@@ -97,7 +96,7 @@ def run_ingest(
             write_ingested_cube(
                 path, cube, files, name=name or cube.name, report=lambda done: progress.show(STAGE, done)
             )
-            if _stamps(cube) != before:  # what was written is not what was hashed
+            if _stamps(cube) != before:
                 raise SceneError(f"{source} changed while it was read; ingest it again once it is whole")
 
         ref, built = opened.produce(STAGE, build, version=VERSION, params=_key(name, cube, files))
@@ -108,7 +107,7 @@ def run_ingest(
 
 
 def hash_files(source: CubeSource, report: Report = lambda done: None) -> list[SourceFile]:
-    """Return the size and SHA-256 of every file of a cube; names have no folders, except within a store."""
+    """Return the name, size and SHA-256 of every file of a cube; names are relative to a store."""
     files: list[SourceFile] = []
     for number, path in enumerate(source.files):
         root = source.root
@@ -119,7 +118,7 @@ def hash_files(source: CubeSource, report: Report = lambda done: None) -> list[S
 
 
 def _next(record: Mapping[str, Any], source: str) -> str:
-    """Return the command that surveys the stored cube: a camera's numbers as a recording, all others as a scene."""
+    """Return the command that surveys the stored cube: a camera's numbers as a recording, others as a scene."""
     words = ["spectralzoom", "survey"]
     if record["source_dtype"].lstrip("<>=|") in ("u1", "u2", "i2"):
         path = Path(source)
@@ -136,8 +135,8 @@ def _stamps(source: CubeSource) -> list[tuple[int, int]]:
 
 
 def _key(name: str | None, source: CubeSource, files: Sequence[SourceFile]) -> dict[str, Any]:
-    """Return the parameters of the store: content, flags, and wavelengths from elsewhere than the files."""
-    named = source.root is not None  # names say where a chunk of a Zarr store, or a part of a cube, lies
+    """Return the parameters of the store: content, flags and wavelengths."""
+    named = source.root is not None  # names of chunks or parts are content
     centres, widths = source.bands.wavelength_nm, source.bands.fwhm_nm
     return {
         "files": [[file.name if named else "", file.size, file.sha256] for file in files],

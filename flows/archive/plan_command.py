@@ -1,4 +1,4 @@
-"""The verb `plan`: a survey's stages are asked which store they want; nothing is built or written."""
+"""The verb `plan`: each stage of a survey is asked for the key of its store; nothing is built or written."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 from textwrap import shorten
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
@@ -55,10 +56,10 @@ State = Literal["cached", "to run", "blocked"]
 def plan(
     settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, preview: Path | None = None, as_json: AsJson = False
 ) -> int:
-    """Tell what a survey would run: what is stored, what is to be made and why, and estimates of what it takes.
+    """Print what a survey would run: the stages that are stored, those to be made and why, and estimates.
 
-    Those are seconds of the camera, bytes, multiply-adds, score and processor time, each with what it comes from.
-    Nothing is captured, started or written, but for the preview. Give the settings that you would give to `survey`.
+    Estimates are seconds of the camera, bytes, multiply-adds and score, each with its source. Only the preview is
+    written. Give the settings that you would give to `survey`.
 
     Parameters
     ----------
@@ -83,12 +84,12 @@ class StageForecast:
 
 
 class _WaitsError(IncompleteStoreError):
-    """A stage asks for the content, or for the key, of what is still to be made."""
+    """A stage needs the content or the key of a store that is still to be made."""
 
 
 @dataclass(frozen=True)
 class _Awaited(StageRef):
-    """Address of a store that is still to be made: asking for its path, or for an unknown key, raises ``made_by``."""
+    """Address of a store that is still to be made: reading its path, or an unknown key, raises _WaitsError."""
 
     made_by: str
 
@@ -101,22 +102,21 @@ class _Awaited(StageRef):
 
 @dataclass(frozen=True)
 class Forecast:
-    """Forecast of a survey, stage by stage in order, and why this machine would refuse it (None: it would not)."""
+    """Forecast of a survey, stage by stage in order."""
 
     stages: list[StageForecast]
-    refused: str | None = None
+    refused: str | None = None  # why this machine would refuse the survey
     scans: ScanChoice = field(default_factory=ScanChoice)
     figures: Mapping[str, Any] = field(default_factory=dict)  # see `flows.publish.findings`
     estimates: Mapping[str, Estimate] = field(default_factory=dict)
-    kept: Mapping[str, Any] | None = (
-        None  # of a uniform scan that is kept and read in part: at most, as receipts tell it
-    )
+    kept: Mapping[str, Any] | None = None  # at most, of a uniform scan that is segmented in part
 
 
 def forecast(settings: Settings, preview: Path | None = None) -> Forecast:
-    """Return what a survey would do, stage by stage; writes nothing but the ``preview``, where one is asked for.
+    """Return what a survey would do, stage by stage; writes only the ``preview``, if one is given.
 
-    Raises PipelineError: what a survey would refuse, but size; ArchiveError: the preview cannot be written.
+    Raises PipelineError: the survey would be refused for another reason than its size; ArchiveError: the preview cannot
+    be written.
     """
     with tempfile.TemporaryDirectory(prefix="spectralzoom-plan-") as empty:
         archive = Archive(Path(empty), writes=False)  # where there is none yet
@@ -131,32 +131,29 @@ def forecast(settings: Settings, preview: Path | None = None) -> Forecast:
         fine: FinePlan | None = None
         attention = planner.products["score"]
         if attention is not None and not isinstance(attention, _Awaited):
-            with suppress(PipelineError, OSError):  # the row of what reads it says why it cannot be read
+            with suppress(PipelineError, OSError):  # the row of the stage that reads it has the error
                 fine = load_plan(attention)
         figures = field_figures(run, fine)
         if preview is not None:
             with refusals(preview.parent, "write the preview"):
                 plan_preview.draw_preview(preview, run, fine, _last_map(run, catalogue), figure_lines(figures))
     kept = run.reading_figures(run.likely_patches) if run.plan.plain and run.chooses else None
-    estimates = estimate_survey(run, fine, catalogue)
-    return Forecast(planner.rows, run.refused, run.scans, figures, estimates, kept)
+    return Forecast(planner.rows, run.refused, run.scans, figures, estimate_survey(run, fine), kept)
 
 
 def _last_map(run: SurveyRun, catalogue: Catalogue) -> ClassMap | None:
-    """The newest map of the field that is of its size and can be read; None where there is none."""
+    """Return the field's newest map of the same size that can be read."""
     for one in reversed(catalogue.runs):
-        parts = one.products.get("class_map", "").split("/")
-        if one.receipt.get("survey") == run.name and len(parts) > 3:
+        if one.receipt.get("survey") == run.name and "class_map" in one.products:
             with suppress(PipelineError, OSError):
-                store = run.archive.find(parts[1], parts[2])
-                found = None if store is None else load_class_map(store.path / "class_map.zarr")
-                if found is not None and found.classes.shape == run.scene.shape:
+                found = load_class_map(run.archive.locate(one.products["class_map"]))
+                if found.classes.shape == run.scene.shape:
                     return found
     return None
 
 
 class Planner(OpenSurvey):
-    """A survey that asks every stage for its key, and runs none."""
+    """A survey that asks every stage for its key and runs none."""
 
     def __init__(self, run: SurveyRun, catalogue: Catalogue) -> None:
         super().__init__(run)
@@ -165,26 +162,26 @@ class Planner(OpenSurvey):
         self._planned: dict[str, Store] = {}  # by address
 
     def __call__(self, stage: str, /, *inputs: StageRef) -> StageRef:
-        """Note what would become of a stage, and return where its store would be."""
+        """Add the forecast of a stage, and return the address that its store would have."""
         try:
             row, ref = self._forecast(STAGES[stage], STAGES[stage].wants(self.run, *inputs))
-        except (PipelineError, OSError) as error:  # what is there cannot be used: the survey would stop here
+        except (PipelineError, OSError) as error:  # the survey would stop here
             why = f"waits for {error}" if isinstance(error, _WaitsError) else str(error)
             row = StageForecast(stage, "blocked", None, why)
             ref = _Awaited(STAGES[stage].product.name, "", Path(), stage)
-        if row not in self.rows:  # lines that later ones lie between are asked for twice
+        if row not in self.rows:  # the later of two passes asks for lines of the first again
             self.rows.append(row)
         self.products[stage] = ref
         return ref
 
     def goes_back(self, request: StageRef) -> bool:
-        """Return whether the survey may ask for more lines, as far as that is known."""
+        """Return whether the survey may ask for more lines."""
         with suppress(PipelineError, OSError):
             return super().goes_back(request)
         return not self.run.plan.plain
 
     def take_as_found(self, stage: str, ref: StageRef, *inputs: StageRef) -> None:
-        """Note a store that is not made again, since what follows was made of it."""
+        """Add a store that is not made again, because later ones were made of it."""
         self.rows.append(StageForecast(stage, "cached", ref.key, "condensed"))
         self.products[stage] = ref
 
@@ -202,7 +199,7 @@ class Planner(OpenSurvey):
         return row, _Awaited(ref.stage, key, ref.path, stage.name)
 
     def _reason(self, stage: Stage, store: Store) -> tuple[str, tuple[Change, ...]]:
-        """Return what differs from the newest store of the same stage of the same scene, in words and in full."""
+        """Return the differences from the newest store of the same stage and scene, in words and in full."""
         there = self.catalogue.stores.get(store.ref.uri)
         if there is not None and there.cleared:
             return "its files were cleared away by gc", ()
@@ -221,58 +218,46 @@ class Planner(OpenSurvey):
 
 
 def _format_summary(changes: Sequence[Change], stage: str) -> str:
-    """The first thing that differs where it began, and how many more."""
+    """Return the first change at its origin, and how many more there are."""
     causes = [change for change in changes if change.kind != "input"] or list(changes)
     if not causes:
-        return "nothing differs but its key"
+        return "only its key differs"
     first = causes[0]
     where = "" if first.where == stage else f" of {first.where}"
     more = f", and {len(causes) - 1} more" if len(causes) > 1 else ""
-    if first.kind == "input":
-        return f"other {first.name} than in the newest store{more}"
-    if first.name == "weights":
-        return f"other weights than in the newest store{where}{more}"
+    if first.kind == "input" or first.name == "weights":
+        return f"other {first.name} than in the newest store{where}{more}"
     name = "version" if first.kind == "version" else first.name
-    return f"{name}{where}: {_shown(first.old)} before, {_shown(first.new)} now{more}"
-
-
-def _shown(value: object) -> str:
-    parts = value if isinstance(value, list) else [value]
-    return ", ".join("none" if part is None else str(part) for part in parts) or "none"
+    old, new = (", ".join(map(str, one)) if isinstance(one, list) else one for one in (first.old, first.new))
+    return f"{name}{where}: {old} before, {new} now{more}"
 
 
 MOST_SCANS = 8  # of the frontier that are shown
-SCANS_TITLE = "One uniform scan of the field, by the weights' record"
-MARKS = {"taken": "this survey", "reference": "nearly as good as any"}
+SCANS_TITLE = "One uniform scan of the field, by the weights' scan performance table"
+MARKS = {"taken": "this survey", "reference": "reference"}
 MOST_LETTERS = 250  # of a reason
 COLOURS = {"cached": "green", "to run": "bold", "blocked": "yellow"}
 
 
 def plan_content(settings: Settings, preview: Path | None = None) -> dict[str, Any]:
-    """The forecast as plain tables; ``refused``: why this machine would not begin."""
+    """Return the forecast as plain tables."""
     found = forecast(settings, preview)
+    best = found.scans.frontier
+    shown = np.linspace(0, len(best) - 1, min(len(best), MOST_SCANS)).round().astype(int)
     return {
         "archive": settings.out,
         "stages": [asdict(row) for row in found.stages],
         "to_make": sum(row.state != "cached" for row in found.stages),
         "refused": found.refused,
-        "scans": scans_content(found.scans),
+        "scans": {
+            "taken": as_figures(found.scans.chosen),
+            "reference": as_figures(found.scans.reference),
+            "frontier": [as_figures(best[number]) for number in shown],
+        },
         "field": found.figures,
         "estimate": {name: asdict(one) for name, one in found.estimates.items()},
         **({} if found.kept is None else {"kept": found.kept}),
         **({} if preview is None else {"preview": str(preview)}),
-    }
-
-
-def scans_content(scans: ScanChoice) -> dict[str, Any]:
-    """Uniform scans of this field by the weights' record: the best for their seconds, and what is or would be taken."""
-    best = scans.frontier
-    last = max(len(best) - 1, 1)
-    shown = sorted({round(number * last / (MOST_SCANS - 1)) for number in range(MOST_SCANS)}) if best else []
-    return {
-        "taken": as_figures(scans.chosen),
-        "reference": as_figures(scans.reference),
-        "frontier": [as_figures(best[number]) for number in shown if number < len(best)],
     }
 
 
@@ -283,16 +268,14 @@ def show_plan(content: dict[str, Any], console: Console) -> None:
         for row in content["stages"]
     ]
     console.print(table(("stage", "state", "why"), rows, left=3, whole=("stage", "state")))
-    for line in figure_lines(content["field"]):
+    kept = [format_kept(content["kept"])] if "kept" in content else []
+    for line in (*figure_lines(content["field"]), *kept):
         console.print(escape(line), soft_wrap=True)
-    if "kept" in content:
-        console.print(escape(format_kept(content["kept"])), soft_wrap=True)
-    made = (
-        f"{content['to_make']} stages to make" if content["to_make"] else "everything is stored: it would be published"
-    )
-    console.print(made)
     if content["to_make"]:
+        console.print(f"{content['to_make']} stages to make")
         console.print(estimate_table(content["estimate"]))
+    else:
+        console.print("everything is stored: it would be published")
     if content["scans"]["frontier"]:
         _show_scans(content["scans"], console)
     if "preview" in content:
@@ -302,9 +285,9 @@ def show_plan(content: dict[str, Any], console: Console) -> None:
 
 
 def figure_lines(figures: Mapping[str, Any]) -> list[str]:
-    """The figures of the field and of the captures in words, a line each."""
+    """Return the figures of the field and of the captures in sentences, a line each."""
     size = f"{' x '.join(map(format_count, figures['size_px']))} px"
-    lines = [f"field: {'; '.join((size, *(words for _, words in finding_rows({'field': figures}))))}"]
+    lines = [f"field: {'; '.join((size, *(text for _, text in finding_rows({'field': figures}))))}"]
     if figures["kept_fraction"] is not None:
         lines.append(f"zones: {format_percent(figures['kept_fraction'])} of the field is kept to")
     if figures["ground_pixel_m"] is None:
@@ -332,16 +315,16 @@ def format_kept(kept: Mapping[str, Any]) -> str:
 
 
 def _show_scans(scans: dict[str, Any], console: Console) -> None:
-    """Print what uniform scans of the field cost, and what the weights' record expects of them."""
+    """Print the cost of uniform scans of the field, and their expected scores."""
     rows = {scan["seconds"]: scan for scan in scans["frontier"]}
     marks = {name: scans[name] for name in ("taken", "reference") if scans[name] is not None}
     rows |= {scan["seconds"]: scan for scan in marks.values()}
     cells = []
     for seconds, scan in sorted(rows.items()):
-        said = ", ".join(MARKS[name] for name, one in marks.items() if one == scan)
+        notes = ", ".join(MARKS[name] for name, one in marks.items() if one == scan)
         predicted = format_prediction(scan["expected_miou"], scan["expected_spread"]) or DASH
         figures = f"{seconds:.1f}", format_bytes(scan["bytes_raw"]), predicted
-        cells.append([format_scan(scan["step"], scan["exposure_ms"]), said, *figures])
+        cells.append([format_scan(scan["step"], scan["exposure_ms"]), notes, *figures])
     columns = ("scan", "", "seconds", "raw data", "mIoU, about")
     console.print(table(columns, cells, left=2, title=SCANS_TITLE, whole=columns))
     if any(row[-1] == DASH for row in cells):

@@ -1,4 +1,4 @@
-"""The products that an export is asked for: flags, and what they mean, checked as far as words alone can be."""
+"""Parse the flags of an export's products."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ class ProductFlags:
     cell: Annotated[
         float | None, Parameter(help="Side of the prescription's cells [m]; by default 3 m, or a pixel if larger.")
     ] = None
-    heading: Annotated[float, Parameter(help="Along which its cells lie, clockwise from north [deg].")] = 0.0
+    heading: Annotated[float, Parameter(help="Heading of its cells, clockwise from north [deg].")] = 0.0
     least_fraction: Annotated[
-        float, Parameter(help="A cell gets the dose of a class of which it has more than this fraction, 0 to 1.")
+        float, Parameter(help="A cell gets the dose of a class that covers more than this fraction of it, 0 to 1.")
     ] = 0.0
     least_area: Annotated[
-        float, Parameter(help="Regions below it go to their neighbour, in polygons and prescription [m2].")
+        float, Parameter(help="Smaller regions are merged into a neighbour, in polygons and prescription [m2].")
     ] = 0.0
     buffer: Annotated[
-        str | None, Parameter(help="How far classes grow in polygons and prescription, with commas: weed=0.3 [m].")
+        str | None, Parameter(help="Buffer around classes in polygons and prescription, with commas: weed=0.3 [m].")
     ] = None
     simplify: Annotated[
-        float | None, Parameter(help="By how much borders of polygons are simplified [m]; by default one pixel.")
+        float | None, Parameter(help="Tolerance for simplifying borders of polygons [m]; by default one pixel.")
     ] = None
 
 
@@ -57,7 +57,7 @@ NO_PRODUCTS = ProductFlags()
 
 @dataclass(frozen=True)
 class ProductChoice:
-    """The flags as values: indices, doses by class (empty without a prescription) and their unit, metres by class."""
+    """The parsed flags: indices, doses by class (empty without a prescription), their unit, and buffers by class."""
 
     flags: ProductFlags
     indices: tuple[SpectralIndex, ...]
@@ -67,7 +67,7 @@ class ProductChoice:
 
 
 def choose_products(flags: ProductFlags) -> ProductChoice:
-    """Read the flags. Raises SettingsError: a number, an index or a unit that cannot be, or that nothing asks for."""
+    """Parse the flags (SettingsError: a number, an index or a unit is wrong, or has no product)."""
     doses = by_class(flags.prescription, "--prescription", "weed=2.5")
     numbers = (
         ("--least-area", flags.least_area, 0 <= flags.least_area < float("inf"), "0 or more"),
@@ -88,7 +88,7 @@ def choose_products(flags: ProductFlags) -> ProductChoice:
 
 
 def by_class(text: str | None, flag: str, example: str) -> dict[str, float]:
-    """Return the numbers by class from ``weed=2.5,grass=1``. Raises SettingsError: not so, or less than 0."""
+    """Return the numbers by class of ``weed=2.5,grass=1`` (SettingsError: another form, or below 0)."""
     found = {}
     for part in split_list(text):
         name, _, number = part.partition("=")
@@ -99,7 +99,7 @@ def by_class(text: str | None, flag: str, example: str) -> dict[str, float]:
 
 
 def class_numbers(names: Sequence[str], wanted: Mapping[str, float], flag: str) -> dict[int, float]:
-    """Return the same by the numbers of a run's classes. Raises SettingsError: the run has no class of a name."""
+    """Return values by class number instead of name (SettingsError: the run has no such class)."""
     unknown = sorted(set(wanted) - set(names))
     if unknown:
         raise SettingsError(f"{flag}: the run has no class {unknown[0]!r}; its classes are {', '.join(names)}")

@@ -1,12 +1,12 @@
-"""The verbs `reprocess` and `evaluate ARCHIVE RUN`: surveys of an archive again, and maps judged later.
+"""Survey the fields of an archive again, and judge published maps: `reprocess` and `evaluate ARCHIVE RUN`.
 
-Existing stores are found by their keys, raw light above all; only stores that new weights or newer stages change are
-made.
+Existing stores are found by their keys; only stores that new weights or newer stages change are made.
 """
 
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from flows.archive.compare_command import find_run
-from flows.archive.stale_runs import asked_again, from_raw_cubes, is_called, is_current, newest_runs, renewals
+from flows.archive.stale_runs import asked_again, called, from_raw_cubes, is_called, is_current, newest_runs, renewals
 from flows.cli.app import ArchiveName, AsJson, Scheduler, Switch, Workers, stderr
 from flows.publish.receipt import Receipt
 from flows.publish.run_folder import extend_with_accuracy, load_receipt
@@ -41,7 +41,6 @@ from storage.parallel.pool import THREADS, WorkerPool
 from storage.remote.opening import open_archive
 
 Survey = Callable[[Settings, Console], Path]  # settings in, the folder of the published run out
-STATES = ("ran", "would run", "skipped", "failed")
 
 
 def reprocess(
@@ -54,24 +53,24 @@ def reprocess(
     dry_run: Switch = False,
     as_json: AsJson = False,
 ) -> int:
-    """Survey every field of an archive again: light is found there, only what has changed is made anew.
+    """Survey every field of an archive again: stored captures are used, only stores that have changed are made.
 
     Parameters
     ----------
     field
-        Only fields whose survey, scene file or newest run is called so; * stands for any letters.
+        Only fields whose survey, scene file or newest run has this name; * matches any letters.
     weights
         Other model weights for all of them.
     dry_run
-        Only say what would run.
+        Only print what would run.
     """
     pool = WorkerPool(scheduler, workers)
     return run_reprocess(archive, stderr, as_json=as_json, field=field, weights=weights, dry_run=dry_run, pool=pool)
 
 
-def run_reprocess(archive: str | Path, console: Console, *, as_json: bool = False, **wishes: Any) -> int:
-    """Survey again what was asked for, as `reprocess_fields`; progress on ``console``, the summary on stdout."""
-    content = reprocess_fields(archive, console, **wishes)
+def run_reprocess(archive: str | Path, console: Console, *, as_json: bool = False, **options: Any) -> int:
+    """Run `reprocess_fields` with progress on ``console``, and print its summary on stdout."""
+    content = reprocess_fields(archive, console, **options)
     put_out(content, _show, as_json=as_json)
     failed = sum(row["state"] == "failed" for row in content["fields"])
     return DONE if not failed else FAILED if failed == len(content["fields"]) else PARTLY
@@ -87,35 +86,34 @@ def reprocess_fields(
     pool: WorkerPool = THREADS,
     survey: Survey | None = None,
 ) -> dict[str, Any]:
-    """Survey again what was asked for, and return a row a field; ``pool`` makes the blocks.
+    """Survey fields of an archive again, and return a row a field.
 
-    Fields whose newest run is already as it would become are skipped: the same command continues after an interruption.
-    Raises SettingsError: no field is called so; ArchiveError: the archive cannot be read or written.
+    Fields whose newest run is current are skipped, so the same command continues after an interruption. Raises
+    SettingsError: no field has this name; ArchiveError: the archive cannot be read or written.
     """
     opened = open_archive(archive, create=False, write=not dry_run)
     catalogue = Catalogue.read(opened.root)
     if weights is not None and not weights.is_file():
         raise SettingsError(f"--weights {weights}: there is no such file; give weights that train has written")
     fields = newest_runs(catalogue)
-    wanted = fields if field is None else [one for one in fields if is_called(one, field)]
+    wanted = fields if field is None else [run for run in fields if is_called(run, field)]
     if field is not None and not wanted:
-        names = ", ".join(dict.fromkeys(one.field for one in fields)) or "none"
-        raise SettingsError(f"--field {field}: no field of this archive is called so; there are {names}")
+        names = ", ".join(dict.fromkeys(map(called, fields))) or "none"
+        raise SettingsError(f"--field {field}: no field of this archive has this name; there are {names}")
     rows: list[dict[str, Any]] = []
     renewed = renewals(catalogue)
-    with pool.open():  # one start of its workers for all fields
-        for number, generation in enumerate(wanted, 1):
-            old = generation.run.folder.name
-            summary = f"{number} of {len(wanted)}: {generation.field} ({old})"
-            console.print(f"[bold]reprocess {escape(summary)}[/]", soft_wrap=True)
-            begun, before = time.perf_counter(), _scores(generation.run.receipt, "before")
-            row = {"field": generation.field, "scene": generation.run.settings.get("scene"), "old": old, "new": None}
+    with pool.open():  # workers start once for all fields
+        for number, run in enumerate(wanted, 1):
+            old = run.folder.name
+            title = f"{number} of {len(wanted)}: {called(run)} ({old})"
+            console.print(f"[bold]reprocess {escape(title)}[/]", soft_wrap=True)
+            begun, before = time.perf_counter(), _scores(run.receipt, "before")
+            row = {"field": called(run), "scene": run.settings.get("scene"), "old": old, "new": None}
             row |= {"state": "failed", "message": None, **before, **_scores({}, "after")}
             try:
-                settings = _asked(catalogue, generation.run, str(archive), weights, pool, renewed)
+                settings = _settings_of(catalogue, run, str(archive), weights, pool, renewed)
                 if settings is None:
-                    row |= {"state": "skipped", "message": "is as it would become"}
-                    row |= _scores(generation.run.receipt, "after")
+                    row |= {"state": "skipped", "message": "is up to date", **_scores(run.receipt, "after")}
                 elif dry_run:
                     row |= {"state": "would run"}
                 else:
@@ -129,12 +127,12 @@ def reprocess_fields(
     return {"archive": opened.name, "dry_run": dry_run, "fields": rows}
 
 
-def _asked(
+def _settings_of(
     catalogue: Catalogue, run: Run, archive: str, weights: Path | None, pool: WorkerPool, renewed: Mapping[str, str]
 ) -> Settings | None:
-    """Return the settings of a field's new survey; None where its newest run is already as it would become.
+    """Return the settings of a field's new survey; None where its newest run is current.
 
-    ``renewed`` names the newest run of each visit that may be another's prior map.
+    ``renewed`` has the newest generation of each run that may be another's prior map.
     """
     here: dict[str, Any] = {"scheduler": pool.scheduler, "workers": pool.workers}
     settings = replace(asked_again(run, archive, weights), **here)
@@ -155,36 +153,32 @@ def _scores(receipt: Mapping[str, Any], when: str) -> dict[str, float | None]:
 
 
 def _format_row(row: Mapping[str, Any]) -> str:
-    words = f"{row['field']} ({row['old']}) {row['state']}"
-    if row["state"] == "ran":
-        words += f": {row['new']}, {format_seconds(row['seconds'])}"
-        for label, name in (("mIoU", "miou"), ("overall", "overall_accuracy")):
-            scores = [row[f"{name}_before"], row[f"{name}_after"]]
-            words += "" if None in scores else f", {label} {' to '.join(map(format_points, scores))}"
-        return words
-    return words + (f": {row['message']}" if row["message"] else "")
+    text = f"{row['field']} ({row['old']}) {row['state']}"
+    if row["state"] != "ran":
+        return text + (f": {row['message']}" if row["message"] else "")
+    text += f": {row['new']}, {format_seconds(row['seconds'])}"
+    for label, name in (("mIoU", "miou"), ("overall", "overall_accuracy")):
+        scores = [row[f"{name}_before"], row[f"{name}_after"]]
+        text += "" if None in scores else f", {label} {' to '.join(map(format_points, scores))}"
+    return text
 
 
 def _show(content: Mapping[str, Any], console: Console) -> None:
     rows = content["fields"]
-    counts = {state: sum(row["state"] == state for row in rows) for state in STATES}
-    summary = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
-    lines = [
-        *map(_format_row, rows),
-        f"{counted(len(rows), 'field')}: {summary}" if rows else "no field matches: nothing to do",
-    ]
-    for line in lines:
+    counts = ", ".join(f"{count} {state}" for state, count in Counter(row["state"] for row in rows).items())
+    total = f"{counted(len(rows), 'field')}: {counts}" if rows else "no field matches: nothing to do"
+    for line in (*map(_format_row, rows), total):
         console.print(escape(line), soft_wrap=True)
 
 
 def run_judge(
     archive: str, name: str, console: Console, *, controls: bool | None = None, labels: str | None = None
 ) -> Receipt:
-    """Judge a run's map and add its accuracy to the run; gives its receipt, as it is where it has what is asked for.
+    """Judge a run's map and add its accuracy to the run; return its receipt.
 
-    ``name`` may be `latest` or `previous`; what is None is as the survey was asked for. Raises ArchiveError: there is
-    no such run, it is damaged, or lacks what is needed; SceneError, WeightsError: scene, labels or weights are not
-    those of the run, or there are no labels.
+    ``name`` may be `latest` or `previous`; ``controls`` and ``labels`` are those of the survey if None. A run that has
+    its accuracy already stays as it is. Raises ArchiveError: there is no such run, or it is damaged or incomplete;
+    SceneError, WeightsError: scene, labels or weights are not those of the run, or there are no labels.
     """
     opened = open_archive(archive, create=False)
     catalogue = Catalogue.read(opened.root)
@@ -196,7 +190,7 @@ def run_judge(
     if labels is not None:
         settings = replace(settings, labels=labels)
     there = "accuracy" in receipt and labels is None
-    placed = not settings.plain or settings.is_map  # patches, beside which other placements are judged
+    placed = not settings.plain or settings.is_map  # patches, which are compared with other placements
     if there and (receipt["accuracy"]["controls"] or not (placed and settings.controls)):
         console.print(escape(f"{found.uri} has its accuracy already"), soft_wrap=True)
         return receipt
@@ -212,7 +206,7 @@ def run_judge(
                 what = f"{stage.title} of {found.uri}"
                 survey.products[stage.name] = _store(catalogue, run.archive, what, str(row["key"]))
         raster, lines = ("condense_raster", "segment", "score"), ("rectify", "segment", "choose_effects", "score")
-        for name in raster if survey.is_map else lines:  # the stages by whose stores a map is judged
+        for name in raster if survey.is_map else lines:  # a map is judged by their stores
             if name not in survey.products:
                 raise ArchiveError(f"the {TITLES[name]} of {found.uri} is missing or damaged; run verify --repair")
         _check_same(catalogue, found, survey.products, run)
@@ -243,15 +237,15 @@ def _store(catalogue: Catalogue, archive: Archive, what: str, key: str) -> Stage
 
 
 def _check_same(catalogue: Catalogue, found: Run, products: Products, run: SurveyRun) -> None:
-    """Refuse to judge by another scene or other weights than the map is of, or where there is nothing to judge by."""
+    """Refuse another scene or other weights than those of the map, and a scene without labels."""
     if run.scene.key != found.receipt.get("scene"):
         raise SceneError(
-            f"the scene {run.settings.scene} is another than {found.uri} looked at; put that one back, or survey again"
+            f"the scene {run.settings.scene} is not the one that {found.uri} captured; restore it, or survey again"
         )
     if run.weights_key != catalogue.stores[products["segment"].uri].params.get("weights"):
         raise WeightsError(
-            f"the weights {run.settings.weights or 'that come with SpectralZoom'} are others than the map of"
-            f" {found.uri} was drawn with; put those back, or reprocess with these"
+            f"the weights {run.settings.weights or 'that come with SpectralZoom'} are not those of the map of"
+            f" {found.uri}; restore those, or reprocess with these"
         )
     if not run.scene.labelled:
         raise SceneError(f"there are no labels to judge {found.uri} by; give --labels FILE, on the scene's pixels")

@@ -1,10 +1,8 @@
-"""Fields of an archive, the newest run of each, and whether it is as the present code, weights and settings make it."""
+"""Select the newest run of every field of an archive, and decide whether present code and weights would change it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from functools import cache
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -23,20 +21,12 @@ from storage.archive.records import Run, Store
 from storage.readers.open_cubes import split_variable
 from storage.readers.recordings import find_raw_cubes, stores_of_lines
 
-OF_THE_SURVEY = ("labels", "weights", "memory", "accuracy", "prior")  # settings that its raw cubes do not bring
-# what the light of a field depends on; surveys that agree in these are generations of one
+OF_THE_SURVEY = ("labels", "weights", "memory", "accuracy", "prior")  # settings that raw cubes do not contain
+# settings that the light of a field depends on; surveys that agree in these are generations of one
 OF_THE_LIGHT = (
     *("scene", "bands", "wavelengths", "source", "seed", "effects", "size"),
     *("day", "hour", "interest", "camera", "pointing_px", "pose", "visit", "sweeps", "pointing", "dark", "white"),
 )
-
-
-@dataclass(frozen=True)
-class Generation:
-    """The newest run of one field."""
-
-    field: str  # what its survey is called
-    run: Run
 
 
 def called(run: Run) -> str:
@@ -44,29 +34,28 @@ def called(run: Run) -> str:
     return str(run.receipt.get("survey") or run.facts.get("survey") or run.folder.name)
 
 
-def newest_runs(catalogue: Catalogue) -> list[Generation]:
-    """Return the newest run of every field, oldest first; a run with unreadable settings is a field of its own."""
-    found: dict[str, Generation] = {}
-    for run in catalogue.runs:  # oldest first
-        name = called(run)
-        field = canonical_json([name, _light_of(_recorded_run(catalogue, run)) if run.settings else run.uri])
-        found.pop(field, None)
-        found[field] = Generation(name, run)
+def _generations(catalogue: Catalogue) -> list[list[Run]]:
+    """Return the runs of each field, oldest first; a run with unreadable settings is a field of its own."""
+    found: dict[str, list[Run]] = {}
+    for run in catalogue.runs:
+        light = _light_of(_recorded_run(catalogue, run)) if run.settings else run.uri
+        found.setdefault(canonical_json([called(run), light]), []).append(run)
     return list(found.values())
 
 
+def newest_runs(catalogue: Catalogue) -> list[Run]:
+    """Return the newest run of every field, oldest first."""
+    newest = {runs[-1].uri for runs in _generations(catalogue)}
+    return [run for run in catalogue.runs if run.uri in newest]
+
+
 def renewals(catalogue: Catalogue) -> dict[str, str]:
-    """Return the newest run of the same look for each run that was made again, by their names."""
-    scan_passes: dict[str, list[str]] = {}
-    for run in catalogue.runs:
-        if run.settings:
-            light = _light_of(_recorded_run(catalogue, run))
-            scan_passes.setdefault(canonical_json([called(run), light]), []).append(run.folder.name)
-    return {earlier: names[-1] for names in scan_passes.values() for earlier in names[:-1]}
+    """Return the name of the newest generation for each run that has one."""
+    return {earlier.folder.name: runs[-1].folder.name for runs in _generations(catalogue) for earlier in runs[:-1]}
 
 
 def _recorded_run(catalogue: Catalogue, run: Run) -> Run:
-    """Return the run of this archive whose raw cubes a run was surveyed from as a recording, else the run itself."""
+    """Return the run whose raw cubes a run has as its recording, else the run itself."""
     by_name = {one.folder.name: one for one in catalogue.runs}
     while run.settings.get("source") == RECORDED:
         place, _, name = str(run.settings.get("sweeps")).rpartition("/runs/")
@@ -77,11 +66,11 @@ def _recorded_run(catalogue: Catalogue, run: Run) -> Run:
 
 
 def from_raw_cubes(catalogue: Catalogue, run: Run, settings: Settings) -> Settings:
-    """Return the settings of a survey of a run's own raw cubes as a recording, where its light is not found otherwise.
+    """Return settings that survey a run's own raw cubes as a recording, where its source cannot be read again.
 
-    That is so where the captures have another version than a rig or a recording left. It is so, too, where the files of
-    a recording or of a simulated scene are gone. Else, and where the raw cubes are gone too, the settings stay. Raises
-    SettingsError, BudgetError: as `asked_again`.
+    That is the case if the stage of captures has another version, or if the files of a recording or scene are gone. The
+    settings stay as they are otherwise, and if the raw cubes are gone too. Raises SettingsError, BudgetError: as
+    `asked_again`.
     """
     raw = set(stores_of_lines(run.products, lambda uri: uri in catalogue.stores and not catalogue.stores[uri].cleared))
     stores = [catalogue.stores.get(uri) for uri in raw]
@@ -96,20 +85,19 @@ def from_raw_cubes(catalogue: Catalogue, run: Run, settings: Settings) -> Settin
 
 
 def _is_there(settings: Settings) -> bool:
-    """Return whether what a recording or a scene comes from still lies where it lay; a rig is taken to be there."""
+    """Return whether the files of a recording or of a scene still exist; True for a rig."""
     if settings.source == RECORDED:
         try:
             find_raw_cubes(str(settings.sweeps))
         except PipelineError:
             return False
         return True
-    if settings.source != "sim" or settings.scene in BUILT_IN_SCENES:
-        return True
-    return split_variable(settings.scene)[0].exists()
+    is_file = settings.source == "sim" and settings.scene not in BUILT_IN_SCENES
+    return not is_file or split_variable(settings.scene)[0].exists()
 
 
 def _light_of(run: Run) -> dict[str, Any]:
-    """Return the settings that the light of a run depends on, a built-in scene by one name and its usual moment."""
+    """Return the settings that the light of a run depends on, with the law of a farm and its usual moment."""
     light = {key: run.settings.get(key) for key in OF_THE_LIGHT}
     sky = run.settings.get("sky")
     light["sky"] = [sky.get("light", "clear"), sky.get("light_fraction")] if isinstance(sky, dict) else ["clear", None]
@@ -119,15 +107,15 @@ def _light_of(run: Run) -> dict[str, Any]:
     return light
 
 
-def is_called(generation: Generation, pattern: str) -> bool:
-    """Return whether a field's survey, scene or run is called so; ``*`` stands for any letters."""
-    scene = str(generation.run.settings.get("scene", ""))
-    names = (generation.field, scene, PurePath(scene).name, generation.run.folder.name)
+def is_called(run: Run, pattern: str) -> bool:
+    """Return whether the survey, scene or run has this name; ``*`` matches any letters."""
+    scene = str(run.settings.get("scene", ""))
+    names = (called(run), scene, PurePath(scene).name, run.folder.name)
     return any(fnmatchcase(name, pattern.replace("[", "[[]").replace("?", "[?]")) for name in names)
 
 
 def asked_again(run: Run, out: str | Path, weights: Path | None) -> Settings:
-    """Return the settings of a run for another survey into the archive ``out``, with other weights if these are given.
+    """Return the settings of a run for another survey into the archive ``out``, with other ``weights`` if given.
 
     Raises SettingsError, BudgetError: the run's settings cannot be read, or are not of this version.
     """
@@ -138,7 +126,7 @@ def asked_again(run: Run, out: str | Path, weights: Path | None) -> Settings:
 
 
 def stale_stores(catalogue: Catalogue, uris: set[str], weights: str | None) -> set[str]:
-    """Return the stores that a survey would make again: gone, damaged, of another version, of other weights."""
+    """Return the stores that a survey would make again: missing, damaged, of another version or of other weights."""
     now, by_weights = versions(), {one.product.name for one in STAGES.values() if one.product.by_weights}
 
     def is_stale(store: Store | None) -> bool:
@@ -149,29 +137,15 @@ def stale_stores(catalogue: Catalogue, uris: set[str], weights: str | None) -> s
     return {uri for uri in uris if is_stale(catalogue.stores.get(uri))}
 
 
-def is_whole(catalogue: Catalogue, run: Run) -> bool:
-    """Return whether run and stores are there, told from manifests alone, and none of its stages failed."""
-    stores = [catalogue.stores.get(uri) for uri in catalogue.named_and_below[run.uri]]
-    failed = any(row.get("state") == "failed" for row in run.stages)
-    return run.problem is None and not failed and all(one is not None and one.problem is None for one in stores)
-
-
 def is_current(catalogue: Catalogue, run: Run, settings: Settings) -> bool:
-    """Return whether its survey would find all that this run rests on, by versions and weights alone."""
-    stale = stale_stores(catalogue, catalogue.named_and_below[run.uri], weights_key(settings))
-    return not stale and is_whole(catalogue, run) and not is_pending(run.receipt)
-
-
-def weights_key(settings: Settings) -> str | None:
-    """Return the key of the weights by their content, as stages know it; None where they cannot be read."""
+    """Return whether a run is whole and its survey would find all of its stores, by versions and weights alone."""
     try:
-        path = weights_path(settings)
-        return _file_key(path, path.stat().st_mtime_ns, path.stat().st_size)
-    except (OSError, SettingsError, WeightsError):  # they came from elsewhere, and nothing says which they are
-        return None
-
-
-@cache
-def _file_key(path: Path, changed_ns: int, size: int) -> str:
-    """Read once for all fields, and again when the file has changed."""
-    return describe_weights(path).key
+        weights = describe_weights(weights_path(settings)).key
+    except (OSError, SettingsError, WeightsError):
+        weights = None
+    complete = run.problem is None and all(row.get("state") != "failed" for row in run.stages)
+    return (
+        complete
+        and not is_pending(run.receipt)
+        and not stale_stores(catalogue, catalogue.named_and_below[run.uri], weights)
+    )

@@ -1,25 +1,23 @@
-"""Image files for programs that read no Zarr: ENVI, and cloud-optimised GeoTIFF for map programs.
+"""Write images for programs that read no Zarr: ENVI, and cloud-optimised GeoTIFF by GDAL.
 
-Both are written block by block; GeoTIFF goes through GDAL's own driver of cloud-optimised files.
+Both are written block by block.
 """
 
 from __future__ import annotations
 
 import importlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-import pyproj
 from affine import Affine
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
-from pipeline.errors import ArchiveError, PoseError, ShapeError
+from pipeline.errors import ArchiveError, ShapeError
 from pipeline.rig.camera.envi_headers import DATA_TYPES
 from storage.archive.whole_files import make_folder, write_whole, written_aside
 from storage.arrays.class_maps import ClassNames
@@ -27,7 +25,6 @@ from storage.arrays.cubes import RawCube
 from storage.arrays.layout import SHARD_ROWS, AngularGrid
 
 TILE = 512  # px: rasters within one tile need no overviews
-OUTSIDE = 0.02  # fraction of pixels that a style's colours end before, at either end
 ANGULAR = (
     "angular grid of the camera: x and y are tangents of the angle from the undeflected direction [rad], y grows "
     "downwards; there is no CRS"
@@ -56,16 +53,23 @@ class CogImage:
 
 
 def write_cog(path: Path, image: CogImage, blocks: Blocks) -> None:
-    """Write one file, replacing what was there as a whole. Blocks come in order; memory: one block, not the image.
+    """Write one file atomically from blocks in order; one block at a time is in memory.
 
-    Classes get a colour table, their names as tags of the band, and as GDAL's category names in ``NAME.aux.xml``.
-    Raises ShapeError: the blocks do not fill the image. ArchiveError: the disk refuses, or does not keep the numbers.
+    Classes get a colour table, and their names as tags of the band and as GDAL's category names in ``NAME.aux.xml``.
+    Raises ShapeError: the blocks do not fill the image; ArchiveError: the disk refuses or changes the numbers.
     """
+    try:
+        _write_cog(path, image, blocks)
+    except importlib.import_module("rasterio").errors.RasterioError as error:
+        raise ArchiveError(f"{path} cannot be written: {error}; is there space on the disk?") from error
+
+
+def _write_cog(path: Path, image: CogImage, blocks: Blocks) -> None:
     rasterio = importlib.import_module("rasterio")
     copy = importlib.import_module("rasterio.shutil").copy
     sidecar = f"{path.name}.aux.xml"
     files = [path.name] if image.legend is None else [path.name, sidecar]
-    with _refusals_of_gdal(path), written_aside(path.parent, files) as aside:
+    with written_aside(path.parent, files) as aside:
         plain, made = aside / "plain.tif", aside / path.name
         _write_plain(rasterio, plain, image, blocks)
         options = {
@@ -88,17 +92,8 @@ def write_cog(path: Path, image: CogImage, blocks: Blocks) -> None:
             ElementTree.ElementTree(root).write(aside / sidecar, encoding="utf-8")
 
 
-@contextmanager
-def _refusals_of_gdal(path: Path) -> Iterator[None]:
-    """Turn an error of rasterio's into one that names the file (ArchiveError)."""
-    try:
-        yield
-    except importlib.import_module("rasterio").errors.RasterioError as error:
-        raise ArchiveError(f"{path} cannot be written: {error}; is there space on the disk?") from error
-
-
 def _write_plain(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> None:
-    """Write an uncompressed TIFF in strips, block by block, from which GDAL makes the other."""
+    """Write an uncompressed TIFF in strips, block by block; GDAL makes the cloud-optimised file from it."""
     (y, x), crs = image.geobox.shape, image.geobox.crs
     profile = {
         "driver": "GTiff",
@@ -140,14 +135,11 @@ def _in_order(name: str, blocks: Blocks, shape: tuple[int, int, int]) -> Iterato
         yield first, block
         reached += len(block)
     if reached != shape[0]:
-        raise ShapeError(f"{name}: {reached} of {shape[0]} rows were given")
+        raise ShapeError(f"{name}: {reached} rows were given, expected {shape[0]}")
 
 
 def _tag_wavelengths(file: Any, image: CogImage) -> None:
-    """Write each band's wavelength and width.
-
-    They are in GDAL's own domain IMAGERY [um], and as its driver of ENVI has them [nm].
-    """
+    """Write each band's wavelength and width in GDAL's domain IMAGERY [um], and as its ENVI driver has them [nm]."""
     if image.wavelength_nm is None:
         return
     widths = [None] * len(image.bands) if image.fwhm_nm is None else image.fwhm_nm
@@ -158,21 +150,6 @@ def _tag_wavelengths(file: Any, image: CogImage) -> None:
             own["FWHM_UM"], usual["fwhm"] = f"{width / 1000:.9g}", f"{width:.9g}"
         file.update_tags(band, ns="IMAGERY", **own)
         file.update_tags(band, **usual)
-
-
-def value_span(path: Path, bands: Sequence[int]) -> tuple[float, float]:
-    """Return the 2nd and 98th percentile of a file's pixels in some bands, counted from 1; 0 and 1 without any value.
-
-    At most 512 x 512 pixels of the file are read.
-    """
-    with importlib.import_module("rasterio").open(path) as file:
-        y, x = (min(size, TILE) for size in file.shape)
-        values = file.read(list(bands), out_shape=(len(bands), y, x), masked=True).astype(np.float64).filled(np.nan)
-    known = values[np.isfinite(values)]
-    if not known.size:
-        return 0.0, 1.0
-    low, high = (float(value) for value in np.quantile(known, (OUTSIDE, 1 - OUTSIDE)))
-    return (low, high) if low < high else (low, low + 1.0)
 
 
 # --- ENVI -------------------------------------------------------------------------------------------------------------
@@ -188,17 +165,15 @@ class EnviFile:
     fwhm_nm: NDArray[np.float64] | None = None  # (band,)
     description: str = ""
     nodata: float | None = None
-    geobox: GeoBox | None = None  # where the image lies on a map
     ending: str = ".img"  # of the file with the numbers
     more: Mapping[str, str] = field(default_factory=dict)  # further entries of the header
 
 
 def write_envi(header: Path, file: EnviFile, blocks: Blocks) -> Path:
-    """Write ``NAME.hdr`` and the numbers beside it; gives the latter's path, ``NAME.img``.
+    """Write ``NAME.hdr`` and the numbers beside it; return the path of the latter.
 
-    A pair that is there is replaced; a header never stands beside numbers that are not its own. Blocks of lines come in
-    order; memory: two blocks. Raises ShapeError: the blocks do not fill the file. PoseError: the map's grid is turned,
-    or its pixels do not run down and to the right. ArchiveError: the disk refuses.
+    Both files replace earlier ones together. Blocks of lines come in order. Raises ShapeError: the blocks do not fill
+    the file; ArchiveError: the disk refuses.
     """
     data, kind = header.with_suffix(file.ending), np.dtype(file.dtype).newbyteorder("<")
     text = "".join(["ENVI\n", *(f"{key} = {value}\n" for key, value in _header_fields(file, kind))])
@@ -211,7 +186,7 @@ def write_envi(header: Path, file: EnviFile, blocks: Blocks) -> Path:
 
 
 def _header_fields(file: EnviFile, kind: np.dtype[Any]) -> Iterator[tuple[str, str]]:
-    """Yield sizes, type, byte order, bands, and the map where there is one."""
+    """Yield sizes, type, byte order and bands."""
     lines, samples, bands = file.shape
     if file.description:
         yield "description", _listed([file.description.replace("{", "(").replace("}", ")")])
@@ -221,8 +196,6 @@ def _header_fields(file: EnviFile, kind: np.dtype[Any]) -> Iterator[tuple[str, s
     yield from (("interleave", "bil"), ("byte order", "0"))
     if file.nodata is not None:
         yield "data ignore value", f"{file.nodata:.17g}"
-    if file.geobox is not None:
-        yield from _map_fields(file.geobox)
     if file.wavelength_nm is not None:
         yield "wavelength units", "Nanometers"
     for key, values in (("wavelength", file.wavelength_nm), ("fwhm", file.fwhm_nm)):
@@ -235,32 +208,8 @@ def _listed(words: list[str]) -> str:
     return "{" + ", ".join(words) + "}"
 
 
-def has_map_info(geobox: GeoBox) -> bool:
-    """Return whether ENVI's header can say where an image lies: north is up, and the CRS counts metres."""
-    a, b, _, d, e, _ = (float(number) for number in geobox.affine[:6])
-    metres = geobox.crs is not None and geobox.crs.projected and "metre" in geobox.crs.units
-    return metres and not b and not d and a > 0 > e
-
-
-def _map_fields(geobox: GeoBox) -> Iterator[tuple[str, str]]:
-    """Yield where the upper left pixel's corner lies, the pixels' sides, and the CRS as the WKT that ENVI reads."""
-    a, _, c, _, e, f = (float(number) for number in geobox.affine[:6])
-    if not has_map_info(geobox) or geobox.crs is None:
-        raise PoseError(f"ENVI's map info takes a grid with north up and a CRS, got {geobox!r}")
-    crs = pyproj.CRS.from_wkt(geobox.crs.to_wkt())
-    zone = crs.utm_zone  # such as 32N; None where the projection is another
-    place = [f"{number!r}" for number in (1.0, 1.0, c, f, a, -e)]
-    datum = "WGS-84" if crs.geodetic_crs is not None and crs.geodetic_crs.to_epsg() == 4326 else "Unknown"
-    if zone is None:
-        words = ["Arbitrary", *place, "0"]
-    else:
-        words = ["UTM", *place, zone[:-1], "North" if zone[-1] == "N" else "South", datum]
-    yield "map info", _listed([*words, "units=Meters"])
-    yield "coordinate system string", "{" + crs.to_wkt("WKT1_ESRI") + "}"
-
-
 def write_recorded_files(cube: RawCube, folder: Path) -> Path:
-    """Write a raw cube as ENVI with a pointing table and reference frames, named like its sweep; gives the header.
+    """Write a raw cube as ENVI with a pointing table and reference frames, named like its sweep; return the header.
 
     `storage.readers.recordings` reads them back bit for bit::
 
@@ -270,8 +219,8 @@ def write_recorded_files(cube: RawCube, folder: Path) -> Path:
         NAME.white.*                 white frame; its header has the value of the white reference per band
         NAME.bad.*  NAME.flat.*      bad elements (1), and the relative response where there is one
 
-    Numbers stand in text with as many digits as give the same float64 again. Files of these names are replaced. Raises
-    ArchiveError: the disk refuses; IncompleteStoreError: the cube is damaged.
+    Numbers have as many digits as give the same float64 again. Files of these names are replaced. Raises ArchiveError:
+    the disk refuses; IncompleteStoreError: the cube is damaged.
     """
     make_folder(folder)
     name = cube.sweep.name

@@ -1,15 +1,14 @@
-"""Files for map programs and machines: polygons (by GDAL), QGIS styles beside them and rasters, and ISOXML task data.
+"""Write vector files for map programs and machines: polygons with QGIS styles, and ISOXML task data.
 
-Polygons are GeoPackage, GeoJSON and shapefile; styles (.qml) are classes with names and colours, ramps, bands as
-colours. Task data (ISO 11783-10, version 4) is TASKDATA.XML and the numbers of its grid, of type 2. Rows begin at the
-south-west corner; each cell has the dose as a 32 bit whole number in steps of the dictionary's entity for it.
+Polygons are GeoPackage, GeoJSON and shapefile, by GDAL. Task data (ISO 11783-10, version 4) is TASKDATA.XML and a
+binary grid of type 2. Its rows begin at the south-west corner. Each cell has the dose as a 32 bit integer in the steps
+of its data dictionary entity.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,11 +39,9 @@ Columns = Mapping[str, Any]  # one value a polygon, each a sequence or an array
 FOLDER, XML, NUMBERS = "TASKDATA", "TASKDATA.XML", "GRD00000.bin"
 DESIGNATOR = 32  # letters of a name
 MOST_NUMBER = 2**31 - 1
-TREATED, UNTREATED = 1, 0  # codes of treatment zones: 0 where there is no cell, no signal, or outside of the field
+TREATED, UNTREATED = 1, 0  # codes of treatment zones; UNTREATED also without a signal and outside the field
 STYLE = "application/xml"
 QGIS_VERSION = "3.34"  # the earliest that these were written for
-GREENS = ((120, 70, 20), (240, 230, 150), (20, 110, 30))  # of indices, from low to high
-GREYS = ((0, 0, 0), (255, 255, 255))
 REDS = ((255, 235, 205), (245, 130, 50), (150, 0, 20))  # of doses above 0
 NONE = (215, 215, 215)  # of a dose of 0
 
@@ -57,18 +54,24 @@ def write_polygons(
 ) -> None:
     """Write polygons as a GeoPackage, as GeoJSON or as a shapefile, by the ending of ``path``.
 
-    ``polygons`` are shapely's, ``columns`` values of each, ``crs`` WKT, None where there is none. A GeoPackage keeps
-    ``when`` (ISO 8601) as its date, so that bytes repeat. GeoJSON is in longitude and latitude, its shells
-    anticlockwise (RFC 7946). A shapefile has .shx, .dbf, .prj and .cpg beside it, and names of columns of 10 letters.
-    Raises ArchiveError: GDAL or the disk refuses.
+    ``polygons`` are shapely's, ``columns`` values of each, ``crs`` WKT or None. A GeoPackage has ``when`` (ISO 8601) as
+    its date, so that the same polygons give the same bytes. GeoJSON is in longitude and latitude (RFC 7946). A
+    shapefile has its other parts beside it, and column names of 10 letters. Raises ArchiveError: GDAL or the disk
+    refuses.
     """
     kind = path.suffix
     names = [path.with_suffix(part).name for part in reversed(SHAPE_PARTS)] if kind == ".shp" else [path.name]
-    with _writing(path, names, when) as aside, warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "'crs' was not provided", UserWarning)  # a missing one has its own message
-        frame = geopandas.GeoDataFrame(dict(columns), geometry=list(polygons), crs=crs)
-        frame = frame.to_crs(4326) if kind == ".geojson" else frame
-        frame.to_file(aside / path.name, layer=layer, engine="pyogrio", **_OPTIONS[kind])
+    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": when})
+    try:
+        with written_aside(path.parent, names) as aside, warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "'crs' was not provided", UserWarning)
+            frame = geopandas.GeoDataFrame(dict(columns), geometry=list(polygons), crs=crs)
+            frame = frame.to_crs(4326) if kind == ".geojson" else frame
+            frame.to_file(aside / path.name, layer=layer, engine="pyogrio", **_OPTIONS[kind])
+    except pyogrio.errors.DataSourceError as error:
+        raise ArchiveError(f"{path} cannot be written: {error}; is there space on the disk?") from error
+    finally:
+        pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": None})
 
 
 _OPTIONS: Mapping[str, Mapping[str, Any]] = {
@@ -76,19 +79,6 @@ _OPTIONS: Mapping[str, Mapping[str, Any]] = {
     ".geojson": {"driver": "GeoJSON", "RFC7946": "YES", "COORDINATE_PRECISION": DEGREE_DIGITS},
     ".shp": {"driver": "ESRI Shapefile", "encoding": "UTF-8"},
 }
-
-
-@contextmanager
-def _writing(path: Path, names: Sequence[str], when: str | None) -> Iterator[Path]:
-    """Yield a folder to write into; GDAL's date of now is ``when``, and its refusals become ArchiveError."""
-    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": when})
-    try:
-        with written_aside(path.parent, names) as aside:
-            yield aside
-    except pyogrio.errors.DataSourceError as error:
-        raise ArchiveError(f"{path} cannot be written: {error}; is there space on the disk?") from error
-    finally:
-        pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": None})
 
 
 @dataclass(frozen=True)
@@ -129,8 +119,8 @@ class TaskText:
     area_m2: float
 
 
-def write_task_data(folder: Path, grid: TaskGrid, words: TaskText) -> tuple[Path, Path]:
-    """Write ``folder/TASKDATA`` with the task and its grid; gives the paths of both files.
+def write_task_data(folder: Path, grid: TaskGrid, text: TaskText) -> tuple[Path, Path]:
+    """Write ``folder/TASKDATA`` with the task and its grid; return the paths of both files.
 
     Raises SettingsError: a dose is larger than the format can hold. ArchiveError: the disk refuses.
     """
@@ -142,28 +132,28 @@ def write_task_data(folder: Path, grid: TaskGrid, words: TaskText) -> tuple[Path
     place = folder / FOLDER
     with written_aside(place, [NUMBERS, XML]) as aside:
         (aside / NUMBERS).write_bytes(numbers)
-        tree = ElementTree.ElementTree(_task_file(grid, words, len(numbers)))
+        tree = ElementTree.ElementTree(_task_file(grid, text, len(numbers)))
         ElementTree.indent(tree)
         tree.write(aside / XML, encoding="UTF-8", xml_declaration=True)
     return place / XML, place / NUMBERS
 
 
-def _task_file(grid: TaskGrid, words: TaskText, length: int) -> ElementTree.Element:
+def _task_file(grid: TaskGrid, text: TaskText, length: int) -> ElementTree.Element:
     """Return one planned task of one field with two treatment zones, one of them the grid's."""
     root = ElementTree.Element(
         "ISO11783_TaskData",
         VersionMajor="4",
         VersionMinor="3",
         ManagementSoftwareManufacturer="SpectralZoom",
-        ManagementSoftwareVersion=words.version[:DESIGNATOR],
+        ManagementSoftwareVersion=text.version[:DESIGNATOR],
         DataTransferOrigin="1",
     )
-    field = {"A": "PFD1", "C": words.field[:DESIGNATOR], "D": f"{words.area_m2:.0f}"}
+    field = {"A": "PFD1", "C": text.field[:DESIGNATOR], "D": f"{text.area_m2:.0f}"}
     ElementTree.SubElement(root, "PFD", field)
-    ElementTree.SubElement(root, "PDT", {"A": "PDT1", "B": words.product[:DESIGNATOR], "D": "VPN1"})
+    ElementTree.SubElement(root, "PDT", {"A": "PDT1", "B": text.product[:DESIGNATOR], "D": "VPN1"})
     zones = {"H": str(UNTREATED), "I": str(UNTREATED), "J": str(UNTREATED)}
     task = ElementTree.SubElement(
-        root, "TSK", {"A": "TSK1", "B": words.task[:DESIGNATOR], "E": "PFD1", "G": "1"} | zones
+        root, "TSK", {"A": "TSK1", "B": text.task[:DESIGNATOR], "E": "PFD1", "G": "1"} | zones
     )
     for code, name in ((UNTREATED, "no treatment"), (TREATED, "by the grid")):
         zone = ElementTree.SubElement(task, "TZN", {"A": str(code), "B": name})
@@ -188,50 +178,9 @@ def _task_file(grid: TaskGrid, words: TaskText, length: int) -> ElementTree.Elem
 
 
 def ramp_colour(fraction: float, ramp: Sequence[Colour]) -> Colour:
-    """Return the colour at a fraction, 0 to 1, of a ramp of colours evenly apart."""
-    place = min(max(fraction, 0.0), 1.0) * (len(ramp) - 1)
-    low = min(int(place), len(ramp) - 2)
-    return tuple(round(a + (place - low) * (b - a)) for a, b in zip(ramp[low], ramp[low + 1], strict=True))
-
-
-def write_class_style(path: Path, classes: Sequence[Entry]) -> None:
-    """Write the style of a raster of class numbers."""
-    root, renderer = _raster({"type": "paletted", "band": "1", "opacity": "1", "alphaBand": "-1"})
-    palette = SubElement(renderer, "colorPalette")
-    for number, name, colour in classes:
-        SubElement(palette, "paletteEntry", value=str(number), label=name, color=_hex(colour), alpha="255")
-    _write(path, root)
-
-
-def write_ramp_style(path: Path, low: float, high: float, ramp: Sequence[Colour]) -> None:
-    """Write the style of a raster of one band: a ramp of colours from ``low`` to ``high``."""
-    span = {"classificationMin": f"{low:g}", "classificationMax": f"{high:g}"}
-    root, renderer = _raster({"type": "singlebandpseudocolor", "band": "1", "opacity": "1", "alphaBand": "-1", **span})
-    kind = {"colorRampType": "INTERPOLATED", "classificationMode": "2", "clip": "0"}
-    scale = {"minimumValue": f"{low:g}", "maximumValue": f"{high:g}"}
-    shader = SubElement(SubElement(renderer, "rastershader"), "colorrampshader", {**kind, **scale})
-    for number, colour in enumerate(ramp):
-        value = f"{low + (high - low) * number / (len(ramp) - 1):g}"
-        SubElement(shader, "item", value=value, label=value, color=_hex(colour), alpha="255")
-    _write(path, root)
-
-
-def write_colour_style(path: Path, bands: Sequence[int], low: float, high: float) -> None:
-    """Write the style of a raster that shows three of its bands, counted from 1, as red, green and blue.
-
-    Each goes from ``low`` to ``high``.
-    """
-    named = dict(zip(("redBand", "greenBand", "blueBand"), map(str, bands), strict=True))
-    root, renderer = _raster({"type": "multibandcolor", "opacity": "1", "alphaBand": "-1", **named})
-    for colour in ("red", "green", "blue"):
-        stretch = SubElement(renderer, f"{colour}ContrastEnhancement")
-        for name, text in (
-            ("minValue", f"{low:g}"),
-            ("maxValue", f"{high:g}"),
-            ("algorithm", "StretchToMinimumMaximum"),
-        ):
-            SubElement(stretch, name).text = text
-    _write(path, root)
+    """Return the colour at a fraction, 0 to 1, of a ramp of evenly spaced colours."""
+    positions = np.linspace(0, 1, len(ramp))
+    return tuple(round(float(np.interp(fraction, positions, channel))) for channel in zip(*ramp, strict=True))
 
 
 def write_polygon_style(path: Path, column: str, entries: Sequence[Entry]) -> None:
@@ -242,8 +191,8 @@ def write_polygon_style(path: Path, column: str, entries: Sequence[Entry]) -> No
     categories, symbols = SubElement(renderer, "categories"), SubElement(renderer, "symbols")
     for number, (value, name, colour) in enumerate(entries):
         kind = "string" if isinstance(value, str) else "double"
-        words = {"symbol": str(number), "value": str(value), "label": name, "type": kind, "render": "true"}
-        SubElement(categories, "category", words)
+        about = {"symbol": str(number), "value": str(value), "label": name, "type": kind, "render": "true"}
+        SubElement(categories, "category", about)
         symbol = SubElement(symbols, "symbol", {"name": str(number), "type": "fill", "alpha": "0.8"})
         options = SubElement(SubElement(symbol, "layer", {"class": "SimpleFill", "enabled": "1"}), "Option", type="Map")
         fill = ",".join(map(str, (*colour, 255)))
@@ -255,19 +204,6 @@ def write_polygon_style(path: Path, column: str, entries: Sequence[Entry]) -> No
         ):
             SubElement(options, "Option", {"name": key, "type": "QString", "value": text})
     SubElement(root, "layerGeometryType").text = "2"
-    _write(path, root)
-
-
-def _raster(renderer: dict[str, str]) -> tuple[Element, Element]:
-    root = Element("qgis", version=QGIS_VERSION, styleCategories="Symbology")
-    return root, SubElement(SubElement(root, "pipe"), "rasterrenderer", renderer)
-
-
-def _hex(colour: Colour) -> str:
-    return "#{:02x}{:02x}{:02x}".format(*colour)
-
-
-def _write(path: Path, root: Element) -> None:
     ElementTree.indent(root, " ")
     text = ElementTree.tostring(root, encoding="unicode")
     write_whole(path, f"<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n{text}\n")

@@ -1,14 +1,11 @@
-"""STAC: one item a run, one collection a folder of exports, with relative links and nothing that needs a server.
-
-Footprints and grids are said in the words of its extensions; wavelengths and classes stand in the files.
-"""
+"""Write STAC: an item for each run and a collection for a folder of exports, with relative links."""
 
 from __future__ import annotations
 
 import importlib
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -17,7 +14,6 @@ from typing import Any
 import numpy as np
 import pyproj
 import shapely
-import shapely.affinity
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
@@ -31,6 +27,7 @@ SCHEMAS = {
     "proj": "https://stac-extensions.github.io/projection/v2.0.0/schema.json",
     "processing": "https://stac-extensions.github.io/processing/v1.2.0/schema.json",
 }
+EDGE_POINTS = 16  # of an outline, at least
 _DIGITS = 9  # of a degree: 0.1 mm
 
 
@@ -39,27 +36,19 @@ def clean_id(text: str, otherwise: str) -> str:
     return re.sub(r"[^A-Za-z0-9_-]+", "-", text).strip("-") or otherwise
 
 
-def footprint(geobox: GeoBox, seen: Iterable[tuple[int, NDArray[np.bool_]]]) -> dict[str, Any] | None:
-    """Return the convex outline of what a map shows, as a GeoJSON polygon in longitude and latitude, anticlockwise.
-
-    ``seen`` is first row and (row, x) whether the map shows anything there, in order. To within one pixel of the map;
-    None where nothing is seen.
-    """
-    corners = []
-    for first, mask in seen:
-        rows = np.flatnonzero(mask.any(axis=1))
-        left, right = mask[rows].argmax(axis=1), mask.shape[1] - mask[rows, ::-1].argmax(axis=1)
-        for columns in (left, right):
-            corners += [np.stack([columns, first + rows + down], axis=-1) for down in (0, 1)]
-    points = np.concatenate(corners) if corners else np.empty((0, 2))
-    if not len(points):
-        return None
-    hull = shapely.MultiPoint(points.astype(np.float64)).convex_hull
-    place = map_attributes(geobox)
-    to_degrees = pyproj.Transformer.from_crs(place["proj:wkt2"], "EPSG:4326", always_xy=True)
+def footprint(geobox: GeoBox) -> dict[str, Any]:
+    """Return the outline of a map as a GeoJSON polygon in longitude and latitude, anticlockwise."""
+    place, (height, width) = map_attributes(geobox), geobox.shape
+    transformer = pyproj.Transformer.from_crs(place["proj:wkt2"], "EPSG:4326", always_xy=True)
     a, b, c, d, e, f = place["spatial:transform"]
-    on_map = shapely.affinity.affine_transform(hull, [a, b, d, e, c, f]).simplify(float(np.hypot(a, d)))
-    on_earth = shapely.transform(on_map, lambda xy: np.stack(to_degrees.transform(*xy.T), axis=-1).round(_DIGITS))
+
+    def to_degrees(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return longitude and latitude of pixel corners (corner, 2)."""
+        x, y = corners.T
+        return np.stack(transformer.transform(a * x + b * y + c, d * x + e * y + f), axis=-1).round(_DIGITS)
+
+    outline = shapely.segmentize(shapely.box(0, 0, width, height), max(height, width) / EDGE_POINTS)
+    on_earth = shapely.transform(outline, to_degrees)
     return dict(shapely.geometry.mapping(shapely.geometry.polygon.orient(on_earth)))
 
 
@@ -96,7 +85,7 @@ class Item:
 
 
 def write_stac(folder: Path, collection_id: str, description: str, item: Item) -> tuple[Path, Path]:
-    """Write ``ID/ID.json`` and the collection of all items that lie in ``folder``; gives both paths.
+    """Write ``ID/ID.json`` and the collection of all items in ``folder``; return both paths.
 
     Raises ArchiveError: the folder is another collection's, or one of its items cannot be read.
     """
@@ -169,7 +158,7 @@ def _item(pystac: Any, item: Item) -> Any:
 
 
 def _extent(pystac: Any, items: Sequence[Any]) -> Any:
-    """Return the box around all items; the whole earth where no item has a place, as STAC knows no other value."""
+    """Return the box around all items; the whole earth if no item has a place, as STAC requires a box."""
     boxes = np.array([item.bbox for item in items if item.bbox is not None])
     box = [*boxes[:, :2].min(axis=0).tolist(), *boxes[:, 2:].max(axis=0).tolist()] if len(boxes) else _EVERYWHERE
     times = [(item.common_metadata.start_datetime, item.common_metadata.end_datetime) for item in items]

@@ -1,4 +1,4 @@
-"""Cubes out of named arrays, wherever these are stored: Zarr stores, NetCDF and HDF5 files, packs of arrays.
+"""Build cubes from named arrays: Zarr stores, NetCDF and HDF5 files, packs of arrays.
 
 Axes are found by their names, else by the number of wavelengths. Values follow from scale, offset and fill value, the
 place on the earth from a grid mapping.
@@ -32,14 +32,8 @@ COLUMNS = ("x", "sample", "samples", "column", "columns", "col", "lon", "longitu
 BANDS = ("band", "bands", "wavelength", "wavelengths", "channel", "channels", "spectral")
 TIMES = ("time", "t", "date", "dates", "step", "visit")
 WAVELENGTHS = (
-    "wavelength",
-    "wavelengths",
-    "radiation_wavelength",
-    "wavelength_nm",
-    "wavelengths_nm",
-    "wl",
-    "lambda",
-    "nm",
+    *("wavelength", "wavelengths", "radiation_wavelength", "wavelength_nm", "wavelengths_nm"),
+    *("wl", "lambda", "nm"),
 )
 METRES = {"m", "meter", "meters", "metre", "metres"}
 
@@ -68,7 +62,7 @@ class FileArray:
 
 @dataclass(frozen=True)
 class ArrayCube:
-    """An array that is a cube, with its axes of rows, columns and, where there are some, bands."""
+    """An array that is a cube, with its axes of rows, columns and (if there are some) bands."""
 
     name: str
     array: Any
@@ -78,16 +72,16 @@ class ArrayCube:
 
     @property
     def dims(self) -> list[str]:
-        """Names of all axes; those that the order gives them where they have none."""
+        """Return names of all axes, or those of their order if they have none."""
         return dims_of(self.array) or (["y", "x", "band"] if self.moment is None else ["time", "y", "x", "band"])
 
 
 def find_cube(arrays: Arrays, variable: str | None, path: Path, *, labels: bool = False) -> ArrayCube:
-    """Find the array that is a cube: the one named, the only one with three axes, or the only one with wavelengths.
+    """Return the array that is named, or the only one with three axes, or the only one with wavelengths.
 
     For ``labels`` the only one with two axes comes first. ``variable`` may end in a step of time (``values:3``), or be
-    one. Nothing but names, shapes and attributes is read. Raises SceneError: there is no such array, there are several,
-    or its axes are not y, x and band.
+    one. Only names, shapes and attributes are read. Raises SceneError: there is no such array, there are several, or
+    the axes are not y, x and band.
     """
     named, step = _split_step(variable, arrays)
     name, notes = _chosen(arrays, named, path, _AXES[labels, step is not None])
@@ -98,12 +92,12 @@ def find_cube(arrays: Arrays, variable: str | None, path: Path, *, labels: bool 
 
 
 def names_beside(arrays: Arrays) -> set[str]:
-    """Return names of the arrays that may say wavelengths or widths."""
+    """Return names of the arrays that may have wavelengths or widths."""
     return {name for name in arrays if _word(name) in (*WAVELENGTHS, "fwhm")}
 
 
 def dims_of(array: Any) -> list[str]:
-    """Return names of an array's axes as Zarr v3 or xarray's v2 keeps them, or none."""
+    """Return names of an array's axes as Zarr v3, or xarray in v2, stores them; empty if there are none."""
     named = getattr(getattr(array, "metadata", None), "dimension_names", None) or array.attrs.get("_ARRAY_DIMENSIONS")
     return ["" if name is None else str(name) for name in named] if isinstance(named, list | tuple) else []
 
@@ -115,7 +109,7 @@ def cube_source(
     attributes: Mapping[str, Any],
     guard: Callable[[], AbstractContextManager[None]],
 ) -> CubeSource:
-    """Return the cube with its lines, bands and place; reading happens within ``guard``, which names the errors.
+    """Return the cube with its lines, bands and place; ``guard`` turns errors of reading into SceneError.
 
     Lines of an array with scale or offset are float32, NaN where there is no value.
     """
@@ -139,7 +133,7 @@ def cube_source(
         return native if plain else unpacked(native, 1.0 if scale is None else scale, offset or 0.0, fill)
 
     dims = cube.dims[order[0]], cube.dims[order[1]]
-    geobox, notes = place_said(lambda: find_geobox(attributes, arrays, (sizes[0], sizes[1]), dims))
+    geobox, notes = place_or_note(lambda: find_geobox(attributes, arrays, (sizes[0], sizes[1]), dims))
     return CubeSource(
         name=path.name,
         shape=(sizes[0], sizes[1], sizes[2] if len(sizes) == 3 else 1),
@@ -153,8 +147,8 @@ def cube_source(
     )
 
 
-def place_said(find: Callable[[], GeoBox | None]) -> tuple[GeoBox | None, tuple[str, ...]]:
-    """Return a place, or a note on why it cannot be read: attributes of anyone's may hold anything."""
+def place_or_note(find: Callable[[], GeoBox | None]) -> tuple[GeoBox | None, tuple[str, ...]]:
+    """Return a place, or a note on why it cannot be read."""
     try:
         return find(), ()
     except Exception as error:  # of PROJ, too
@@ -162,7 +156,7 @@ def place_said(find: Callable[[], GeoBox | None]) -> tuple[GeoBox | None, tuple[
 
 
 def _fill(array: Any) -> float | None:
-    """Return the number that stands for no value, wherever xarray has put it; in Zarr v3 floats are in base64."""
+    """Return the number of pixels without a value, as CF, xarray or Zarr has it; Zarr v3 has floats in base64."""
     stated = array.attrs.get("_FillValue", array.attrs.get("missing_value"))
     if isinstance(stated, str) and array.dtype.kind == "f":
         return float(struct.unpack("<d", base64.standard_b64decode(stated))[0])
@@ -173,7 +167,7 @@ def _fill(array: Any) -> float | None:
 
 
 def _bands_of(cube: ArrayCube, arrays: Arrays, count: int) -> Bands:
-    """Return wavelengths and widths of the arrays that say them, in nm; none in another unit than one of length."""
+    """Return wavelengths and widths in nm; none if their unit is no length."""
     axis = cube.dims[cube.order[2]] if len(cube.order) == 3 and len(cube.dims) == cube.array.ndim else ""
     found = _vector(arrays, WAVELENGTHS, count)
     if found is None and _is_line(arrays, axis, count) and _is_spectral(arrays[axis]):
@@ -185,21 +179,22 @@ def _bands_of(cube: ArrayCube, arrays: Arrays, count: int) -> Bands:
     scale = _scale(unit, float(centres.max()))
     if scale is None or not (np.isfinite(centres) & (centres > 0)).all():
         return Bands()
-    stated = f"in {unit}" if unit not in UNSAID else "without a unit, read by their size"
+    source = f"in {unit}" if unit not in UNSAID else "without a unit, read by their size"
     beside, widths = _vector(arrays, ("fwhm",), count), None
     if beside is not None:
         own = _unit(arrays[beside].attrs)
-        widths = np.asarray(arrays[beside][...], np.float64).ravel()
-        widths = widths * (scale if own in UNSAID else _scale(own, 0.0) or np.nan)
+        widths = np.asarray(arrays[beside][...], np.float64).ravel() * (
+            scale if own in UNSAID else _scale(own, 0.0) or np.nan
+        )
         widths = widths if (widths > 0).all() else None
-    return Bands(centres * scale, widths, f"wavelengths from the array {found}, {stated}")
+    return Bands(centres * scale, widths, f"wavelengths from the array {found}, {source}")
 
 
 _AXES = {(False, False): (3, 4, 2), (True, False): (2, 3), (False, True): (4,), (True, True): (3, 4)}
 
 
 def _split_step(variable: str | None, names: Container[str]) -> tuple[str | None, int | None]:
-    """Return name and step of ``cube``, ``cube:3`` or, where no array is called so, of the step ``3`` alone."""
+    """Return name and step of ``cube``, ``cube:3`` or the step ``3`` alone."""
     if variable is None or variable in names:
         return variable, None
     name, colon, step = variable.rpartition(":")
@@ -207,40 +202,38 @@ def _split_step(variable: str | None, names: Container[str]) -> tuple[str | None
 
 
 def _chosen(arrays: Arrays, variable: str | None, path: Path, axes: Sequence[int]) -> tuple[str, tuple[str, ...]]:
-    """Return the name of the array that is meant, with a number of axes that is tried in this order; and notes."""
-    listed = [f"{name} {array.shape}" for name, array in arrays.items() if array.ndim > 1]
-    listing = ", ".join(listed) or "none"
+    """Return the name of the array to read, and notes; numbers of ``axes`` are tried in their order."""
     if list(arrays) == [""]:
         if variable is not None:
             raise SceneError(f"{path} holds one array, which has no name; only a step of time can be named: {path}:0")
         return "", ()
+    tables = {name: f"{name} {array.shape}" for name, array in arrays.items() if array.ndim > 1}
+    listing = f"it has {', '.join(tables.values()) or 'none'}"
     if variable is not None:
         fitting = [name for name in arrays if name == variable] or [one for one in arrays if _base(one) == variable]
         if len(fitting) != 1:
-            raise SceneError(f"{path} has no array {variable}; it has {listing}; name one: {path.name}:ARRAY")
+            raise SceneError(f"{path} has no array {variable}; {listing}; name one: {path.name}:ARRAY")
         return fitting[0], ()
     for count in axes:
         fitting = [name for name, one in arrays.items() if one.ndim == count and one.dtype.kind in "buifc"]
-        fitting = [name for name in fitting if min(arrays[name].shape) > 1] or fitting  # vectors stand back
+        fitting = [name for name in fitting if min(arrays[name].shape) > 1] or fitting  # vectors come last
         fitting = [name for name in fitting if math.prod(arrays[name].shape) > 1]
         own = [name for name in fitting if name == "values"]
         spectra = [name for name in fitting if _spectral_axes(arrays, arrays[name])]
         for chosen, why in ((own, ""), (fitting, ""), (spectra, ", the only one with wavelengths")):
             if len(chosen) == 1:
-                others = [f"{name} {one.shape}" for name, one in arrays.items() if one.ndim > 1 and name != chosen[0]]
-                more = f"array {chosen[0]} of the file{why}, which also has {', '.join(others[:_SHOWN])}"
-                return chosen[0], (more,) if others else ()
+                others = [text for name, text in tables.items() if name != chosen[0]]
+                note = f"array {chosen[0]} of the file{why}, which also has {', '.join(others[:_SHOWN])}"
+                return chosen[0], (note,) if others else ()
         if fitting:
-            raise SceneError(
-                f"{path} has several arrays with {count} axes; it has {listing}; name one: {path.name}:ARRAY"
-            )
-    raise SceneError(f"{path} has no array of numbers with the axes y, x and band; it has {listing}")
+            raise SceneError(f"{path} has several arrays with {count} axes; {listing}; name one: {path.name}:ARRAY")
+    raise SceneError(f"{path} has no array of numbers with the axes y, x and band; {listing}")
 
 
 def _moment(array: Any, step: int | None, address: str, *, unnamed: bool) -> tuple[int, int] | None:
-    """Return axis and step of an array with an axis of time (SceneError: none is named, or one that it lacks).
+    """Return axis and step of an array with an axis of time; the first of ``unnamed`` axes is time.
 
-    The first of ``unnamed`` axes is time.
+    Raises SceneError: the array has several steps and none is named, or it lacks the step or the axis.
     """
     words = [_word(dim) for dim in dims_of(array)]
     known = set(words) & set(ROWS) and set(words) & set(COLUMNS)
@@ -265,7 +258,7 @@ def _moment(array: Any, step: int | None, address: str, *, unnamed: bool) -> tup
 def _axes(
     arrays: Arrays, name: str, path: Path, moment: tuple[int, int] | None
 ) -> tuple[tuple[int, ...], tuple[str, ...]]:
-    """Return the axes of rows, columns and (where there are some) bands; and notes."""
+    """Return the axes of rows, columns and (if there are some) bands; and notes."""
     array = arrays[name]
     named, own = dims_of(array), [axis for axis in range(array.ndim) if moment is None or axis != moment[0]]
     if len(own) not in (2, 3):
@@ -287,7 +280,7 @@ def _axes(
 
 
 def _spectral_axes(arrays: Arrays, array: Any) -> list[int]:
-    """Return the axes of an array that are as long as the wavelengths: one, unless sizes are alike by chance."""
+    """Return the axes that are named by a spectral coordinate, else those as long as the wavelengths."""
     known = [arrays[name].shape for name in arrays if _word(name) in WAVELENGTHS]
     lengths = {max(shape) for shape in known if shape and max(shape) == math.prod(shape)}
     by_name = [axis for axis, dim in enumerate(dims_of(array)) if _is_spectral(arrays.get(dim))]
@@ -295,20 +288,20 @@ def _spectral_axes(arrays: Arrays, array: Any) -> list[int]:
 
 
 def _is_spectral(coordinate: Any) -> bool:
-    """Return whether a coordinate says wavelengths: by its standard name or its unit."""
+    """Return whether a coordinate has wavelengths, by its standard name or unit."""
     if coordinate is None or coordinate.ndim != 1:
         return False
     return coordinate.attrs.get("standard_name") in WAVELENGTHS or _unit(coordinate.attrs) in NANOMETRES | MICROMETRES
 
 
 def _vector(arrays: Arrays, words: tuple[str, ...], count: int) -> str | None:
-    """Return the first array of ``count`` numbers that is called by one of the words, in the words' order."""
+    """Return the first array of ``count`` numbers that has one of the names, in their order."""
     found = (name for word in words for name in arrays if _word(name) == word and _is_line(arrays, name, count))
     return next(found, None)
 
 
 def _is_line(arrays: Arrays, name: str, count: int) -> bool:
-    """Return whether an array is ``count`` numbers in a row, along whichever of its axes."""
+    """Return whether an array has ``count`` numbers along one of its axes."""
     shape = arrays[name].shape if name in arrays else ()
     return bool(shape) and math.prod(shape) == max(shape) == count and arrays[name].dtype.kind in "uif"
 
@@ -326,7 +319,7 @@ def _number(value: object) -> float | None:
 
 
 def _scale(unit: str, largest: float) -> float | None:
-    """Return one of the unit in nm; where none is said, micrometres or nm by the size; None of other units."""
+    """Return the size of a unit in nm, without a unit by the largest value; None if it is no length."""
     if unit in UNSAID:
         return 1000.0 if largest <= 20 else 1.0
     return 1.0 if unit in NANOMETRES else 1000.0 if unit in MICROMETRES else 1e9 if unit in METRES else None

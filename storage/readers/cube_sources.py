@@ -1,6 +1,6 @@
-"""The record that all readers return: a cube whose lines are read when asked for, and what is known of it.
+"""Define a cube whose lines are read on demand, as all readers return it.
 
-The size that a file claims is checked against its bytes and the machine before anything of that size is read.
+The size that a file claims is checked against its bytes and the machine before it is read.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ def machine_bytes() -> int:
 
 
 def check_claim(where: object, claimed: int, stored: int, ratio: int = MOST_RATIO) -> None:
-    """Refuse more bytes of numbers than ``stored`` bytes can mean (SceneError)."""
+    """Refuse more bytes of numbers than ``stored`` bytes can hold (SceneError)."""
     if claimed > max(stored * ratio, SPARE_BYTES):
         raise SceneError(
-            f"{where} claims {claimed} bytes of numbers, and {stored} bytes lie on the disk: it is damaged or made to "
-            "fill the memory; copy it again"
+            f"{where} claims {claimed} bytes of numbers, and {stored} bytes lie on the disk, so it is damaged or "
+            "malicious; copy it again"
         )
 
 
 def check_memory(where: object, needed: int) -> None:
-    """Refuse what takes more memory than there is (SceneError)."""
+    """Refuse to read more than the machine's memory (SceneError)."""
     there = machine_bytes()
     if needed > there:
         raise SceneError(
@@ -61,34 +61,34 @@ def check_memory(where: object, needed: int) -> None:
 
 @contextmanager
 def reading(path: Path, kind: str, cure: str = "copy it again") -> Iterator[None]:
-    """Turn whatever a decoder raises on damaged bytes into a SceneError that names the file and its kind."""
+    """Turn any error of a decoder into a SceneError with the file's name and kind."""
     try:
         yield
     except SceneError:
         raise
     except UnknownCodecError as error:
-        name = error.codec_id.strip("'")  # numcodecs gives it in quotes
+        name = error.codec_id.strip("'")
         raise SceneError(
             f"{path} is packed with {name}, which is not installed; pip install {name} (nothing is damaged)"
         ) from error
     except KeyError as error:
         raise SceneError(f"{path} lacks what files of its kind have: {error}; copy it again") from error
     except Exception as error:
-        why = error.__cause__ or error  # rasterio's own says only that it failed
+        why = error.__cause__ or error  # of rasterio, whose own says only that it failed
         raise SceneError(
             f"{path} cannot be read as {kind}: {type(why).__name__}: {why}; is it damaged? {cure}"
         ) from error
 
 
 BLOCK_LINES = 64
-MOST_MISSING = 1 << 14  # lines a cube may promise beyond those it has: each costs memory before any of them is seen
+MOST_MISSING = 1 << 14  # lines that a cube may claim beyond those in its file
 
 ReadLines = Callable[[int, int], NDArray[Any]]
 
 
 @dataclass(frozen=True)
 class LineFacts:
-    """Known facts of each line; None where nothing is known of any."""
+    """Facts of each line; None if not known."""
 
     valid: NDArray[np.bool_] | None = None  # (line,) the file holds it whole; None where it holds all
     time_s: NDArray[np.float64] | None = None  # (line,) since the first stamp; NaN where not known
@@ -98,7 +98,7 @@ class LineFacts:
 
 @dataclass(frozen=True)
 class Bands:
-    """Known facts of the bands; None where nothing is."""
+    """Facts of the bands; None if not known."""
 
     wavelength_nm: NDArray[np.float64] | None = None  # (band,)
     fwhm_nm: NDArray[np.float64] | None = None  # (band,)
@@ -107,39 +107,39 @@ class Bands:
 
 @dataclass(frozen=True)
 class CubeSource:
-    """A cube, opened. ``read(start, stop)`` gives lines as (line, sample, band) of ``dtype``, native byte order."""
+    """An open cube. ``read(start, stop)`` returns lines (line, sample, band) of ``dtype`` in native byte order."""
 
     name: str
     shape: tuple[int, int, int]
     dtype: np.dtype[Any]
     read: ReadLines
-    files: tuple[Path, ...]  # that all this came from
+    files: tuple[Path, ...]  # that it was read from
     lines: LineFacts = LineFacts()
     bands: Bands = field(default_factory=Bands)
     dark: NDArray[np.float32] | None = None  # (sample, band)
     white: NDArray[np.float32] | None = None  # (sample, band)
     nodata: float | None = None
     geobox: GeoBox | None = None  # where (line, sample) lie on the earth
-    bad_bands: tuple[int, ...] = ()  # that the files themselves call bad, from 0
-    void: NDArray[np.bool_] | None = None  # (line, sample) transparent or masked, which have no value
+    bad_bands: tuple[int, ...] = ()  # that the files mark as bad, from 0
+    void: NDArray[np.bool_] | None = None  # (line, sample) transparent or masked: without a value
     scaling: str = ""  # scale and offset that were applied to the file's numbers, for hashes
     headers: Mapping[str, str] = field(default_factory=dict)  # file name -> its text
-    root: Path | None = None  # of a store or folder whose files' names count, too
+    root: Path | None = None  # of a store or folder whose file names are part of the content
     notes: tuple[str, ...] = ()
 
     @property
     def lost_lines(self) -> int:
-        """Lines that should be there and are not."""
+        """Return the number of missing lines."""
         return int(np.count_nonzero(~self.valid))
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """(line,) that are whole in their file."""
+        """Return (line,) whether each line is whole in its file."""
         return np.ones(self.shape[0], np.bool_) if self.lines.valid is None else self.lines.valid
 
 
 def check_cube_source(source: CubeSource) -> None:
-    """Refuse what cannot be a cube (SceneError): no real numbers, nothing in it, frames of another size."""
+    """Refuse a cube without real numbers, without pixels, or with frames of another size (SceneError)."""
     where = source.name
     if source.dtype.kind == "c":
         raise SceneError(f"{where} holds complex numbers; store their magnitude")
@@ -158,7 +158,7 @@ def check_cube_source(source: CubeSource) -> None:
 def unpacked(
     raw: NDArray[Any], scale: float | NDArray[np.float64], offset: float | NDArray[np.float64], fill: float | None
 ) -> NDArray[np.float32]:
-    """Return packed numbers (..., band) as the values that they mean: ``raw * scale + offset``, NaN where raw is fill.
+    """Return ``raw * scale + offset`` (..., band) as float32, NaN where raw is ``fill``.
 
     Scale and offset are one number, or one for each band.
     """
@@ -169,9 +169,9 @@ def unpacked(
 
 
 def read_by_chunks(read: ReadLines, lines: int, chunk_lines: int) -> ReadLines:
-    """Return a reader that asks for whole rows of chunks and keeps the last one, so that none is unpacked twice.
+    """Return a reader that reads whole rows of chunks and keeps the last one, so that none is unpacked twice.
 
-    It is for files whose chunks hold more lines than are asked for at a time. Threads take turns.
+    Threads take turns.
     """
     if chunk_lines <= 1:
         return read
@@ -192,10 +192,7 @@ def read_by_chunks(read: ReadLines, lines: int, chunk_lines: int) -> ReadLines:
 
 
 def scene_lines(source: CubeSource, start: int, stop: int) -> NDArray[Any]:
-    """Return the lines as scene values, (line, sample, band).
-
-    These are over the white reference where dark and white frames are known.
-    """
+    """Return lines (line, sample, band) as scene values: over the white reference if both frames are known."""
     raw = source.read(start, stop)
     valid = source.valid[start:stop]
     if source.dark is None or source.white is None:

@@ -1,4 +1,4 @@
-"""Data sets: scenes in a folder, or one scene with a training mask, loaded one at a time."""
+"""List the scenes of a folder, or one scene with a training mask, for training."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
 from storage.readers.label_files import (
     MatchedFiles,
+    classes_of_files,
     folders_within,
     image_folder,
     is_label_name,
@@ -25,9 +26,8 @@ from storage.readers.label_files import (
     scene_entries,
     scene_number,
 )
-from storage.readers.labels import found_classes, load_codes
+from storage.readers.labels import load_codes
 from storage.readers.open_cubes import CUBE_ENDINGS, split_variable
-from storage.readers.polygons import is_polygon_file, polygon_classes
 from storage.readers.scene_files import SceneFile, load_scene_file
 from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings
 
@@ -44,54 +44,46 @@ class DataSet:
     wavelengths: tuple[float, ...] | None = None
     train_mask: str | Path | None = None
     mask_classes: tuple[int, ...] | None = None
-    label_files: Mapping[str, Path] = field(default_factory=dict)  # of scenes of a folder, by their names
-    alone: tuple[Path, ...] = ()  # label files that belong to no scene
+    label_files: Mapping[str, Path] = field(default_factory=dict)  # by name of the scene
+    alone: tuple[Path, ...] = ()  # label files without a scene
 
     @property
     def unlabelled(self) -> tuple[str, ...]:
-        """Scenes without a label file, where others have one."""
+        """Return the scenes without a label file, if others have one."""
         return tuple(name for name in self.files if name not in self.label_files) if self.label_files else ()
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Return notes on what was left out: scenes without labels, and labels without a scene."""
+        """Return notes on scenes without labels, and on labels without a scene."""
         bare = [Path(self.files[name]) for name in self.unlabelled]
-        told = [f"of {len(self.files)} scenes {len(bare)} without labels left out: {listed_names(bare)}"]
-        lone = [f"label files without a scene, {len(self.alone)}: {listed_names(self.alone)}"]
-        return (*(told if bare else ()), *(lone if self.alone else ()))
+        notes = (
+            [f"of {len(self.files)} scenes {len(bare)} without labels left out: {listed_names(bare)}"] if bare else []
+        )
+        lone = [f"label files without a scene, {len(self.alone)}: {listed_names(self.alone)}"] if self.alone else []
+        return (*notes, *lone)
 
     @cached_property
     def classes(self) -> dict[str, ClassValue]:
-        """Every class that any of the label files holds, by its value; none where scene.toml names them, or one is."""
-        if len(self.label_files) < 2:
-            return {}
+        """Return the classes of several label files together; empty if scene.toml names them."""
         settings = find_scene_settings(Path(next(iter(self.files.values()))))
-        if settings.classes:
+        if len(self.label_files) < 2 or settings.classes:
             return {}
-        polygons = [file for file in self.label_files.values() if is_polygon_file(file)]
-        if polygons and len(polygons) < len(self.label_files):
-            raise SceneError(
-                f"{self.path}: some labels are polygons ({listed_names(polygons)}) and some are pictures; name their"
-                f" classes in a {SETTINGS_NAME}, or use one kind"
-            )
-        if polygons:
-            return dict(polygon_classes(polygons, settings))
-        return found_classes(self.label_files.values(), settings.unlabelled)
+        return classes_of_files(tuple(self.label_files.values()), settings)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Every scene, in the order of the files' names."""
+        """Return the names of all scenes, in the order of their files."""
         return tuple(self.files)
 
     @property
     def train_names(self) -> tuple[str, ...]:
-        """Scenes to train on."""
+        """Return the names of the scenes to train on."""
         return tuple(name for name in self.files if name not in self.held_out)
 
     def load(self, name: str, part: Literal["train", "test"] | None = None) -> SceneFile:
-        """Read one scene with its labels: all, or those that a training mask takes or leaves for a test.
+        """Read one scene by its name with all labels, or with those inside or outside of the training mask.
 
-        Its ``name`` is the data set's. Errors as load_scene_file.
+        Raises SceneError, WavelengthError: as `load_scene_file`.
         """
         if name not in self.files:
             raise SceneError(f"{self.path} has no scene {name}; it has {', '.join(self.files)}")
@@ -106,9 +98,9 @@ class DataSet:
             return scene
         train, rest = split_labels(scene, self.train_mask, self.mask_classes)
         if part == "train":
-            chosen, note = train, f"labels only where {self.train_mask} says so: training"
+            chosen, note = train, f"labels inside {self.train_mask}: training"
         else:
-            chosen, note = rest, f"labels only where {self.train_mask} does not train: test"
+            chosen, note = rest, f"labels outside {self.train_mask}: test"
         return replace(scene, labels=chosen, provenance=(*scene.provenance, note))
 
 
@@ -150,10 +142,7 @@ def load_data_set(
 def split_labels(
     scene: SceneFile, train_mask: str | Path, mask_classes: Sequence[int] | None
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return the labels to train on (where the mask's class is the label's) and the labelled rest.
-
-    Both are (y, x) and 255 elsewhere.
-    """
+    """Return the labels with the mask's class, to train on, and all other labels, (y, x) each, 255 elsewhere."""
     if scene.labels is None:
         raise SceneError(f"{scene.path} has no labels, which a training mask needs; give --labels")
     mask = load_codes(train_mask, scene.geobox, by_number=True).values
@@ -181,7 +170,7 @@ def split_labels(
 def _scenes(
     path: str | Path, train_mask: str | Path | None
 ) -> tuple[dict[str, str], dict[str, Path], tuple[Path, ...]]:
-    """Return the files of scenes, their label files, both by name, and label files without a scene."""
+    """Return the files and the label files of scenes by their names, and label files without a scene."""
     file, _ = split_variable(path)
     if not file.is_dir() or is_store(file):
         if not file.exists():
@@ -207,28 +196,27 @@ def _scenes(
 
 
 def _match_by_settings(folder: Path, settings: SceneSettings) -> MatchedFiles:
-    """Return the images of a folder and their labels by ``labels`` in scene.toml; label files are no images."""
+    """Return the images of a folder and their labels by ``labels`` in scene.toml."""
     entries = scene_entries(folder)
-    told: dict[Path, Path] = {}
-    for entry in entries:
-        if "{number}" in str(settings.labels) and scene_number(entry) is None:
-            continue  # reading the scene reports it
-        address = label_file(entry, settings)[0]
-        if address is not None:
-            told[entry] = address
-    labels = {split_variable(address)[0].resolve() for address in told.values()}
+    by_number = "{number}" in str(settings.labels)  # a scene without a number is refused when it is read
+    matched = {
+        entry: address
+        for entry in entries
+        if not (by_number and scene_number(entry) is None) and (address := label_file(entry, settings)[0]) is not None
+    }
+    labels = {split_variable(address)[0].resolve() for address in matched.values()}
     others = [entry for entry in entries if entry.resolve() not in labels]
     images = tuple(entry for entry in others if not is_label_name(entry)) or tuple(others)
-    apart = {address.parent for address in told.values()} - {folder}
+    apart = {address.parent for address in matched.values()} - {folder}
     beside = [entry for place in sorted(apart) if place.is_dir() for entry in scene_entries(place)]
     alone = tuple(one for one in (*others, *beside) if one not in images and one.resolve() not in labels)
-    return MatchedFiles(images, {image: told[image] for image in images if image in told}, alone)
+    return MatchedFiles(images, {image: matched[image] for image in images if image in matched}, alone)
 
 
 def _names(images: Sequence[Path]) -> dict[str, Path]:
-    """Return the names of scenes: their first numbers, where each has its own, else the names of their files.
+    """Return the names of scenes: their first numbers if these are unique, else the names of their files.
 
-    Endings are kept where two names differ by nothing else.
+    Names keep their endings only if they are not unique without.
     """
     numbers = [scene_number(image) or "" for image in images]
     stems = [image.stem for image in images]

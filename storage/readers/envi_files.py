@@ -1,13 +1,12 @@
-"""ENVI cubes: one file, or the parts of one cube in a folder of a Headwall camera.
+"""Open ENVI cubes: one file, or the parts of one cube in a folder of a Headwall camera.
 
 ::
 
     raw_0  raw_0.hdr  raw_2000  raw_2000.hdr     parts of one cube, each named by its first frame
     frameIndex_0.txt  frameIndex_2000.txt        when each frame was taken
-    darkReference(.hdr)  whiteReference(.hdr)    found by how their names begin, whatever their endings
+    darkReference(.hdr)  whiteReference(.hdr)    found by how their names begin
 
-Headers are read leniently and refused where they say too little; the numbers stay in their file until a part of the
-view is read. The layout of folders is that of the Nano-Hyperspec. Tested on small folders made in it, and on the
+Folders have the layout of the Nano-Hyperspec. The reader was tested on small folders in this layout, and on the
 references of a real MV.X.
 """
 
@@ -45,26 +44,26 @@ _EXPOSURE = "exposure (ms)"  # a setting in the comments of Headwall's headers
 
 @dataclass(frozen=True)
 class EnviCube:
-    """An ENVI cube, opened. ``values`` is a read-only view of the file, (line, sample, band) in the file's type."""
+    """An open ENVI cube. ``values`` is a read-only view of the file, (line, sample, band) in the file's type."""
 
     header_path: Path
     path: Path
     header: EnviHeader
     values: NDArray[Any]
-    lost_lines: int  # that the header states and the file does not hold whole
+    lost_lines: int  # in the header and not whole in the file
     notes: tuple[str, ...]
 
     @property
     def frames(self) -> tuple[Any, ...]:
-        """Return the size and type of a frame, which all of one cube have."""
+        """Return the size and type of a frame."""
         return self.values.shape[1:], self.values.dtype
 
 
 def open_envi_cube(path: str | Path) -> EnviCube:
     """Open a cube by its header or its data file, of any interleave, type, byte order and header offset.
 
-    A file that is cut off keeps the lines that are whole in all bands, and ``lost_lines`` and a note say so. Raises
-    SceneError: header or data are missing or cannot be used, or no line is whole.
+    A file that is cut off keeps its whole lines, with a note. Raises SceneError: header or data are missing or
+    cannot be used, or no line is whole.
     """
     header_path, data_path = find_envi_pair(Path(path))
     header = load_envi_header(header_path)
@@ -74,7 +73,7 @@ def open_envi_cube(path: str | Path) -> EnviCube:
     samples, bands, line_bytes = header.samples, header.bands, header.line_bytes
     promised = size // line_bytes if header.lines is None else header.lines
     whole = size // line_bytes
-    if header.interleave == "bsq":  # band after band: the last one says how far all of them reach
+    if header.interleave == "bsq":  # only lines of the last band are missing
         whole = max(size - (bands - 1) * promised * samples * item, 0) // (samples * item)
     held = min(promised, max(whole, 0))
     if held < 1:
@@ -100,7 +99,7 @@ def open_envi_cube(path: str | Path) -> EnviCube:
 
 
 def find_envi_pair(path: Path) -> tuple[Path, Path]:
-    """Return header and data file of an address that names either (SceneError: one of them is missing)."""
+    """Return header and data file by the address of either (SceneError: one of them is missing)."""
     if not path.exists() or (path.suffix.lower() != ".hdr" and not path.is_file()):
         raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
     if path.suffix.lower() == ".hdr":
@@ -121,7 +120,7 @@ def find_envi_pair(path: Path) -> tuple[Path, Path]:
 
 
 def load_envi_header(path: Path) -> EnviHeader:
-    """Read one header file (SceneError: there is no such file, or it is no ENVI header that can be used)."""
+    """Read one header file (SceneError: there is no such file, or it is no usable ENVI header)."""
     if path.exists() and not path.is_file():  # reading a pipe may never end
         raise SceneError(f"{path} is no file; name an ENVI header")
     try:
@@ -139,14 +138,14 @@ def load_envi_header(path: Path) -> EnviHeader:
 
 
 def is_headwall_folder(folder: Path) -> bool:
-    """Return whether a folder holds parts of a cube as a Headwall camera names them."""
+    """Return whether a folder has files ``raw_<frame>`` of a Headwall camera."""
     return any(_PART.fullmatch(entry.name) is not None for entry in folder.iterdir())
 
 
 def open_envi_source(path: Path, *, scaled: bool = True) -> CubeSource:
-    """Open one ENVI cube by its header or data file; the lines that it lost are its last (SceneError as there).
+    """Open one ENVI cube by its header or data file (SceneError as `open_envi_cube`).
 
-    Numbers are divided by the header's reflectance scale factor, unless not ``scaled``.
+    Numbers are divided by the header's reflectance scale factor if ``scaled``.
     """
     cube = open_envi_cube(path)
     source = _joined(cube.path.name, {0: cube}, list(cube.notes))
@@ -161,9 +160,8 @@ def open_envi_source(path: Path, *, scaled: bool = True) -> CubeSource:
 def open_headwall_cube(folder: Path) -> CubeSource:
     """Open the parts of a folder as one cube, in the order of their frames.
 
-    Lines are missing where a part's name has a later frame than the end of the part before it, and in a file that is
-    cut off. A part without any byte is left out. Raises SceneError: a part cannot be used, parts differ in their
-    frames, or too many lines between them are missing.
+    Lines are missing between parts, and at the end of a file that is cut off. Empty parts are left out. Raises
+    SceneError: a part cannot be used, parts differ in their frames, or too many lines are missing.
     """
     headers, notes, opened = _headers(folder), list[str](), dict[int, EnviCube]()
     if not headers:
@@ -184,7 +182,7 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     starts = place_parts(parts, MOST_MISSING, notes)
     notes += [note for cube in opened.values() for note in cube.notes]
     source = _joined(folder.resolve().name, dict(zip(starts, opened.values(), strict=True)), notes)
-    source = replace(source, root=folder)  # lines and their times follow from the files' names
+    source = replace(source, root=folder)  # the names of files are part of the content
     listed = ((FRAME_INDEX.fullmatch(file.name), file) for file in folder.iterdir() if file.is_file())
     indices = {int(match[1]): file for match, file in listed if match is not None and int(match[1]) in opened}
     if not indices:
@@ -207,7 +205,7 @@ def open_headwall_cube(folder: Path) -> CubeSource:
 
 
 def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeSource:
-    """Return files by their first lines as one cube; lines that are in none of them are 0 and not valid."""
+    """Return files by their first lines as one cube; lines that are in no file are 0 and not valid."""
     cubes = list(parts.values())
     last, cube = list(parts.items())[-1]
     lost = cube.lost_lines if cube.lost_lines <= MOST_MISSING else 0
@@ -253,7 +251,7 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
 
 
 def _timed(lines: LineFacts, times: LineTimes) -> LineFacts:
-    """Add what frame indices say; their exposures count before those of the headers."""
+    """Add the times of frame indices; their exposures take precedence over those of the headers."""
     of_header = np.nan if lines.exposure_ms is None else lines.exposure_ms
     exposure = np.where(np.isnan(times.exposure_ms), of_header, times.exposure_ms)
     lines = replace(lines, exposure_ms=None if np.isnan(exposure).all() else exposure, frame=times.frame)
@@ -264,10 +262,7 @@ def _timed(lines: LineFacts, times: LineTimes) -> LineFacts:
 
 
 def find_reference(folder: Path, kind: str) -> Path | None:
-    """Return the header of the ``dark`` or ``white`` frame in a folder, by how its name begins.
-
-    Raises SceneError: there are several; name one.
-    """
+    """Return the header of the ``dark`` or ``white`` frame in a folder by its name (SceneError: there are several)."""
     headers = (entry for entry in sorted(folder.iterdir()) if entry.suffix.lower() == ".hdr")
     found = [entry for entry in headers if entry.name.lower().startswith(kind)]
     if len(found) > 1:
@@ -277,19 +272,16 @@ def find_reference(folder: Path, kind: str) -> Path | None:
 
 
 def load_frame_index(path: Path) -> FrameIndex:
-    """Read one index. Lines that are no frame are passed over and counted; of a frame listed twice the first counts.
-
-    Raises SceneError: the file cannot be read, or no line of it is a frame.
-    """
+    """Read one index (SceneError: the file cannot be read, or no line of it is a frame)."""
     try:
         with path.open(encoding="utf-8-sig", errors="replace") as file:
             return parse_frame_index(iter(lambda: file.readline(LONGEST_LINE), ""), path.name, str(path))
     except OSError as error:
-        raise SceneError(f"{path} cannot be read: {error}; take it away to go on without times") from error
+        raise SceneError(f"{path} cannot be read: {error}; remove it to read the cube without times") from error
 
 
 def _headers(folder: Path) -> dict[int, Path]:
-    """Return first frame -> header of each part, in order (SceneError: a part has not one header)."""
+    """Return the header of each part by its first frame, sorted (SceneError: a part has no or several headers)."""
     found: dict[int, list[Path]] = {}
     for entry in folder.iterdir():
         match = _PART.fullmatch(entry.name)

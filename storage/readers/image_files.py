@@ -1,8 +1,7 @@
-"""Images as cubes: GeoTIFF and JPEG 2000 some rows at a time, PNG, JPEG and BMP as a whole, all through rasterio.
+"""Open images as cubes through rasterio: GeoTIFF and JPEG 2000 some rows at a time, PNG, JPEG and BMP whole.
 
-Several images of one size in a TIFF are its bands, in their order: so cameras that know no bands write cubes.
-Transparent and masked pixels have no value. Places, wavelengths and bad bands are read from the tags that GDAL's
-drivers of ENVI and GeoTIFF write, and from band names.
+Several images of one size in a TIFF are its bands, in their order. Transparent and masked pixels have no value. Places,
+wavelengths and bad bands are read from the tags of GDAL's ENVI and GeoTIFF drivers, and from band names.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ from storage.readers.cube_sources import (
     unpacked,
 )
 
-if TYPE_CHECKING:  # half a second to import, for files with a place alone
+if TYPE_CHECKING:  # half a second to import
     import odc.geo.crs as odc_crs
     import odc.geo.geobox as odc_geobox
     import pyproj
@@ -49,16 +48,13 @@ else:
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp")  # of files that are read as a whole
 JPEG2000_ENDINGS = (".jp2", ".j2k")
 IMAGE_ENDINGS = (*PICTURE_ENDINGS, ".tif", ".tiff", *JPEG2000_ENDINGS)
-# Other formats of GDAL's may name any file or server: a file is opened as its ending says and as nothing else.
+# A file is only opened by the driver of its ending: other formats of GDAL may name any file or server.
 _DRIVERS = dict.fromkeys(JPEG2000_ENDINGS, "JP2OpenJPEG") | {".png": "PNG", ".bmp": "BMP"}
 _DRIVERS |= dict.fromkeys((".jpg", ".jpeg"), "JPEG") | dict.fromkeys((".tif", ".tiff"), "GTiff")
 _STRICT = {"GDAL_ERROR_ON_LIBJPEG_WARNING": True, "GDAL_PNG_WHOLE_IMAGE_OPTIM": False}  # cut off files are refused
 _CALLED = {"GTiff": "TIFF", "JP2OpenJPEG": "JPEG 2000"}  # in messages
 ALPHA_NOTE = "its alpha channel says where there are pixels, and is no band"
-NO_MASK_NOTE = (
-    "its channel called alpha holds what no mask does, and is taken as a band: programs call the fourth band of a file "
-    "alpha where nothing says what it is"
-)
+NO_MASK_NOTE = "its channel called alpha has the values of a band, not of a mask, and is taken as a band"
 RGB_NM, NEAR_INFRARED_NM, GREY_NM = (640.0, 550.0, 460.0), 800.0, 550.0
 _COLOURS_NM: Mapping[tuple[str, ...], tuple[float, ...]] = {
     ("gray",): (GREY_NM,),
@@ -67,14 +63,14 @@ _COLOURS_NM: Mapping[tuple[str, ...], tuple[float, ...]] = {
     ("red", "green", "blue", "undefined"): (*RGB_NM, NEAR_INFRARED_NM),
     ("red", "green", "blue", "nir"): (*RGB_NM, NEAR_INFRARED_NM),
 }
-SAMPLED_PX, MOST_BETWEEN = 256, 0.1  # a mask is recognised by so many pixels a side, of which so many are half there
+SAMPLED_PX, MOST_BETWEEN = 256, 0.1  # side of the part that is read of a mask, and its partly transparent fraction
 
 
 def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> CubeSource:
     """Open an image, (y, x, band), without its alpha channel.
 
-    Scale and offset of the file are applied, unless not ``scaled``; ``palette`` keeps the numbers of a picture's
-    colours. Raises SceneError: there is no such file, it is damaged, or claims more than its bytes can mean.
+    Scale and offset of the file are applied if ``scaled``; ``palette`` keeps the numbers of a palette. Raises
+    SceneError: there is no such file, it is damaged, or claims more than its bytes can hold.
     """
     if not path.is_file():
         raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
@@ -83,7 +79,7 @@ def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> Cub
         pages, notes = _pages(path, file)
         block, item = max(file.block_shapes), max(np.dtype(one).itemsize for one in file.dtypes)
         claimed = (file.height, file.width, file.count * len(pages))
-        _check_size(path, driver, claimed, item, math.prod(block) * file.count)  # before any of it is read
+        _check_size(path, driver, claimed, item, math.prod(block) * file.count)
         kinds = [kind.name for kind in file.colorinterp]
         if driver in _CALLED and "alpha" in kinds and not _is_mask(file, kinds.index("alpha")):
             kinds, notes = ["undefined" if kind == "alpha" else kind for kind in kinds], [*notes, NO_MASK_NOTE]
@@ -145,9 +141,9 @@ def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> Cub
 def rescaled(
     source: CubeSource, scale: NDArray[np.float64], offset: NDArray[np.float64], nodata: float | None
 ) -> CubeSource:
-    """Return the cube with ``number * scale + offset`` as its values, (band,) each, NaN where a number is no data."""
+    """Return the cube with ``number * scale + offset`` as values, (band,) each, NaN for ``nodata``."""
     pairs = sorted(set(zip(scale.tolist(), offset.tolist(), strict=True)))
-    others = "" if len(pairs) == 1 else ", or others by the band"
+    others = "" if len(pairs) == 1 else " (others by band)"
     return replace(
         source,
         dtype=np.dtype(np.float32),
@@ -156,18 +152,18 @@ def rescaled(
         scaling=f"scale {scale.tolist()} offset {offset.tolist()}",
         notes=(
             *source.notes,
-            f"values are the file's numbers times {pairs[0][0]:g} plus {pairs[0][1]:g}{others}, as it says",
+            f"values are the file's numbers times {pairs[0][0]:g} plus {pairs[0][1]:g}{others}, as in its header",
         ),
     )
 
 
 @contextmanager
 def _opened(path: Path, image: str = "") -> Iterator[Any]:
-    """Open the first or another image of a file (SceneError: it is damaged, or no image of its ending)."""
+    """Open the first or another image of a file (SceneError: it is damaged, or of another kind)."""
     rasterio = importlib.import_module("rasterio")
     driver = _DRIVERS[path.suffix.lower()]
     with warnings.catch_warnings(), rasterio.Env(**_STRICT):
-        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)  # a scene lies on the camera's grid
+        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
         kind = _CALLED.get(driver, path.suffix.lower())
         with (
             reading(path, kind, "Copy it again, or save it as PNG or TIFF"),
@@ -177,7 +173,7 @@ def _opened(path: Path, image: str = "") -> Iterator[Any]:
 
 
 def _pages(path: Path, first: Any) -> tuple[list[str], list[str]]:
-    """Return names of the images that are bands of one cube, and notes; the first alone where others differ."""
+    """Return names of the images that are bands of one cube, and notes; only the first if others differ."""
     names = list(first.subdatasets)
     if len(names) < 2:
         return [""], []
@@ -189,17 +185,17 @@ def _pages(path: Path, first: Any) -> tuple[list[str], list[str]]:
 
 
 def _check_size(path: Path, driver: str, shape: tuple[int, int, int], item: int, block: int) -> None:
-    """Refuse more than the file's bytes can mean, or the memory can hold (SceneError)."""
+    """Refuse more than the file's bytes or the memory can hold (SceneError)."""
     claimed = math.prod(shape) * item
-    if driver != "JPEG":  # which may say that blocks without end are alike
+    if driver != "JPEG":  # its blocks may have no byte each
         check_claim(path, claimed, path.stat().st_size, MOST_RATIO if driver in _CALLED else DEFLATE_RATIO)
     check_memory(path, claimed * 3 if driver not in _CALLED else block * item + claimed // shape[0] * BLOCK_LINES)
 
 
 def _is_mask(file: Any, channel: int) -> bool:
-    """Return whether nearly all values of a channel are 0 or its greatest, in the middle of the image.
+    """Return whether nearly all values of a channel are 0 or its maximum, in the middle of the image.
 
-    Programs call the fourth band of a file alpha where nothing says what it is.
+    Programs call the fourth band of a file alpha if nothing else is stated.
     """
     high, wide = min(file.height, SAMPLED_PX), min(file.width, SAMPLED_PX)
     top, left = (file.height - high) // 2, (file.width - wide) // 2
@@ -208,7 +204,7 @@ def _is_mask(file: Any, channel: int) -> bool:
 
 
 def _void(file: Any, alpha: int | None) -> NDArray[np.bool_] | None:
-    """Return (y, x) pixels that alpha or the file's mask says are not there; None where it has neither."""
+    """Return (y, x) pixels that are transparent or masked; None without a mask."""
     kinds, flags = importlib.import_module("rasterio").enums.MaskFlags, file.mask_flag_enums[0]
     if alpha is None and (kinds.per_dataset not in flags or kinds.alpha in flags):
         return None
@@ -222,7 +218,7 @@ def _void(file: Any, alpha: int | None) -> NDArray[np.bool_] | None:
 
 
 def place_of_file(file: Any) -> tuple[GeoBox | None, tuple[str, ...]]:
-    """Return the grid on the earth of an opened rasterio file; None with a note where it has none."""
+    """Return the grid on the earth of an open rasterio file, or None with a note."""
     if file.transform.is_identity:
         other = " and ".join([*(["ground control points"] if file.gcps[0] else []), *(["RPCs"] if file.rpcs else [])])
         return None, (f"its place is given by {other}, which are not read; warp it first (gdalwarp)",) if other else ()
@@ -234,15 +230,15 @@ def place_of_file(file: Any) -> tuple[GeoBox | None, tuple[str, ...]]:
     except Exception as error:  # of PROJ and of GDAL
         return None, (f"its CRS cannot be read ({error}); its place on the earth is not known",)
     if not (crs.is_projected or crs.is_geographic):
-        return None, (f"its CRS, {crs.name!r}, is none of the earth; its place is not known",)
-    code = crs.to_epsg()  # the same CRS by whichever words a file has it
+        return None, (f"its CRS, {crs.name!r}, is not geographic or projected; its place is not known",)
+    code = crs.to_epsg()
     return odc_geobox.GeoBox(file.shape, file.transform, odc_crs.CRS(crs.to_wkt() if code is None else code)), ()
 
 
 def place_of_envi(
     header: Mapping[str, str], data: Path, shape: tuple[int, int]
 ) -> tuple[GeoBox | None, tuple[str, ...]]:
-    """Return the grid of an ENVI file of (line, sample) ``shape``, by its ``map info``, as GDAL reads it."""
+    """Return the grid of an ENVI file with (line, sample) ``shape``, by its ``map info`` as GDAL reads it."""
     if "map info" not in header:
         return None, ()
     rasterio = importlib.import_module("rasterio")
@@ -251,7 +247,7 @@ def place_of_envi(
             warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
             with rasterio.open(data, driver="ENVI") as file:
                 found, notes = place_of_file(file)
-    except Exception as error:  # GDAL raises anything at all on damaged headers
+    except Exception as error:  # of GDAL and PROJ
         return None, (f"its map info cannot be read: {error}",)
     return (None if found is None else odc_geobox.GeoBox(shape, found.affine, found.crs)), notes
 
@@ -270,7 +266,7 @@ def _of_colours(colours_nm: Sequence[float]) -> Bands:
 
 
 def _bands_of(file: Any, keep: Sequence[int], kinds: Sequence[str], path: Path) -> tuple[Bands, tuple[str, ...]]:
-    """Return wavelengths and widths by the tags of an opened file, else its band names, else its colours; and notes."""
+    """Return wavelengths and widths by the tags of an open file, else its band names, else its colours; and notes."""
     notes: list[str] = []
     of_file, of_bands = _lower(file.tags()) | _lower(file.tags(ns="ENVI")), [_band_tags(file, band) for band in keep]
     fields = {}
@@ -298,13 +294,13 @@ def _bands_of(file: Any, keep: Sequence[int], kinds: Sequence[str], path: Path) 
 
 
 def bad_bands(listed: str | None, count: int) -> tuple[int, ...]:
-    """Return bands, from 0, that a list of bad bands marks by 0 (``{1, 1, 0}``); none where it is not of ``count``."""
+    """Return the bands (from 0) that a list of ``count`` flags marks by 0, such as ``{1, 1, 0}``."""
     flags = [finite_number(word) for word in re.split(r"[,\s{}]+", listed or "") if word]
     return tuple(band for band, flag in enumerate(flags) if flag == 0) if len(flags) == count else ()
 
 
 def _bad_bands_of(file: Any, keep: Sequence[int]) -> tuple[int, ...]:
-    """Return bands of an opened file that it calls bad, by their places in ``keep``."""
+    """Return the bands of an open file that it marks as bad, by their index in ``keep``."""
     listed = _first(_lower(file.tags(ns="ENVI")) | _lower(file.tags()), ("bbl", "bad_bands", "bad_band_list"))
     bad = set(bad_bands(listed, file.count))
     bad |= {band for band in keep if _first(_band_tags(file, band), ("bbl", "bad_band")) in ("0", "0.0")}
@@ -312,7 +308,7 @@ def _bad_bands_of(file: Any, keep: Sequence[int]) -> tuple[int, ...]:
 
 
 def _band_tags(file: Any, band: int) -> dict[str, str]:
-    """Return the tags of one band, counted from 0; GDAL's own in micrometres count first."""
+    """Return the tags of one band, counted from 0; GDAL's own take precedence."""
     tags, imagery = _lower(file.tags(band + 1)), file.tags(band + 1, ns="IMAGERY")
     if "CENTRAL_WAVELENGTH_UM" in imagery:
         tags |= {"wavelength": imagery["CENTRAL_WAVELENGTH_UM"], "wavelength_units": "um"}

@@ -1,6 +1,6 @@
-"""Label files that belong to scenes by their names.
+"""Find and read the label files of scenes.
 
-Labels are pictures, or polygons where there is no picture. They lie beside their images (``001_mask.png``,
+Labels are pictures, or polygons if there is no picture. They lie beside their images (``001_mask.png``,
 ``field_a_labels.png``, ``field_a.gpkg``) or in a folder of labels. That folder lies there, or beside a folder of images
 (``labels/001.png``, ``annotations/001_annotation.png``). Names are equal, or differ by a word such as ``_mask``. Upper
 and lower case are alike.
@@ -13,11 +13,16 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pipeline.errors import SceneError
+from storage.readers.labels import Labels, found_classes, load_labels
 from storage.readers.open_cubes import CUBE_ENDINGS
-from storage.readers.polygons import POLYGON_ENDINGS, split_layer
-from storage.readers.scene_toml import SETTINGS_NAME, SceneSettings, is_image_folder
+from storage.readers.polygons import POLYGON_ENDINGS, is_polygon_file, load_polygon_labels, polygon_classes, split_layer
+from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, is_image_folder
+
+if TYPE_CHECKING:
+    from odc.geo.geobox import GeoBox
 
 _OF_LAND = ("lulc", "landcover", "land_cover")
 _OF_TRUTH = ("gt", "groundtruth", "truth", "seg")
@@ -37,20 +42,42 @@ _LABEL_WORD, _IMAGE_WORD = _word_at_an_end(LABEL_WORDS), _word_at_an_end(IMAGE_W
 
 @dataclass(frozen=True)
 class MatchedFiles:
-    """Images of a folder, and the label files that belong to them."""
+    """Images of a folder, and their label files."""
 
     images: tuple[Path, ...]
-    labels: dict[Path, Path]  # of an image
+    labels: dict[Path, Path]  # by image
     alone: tuple[Path, ...]  # label files without an image
 
     @property
     def bare(self) -> tuple[Path, ...]:
-        """Images without labels."""
+        """Return the images without labels."""
         return tuple(image for image in self.images if image not in self.labels)
 
 
+def read_labels(address: str | Path, shape: tuple[int, int], geobox: GeoBox | None, settings: SceneSettings) -> Labels:
+    """Read labels on a scene's (y, x) pixels, out of a picture or of polygons (SceneError: they do not fit)."""
+    if is_polygon_file(address):
+        return load_polygon_labels(address, shape, geobox, settings=settings)
+    return load_labels(
+        address, shape, geobox, classes=settings.classes, unlabelled=settings.unlabelled, colours=settings.colours
+    )
+
+
+def classes_of_files(files: Sequence[Path], settings: SceneSettings) -> dict[str, ClassValue]:
+    """Return every class of several label files by its value (SceneError: some are polygons, some pictures)."""
+    polygons = [file for file in files if is_polygon_file(file)]
+    if not polygons:
+        return found_classes(files, settings.unlabelled)
+    if len(polygons) < len(files):
+        raise SceneError(
+            f"some labels are polygons ({listed_names(polygons)}) and some are pictures; name their classes in a "
+            f"{SETTINGS_NAME}, or use one kind"
+        )
+    return polygon_classes(polygons, settings)
+
+
 def scene_entries(folder: Path) -> list[Path]:
-    """Return the files and Zarr stores that may be scenes or labels, by name; hidden ones are left out."""
+    """Return the files and Zarr stores that may be scenes or labels, sorted by name, without hidden ones."""
     return sorted(
         entry
         for entry in folder.iterdir()
@@ -60,9 +87,9 @@ def scene_entries(folder: Path) -> list[Path]:
 
 
 def image_folder(folder: Path) -> Path:
-    """Return the folder of images: the folder ``images`` in this one, where there is one, or this one."""
+    """Return the folder ``images`` (or of a similar name) in a folder, or the folder itself."""
     inner = sorted(entry for entry in folder.iterdir() if is_image_folder(entry) and entry.is_dir())
-    return next((entry for entry in inner if entry.name == "images"), inner[0] if inner else folder)
+    return min(inner, key=lambda entry: entry.name != "images", default=folder)
 
 
 def match_folder(folder: Path) -> MatchedFiles:
@@ -74,13 +101,13 @@ def match_folder(folder: Path) -> MatchedFiles:
     apart = _in_label_folders(folder)
     beside = [entry for entry in own if is_label_name(entry)]
     images = [entry for entry in own if entry not in beside]
-    if not images:  # a folder of labels is asked for as such: they are what there is
+    if not images:  # a folder of labels is read as images
         images, beside = own, []
-    polygons = _polygons_about(folder)
-    told = {image: _label_of(image, [*beside, *apart]) or _label_of(image, polygons) for image in images}
-    labels = {image: found for image, found in told.items() if found is not None}
-    if len(images) == len([*beside, *apart]) == 1:  # they need no name to belong together
-        labels = dict(zip(images, [*beside, *apart], strict=True))
+    pictures, polygons = [*beside, *apart], _polygons_near(folder)
+    matched = {image: _label_of(image, pictures) or _label_of(image, polygons) for image in images}
+    labels = {image: found for image, found in matched.items() if found is not None}
+    if len(images) == len(pictures) == 1:  # a single pair may have any names
+        labels = dict(zip(images, pictures, strict=True))
     owner: dict[Path, Path] = {}
     for image, label in labels.items():
         if label in owner:
@@ -89,55 +116,49 @@ def match_folder(folder: Path) -> MatchedFiles:
                 f" say which files are labels in a {SETTINGS_NAME}"
             )
         owner[label] = image
-    alone = tuple(entry for entry in (*beside, *apart) if entry not in set(labels.values()))
+    alone = tuple(entry for entry in pictures if entry not in set(labels.values()))
     return MatchedFiles(tuple(images), labels, alone)
 
 
 def find_label(scene: Path) -> Path | None:
-    """Return the label file of one scene by its name; None where there is none.
-
-    Raises SceneError: there are several.
-    """
+    """Return the label file of one scene by its name (SceneError: there are several)."""
     if not scene.parent.is_dir() or (scene.is_dir() and not is_store(scene)):
         return None
     try:
         beside = [entry for entry in scene_entries(scene.parent) if is_label_name(entry) and entry != scene]
         found = _label_of(scene, [*beside, *_in_label_folders(scene.parent)])
-        return found or _label_of(scene, _polygons_about(scene.parent))
-    except PermissionError:  # who may read the file need not be allowed to list the folder
+        return found or _label_of(scene, _polygons_near(scene.parent))
+    except PermissionError:  # the folder cannot be listed
         return None
 
 
 def is_label_name(path: Path) -> bool:
-    """Return whether a file's name says that it holds labels: ``001_mask.png``, ``labels.png``."""
+    """Return whether a file's name is that of labels: ``001_mask.png``, ``labels.png``."""
     stem = path.stem.lower()
     return stem in LABEL_WORDS or _LABEL_WORD.search(stem) is not None
 
 
 def folders_within(folder: Path) -> str:
-    """Return words for the folders of a folder in which images lie; empty where none does."""
+    """Return a hint on the folders within a folder that have images; empty if none has."""
     inner = [entry for entry in sorted(folder.iterdir()) if entry.is_dir() and not is_store(entry)]
     found = [entry for entry in inner if not entry.name.startswith(".") and scene_entries(image_folder(entry))]
     return f"; there are some in its folders {listed_names(found)}: name one" if found else ""
 
 
 def listed_names(paths: Iterable[Path]) -> str:
-    """Return the first names, and how many follow."""
+    """Return the first names, and how many there are beyond them."""
     names = [path.name for path in paths]
     more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
     return ", ".join(names[:SHOWN]) + more
 
 
 def is_store(entry: Path) -> bool:
-    """Return whether a folder is one scene: a Zarr store."""
+    """Return whether a folder is a Zarr store, which is one scene."""
     return entry.suffix.lower() == ".zarr" and entry.is_dir()
 
 
 def _in_label_folders(folder: Path) -> list[Path]:
-    """Return all pictures that may be labels in folders of labels.
-
-    Such a folder lies in this one, or beside it where it is one of images.
-    """
+    """Return all pictures in the folders of labels in or beside a folder."""
     return [entry for inner in _label_folders(folder) for entry in scene_entries(inner)]
 
 
@@ -147,11 +168,8 @@ def _label_folders(folder: Path) -> list[Path]:
     return [inner for inner in found if inner.is_dir() and inner != folder]
 
 
-def _polygons_about(folder: Path) -> list[Path]:
-    """Return the files of polygons that may be labels.
-
-    They lie in a folder, in one of labels, or beside it where it is one of images.
-    """
+def _polygons_near(folder: Path) -> list[Path]:
+    """Return the files of polygons in a folder, in its folders of labels, or beside it if it has images."""
     places = [folder, *([folder.parent] if is_image_folder(folder) else []), *_label_folders(folder)]
     return [
         entry
@@ -162,22 +180,18 @@ def _polygons_about(folder: Path) -> list[Path]:
 
 
 def _label_of(image: Path, candidates: Sequence[Path]) -> Path | None:
-    """Return the file that has the image's name, else the one that differs by a word for images."""
-    stem = image.stem.lower()
-    for alike in (lambda name: name, lambda name: _IMAGE_WORD.sub("", name)):
-        wanted = alike(stem)
-        found = [
-            one
-            for one in candidates
-            if wanted in (alike(one.stem.lower()), alike(_LABEL_WORD.sub("", one.stem.lower(), count=1)))
-        ]
+    """Return the file with the image's name, else the one that differs by a word for images."""
+    for word in (re.compile("(?!)"), _IMAGE_WORD):
+        wanted = word.sub("", image.stem.lower())
+        stems = {one: (one.stem.lower(), _LABEL_WORD.sub("", one.stem.lower(), count=1)) for one in candidates}
+        found = [one for one, both in stems.items() if wanted in [word.sub("", stem) for stem in both]]
         if len(found) > 1:
             names = " and ".join(str(one) for one in found[:SHOWN])
             home = image.parent.parent if is_image_folder(image.parent) else image.parent
-            told = Path(os.path.relpath(found[0].parent, home), found[0].name.replace(image.stem, "{name}", 1))
+            pattern = Path(os.path.relpath(found[0].parent, home), found[0].name.replace(image.stem, "{name}", 1))
             raise SceneError(
                 f"{image} has several files of labels by their names: {names}; keep one, or say which in a"
-                f' {SETTINGS_NAME}: labels = "{told.as_posix()}"'
+                f' {SETTINGS_NAME}: labels = "{pattern.as_posix()}"'
             )
         if found:
             return found[0]
@@ -185,9 +199,9 @@ def _label_of(image: Path, candidates: Sequence[Path]) -> Path | None:
 
 
 def label_file(scene: Path, settings: SceneSettings) -> tuple[Path | None, str]:
-    """Return the labels of a scene, by scene.toml or else by their name; and why there are none, if that is known.
+    """Return the label file of a scene by scene.toml, else by its name; and a note if scene.toml names a missing one.
 
-    Raises SceneError: scene.toml asks for a number that the scene's name lacks, or several files may be meant.
+    Raises SceneError: the pattern in scene.toml needs a number that the scene's name lacks, or several files fit.
     """
     if settings.labels is None or settings.path is None:
         return find_label(scene), ""
@@ -206,7 +220,7 @@ def label_file(scene: Path, settings: SceneSettings) -> tuple[Path | None, str]:
 
 
 def filled(pattern: str, scene: Path) -> str:
-    """Return the ``labels`` of a scene.toml with the name and the number of a scene put in."""
+    """Return the ``labels`` of a scene.toml for one scene."""
     return pattern.replace("{number}", scene_number(scene) or "").replace("{name}", scene.stem)
 
 

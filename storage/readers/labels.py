@@ -1,4 +1,4 @@
-"""Labels of the pixels of a scene: numbers, exact colours or an image with a palette."""
+"""Read labels of pixels from pictures: numbers, exact colours or a palette."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ MIXED = (
     "JPEG, soft edges and scaling mix values; save the labels again as PNG, with hard edges and by nearest neighbour,"
     " or is this the picture itself?"
 )
-_MANY_UNKNOWN = 16  # values that are no class: too many to be forgotten ones
+_MANY_UNKNOWN = 16  # values that are no class: more are mixed colours, not forgotten classes
 
-# Eight colours that stay apart for most kinds of colour blindness (Okabe and Ito, 2008), in an order for maps.
+# Eight colours that most people with colour blindness can distinguish (Okabe and Ito, 2008), in an order for maps.
 _EIGHT_COLOURS = (
     (230, 159, 0),
     (86, 180, 233),
@@ -45,7 +45,7 @@ _EIGHT_COLOURS = (
     (90, 90, 90),
 )
 
-# Land cover as maps usually show it; the words of one row mean the same.
+# Usual colours of land cover on maps; the words of one row are synonyms.
 _COLOURS_OF_WORDS: dict[str, Colour] = {
     word: colour
     for words, colour in (
@@ -69,16 +69,20 @@ _COLOURS_OF_WORDS: dict[str, Colour] = {
 }
 
 
+class MixedLabelsError(SceneError):
+    """A label file has too many values for classes."""
+
+
 @dataclass(frozen=True)
 class Labels:
-    """Class index of every pixel and what the classes are."""
+    """Class index of every pixel, and the classes."""
 
     index: NDArray[np.uint8]  # (y, x), 255 = unlabelled
     names: tuple[str, ...]
     values: tuple[ClassValue, ...]  # number or colour of each class in the file
     colours: NDArray[np.uint8]  # (class, 3)
     notes: tuple[str, ...] = ()
-    regridded: bool = False  # their file has another grid than the scene
+    regridded: bool = False  # from another grid than the scene's
 
 
 @dataclass(frozen=True)
@@ -88,7 +92,7 @@ class LabelCodes:
     values: NDArray[np.int64]  # (y, x), -1 = no value
     of_colours: bool  # a number is r * 65536 + g * 256 + b
     notes: tuple[str, ...] = ()
-    regridded: bool = False  # the file has another grid than the one that was asked for
+    regridded: bool = False  # from another grid
 
 
 def load_labels(
@@ -100,11 +104,11 @@ def load_labels(
     unlabelled: ClassValue | None = None,
     colours: Mapping[str, Colour] | None = None,
 ) -> Labels:
-    """Read a label file of numbers or exact colours; without ``classes`` every value found becomes one.
+    """Read a label file of numbers or exact colours; without ``classes`` every value is a class.
 
-    ``geobox`` is the grid of the scene: labels with a place of their own are brought to it. Raises SceneError: the file
-    cannot be read, lies beside the scene, or has another size and no place. So does a value that is no class (named
-    with its count), and more than 64 values where no classes are stated.
+    Labels with a place on the earth are resampled to the scene's ``geobox``. Raises SceneError: the file cannot be
+    read, lies beside the scene, has another size and no place, has a value that is no class, or more than 64 values
+    without ``classes``.
     """
     by_colour = any(isinstance(value, tuple) for value in (*classes.values(), unlabelled))
     read = load_codes(address, geobox, by_number=bool(classes) and not by_colour, classes=classes.values())
@@ -129,7 +133,7 @@ def load_labels(
 
 
 def found_classes(addresses: Iterable[str | Path], unlabelled: ClassValue | None = None) -> dict[str, ClassValue]:
-    """Return every value of several label files as one class each, named by it; errors as for :func:`load_labels`."""
+    """Return every value of several label files as one class each (SceneError as `load_labels`)."""
     codes: set[int] = set()
     is_colour = isinstance(unlabelled, tuple)
     parts: list[tuple[NDArray[np.int64], bool]] = []
@@ -137,7 +141,7 @@ def found_classes(addresses: Iterable[str | Path], unlabelled: ClassValue | None
         read = load_codes(address, by_number=False)
         is_colour = is_colour or read.of_colours
         parts.append((np.unique(read.values), read.of_colours))
-        found_codes(parts[-1][0], None, read.of_colours, str(address))  # refuses mixed values by the file's name
+        found_codes(parts[-1][0], None, read.of_colours, str(address))  # raises for mixed values
     for values, of_colours in parts:  # a grey value g is the colour (g, g, g) where others have colours
         codes |= {int(code) * (0x010101 if is_colour and not of_colours else 1) for code in values if code >= 0}
     none = None if unlabelled is None else _code(unlabelled)
@@ -147,11 +151,11 @@ def found_classes(addresses: Iterable[str | Path], unlabelled: ClassValue | None
 def load_codes(
     address: str | Path, geobox: GeoBox | None = None, *, by_number: bool, classes: Collection[ClassValue] = ()
 ) -> LabelCodes:
-    """Read a file as one whole number a pixel; NaN and the file's no-data value are none, unless it is of ``classes``.
+    """Read a file as one whole number a pixel; NaN, and a no-data value that is none of ``classes``, are no value.
 
-    On a ``geobox`` a file with a place is brought to its pixels by nearest neighbour. ``by_number`` takes the indices
-    of an image with a palette, and the one value of an image whose channels are alike. Raises SceneError: the file
-    cannot be read, holds fractions, or lies beside the geobox.
+    A file with a place is resampled to ``geobox`` by nearest neighbour. ``by_number`` takes the indices of a palette,
+    and the value of an image with equal channels. Raises SceneError: the file cannot be read, holds fractions, or lies
+    beside the geobox.
     """
     source = open_labels(address, by_number=by_number)
     codes, of_colours = _whole_numbers(source.read(0, source.shape[0]), address, by_number=by_number)
@@ -163,12 +167,12 @@ def load_codes(
             notes.append(f"{void.sum()} px have the label file's no-data value {source.nodata:g}: unlabelled")
     if geobox is not None and own is not None and (difference := _grid_difference(own, geobox)):
         codes, regridded = _on_grid(codes, own, geobox, address), True
-        notes.append(f"labels {address} {difference}: they are brought to its pixels by nearest neighbour")
+        notes.append(f"labels {address} {difference}: they are resampled to its pixels by nearest neighbour")
     return LabelCodes(codes, of_colours, tuple(notes), regridded)
 
 
 def _whole_numbers(values: NDArray[Any], address: str | Path, *, by_number: bool) -> tuple[NDArray[np.int64], bool]:
-    """Return one number a pixel of (y, x, band) values, -1 for NaN, and whether they are colours."""
+    """Return one number a pixel for (y, x, band) values, -1 for NaN, and whether they are colours."""
     if values.shape[2] == 1:
         values = values[..., 0]
         if values.dtype.kind != "f":
@@ -189,7 +193,7 @@ def _whole_numbers(values: NDArray[Any], address: str | Path, *, by_number: bool
 
 
 def _grid_difference(own: GeoBox, scene: GeoBox) -> str:
-    """Return how the grid of labels differs from a scene's; empty where the pixels are the same."""
+    """Return the difference between the grids of labels and scene in words; empty if they are equal."""
     if own.crs != scene.crs:
         return f"are in {crs_name(own)}, the scene in {crs_name(scene)}"
     shift = shift_px(scene, own)
@@ -201,7 +205,7 @@ def _grid_difference(own: GeoBox, scene: GeoBox) -> str:
 
 
 def _on_grid(codes: NDArray[np.int64], own: GeoBox, grid: GeoBox, address: str | Path) -> NDArray[np.int64]:
-    """Return the nearest code to each pixel of a grid, -1 beside the labels (SceneError: all of it lies there)."""
+    """Return the nearest code to each pixel of a grid, -1 beside the labels (SceneError: all pixels are)."""
     values, index = np.unique(codes, return_inverse=True)
     found = np.full(tuple(grid.shape), NO_VALUE, np.int32)
     odc_warp.rio_reproject(index.reshape(codes.shape).astype(np.int32), found, own, grid, "nearest", NO_VALUE, NO_VALUE)
@@ -223,19 +227,16 @@ def _code(value: ClassValue) -> int:
 
 
 def colour_of(code: int) -> Colour:
-    """Return the colour that a number of `load_codes` stands for."""
+    """Return the colour of a number of `load_codes`."""
     return code >> 16 & 255, code >> 8 & 255, code & 255
 
 
 def found_codes(codes: NDArray[np.int64], none: int | None, is_colour: bool, where: str) -> dict[str, ClassValue]:
-    """Return one class for each value in the file, ascending.
-
-    Classes are called ``class_N`` after a number, ``colour_RRGGBB`` after a colour.
-    """
+    """Return one class for each value, ascending, named ``class_N`` or ``colour_RRGGBB``."""
     found = [int(code) for code in np.unique(codes) if code != none and code >= 0]
     if len(found) > MOST_FOUND_CLASSES:
         what = "colours" if is_colour else "numbers"
-        raise SceneError(
+        raise MixedLabelsError(
             f"labels {where} have {len(found)} different {what}, at most {MOST_FOUND_CLASSES} are taken for classes: "
             f"{MIXED}"
         )
@@ -251,7 +252,7 @@ def _index(
     table = {_code(value): index for index, value in enumerate(classes.values())}
     if none is not None and none in table:
         name = tuple(classes)[table[none]]
-        raise SceneError(f"scene.toml says that {_shown(none, classes)} is unlabelled and also class {name}; keep one")
+        raise SceneError(f"scene.toml has {_shown(none, classes)} as unlabelled and as class {name}; keep one")
     unknown = [int(value) for value in values if int(value) not in table and value not in (none, NO_VALUE)]
     if unknown:
         count = int((codes == unknown[0]).sum())
@@ -260,8 +261,8 @@ def _index(
             f"labels {where} have {count} px of {_shown(unknown[0], classes)}, which is no class (and "
             f"{len(unknown) - 1} more such values); {MIXED if len(unknown) > _MANY_UNKNOWN else cure}"
         )
-    geolocation = np.array([table.get(int(value), UNLABELLED) for value in values], np.uint8)
-    return geolocation[inverse.reshape(codes.shape)]
+    index = np.array([table.get(int(value), UNLABELLED) for value in values], np.uint8)
+    return index[inverse.reshape(codes.shape)]
 
 
 def _shown(code: int, classes: Mapping[str, ClassValue]) -> str:
@@ -270,10 +271,9 @@ def _shown(code: int, classes: Mapping[str, ClassValue]) -> str:
 
 
 def class_colours(classes: Mapping[str, ClassValue], stated: Mapping[str, Colour] | None = None) -> NDArray[np.uint8]:
-    """Return a colour (class, 3) for each class: as stated, as in the label file, by a word of its name, or any.
+    """Return a colour (class, 3) for each class: as stated, as in the label file, by a word of its name, or a default.
 
-    A word that several classes share gives its colour to the shortest name, `woods` before `grass_trees`, then to the
-    first, `winter_wheat` before `spring_wheat`.
+    If several classes share a word, the shortest name gets its colour (`woods` before `grass_trees`), then the first.
     """
     words = {name: re.findall(r"[a-z]+", name.lower()) for name in classes}
     found = {name: value for name, value in classes.items() if isinstance(value, tuple)} | dict(stated or {})
@@ -285,7 +285,7 @@ def class_colours(classes: Mapping[str, ClassValue], stated: Mapping[str, Colour
 
 
 def default_colour(index: int) -> Colour:
-    """Return the colour of class ``index`` where the file has none: eight safe ones, then hues a golden angle apart."""
+    """Return a default colour: eight colours for colour blindness, then hues a golden angle apart."""
     if index < len(_EIGHT_COLOURS):
         return _EIGHT_COLOURS[index]
     turn = index * 0.618033988749895 % 1.0

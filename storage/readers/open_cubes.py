@@ -1,4 +1,4 @@
-"""Anything that holds a cube, opened to be read some lines at a time, by whichever reader knows it."""
+"""Open any file or folder that holds a cube, by the reader of its kind."""
 
 from __future__ import annotations
 
@@ -12,14 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from storage.readers.array_files import (
-    ARRAY_ENDINGS,
-    HDF_ENDINGS,
-    load_npy,
-    open_array_file,
-    open_hdf_cube,
-    reading_array,
-)
+from storage.readers.array_files import ARRAY_ENDINGS, check_picture, load_npy, open_array_file, reading_array
 from storage.readers.cube_sources import Bands, CubeSource, check_cube_source
 from storage.readers.envi_files import (
     DATA_ENDINGS,
@@ -29,8 +22,8 @@ from storage.readers.envi_files import (
     open_envi_source,
     open_headwall_cube,
 )
+from storage.readers.hdf_files import HDF_ENDINGS, open_hdf_cube
 from storage.readers.image_files import IMAGE_ENDINGS, JPEG2000_ENDINGS, open_image
-from storage.readers.pixel_tables import check_picture
 from storage.readers.scene_toml import SceneSettings, find_scene_settings, settle_wavelengths
 from storage.readers.zarr_files import find_zarr_store, open_zarr_cube
 
@@ -41,7 +34,7 @@ _WITH_VARIABLE = re.compile(
     r"|^(?P<path2>.+\.(?:nc4?|h5|hdf5|he5)):(?P<variable2>[^:]+(?::\d+)?)$",
     re.IGNORECASE | re.DOTALL,
 )
-_BEGINNINGS = {  # of files, and the endings that go with them
+_BEGINNINGS = {  # of files, and their endings
     b"\x89PNG": (".png",),
     b"\xff\xd8\xff": (".jpg", ".jpeg"),
     b"II*\0": (".tif", ".tiff"),
@@ -56,7 +49,7 @@ _BEGINNINGS = {  # of files, and the endings that go with them
 
 
 def split_variable(address: str | Path) -> tuple[Path, str | None]:
-    """Return path and variable of ``scene.mat:cube``, with the step of time in ``cube:3``; None where none is named."""
+    """Return path and variable of ``scene.mat:cube``, the latter with its step of time (``cube:3``)."""
     found = _WITH_VARIABLE.match(str(address))
     if found is None:
         return Path(address), None
@@ -64,9 +57,9 @@ def split_variable(address: str | Path) -> tuple[Path, str | None]:
 
 
 def reader_of(address: str | Path) -> Reader:
-    """Return the reader that takes an address; none where there is no such file, or it is of a kind that is not read.
+    """Return the reader of an address; "none" if there is no such file, or none reads its kind.
 
-    A folder is a Zarr store or a Headwall camera's, an ENVI cube is named by its header or its data file.
+    A folder is a Zarr store or a Headwall camera's; an ENVI cube is named by its header or its data file.
     """
     path, _ = split_variable(address)
     ending = path.suffix.lower()
@@ -86,12 +79,12 @@ def reader_of(address: str | Path) -> Reader:
 def open_cube(
     address: str | Path, *, dark: str | Path | None = None, white: str | Path | None = None, labels: bool = False
 ) -> CubeSource:
-    """Open whatever holds a cube; nothing of its numbers is read yet but pictures, .mat and .npz, which are whole.
+    """Open a cube; pictures, .mat and .npz are read whole, of others only headers.
 
     ``address`` may name an array and a step of time: ``STORE:ARRAY:3``. ``dark`` and ``white`` are ENVI or .npy files
-    of reference frames, averaged over their lines; they win over those in a Headwall folder. Numbers of ``labels`` are
-    those in the file, without any scale; of several arrays that with two axes is meant. Raises SceneError: there is no
-    such thing, it is damaged, or not of a kind or shape that can be used.
+    of reference frames, averaged over their lines; they replace those in a Headwall folder. ``labels`` are read without
+    scale, and an array with two axes is preferred. Raises SceneError: there is no such file, it is damaged, or its kind
+    or shape cannot be used.
     """
     path, variable = split_variable(address)
     frames: list[tuple[str, str | Path | None]] = [("dark", dark), ("white", white)]
@@ -125,10 +118,7 @@ def open_cube(
 
 
 def open_labels(address: str | Path, *, by_number: bool = False) -> CubeSource:
-    """Open a file of labels or a mask as it stands: no scale is applied.
-
-    ``by_number`` keeps the numbers of a picture with a palette. Raises SceneError: as `open_cube`.
-    """
+    """Open a file of labels or a mask without its scale; ``by_number`` keeps the numbers of a palette (SceneError)."""
     path, _ = split_variable(address)
     if reader_of(address) == "image":
         _check_content(path)
@@ -137,13 +127,13 @@ def open_labels(address: str | Path, *, by_number: bool = False) -> CubeSource:
 
 
 def load_labels_array(address: str | Path) -> NDArray[Any]:
-    """Read a file of labels or a mask as it stands, (y, x, band). Raises SceneError: as `open_cube`."""
+    """Read a file of labels or a mask without its scale, (y, x, band) (SceneError)."""
     source = open_labels(address)
     return source.read(0, source.shape[0])
 
 
 def load_frame(address: str | Path) -> tuple[NDArray[np.float32], tuple[Path, ...]]:
-    """Read one reference frame, (sample, band), the mean of its lines, and the files that it stands in.
+    """Read one reference frame, (sample, band), as the mean of its lines, and return its files too.
 
     Raises SceneError: the file cannot be read or holds no real numbers.
     """
@@ -167,14 +157,14 @@ def load_frame(address: str | Path) -> tuple[NDArray[np.float32], tuple[Path, ..
 
 
 def with_wavelengths(source: CubeSource, address: str | Path, stated: Sequence[float] | None) -> CubeSource:
-    """Return the cube with wavelengths as a flag says them [nm], one a band, else the ``scene.toml`` beside it.
+    """Return the cube with the ``stated`` wavelengths [nm], one a band, else with those of ``scene.toml``, if any.
 
     Raises WavelengthError: they do not fit.
     """
     path, count = split_variable(address)[0], source.shape[2]
     settings = SceneSettings() if stated is not None else find_scene_settings(path)
     if settings.bands is not None and settings.wavelengths_nm is not None and len(settings.wavelengths_nm) != count:
-        settings = SceneSettings()  # stated for some of the bands only
+        settings = SceneSettings()  # of some bands only
     if stated is None and settings.wavelengths_nm is None and settings.wavelengths_file is None:
         return source
     found = settle_wavelengths(path, range(count), count, stated=stated, settings=settings, known=Bands())
@@ -183,7 +173,7 @@ def with_wavelengths(source: CubeSource, address: str | Path, stated: Sequence[f
 
 
 def _check_content(path: Path) -> None:
-    """Refuse a file that begins as one of another ending does (SceneError)."""
+    """Refuse a file that begins like a file of another ending (SceneError)."""
     with path.open("rb") as file:
         head = file.read(8)
     for begins, endings in _BEGINNINGS.items():

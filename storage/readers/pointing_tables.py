@@ -1,11 +1,12 @@
-"""Pointing of recorded lines, out of files: a table with a row a line, or a vector that the mirror played.
+"""Read the pointing of recorded lines: a table with a row for each line, or a vector that the mirror played.
 
-A table is CSV (commas, semicolons or tabs) or Parquet. Its columns are, beside ``line`` (from 0), ``sweep``, ``time``
-(of mid exposure, since the sweep's start) [s], ``exposure_ms`` and ``valid`` (0 or 1), exactly one of these kinds:
+A table is CSV (commas, semicolons or tabs) or Parquet. Optional columns are ``line`` (from 0), ``sweep``,
+``time`` (of mid exposure since the start of the sweep) [s], ``exposure_ms`` and ``valid`` (0 or 1). A table has exactly
+one of these kinds of pointing:
 
 ::
 
-    mirror_x, mirror_y         mirror position, -1..1, as the device counts it
+    mirror_x, mirror_y         mirror position, -1..1, in the device's axes
     angle_x_deg, angle_y_deg   viewing angle along the line and along the scan
     angle_deg                  viewing angle along the scan, of a scan through the undeflected direction
     position_px                place along a straight scan without a mirror: stage, conveyor, drone
@@ -15,7 +16,7 @@ A vector is a TOML file, for a path that the mirror played by its own clock::
 
     vector = "positions.csv"   # CSV or .npy: two columns X and Y, or all X before all Y in one
     rate_hz = 14.5             # cells a second
-    start_s = 0.0              # the path began so long before the first line's exposure; 0 where it is not said
+    start_s = 0.0              # time of the path at the first line's exposure; 0 by default
 """
 
 from __future__ import annotations
@@ -61,20 +62,20 @@ WORDS = {"": math.nan, "none": math.nan, "true": 1.0, "false": 0.0}
 
 @dataclass(frozen=True)
 class LinePointing:
-    """Mirror positions or places of the lines of one sweep; ``position`` of lines that are not valid may be made up."""
+    """Mirror positions or places of the lines of one sweep; those of invalid lines are interpolated."""
 
     kind: Kind
     position: Floats  # (line, 2) mirror X and Y of the model, or (line, 1) place along a scan without a mirror
     valid: NDArray[np.bool_]  # (line,)
     time_s: Floats | None = None  # (line,) of mid exposure
     exposure_ms: Floats | None = None  # (line,)
-    part: tuple[str, ...] | None = None  # (line,) names of the sweeps that a table of one cube cuts it into
+    part: tuple[str, ...] | None = None  # (line,) names of the sweeps, if a table cuts one cube into several
     notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class PointingTable:
-    """The rows of one table as they stand in its file; ``rows`` are their numbers for messages."""
+    """The rows of one table as in its file."""
 
     path: Path
     kind: Kind
@@ -83,13 +84,11 @@ class PointingTable:
     first_row: int  # number of the first row in the file, as an editor counts them
 
     def of_cube(self, name: str, lines: int, mounting: Mounting = STRAIGHT, *, alone: bool = False) -> LinePointing:
-        """Return the pointing of a cube's ``lines`` lines.
+        """Return the pointing of a cube: the rows whose ``sweep`` is its name, or all without that column.
 
-        Its rows are those whose ``sweep`` is its name, or all without that column.
-
-        If the cube is ``alone`` and no row has its name, the column cuts it into sweeps. ``mounting`` leads from the
-        device's positions to the model's. Raises SceneError: the cube has no row or another number of rows, or no valid
-        one. So does a value that is no number, out of range or beyond the mirror, and times that do not rise.
+        If the cube is ``alone`` and no row has its name, the column cuts it into sweeps. ``mounting`` transforms the
+        device's positions to the model's. Raises SceneError: the cube has another number of rows or no valid one; a
+        value is no number, out of range or beyond the mirror; or times do not rise.
         """
         rows, sweeps = np.arange(len(self.columns[KINDS[self.kind][0]])), tuple(dict.fromkeys(self.sweep or ()))
         cut = self.sweep is not None and alone and name not in sweeps
@@ -121,7 +120,7 @@ class PointingTable:
             unknown = valid & ~np.isfinite(self.columns[column][rows])
             self._refuse(rows, unknown, column, "expected a number; set valid = 0 where it is not known")
         time_s = exposure_ms = None
-        if "time" in self.columns:  # NaN where a line is not valid and has none
+        if "time" in self.columns:  # may be NaN for invalid lines
             time_s = self.columns["time"][rows]
             known = np.flatnonzero(np.isfinite(time_s))
             stuck = np.zeros(lines, np.bool_)
@@ -134,7 +133,7 @@ class PointingTable:
         return LinePointing(self.kind, self._positions(rows, valid, mounting), valid, time_s, exposure_ms, part)
 
     def _positions(self, rows: NDArray[np.intp], valid: NDArray[np.bool_], mounting: Mounting) -> Floats:
-        """Return (line, 2) positions of the model, or (line, 1) places; values of invalid lines are interpolated."""
+        """Return (line, 2) positions of the model, or (line, 1) places, interpolated for invalid lines."""
         values = np.stack([self.columns[name][rows] for name in KINDS[self.kind]], axis=-1)
         values = np.stack([_filled(column, valid) for column in values.T], axis=-1)
         if self.kind in WITHOUT_MIRROR:
@@ -154,7 +153,7 @@ class PointingTable:
     def _refuse(
         self, rows: NDArray[np.intp], wrong: NDArray[np.bool_], columns: str | Sequence[str], expected: str
     ) -> None:
-        """Raise SceneError for the first row that is wrong, by its number in the file, with the range of the column."""
+        """Raise SceneError for the first wrong row, with its number in the file and the range of the column."""
         if not wrong.any():
             return
         names = (columns,) if isinstance(columns, str) else tuple(columns)
@@ -169,17 +168,17 @@ class PointingTable:
 
 
 def _filled(values: Floats, valid: NDArray[np.bool_]) -> Floats:
-    """Return the values; unknown ones of invalid lines are interpolated between valid lines."""
+    """Return the values, with unknown ones of invalid lines interpolated."""
     known = valid | np.isfinite(values)
     at = np.arange(len(values))
     return values if known.all() else np.interp(at, at[known], values[known])
 
 
 def load_pointing_table(path: Path) -> PointingTable:
-    """Read a table with a row a line.
+    """Read a table with a row for each line.
 
-    Raises SceneError: it cannot be read, has no row, an unknown column, or a cell that is no number. So does a table
-    that has not exactly one kind of pointing.
+    Raises SceneError: it cannot be read, has no row, an unknown column, a cell that is no number, or not exactly one
+    kind of pointing.
     """
     header: list[str]
     cells: Sequence[Sequence[object]]
@@ -195,11 +194,9 @@ def load_pointing_table(path: Path) -> PointingTable:
     kinds = [kind for kind, names in KINDS.items() if set(names) & set(header)]
     missing = [name for kind in kinds for name in KINDS[kind] if name not in header]
     if len(kinds) != 1 or missing:
-        came = (
-            f"{missing[0]} is missing" if missing else f"{len(kinds)} of them are there" if kinds else "none is there"
-        )
+        came = f"{missing[0]} is missing" if missing else f"it has {len(kinds)} kinds" if kinds else "it has none"
         wanted = "; or ".join(", ".join(names) for names in KINDS.values())
-        raise SceneError(f"{path} must have one kind of pointing, and {came}; give {wanted}")
+        raise SceneError(f"{path} must have one kind of pointing, but {came}; give {wanted}")
     if not cells:
         raise SceneError(f"{path} has no row below its header; give a row for each line")
     columns = {
@@ -212,7 +209,7 @@ def load_pointing_table(path: Path) -> PointingTable:
 
 
 def _numbers(path: Path, name: str, cells: Sequence[object], first_row: int) -> Floats:
-    """Return the cells of a column as numbers; empty ones and None are NaN, True is 1."""
+    """Return the cells of a column as numbers, NaN for empty ones, 1 for True."""
     values = np.empty(len(cells))
     for number, cell in enumerate(cells):
         text = str(cell).strip().lower()
@@ -227,7 +224,7 @@ def _numbers(path: Path, name: str, cells: Sequence[object], first_row: int) -> 
 
 
 def _csv_cells(path: Path) -> tuple[list[str], list[list[str]]]:
-    """Return the names of the columns and the cells of all rows; the header's delimiter holds."""
+    """Return the names of the columns and the cells of all rows, by the delimiter of the header."""
     text = _text(path)
     lines = text.splitlines()
     header = lines[0] if lines else ""
@@ -257,8 +254,7 @@ def _parquet_cells(path: Path) -> tuple[list[str], list[list[object]]]:
         table = parquet.read_table(path)
     except ImportError as error:
         raise SceneError(
-            f"{path} is Parquet, and pyarrow, which reads it, is not installed; install spectralzoom[parquet], or "
-            "write the table as CSV"
+            f"{path} is Parquet, and pyarrow is not installed; install spectralzoom[parquet], or write the table as CSV"
         ) from error
     except (OSError, ValueError) as error:  # pyarrow's errors are of these
         raise SceneError(f"{path} cannot be read as Parquet: {error}; write the table anew, or as CSV") from error
@@ -267,10 +263,10 @@ def _parquet_cells(path: Path) -> tuple[list[str], list[list[object]]]:
 
 
 def load_played_vector(path: Path, mounting: Mounting = STRAIGHT) -> PlayedVector:
-    """Read the TOML file of a vector that the mirror played, with the file of positions that it names.
+    """Read the TOML file of a played vector, and the file of positions that it names.
 
-    Raises SceneError: either cannot be read, says something else than vector, rate_hz and start_s, or a position is
-    beyond the mirror.
+    Raises SceneError: either cannot be read, the TOML file has other keys than vector, rate_hz and start_s, or a
+    position is beyond the mirror.
     """
     try:
         stated = tomllib.loads(_text(path))
@@ -307,7 +303,7 @@ def load_played_vector(path: Path, mounting: Mounting = STRAIGHT) -> PlayedVecto
 def follow_vector(vector: PlayedVector, middle_s: Floats, where: str) -> LinePointing:
     """Return the pointing of lines by a played vector and the times of their mid exposures (line,) [s].
 
-    Times count from when the first line's exposure began; lines without a time, or outside of the path's time, are not
+    Times count from the start of the first exposure. Lines without a time, or outside of the path's time, are not
     valid. Raises SceneError: no line lies within the path's time.
     """
     known = np.isfinite(middle_s)
@@ -327,6 +323,6 @@ def follow_vector(vector: PlayedVector, middle_s: Floats, where: str) -> LinePoi
 
 
 def find_pointing(folder: Path, stem: str) -> Path | None:
-    """Return the pointing file of a cube in a folder, by its name: ``STEM.pointing.csv``, ``.parquet`` or ``.toml``."""
+    """Return the file ``STEM.pointing.csv``, ``.parquet`` or ``.toml`` of a cube in a folder."""
     names = [f"{stem}.pointing{ending}" for ending in ENDINGS]
     return next((folder / name for name in names if (folder / name).is_file()), None)

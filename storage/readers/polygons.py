@@ -1,8 +1,8 @@
-"""Polygons out of GeoJSON, GeoPackage and shapefile: zones with names, and labels burnt onto the pixels of a scene.
+"""Read polygons from GeoJSON, GeoPackage and shapefile: zones with names, and labels burnt onto a scene's pixels.
 
-A pixel has the class of the polygon around its centre: of the last one in the file where several hold it, and none
-outside. On a scene with a place polygons lie where their CRS says. On a scene without one they are in pixels, x to the
-right and y down from the upper left corner.
+A pixel has the class of the last polygon in the file that contains its centre. On a scene with a place polygons are
+transformed from their CRS. On a scene without one they are in pixels, x to the right and y down from the upper left
+corner.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     import shapely
     from odc.geo.geobox import GeoBox
     from shapely.geometry.base import BaseGeometry
-else:  # two seconds to import, for surveys with polygons alone
+else:  # two seconds to import
     pyogrio = deferred("pyogrio")
     pyproj = deferred("pyproj")
     rasterio_features = deferred("rasterio.features")
@@ -41,7 +41,7 @@ else:  # two seconds to import, for surveys with polygons alone
 
 GEOJSON = (".geojson", ".json")
 ZONE_ENDINGS = (*GEOJSON, ".gpkg", ".shp")
-POLYGON_ENDINGS = (".gpkg", ".geojson", ".shp")  # of labels: a .json is a list of names
+POLYGON_ENDINGS = (".gpkg", ".geojson", ".shp")  # of labels; a .json file may hold anything
 USUAL_NAMES = ("name", "plot", "plot_name", "plot_id", "plotid", "id", "label")
 _OF_CROPS = ("crop", "crop_type", "species", "category", "land_cover", "landcover", "cover", "type", "code", "name")
 CLASS_ATTRIBUTES = ("class", "class_name", "classname", "class_id", "label", *_OF_CROPS)  # in the order tried
@@ -52,19 +52,19 @@ POLYGONS = ("Polygon", "MultiPolygon")
 class PolygonLayer:
     """Polygons of one layer, in its order, and their attributes."""
 
-    crs: pyproj.CRS | None  # None where the file names none
+    crs: pyproj.CRS | None  # None if the file names none
     shapes: list[BaseGeometry]  # x before y, longitude before latitude
-    rows: list[int]  # of the layer, from 0, that the polygons stand in
+    rows: list[int]  # of the polygons in the layer, from 0
     fields: dict[str, NDArray[Any]]  # attributes by name, one value a polygon
     notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class ZoneFile:
-    """Polygons of one file, those of one name together, and what was mended of them."""
+    """Polygons of one file, united by name."""
 
     path: str
-    crs: pyproj.CRS | None  # None where the file names none
+    crs: pyproj.CRS | None  # None if the file names none
     shapes: dict[str, BaseGeometry]  # by name, in the order of the file; x before y, longitude before latitude
     notes: tuple[str, ...] = ()
 
@@ -72,9 +72,9 @@ class ZoneFile:
 def read_zones(source: str, *, named_by: str | None = None) -> ZoneFile:
     """Read the polygons of ``FILE`` or ``FILE.gpkg:LAYER``, named by the attribute ``named_by``.
 
-    None takes the first of name, plot, plot_id, id and label that there is, else numbers from 1. Polygons of one name
-    are one zone. Those whose borders cross or touch themselves are mended, and a note says so. Raises ZoneError: no
-    such file, layer or attribute, a file that cannot be read, or one with anything but polygons.
+    None takes the first attribute of name, plot, plot_id, id and label, else numbers from 1. Polygons of one name are
+    one zone. Invalid borders are repaired with a note. Raises ZoneError: there is no such file, layer or attribute, the
+    file cannot be read, or it has other shapes than polygons.
     """
     layer = read_polygons(source)
     called = _names(layer, named_by, source)
@@ -85,10 +85,7 @@ def read_zones(source: str, *, named_by: str | None = None) -> ZoneFile:
 
 
 def read_polygons(source: str) -> PolygonLayer:
-    """Read the polygons of ``FILE`` or ``FILE.gpkg:LAYER`` with their attributes; ZoneError as for `read_zones`.
-
-    Polygons whose borders cross or touch themselves are mended, and a note says so; empty ones are left out.
-    """
+    """Read the polygons of ``FILE`` or ``FILE.gpkg:LAYER`` with their attributes, without empty ones (ZoneError)."""
     path, layer = split_layer(source)
     if path.suffix.lower() not in ZONE_ENDINGS:
         raise ZoneError(f"{source}: expected polygons as {', '.join(ZONE_ENDINGS)}; save the layer as one of them")
@@ -99,7 +96,7 @@ def read_polygons(source: str) -> PolygonLayer:
             layer = _layer_of(path, layer)
         about, _, found, values = pyogrio.raw.read(path, layer=layer)
         known = about["crs"] is not None
-        if known and path.suffix.lower() in GEOJSON:  # GDAL takes WGS 84 for granted; whether it is, the survey says
+        if known and path.suffix.lower() in GEOJSON:  # GDAL assumes WGS 84
             content = json.loads(path.read_text(encoding="utf-8-sig"))
             known = isinstance(content, dict) and content.get("crs") is not None
         crs = pyproj.CRS.from_user_input(about["crs"]) if known else None
@@ -114,20 +111,20 @@ def read_polygons(source: str) -> PolygonLayer:
     shapes = [shapely.force_2d(geometry[number]) for number in rows]
     crossed = sum(not shape.is_valid for shape in shapes)
     shapes = [shape if shape.is_valid else polygons_of(shapely.make_valid(shape)) for shape in shapes]
-    told = f"{source}: the borders of {crossed} of {len(rows)} polygons cross or touch themselves and were mended"
+    note = f"{source}: the borders of {crossed} of {len(rows)} polygons cross or touch themselves and were repaired"
     fields = {str(name): column[rows] for name, column in zip(about["fields"], values, strict=True)}
-    return PolygonLayer(crs, shapes, rows, fields, (told,) if crossed else ())
+    return PolygonLayer(crs, shapes, rows, fields, (note,) if crossed else ())
 
 
 def polygons_of(shape: BaseGeometry) -> BaseGeometry:
-    """Return the parts of a geometry that have an area, as one polygon or several; lines and points are dropped."""
+    """Return the polygons of a geometry as one shape, without lines and points."""
     parts = [one for one in shapely.get_parts(shape) if one.geom_type in POLYGONS]
     inner = [polygons_of(one) for one in shapely.get_parts(shape) if one.geom_type == "GeometryCollection"]
     return shapely.union_all([*parts, *inner]) if len(parts) + len(inner) != 1 else (parts + inner)[0]
 
 
 def split_layer(source: str | Path) -> tuple[Path, str | None]:
-    """Return path and layer of ``FILE.gpkg:LAYER``; None where no layer is named."""
+    """Return path and layer of ``FILE.gpkg:LAYER``."""
     head, mark, layer = str(source).rpartition(".gpkg:")
     return Path(f"{head}.gpkg" if mark else source), layer if mark else None
 
@@ -156,7 +153,7 @@ def _names(content: PolygonLayer, named_by: str | None, source: str) -> list[str
 
 
 def word_of(value: object) -> str:
-    """Return an attribute as a name; empty where it has no value."""
+    """Return the text of an attribute; empty if it has no value."""
     if value is None or (isinstance(value, float | np.floating) and np.isnan(value)):
         return ""
     if isinstance(value, float | np.floating) and float(value).is_integer():
@@ -168,30 +165,29 @@ def word_of(value: object) -> str:
 
 
 def is_polygon_file(address: str | Path) -> bool:
-    """Tell by its name whether a label file holds polygons."""
+    """Return whether a label file holds polygons, by its name."""
     return split_layer(address)[0].suffix.lower() in POLYGON_ENDINGS
 
 
 def load_polygon_labels(
     address: str | Path, shape: tuple[int, int], geobox: GeoBox | None, *, settings: SceneSettings
-) -> tuple[Labels, tuple[str, ...]]:
-    """Burn the polygons of ``FILE`` or ``FILE.gpkg:LAYER`` onto the (y, x) pixels of a scene; and notes.
+) -> Labels:
+    """Burn the polygons of ``FILE`` or ``FILE.gpkg:LAYER`` onto the (y, x) pixels of a scene.
 
-    Classes are those of the settings, by name or by number, else every value of the attribute that says them. Raises
-    SceneError: the file, layer or attribute is missing, there is no polygon, or none on the scene. So does a missing
-    CRS where one is needed, one where none is known, or a class that the settings lack.
+    Classes are those of the settings, by name or by number, else every value of the class attribute. Raises SceneError:
+    the file, layer, attribute or a CRS is missing, no polygon lies on the scene, or one has a class that the settings
+    lack.
     """
     layer = _labels_in(address)
-    attribute, said = _classes_said(layer, address, settings)
-    classes = dict(settings.classes) or _named(said, settings.unlabelled, str(address))
-    codes = [_index_of(word, classes, settings.unlabelled) for word in said]
-    if unknown := [word for word, code in zip(said, codes, strict=True) if code is None and word]:
+    attribute, names = _classes_in(layer, address, settings)
+    classes = dict(settings.classes) or _named(names, settings.unlabelled, str(address))
+    codes = [_index_of(name, classes, settings.unlabelled) for name in names]
+    if unknown := [name for name, code in zip(names, codes, strict=True) if code is None and name]:
         raise SceneError(
             f"labels {address} have {unknown.count(unknown[0])} polygons of {attribute} = {unknown[0]!r}, which is no"
             f" class; add it to [classes] or state it as unlabelled in {SETTINGS_NAME}"
         )
-    place = NoPlace(shape) if geobox is None else PlacedPicture(geobox)
-    moved = _moved(layer, place, address)
+    moved = _moved(layer, NoPlace(shape) if geobox is None else PlacedPicture(geobox), address)
     burnt = [
         (one, code)
         for one, code in zip(moved, codes, strict=True)
@@ -203,28 +199,22 @@ def load_polygon_labels(
             f"labels {address}: no pixel's centre lies in a polygon that has a class; give polygons larger than a"
             f" pixel, with a value of {attribute}"
         )
-    values = tuple(classes.values())
-    labels = Labels(index, tuple(classes), values, class_colours(classes, settings.colours))
     shared = int(np.count_nonzero(index != _burn(burnt[::-1], shape)))
-    lacking = sum(not word for word in said)
-    return labels, (
+    lacking = names.count("")
+    notes = (
         f"{len(burnt)} polygons by their attribute {attribute}",
         *layer.notes,
         *([f"{lacking} polygons without a value of {attribute} are left out"] if lacking else []),
         *([f"{shared} px lie in polygons of several classes: the later polygon counts"] if shared else []),
         *(["polygons are taken in pixels of the scene, x to the right and y down"] if geobox is None else []),
     )
+    return Labels(index, tuple(classes), tuple(classes.values()), class_colours(classes, settings.colours), notes)
 
 
 def polygon_classes(addresses: Iterable[str | Path], settings: SceneSettings) -> dict[str, ClassValue]:
-    """Return every class of several files of polygons: names in their order, or ``class_N`` after numbers.
-
-    Raises SceneError as `load_polygon_labels`, and where there are more than 64 classes.
-    """
-    said: list[str] = []
-    for address in addresses:
-        said += _classes_said(_labels_in(address), address, settings)[1]
-    return _named(said, settings.unlabelled, "of several files")
+    """Return every class of several files of polygons (SceneError, also for more than 64 classes)."""
+    names = [name for one in addresses for name in _classes_in(_labels_in(one), one, settings)[1]]
+    return _named(names, settings.unlabelled, "of several files")
 
 
 def _labels_in(address: str | Path) -> PolygonLayer:
@@ -234,8 +224,8 @@ def _labels_in(address: str | Path) -> PolygonLayer:
         raise SceneError(f"labels: {error}") from error
 
 
-def _classes_said(layer: PolygonLayer, address: str | Path, settings: SceneSettings) -> tuple[str, list[str]]:
-    """Return the attribute with the classes, and each polygon's value of it; empty where there is none."""
+def _classes_in(layer: PolygonLayer, address: str | Path, settings: SceneSettings) -> tuple[str, list[str]]:
+    """Return the class attribute and each polygon's value of it, empty without one."""
     by_word = {name.lower(): name for name in reversed(layer.fields)}
     stated = settings.class_attribute
     found = next((by_word[word] for word in CLASS_ATTRIBUTES if word in by_word), None) if stated is None else stated
@@ -249,23 +239,23 @@ def _classes_said(layer: PolygonLayer, address: str | Path, settings: SceneSetti
     return found, [word_of(value) for value in layer.fields[found]]
 
 
-def _named(said: Iterable[str], unlabelled: ClassValue | None, where: str) -> dict[str, ClassValue]:
-    """Return a class for every word: numbers as label pictures have them, other words in their order from 1."""
-    words = sorted({word for word in said if word and word != str(unlabelled)})
+def _named(names: Iterable[str], unlabelled: ClassValue | None, where: str) -> dict[str, ClassValue]:
+    """Return a class for every name: ``class_N`` for numbers, other names sorted and numbered from 1."""
+    words = sorted({name for name in names if name and name != str(unlabelled)})
     if len(words) > MOST_FOUND_CLASSES:
         raise SceneError(
             f"labels {where} have {len(words)} different classes, at most {MOST_FOUND_CLASSES} are taken; name another"
             f" attribute, class_attribute in a {SETTINGS_NAME}"
         )
     if not words:
-        raise SceneError(f"labels {where} say no class of any polygon; fill in the attribute, or name another")
+        raise SceneError(f"labels {where} have no class for any polygon; fill in the attribute, or name another")
     if all(word.isdecimal() for word in words):
         return {f"class_{number}": number for number in sorted(map(int, words))}
     return {word: number for number, word in enumerate(words, 1)}
 
 
 def _index_of(word: str, classes: dict[str, ClassValue], unlabelled: ClassValue | None) -> int | None:
-    """Return the index of the class of a polygon's word, by name or number; 255 for unlabelled, None for no class."""
+    """Return the class index of a polygon's name or number; 255 for unlabelled, None for no class."""
     if word and word == str(unlabelled):
         return UNLABELLED
     names, values = list(classes), list(classes.values())
@@ -275,9 +265,9 @@ def _index_of(word: str, classes: dict[str, ClassValue], unlabelled: ClassValue 
 
 
 def _moved(layer: PolygonLayer, place: FieldPlace, address: str | Path) -> list[BaseGeometry]:
-    """Return the polygons in pixels of the scene, cut to it.
+    """Return the polygons in pixels of the scene, clipped to it.
 
-    Raises SceneError: none lies on it, or their CRS does not fit.
+    Raises SceneError: none lies on the scene, or their CRS does not fit.
     """
     crs = layer.crs
     if place.crs is None and crs is not None:
@@ -304,7 +294,7 @@ def _moved(layer: PolygonLayer, place: FieldPlace, address: str | Path) -> list[
 
 
 def _burn(polygons: Sequence[tuple[BaseGeometry, int | None]], shape: tuple[int, int]) -> NDArray[np.uint8]:
-    """Return (y, x) index of the class at each pixel's centre; the last polygon wins."""
+    """Return the (y, x) class index at each pixel's centre; the last polygon wins."""
     if not polygons:
         return np.full(shape, UNLABELLED, np.uint8)
     return np.asarray(rasterio_features.rasterize(polygons, out_shape=shape, fill=UNLABELLED, dtype="uint8"))

@@ -1,6 +1,6 @@
-"""Rasters whose pixels are taken as they are: one file, or tiles of a folder or a glob placed side by side.
+"""Open rasters whose pixels are taken as they are: one file, or tiles of a folder or a glob side by side.
 
-Their pixels are stored as a survey's images, coarse means and patches, a block of rows in memory at a time.
+Their pixels are read a block of rows at a time.
 """
 
 from __future__ import annotations
@@ -28,9 +28,10 @@ from storage.readers.label_files import (
     is_label_name,
     listed_names,
     match_folder,
+    read_labels,
     scene_entries,
 )
-from storage.readers.labels import Labels, load_labels
+from storage.readers.labels import Labels
 from storage.readers.open_cubes import reader_of, split_variable
 from storage.readers.scene_files import SceneFile, open_scene_file
 from storage.readers.scene_toml import find_scene_settings
@@ -43,8 +44,8 @@ else:
 
 WILD = "*?["
 APART_NM = 0.1  # wavelengths of one band
-COPIES = 6  # of a block while it is read: the file's numbers, their float32, and what is made of them
-FRACTION = 4  # of the memory beside what the process takes anyway: more at once is read no faster
+COPIES = 6  # of a block in memory while it is read and processed
+FRACTION = 4  # of the free memory for a block: larger ones are no faster
 Report = Callable[[float], None]
 
 
@@ -57,9 +58,9 @@ def open_raster(
 ) -> SceneFile:
     """Open a file, or the tiles of a folder or a glob as one field, to be read some rows at a time.
 
-    The first tile by name that has a value wins where several overlap; pixels without any tile are missing. ``labels``
-    are on the pixels of the whole field. Raises SceneError, WavelengthError: as `open_scene_file`, or the tiles do not
-    lie on one grid, do not say where they lie, or have other bands.
+    The first tile by name with a value wins in overlaps; pixels without a tile are missing. ``labels`` are on the
+    pixels of the whole field. Raises SceneError, WavelengthError: as `open_scene_file`, or the tiles have different
+    grids or bands, or no place.
     """
     files = tiles_of(address)
     if len(files) == 1:
@@ -69,15 +70,14 @@ def open_raster(
 
 
 def is_glob(address: str | Path) -> bool:
-    """Return whether an address stands for files by a pattern; a file of that very name is meant as it is."""
+    """Return whether an address is a pattern and no existing file."""
     return any(sign in str(address) for sign in WILD) and not split_variable(address)[0].exists()
 
 
 def tiles_of(address: str | Path) -> tuple[str, ...]:
-    """Return the files that an address stands for: itself, the images of a folder, or what a glob names, by name.
+    """Return the files of an address, sorted: the file itself, or the images of a folder or a glob without labels.
 
-    A folder that is itself a cube (Zarr, a Headwall camera) stands for itself. Label files are no tiles.
-    Raises SceneError: there is no image.
+    A folder that is itself a cube (Zarr, a Headwall camera) counts as a file. Raises SceneError: there is no image.
     """
     path, _ = split_variable(address)
     if is_glob(address):
@@ -101,7 +101,7 @@ def tiles_of(address: str | Path) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class _Tile:
-    """A tile with the row and column of the field at which it begins."""
+    """A tile with its first row and column in the field."""
 
     scene: SceneFile
     row: int
@@ -109,6 +109,7 @@ class _Tile:
 
     @property
     def place(self) -> tuple[slice, slice]:
+        """Return its rows and columns in the field."""
         height, width = self.scene.shape
         return slice(self.row, self.row + height), slice(self.column, self.column + width)
 
@@ -134,11 +135,8 @@ def _side_by_side(address: Path, opened: Sequence[SceneFile], labels: str | Path
     notes += list(dict.fromkeys(note for one in opened for note in one.provenance))
     if labels is None:
         found = _merged_labels(tiles, shape, notes)
-    else:  # on the pixels of the whole field
-        settings = find_scene_settings(first.path)
-        found = load_labels(
-            labels, shape, geobox, classes=settings.classes, unlabelled=settings.unlabelled, colours=settings.colours
-        )
+    else:
+        found = read_labels(labels, shape, geobox, find_scene_settings(first.path))
         notes += found.notes
     places = [(tile.scene.light_hash, tile.row, tile.column) for tile in tiles]
     light_hash = hashlib.sha256(json.dumps(places).encode()).hexdigest()
@@ -182,7 +180,7 @@ def _rows_of(tiles: Sequence[_Tile], width: int, bands: int, start: int, stop: i
 
 
 def _check_bands(first: SceneFile, other: SceneFile) -> None:
-    """Refuse tiles of other bands (SceneError)."""
+    """Refuse tiles with different bands (SceneError)."""
     one, two = first.wavelength_nm, other.wavelength_nm
     if len(one) != len(two) or not np.allclose(one, two, rtol=0, atol=APART_NM):
         raise SceneError(
@@ -193,51 +191,45 @@ def _check_bands(first: SceneFile, other: SceneFile) -> None:
 
 
 def _placed(opened: Sequence[SceneFile]) -> tuple[list[_Tile], GeoBox]:
-    """Find row and column of each tile, and the grid of them all (SceneError: they do not lie on one)."""
-    first, origins = opened[0], list[tuple[int, int]]()
-    for one in opened:
-        if one.geobox is None or one.geobox.crs is None:
-            raise SceneError(
-                f"{len(opened)} tiles are one field where they say how they lie side by side, and {one.path} has no "
-                "place on the earth: survey them one by one, or give them one (gdal_translate -a_srs -a_ullr)"
-            )
-        assert first.geobox is not None
-        if one.geobox.crs != first.geobox.crs:
-            raise SceneError(
-                f"the tiles {first.path} and {one.path} lie in {first.geobox.crs} and {one.geobox.crs}: tiles of one "
-                "field have one CRS; warp them onto one grid (gdalwarp -t_srs), or survey them one by one"
-            )
-        origins.append(_origin(first, one, first.geobox, one.geobox))
+    """Return the tiles with their places, and the grid of the field (SceneError: they do not lie on one grid)."""
+    first, origins = opened[0].geobox, [_origin(opened[0], one) for one in opened]
+    assert first is not None
     top, left = (min(origin[axis] for origin in origins) for axis in (0, 1))
     tiles = [_Tile(one, row - top, column - left) for one, (row, column) in zip(opened, origins, strict=True)]
     shape = max(tile.place[0].stop for tile in tiles), max(tile.place[1].stop for tile in tiles)
-    assert first.geobox is not None
-    return tiles, odc_geobox.GeoBox(shape, first.geobox.affine * Affine.translation(left, top), first.geobox.crs)
+    return tiles, odc_geobox.GeoBox(shape, first.affine * Affine.translation(left, top), first.crs)
 
 
-def _origin(first: SceneFile, other: SceneFile, grid: GeoBox, own: GeoBox) -> tuple[int, int]:
-    """Return the row and column of a tile on the grid of the first.
-
-    Raises SceneError: its pixels have another size, or lie between those of the first.
-    """
-    shift = shift_px(grid, own)
-    if shift is None:
-        sizes = [f"{abs(one.affine.a):g} x {abs(one.affine.e):g}" for one in (grid, own)]
-        raise SceneError(
-            f"the tiles {first.path} and {other.path} have pixels of {sizes[0]} and {sizes[1]}, or turned ones: tiles "
-            "of one field have the same; warp them onto one grid (gdalwarp -tr -tap), or survey them one by one"
-        )
-    (x, y), row, column = shift, round(shift[1]), round(shift[0])
-    if max(abs(y - row), abs(x - column)) > OFF_GRID_PX:
-        raise SceneError(
-            f"the pixels of {other.path} lie {x - column:.2f} and {y - row:.2f} px (x, y) beside those of {first.path}:"
-            " tiles of one field lie on one grid; warp them onto one (gdalwarp -tr -tap), or survey them one by one"
-        )
-    return row, column
+def _origin(first: SceneFile, other: SceneFile) -> tuple[int, int]:
+    """Return the row and column of a tile on the grid of the first (SceneError: it does not lie on it)."""
+    for one in (first, other):
+        if one.geobox is None or one.geobox.crs is None:
+            raise SceneError(
+                f"tiles are one field if all have a place on the earth, and {one.path} has none: survey them one by"
+                " one, or give them one (gdal_translate -a_srs -a_ullr)"
+            )
+    grid, own = first.geobox, other.geobox
+    assert grid is not None
+    assert own is not None
+    shift = shift_px(grid, own) if own.crs == grid.crs else None
+    if shift is not None and max(abs(at - round(at)) for at in shift) <= OFF_GRID_PX:
+        return round(shift[1]), round(shift[0])
+    if own.crs != grid.crs:
+        problem = f"lie in {grid.crs} and {own.crs}: tiles of one field have one CRS"
+    elif shift is None:
+        sizes = " and ".join(f"{abs(one.affine.a):g} x {abs(one.affine.e):g}" for one in (grid, own))
+        problem = f"have pixels of {sizes}, or turned ones: tiles of one field have the same"
+    else:
+        off = " and ".join(f"{at - round(at):.2f}" for at in shift)
+        problem = f"have pixels that lie {off} px (x, y) apart: tiles of one field lie on one grid"
+    raise SceneError(
+        f"the tiles {first.path} and {other.path} {problem}; warp them onto one grid (gdalwarp -t_srs -tr -tap), or "
+        "survey them one by one"
+    )
 
 
 def _merged_labels(tiles: Sequence[_Tile], shape: tuple[int, int], notes: list[str]) -> Labels | None:
-    """Lay the tiles' own labels side by side; None without any, or where classes differ, which a note says."""
+    """Return the tiles' own labels side by side; None without any, or with a note if their classes differ."""
     labelled = [tile.scene for tile in tiles if tile.scene.labels is not None]
     if not labelled:
         return None
@@ -262,10 +254,10 @@ def _merged_labels(tiles: Sequence[_Tile], shape: tuple[int, int], notes: list[s
 
 @dataclass(frozen=True)
 class RasterPixels:
-    """The pixels of a raster: ``read`` gives (y, x, band) float32 of some rows, NaN without a value."""
+    """The pixels of a raster: ``read`` returns rows (y, x, band) in float32, NaN without a value."""
 
     read: Callable[[int, int], NDArray[np.float32]]
-    missing: NDArray[np.bool_]  # (y, x) of which nothing is known
+    missing: NDArray[np.bool_]  # (y, x) without a value
     bands: int
     grid: SceneGrid
 
@@ -276,7 +268,7 @@ class RasterPixels:
         return values
 
     def rows_at_once(self, memory: int) -> int:
-        """Return how many rows are read at a time: whole rows of patches, at least one (SettingsError: too many)."""
+        """Return the rows to read at a time: whole rows of patches (SettingsError: one does not fit the memory)."""
         grid = self.grid
         deep, row = grid.patch * grid.factor, COPIES * grid.width * self.bands * 4
         least = RESERVED_BYTES + deep * row
@@ -289,9 +281,9 @@ class RasterPixels:
 def patches_of(
     raster: RasterPixels, patch_index: NDArray[np.integer], *, memory: int
 ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.bool_]]]:
-    """Read the patches of ascending ``patch_index``: values (patch, y, x, band), validity (patch, y, x), by rows.
+    """Yield the patches of ascending ``patch_index`` by rows: values (patch, y, x, band), validity (patch, y, x).
 
-    Raises SettingsError: not even one row of patches fits the memory.
+    Raises SettingsError: one row of patches does not fit the memory.
     """
     grid = raster.grid
     p, (_, across) = grid.patch, grid.patch_shape

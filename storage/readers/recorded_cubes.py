@@ -1,4 +1,4 @@
-"""Cubes of files that recordings consist of, found in a folder and opened, and their dark and white frames."""
+"""Find and open the cubes of recordings, and their dark and white frames."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from storage.readers.envi_files import DATA_ENDINGS, find_envi_pair, find_refere
 from storage.readers.open_cubes import load_frame, open_cube, reader_of, with_wavelengths
 from storage.readers.zarr_files import find_zarr_store
 
-FRAMES = ("dark", "white", "bad", "flat")  # what a cube's name is followed by in those of its frames
-SAMPLED_LINES = 16  # looked at for byte order and bits
-MOST_LINES_OVER = 0.5  # fraction of numbers above full scale that says the byte order is wrong, if swapped ones fit
+FRAMES = ("dark", "white", "bad", "flat")  # behind the name of a cube in those of its frames
+SAMPLED_LINES = 16  # for byte order and bits
+MOST_LINES_OVER = 0.5  # fraction above full scale from which the byte order is wrong, if swapped numbers fit
 SWAPPED_OVER = 0.01
 
 
 @dataclass(frozen=True)
 class RecordedFile:
-    """One cube of files and what belongs to it."""
+    """One cube of a recording."""
 
     name: str
     path: Path
@@ -36,15 +36,12 @@ class RecordedFile:
 
     @property
     def folder(self) -> Path:
-        """Return where its companions lie."""
+        """Return the folder of its pointing and frames."""
         return self.path if self.path.is_dir() and find_zarr_store(self.path) is None else self.path.parent
 
 
 def find_cubes(path: Path) -> list[Path]:
-    """Find the cubes that an address of files stands for: itself, or the ENVI cubes or Zarr stores of a folder.
-
-    Raises SceneError: the folder holds none.
-    """
+    """Return the cubes of an address: itself, or the ENVI cubes or Zarr stores of a folder (SceneError: none)."""
     if not path.is_dir() or find_zarr_store(path) is not None:
         return [path]
     headers = sorted(entry for entry in path.iterdir() if entry.suffix.lower() == ".hdr" and entry.is_file())
@@ -88,10 +85,9 @@ def open_recorded_cube(path: Path, wavelengths: Sequence[float] | None) -> Recor
 
 
 def with_bits(camera: LineCamera, cubes: Sequence[RecordedFile], notes: list[str]) -> LineCamera:
-    """Return the camera with as many bits as the numbers need, by some lines of each cube.
+    """Return the camera with as many bits as some lines of each cube need.
 
-    Raises SceneError: most numbers are above full scale, and would not be with their bytes swapped; or some are below
-    0.
+    Raises SceneError: the byte order is wrong, or numbers are below 0.
     """
     bits = camera.bits
     for cube in cubes:
@@ -130,11 +126,10 @@ def find_references(
     stated: dict[str, Path | None],
     white_reference: NDArray[np.float32],
 ) -> References:
-    """Return the reference frames of a cube whose companions are called ``stem.dark.hdr`` and the like.
+    """Return the reference frames of a cube: ``stated``, else ``stem.dark.hdr`` etc., else those of the folder.
 
-    ``stated`` files come first, then those of the cube's name, then the folder's only dark and white frame.
-    ``white_reference`` is the value of the white reference, one or (band,), where nothing else says it. Raises
-    SceneError: a frame has other samples or bands than the cube.
+    ``white_reference`` is the default value of the white reference, one or (band,). Raises SceneError: a frame has
+    other samples or bands than the cube.
     """
     name, frame = stem.name, source.shape[1:]
     white_dn = camera.full_scale_dn * max(camera.samples // frame[0], 1)

@@ -1,4 +1,4 @@
-"""Recordings: sweeps that were taken before, out of an archive or out of files with a pointing table.
+"""Open recordings: sweeps of an archive, or of files with a pointing table.
 
 ::
 
@@ -6,13 +6,13 @@
     stages/capture/KEY, NAME.zarr         raw cubes of one capture, or a single one
     NAME.hdr, NAME.bil, .bip, .bsq        an ENVI cube, or a folder of them
     a folder with raw_<frame> files       a Headwall camera's capture
-    NAME.zarr                             a cube of anyone's
+    NAME.zarr                             any Zarr cube
 
-Files beside a cube ``NAME`` are found where no flag names them: ``NAME.pointing.csv`` (.parquet, .toml),
+Files beside a cube ``NAME`` are used if no flag names others: ``NAME.pointing.csv`` (.parquet, .toml),
 ``NAME.dark.hdr``, ``NAME.white.hdr``, ``NAME.bad.hdr`` and ``NAME.flat.hdr``. Frames for all cubes of the folder are
-``dark*.hdr`` and ``white*.hdr``. The header of an ENVI cube may say ``line axis = y``: lines lie along y of the field,
-and the scan goes along x. The header of a white frame may hold ``white_reference = {...}``, the value of the white
-reference per band. ``mirror at rest = 1`` says that it was taken so.
+``dark*.hdr`` and ``white*.hdr``. The header of an ENVI cube may have ``line axis = y``: lines lie along y of the field,
+and the scan goes along x. The header of a white frame may have ``white_reference = {...}``, the value of the white
+reference per band, and ``mirror at rest = 1``, if it was taken so.
 """
 
 from __future__ import annotations
@@ -61,10 +61,9 @@ LINE_PRODUCTS = {"raw_coarse": "signal_coarse", "raw_fine": "signal_fine"}  # of
 
 
 def stores_of_lines(products: Mapping[str, str], is_there: Callable[[str], bool]) -> list[str]:
-    """Return the addresses of the stores that hold a run's lines.
+    """Return the addresses of the stores with a run's lines: raw ones, or condensed ones if raw ones were cleared.
 
-    These are the raw ones, or the condensed ones where raw ones were cleared away: later passes are condensed together
-    with the first.
+    Later passes are condensed together with the first.
     """
     raw = [products[name] for name in LINE_PRODUCTS if name in products]
     condensed = [products[name] for name in reversed(LINE_PRODUCTS.values()) if name in products]
@@ -73,10 +72,10 @@ def stores_of_lines(products: Mapping[str, str], is_there: Callable[[str], bool]
 
 @dataclass(frozen=True)
 class Recording:
-    """A recording, opened; no line has been read.
+    """An open recording, of which no line has been read.
 
-    ``camera`` is the one given, with the samples, bits, exposure and period that the recording has. A scan without a
-    mirror has so long a lens that lines are parallel.
+    ``camera`` has the samples, bits, exposure and period of the recording. A scan without a mirror has a long focal
+    length, so that lines are parallel.
     """
 
     name: str
@@ -85,13 +84,10 @@ class Recording:
     fwhm_nm: Floats | None  # (band,)
     camera: LineCamera
     notes: tuple[str, ...]
-    light: tuple[str, ...]  # what the numbers are known by without reading them: a manifest's hash, or file stamps
+    light: tuple[str, ...]  # identity of the numbers: hashes of manifests, or sizes and times of files
 
     def key(self) -> dict[str, Any]:
-        """Return all that captures from the recording depend on: lines, references, bands and light.
-
-        Its place and name are not among them.
-        """
+        """Return the parameters of captures from the recording: lines, references, bands and light, without names."""
         arrays = list[NDArray[Any]]()
         for one in self.sweeps:
             known = one.references
@@ -107,10 +103,7 @@ class Recording:
         }
 
     def source(self, field_shape: tuple[int, int] | None = None) -> RecordedSource:
-        """Give it as a source of lines for a field of (y, x) px; None takes the field that the sweeps cover.
-
-        Raises SceneError: the sweeps cover no common field.
-        """
+        """Return a source of lines for a field of (y, x) px, by default the one that the sweeps cover (SceneError)."""
         if field_shape is None:
             sweeps, tangents = [one.sweep for one in self.sweeps], [one.tangents for one in self.sweeps]
             field_shape = covered_field(sweeps, tangents, self.camera).shape
@@ -119,7 +112,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class RecordedWith:
-    """Statements of the user on the files of a recording; None is looked for beside them, or assumed with a note."""
+    """Flags on the files of a recording; None is looked for beside them, or assumed with a note."""
 
     pointing: Path | None = None  # a table or vector, or a folder with one for each cube
     dark: Path | None = None
@@ -132,12 +125,11 @@ class RecordedWith:
 def open_recording(
     address: str | Path, camera: LineCamera | None = None, given: RecordedWith | None = None
 ) -> Recording:
-    """Open a recording; ``camera`` None takes the default camera.
+    """Open a recording, by default with the default camera.
 
-    Raises SceneError: there is no recording, or files or pointing cannot be used; WavelengthError: nothing says the
-    wavelengths; SettingsError: something is given for an archive, whose cubes bring it; ArchiveError,
-    IncompleteStoreError: the archive cannot be read, or its raw cubes were cleared away; PoseError: a position of a
-    raw cube is beyond the mirror.
+    Raises SceneError: there is no recording, or files or pointing cannot be used; WavelengthError: there are no
+    wavelengths; SettingsError: a flag is given for an archive; ArchiveError, IncompleteStoreError: the archive cannot
+    be read, or its raw cubes were cleared away; PoseError: a position of a raw cube is beyond the mirror.
     """
     camera, given = camera or LineCamera(), given or RecordedWith()
     stores = find_raw_cubes(address)
@@ -146,7 +138,7 @@ def open_recording(
     for name in ("pointing", "dark", "white", "wavelengths"):
         if getattr(given, name) is not None:
             raise SettingsError(
-                f"--{name} is for files, and {address} holds raw cubes, which bring their own; leave --{name} out"
+                f"--{name} is for files, and {address} holds raw cubes, which have their own; leave --{name} out"
             )
     cubes = [open_lines(path) for path in stores]
     first = cubes[0]
@@ -210,7 +202,7 @@ def _open_files(path: Path, camera: LineCamera, given: RecordedWith) -> Recordin
 def _point(
     cube: RecordedFile, camera: LineCamera, given: RecordedWith, notes: list[str], *, alone: bool
 ) -> LinePointing | None:
-    """Return the pointing of a cube by the file given, or by one named like the cube; None without either."""
+    """Return the pointing of a cube by the file given, else by one with the cube's name, else None."""
     file, lines = given.pointing, cube.source.shape[0]
     if file is not None and file.is_dir():
         folder, names = file, [f"{cube.name}{middle}{end}" for middle in ("", ".pointing") for end in ENDINGS]
@@ -236,7 +228,7 @@ def _point(
 def _without_mirror(
     cube: RecordedFile, pointing: LinePointing | None, camera: LineCamera, notes: list[str]
 ) -> tuple[LineCamera, list[LinePointing | None]]:
-    """Return the camera and pointing of a straight scan without a mirror: its middle is the field's centre."""
+    """Return the camera and pointing of a straight scan without a mirror, centred on the field."""
     lines = cube.source.shape[0]
     if pointing is None:
         notes.append(f"{cube.name} has no pointing: taken as an even straight scan along y with one pixel a line")
@@ -257,7 +249,7 @@ def _without_mirror(
 def _timed(
     camera: LineCamera, cubes: Sequence[RecordedFile], pointing: Sequence[LinePointing | None], notes: list[str]
 ) -> LineCamera:
-    """Return the camera with the exposure and period of the recording, where these are known."""
+    """Return the camera with the exposure and period of the recording, if known."""
     exposures, periods = [], []
     for cube, one in zip(cubes, pointing, strict=True):
         known = cube.source.lines.exposure_ms if one is None or one.exposure_ms is None else one.exposure_ms
@@ -280,7 +272,7 @@ def _timed(
 def _sweeps_of(
     cube: RecordedFile, pointing: LinePointing, camera: LineCamera, given: RecordedWith, notes: list[str]
 ) -> list[RecordedSweep]:
-    """Return the sweeps of one cube: one, or as many as its pointing table cuts it into."""
+    """Return the sweep of one cube, or the sweeps that its pointing table cuts it into."""
     source = cube.source
     valid = source.valid & pointing.valid
     time_s = _middle_s(source, pointing.time_s, camera, notes)
@@ -300,10 +292,10 @@ def _sweeps_of(
     names = (cube.name,) if pointing.part is None else tuple(name for name in dict.fromkeys(pointing.part) if name)
     along: Axis = "x"
     if reader_of(cube.path) == "envi":
-        said = load_envi_header(find_envi_pair(cube.path)[0]).fields.get("line axis", "x").strip()
-        if said not in ("x", "y"):
-            raise SceneError(f"{cube.path} says line axis = {said!r}, expected x or y; correct the header")
-        along = "y" if said == "y" else "x"
+        axis = load_envi_header(find_envi_pair(cube.path)[0]).fields.get("line axis", "x").strip()
+        if axis not in ("x", "y"):
+            raise SceneError(f"{cube.path} has line axis = {axis!r}, expected x or y; correct the header")
+        along = "y" if axis == "y" else "x"
     sweeps: list[RecordedSweep] = []
     for name in names:
         own = np.arange(source.shape[0])
@@ -330,7 +322,7 @@ def _sweeps_of(
 
 
 def _line_reader(source: CubeSource, own: NDArray[np.intp]) -> Callable[[NDArray[np.intp]], NDArray[np.uint16]]:
-    """Return a reader of single lines of a sweep that consists of the lines ``own`` of the cube."""
+    """Return a reader of single lines of a sweep, which are the lines ``own`` of the cube."""
 
     def read_lines(numbers: NDArray[np.intp]) -> NDArray[np.uint16]:
         lines = np.concatenate([source.read(first, stop) for first, stop in line_runs(own[numbers])])
@@ -345,10 +337,7 @@ def _line_reader(source: CubeSource, own: NDArray[np.intp]) -> Callable[[NDArray
 
 
 def _middle_s(source: CubeSource, stated_s: Floats | None, camera: LineCamera, notes: list[str]) -> Floats:
-    """Return (line,) times of mid exposure since the first exposure began [s].
-
-    They are as stated, by the files' stamps, or even.
-    """
+    """Return (line,) times of mid exposure since the first exposure began [s]: as stated, by stamps, or even."""
     at = np.arange(source.shape[0])
     if stated_s is None and source.lines.time_s is not None:
         exposure_ms = camera.exposure_ms
@@ -367,10 +356,9 @@ def _middle_s(source: CubeSource, stated_s: Floats | None, camera: LineCamera, n
 
 
 def find_raw_cubes(address: str | Path) -> list[Path] | None:
-    """Find the raw cubes that an address stands for, in the order of their names; None where it is no such address.
+    """Return the raw cubes of an address, sorted by name; None if it has none.
 
-    Raises ArchiveError: the archive has no run of that name, or no run with raw cubes; as `Archive.locate` where they
-    are gone.
+    Raises ArchiveError: the archive has no such run, or no run with raw cubes; SceneError: there is no such file.
     """
     named = _named_run(address)
     if named is not None:
@@ -386,7 +374,7 @@ def find_raw_cubes(address: str | Path) -> list[Path] | None:
 
 
 def _is_raw_cube(path: Path) -> bool:
-    """Return whether a folder is a store of a survey's lines; other stores are left to their readers."""
+    """Return whether a folder is a store of a survey's lines."""
     if not (path / "zarr.json").is_file():
         return False
     try:
@@ -396,9 +384,9 @@ def _is_raw_cube(path: Path) -> bool:
 
 
 def find_recorded_run(address: str | Path) -> tuple[Run, tuple[int, int] | None] | None:
-    """Find the run of an archive whose raw cubes an address stands for, with its field's (y, x) size where known.
+    """Return the run of an address, with its field's (y, x) size if known; None if the address is no archive's.
 
-    None of addresses that stand for no run. Raises SceneError, ArchiveError: as `find_raw_cubes`.
+    Raises SceneError, ArchiveError: as `find_raw_cubes`.
     """
     named = _named_run(address)
     if named is None:
@@ -415,7 +403,7 @@ def find_recorded_run(address: str | Path) -> tuple[Run, tuple[int, int] | None]
 
 
 def _named_run(address: str | Path) -> tuple[str, str | None] | None:
-    """Return the archive and the run (None: unnamed) that an address names; None where it is no such address."""
+    """Return the archive and the run (None: the newest) of an address; None if it is no archive's."""
     text = str(address).rstrip("/")
     place, _, run = text.rpartition("/runs/")
     if place and run and is_archive(place):
@@ -424,7 +412,7 @@ def _named_run(address: str | Path) -> tuple[str, str | None] | None:
 
 
 def _run_with_cubes(address: str, name: str | None) -> tuple[Archive, Run, list[Path]]:
-    """Return a run of an archive with its raw cubes: the named one, or the newest that has some."""
+    """Return a run of an archive with its raw cubes: the named one, or the newest that has any."""
     archive = open_archive(address, create=False, write=False)
     folders = archive.runs()
     if name is not None and name not in [folder.name for folder in folders]:

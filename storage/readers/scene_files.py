@@ -1,4 +1,4 @@
-"""Scene files: an image or cube with its wavelengths and labels, as a survey takes it."""
+"""Open an image or cube with its wavelengths and labels as a scene."""
 
 from __future__ import annotations
 
@@ -17,47 +17,46 @@ from pipeline.geometry.grid import UNLABELLED
 from pipeline.readings import MOST_VALUE, beyond_range, find_beyond
 from storage.archive.staging import file_hash
 from storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, check_memory, scene_lines, unpacked
-from storage.readers.label_files import label_file
-from storage.readers.labels import Labels, load_labels
+from storage.readers.label_files import label_file, read_labels
+from storage.readers.labels import Labels
 from storage.readers.open_cubes import open_cube, split_variable
-from storage.readers.polygons import is_polygon_file, load_polygon_labels
 from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings, settle_wavelengths
 
 if TYPE_CHECKING:
     from odc.geo.geobox import GeoBox
 
 ReadRows = Callable[[int, int], NDArray[np.float32]]
-USUAL_NODATA = -9999.0  # what programs write for no data, and no sensor reads
+USUAL_NODATA = -9999.0  # assumed where no file states another
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneFile:
-    """A scene as its file gives it, on the file's own pixels; its numbers are read when they are asked for."""
+    """A scene on the pixels of its file; values are read on demand."""
 
     name: str
     path: Path
     wavelength_nm: NDArray[np.float64]  # (band,)
     fwhm_nm: NDArray[np.float64] | None = None  # (band,)
     shape: tuple[int, int]  # (y, x)
-    read: ReadRows  # from one row to before another: (y, x, band) float32, NaN where the file has no value
+    read: ReadRows  # rows from one to another: (y, x, band) float32, NaN without a value
     missing: NDArray[np.bool_]  # (y, x) pixels without a value in more than half of their bands
     filled_px: int  # pixels without a value in a band
-    light_hash: str  # of values and wavelengths alone: labels do not change what a camera sees
-    content: tuple[str, ...]  # hash of what it was read from, in whatever bands; one for each tile
-    provenance: tuple[str, ...]  # one sentence for each thing assumed or left out
+    light_hash: str  # of values and wavelengths, without labels
+    content: tuple[str, ...]  # hashes of the files, one for each tile
+    provenance: tuple[str, ...]  # one sentence for each assumption or omission
     labels: NDArray[np.uint8] | None = None  # (y, x) class index, 255 = unlabelled
     class_names: tuple[str, ...] = ()
-    class_values: tuple[ClassValue, ...] = ()  # what each class is in the label file: a number or a colour
+    class_values: tuple[ClassValue, ...] = ()  # number or colour of each class in the label file
     class_colours: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))  # (class, 3)
     geobox: GeoBox | None = None  # where the pixels lie on the earth
-    pixel_m: float | None = None  # side of a pixel on the ground, as scene.toml says, of a scene without a place
-    labels_found: bool = False  # by the file's name: no setting names them
-    regridded: bool = False  # labels came on another grid and were brought to the scene's
-    kept: NDArray[np.float32] | None = field(default=None, repr=False)  # all values, where they were kept
+    pixel_m: float | None = None  # side of a pixel on the ground, by scene.toml, if there is no geobox
+    labels_found: bool = False  # by the file's name
+    regridded: bool = False  # labels were resampled from another grid
+    kept: NDArray[np.float32] | None = field(default=None, repr=False)  # all values, if they were kept in memory
 
     @property
     def values(self) -> NDArray[np.float32]:
-        """Return all values, (y, x, band), NaN where the file has none."""
+        """Return all values (y, x, band), NaN where the file has none."""
         return self.read(0, self.shape[0]) if self.kept is None else self.kept
 
     def labelled(self, found: Labels | None, *, by_name: bool) -> SceneFile:
@@ -84,17 +83,7 @@ def load_scene_file(
     classes: Mapping[str, ClassValue] | None = None,
     labels_needed: bool = True,
 ) -> SceneFile:
-    """Read a scene from an image, .npy, .npz, .mat, ENVI, Zarr, NetCDF, HDF5 or a Headwall folder.
-
-    ``path`` may be ``FILE.mat:ARRAY`` or ``STORE.zarr:ARRAY``, and end in a step of time, ``FILE.npy:STEP``. Axes are
-    y, x, band; two axes are one band. Lines with dark and white frames are taken over the white reference. Arguments
-    win over the ``scene.toml`` beside the file, and that over the file itself. ``labels`` is a file of class numbers or
-    colours on the same pixels, or of polygons; others are found by their names. ``bands`` count from 0; ``wavelengths``
-    [nm] are one for each band used or for each of the file. ``classes`` are those of a scene.toml that states none.
-    Labels found by their names that cannot be used are left out with a note where no ``labels_needed``. Raises
-    SceneError: a file is missing, damaged, of a kind or shape that cannot be used, or the labels do not fit.
-    WavelengthError: wavelengths are missing, or their number, unit or range is wrong.
-    """
+    """Open a scene as `open_scene_file` does, and keep all values in memory."""
     return open_scene_file(
         path,
         labels=labels,
@@ -116,10 +105,16 @@ def open_scene_file(
     labels_needed: bool = False,
     keep: bool = False,
 ) -> SceneFile:
-    """Open a scene as `load_scene_file` reads it, whose numbers are looked through once and not kept.
+    """Open a scene from an image, .npy, .npz, .mat, ENVI, Zarr, NetCDF, HDF5 or a Headwall folder.
 
-    GeoTIFF, ENVI, Zarr and .npy are read some rows at a time; images, .mat and .npz are whole in memory. Labels that
-    were found by their names and cannot be used are left out with a note. Raises what `load_scene_file` does.
+    ``address`` may be ``FILE.mat:ARRAY`` or ``STORE.zarr:ARRAY``, and end in a step of time, ``FILE.npy:STEP``. Axes
+    are y, x, band; two axes are one band. All values are read once for gaps; only with ``keep``, and of images, .mat
+    and .npz, they stay in memory. Arguments take precedence over the ``scene.toml`` beside the file, and that over the
+    file. ``labels`` are class numbers or colours on the same pixels, or polygons; others are found by their names.
+    ``bands`` count from 0; ``wavelengths`` [nm] are one for each band used or for each of the file. ``classes`` replace
+    those of a scene.toml that has none. Labels found by their names that cannot be used are left out with a note unless
+    ``labels_needed``. Raises SceneError: a file is missing, damaged, or of a kind or shape that cannot be used, or the
+    labels do not fit; WavelengthError: wavelengths are missing, or their number, unit or range is wrong.
     """
     file, variable = split_variable(address)
     source, settings = open_cube(address), find_scene_settings(file)
@@ -132,7 +127,7 @@ def open_scene_file(
     if keep:
         check_memory(address, 8 * height * width * count)  # as float32, and once more while the scene is made
     kept = np.empty((height, width, len(chosen)), np.float32) if keep else None
-    gaps = _find_gaps(file, values, kept)
+    missing, filled_px, void, gaps = _find_gaps(file, values, kept)
     found, label_note, by_name = _labels_of(
         file, source.shape[:2], source.geobox, labels, settings, classes or {}, labels_needed
     )
@@ -146,11 +141,11 @@ def open_scene_file(
         fwhm_nm=light.fwhm_nm,
         shape=(height, width),
         read=values.read,
-        missing=gaps.missing,
-        filled_px=gaps.filled_px,
-        light_hash=_light_hash(content, variable, values, light, used=gaps.void > 0, stated=settings.nodata),
+        missing=missing,
+        filled_px=filled_px,
+        light_hash=_light_hash(content, variable, values, light, used=void > 0, stated=settings.nodata),
         content=(content if variable is None else _digest(content, variable),),
-        provenance=(*some, *bad_note, *source.notes, *how, light.origin, *of_mask, *gaps.notes, *label_note),
+        provenance=(*some, *bad_note, *source.notes, *how, light.origin, *of_mask, *gaps, *label_note),
         geobox=source.geobox,
         pixel_m=None if source.geobox is not None else settings.pixel_m,
         kept=kept,
@@ -159,15 +154,14 @@ def open_scene_file(
 
 
 def _stated_scaling(scale: float, offset: float) -> str:
-    """Return scene.toml's scaling of the numbers, for hashes; empty where there is none."""
+    """Return scene.toml's scaling as a text for hashes; empty without one."""
     return "" if (scale, offset) == (1.0, 0.0) else f"{SETTINGS_NAME} scale {scale!r} offset {offset!r}"
 
 
 def with_stated_values(source: CubeSource, address: str | Path) -> CubeSource:
-    """Return a cube whose numbers are what the ``scene.toml`` beside it says: no data, scale and offset.
+    """Return a cube with no-data value, scale and offset of the ``scene.toml`` beside it.
 
-    Scaled numbers are float32, NaN where there is no data, as a survey of the file has them. Raises SceneError: a scale
-    is stated for numbers that have dark or white frames.
+    Scaled numbers are float32, NaN without data. Raises SceneError: the cube has dark or white frames and a scale.
     """
     settings = find_scene_settings(split_variable(address)[0])
     scaling = _stated_scaling(settings.scale, settings.offset)
@@ -178,8 +172,8 @@ def with_stated_values(source: CubeSource, address: str | Path) -> CubeSource:
         return source
     if source.dark is not None or source.white is not None:
         raise SceneError(
-            f"{settings.path} has a scale or offset, and {address} dark or white frames: a camera's own numbers are "
-            "stored as they are; take scale and offset out of it, and state them where values are made of the numbers"
+            f"{settings.path} has a scale or offset, and {address} dark or white frames, so its numbers are stored as "
+            "they are; remove scale and offset from the scene.toml"
         )
     note = f"values are the file's times {settings.scale:g} plus {settings.offset:g}, as {SETTINGS_NAME} says"
     nodata, plain = USUAL_NODATA if nodata is None and source.dtype.kind in "if" else nodata, source.read
@@ -194,21 +188,21 @@ def with_stated_values(source: CubeSource, address: str | Path) -> CubeSource:
 def _light_hash(
     content: str, variable: str | None, values: FileValues, light: Bands, *, used: bool, stated: float | None
 ) -> str:
-    """Return the hash of values and wavelengths: of the files, and of all that says what their numbers mean.
+    """Return the hash of the files and of bands, wavelengths, scale, mask and no-data value.
 
-    An assumed no-data value counts where it is ``used``, else the ``stated`` one.
+    An assumed no-data value counts if it is ``used``, else the ``stated`` one.
     """
     assert light.wavelength_nm is not None
     widths = None if light.fwhm_nm is None else light.fwhm_nm.tolist()
     nodata, void = values.nodata if values.assumed and used else stated, values.void
-    said: tuple[str, ...] = () if nodata is None else (f"nodata {nodata!r}",)
-    said += () if void is None else (f"void {hashlib.sha256(np.packbits(void).tobytes()).hexdigest()}",)
-    said += tuple(one for one in (values.source.scaling, values.scaling) if one)
-    return _digest(content, variable, values.bands, light.wavelength_nm.tolist(), widths, *said)
+    more = [] if nodata is None else [f"nodata {nodata!r}"]
+    more += [] if void is None else [f"void {hashlib.sha256(np.packbits(void).tobytes()).hexdigest()}"]
+    more += [one for one in (values.source.scaling, values.scaling) if one]
+    return _digest(content, variable, values.bands, light.wavelength_nm.tolist(), widths, *more)
 
 
 def _refuse_bands_first(path: Path, shape: tuple[int, ...], wavelengths: Sequence[float] | None) -> None:
-    """Refuse a cube that has as many rows as there are wavelengths, and other bands (SceneError)."""
+    """Refuse a cube with as many rows, instead of bands, as wavelengths (SceneError)."""
     count = 0 if wavelengths is None else len(wavelengths)
     if count > 1 and shape[0] == count != shape[2] and shape[1] != shape[2]:
         raise SceneError(
@@ -218,7 +212,7 @@ def _refuse_bands_first(path: Path, shape: tuple[int, ...], wavelengths: Sequenc
 
 
 def _content_hash(file: Path, files: tuple[Path, ...]) -> str:
-    """Return the hash of all files that the numbers came from; within a folder their names count, too."""
+    """Return the hash of all files, and of their names within a folder."""
     if files == (file,):
         return file_hash(file)
     within = [file.is_dir() and entry.is_relative_to(file) for entry in files]
@@ -229,7 +223,7 @@ def _content_hash(file: Path, files: tuple[Path, ...]) -> str:
 def _chosen_bands(
     bands: Sequence[int] | None, settings: SceneSettings, count: int, path: Path, bad: Sequence[int]
 ) -> tuple[list[int], tuple[str, ...]]:
-    """Return the bands to use, and a note; without a choice by the user, all that the file does not call bad."""
+    """Return the chosen bands, else all that the file does not mark as bad, and a note."""
     where = "--bands" if bands is not None else f"bands in {settings.path}"
     chosen = bands if bands is not None else settings.bands
     if chosen is None:
@@ -237,8 +231,8 @@ def _chosen_bands(
         if len(good) == count or not good:
             return list(range(count)), ()
         everything = bands_text(range(count))
-        left_out = f"bands {bands_text(sorted(bad))} are left out: the file calls them bad; --bands {everything} takes"
-        return good, (f"{left_out} them all the same",)
+        left_out = bands_text(sorted(bad))
+        return good, (f"bands {left_out} are left out: the file marks them as bad; --bands {everything} takes all",)
     wrong = [band for band in chosen if not 0 <= band < count]
     if wrong or not chosen:
         raise SceneError(
@@ -259,36 +253,25 @@ def _labels_of(
     classes: Mapping[str, ClassValue],
     needed: bool,
 ) -> tuple[Labels | None, tuple[str, ...], bool]:
-    """Return labels, a note of them, and whether their file was found by its name alone."""
+    """Return labels, notes on them, and whether their file was found by its name."""
     by_name = stated is None and settings.labels is None
+    known = settings if settings.classes else settings.model_copy(update={"classes": dict(classes)})
     try:
         address, why_none = (stated, "") if stated is not None else label_file(scene, settings)
         if address is None:
             return None, (why_none,) if why_none else (), by_name
-        stated_classes, notes = bool(settings.classes), tuple[str, ...]()
-        known = settings.classes or classes
-        if is_polygon_file(address):
-            settings = settings.model_copy(update={"classes": dict(known)})
-            found, notes = load_polygon_labels(address, shape, geobox, settings=settings)
-        else:
-            found = load_labels(
-                address, shape, geobox, classes=known, unlabelled=settings.unlabelled, colours=settings.colours
-            )
-            notes = found.notes
+        found = read_labels(address, shape, geobox, known)
     except SceneError as error:
         if needed or not by_name:
             raise
         return None, (f"the labels beside the scene are left out: {error}",), by_name
-    how = f"classes from {settings.path}" if stated_classes else f"{len(found.names)} classes as found in the file"
+    how = f"classes from {settings.path}" if settings.classes else f"{len(found.names)} classes as found in the file"
     note = f"labels from {address}{', found by its name' if by_name else ''}, {how}"
-    return found, (note, *notes, *_one_class_note(found)), by_name
+    return found, (note, *found.notes, *_one_class_note(found)), by_name
 
 
 def load_field_labels(address: str | Path, shape: tuple[int, int]) -> tuple[Labels, tuple[str, ...]]:
-    """Read labels on a field's (y, x) pixels, with the classes of a scene.toml beside them; and notes.
-
-    Raises SceneError: they cannot be read, or do not fit.
-    """
+    """Read labels on a field's (y, x) pixels, with the classes of a scene.toml beside them; and notes (SceneError)."""
     file, _ = split_variable(address)
     found, notes, _ = _labels_of(file, shape, None, address, find_scene_settings(file), {}, True)
     assert found is not None
@@ -296,15 +279,15 @@ def load_field_labels(address: str | Path, shape: tuple[int, int]) -> tuple[Labe
 
 
 def _one_class_note(found: Labels) -> tuple[str, ...]:
-    """Return a question on labels that are all alike: the one value may mean unlabelled. Empty otherwise."""
+    """Return a note on labels of a single class: its value may mean unlabelled."""
     there = np.unique(found.index[found.index != UNLABELLED])
     if len(there) != 1:
         return ()
-    name, value = found.names[there[0]], found.values[there[0]]
-    told = value if isinstance(value, int) else list(value)
+    value = found.values[there[0]]
+    text = value if isinstance(value, int) else list(value)
     return (
-        f"all labels are {name}: if {told} in the label file stands for no class, write unlabelled = {told} into a"
-        f" {SETTINGS_NAME}",
+        f"all labels are {found.names[there[0]]}: if {text} in the label file means no class, write unlabelled = {text}"
+        f" into a {SETTINGS_NAME}",
     )
 
 
@@ -317,7 +300,7 @@ def _digest(*parts: object) -> str:
 
 @dataclass(frozen=True)
 class FileValues:
-    """The numbers of a file in the chosen bands as the values of a scene, NaN where there is none."""
+    """The numbers of a file in the chosen bands as the values of a scene, NaN without one."""
 
     source: CubeSource
     bands: list[int]
@@ -329,7 +312,7 @@ class FileValues:
 
     @classmethod
     def of(cls, source: CubeSource, bands: list[int], settings: SceneSettings) -> FileValues:
-        """Take the no-data value of scene.toml, of the file, or the usual one; a mask of everything does not count."""
+        """Use the no-data value of scene.toml, of the file, or the usual one; a mask of all pixels is ignored."""
         calibrated = source.dark is not None and source.white is not None
         nodata = settings.nodata if settings.nodata is not None or calibrated else source.nodata
         assumed = nodata is None and not calibrated and source.dtype.kind in "if"
@@ -338,11 +321,11 @@ class FileValues:
 
     @property
     def scaling(self) -> str:
-        """Return scene.toml's scaling of the numbers, for hashes."""
+        """Return scene.toml's scaling as a text for hashes."""
         return _stated_scaling(self.scale, self.offset)
 
     def notes(self, settings: Path | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Return sentences on what is done to the numbers, by the scene.toml ``settings``; and on gaps."""
+        """Return notes on scaling, by the scene.toml ``settings``, and notes on the mask."""
         how, void = list[str](), self.source.void
         if self.source.dark is not None and self.source.white is not None:
             how.append("values are over the white reference")
@@ -355,14 +338,14 @@ class FileValues:
         return tuple(how), (f"{int(void.sum())} transparent or masked pixels have no value, and no class in a map",)
 
     def converted(self, first: int, stop: int) -> tuple[NDArray[Any], NDArray[np.float32], NDArray[np.bool_] | None]:
-        """Return rows in the file's numbers and as float32 with NaN, (y, x, band), and which of them are no data."""
+        """Return rows (y, x, band) as the file's numbers and as float32 with NaN, and which of them are no data."""
         rows = scene_lines(self.source, first, stop)
         picked = rows if self.bands == list(range(rows.shape[2])) else rows[..., self.bands]
         with np.errstate(over="ignore"):
             values = np.array(picked, np.float32, order="C")
         if self.nodata is None:
             return picked, values, None
-        # Compared as numbers: -9999 in the numbers of the file would wrap to 55537 where they are uint16.
+        # compared as numbers: -9999 as uint16 would be 55537
         with np.errstate(over="ignore"):
             empty = np.asarray(picked == self.nodata if np.isfinite(self.nodata) else np.isnan(values), np.bool_)
         values[empty] = np.nan
@@ -379,20 +362,14 @@ class FileValues:
         return self.scaled(values)
 
 
-@dataclass(frozen=True)
-class Gaps:
-    """Values missing among the values of a file."""
+def _find_gaps(
+    path: Path, values: FileValues, kept: NDArray[np.float32] | None
+) -> tuple[NDArray[np.bool_], int, int, tuple[str, ...]]:
+    """Read all values once, and store them in ``kept`` if it is given.
 
-    missing: NDArray[np.bool_]  # (y, x) pixels without a value in more than half of their bands
-    filled_px: int  # pixels without a value in a band
-    void: int  # samples that have the no-data value
-    notes: tuple[str, ...]  # a sentence for each thing that is missing
-
-
-def _find_gaps(path: Path, values: FileValues, kept: NDArray[np.float32] | None) -> Gaps:
-    """Look through all values of a file once, and keep them in ``kept`` where it is given.
-
-    Raises SceneError: a value is no reading, a band has no value anywhere, or no value is finite.
+    Returns (y, x) pixels without a value in most bands, and notes. The counts between them are of pixels without a
+    value in a band, and of no-data samples. Raises SceneError: a value is out of range, a band has no value, or no
+    value is finite.
     """
     height, width, _ = values.source.shape
     chosen, nodata, notes = values.bands, values.nodata, list[str]()
@@ -407,10 +384,9 @@ def _find_gaps(path: Path, values: FileValues, kept: NDArray[np.float32] | None)
             if found is not None:
                 y, x, band = found.place
                 raise SceneError(
-                    f"{path} has {found.value!s} at y {first + y}, x {x}, band {chosen[band]}, beyond the"
-                    f" {MOST_VALUE:g} that readings reach; if it stands for no data, write nodata = {found.value!s}"
-                    f" into a {SETTINGS_NAME} beside the file, else leave the band out with --bands, or give the values"
-                    " in a larger unit"
+                    f"{path} has {found.value!s} at y {first + y}, x {x}, band {chosen[band]}, above the limit of"
+                    f" {MOST_VALUE:g}; if it means no data, write nodata = {found.value!s} into a {SETTINGS_NAME}"
+                    " beside the file, else leave the band out with --bands, or give the values in a larger unit"
                 )
             infinite += int(np.count_nonzero(np.isinf(block)))
             block[np.isinf(block)] = np.nan
@@ -426,8 +402,8 @@ def _find_gaps(path: Path, values: FileValues, kept: NDArray[np.float32] | None)
         notes.append(f"{void} samples have the file's no-data value {nodata:g}")
     elif void:
         notes.append(
-            f"{void} samples are {nodata:g}, which is taken for no data though nothing says so; where it"
-            f" is a reading, state another number as nodata in a {SETTINGS_NAME}"
+            f"{void} samples are {nodata:g}, which is taken for no data; if it is a value, state another number as"
+            f" nodata in a {SETTINGS_NAME}"
         )
     if infinite:
         notes.append(f"{infinite} infinite samples count as missing")
@@ -440,16 +416,11 @@ def _find_gaps(path: Path, values: FileValues, kept: NDArray[np.float32] | None)
         )
         raise SceneError(f"{path} has no value anywhere in bands {without} (from 0); take the others: --bands {rest}")
     if absent:
-        notes.append(f"{absent} of {missing.size * len(chosen)} samples are missing")
-    return Gaps(missing, filled_px, void, tuple(notes))
+        notes.append(f"missing samples: {absent} of {missing.size * len(chosen)}")
+    return missing, filled_px, void, tuple(notes)
 
 
 def bands_text(bands: Sequence[int]) -> str:
     """Return the band numbers as ``--bands`` takes them: ``0-3,7``."""
-    runs: list[list[int]] = []
-    for band in bands:
-        if runs and band == runs[-1][1] + 1:
-            runs[-1][1] = band
-        else:
-            runs.append([band, band])
-    return ",".join(str(first) if first == last else f"{first}-{last}" for first, last in runs)
+    runs = np.split(np.array(bands, int), np.flatnonzero(np.diff(bands) != 1) + 1) if bands else []
+    return ",".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)

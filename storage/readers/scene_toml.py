@@ -1,11 +1,11 @@
-"""``scene.toml``: what a scene file does not say about itself; and which wavelength each band has, and where from."""
+"""Read ``scene.toml``, and settle the wavelength of each band and its origin."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,50 +16,52 @@ from storage.archive.staging import read_toml
 from storage.readers.cube_sources import Bands
 
 SETTINGS_NAME = "scene.toml"
-IMAGE_FOLDERS = ("images", "image", "imgs", "img", "pictures", "photos")  # a scene.toml stands above such a one
+IMAGE_FOLDERS = ("images", "image", "imgs", "img", "pictures", "photos")  # scene.toml may be above such a folder
 
 Colour = tuple[int, int, int]
 ClassValue = int | Colour
-_Number = Annotated[float, Field(strict=True)]
+_Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 _Channel = Annotated[int, Field(strict=True, ge=0, le=255)]
 _Value = StrictInt | tuple[_Channel, _Channel, _Channel]
 _WHOLE, _FILE = "a list of whole numbers such as [0, 1]", "a file name in quotes"
-_EXPECTED = {
-    "bands": _WHOLE,
-    "wavelengths_nm": "a list of numbers such as [660.0, 800.0]",
-    "wavelengths_file": _FILE,
-    "dropped_bands": _WHOLE,
-    "nodata": "a number such as -9999 or 1e30",
-    "scale": "a number above 0 such as 0.0001",
-    "offset": "a number such as -0.1",
-    "pixel_m": "a number of metres above 0 such as 0.05",
-    "labels": _FILE,
-    "unlabelled": "a whole number or a colour [r, g, b] in 0..255",
-    "class_attribute": "the name of an attribute in quotes",
-    "classes": "a table of name = number or name = [r, g, b] in 0..255",
-    "colours": "a table of name = [r, g, b] in 0..255",
-}
+_A_CLASS = "a whole number or a colour [r, g, b] in 0..255"
+
+
+def _key(default: Any, expected: str, **limits: Any) -> Any:
+    """Return a field whose description is the value that messages ask for."""
+    return Field(default, description=expected, **limits)
 
 
 class SceneSettings(BaseModel):
-    """Content of one ``scene.toml``. Everything is optional; ``path`` is None where there is no such file."""
+    """Content of one ``scene.toml``. Every key is optional; ``path`` is None if there is no such file."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     path: Path | None = None
-    bands: tuple[StrictInt, ...] | None = None  # of the file, counted from 0
-    wavelengths_nm: tuple[_Number, ...] | None = None  # of ``bands``, or of all bands of the file
-    wavelengths_file: StrictStr | None = None  # rows of nm and FWHM, all bands of the file and the dropped ones
-    dropped_bands: tuple[StrictInt, ...] = ()  # rows of wavelengths_file that the file leaves out, counted from 1
-    nodata: _Number | None = None  # the number that stands for no value
-    scale: Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)] = 1.0  # values = file's * scale + offset
-    offset: Annotated[float, Field(strict=True, allow_inf_nan=False)] = 0.0
-    pixel_m: Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)] | None = None  # side, on the ground
-    labels: StrictStr | None = None  # beside scene.toml; may hold {number}, {name}; "": there are none
-    unlabelled: _Value | None = None
-    class_attribute: StrictStr | None = None  # of labels that are polygons: which attribute says the class
-    classes: dict[str, _Value] = {}
-    colours: dict[str, tuple[_Channel, _Channel, _Channel]] = {}  # that maps show classes in
+    # of the file, counted from 0
+    bands: tuple[StrictInt, ...] | None = _key(None, _WHOLE)
+    # of ``bands``, or of all bands of the file
+    wavelengths_nm: tuple[Annotated[float, Field(strict=True)], ...] | None = _key(
+        None, "a list of numbers such as [660.0, 800.0]"
+    )
+    # rows of nm and FWHM, of all bands of the file and the dropped ones
+    wavelengths_file: StrictStr | None = _key(None, _FILE)
+    # rows of wavelengths_file that the file lacks, counted from 1
+    dropped_bands: tuple[StrictInt, ...] = _key((), _WHOLE)
+    nodata: Annotated[float, Field(strict=True)] | None = _key(None, "a number such as -9999 or 1e30")
+    # values = file's * scale + offset
+    scale: _Number = _key(1.0, "a number above 0 such as 0.0001", gt=0)
+    offset: _Number = _key(0.0, "a number such as -0.1")
+    # side of a pixel on the ground
+    pixel_m: _Number | None = _key(None, "a number of metres above 0 such as 0.05", gt=0)
+    # relative to scene.toml, with {number} or {name}; "" if there are none
+    labels: StrictStr | None = _key(None, _FILE)
+    unlabelled: _Value | None = _key(None, _A_CLASS)
+    # attribute of polygons with their class
+    class_attribute: StrictStr | None = _key(None, "the name of an attribute in quotes")
+    classes: dict[str, _Value] = _key({}, "a table of name = number or name = [r, g, b] in 0..255")
+    # of classes on maps
+    colours: dict[str, tuple[_Channel, _Channel, _Channel]] = _key({}, "a table of name = [r, g, b] in 0..255")
 
     @model_validator(mode="after")
     def _agree(self) -> Self:
@@ -77,9 +79,9 @@ class SceneSettings(BaseModel):
 
 
 def find_scene_settings(scene: Path) -> SceneSettings:
-    """Read the ``scene.toml`` beside a scene file, or above it where that lies in a folder such as ``images``.
+    """Read the ``scene.toml`` beside a scene file, or above its folder if that is one such as ``images``.
 
-    Raises SceneError: the file is no TOML, has a key that is not known, or a value of the wrong kind.
+    Raises SceneError: the file is no TOML, or has an unknown key or a wrong value.
     """
     folders = [scene.parent, scene.parent.parent] if is_image_folder(scene.parent) else [scene.parent]
     found = next((path for folder in folders if (path := folder / SETTINGS_NAME).is_file()), None)
@@ -87,7 +89,7 @@ def find_scene_settings(scene: Path) -> SceneSettings:
 
 
 def is_image_folder(folder: Path) -> bool:
-    """Return whether a folder's name says that images lie in it, and what belongs to them beside it."""
+    """Return whether a folder has a name for folders of images."""
     return folder.name.lower() in IMAGE_FOLDERS
 
 
@@ -96,22 +98,21 @@ def load_scene_settings(path: Path) -> SceneSettings:
     try:
         content = read_toml(path)
     except (FileNotFoundError, ValueError) as error:
-        raise SceneError(f"{path} cannot be read as TOML: {error}; correct it or take it away") from error
-    unknown = sorted(set(content) - set(_EXPECTED))
-    if unknown:
-        raise SceneError(f"{path} has the unknown key {', '.join(unknown)}; known are {', '.join(_EXPECTED)}")
+        raise SceneError(f"{path} cannot be read as TOML: {error}; correct it or remove it") from error
+    keys = [name for name in SceneSettings.model_fields if name != "path"]
+    if unknown := sorted(set(content) - set(keys)):
+        raise SceneError(f"{path} has the unknown key {', '.join(unknown)}; known are {', '.join(keys)}")
     try:
         return SceneSettings.model_validate({**content, "path": path})
     except ValidationError as error:
         first = error.errors()[0]
-        if not first["loc"]:
-            raise SceneError(f"{path} {first['msg'].removeprefix('Value error, ')}") from None
-        key = str(first["loc"][0])
-        value, name = content[key], key
-        if key == "classes" and len(first["loc"]) > 1:
-            name, key = f"class {first['loc'][1]}", "unlabelled"
-            value = content["classes"][first["loc"][1]]
-        raise SceneError(f"{path}: {name} must be {_EXPECTED[key]}, got {value!r}") from None
+    if not first["loc"]:
+        raise SceneError(f"{path} {first['msg'].removeprefix('Value error, ')}")
+    name = str(first["loc"][0])
+    value, expected = content[name], SceneSettings.model_fields[name].description
+    if name == "classes" and len(first["loc"]) > 1:
+        value, name, expected = value[first["loc"][1]], f"class {first['loc'][1]}", _A_CLASS
+    raise SceneError(f"{path}: {name} must be {expected}, got {value!r}")
 
 
 RANGE_NM = (200.0, 3000.0)
@@ -119,7 +120,7 @@ MICROMETRES = (0.2, 5.0)
 
 
 def check_wavelengths(wavelengths: Sequence[float] | NDArray[np.float64], where: str) -> NDArray[np.float64]:
-    """Return the wavelengths as float64 [nm], any order.
+    """Return the wavelengths as float64 [nm] in their order.
 
     Raises WavelengthError: they are not finite, look like micrometres, or lie outside 200-3000 nm.
     """
@@ -148,11 +149,11 @@ def settle_wavelengths(
     settings: SceneSettings,
     known: Bands,
 ) -> Bands:
-    """Return wavelengths of the chosen bands: the flag first, then ``scene.toml``, then the file or its colours.
+    """Return wavelengths of the chosen bands [nm] from the flag, else from ``scene.toml``, else from the file.
 
-    ``bands`` are counted from 0, of ``file_bands``. The flag has one for each of them or for each band of the file;
-    what the file says (``known``) is of every band. [nm] Raises WavelengthError: nothing says them, or their number,
-    unit or range is wrong.
+    ``bands`` count from 0, of ``file_bands``. The flag (``stated``) has one for each of them or for each band of the
+    file; ``known`` has one for every band of the file. Raises WavelengthError: there are none, or their number, unit or
+    range is wrong.
     """
     chosen = list(bands)
     if stated is not None:
@@ -178,7 +179,7 @@ def settle_wavelengths(
 def _fit(
     values: NDArray[np.float64], chosen: list[int], file_bands: int, own: list[int], where: str
 ) -> NDArray[np.float64]:
-    """Pick the chosen bands out of wavelengths that belong to the bands ``own``, or to every band of the file."""
+    """Return the wavelengths of the chosen bands, out of those of the bands ``own`` or of every band."""
     belongs = own if len(values) == len(own) else list(range(file_bands))
     if len(values) != len(belongs):
         ways = f"{len(own)} or {file_bands}" if len(own) != file_bands else f"{file_bands}"
@@ -191,7 +192,7 @@ def _fit(
 
 
 def _from_file(path: Path, dropped: Sequence[int], chosen: list[int], file_bands: int) -> Bands:
-    """Return the rows of nm and FWHM, less the dropped ones (counted from 1)."""
+    """Return the rows of nm and FWHM, without the dropped ones (counted from 1)."""
     table = _table(path)
     bad = [row for row in dropped if not 1 <= row <= len(table)]
     if bad:
@@ -210,21 +211,21 @@ def _from_file(path: Path, dropped: Sequence[int], chosen: list[int], file_bands
 
 
 def _table(path: Path) -> NDArray[np.float64]:
-    """Return the rows of a text file that begin with a number; headings are passed over. (row, 1 or 2)"""
+    """Return the rows of a text file that begin with a number, as (row, 1 or 2)."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise WavelengthError(f"wavelengths_file {path} cannot be read: {error}; correct scene.toml") from error
     rows: list[list[float]] = []
     for line in lines:
-        row: list[float] = []
-        with suppress(ValueError):
-            for word in line.replace(",", " ").replace(";", " ").split():
-                row.append(float(word))
-        rows += [row] if row else []
+        fields = line.replace(",", " ").replace(";", " ").split()[:2]
+        for count in range(len(fields), 0, -1):
+            with suppress(ValueError):
+                rows.append([float(field) for field in fields[:count]])
+                break
     if not rows:
         raise WavelengthError(f"{path} has no row that begins with a number; expected columns of nm and FWHM")
-    columns = min(2, *(len(row) for row in rows)) if len(rows) > 1 else min(2, len(rows[0]))
+    columns = min(map(len, rows))
     return np.array([row[:columns] for row in rows], np.float64)
 
 

@@ -1,18 +1,17 @@
-"""Cubes out of Zarr stores: those of this project, and arrays of anyone with dims y x and band, or band y x.
+"""Read cubes from Zarr stores: those of this project, and any array with dims y, x and band.
 
-A store is checked before it is opened: links may not lead out of it, and its codecs may only carry numbers. A codec of
-another name (``pickle`` is one) is refused, so that reading data never runs what it brings.
-A cube of files is ingested as one immutable store:
+A store is checked before it is opened. Links out of it and codecs other than those of numbers (such as ``pickle``) are
+refused, so that reading never runs code of the store. A cube of files is ingested as one immutable store:
 
 ::
 
-    cube.zarr/values          (line, sample, band): whole numbers as uint8 or uint16 where they fit, else float32
-    cube.zarr/wavelength      (band,) nm, fwhm beside it; missing where nothing says them
-    cube.zarr/valid_line      (line,) false for lines that no file holds whole; time, exposure_ms, frame where known
-    cube.zarr/dark, white     (sample, band) reference frames, where there are some
+    cube.zarr/values          (line, sample, band): whole numbers as uint8 or uint16 if they fit, else float32
+    cube.zarr/wavelength      (band,) nm, fwhm beside it, if known
+    cube.zarr/valid_line      (line,) false for lines that no file holds whole; time, exposure_ms, frame if known
+    cube.zarr/dark, white     (sample, band) reference frames, if there are some
     cube.zarr/quicklook       (y, x, 3) uint8 for viewers; the same as quicklook.png beside the cube
 
-Attributes say where it came from: file names without folders, sizes, SHA-256, header texts, notes.
+Attributes have file names without folders, sizes, SHA-256, header texts and notes.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ Report = Callable[[float], None]
 
 
 def find_zarr_store(path: Path) -> Path | None:
-    """Return the Zarr store at a path, or the ``cube.zarr`` in it; None where there is neither."""
+    """Return the Zarr store at a path, or the ``cube.zarr`` in it."""
     for folder in (path, path / "cube.zarr"):
         if any((folder / name).is_file() for name in METADATA):
             return folder
@@ -60,17 +59,16 @@ def find_zarr_store(path: Path) -> Path | None:
 
 
 def open_zarr_cube(path: Path, variable: str | None = None, *, labels: bool = False) -> CubeSource:
-    """Open one array of a store, or of the ``cube.zarr`` in a folder, as a cube.
+    """Open the only array with three axes, or the one that is named, as a cube.
 
-    Stores of this project have ingested cubes or mosaics. Other stores have the only array with three axes of numbers,
-    or the one named, at the step of time named (``values:3`` or ``3``). Wavelengths come from a coordinate of that
-    name, or of the band axis with a unit. Raises SceneError: the store is damaged, or has no such array, unknown dims
-    or a codec that is not allowed. So does one that claims far more than lies on the disk.
+    ``variable`` may end in a step of time (``values:3`` or ``3``). Wavelengths come from a coordinate of that name, or
+    from that of the band axis. Raises SceneError: the store is damaged, has no such array, unknown dims or a codec that
+    is not allowed, or claims far more than lies on the disk.
     """
     path = find_zarr_store(path) or path
     with reading(path, "Zarr"):
         _check_store(path)
-        # a group is read from its members: only their metadata were checked
+        # consolidated metadata of a group are not used: only those of its members were checked
         is_group = (path / ".zgroup").is_file() or (
             (path / "zarr.json").is_file() and _read_json(path / "zarr.json").get("node_type") == "group"
         )
@@ -79,8 +77,7 @@ def open_zarr_cube(path: Path, variable: str | None = None, *, labels: bool = Fa
         attributes = dict(node.attrs) if isinstance(node, zarr.Group) else {}
         if "sweep" in attributes:
             raise SceneError(
-                f"{path} holds raw lines of a survey, whose pixels lie where the mirror looked; survey them as "
-                f"--sweeps {path}"
+                f"{path} holds raw lines of a survey, which are on no map yet; survey them as --sweeps {path}"
             )
         if isinstance(node, zarr.Group) and {"scores", "axes"} <= set(node.array_keys()):
             raise SceneError(
@@ -107,7 +104,7 @@ def open_zarr_cube(path: Path, variable: str | None = None, *, labels: bool = Fa
 
 
 def _with_own(source: CubeSource, arrays: dict[str, Any], attributes: dict[str, Any]) -> CubeSource:
-    """Add what ingested cubes say of lines, reference frames and bad bands."""
+    """Add the lines, reference frames and bad bands of an ingested cube."""
     lines, samples, bands = source.shape
 
     def known(name: str, *shape: int) -> NDArray[Any] | None:
@@ -126,7 +123,7 @@ def _with_own(source: CubeSource, arrays: dict[str, Any], attributes: dict[str, 
 
 
 def _check_store(path: Path) -> None:
-    """Refuse links out of the store, entries that are neither file nor folder, and codecs not known (SceneError)."""
+    """Refuse links out of the store, special files, and unknown codecs (SceneError)."""
     home = path.resolve()
     for place, folders, files in os.walk(path):
         for entry in (Path(place, name) for name in (*folders, *files)):
@@ -152,7 +149,7 @@ def _read_json(path: Path) -> Mapping[str, Any]:
 
 
 def _codecs(content: object) -> Iterator[str]:
-    """Yield names of all codecs in an array's metadata, those within others too."""
+    """Yield the names of all codecs in an array's metadata, nested ones too."""
     if isinstance(content, dict):
         for key in ("codecs", "index_codecs", "filters", "compressor", "compressors"):
             listed = content.get(key) or []
@@ -166,9 +163,9 @@ def _codecs(content: object) -> Iterator[str]:
 
 @dataclass(frozen=True)
 class SourceFile:
-    """One file that a cube came from."""
+    """A file of a cube."""
 
-    name: str  # without folders, but those within a store
+    name: str  # relative to the store, else without folders
     size: int
     sha256: str
 
@@ -176,10 +173,9 @@ class SourceFile:
 def write_ingested_cube(
     folder: Path, source: CubeSource, files: Sequence[SourceFile], *, name: str, report: Report = lambda done: None
 ) -> None:
-    """Store a cube as ``cube.zarr`` and ``quicklook.png`` in a folder, 64 lines at a time.
+    """Write a cube as ``cube.zarr`` and ``quicklook.png`` into a folder, 64 lines at a time.
 
-    Its attributes have its name and the files that it came from; ``report`` is called with how far it is, 0..1. Raises
-    SceneError: lines cannot be read.
+    ``report`` is called with the progress, 0..1. Raises SceneError: lines cannot be read.
     """
     kind = stored_dtype(source, lambda done: report(0.3 * done))
     sampled = source.dtype.kind in "ui" and source.dtype not in (np.uint8, np.uint16)
@@ -191,7 +187,7 @@ def write_ingested_cube(
     for start in range(0, source.shape[0], BLOCK_LINES):
         stop = min(start + BLOCK_LINES, source.shape[0])
         lines, valid = source.read(start, stop), source.valid[start:stop]
-        with np.errstate(over="ignore"):  # a float64 beyond float32 becomes infinite, which a scene takes for missing
+        with np.errstate(over="ignore"):  # values beyond float32 become infinite: missing
             block = lines.astype(kind)
         if not valid.all():
             block[~valid] = np.nan if kind.kind == "f" else 0
@@ -204,16 +200,11 @@ def write_ingested_cube(
 
 
 def stored_dtype(source: CubeSource, report: Report = lambda done: None) -> np.dtype[Any]:
-    """Return the type of the store.
-
-    uint8 and uint16 stay, other whole numbers become uint16 where all fit, the rest float32.
-    """
-    if source.dtype.kind == "b" or source.dtype == np.uint8:
+    """Return the type of the store: uint8 or uint16 if all values are such whole numbers, else float32."""
+    if source.dtype in (np.bool_, np.uint8):
         return np.dtype(np.uint8)
-    if source.dtype == np.uint16:
-        return np.dtype(np.uint16)
-    if source.dtype.kind not in "ui":
-        return np.dtype(np.float32)
+    if source.dtype == np.uint16 or source.dtype.kind == "f":
+        return np.dtype(np.uint16 if source.dtype == np.uint16 else np.float32)
     for start in range(0, source.shape[0], BLOCK_LINES):
         stop = min(start + BLOCK_LINES, source.shape[0])
         lines = source.read(start, stop)
@@ -244,7 +235,7 @@ def _attributes(source: CubeSource, files: Sequence[SourceFile], name: str) -> d
 
 
 def _write_coordinates(group: zarr.Group, source: CubeSource) -> dict[str, str]:
-    """Store what is known of lines, bands and place, and the reference frames; give the attributes that name it."""
+    """Write lines, bands, place and reference frames; return the attributes of the values that name them."""
     write_counts(group, line=source.shape[0], sample=source.shape[1])
     names: list[str] = []
     if source.bands.wavelength_nm is not None:

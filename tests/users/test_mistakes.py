@@ -213,7 +213,7 @@ WORKS = {  # what is read, with which wavelengths, as what (y, x, band), and wha
     "negative reflectance": ("negative.npy", NM, (12, 16, 5), ""),
     "percent": ("percent.npy", NM, (12, 16, 5), ""),
     "scaled whole numbers": ("scaled.npy", NM, (12, 16, 5), ""),
-    "some NaN": ("holes.npy", NM, (12, 16, 5), "60 of 960 samples are missing"),
+    "some NaN": ("holes.npy", NM, (12, 16, 5), "missing samples: 60 of 960"),
     "two axes": ("plane.npy", "550", (12, 16, 1), ""),
     "one cube beside vectors": ("one_cube.mat", NM, (12, 16, 5), r"array cube of the file, which also has wl \(1, 5\)"),
     "wavelengths beside the cube": (

@@ -90,7 +90,7 @@ def test_init_tells_what_it_could_not_see(made: Path, command_line: Any) -> None
     """Images without labels, labels without images, other sizes and bands, one class, and unknown wavelengths."""
     for folder, words in {
         "lacking": ["labels of 1 image, left out", "the image of 1 label file: 009.png"],
-        "sizes": ["002.png is 9 x 32 px, its image 24 x 32"],
+        "sizes": ["002.png are 9 x 32 px, the scene is 24 x 32 px"],
         "other_bands": ["002.png has 1 bands, the first image 3"],
         "soil": ["a second class: all labels are class_0"],
         "bare": ["label files: beside an image NAME.png"],

@@ -234,12 +234,12 @@ def test_a_table_of_areas_adds_up(posed: Products) -> None:
 
 
 def test_the_catalogue_names_every_product(posed: Products) -> None:
-    """A valid item whose assets are there: products, their styles, and the sheet of areas."""
+    """A valid item whose assets are there: products, and the sheet of areas."""
     item = json.loads(Path(posed.answer["item"]).read_text())
     assert core_problems(Path(posed.answer["item"])) == []
     assert extension_problems(item) == []
     wanted = {"reflectance", "NDVI", "SAVI", "polygons", "polygons_geojson", "prescription", "task_data", "areas"}
-    assert wanted | {f"{name}_style" for name in ("class_map", "NDVI", "reflectance")} <= set(item["assets"])
+    assert wanted <= set(item["assets"])
     assert all(posed.file(key).is_file() for key in posed.answer["files"])
     assert len(item["assets"]["reflectance"]["bands"]) == len(posed.store("mosaic")["wavelength"])
 
@@ -284,7 +284,7 @@ def test_a_survey_without_a_place_has_what_needs_none(one_picture: Products) -> 
     assert {row["estimated_from"] for row in table} == {"labels"}
     assert sum(int(row["pixels"]) for row in table) == pixels
     for flags in ({"prescription": "class_1=1"}, {"polygons": True, "least_area": 1.0}):
-        with pytest.raises(SettingsError, match=r"metres, and the run does not say where .* \[pose\]"):
+        with pytest.raises(SettingsError, match=r"metres, and the run has no place .* \[pose\]"):
             run_export(
                 one_picture.archive, None, one_picture.out / "no", False, QUIET, choose_products(ProductFlags(**flags))
             )
@@ -433,7 +433,7 @@ def test_an_index_of_reflectance_stored_to_10000(tmp_path: Path, weights: Path) 
     for name, more in (("raw", ""), ("scaled", "scale = 0.0001\n")):
         (tmp_path / "scene.toml").write_text(toml + more)
         run_survey(load_settings(None, {**given, "out": str(tmp_path / name), "controls": False}), QUIET)
-    with pytest.raises(SettingsError, match=r"SAVI wants reflectance .*scene\.toml .*scale = 0\.0001 where 10000"):
+    with pytest.raises(SettingsError, match=r"SAVI wants reflectance .*scene\.toml .*scale = 0\.0001 if 10000"):
         run_export(tmp_path / "raw", None, tmp_path / "none", False, QUIET, choice)
     answer = run_export(tmp_path / "scaled", None, tmp_path / "out", False, QUIET, choice)
     with rasterio.open(tmp_path / "out" / answer["files"]["SAVI"]) as file:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from datetime import UTC, datetime, timedelta
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +12,13 @@ import pytest
 from PIL import Image
 
 from flows.archive.compare_command import _by_one_list, _comparison, compare, find_run
-from flows.publish.panels import draw_difference
 from pipeline.errors import ArchiveError, SceneError, SettingsError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run
 from storage.arrays.class_maps import ClassMap
-from tests.conftest import Survey, WeightsMaker
+from tests.conftest import Survey
 from tests.flows.conftest import turned
 from tests.storage.small_archive import flip
 
@@ -42,19 +39,6 @@ def _compared(
 def _map(classes: np.ndarray[Any, Any], names: tuple[str, ...], seed: int = 0) -> ClassMap:
     colours = np.random.default_rng(seed).integers(0, 256, (len(names), 3), dtype=np.uint8)
     return ClassMap(np.asarray(classes, np.uint8), np.ones(classes.shape, np.float32), names, colours)
-
-
-def test_a_run_is_the_same_as_itself(two_budgets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Every class agrees wholly; the picture lies beside the archive, which is left as it is."""
-    content = _compared(capsys, two_budgets, "latest", "latest", tmp_path)
-    assert content["differing"] == {"pixels": 0, "fraction": 0.0}
-    assert (content["settings"], content["made"], content["largest"]) == ([], [], [])
-    assert {row["iou"] for row in content["classes"]} == {1.0}
-    old, new = (path.name for path in Archive.open(two_budgets).runs())
-    before = sorted(two_budgets.rglob("*"))
-    content = _compared(capsys, two_budgets, old, f"runs/{new}")
-    assert Path(content["picture"]) == two_budgets.parent / f"compare-{old}-{new}.png"
-    assert sorted(two_budgets.rglob("*")) == before
 
 
 def test_two_budgets_are_told_apart_either_way(
@@ -87,22 +71,6 @@ def test_two_budgets_are_told_apart_either_way(
     }
 
 
-def test_new_weights_and_hectares_are_told(
-    survey_png: Survey, make_weights: WeightsMaker, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Keys of the stages that read them, and hectares where both runs have a map on the ground."""
-    small = {"pose": POSE, "map": {"resolution_m": 0.02}}
-    for names in (("class_0", "class_1", "class_2"), ("class_1", "class_0", "class_2", "more")):
-        survey_png(tmp_path / "archive", weights=str(make_weights(names=names)), **small)
-    content = _compared(capsys, tmp_path / "archive", "previous", "latest", tmp_path)
-    made = {row["name"] for row in content["made"]}
-    assert "stage.segment" in made
-    assert "stage.rectify" not in made
-    assert sum(row["ha"][1] for row in content["classes"]) > 0
-    compare(tmp_path / "archive", "previous", "latest", out=tmp_path)
-    assert " m²" in capsys.readouterr().out
-
-
 def test_runs_of_different_fields_are_refused(survey_png: Survey, scene_files: Path, tmp_path: Path) -> None:
     """Also by `previous`, which looks for the same field."""
     other = turned(scene_files / "scene.png", tmp_path / "turned.png")
@@ -115,27 +83,6 @@ def test_runs_of_different_fields_are_refused(survey_png: Survey, scene_files: P
         compare(tmp_path / "archive", "previous", "latest")
     with pytest.raises(ArchiveError, match="there is no run nothing"):
         compare(tmp_path / "archive", "nothing", "latest")
-
-
-def test_dates_of_one_name_are_one_field(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A series has a file for each date; other names are other fields."""
-    hours = count()
-
-    class Clock(datetime):  # runs of one second are told apart by their names alone
-        @classmethod
-        def now(cls, tz: Any = None) -> datetime:
-            return datetime(2026, 8, 1, tzinfo=UTC) + timedelta(hours=next(hours))
-
-    monkeypatch.setattr("storage.archive.archive.datetime", Clock)
-    archive = Archive.open(tmp_path)
-    made = []
-    for date, name in (("2026-05-01", "north"), ("2026-06-01", "south"), ("2026-07-01", "north")):
-        settings = {"scene": f"{date}.tif", "name": name}
-        receipt = {"scene": date, "settings": settings, "products": {"class_map": "stages/segment/aaaa/m"}}
-        with archive.new_run(name) as draft:
-            draft.write_file("receipt.json", json.dumps(receipt))
-            made.append(draft.id)
-    assert find_run(Catalogue.read(tmp_path), "previous").folder.name == made[0]
 
 
 def test_a_map_that_cannot_be_believed_is_not_compared(two_budgets: Path, tmp_path: Path) -> None:
@@ -200,12 +147,3 @@ def test_hectares_are_told_where_both_runs_have_them() -> None:
     assert found["largest"] == [{"from": "a", "to": "b", "pixels": 2, "fraction": 0.5}]
     (row,) = _comparison((posed, posed), alike)["classes"]
     assert (row["ha"], row["pixels"], row["iou"]) == ([2.5, 2.5], [4, 4], 1.0)
-
-
-@pytest.mark.parametrize("shape", [(1, 90), (300, 8), (20, 2600)])
-def test_maps_of_any_shape_and_name_are_drawn(shape: tuple[int, int], tmp_path: Path) -> None:
-    """Also those that are thinned, and class names that look like formulas."""
-    maps = [_map(np.zeros(shape), ("a $x$_b",)) for _ in range(2)]
-    draw_difference(tmp_path / "a.png", maps, ("A", "B $y$", "0 % differ"))
-    with Image.open(tmp_path / "a.png") as picture:
-        assert picture.format == "PNG"

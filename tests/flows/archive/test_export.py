@@ -24,8 +24,6 @@ from flows.settings.load import load_settings
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from pipeline.ground.view import RigPose
 from storage.archive.archive import Archive
-from storage.arrays.mosaics import open_mosaic
-from storage.arrays.signal_cubes import open_lines
 from storage.readers.envi_files import open_envi_cube
 from storage.remote.opening import verify_archive
 from tests.prior_work import without_effects
@@ -70,7 +68,7 @@ def surveys(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Publis
     """One archive with the same farm twice: without a pose and with one."""
     archive = tmp_path_factory.mktemp("surveys") / "field-a"
     flags = {
-        "size": "192x128",
+        "size": "128x96",
         "bands": "20,60,100,150,200",
         "budget": "0.9",
         "engine": "plain",
@@ -175,11 +173,10 @@ def test_images_say_what_they_show_and_of_which_run(exports: list[Exported], num
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")  # cubes lie on the camera's grid
 @pytest.mark.parametrize("number", [0, 1])
 def test_cubes_are_the_archives_bit_for_bit(exports: list[Exported], number: int) -> None:
-    """Mosaic and sweeps through this project's ENVI reader and through rasterio are the Zarr stores' numbers."""
+    """Sweeps through this project's ENVI reader are the Zarr stores' numbers."""
     done = exports[number]
     mosaic, products = done.store("mosaic"), done.published.receipt["products"]
-    values = open_mosaic(done.archive / products["mosaic"]).values()
-    stores = {"mosaic_envi": values}
+    stores = {}
     for product in ("raw_coarse", "raw_fine"):
         for path in (done.archive / products[product]).glob("*.zarr"):
             stores[f"{path.stem}_envi"] = xr.open_zarr(path, consolidated=False)["dn"].values
@@ -191,9 +188,6 @@ def test_cubes_are_the_archives_bit_for_bit(exports: list[Exported], number: int
         np.testing.assert_array_equal(cube.header.wavelength_nm, mosaic["wavelength"].values)
         np.testing.assert_array_equal(cube.header.fwhm_nm, mosaic["fwhm"].values)
         assert cube.notes == ()
-    with rasterio.open(done.file("mosaic_envi")) as file:
-        np.testing.assert_array_equal(np.moveaxis(file.read(), 0, -1), values)
-        assert np.isnan(file.nodata)
 
 
 def test_the_catalogue_is_valid_and_leads_to_every_file(exports: list[Exported]) -> None:
@@ -211,22 +205,7 @@ def test_the_catalogue_is_valid_and_leads_to_every_file(exports: list[Exported])
             assert (target / "zarr.json").is_file() if "zarr" in asset.media_type else target.is_file()
             assert asset.roles
         assert any(one.title.startswith("Raw sweep ") for one in item.assets.values() if "raw" in one.roles)
-    assert {"class_map", "mosaic_zarr", "detail_zarr", "receipt", "mosaic_envi_header"} <= set(items[0].assets)
-
-
-def test_sweeps_whose_raw_lines_went_are_not_called_raw(surveyed_png: Any, tmp_path: Path) -> None:
-    """Their condensed stores are named as such, and their files hold numbers that these give back."""
-    published = surveyed_png(tmp_path / "archive")
-    answer = run_export(tmp_path / "archive", None, tmp_path / "out", envi=True, console=QUIET)
-    done = Exported(published, tmp_path / "archive", tmp_path / "out", answer)
-    assets = done.item()["assets"]
-    assert not [key for key, asset in assets.items() if "raw" in asset["roles"]]
-    products = published.receipt["products"]  # lines of two passes are condensed together
-    sweeps = sorted((done.archive / products.get("signal_fine", products["signal_coarse"])).glob("*.zarr"))
-    assert sweeps
-    for path in sweeps:
-        assert assets[f"{path.stem}_zarr"]["title"] == f"Signal of sweep {path.stem}"
-        np.testing.assert_array_equal(open_envi_cube(done.file(f"{path.stem}_envi")).values, open_lines(path).read())
+    assert {"class_map", "mosaic_zarr", "detail_zarr", "receipt"} <= set(items[0].assets)
 
 
 def test_items_say_when_where_and_how(plain: Exported, posed: Exported) -> None:
@@ -282,6 +261,15 @@ def test_runs_and_places_that_are_none_are_refused(posed: Exported, tmp_path: Pa
     assert all(finding.problem is None for finding in verify_archive(Archive.open(posed.archive)))
 
 
+def test_a_store_that_is_gone_is_named(posed: Exported, tmp_path: Path) -> None:
+    """Which product it is and what to do; what was written before it stays, and no catalogue names it."""
+    archive, out = Path(shutil.copytree(posed.archive, tmp_path / "field-a")), tmp_path / "out"
+    shutil.rmtree((archive / posed.published.receipt["products"]["mosaic"]).parent)
+    with pytest.raises(IncompleteStoreError, match=r"the mosaic of run .* does not; run its survey again"):
+        run_export(archive, posed.id, out, envi=False, console=QUIET)
+    assert not (out / "collection.json").exists()
+
+
 def test_leftovers_of_a_killed_export_go(posed: Exported, tmp_path: Path) -> None:
     """With the next export of the run, by whichever of its names."""
     for run in (f"runs/{posed.id}", f"{posed.id}/", "latest"):
@@ -316,12 +304,3 @@ def test_what_cannot_be_believed_is_named_and_gives_no_image(
     with pytest.raises(IncompleteStoreError, match=words):
         run_export(archive, posed.id, tmp_path / "out", envi=False, console=QUIET)
     assert not list((tmp_path / "out").rglob("*.tif"))
-
-
-def test_a_store_that_is_gone_is_named(posed: Exported, tmp_path: Path) -> None:
-    """Which product it is and what to do; what was written before it stays, and no catalogue names it."""
-    archive, out = Path(shutil.copytree(posed.archive, tmp_path / "field-a")), tmp_path / "out"
-    shutil.rmtree((archive / posed.published.receipt["products"]["mosaic"]).parent)
-    with pytest.raises(IncompleteStoreError, match=r"the mosaic of run .* does not; run its survey again"):
-        run_export(archive, posed.id, out, envi=False, console=QUIET)
-    assert not (out / "collection.json").exists()

@@ -31,7 +31,7 @@ QUIET = Console(quiet=True)
 SHAPE, PATCH = (96, 128), 8
 MEMORY = ("age", "changed", "changed_from")
 VISITS = ("2026-06-01T10:00:00Z", "2026-06-04T10:00:00Z")
-PLACES = ("plain", "georeferenced", "posed")
+PLACES = ("georeferenced", "posed")
 
 
 @dataclass(frozen=True)
@@ -142,15 +142,6 @@ def test_images_lie_where_the_class_map_lies(visited: Visited) -> None:
     there = rasterio.Affine(*(number * (size if place % 3 < 2 else 1) for place, number in enumerate(transform[:6])))
     assert grids["changed"][0] == crs
     assert grids["changed"][1].almost_equals(there)
-
-
-def test_what_was_not_looked_at_grows_older(visited: Visited) -> None:
-    """Three days where no line looked, none in the patches where lines did; the rest of the memory is kept."""
-    age, seen = visited.store("class_probabilities")["age"].values, visited.store("mosaic")["coverage"].values > 0
-    assert 0 < seen.mean() < 1
-    assert set(np.unique(age)) == {0.0, 3.0}
-    assert (age[~seen] == 3).all()
-    assert (age[seen] == 0).mean() > 0.9  # a patch that is seen in part keeps its memory
 
 
 def test_receipt_and_page_have_the_hectares(visited: Visited) -> None:

@@ -13,7 +13,6 @@ import pytest
 from rich.console import Console
 
 from flows.archive.reprocess_command import run_reprocess
-from flows.publish import run_folder as publish
 from flows.publish.receipt import check_receipt, is_pending
 from flows.tasks.open_survey import STAGES
 from flows.tasks.stages import accuracy as evaluation
@@ -129,32 +128,6 @@ def test_the_run_is_published_before_its_map_is_judged(
     assert receipts(out) == [published.receipt]
 
 
-def test_where_accuracy_is_stored_the_run_is_published_once(
-    survey: Callable[..., Any], out: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Nothing takes time then: it is drawn once, and the manifest tells of nothing that it was before."""
-    survey()
-    draw, drawn = publish.draw_quicklook, list[Path]()
-    monkeypatch.setattr(publish, "draw_quicklook", lambda path, data: (drawn.append(path), draw(path, data)))
-    folder = survey().folder
-    assert len(drawn) == 1
-    assert "extended" not in json.loads((folder / "manifest.json").read_text())
-    first, second = receipts(out)
-    assert comparable(first) == comparable(second)
-
-
-def test_a_stopped_run_is_judged_by_its_own_words(
-    survey: Callable[..., Any], out: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A survey of other words leaves it and publishes one of its own."""
-    break_off(survey, monkeypatch, name="north")
-    survey(name="south")
-    assert {one["survey"]: is_pending(one) for one in receipts(out)} == {"north": True, "south": False}
-    survey(name="north")
-    assert {one["survey"]: is_pending(one) for one in receipts(out)} == {"north": False, "south": False}
-    assert len(receipts(out)) == 2
-
-
 def test_reprocess_adds_what_a_stopped_survey_lacks(
     survey: Callable[..., Any], out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -181,21 +154,6 @@ def test_a_run_that_is_being_judged_is_left_alone(
         assert ended.errors == [f"runs/{run.name} is being judged by another process; it adds the accuracy"]
         survey()
     assert [is_pending(one) for one in receipts(out)] == [True, False]
-
-
-def test_ls_and_the_receipt_say_that_a_map_is_not_judged_yet(
-    survey: Callable[..., Any], out: Path, monkeypatch: pytest.MonkeyPatch, command_line: CommandLine
-) -> None:
-    """Of one that was stopped; of one that was not to be judged they say nothing of a time to come."""
-    break_off(survey, monkeypatch, name="north")
-    survey(name="south", accuracy=False)
-    north, south = (line for line in command_line("ls", out).out.splitlines() if "scene.png" in line)
-    assert "not yet" in north
-    assert "not yet" not in south
-    listed = json.loads(command_line("ls", out, "--json").out)["runs"]
-    assert [(row["accuracy_is"], row["miou"]) for row in listed] == [("pending", None), ("left out", None)]
-    pages = [(run / "report.html").read_text() for run in Archive.open(out).runs()]
-    assert ["The map is not judged yet" in page for page in pages] == [True, False]
 
 
 def test_what_was_left_out_is_added_later(
@@ -244,7 +202,7 @@ def _mosaic_gone(scene: Path, out: Path, patch: pytest.MonkeyPatch) -> None:
 REFUSED: dict[str, tuple[Refuse, str]] = {
     "another scene": (
         lambda scene, *_: turned(scene / "scene.png", scene / "scene.png"),
-        "is another than runs/.* looked at; put that one back",
+        "is not the one that runs/.* captured; restore it",
     ),
     "no scene": (lambda scene, *_: (scene / "scene.png").unlink(), "there is no file .*scene.png"),
     "a damaged receipt": (
@@ -256,10 +214,7 @@ REFUSED: dict[str, tuple[Refuse, str]] = {
         lambda scene, out, patch: be_version(patch, "segment", 99),
         r"version \d+ of the stage segment, which is now 99: `spectralzoom reprocess .*` makes a new run",
     ),
-    "other weights": (
-        _other_weights,
-        "w.safetensors are others than the map of runs/.* was drawn with; put those back",
-    ),
+    "other weights": (_other_weights, "w.safetensors are not those of the map of runs/.*; restore those"),
 }
 
 

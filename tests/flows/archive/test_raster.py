@@ -15,24 +15,20 @@ import rasterio
 import xarray
 from affine import Affine
 from numpy.typing import NDArray
-from PIL import Image
 from rich.console import Console
 
-import models.reading.prior_map as prior_map
 from flows.archive.export_command import run_export
 from flows.archive.plan_command import plan_content, show_plan
 from flows.archive.product_choice import ProductFlags, choose_products
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
-from flows.tasks.run import open_run
-from flows.tasks.stages.accuracy import columns_of_all_patches, columns_of_raster
 from flows.terminal.figures import format_area, format_count
 from pipeline.errors import PipelineError, SceneError, SettingsError
 from storage.archive.archive import Archive
 from storage.arrays.mosaics import open_mosaic
 from storage.readers.raster_fields import open_raster
 from storage.remote.opening import verify_archive
-from tests.conftest import RGB_NM, Survey, WeightsMaker, patchy_scene
+from tests.conftest import RGB_NM, patchy_scene
 
 QUIET = Console(quiet=True)
 CORNER = Affine(0.5, 0, 500_000, 0, -0.5, 5_400_000)
@@ -85,17 +81,7 @@ def means_of(values: NDArray[Any], factor: int = 4) -> NDArray[np.float64]:
     return np.array(rows).reshape(-(-height // factor), -(-width // factor), values.shape[2])
 
 
-@pytest.mark.parametrize(
-    ("shape", "kind"),
-    [
-        ((33, 47), np.uint8),
-        ((33, 47), np.float32),
-        ((64, 96), np.uint16),
-        ((1, 40), np.uint8),
-        ((40, 1), np.float32),
-        ((5, 3), np.uint16),
-    ],
-)
+@pytest.mark.parametrize(("shape", "kind"), [((33, 47), np.float32), ((1, 40), np.uint8), ((5, 3), np.uint16)])
 def test_what_is_stored_is_what_the_file_says(
     surveyed: Raster, tmp_path: Path, kind: type[np.generic], shape: tuple[int, int]
 ) -> None:
@@ -106,15 +92,6 @@ def test_what_is_stored_is_what_the_file_says(
     image, mosaic = whole(published, tmp_path / "archive")
     np.testing.assert_allclose(image, values, atol=rounding(values))
     np.testing.assert_allclose(mosaic, means_of(values), atol=rounding(values) + 1e-4)
-
-
-def test_a_raster_of_one_band(surveyed: Raster, make_weights: WeightsMaker, tmp_path: Path) -> None:
-    """Weights for that band read it, and its pixels come back."""
-    values = patchy_scene((40, 56), 1, seed=2)[0]
-    np.save(tmp_path / "one.npy", values[..., 0])
-    one = make_weights((540.0, 550.0, 560.0))
-    published = surveyed(tmp_path / "one.npy", wavelengths="550", weights=str(one))
-    np.testing.assert_allclose(whole(published, tmp_path / "archive")[0], values, atol=rounding(values))
 
 
 def test_what_has_no_value_stays_without_one(surveyed: Raster, tmp_path: Path) -> None:
@@ -135,25 +112,6 @@ def test_what_has_no_value_stays_without_one(surveyed: Raster, tmp_path: Path) -
     classes = xarray.open_zarr(tmp_path / "archive" / published.receipt["products"]["class_map"], consolidated=False)
     assert (np.asarray(classes["classes"])[8:20, 8:30] == 255).all()
     assert np.asarray(classes["classes"])[30, 40] != 255
-
-
-def test_a_simulated_scan_shows_the_same_but_for_its_noise(
-    survey_png: Survey, weights: Path, scene_files: Path
-) -> None:
-    """A raster's numbers are in the scale that a simulated scan is calibrated to."""
-    pixels = open_run(
-        load_settings(None, {"scene": str(scene_files / "scene.png"), "weights": str(weights), "out": "none"}),
-        planning=True,
-    )
-    given = {"scene": str(scene_files / "scene.png"), "source": "sim", "weights": str(weights), "out": "none"}
-    scanned = open_run(load_settings(None, given | {"scan_step": 1, "effects": "none"}))
-    assert pixels.raster is not None
-    own = columns_of_raster(pixels.raster, pixels.weights, pixels.scene.wavelength_nm, memory=2**30)
-    seen = columns_of_all_patches(
-        scanned.simulated, scanned.plan.coarse, scanned.grid, scanned.weights, memory=2**30, resampling="nearest"
-    )
-    valid = pixels.grid.valid_patches()
-    assert np.abs(own[valid] - seen[valid]).mean() < 0.02 * own[valid].std()
 
 
 def test_a_receipt_of_a_raster_tells_of_no_camera(surveyed: Raster, scene_files: Path, tmp_path: Path) -> None:
@@ -195,14 +153,6 @@ def test_areas_are_told_without_a_place(surveyed: Raster, tmp_path: Path, pixel_
     assert published.receipt["areas"]["ha"] == pytest.approx(hectares)
     assert f"<td>{format_area(hectares[most])}</td>" in table
     assert float(rows[most]["hectares"]) == pytest.approx(hectares[most], rel=1e-5)
-
-
-def test_what_is_read_whole_scores_as_all_of_it(surveyed: Raster, scene_files: Path) -> None:
-    """Its accuracy is that of detail everywhere, beside none and other placements, all from the raster itself."""
-    accuracy = surveyed(scene_files / "scene.png", labels=str(scene_files / "labels.png")).receipt["accuracy"]
-    assert accuracy["miou"] == pytest.approx(accuracy["all"]["miou"])
-    assert accuracy["none"]["miou"] != accuracy["miou"]
-    assert {"gain", "random"} <= set(accuracy["controls"])
 
 
 def test_the_plan_says_what_the_survey_does(surveyed: Raster, scene_files: Path, weights: Path, tmp_path: Path) -> None:
@@ -273,19 +223,6 @@ def test_a_setting_of_a_camera_is_refused(scene_files: Path, name: str, value: o
         load_settings(None, {"scene": str(scene_files / "scene.png"), name: value})
 
 
-def test_what_a_file_says_of_a_camera_by_default_asks_for_nothing(tmp_path: Path) -> None:
-    """Settings written out with their defaults, as in the example, are those of a raster too."""
-    text = (Path(__file__).parents[3] / "survey.example.toml").read_text(encoding="utf-8")
-    (tmp_path / "mine.toml").write_text(text.replace('scene = "farm"', 'scene = "field.tif"'), encoding="utf-8")
-    assert load_settings(tmp_path / "mine.toml").source == "raster"
-
-
-@pytest.mark.parametrize(("scene", "source"), [("farm", "sim"), ("field.png", "raster")])
-def test_where_pixels_come_from_follows_from_the_scene(scene: str, source: str) -> None:
-    """The settings hold what auto stands for."""
-    assert load_settings(None, {"scene": scene}).source == source
-
-
 def test_a_raster_larger_than_its_memory(surveyed: Raster, tmp_path: Path) -> None:
     """Its rows are read in blocks; where not one fits, one message says what to give."""
     values = np.zeros((64, 4096, 3), np.uint8)
@@ -352,7 +289,7 @@ def _other_crs(folder: Path, values: NDArray[Any]) -> None:
         (_other_crs, r"lie in EPSG:32632 and EPSG:32633: tiles of one field have one CRS"),
         (lambda at, v: write_tif(at / "b.tif", v, CORNER * Affine.scale(2)), r"have pixels of 0.5 x 0.5 and 1 x 1"),
         (lambda at, v: write_tif(at / "b.tif", v, CORNER * Affine.translation(8.4, 0)), r"lie 0.40 and 0.00 px"),
-        (lambda at, v: write_tif(at / "b.tif", v, None), r"has no place on the earth: survey them one by one"),
+        (lambda at, v: write_tif(at / "b.tif", v, None), r"b.tif has none: survey them one by one"),
     ],
 )
 def test_tiles_that_are_no_field_are_refused(
@@ -374,45 +311,3 @@ def test_tiles_of_other_bands_are_refused(tmp_path: Path) -> None:
     write_tif(tmp_path / "b.tif", values[..., :1])
     with pytest.raises(SceneError, match=r"a.tif and .*b.tif have other bands, 3 from 640.0 nm on and 1 from 550.0 nm"):
         open_raster(tmp_path)
-
-
-def test_a_glob_without_a_file_is_refused(surveyed: Raster, tmp_path: Path) -> None:
-    """One message says so."""
-    with pytest.raises(SceneError, match=r"names no image; check the pattern"):
-        surveyed(tmp_path / "no" / "*.tif")
-
-
-def test_prefect_runs_the_stages_of_a_raster(
-    scene_files: Path, weights: Path, tmp_path: Path, prefect_home: Path
-) -> None:
-    """The same receipt comes of the Prefect engine."""
-    given = {"scene": str(scene_files / "scene.png"), "weights": str(weights), "out": str(tmp_path / "archive")}
-    published = run_survey(load_settings(None, given), QUIET)
-    assert [row["state"] for row in published.receipt["stages"]] == ["ran"] * 3
-
-
-def test_an_image_and_its_wavelengths(surveyed: Raster, tmp_path: Path) -> None:
-    """A picture of 8 bits comes back bit by bit: its numbers need no rounding."""
-    values = patchy_scene((24, 24), 3, seed=9)[0].astype(np.uint8)
-    Image.fromarray(values).save(tmp_path / "picture.png")
-    image = whole(surveyed(tmp_path / "picture.png"), tmp_path / "archive")[0]
-    np.testing.assert_array_equal(image, values)
-    assert len(RGB_NM) == image.shape[2]
-
-
-def test_two_dates_of_the_same_ground_tell_no_change(
-    tmp_path: Path, surveyed: Raster, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """One field with the noise of two days: its maps differ at hundreds of pixels, as their confidences say."""
-    for name in ("CERTAIN", "SURE"):  # untrained weights are sure of nothing: what they say is taken for sure
-        monkeypatch.setattr(prior_map, name, 1e-6)
-    values = patchy_scene((96, 128), 3, seed=4)[0]
-    for seed, date in ((1, "2026-06-01T10:00:00Z"), (2, "2026-06-11T10:00:00Z")):
-        noise = np.random.default_rng(seed).normal(0, 25, values.shape)
-        scene = write_tif(tmp_path / "a.tif", np.clip(values + noise, 0, 255).astype(np.uint8))
-        published = surveyed(scene, name="north", visit=date, prior="latest")
-    memory, page = published.receipt["memory"], (published.folder / "report.html").read_text(encoding="utf-8")
-    assert 300 < memory["differing_px"] < 1.3 * memory["expected_differing_px"]
-    assert (memory["changed_px"], memory["changes"], published.receipt["ground"]["changes_ha"]) == (0, [], [])
-    assert "two maps of the same ground would differ at about" in page
-    assert "px changed" not in page

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import json
 import shutil
 from pathlib import Path
@@ -116,21 +115,6 @@ def test_new_weights_make_a_generation_beside_the_old(archive: Path, other: Path
     assert run_verify(archive, QUIET) == DONE
 
 
-def test_an_interrupted_run_goes_on(archive: Path, other: Path, reprocess: Reprocess) -> None:
-    """What was done is in the archive, and is not done again."""
-    done: list[Path] = []
-
-    def interrupted(settings: Settings, console: Console) -> Path:
-        if done:
-            raise KeyboardInterrupt
-        done.append(_survey(settings, console))
-        return done[0]
-
-    with pytest.raises(KeyboardInterrupt):
-        run_reprocess(archive, QUIET, weights=other, survey=interrupted)
-    assert reprocess.states(archive, weights=other) == [("scene", "ran"), ("turned", "skipped")]
-
-
 def test_a_newer_stage_is_run_for_those_that_rest_on_an_older(
     archive: Path, reprocess: Reprocess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -177,24 +161,13 @@ def test_a_run_without_settings_is_told(archive: Path, reprocess: Reprocess) -> 
     assert any("cannot be read" in str(row["message"]) for row in rows)
 
 
-def test_a_dry_run_leaves_everything(surveyed: Path, other: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """It says what would run, for people on stdout and its progress on the console."""
-    before = sorted(path for path in surveyed.rglob("*") if ".locks" not in path.parts)
-    told = io.StringIO()
-    assert run_reprocess(surveyed, Console(file=told), weights=other, dry_run=True) == DONE
-    out = capsys.readouterr().out
-    assert "2 fields: 2 would run" in out
-    assert "reprocess 1 of 2: turned" in told.getvalue()
-    assert sorted(path for path in surveyed.rglob("*") if ".locks" not in path.parts) == before
-
-
 def test_a_run_is_current_only_where_all_of_it_is_there(archive: Path) -> None:
     """With its own folder and without a stage that failed; what it asked for stands in its manifest too."""
     run = Catalogue.read(archive).runs[-1]
     settings = generations.asked_again(run, archive, None)
     assert generations.is_current(Catalogue.read(archive), run, settings)
     failed = {**run.receipt, "stages": [*run.stages[:-1], {**run.stages[-1], "state": "failed"}]}
-    assert not generations.is_whole(Catalogue.read(archive), dataclasses.replace(run, receipt=failed))
+    assert not generations.is_current(Catalogue.read(archive), dataclasses.replace(run, receipt=failed), settings)
     flip(run.folder / "receipt.json")
     damaged = Catalogue.read(archive).runs[-1]
     assert generations.asked_again(damaged, archive, None) == settings
@@ -204,7 +177,7 @@ def test_a_run_is_current_only_where_all_of_it_is_there(archive: Path) -> None:
 def test_fields_are_told_apart_by_what_they_asked_for_and_are_called(surveyed: Path, tmp_path: Path) -> None:
     """Runs that do not tell are fields of their own; only the star stands for other letters."""
     (one, _) = generations.newest_runs(Catalogue.read(surveyed))
-    odd = dataclasses.replace(one, field="field[1]?.png")
+    odd = dataclasses.replace(one, receipt={**one.receipt, "survey": "field[1]?.png"})
     for pattern in ("field[1]?.png", "*[1]*", "*"):
         assert generations.is_called(odd, pattern)
     for pattern in ("field1?.png", "fiel?[1]?.png", "Field*"):
@@ -213,17 +186,4 @@ def test_fields_are_told_apart_by_what_they_asked_for_and_are_called(surveyed: P
     for asked in ({}, {}, {"seed": 1}, {"seed": 2}, {"seed": 1, "budget": 0.4}):
         archive.new_run("farm").publish(survey="farm", settings=asked)
     runs = Catalogue.read(tmp_path).runs
-    assert [one.run for one in generations.newest_runs(Catalogue.read(tmp_path))] == [runs[n] for n in (0, 1, 3, 4)]
-
-
-def test_fields_of_one_file_name_are_told_apart(
-    tmp_path: Path, survey_png: Survey, scene_files: Path, monkeypatch: pytest.MonkeyPatch, reprocess: Reprocess
-) -> None:
-    """Two folders with a scene.png each: relative paths alone would take them for one field."""
-    (tmp_path / "b").mkdir()
-    turned(scene_files / "scene.png", tmp_path / "b" / "scene.png")
-    for folder in (scene_files, tmp_path / "b"):
-        monkeypatch.chdir(folder)
-        survey_png(tmp_path / "archive", scene="scene.png", labels=None)
-    monkeypatch.chdir(tmp_path)
-    assert reprocess.states(tmp_path / "archive") == [("scene", "skipped")] * 2
+    assert generations.newest_runs(Catalogue.read(tmp_path)) == [runs[n] for n in (0, 1, 3, 4)]

@@ -16,18 +16,7 @@ from isoxml.models.ddi_entities import DDEntity
 from isoxml.util.isoxml_io import isoxml_from_path
 
 from pipeline.errors import SettingsError
-from storage.export.map_files import (
-    REDS,
-    UNITS,
-    TaskGrid,
-    TaskText,
-    ramp_colour,
-    write_class_style,
-    write_colour_style,
-    write_polygon_style,
-    write_ramp_style,
-    write_task_data,
-)
+from storage.export.map_files import REDS, UNITS, TaskGrid, TaskText, ramp_colour, write_polygon_style, write_task_data
 
 DOSES = np.array([[0.0, 2.5, np.nan], [200.0, 0.0, 0.01]])
 GRID = TaskGrid(51.960197927, -7.600100835, 2.7e-05, 4.4e-05, DOSES, UNITS["l/ha"])
@@ -100,32 +89,6 @@ def test_a_dose_beyond_the_format_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="doses up to 214748 l/ha, got 300000"):
         write_task_data(tmp_path, replace(GRID, doses=np.array([[3e5]])), WORDS)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_classes_have_names_and_colours(tmp_path: Path) -> None:
-    """A palette's entries by number; letters that XML keeps for itself come back."""
-    write_class_style(tmp_path / "a.qml", ENTRIES)
-    root = ElementTree.parse(tmp_path / "a.qml").getroot()
-    assert root.tag == "qgis"
-    found = [dict(entry.attrib) for entry in root.iterfind("pipe/rasterrenderer[@type='paletted']/colorPalette/*")]
-    assert [(one["value"], one["label"], one["color"]) for one in found] == [
-        ("0", "soil & stones", "#9e7752"),
-        ("7", 'weed "wild"', "#dc1e1e"),
-    ]
-
-
-def test_ramps_go_from_low_to_high(tmp_path: Path) -> None:
-    """Values evenly apart, the outer ones those given; three bands by their numbers with one range."""
-    write_ramp_style(tmp_path / "a.qml", -0.5, 1.5, REDS)
-    items = list(ElementTree.parse(tmp_path / "a.qml").iterfind(".//colorrampshader/item"))
-    assert [(float(item.attrib["value"]), item.attrib["color"]) for item in items][::2] == [
-        (-0.5, "#ffebcd"),
-        (1.5, "#960014"),
-    ]
-    write_colour_style(tmp_path / "a.qml", (7, 4, 1), 0.1, 0.6)
-    (renderer,) = ElementTree.parse(tmp_path / "a.qml").iterfind("pipe/rasterrenderer")
-    assert [renderer.attrib[f"{name}Band"] for name in ("red", "green", "blue")] == ["7", "4", "1"]
-    assert {one.text for one in renderer.iterfind("*/maxValue")} == {"0.6"}
 
 
 def test_polygons_have_a_symbol_each(tmp_path: Path) -> None:

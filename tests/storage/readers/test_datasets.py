@@ -38,16 +38,6 @@ def test_scenes_are_named_by_number(tmp_path: Path) -> None:
     assert scene.values[0, 0, 0] == 10
 
 
-def test_labels_beside_their_scenes_are_no_scenes(tmp_path: Path) -> None:
-    """In a folder without images/ the files that the label template names are left out."""
-    (tmp_path / "scene.toml").write_text('labels = "{number}_labels.png"\n[classes]\nsoil = [0, 0, 0]\n')
-    for name in ("001.png", "002.png", "001_labels.png", "002_labels.png"):
-        Image.new("RGB", (6, 5)).save(tmp_path / name)
-    data = load_data_set(tmp_path)
-    assert data.names == ("001", "002")
-    assert (data.load("002").labels == 0).all()
-
-
 def test_unknown_scenes_to_hold_out_are_listed(tmp_path: Path) -> None:
     """What there is stands in the message; nor can all be held out."""
     _folder(tmp_path)
@@ -106,10 +96,3 @@ def test_indian_pines_disjoint_mask(real_data: Path) -> None:
     train, test = data.load(name, "train"), data.load(name, "test")
     assert np.count_nonzero(np.asarray(train.labels) != 255) == 5528
     assert np.count_nonzero(np.asarray(test.labels) != 255) == 10249 - 5528
-
-
-def test_field_frames_by_number(real_data: Path) -> None:
-    """The frames of the field set are named by their number."""
-    data = load_data_set(real_data / "cwfid", hold_out=["059"])
-    assert len(data.names) == 39
-    assert data.held_out == ("059",)

@@ -31,17 +31,6 @@ def write_envi(path: Path, values: NDArray[Any], interleave: str = "bil", *, off
     return path
 
 
-def test_lazy_and_read_only(tmp_path: Path) -> None:
-    """The view is the file itself: a change in the file shows, a change of the view is refused."""
-    path = write_envi(tmp_path / "a.raw", np.zeros((4, 3, 2), "u2"))
-    values = open_envi_cube(path.with_suffix(".hdr")).values
-    with path.open("r+b") as file:
-        file.write(b"\x07\x00")
-    assert values[0, 0, 0] == 7
-    with pytest.raises(ValueError, match="read-only"):
-        values[0, 0, 0] = 1
-
-
 @pytest.mark.parametrize("interleave", sorted(AXES))
 def test_cut_off_at_every_byte(tmp_path: Path, interleave: str) -> None:
     """Wherever a cube ends, in its offset, in a line or at one: lines that are whole in all bands are kept."""
@@ -76,15 +65,6 @@ def test_lines_not_said(tmp_path: Path, interleave: str) -> None:
     assert "the file holds 5" in cube.notes[0]
 
 
-def test_more_bytes_than_said(tmp_path: Path) -> None:
-    """Bytes after the last line are left alone and noted."""
-    path = write_envi(tmp_path / "a.dat", np.ones((2, 2, 2), "u1"))
-    path.write_bytes(path.read_bytes() + b"tail")
-    cube = open_envi_cube(path)
-    assert cube.values.shape == (2, 2, 2)
-    assert cube.notes == ("a.dat holds 4 bytes more than its header says",)
-
-
 def test_names_of_the_pair(tmp_path: Path) -> None:
     """Header and data find each other by either name; a missing one is named."""
     path = write_envi(tmp_path / "scene.bip", np.ones((2, 2, 2), "u1"), "bip")
@@ -104,24 +84,6 @@ def _touched(path: Path) -> Path:
     return path
 
 
-def test_spectral_library_is_no_cube(tmp_path: Path) -> None:
-    """A library of spectra has neither lines nor bands."""
-    path = write_envi(tmp_path / "a.dat", np.ones((2, 2, 1), "f4"), "bsq")
-    header = path.with_suffix(".hdr")
-    header.write_text(header.read_text() + "file type = ENVI Spectral Library\n")
-    with pytest.raises(SceneError, match="spectral library, expected a cube"):
-        open_envi_cube(path)
-
-
-def test_raw_frames_of_a_spaceborne_imager(real_data: Path) -> None:
-    """Three raw lines of 1280 samples and 328 bands open by their data file, which has no ending."""
-    cube = open_envi_cube(real_data / "emit_raw" / "emit20220305t002444_subset_raw")
-    assert cube.values.shape == (3, 1280, 328)
-    assert cube.values.dtype == np.dtype("<i2")
-    flat = np.fromfile(cube.path, "<i2").reshape(3, 328, 1280)
-    np.testing.assert_array_equal(cube.values[1], flat[1].T)
-
-
 PLAIN = "ENVI\nsamples = 4\nlines = 3\nbands = 2\ndata type = 12\ninterleave = bil\nbyte order = 0\n"
 
 REFUSED = {
@@ -130,15 +92,6 @@ REFUSED = {
     "plantcv__darkReference4.hdr": "interleave = 'bup', expected one of bil, bip, bsq",
     "emit_l1b__EMIT_Linearity_20210111.hdr": "bands = '0', expected a whole number from 1",
 }
-
-
-def test_plain_header() -> None:
-    """What a header says is what comes back, and what it does not say is None."""
-    header = parse_envi_header(PLAIN)
-    assert (header.lines, header.samples, header.bands, header.offset) == (3, 4, 2, 0)
-    assert (header.dtype, header.interleave, header.kind) == (np.dtype("<u2"), "bil", "ENVI Standard")
-    assert header.wavelength_nm is header.fwhm_nm is header.nodata is None
-    assert header.notes == ()
 
 
 def test_braces() -> None:
@@ -197,20 +150,6 @@ def test_wavelengths(unit: str, listed: str, found: list[float] | None) -> None:
     else:
         np.testing.assert_allclose(header.wavelength_nm, found)
         assert bool(header.notes) == (unit in ("", "Unknown"))
-
-
-def test_missing_fields() -> None:
-    """Lines, byte order and offset may be missing; sizes, data type and interleave may not, and are named."""
-    header = parse_envi_header("ENVI\nsamples = 4\nbands = 2\ndata type = 12\ninterleave = bil\n")
-    assert (header.lines, header.offset, header.dtype) == (None, 0, np.dtype("<u2"))
-    assert header.notes == ("the byte order is not said, taken as little endian",)
-    for key in ("samples", "bands", "data type"):
-        text = "\n".join(line for line in PLAIN.splitlines() if not line.startswith(key))
-        with pytest.raises(SceneError, match=f"does not say {key}"):
-            parse_envi_header(text)
-    with pytest.raises(SceneError, match="no interleave, expected one of bil, bip, bsq"):
-        parse_envi_header(PLAIN.replace("interleave = bil\n", ""))
-    assert parse_envi_header(PLAIN.replace("interleave = bil\n", "").replace("bands = 2", "bands = 1")).notes
 
 
 @pytest.mark.parametrize(
@@ -305,14 +244,6 @@ def test_lines_beyond_the_file_are_not_made_up(tmp_path: Path) -> None:
     source = open_cube(tmp_path / "a.hdr")
     assert (source.shape[0], source.lost_lines) == (3, 0)
     assert any("999999999997 lines that a.bin lacks are not filled up" in note for note in source.notes)
-
-
-def test_one_band_with_any_number_of_lines(tmp_path: Path) -> None:
-    """With one band the distance between bands counts for nothing, however many lines are promised."""
-    text = PLAIN.replace("bil", "bsq").replace("bands = 2", "bands = 1").replace("lines = 3", f"lines = {10**26}")
-    (tmp_path / "a.hdr").write_text(text)
-    (tmp_path / "a.bin").write_bytes(bytes(48))
-    assert open_cube(tmp_path / "a.hdr").shape == (6, 4, 1)
 
 
 @pytest.mark.parametrize(

@@ -141,19 +141,6 @@ def test_prisma_reflectance(tmp_path: Path) -> None:
     assert "a PRISMA product of level 2D; 2 bands without a wavelength are left out" in scene.provenance
 
 
-def test_one_spectrometer_of_prisma(tmp_path: Path) -> None:
-    """Its axes are y, band and x: it is refused by its own name, and part of the whole."""
-    prisma_file(tmp_path / "PRS_L2D.he5")
-    with pytest.raises(SceneError, match="has VNIR_Cube as a part of one cube, which is not read"):
-        load_scene_file(f"{tmp_path / 'PRS_L2D.he5'}:VNIR_Cube")
-
-
-def test_prisma_in_sensor_geometry(tmp_path: Path) -> None:
-    """Level 2C has no map grid, and says so."""
-    prisma_file(tmp_path / "PRS_L2C.he5", "C")
-    assert load_scene_file(tmp_path / "PRS_L2C.he5").geobox is None
-
-
 def cf_dataset(dims: tuple[str, ...] = ("y", "x", "wl"), unit: str = "nm", scale: float = 1.0) -> xr.Dataset:
     """Return a cube with wavelengths and a place, as rioxarray writes it."""
     order = [("y", "x", "wl").index(dim) for dim in dims]
@@ -164,9 +151,14 @@ def cf_dataset(dims: tuple[str, ...] = ("y", "x", "wl"), unit: str = "nm", scale
     return data.rio.write_crs(32632).rio.write_coordinate_system()
 
 
-@pytest.mark.parametrize("engine", ["h5netcdf", "scipy"])
-@pytest.mark.parametrize("dims", [("y", "x", "wl"), ("wl", "y", "x"), ("y", "wl", "x")])
-@pytest.mark.parametrize(("unit", "scale"), [("nm", 1.0), ("micrometer", 1e-3), ("m", 1e-9)])
+@pytest.mark.parametrize(
+    ("engine", "dims", "unit", "scale"),
+    [
+        ("h5netcdf", ("y", "x", "wl"), "nm", 1.0),
+        ("h5netcdf", ("wl", "y", "x"), "micrometer", 1e-3),
+        ("scipy", ("y", "wl", "x"), "m", 1e-9),
+    ],
+)
 def test_cf_files(tmp_path: Path, engine: Any, dims: tuple[str, ...], unit: str, scale: float) -> None:
     """Any order of axes, unit of wavelengths and version of NetCDF give one scene: packed values, place and units."""
     path = tmp_path / "cube.nc"
@@ -182,17 +174,6 @@ def test_cf_files(tmp_path: Path, engine: Any, dims: tuple[str, ...], unit: str,
     assert scene.geobox.crs.epsg == 32632
     assert scene.geobox.affine[:6] == (2.0, 0.0, CORNER[0], 0.0, -2.0, CORNER[1])
     assert "values are in W m-2 sr-1 um-1" in scene.provenance
-
-
-def test_gdal_sees_the_same_place(tmp_path: Path) -> None:
-    """GDAL's reader of NetCDF gives the CRS and the transform that the scene has."""
-    cf_dataset(("wl", "y", "x")).to_netcdf(tmp_path / "cube.nc", engine="h5netcdf")
-    scene = load_scene_file(tmp_path / "cube.nc")
-    with rasterio.open(f"netcdf:{tmp_path / 'cube.nc'}:radiance") as other:
-        assert scene.geobox is not None
-        assert other.transform.almost_equals(scene.geobox.affine)
-        assert other.crs.to_epsg() == 32632
-        np.testing.assert_array_equal(np.moveaxis(other.read(), 0, -1), scene.values)
 
 
 def test_plain_hdf5_without_names(tmp_path: Path) -> None:
@@ -283,7 +264,7 @@ def linked_outside(path: Path) -> None:
         (no_cube, "has no array of numbers with the axes y, x and band; it has none"),
         (lost_attribute, "lacks what files of its kind have: .*L2ScaleSwirMax"),
         (short_list, r"Vnir_Cube has the shape \(7, 4, 6\) and 3 wavelengths"),
-        (level_1, "is a PRISMA product of level 1, which is not read; give a product of level 2B, 2C or 2D"),
+        (level_1, "is no PRISMA product of level 2B, 2C or 2D"),
         (linked_outside, "has no array of numbers with the axes y, x and band; it has none"),
     ],
 )

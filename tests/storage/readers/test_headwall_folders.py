@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.rig.camera.camera_texts import times_of_lines
-from pipeline.signal.detector import find_bad_elements
 from storage.readers.envi_files import load_frame_index
 from storage.readers.open_cubes import open_cube
 
@@ -136,30 +134,6 @@ def test_folders_that_are_none(tmp_path: Path, lines: NDArray[np.uint16]) -> Non
         open_cube(tmp_path)
 
 
-def test_real_references(real_data: Path) -> None:
-    """The frames of a real MV.X are found by their names, dark as integers, white as floats; 197 elements are hot."""
-    dark = open_cube(real_data / "headwall_references" / "darkReference.bin")
-    white = open_cube(real_data / "headwall_references" / "whiteReference.hdr")
-    assert dark.shape == white.shape == (1, 1020, 301)
-    assert (dark.dtype, white.dtype) == (np.uint16, np.float32)
-    np.testing.assert_allclose(dark.lines.exposure_ms, [100.0033437])
-    level, light = dark.read(0, 1)[0].astype(float), white.read(0, 1)[0]
-    spread = 1.4826 * np.median(np.abs(level - np.median(level, axis=0)), axis=0)
-    bad = find_bad_elements(level, light)
-    assert np.count_nonzero(bad) == 197
-    np.testing.assert_array_equal(bad, level > np.median(level, axis=0) + 8 * np.maximum(1, spread))
-
-
-def test_times_of_a_part_that_is_cut_off(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
-    """Frames that the camera dropped do not shift the times of a file that lost its end afterwards."""
-    write_part(tmp_path, "raw_0", lines[:6], lines=8)
-    frames = [0, 1, 4, 5, 6, 7, 8, 9]
-    (tmp_path / "frameIndex_0.txt").write_text("f\tt\n" + "".join(f"{frame}\t{10 * frame}\n" for frame in frames))
-    source = open_cube(tmp_path)
-    assert source.lines.frame is not None
-    assert source.lines.frame.tolist() == [0, 1, 4, 5, 6, 7, -1, -1]
-
-
 def test_what_is_no_file_is_no_part(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
     """Folders and pipes with the names of parts and indices are passed over; none of them is waited for."""
     write_part(tmp_path, "raw_0", lines[:5])
@@ -176,38 +150,6 @@ def _index(folder: Path, text: str) -> Path:
     path = folder / "frameIndex_0.txt"
     path.write_bytes(text.encode())
     return path
-
-
-@pytest.mark.parametrize("between", ["\t", " ", "  ", ","])
-@pytest.mark.parametrize("end", ["\n", "\r\n"])
-def test_layouts(tmp_path: Path, between: str, end: str) -> None:
-    """A tab or spaces between number and time, Unix and Windows line ends, with and without a last one."""
-    lines = [between.join(words) for words in (("Frame#", "Timestamp"), ("0", "1500000"), ("1", "1510000"))]
-    for text in (end.join(lines), end.join(lines) + end, "\ufeff" + end.join(lines)):
-        index = load_frame_index(_index(tmp_path, text))
-        assert index.frame.tolist() == [0, 1]
-        assert index.stamp_us.tolist() == [1500000, 1510000]
-        assert index.notes == ()
-    assert load_frame_index(_index(tmp_path, "5 10\n6 20\n")).frame.tolist() == [5, 6]  # without a heading
-
-
-def test_what_is_no_frame_is_counted(tmp_path: Path) -> None:
-    """Torn lines, words and numbers beyond all measure are passed over; of a frame twice the first counts."""
-    text = "Frame\tTime\n0\t10\n1\t\n2\tx\n1\t30\n1\t40\n99999999999999999999\t5\n3\t20\n"
-    index = load_frame_index(_index(tmp_path, text))
-    assert (index.frame.tolist(), index.stamp_us.tolist()) == ([0, 1, 3], [10, 30, 20])
-    assert index.notes == (
-        "frameIndex_0.txt: 3 lines are no frames",
-        "frameIndex_0.txt: 1 frames are listed twice, the first counts",
-        "frameIndex_0.txt: time goes back 1 times",
-    )
-
-
-def test_exposure_column(tmp_path: Path) -> None:
-    """A column that the heading calls exposure is read; where it says nothing there is none."""
-    index = load_frame_index(_index(tmp_path, "Frame#\tTimestamp\tExposure (ms)\n0\t10\t4.5\n1\t20\n"))
-    assert index.exposure_ms is not None
-    np.testing.assert_array_equal(index.exposure_ms, [4.5, np.nan])
 
 
 @pytest.mark.parametrize("text", ["", "Frame#\tTimestamp\n", "\0\0\0"])
@@ -258,29 +200,3 @@ def test_times_of_lines(
     assert times.stamp_us.tolist() == [frames.get(frame, -1) for frame in found]
     if notes is not None:
         assert (times.frame.tolist(), times.notes) == (found, notes)
-
-
-@pytest.mark.parametrize(
-    ("heading", "ms"),
-    [
-        ("Frame Number\tTime Stamp\tExposure (ms)\tGain", 4.5),
-        ("Frame#, Time, Exposure (us), Gain", 0.0045),
-        ("frame  time  exposure [s]  gain", 4500),
-        ("frame time exposure gain", 4.5),
-    ],
-)
-def test_titles_of_several_words(tmp_path: Path, heading: str, ms: float) -> None:
-    """Spaces within a title do not shift the columns, and the title's unit counts."""
-    between = "\t" if "\t" in heading else "," if "," in heading else " "
-    index = load_frame_index(_index(tmp_path, f"{heading}\n" + between.join(("0", "10", "4.5", "7", "8")) + "\n"))
-    assert index.exposure_ms is not None
-    np.testing.assert_allclose(index.exposure_ms, [ms])
-
-
-def test_a_long_index_takes_little_memory(tmp_path: Path) -> None:
-    """Reading an index takes a few times the bytes of its file, not what lists of its words would."""
-    path = _index(tmp_path, "f\tt\n" + "".join(f"{n}\t{1600000000000000 + 40000 * n}\n" for n in range(50_000)))
-    tracemalloc.start()
-    assert len(load_frame_index(path).frame) == 50_000
-    assert tracemalloc.get_traced_memory()[1] < 4 * path.stat().st_size
-    tracemalloc.stop()

@@ -95,16 +95,6 @@ def test_north_up_beside_south_up(tmp_path: Path, turned: str) -> None:
     assert any("other or turned pixels" in note for note in scene.provenance)
 
 
-def test_coarse_labels_of_a_larger_area(tmp_path: Path) -> None:
-    """Labels of 5 m around the image give each pixel the class that its centre lies in."""
-    path = image(tmp_path)
-    coarse = np.pad(CLASSES[2::5, 2::5], 4, mode="edge")
-    write(tmp_path / "field_labels.tif", coarse, NORTH_UP * Affine.translation(-20, -20) * Affine.scale(5))
-    scene = load_scene_file(path)
-    assert agree(scene) == 1.0
-    assert (scene.labels != 255).all()
-
-
 def test_labels_of_one_grid_are_as_they_were(tmp_path: Path) -> None:
     """Labels on the image's own pixels are taken without a word, rounding of their place included."""
     path = image(tmp_path)
@@ -146,13 +136,6 @@ def test_labels_of_tiles_and_a_training_mask(tmp_path: Path) -> None:
     assert any("other or turned pixels" in note for note in field.provenance)
 
 
-def test_init_takes_labels_of_another_grid(tmp_path: Path) -> None:
-    """Labels of another size with a place are nothing that `init` could not see."""
-    image(tmp_path).rename(tmp_path / "a.tif")
-    write(tmp_path / "a_labels.tif", CLASSES[:, 7:], NORTH_UP * Affine.translation(7, 0))
-    assert draft_scene(tmp_path).unseen == ()
-
-
 @pytest.mark.parametrize("turned", [False, True])
 def test_no_data_of_a_label_file_is_no_class(tmp_path: Path, turned: bool) -> None:
     """The file's no-data value is unlabelled, on its own grid and on another; a note counts its pixels."""
@@ -175,13 +158,3 @@ def test_a_stated_class_is_no_missing_label(tmp_path: Path) -> None:
     names = "\n".join(f"class_{number} = {number}" for number in range(4))
     (tmp_path / "scene.toml").write_text(f"wavelengths_nm = [800]\n[classes]\n{names}\n")
     np.testing.assert_array_equal(load_scene_file(path).labels, CLASSES)
-
-
-def test_no_data_of_coloured_labels(tmp_path: Path) -> None:
-    """Colours whose every channel is the no-data value are unlabelled; others that share a channel are not."""
-    path = image(tmp_path)
-    colours = np.array([(0, 0, 0), (0, 200, 0), (200, 0, 0), (9, 9, 9)], np.uint8)[CLASSES]
-    write(tmp_path / "field_labels.tif", colours, NORTH_UP, nodata=0)
-    scene = load_scene_file(path)
-    assert scene.class_names == ("colour_00c800", "colour_090909", "colour_c80000")
-    np.testing.assert_array_equal(scene.labels == 255, CLASSES == 0)

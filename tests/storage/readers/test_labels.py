@@ -11,7 +11,6 @@ from PIL import Image
 
 from pipeline.errors import SceneError
 from storage.readers.labels import class_colours, default_colour, load_labels
-from storage.readers.scene_files import load_scene_file
 
 COLOURS = {"soil": (0, 0, 0), "crop": (0, 255, 0), "weed": (255, 0, 0)}
 
@@ -24,33 +23,6 @@ def test_colours_become_indices(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.index, index)
     assert found.names == ("soil", "crop", "weed")
     assert found.colours.tolist() == [[0, 0, 0], [0, 255, 0], [255, 0, 0]]
-
-
-def test_shades_of_blue_are_not_grey(tmp_path: Path) -> None:
-    """Colours without red and green are themselves, stated or found, not grey values of the same number."""
-    image = np.zeros((2, 3, 3), np.uint8)
-    image[0, :, 2] = 255
-    Image.fromarray(image).save(tmp_path / "a.png")
-    stated = load_labels(tmp_path / "a.png", (2, 3), classes={"water": (0, 0, 255)}, unlabelled=(0, 0, 0))
-    assert stated.index.tolist() == [[0, 0, 0], [255, 255, 255]]
-    found = load_labels(tmp_path / "a.png", (2, 3), classes={}, unlabelled=(0, 0, 0))
-    assert found.colours.tolist() == [[0, 0, 255]]
-
-
-def test_found_colours_name_their_classes(tmp_path: Path) -> None:
-    """A class found by its colour has one name in every file, whatever other colours the file holds."""
-    names = []
-    for number, colours in enumerate([[(200, 0, 0), (0, 200, 0), (0, 0, 200)], [(200, 0, 0), (0, 200, 0)]]):
-        Image.fromarray(np.array([colours], np.uint8)).save(tmp_path / f"{number}.png")
-        names.append(load_labels(tmp_path / f"{number}.png", (1, len(colours)), classes={}).names)
-    assert names == [("colour_0000c8", "colour_00c800", "colour_c80000"), ("colour_00c800", "colour_c80000")]
-
-
-def test_grey_values_stand_for_grey_colours(tmp_path: Path) -> None:
-    """A grey image of two classes stated by colour: the value g is the colour (g, g, g)."""
-    np.save(tmp_path / "a.npy", np.array([[0, 9], [9, 0]], np.uint8))
-    found = load_labels(tmp_path / "a.npy", (2, 2), classes={"a": (9, 9, 9), "b": (0, 0, 0)})
-    assert found.index.tolist() == [[1, 0], [0, 1]]
 
 
 def test_an_unknown_colour_is_counted(tmp_path: Path) -> None:
@@ -101,7 +73,7 @@ def test_classes_are_found_where_none_are_stated(tmp_path: Path) -> None:
 def test_unlabelled_cannot_be_a_class(tmp_path: Path) -> None:
     """One number cannot mean a class and no class."""
     np.save(tmp_path / "a.npy", np.zeros((3, 4), int))
-    with pytest.raises(SceneError, match="value 0 is unlabelled and also class soil"):
+    with pytest.raises(SceneError, match="value 0 as unlabelled and as class soil"):
         load_labels(tmp_path / "a.npy", (3, 4), classes={"soil": 0}, unlabelled=0)
 
 
@@ -116,16 +88,3 @@ def test_names_that_all_know_have_their_colour() -> None:
     assert class_colours(names, {"Bare soil": (1, 2, 3)})[4].tolist() == [1, 2, 3]
     assert class_colours({"water": (9, 9, 9)}).tolist() == [[9, 9, 9]]
     assert class_colours({"grass_trees": 1, "woods": 2})[1].tolist() == class_colours({"forest": 1})[0].tolist()
-
-
-def test_scene_toml_says_colours_of_numbers(tmp_path: Path) -> None:
-    """They reach the scene; a colour of no class is refused."""
-    np.save(tmp_path / "a.npy", np.zeros((4, 4, 3), np.uint8) + 7)
-    np.save(tmp_path / "a_gt.npy", np.arange(16).reshape(4, 4) % 2)
-    facts = 'wavelengths_nm = [650.0, 550.0, 450.0]\nlabels = "{name}_gt.npy"\n'
-    words = f"{facts}[classes]\nsoil = 0\ncane = 1\n[colours]\ncane = [1, 2, 3]\n"
-    (tmp_path / "scene.toml").write_text(words)
-    assert load_scene_file(tmp_path / "a.npy").class_colours.tolist()[1] == [1, 2, 3]
-    (tmp_path / "scene.toml").write_text(words.replace("cane = [1", "can = [1"))
-    with pytest.raises(SceneError, match=r"has colours of can, which \[classes\] lacks"):
-        load_scene_file(tmp_path / "a.npy")

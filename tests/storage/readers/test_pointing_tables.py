@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import SceneError
-from pipeline.geometry.mirror import REST_TANGENT, Mounting, direction_to_scene, position_to_direction
+from pipeline.geometry.mirror import REST_TANGENT, direction_to_scene, position_to_direction
 from storage.readers.pointing_tables import (
     ACCEPTED,
     find_pointing,
@@ -52,12 +52,6 @@ def test_angles_become_positions(tmp_path: Path) -> None:
     one = load_pointing_table(_table(tmp_path, "angle_deg\n-10\n20\n")).of_cube("c", 2)
     expected = -np.tan(np.deg2rad([-10, 20])) / REST_TANGENT
     np.testing.assert_allclose(one.position, np.stack([expected, [0, 0]], axis=-1), atol=1e-12)
-
-
-def test_a_mounting_leads_to_the_models_positions(tmp_path: Path) -> None:
-    """The table has the device's X and Y, which are the model's Y and -X here."""
-    found = load_pointing_table(_table(tmp_path, MIRROR)).of_cube("c", 3, Mounting("y,-x"))
-    np.testing.assert_allclose(found.position, [[0, 0.1], [0, 0.2], [0, 0.3]], atol=1e-15)
 
 
 def test_lines_that_are_not_valid_need_no_numbers(tmp_path: Path) -> None:
@@ -117,9 +111,9 @@ def test_parquet_without_its_reader_says_what_to_install(tmp_path: Path, monkeyp
             f"the column 'roll', which is not known; accepted are {', '.join(ACCEPTED)}",
         ),
         ("mirror_x,mirror_x\n0,0\n", "has the column 'mirror_x' twice"),
-        ("mirror_x\n0\n", "one kind of pointing, and mirror_y is missing"),
-        ("time\n0\n", "one kind of pointing, and none is there"),
-        ("angle_deg,position_m\n0,0\n", "one kind of pointing, and 2 of them are there"),
+        ("mirror_x\n0\n", "one kind of pointing, but mirror_y is missing"),
+        ("time\n0\n", "one kind of pointing, but it has none"),
+        ("angle_deg,position_m\n0,0\n", "one kind of pointing, but it has 2 kinds"),
         ("angle_deg\nten\n", "row 2: angle_deg = 'ten' is no number"),
         ("angle_deg;time\n1,5;0\n", r"row 2: angle_deg = '1,5' is no number; write numbers with a decimal point"),
         ("angle_deg,time\n1\n", "row 2 has 1 cells, its header 2"),

@@ -52,8 +52,7 @@ def written(path: Path, shapes: Any = (WEST, EAST), crs: Any = 32632, layer: str
     return path
 
 
-@pytest.mark.parametrize("name", ["a.gpkg", "a.geojson", "a.shp"])
-@pytest.mark.parametrize("crs", [32632, 4326, 3857])
+@pytest.mark.parametrize(("name", "crs"), [("a.gpkg", 32632), ("a.geojson", 4326), ("a.shp", 3857)])
 def test_polygons_on_a_map(name: str, crs: int, tmp_path: Path) -> None:
     """In whatever format and CRS, the pixels whose centres they hold have their class, and no other."""
     table = geopandas.GeoSeries([WEST, EAST], crs=32632).to_crs(crs)
@@ -164,21 +163,12 @@ def test_a_folder_of_scenes(tmp_path: Path) -> None:
         _ = load_data_set(tmp_path).classes
 
 
-def test_unfit_labels_found_by_name_are_left_out(tmp_path: Path) -> None:
-    """A survey goes on without them, with a note."""
-    image = scene(tmp_path)
-    written(tmp_path / "field.gpkg", owner=["Ada", "Ben"])
-    found = load_scene_file(image, labels_needed=False)
-    assert found.labels is None
-    assert any(note.startswith("the labels beside the scene are left out: labels ") for note in found.provenance)
-
-
 @pytest.mark.parametrize(
     ("shapes", "crs", "columns", "place", "words"),
     [
         ([shapely.Point(1, 1)] * 2, 32632, {}, PLACE, "expected polygons, got 2 Point"),
         ((WEST, EAST), 32632, {"owner": ["a", "b"]}, PLACE, r"lack an attribute that says the class; they have owner;"),
-        ((WEST, EAST), 32632, {"crop": [None, None]}, PLACE, "say no class of any polygon"),
+        ((WEST, EAST), 32632, {"crop": [None, None]}, PLACE, "have no class for any polygon"),
         ((WEST, EAST), 32632, {}, None, r"are in WGS 84 / UTM zone 32N, and the scene does not say where it lies"),
         ((WEST, EAST), None, {}, PLACE, "do not say their CRS; save them with one"),
         (PIXELS, 32632, {}, PLACE, "do not lie on the scene: all polygons are within x 0 to 12, y 0 to 10 in WGS 84"),
@@ -192,22 +182,3 @@ def test_mistakes_end_in_one_message(
     path = written(tmp_path / "labels.shp", shapes, crs, **columns)
     with pytest.raises(SceneError, match=words):
         load_scene_file(scene(tmp_path, place=place), labels=path)
-
-
-def test_files_that_cannot_be_read(tmp_path: Path) -> None:
-    """One that is missing, and one that is cut off."""
-    image = scene(tmp_path)
-    with pytest.raises(SceneError, match="there is no file"):
-        load_scene_file(image, labels=tmp_path / "none.gpkg")
-    path = written(tmp_path / "labels.gpkg")
-    path.write_bytes(path.read_bytes()[:2000])
-    with pytest.raises(SceneError, match=r"cannot read .*labels\.gpkg"):
-        load_scene_file(image, labels=path)
-
-
-def test_an_attribute_that_is_not_there(tmp_path: Path) -> None:
-    """The message lists those that are."""
-    (tmp_path / "scene.toml").write_text('class_attribute = "culture"\n')
-    path = written(tmp_path / "labels.gpkg", crop=["a", "b"], owner=["c", "d"])
-    with pytest.raises(SceneError, match="lack the attribute 'culture'; they have crop, owner; write class_attribute"):
-        load_scene_file(scene(tmp_path), labels=path)

@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 from PIL import Image
 from rasterio.control import GroundControlPoint
 
-from pipeline.errors import SceneError
 from pipeline.setting_fields import numbers_of
 from storage.readers.image_files import bad_bands
 from storage.readers.open_cubes import open_cube
@@ -93,17 +92,10 @@ def test_bands_that_a_file_calls_bad_are_left_out(tmp_path: Path) -> None:
         file.update_tags(bbl="{1, 0, 1, 1}")
     scene = load_scene_file(tmp_path / "a.tif")
     assert scene.wavelength_nm.tolist() == [450.0, 660.5, 800.0]
-    assert any("bands 1 are left out: the file calls them bad; --bands 0-3 takes" in note for note in scene.provenance)
+    assert any(
+        "bands 1 are left out: the file marks them as bad; --bands 0-3 takes" in note for note in scene.provenance
+    )
     assert load_scene_file(tmp_path / "a.tif", bands=[1]).wavelength_nm.tolist() == [550.0]
-
-
-def test_a_band_without_a_value_is_named_with_the_bands_that_have_some(tmp_path: Path) -> None:
-    """One message, with what to write."""
-    values = VALUES.astype(np.float32)
-    values[1:3] = np.nan
-    write(tmp_path / "a.tif", values).close()
-    with pytest.raises(SceneError, match=r"no value anywhere in bands 1-2 \(from 0\); take the others: --bands 0,3$"):
-        load_scene_file(tmp_path / "a.tif", wavelengths=NM)
 
 
 @pytest.mark.parametrize("kind", ["mask", "png"])

@@ -67,18 +67,6 @@ def test_a_raw_cube_as_files_reads_back_bit_for_bit(tmp_path: Path) -> None:
     assert recording.camera == CAMERA
 
 
-def test_written_files_are_what_another_reader_takes_them_for(tmp_path: Path) -> None:
-    """SPy reads the numbers, the dark frame and the wavelengths of an exported cube."""
-    envi = pytest.importorskip("spectral.io.envi")
-    cube = write_raw(tmp_path / "raw", simulated(), FULL)
-    header = write_recorded_files(cube, tmp_path / "files")
-    found = envi.open(str(header))
-    np.testing.assert_array_equal(found.open_memmap(interleave="bip"), cube.read())
-    np.testing.assert_array_equal(found.bands.centers, cube.wavelength_nm)
-    dark = envi.open(str(tmp_path / "files" / "scan-0.dark.hdr"))
-    np.testing.assert_array_equal(dark.open_memmap(interleave="bip")[0], cube.references.dark)
-
-
 def test_raw_cubes_of_a_folder_a_store_and_an_archive(tmp_path: Path, archive: Archive) -> None:
     """Raw cubes are found in a capture's folder, singly, and by the newest or a named run; lines read singly too."""
     source = simulated()
@@ -135,16 +123,6 @@ def test_frames_that_are_not_there_are_assumed_and_said(files: Path) -> None:
     assert any(
         "full scale (4095 DN) is assumed to be white, and values are relative" in note for note in recording.notes
     )
-
-
-def test_frames_that_are_given_win(files: Path, tmp_path: Path) -> None:
-    """A frame by flag is taken instead of the one beside the cube; one of other samples is refused."""
-    np.save(tmp_path / "dark.npy", np.full((64, 3), 7.0))
-    recording = open_recording(files, CAMERA, RecordedWith(dark=tmp_path / "dark.npy"))
-    assert recording.sweeps[0].references.dark.tolist() == np.full((64, 3), 7.0).tolist()
-    np.save(tmp_path / "small.npy", np.zeros((50, 3)))
-    with pytest.raises(SceneError, match=r"small.npy is \(50, 3\) \(sample, band\), the cube \(64, 3\)"):
-        open_recording(files, CAMERA, RecordedWith(white=tmp_path / "small.npy"))
 
 
 def test_a_cube_without_pointing_is_an_even_straight_scan(files: Path) -> None:
@@ -206,14 +184,6 @@ def test_a_played_vector_beside_a_cube(files: Path) -> None:
     assert recording.sweeps[0].valid_line.all()
 
 
-def test_the_widest_cube_says_the_samples_and_the_numbers_the_bits(tmp_path: Path) -> None:
-    """A cube of 64 samples up to 40000 DN gives a camera of 64 samples and 16 bits, whatever the default says."""
-    write_envi_cube(tmp_path / "a", np.full((6, 64, 3), 40000, "<u2"))
-    recording = open_recording(tmp_path / "a.hdr")
-    assert (recording.camera.samples, recording.camera.bits) == (64, 16)
-    assert any("numbers reach 40000, so 16 bits are taken" in note for note in recording.notes)
-
-
 def write_envi_cube(stem: Path, values: NDArray[Any], ending: str = "", **fields: object) -> None:
     """An ENVI cube in BIL with a header of given fields."""
     lines, samples, bands = values.shape
@@ -270,17 +240,6 @@ def test_a_cube_that_cannot_be_used_says_why(
     assert message in str(caught.value)
 
 
-def test_a_cube_that_is_cut_off_keeps_its_whole_lines(tmp_path: Path) -> None:
-    """Lines that the header promises and the file lacks are not valid, and a note counts them."""
-    write_envi_cube(tmp_path / "cube", VALUES)
-    content = (tmp_path / "cube").read_bytes()
-    (tmp_path / "cube").write_bytes(content[: len(content) * 2 // 3 - 1])
-    recording = open_recording(tmp_path / "cube")
-    assert recording.sweeps[0].valid_line.tolist() == [True, True, True, False, False, False]
-    assert "cube is cut off: 3 of 6 lines are whole" in recording.notes
-    np.testing.assert_array_equal(recording.sweeps[0].read(0, 3), VALUES[:3])
-
-
 def test_several_cubes_need_pointing_and_the_same_bands(tmp_path: Path) -> None:
     """How cubes without pointing lie beside each other is not known, and cubes of other bands are not one recording."""
     write_envi_cube(tmp_path / "a", VALUES)
@@ -305,25 +264,6 @@ def test_a_zarr_cube_of_anyones_is_a_recording(tmp_path: Path, version: Any) -> 
     recording = open_recording(tmp_path / "cube.zarr")
     assert recording.wavelength_nm.tolist() == [500, 600, 700]
     np.testing.assert_array_equal(recording.sweeps[0].read_lines(np.array([1, 4])), VALUES[[1, 4]])
-
-
-def test_a_zarr_array_alone_is_a_recording_with_stated_wavelengths(tmp_path: Path) -> None:
-    """A store that is no group has no wavelengths of its own."""
-    zarr.create_array(tmp_path / "cube.zarr", shape=VALUES.shape, dtype="uint16")[...] = VALUES
-    recording = open_recording(tmp_path / "cube.zarr", given=RecordedWith(wavelengths=[500, 600, 700]))
-    np.testing.assert_array_equal(recording.sweeps[0].read(0, 6), VALUES)
-
-
-def test_addresses_without_a_recording_say_so(tmp_path: Path, archive: Archive) -> None:
-    """Nothing there, an empty folder, and an archive without runs."""
-    with pytest.raises(SceneError, match="there is no recording"):
-        open_recording(tmp_path / "none")
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(SceneError, match="holds no cube; expected ENVI headers"):
-        open_recording(tmp_path / "empty")
-    (tmp_path / "stages").mkdir(exist_ok=True)
-    with pytest.raises(ArchiveError, match="no run has raw cubes; survey into the archive first"):
-        open_recording(tmp_path)
 
 
 def test_a_headwall_folder_is_a_recording(tmp_path: Path) -> None:

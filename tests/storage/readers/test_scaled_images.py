@@ -68,7 +68,7 @@ def test_scale_and_offset_of_tiff(tmp_path: Path) -> None:
     np.testing.assert_allclose(scene.values, expected, rtol=1e-6)
     np.testing.assert_allclose(open_cube(scaled).read(1, 3), expected[1:3], rtol=1e-6)
     assert any(
-        note.startswith("values are the file's numbers times 0.001 plus 0.5, or others") for note in scene.provenance
+        note.startswith("values are the file's numbers times 0.001 plus 0.5 (others") for note in scene.provenance
     )
     sidecar = write_tiff(tmp_path / "sidecar.tif")
     before = load_scene_file(sidecar, wavelengths=[500, 600])
@@ -77,16 +77,6 @@ def test_scale_and_offset_of_tiff(tmp_path: Path) -> None:
     after = load_scene_file(sidecar, wavelengths=[500, 600])
     np.testing.assert_allclose(after.values, before.values * 0.1, rtol=1e-6)
     assert before.light_hash != after.light_hash
-
-
-def test_labels_are_never_scaled(tmp_path: Path) -> None:
-    """A label file is numbers, whatever scale it says."""
-    write_tiff(tmp_path / "a.tif")
-    with rasterio.open(tmp_path / "labels.tif", "w", "GTiff", 4, 3, 1, dtype="uint8", photometric="MINISBLACK") as file:
-        file.write(np.arange(12, dtype=np.uint8).reshape(1, 3, 4) % 3 + 1)
-        file.scales = (0.5,)
-    scene = load_scene_file(tmp_path / "a.tif", labels=tmp_path / "labels.tif", wavelengths=[500, 600])
-    assert scene.class_values == (1, 2, 3)
 
 
 def test_unscaled_files_keep_their_hash(tmp_path: Path) -> None:
@@ -109,15 +99,6 @@ def test_scale_of_scene_toml(tmp_path: Path) -> None:
     np.testing.assert_array_equal(opened.read(1, 3), after.values[1:3])
     assert before.light_hash != after.light_hash == opened.light_hash
     assert any(note.startswith("values are the file's times 0.0001 plus -0.1, as ") for note in after.provenance)
-
-
-def test_scale_of_scene_toml_comes_after_that_of_the_file(tmp_path: Path) -> None:
-    """A file that scales its numbers is scaled once more."""
-    path = write_tiff(tmp_path / "scaled.tif", (0.1, 0.1))
-    before = load_scene_file(path, wavelengths=[500, 600])
-    (tmp_path / "scene.toml").write_text("scale = 0.001\n")
-    after = load_scene_file(path, wavelengths=[500, 600])
-    np.testing.assert_allclose(after.values, before.values * 0.001, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -93,10 +93,3 @@ def test_what_holds_no_polygons_is_one_message(name: str, content: str | None, w
         (tmp_path / name).write_text(content)
     with pytest.raises(ZoneError, match=words):
         read_zones(str(tmp_path / name))
-
-
-def test_lines_and_points_are_refused(tmp_path: Path) -> None:
-    """With what came, and what to draw."""
-    path = written(tmp_path / "z.gpkg", [shapely.Point(1, 2), SQUARE])
-    with pytest.raises(ZoneError, match="expected polygons, got 1 Point; draw areas"):
-        read_zones(path)
