@@ -31,7 +31,7 @@ from models.reading.prior_map import (
 )
 from models.reading.regions import Region
 from pipeline.geometry.grid import UNLABELLED, patch_pixels
-from pipeline.rectify.tiles import let_tiles_go
+from pipeline.rectify.region import let_tiles_go
 from storage.arrays.class_maps import write_changes_tile, write_class_tile, write_probabilities_tile
 from storage.arrays.mosaics import Mosaic, chosen_patches, open_mosaic
 from storage.parallel.pool import run_blocks

@@ -26,7 +26,7 @@ from models.weights.checksummed_files import SEAL
 from models.weights.files import Weights, describe_weights, load_ood, load_reader, load_weights
 from pipeline.errors import WeightsError
 from pipeline.geometry.grid import SceneGrid
-from pipeline.rectify.tiles import let_tiles_go
+from pipeline.rectify.region import let_tiles_go
 from storage.arrays.mosaics import open_mosaic
 from storage.parallel.pool import RESERVED_BYTES, WorkerPool, memory_refusal, mib, run_blocks
 

@@ -16,7 +16,7 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel, Sweep, exposing
 from pipeline.planning.coverage import field_px
 from pipeline.planning.fine_pass import FinePlan, plan_fine
-from pipeline.planning.interlaced import lines_between, merged_ms, most_within
+from pipeline.planning.partial_scans import lines_between, merged_ms, most_within
 from pipeline.planning.uniform_scans import MIOU, ScanPerformance, format_scan, longest_exposure
 
 LEAST_GAIN = 1e-3  # of mIoU that later lines are expected to add; for less none are captured

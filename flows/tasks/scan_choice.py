@@ -14,7 +14,7 @@ from flows.tasks.capture_plan import CapturePlan, PassLayout
 from models.weights.files import Description
 from pipeline.errors import BudgetError, NotRecordedError, SettingsError, WeightsError
 from pipeline.geometry.scan import Sweep
-from pipeline.planning.interlaced import FIRST_STEP, FIRST_STEPS, every_nth, lines_between, merged_ms
+from pipeline.planning.partial_scans import FIRST_STEP, FIRST_STEPS, every_nth, lines_between, merged_ms
 from pipeline.planning.uniform_scans import (
     LOSS,
     MIOU,

@@ -20,10 +20,18 @@ from pipeline.errors import BudgetError, IncompleteStoreError
 from pipeline.geometry.camera import LineCamera
 from pipeline.signal.calibrate import number_values
 from pipeline.signal.components import Components
-from pipeline.signal.condense import RESIDUAL_STEP, ResidualLaw, score_lines, whole_steps
+from pipeline.signal.condense import (
+    RESIDUAL_STEP,
+    CondensedSweep,
+    Condenser,
+    ResidualLaw,
+    calibrated_blocks,
+    differing_lines,
+    score_lines,
+    whole_steps,
+)
 from pipeline.signal.lines import BLOCK_LINES
 from pipeline.signal.subspace import FEW_BANDS, SignalStatistics, bands_alone, components_of_field, with_shared
-from pipeline.signal.sweep_signal import CondensedSweep, Condenser, calibrated_blocks, differing_lines
 from storage.archive.keys import StageRef
 from storage.archive.manifests import check_files, read_table, write_table
 from storage.arrays.cubes import RawCube, SweepHeader, open_raw_cubes

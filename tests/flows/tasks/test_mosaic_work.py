@@ -19,8 +19,7 @@ from pipeline.errors import SettingsError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.rectify.placed import PixelGrid, place
-from pipeline.rectify.region import plan_tiles
-from pipeline.rectify.tiles import MosaicWork, TileMaker, let_tiles_go, opened_tiles
+from pipeline.rectify.region import MosaicWork, TileMaker, let_tiles_go, opened_tiles, plan_tiles
 from pipeline.source import References
 from storage.arrays.cubes import SweepHeader
 from storage.arrays.mosaics import MosaicWriter

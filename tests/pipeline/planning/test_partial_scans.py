@@ -167,7 +167,7 @@ def test_what_is_worth_much_is_looked_at_first() -> None:
 @pytest.mark.parametrize(
     ("runs", "told"),
     [
-        ([(3, 0, 5)], "look is at sweep 3, the scan has sweeps 0 to 2"),
+        ([(3, 0, 5)], "extent names sweep 3, the scan has sweeps 0 to 2"),
         ([(0, 0, 100_000)], "lines 0 to 100000 of sweep 0, which has lines 0 to"),
         ([(1, 0, 5), (1, 9, 12)], "names sweep 1 twice"),
     ],

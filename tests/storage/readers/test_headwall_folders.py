@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.rig.camera.camera_texts import times_of_lines
-from pipeline.signal.detector import find_bad_elements
+from pipeline.signal.calibrate import find_bad_elements
 from storage.readers.envi_files import load_frame_index
 from storage.readers.open_cubes import open_cube
 
