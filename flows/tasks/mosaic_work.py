@@ -12,7 +12,7 @@ from pathlib import Path
 from pipeline.geometry.camera import LineCamera
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.placed import PixelGrid, PlacedSweep
-from pipeline.rectify.region import MosaicWork, Tile, TileMaker, let_tiles_go, opened_tiles, opened_work, plan_tiles
+from pipeline.rectify.region import MosaicWork, Tile, TileMaker, free_tiles, opened_tiles, opened_work, plan_tiles
 from pipeline.rectify.sweep_paths import SweepPath, interlaced_paths, sweep_paths
 from storage.archive.manifests import read_table
 from storage.arrays.geolocation import Tables, open_geolocation
@@ -108,7 +108,7 @@ def write_mosaic(
         pool = WorkerPool(pool.scheduler, budget.workers)
     places = [(tile.rows, tile.columns) for tile in tiles]
     write_tiles(writer, maker, places, pool, paths=recipe.folders, report=report)
-    let_tiles_go()
+    free_tiles()
     return budget
 
 

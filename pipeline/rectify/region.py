@@ -275,7 +275,7 @@ def opened_tiles(maker: TileMaker) -> tuple[MosaicWork, LineCache, Callable[[int
     return work, LineCache(maker.cache), lru_cache(maxsize=2)(reach)
 
 
-def let_tiles_go() -> None:
+def free_tiles() -> None:
     """Free the memory of the last mosaic's raw lines in this process."""
     opened_tiles.cache_clear()
     opened_work.cache_clear()

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import pairwise
 from typing import Any, Protocol
 
@@ -91,67 +90,55 @@ class InterlacedLines:
     parts: tuple[StoredLines, ...]
     part: NDArray[np.intp]  # (line,) number of the sweep of a line
     number: NDArray[np.intp]  # (line,) its line number there
+    position: NDArray[np.float64]  # (line, 2) mirror at mid exposure
+    time_s: NDArray[np.float64]  # (line,) since the start of their own sweeps
+    valid_line: NDArray[np.bool_]  # (line,)
+    usable: NDArray[np.bool_]  # (line, sample)
+    source: str  # of the first sweep
+    references: References  # of the first sweep; scores need none
+    components: Components  # of all sweeps
+    step: float  # of a stored score, in all sweeps
 
-    def _gathered(self, columns: Iterable[NDArray[Any]]) -> NDArray[Any]:
-        every = list(columns)
-        found = np.empty((len(self.part), *every[0].shape[1:]), every[0].dtype)
-        for taker, column in enumerate(every):
-            here = self.part == taker
-            found[here] = column[self.number[here]]
-        return found
+    @classmethod
+    def of(
+        cls, sweep: Sweep, parts: Sequence[StoredLines], part: NDArray[np.intp], number: NDArray[np.intp]
+    ) -> InterlacedLines:
+        """Gather the columns of the sweeps' lines."""
 
-    @property
-    def source(self) -> str:
-        """Return the source of the first sweep."""
-        return self.parts[0].source
+        def gathered(name: str) -> NDArray[Any]:
+            every = [getattr(one, name) for one in parts]
+            found = np.empty((len(part), *every[0].shape[1:]), every[0].dtype)
+            for taker, column in enumerate(every):
+                found[part == taker] = column[number[part == taker]]
+            return found
 
-    @property
-    def references(self) -> References:
-        """Return the frames of the first sweep; scores need none."""
-        return self.parts[0].references
-
-    @property
-    def components(self) -> Components:
-        """Return the components that all sweeps share."""
-        return self.parts[0].components
-
-    @property
-    def step(self) -> float:
-        """Return the step of a stored score that all sweeps share."""
-        return self.parts[0].step
-
-    @cached_property
-    def position(self) -> NDArray[np.float64]:
-        """Return the mirror's positions at mid exposure, (line, 2)."""
-        return self._gathered(one.position for one in self.parts)
-
-    @cached_property
-    def time_s(self) -> NDArray[np.float64]:
-        """Return the lines' times since the start of their own sweeps, (line,) [s]."""
-        return self._gathered(one.time_s for one in self.parts)
-
-    @cached_property
-    def valid_line(self) -> NDArray[np.bool_]:
-        """Return the lines that were captured, (line,)."""
-        return self._gathered(one.valid_line for one in self.parts)
-
-    @cached_property
-    def usable(self) -> NDArray[np.bool_]:
-        """Return the spectra that can be used, (line, sample)."""
-        return self._gathered(one.usable for one in self.parts)
+        first = parts[0]
+        return cls(
+            sweep,
+            tuple(parts),
+            part,
+            number,
+            position=gathered("position"),
+            time_s=gathered("time_s"),
+            valid_line=gathered("valid_line"),
+            usable=gathered("usable"),
+            source=first.source,
+            references=first.references,
+            components=first.components,
+            step=first.step,
+        )
 
     def read(self, start: int, stop: int) -> Raw:
         """Return the scores of the lines ``start`` to ``stop`` in steps, (line, sample, component)."""
         part, number = self.part[start:stop], self.number[start:stop]
-        takers = np.unique(part).tolist()
-        firsts = [int(number[part == taker].min()) for taker in takers]
-        raws = [
-            self.parts[taker].read(first, int(number[part == taker].max()) + 1)
-            for taker, first in zip(takers, firsts, strict=True)
-        ]
-        found = np.empty((len(part), *raws[0].shape[1:]), raws[0].dtype)
-        for taker, first, raw in zip(takers, firsts, raws, strict=True):
-            found[part == taker] = raw[number[part == taker] - first]
+        found: Raw | None = None
+        for taker in np.unique(part).tolist():
+            here = part == taker
+            first = int(number[here].min())
+            raw = self.parts[taker].read(first, int(number[here].max()) + 1)
+            found = np.empty((len(part), *raw.shape[1:]), raw.dtype) if found is None else found
+            found[here] = raw[number[here] - first]
+        assert found is not None
         return found
 
 
@@ -204,7 +191,7 @@ def _runs(paths: Sequence[SweepPath], camera: LineCamera, grid: PixelGrid | None
             step=int(apart[first]),
             exposure_ms=float(1 / (1 / exposure_ms[part[run]]).mean()),  # with the mean noise of the lines
         )
-        lines = InterlacedLines(sweep, tuple(one.lines for one in parts), np.searchsorted(used, part[run]), number[run])
+        lines = InterlacedLines.of(sweep, [one.lines for one in parts], np.searchsorted(used, part[run]), number[run])
         usable, shift = (np.concatenate([getattr(one, name) for one in paths])[run] for name in ("usable", "shift_px"))
         found.append(place(lines, camera, grid=grid, usable=usable, shift_px=shift, gain=parts[0].gain))
     return found

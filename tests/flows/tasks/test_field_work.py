@@ -140,7 +140,7 @@ def test_a_worker_goes_region_by_region(
     run, stages = surveyed
     let_go: list[bool] = []
     for module in ("field_work", "drawing"):
-        monkeypatch.setattr(f"flows.tasks.{module}.let_tiles_go", lambda: let_go.append(True))
+        monkeypatch.setattr(f"flows.tasks.{module}.free_tiles", lambda: let_go.append(True))
     work = _work(run, WorkerPool(workers=1), 32)
     work.score("entropy", _mosaics(stages)[0], run.capture, lambda done: None)
     assert len(let_go) == 2

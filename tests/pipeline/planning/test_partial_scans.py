@@ -104,6 +104,18 @@ def test_hardly_any_runs_of_two_swaths_are_worth_more(seed: int, fraction: float
     assert 0.98 * best <= scan_pass.expected_gain <= best * (1 + 1e-9)
 
 
+def test_a_swath_that_does_not_pay_its_set_up_is_left_out() -> None:
+    """Two rows of two swaths are taken, and nothing of the third, where time is for these two."""
+    expected_gain, count = np.full(int(np.prod(GRID.patch_shape)), 1e-6), ROWS.first.shape[1]
+    for number in (0, 2):
+        expected_gain[ROWS.row == number * count + 5] = 1.0
+    wanted = tuple((number, int(ROWS.first[number, 5]), int(ROWS.stop[number, 5])) for number in (0, 2))
+    seconds = COST.seconds(sweeps_of_runs(ROWS.sweeps, wanted), CAMERA) + 0.01
+    found = partial_scan(ROWS, expected_gain, CAMERA, COST, exposure_ms=EXPOSURE_MS, seconds=seconds)
+    assert found is not None
+    assert found.runs == wanted
+
+
 def test_rows_worth_the_same_are_looked_at_as_far_as_time_goes() -> None:
     """Of a block that the seconds do not pay for as much as they do, and no lines beside it."""
     expected_gain = np.zeros(GRID.patch_shape)

