@@ -30,7 +30,7 @@ def drawn(grid: SceneGrid, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).exponential(size=int(np.prod(grid.patch_shape))) ** 3
 
 
-@settings(max_examples=7, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(st.floats(0, 60), st.floats(0, 60), st.integers(0, 99), st.sampled_from(["x", "y"]))
 def test_price_within_budget_and_worth_grows_with_it(one: float, other: float, seed: int, along: str):
     """The plan never costs more than the budget, and a bigger budget never buys less score."""
@@ -41,7 +41,7 @@ def test_price_within_budget_and_worth_grows_with_it(one: float, other: float, s
     assert large.expected_gain >= small.expected_gain * (1 - 1e-12)
 
 
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=3, deadline=None)
 @given(st.integers(40, 700), st.integers(40, 1500), st.floats(0, 80), st.integers(0, 99))
 def test_plans_hold_together(height: int, width: int, budget_s: float, seed: int):
     """Sweeps lie apart, the price is the cost model's, and the patches shown are worth at least what was bought."""
@@ -152,7 +152,7 @@ def test_a_margin_shows_the_patches_wherever_the_mirror_looks() -> None:
         assert set(plan.patch_index) <= set(covered_patches(grid, camera, beside))
 
 
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=3, deadline=None)
 @given(st.integers(0, 99), st.floats(5, 40))
 def test_negative_scores_ride_along_and_change_nothing(seed: int, budget_s: float):
     """The plan is that of scores of 0 in their place: negative patches are shown by runs made for others alone."""

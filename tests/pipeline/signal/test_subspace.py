@@ -22,7 +22,7 @@ from pipeline.signal.subspace import (
 )
 from tests.pipeline.signal.made_spectra import field_of, marked, restored, scored, statistics_of, with_noise
 
-FALSE_ALARM, TRIALS = 0.1, 120
+FALSE_ALARM, TRIALS = 0.1, 60
 
 
 @settings(max_examples=12)
