@@ -1,4 +1,4 @@
-"""Loops over arrays, compiled by numba when their module is first imported and kept for the next process."""
+"""Compile loops over arrays with numba when their module is first imported, and cache them for the next process."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from numba import types
 
 Loop = TypeVar("Loop", bound=Callable[..., Any])
 FLOATS, DOUBLES, OFFSETS = types.float32, types.float64, types.int64
-# Sums that are not reassociated are the same anywhere in a vector: a * b + c is rounded once, in all lanes alike.
+# Without reassociation a sum is the same in every lane of a vector; a * b + c is rounded once.
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
 
 
 def rows_of(kind: types.Type, axes: int, *, read_only: bool = False) -> types.Array:
-    """Give the type of C-contiguous arrays; those that are ``read_only`` may be any."""
+    """Return the type of C-contiguous arrays; with ``read_only`` the type takes writable ones too."""
     return types.Array(kind, axes, "C", readonly=read_only)
 
 
 def record_of(record: type, *fields: types.Type) -> types.Type:
-    """Give the type of a named tuple whose fields are of these types."""
+    """Return the type of a named tuple with fields of these types."""
     make: Any = types.NamedTuple
     found: types.Type = make(fields, record)
     return found
@@ -29,16 +29,15 @@ def record_of(record: type, *fields: types.Type) -> types.Type:
 def compiled(*signature: types.Type) -> Callable[[Loop], Loop]:
     """Compile a function for arguments of these types alone; threads may call it at the same time.
 
-    What it calls stands in the same file: numba asks that one alone whether what it kept is still right. Values of
-    other files are arguments, not globals. Nothing is refused where nothing can be kept, or what was kept is spoilt: it
-    is compiled anew.
+    All functions that it calls stand in the same file, since numba checks only that file for changes to its cache.
+    Values of other files are arguments, not globals. Without a usable cache the function is compiled again.
     """
 
     def compile_loop(loop: Loop) -> Loop:
         made: Any
         try:
             made = numba.njit(signature, cache=True, **_OPTIONS)(loop)
-        except Exception:  # of folders, disks and files; an error of the loop itself comes again
+        except Exception:  # of the cache's folder or file; an error of the loop itself is raised again below
             made = numba.njit(signature, **_OPTIONS)(loop)
         return cast(Loop, made)
 

@@ -1,6 +1,6 @@
-"""The error tree, and how text from files and devices is shown.
+"""Define the errors of the package, and escape control characters in text from files and devices.
 
-Every message says what was expected, what came, where, and what to do.
+A message names the wrong value, what is allowed, and what to do.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ import re
 import unicodedata
 from collections.abc import Callable
 
-_LAYOUT = "\n\t"  # control characters that text for people has
+_LAYOUT = "\n\t"  # control characters that stay
 _DIRECTION = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
-_UNSEEN = "\u00ad\u061c\u200b\u200e\u200f\u2060\ufeff"  # marks of direction, and what takes no room
+_UNSEEN = "\u00ad\u061c\u200b\u200e\u200f\u2060\ufeff"  # marks of direction, and characters without width
 _SUSPECT = re.compile(r"[^\n\t\x20-\x7e\u00a1-\u00ac\u00ae-\u02ff\u0370-\u058f\u2010-\u2027\u2030-\u205e\u4e00-\u9fff]")
 
 
@@ -20,15 +20,15 @@ def _escaped(character: str) -> str:
 
 
 def visible(text: str, escaped: Callable[[str], str] = _escaped) -> str:
-    r"""Text in which control characters, marks of direction and unseen ones stand as escapes: ``\x1b``, ``\u202e``.
+    r"""Return text with escapes (``\x1b``, ``\u202e``) for control characters, marks of direction and unseen ones.
 
-    Lines, tabs and the letters of all scripts stay; so do the joiners that some scripts are written with.
+    Line ends, tabs and the letters of all scripts stay, also the joiners that some scripts need.
     """
     return _SUSPECT.sub(lambda found: found[0] if is_visible(found[0]) else escaped(found[0]), text)
 
 
 def is_visible(character: str) -> bool:
-    """Return whether a character is one that `visible` leaves as it is."""
+    """Return whether `visible` leaves a character as it is."""
     if character in _LAYOUT:
         return True
     if character in _UNSEEN or unicodedata.bidirectional(character) in _DIRECTION:
@@ -38,9 +38,9 @@ def is_visible(character: str) -> bool:
 
 
 class PipelineError(Exception):
-    """Base of every error that the user is meant to read; ``exit_code`` is the process's.
+    """Base of every error with a message for the user; ``exit_code`` is that of the process.
 
-    Words of files and devices in it are shown as `visible` shows them.
+    Text of files and devices in the message is escaped by `visible`.
     """
 
     exit_code = 1
@@ -61,8 +61,8 @@ class BudgetError(PipelineError, ValueError):
     exit_code = 2
 
 
-class NoScanPaidFor(BudgetError):  # noqa: N818 - said of scans
-    """No uniform scan that some weights read costs as little; others may read fewer lines."""
+class NoScanPaidFor(BudgetError):  # noqa: N818 - named for what is missing
+    """No uniform scan that these weights can read is within the limits; other weights may read fewer lines."""
 
 
 class SceneError(PipelineError, ValueError):
@@ -70,23 +70,23 @@ class SceneError(PipelineError, ValueError):
 
 
 class NotRecordedError(SceneError):
-    """A line is asked of a recording that was never taken."""
+    """A requested line is not part of the recording."""
 
 
-class NoSceneYet(SceneError):  # noqa: N818 - said of files
-    """A pattern stands for no file yet; one may come."""
+class NoSceneYet(SceneError):  # noqa: N818 - named for what is missing
+    """A pattern matches no file yet."""
 
 
 class WavelengthError(SceneError):
-    """Wavelengths do not fit the bands, the unit or the range."""
+    """Wavelengths do not fit the bands, the unit or the allowed range."""
 
 
 class EmptySceneError(SceneError):
-    """A scene has no value anywhere."""
+    """A scene has no valid value."""
 
 
 class SeriesError(SceneError):
-    """A file holds several steps of time, and none is named."""
+    """A file holds several time steps, and none is selected."""
 
     def __init__(self, message: str, steps: int) -> None:
         super().__init__(message)
@@ -98,11 +98,11 @@ class ShapeError(PipelineError, ValueError):
 
 
 class PoseError(PipelineError, ValueError):
-    """A direction or mirror position out of reach, or not finite."""
+    """A direction or mirror position is out of reach or not finite."""
 
 
 class ZoneError(PipelineError, ValueError):
-    """Polygons of an area, of zones or plots cannot be used, or do not lie on the field."""
+    """Polygons of an area, of zones or plots cannot be used, or lie off the field."""
 
 
 class WeightsError(PipelineError, ValueError):
@@ -110,7 +110,7 @@ class WeightsError(PipelineError, ValueError):
 
 
 class RigError(PipelineError, OSError):
-    """A device failed, or what it sent could not be kept."""
+    """A device failed, or its data could not be stored."""
 
 
 class ArchiveError(PipelineError, OSError):
@@ -118,7 +118,7 @@ class ArchiveError(PipelineError, OSError):
 
 
 class ChunkError(PipelineError, ValueError):
-    """A region splits stored chunks."""
+    """A region does not end at chunk borders."""
 
 
 class IncompleteStoreError(PipelineError, LookupError):
@@ -126,19 +126,19 @@ class IncompleteStoreError(PipelineError, LookupError):
 
 
 class OldStoreError(IncompleteStoreError):
-    """A store is whole, but of an earlier version that this one does not read."""
+    """A complete store has a version that this package does not read."""
 
 
 class WorkerError(PipelineError, RuntimeError):
-    """Processes that work for this one died, or their scheduler went away."""
+    """Worker processes died, or the connection to their scheduler was lost."""
 
 
 class BoundError(PipelineError, ArithmeticError):
-    """A simulated effect, left out or cheapened, changes light by more than its bound says."""
+    """A simulated effect that was left out or simplified changes the signal by more than its bound."""
 
 
-class NothingToMend(Exception):  # noqa: N818 - no error: a survey that ends well without a look
-    """The prior map of a field is sure enough, and no capture is needed; ``run`` is the one whose map stands."""
+class NothingToMend(Exception):  # noqa: N818 - no error: a survey that ends without a capture
+    """The prior map of a field is certain enough, and no capture is needed; ``run`` is the run of that map."""
 
     def __init__(self, run: str, why: str) -> None:
         super().__init__(why)

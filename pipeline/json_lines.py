@@ -1,6 +1,6 @@
-"""Lines of JSON that vouch for themselves, for files that only grow and of which any byte may change.
+"""Read and write lines of JSON with a checksum, for files that are only appended to.
 
-The last member of each object, ``check``, is the CRC-32 of the text before it, so that every bit of a line counts.
+The last member of each object, ``check``, is the CRC-32 of the text before it.
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ State = Literal["whole", "torn", "changed"]
 
 @dataclass(frozen=True)
 class CheckedLine:
-    """One line as it was found; ``content`` is None where the line is damaged.
+    """One line of a file; ``content`` is None where the line is damaged.
 
-    ``torn``: what a power cut leaves of a line, or of others' bytes. ``changed``: it was whole once.
+    ``torn``: the incomplete end of a write that a power cut interrupted, or bytes of another kind. ``changed``: a
+    complete line in which bytes have changed.
     """
 
     number: int  # from 1
@@ -33,15 +34,16 @@ class CheckedLine:
 
 
 def with_check(text: bytes) -> bytes:
-    """Make the line of an object, given as JSON on one line and not empty."""
+    """Return the line of an object, given as JSON on one line and not empty."""
     body = text[: -len(b"}")]
     return body + b"%s%08x%s\n" % (_OPENS, zlib.crc32(body), _CLOSES)
 
 
 def read_checked(content: bytes) -> Iterator[CheckedLine]:
-    """Give every line of a file. Two that only lost the end between them are both whole, and one more is ``changed``.
+    """Yield every line of a file. Two lines that lost the line end between them are both whole.
 
-    No single bit that flips makes a line ``torn``, or gives it another content.
+    They are followed by one line that is ``changed``. A single flipped bit never makes a line ``torn``, and never
+    changes the content of a ``whole`` one.
     """
     for number, text in enumerate(content.split(b"\n"), 1):
         if text:
@@ -55,7 +57,7 @@ def _line(number: int, text: bytes) -> Iterator[CheckedLine]:
         return
     ends = [match.end() for match in _CHECK.finditer(text)]
     for start, end in zip([0, *ends], ends, strict=False):
-        for part in (text[start:end], text[start + 1 : end]):  # or behind what the end of a line became
+        for part in (text[start:end], text[start + 1 : end]):  # the second: behind a line end that has changed
             found = _whole(part)
             if found is not None:
                 yield CheckedLine(number, part, found, "whole")
@@ -65,7 +67,7 @@ def _line(number: int, text: bytes) -> Iterator[CheckedLine]:
 
 
 def _whole(text: bytes) -> dict[str, Any] | None:
-    """The object of a line whose checksum is that of its text."""
+    """Return the object of a line if the checksum is that of its text."""
     body, check = text[:-_LENGTH], _CHECK.fullmatch(text[-_LENGTH:])
     if check is None or int(check[1], 16) != zlib.crc32(body):
         return None
@@ -77,7 +79,7 @@ def _whole(text: bytes) -> dict[str, Any] | None:
 
 
 def _had_check(text: bytes) -> bool:
-    """Return whether a line ends as one with a checksum does, but for one byte at most."""
+    """Return whether a line ends in a checksum, up to one wrong byte."""
     tail = text[-_LENGTH:]
     fixed = tail[: len(_OPENS)] + tail[-len(_CLOSES) :]
     return len(tail) == _LENGTH and sum(a != b for a, b in zip(fixed, _OPENS + _CLOSES, strict=True)) <= 1

@@ -1,4 +1,4 @@
-"""Lazy values and modules: a value is made, and a module imported, once it is asked for."""
+"""Compute values and import modules when they are first used."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ Value = TypeVar("Value")
 
 
 class Once(Generic[Value]):
-    """Calls ``make`` once, by whichever thread asks first, while the others wait; a ``make`` that fails is asked again.
+    """Call ``make`` once, in the thread that needs it first, while others wait; after an error it is called again.
 
-    Equal to nothing but itself: what it will hold is not known before.
+    Compares equal only to itself.
     """
 
     def __init__(self, make: Callable[[], Value]) -> None:
@@ -24,35 +24,35 @@ class Once(Generic[Value]):
 
     @staticmethod
     def of(value: Value) -> Once[Value]:
-        """Hold a value that is there already."""
+        """Hold a value that is already known."""
         once = Once(lambda: value)
         once()
         return once
 
     def is_made(self) -> bool:
-        """Return whether the value is there."""
+        """Return whether the value is known."""
         return bool(self._made)
 
     def __call__(self) -> Value:
-        """Give the value, making it the first time."""
+        """Return the value; the first call computes it."""
         with self._lock:
             if self._make is not None:
                 self._made.append(self._make())
-                self._make = None  # what it was made from may go
+                self._make = None  # frees its inputs
             return self._made[0]
 
 
 class DeferredModule(ModuleType):
-    """Stands for a module at the head of a file; the module is imported when a name of it is first used."""
+    """A module that is imported when one of its names is first used."""
 
     def __getattr__(self, name: str) -> Any:
         return getattr(import_module(self.__name__), name)
 
 
 def deferred(name: str) -> Any:
-    """A package that takes long to load, or is an extra, for a file that most commands load and few make use of.
+    """Return a package that is imported at its first use: one that loads slowly, or is an optional extra.
 
-    Written beside the import for type checkers::
+    Write it beside the import for type checkers::
 
         if TYPE_CHECKING:
             import torch

@@ -1,6 +1,6 @@
-"""Readings: the range of numbers that a sensor, or a product made of its lines, can give.
+"""Check the range of values that a sensor, or a product of its lines, can have.
 
-Fill values of common formats lie outside: 1e20, 9.97e36, 1e30, 3.4e38. So do the ends of 32-bit whole numbers.
+Fill values of common formats are out of range: 1e20, 9.97e36, 1e30, 3.4e38, and the ends of 32-bit integers.
 """
 
 from __future__ import annotations
@@ -13,26 +13,27 @@ from numpy.typing import NDArray
 
 SIGMA_OF_MEDIAN = 1.4826  # standard deviation of a normal law over its median absolute deviation
 
-MOST_VALUE = 1e9  # in any unit that scenes come in; what is larger is to be given in a larger unit
-MOST_STEPS = 65535  # that a camera tells apart: raw lines hold 16 bits
+MOST_VALUE = 1e9  # in any unit of scenes; larger values need a larger unit
+MOST_STEPS = 65535  # of a camera: raw lines hold 16 bits
+MOST_EDGE = 0.1  # fraction of a picture's edge with one value; less occurs by chance
 
 
 @dataclass(frozen=True)
 class Beyond:
-    """Values of a cube that are no readings: how many, and the first of them."""
+    """Count and first of the out-of-range values of a cube."""
 
     count: int
     place: tuple[int, ...]  # (y, x, band)
     value: np.number[Any]
 
     def words(self) -> str:
-        """Count, place and value."""
+        """Format count, place and value."""
         y, x, band = self.place
         return f"{self.count} value{'s' * (self.count > 1)}, the first {self.value!s} at y {y}, x {x}, band {band}"
 
 
 def beyond_range(values: NDArray[Any], most: float = MOST_VALUE) -> NDArray[np.bool_] | None:
-    """Mark values larger than ``most`` by size, infinite ones too; None where none is. NaN is no value at all."""
+    """Mark values larger than ``most`` by size, infinite ones too; None if there is none. NaN counts as no value."""
     kind = values.dtype
     if not values.size or kind.kind not in "fiu" or (kind.kind in "iu" and np.iinfo(kind).max <= most):
         return None
@@ -44,9 +45,9 @@ def beyond_range(values: NDArray[Any], most: float = MOST_VALUE) -> NDArray[np.b
 
 
 def find_beyond(values: NDArray[Any]) -> Beyond | None:
-    """Count the finite values of a (y, x, band) cube that are no readings, and name the first; None where all are.
+    """Count the finite out-of-range values of a (y, x, band) cube, and name the first; None if there is none.
 
-    Infinite ones are missing values, as NaN is.
+    Infinite values are missing, as NaN.
     """
     found = beyond_range(values)
     if found is None or not (found := found & np.isfinite(values)).any():
@@ -56,19 +57,16 @@ def find_beyond(values: NDArray[Any]) -> Beyond | None:
 
 
 def readings_alone(values: NDArray[np.floating], most: float) -> NDArray[np.floating]:
-    """Give values with NaN for those that are no readings; the same array where all are."""
+    """Return values with NaN for out-of-range ones; the same array if there is none."""
     found = beyond_range(values, most)
     return values if found is None else np.where(found, values.dtype.type(np.nan), values)
 
 
-MOST_EDGE = 0.1  # of a picture's edge that is one value: by chance it is less
-
-
 def edge_fill(edge: NDArray[Any]) -> tuple[float, float] | None:
-    """Return the value that may fill a picture's edge, and its fraction of the edge; None where nothing suggests one.
+    """Return the value that may fill a picture's edge, and its fraction of the edge; None if nothing suggests one.
 
-    ``edge`` is (pixel, band), NaN where nothing is known. Taken is the commonest value that all bands of a pixel have,
-    where it is 0 or less, the most that its kind of whole numbers holds, or no reading.
+    ``edge`` is (pixel, band), NaN where unknown. The candidate is the most frequent value that all bands of a pixel
+    share. It is returned if it is 0 or less, the largest of its integer type, or out of range.
     """
     alike = edge[(edge == edge[:, :1]).all(axis=1), 0]
     if not alike.size:

@@ -1,4 +1,4 @@
-"""Numbers and words that settings give, stated where they are used: default, range, unit, meaning, where it is from."""
+"""Declare settings where they are used: default, range, unit, meaning and source."""
 
 from __future__ import annotations
 
@@ -25,35 +25,35 @@ def stated(
     example: object = None,
     why: str = "",
 ) -> Any:
-    """A dataclass's field that says all there is to know of it; nothing else repeats it.
+    """Return a dataclass field with the complete description of a setting.
 
-    ``default`` is ``dataclasses.MISSING`` where it has to be given; a number is finite, unless its default is infinite.
-    ``about`` is one line of help, ``ge`` and ``le`` the least and greatest value, both allowed [unit]. ``source`` says
-    where the default comes from: nothing here was measured on a unit unless it says so. ``example`` is what to show
-    where there is no default, or it is written in another way, and ``why`` what a refusal adds to the range.
+    ``default`` is ``dataclasses.MISSING`` for a required setting. A number is finite, unless its default is infinite.
+    ``about`` is one line of help, ``ge`` and ``le`` the least and greatest allowed value [unit]. ``source`` says where
+    the default comes from: only "measured" ones were measured on a unit. Help shows ``example`` if there is no default,
+    or if the default is written in another way. ``why`` is added to the message of a refusal.
     """
-    known = {"description": about, "ge": ge, "le": le}  # as pydantic's Field calls them
-    told = {"unit": unit, "source": source, "example": example, "why": why}
-    return field(default=default, metadata={**known, "json_schema_extra": told})
+    known = {"description": about, "ge": ge, "le": le}  # names of pydantic's Field
+    extra = {"unit": unit, "source": source, "example": example, "why": why}
+    return field(default=default, metadata={**known, "json_schema_extra": extra})
 
 
 assumed = partial(stated, source="assumed")  # the default is not confirmed on a unit
 
 
 def format_number(low: float, high: float, unit: str = "", *, endless: bool = False) -> str:
-    """Return what a number may be, for a message."""
+    """Return the allowed range of a number, for a message."""
     words = f"a number from {low:g} to {high:g}" if math.isfinite(high) else f"a number of at least {low:g}"
     return words + (f" {unit}" if unit else "") + (" or inf" if endless else "")
 
 
 def span_of(item: Field[Any]) -> tuple[float, float]:
-    """Least and greatest value of a number."""
+    """Return the least and greatest value of a number."""
     low, high = item.metadata.get("ge"), item.metadata.get("le")
     return (-math.inf if low is None else low), (math.inf if high is None else high)
 
 
 def misfits(part: Any) -> Iterator[tuple[str, str]]:
-    """Names of the numbers of a dataclass that are out of range or not finite, with what is wrong of each."""
+    """Yield the numbers of a dataclass that are out of range or not finite: name and message."""
     for item in fields(part):
         value, (low, high) = getattr(part, item.name), span_of(item)
         if value is None or (low, high) == (-math.inf, math.inf):
@@ -65,12 +65,12 @@ def misfits(part: Any) -> Iterator[tuple[str, str]]:
 
 
 def check_stated(part: Any, place: str) -> None:
-    """Refuse a dataclass with a number out of range or not finite; messages name it as ``place.name``."""
+    """Raise SettingsError for a dataclass with a number out of range or not finite; messages name it ``place.name``."""
     for name, words in misfits(part):
         raise SettingsError(f"{place}.{name} {words}")
 
 
 def numbers_of(item: object) -> Sequence[object]:
-    """The numbers that one word of a list stands for: ``4-7`` for four of them."""
+    """Return the numbers of one item of a list: ``4-7`` means four of them."""
     found = re.fullmatch(r"(\d{1,5})-(\d{1,5})", str(item).strip())
     return [item] if found is None else range(int(found[1]), int(found[2]) + 1)

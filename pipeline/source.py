@@ -1,4 +1,4 @@
-"""Source of raw lines: what the rig, the simulator and an archive have in common."""
+"""Define the interface of sources of raw lines: the rig, the simulator and an archive."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 
-AT_REST = Sweep("references", "fine", "x", 0.0, 0.0, 1)  # a line for references: the mirror at 0; 0, nothing summed
+AT_REST = Sweep("references", "fine", "x", 0.0, 0.0, 1)  # a line for references: mirror at (0, 0), no binning
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,11 @@ class Line:
 
 @dataclass(frozen=True)
 class References:
-    """Dark and white frames of one sweep's binning, (sample, band) float32 DN, and the white reference's value a band.
+    """Dark and white frames of one sweep's binning, (sample, band) float32 DN, and the white reference's value by band.
 
-    A sample's scene value is ``(raw - dark) / (white - dark) * white_reference``, over ``flat`` where there is one,
-    over the mirror's throughput where ``by_mirror`` says that the light falls off with its tilt. ``bad`` elements of
-    the detector are not trusted.
+    A sample's scene value is ``(raw - dark) / (white - dark) * white_reference``, divided by ``flat`` if there is one.
+    With ``by_mirror`` it is also divided by the mirror's throughput, which falls off with its tilt. ``bad`` marks
+    unreliable elements of the detector.
     """
 
     dark: NDArray[np.float32]
@@ -45,7 +45,7 @@ class References:
     by_mirror: bool = False  # white was taken at rest; away from it the mirror passes another fraction of the light
 
     def same_as(self, other: References) -> bool:
-        """Return True if all frames of two references are equal bit for bit."""
+        """Return whether all frames of two references are equal bit for bit."""
         frames = ("dark", "white", "white_reference", "bad", "flat")
         pairs = [(getattr(self, name), getattr(other, name)) for name in frames]
         return self.by_mirror == other.by_mirror and all(
@@ -54,60 +54,60 @@ class References:
 
 
 class Source(Protocol):
-    """Something that can look at a field line by line."""
+    """A source that captures a field line by line."""
 
     @property
     def name(self) -> str:
-        """Return what the receipt calls it: ``sim``, ``rig``, or an archive's address."""
+        """Return its name in the receipt: ``sim``, ``rig``, or an archive's address."""
 
     @property
     def camera(self) -> LineCamera:
-        """The camera that takes the lines."""
+        """Return the camera that takes the lines."""
 
     @property
     def wavelength_nm(self) -> NDArray[np.float64]:
-        """(band,) centre wavelengths [nm]."""
+        """Return (band,) centre wavelengths [nm]."""
 
     @property
     def field_shape(self) -> tuple[int, int]:
-        """(y, x) size of the field to survey [px]."""
+        """Return the (y, x) size of the field [px]."""
 
     def lines(self, sweep: Sweep, first: int = 0) -> Iterator[Line]:
-        """Give the sweep's lines one by one, from line ``first`` on."""
+        """Yield the sweep's lines one by one, from line ``first`` on."""
 
     def lines_again(self, sweep: Sweep, numbers: Sequence[int]) -> Iterator[Line]:
-        """Give single lines that it gave before, in order; not valid where it no longer has them."""
+        """Yield single lines of an earlier capture again, in order; not valid if they are gone."""
 
     def references(self, sweep: Sweep) -> References:
-        """Dark and white frames with the sweep's binning."""
+        """Return dark and white frames with the sweep's binning."""
 
     @property
     def record(self) -> Mapping[str, Any] | None:
-        """Return what its captures were like, for their store; None where its effects tell all of it."""
+        """Return facts of its captures for their store; None if the effects describe them."""
 
 
 class SweepLines(Protocol):
-    """The lines of one sweep, wherever they are: a stored cube, or a source that gives them when asked."""
+    """The lines of one sweep: a stored cube, or a source that computes them on request."""
 
     @property
     def sweep(self) -> Sweep:
-        """The sweep that the lines belong to."""
+        """Return the sweep of the lines."""
 
     @property
     def references(self) -> References:
-        """Dark and white frames of its binning."""
+        """Return dark and white frames of its binning."""
 
     @property
     def position(self) -> NDArray[np.float64]:
-        """(line, 2) mirror X and Y at mid exposure."""
+        """Return (line, 2) mirror X and Y at mid exposure."""
 
     @property
     def time_s(self) -> NDArray[np.float64]:
-        """(line,) of mid exposure, since the start of the sweep [s]."""
+        """Return (line,) times of mid exposure, since the start of the sweep [s]."""
 
     @property
     def valid_line(self) -> NDArray[np.bool_]:
-        """(line,) lines that can be used."""
+        """Return (line,) whether a line can be used."""
 
     def read(self, start: int, stop: int) -> NDArray[np.integer[Any]]:
-        """Numbers of the lines ``start`` to ``stop``: raw, (line, sample, band), or scores in steps of components."""
+        """Return the lines ``start`` to ``stop``: raw DN (line, sample, band), or scores in steps of components."""

@@ -20,8 +20,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, CostModel, Sweep
 from pipeline.planning.coverage import cheapest_full, full_sweeps, sweeps_over, uniform_sweeps, with_margin
-from pipeline.planning.interlaced import FIRST_STEP, FIRST_STEPS, every_nth, lines_between, merged_ms
-from pipeline.planning.partial_scans import sweeps_of_runs
+from pipeline.planning.partial_scans import FIRST_STEP, FIRST_STEPS, every_nth, lines_between, merged_ms, sweeps_of_runs
 from pipeline.planning.prices import check_budget
 from pipeline.planning.uniform_scans import (
     LOSS,

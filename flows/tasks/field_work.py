@@ -26,7 +26,7 @@ from models.weights.checksummed_files import SEAL
 from models.weights.files import Weights, describe_weights, load_ood, load_reader, load_weights
 from pipeline.errors import WeightsError
 from pipeline.geometry.grid import SceneGrid
-from pipeline.rectify.tiles import let_tiles_go
+from pipeline.rectify.region import free_tiles
 from storage.arrays.mosaics import open_mosaic
 from storage.parallel.pool import RESERVED_BYTES, WorkerPool, memory_refusal, mib, run_blocks
 
@@ -79,7 +79,7 @@ class Scoring:
 
     def __call__(self, region: Region) -> NDArray[np.float64]:
         """Return the scores of the region's own patches, (patch_y, patch_x)."""
-        let_tiles_go()
+        free_tiles()
         weights = self.weights.load()
         scan_pass = coarse_region(weights, self.mosaic, region, self.capture)
         if self.policy in GLANCING_POLICIES:
@@ -101,7 +101,7 @@ class ExpectedErrors:
 
     def __call__(self, region: Region) -> PatchExpectedErrors:
         """Return the errors of the region's own patches."""
-        let_tiles_go()
+        free_tiles()
         weights = self.weights.load()
         coarse = read_coarse_prediction(weights, coarse_region(weights, self.mosaic, region, self.capture))
         with np.errstate(divide="ignore"):

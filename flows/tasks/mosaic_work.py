@@ -1,6 +1,6 @@
 """Compute mosaics from stored sweeps, several tiles at a time, within a limit of memory.
 
-A tile is a shard of the mosaic: `pipeline.rectify.tiles` computes it, `storage.arrays.mosaics` stores it.
+A tile is a shard of the mosaic: `pipeline.rectify.region` computes it, `storage.arrays.mosaics` stores it.
 """
 
 from __future__ import annotations
@@ -10,12 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.geometry.camera import LineCamera
-from pipeline.rectify.interlaced import interlaced_paths
 from pipeline.rectify.kernels import Kernel
-from pipeline.rectify.placed import PixelGrid, Placed
-from pipeline.rectify.region import Tile, plan_tiles
-from pipeline.rectify.sweep_paths import SweepPath, sweep_paths
-from pipeline.rectify.tiles import MosaicWork, TileMaker, let_tiles_go, opened_tiles, opened_work
+from pipeline.rectify.placed import PixelGrid, PlacedSweep
+from pipeline.rectify.region import MosaicWork, Tile, TileMaker, free_tiles, opened_tiles, opened_work, plan_tiles
+from pipeline.rectify.sweep_paths import SweepPath, interlaced_paths, sweep_paths
 from storage.archive.manifests import read_table
 from storage.arrays.geolocation import Tables, open_geolocation
 from storage.arrays.mosaics import MosaicWriter, write_tiles
@@ -64,7 +62,7 @@ class MosaicRecipe:
         placed = []
         for one in self.sweeps():  # no stored tie points if lines are too uneven
             stored = tables.get(one.lines.sweep.name)
-            placed.append(Placed(one.lines, tuple(stored), one.gain) if stored else one.placed(self.camera))
+            placed.append(PlacedSweep(one.lines, tuple(stored), one.gain) if stored else one.placed(self.camera))
         return MosaicWork(placed, self.camera, self.grid, self.kernel)
 
 
@@ -108,7 +106,7 @@ def write_mosaic(
         pool = WorkerPool(pool.scheduler, budget.workers)
     places = [(tile.rows, tile.columns) for tile in tiles]
     write_tiles(writer, maker, places, pool, paths=recipe.folders, report=report)
-    let_tiles_go()
+    free_tiles()
     return budget
 
 

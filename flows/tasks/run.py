@@ -58,8 +58,7 @@ from pipeline.ground.map_grid import GroundGrid
 from pipeline.lazy import Once, deferred
 from pipeline.planning.uniform_scans import ScanPerformance
 from pipeline.rectify.placed import PixelGrid, place
-from pipeline.rectify.region import plan_tiles
-from pipeline.rectify.tiles import MosaicWork
+from pipeline.rectify.region import MosaicWork, plan_tiles
 from pipeline.signal.subspace import SMOOTH
 from pipeline.simulator.effects.pointing import PointingErrors
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene

@@ -24,7 +24,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.planning.coverage import cheapest_full, uniform_sweeps
-from pipeline.signal.calibrate import reflectance
+from pipeline.signal.calibrate import calibrate
 from pipeline.signal.components import Components
 from pipeline.signal.subspace import SignalStatistics, find_components
 from pipeline.simulator.effects.probe import noise_electrons
@@ -172,7 +172,7 @@ def scan_raster(path: str, weights_path: Path | None) -> ScanLines:
 
 
 def _calibrated(dn: NDArray[Any], lines: HeldLines) -> Values:
-    return reflectance(dn, lines.references, position=lines.position)
+    return calibrate(dn, lines.references, saturated_dn=np.inf, position=lines.position)[0]
 
 
 def _components(values: Values) -> Components:

@@ -34,8 +34,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.geometry.scan import Axis, CostModel, Sweep
 from pipeline.planning.coverage import cheapest_full, full_sweeps, uniform_sweeps
-from pipeline.planning.prices import raw_bytes
-from pipeline.planning.selection import frame_patches
+from pipeline.planning.prices import frame_patches, raw_bytes
 from pipeline.planning.uniform_scans import format_scan
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.resample import resample

@@ -24,9 +24,8 @@ from flows.tasks.stages.condense import with_shared_directions
 from flows.tradeoff.entries import Setting, Tradeoff
 from flows.tradeoff.scan_lines import BLOCK_PX, EXPOSURE_MS, FIELD_SHAPE, ScanLines, Values, scan_farm, scan_raster
 from pipeline.signal.components import Components
-from pipeline.signal.condense import ResidualLaw, score_lines
+from pipeline.signal.condense import CondensedSweep, Condenser, ResidualLaw, calibrated_blocks, score_lines
 from pipeline.signal.subspace import SignalStatistics, find_components
-from pipeline.signal.sweep_signal import CondensedSweep, Condenser, calibrated_blocks
 from storage.arrays.cubes import SweepHeader
 from storage.arrays.layout import numbers_in_memory
 from storage.arrays.signal_cubes import LineRows, SignalCubeInMemory

@@ -21,7 +21,7 @@ from models.reading.inference import CoarsePrediction, captured, overview_of, pa
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED, patch_pixels
 from pipeline.lazy import deferred
-from pipeline.planning.selection import frame_patches
+from pipeline.planning.prices import frame_patches
 
 if TYPE_CHECKING:
     import torch

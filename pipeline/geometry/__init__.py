@@ -1,1 +1,1 @@
-"""Mirror, camera, scan paths and grid: where each sample looks, in closed forms."""
+"""Model the mirror, the camera, scan paths and the scene grid in closed forms."""

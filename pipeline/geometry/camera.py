@@ -1,4 +1,4 @@
-"""The line camera: pixel rays, slit, exposure, timing, and the one operator by which every pass looks at light.
+"""Model the line camera: pixel rays, slit, exposure, timing, and the footprint of a sample.
 
 Positions along the line and along the scan are in px: one IFOV in the tangent plane of the undeflected direction.
 """
@@ -21,7 +21,7 @@ LARGEST_SUM_DN = 65535
 
 @dataclass(frozen=True)
 class LineCamera:
-    """A pushbroom camera as the mirror sees it. Assumed values are not measured on a unit.
+    """A pushbroom camera behind the mirror. Values marked as assumed are not measured on a unit.
 
     The defaults describe a 640 x 270 line camera behind a 70 mm lens: IFOV 105.714 urad.
     """
@@ -40,59 +40,59 @@ class LineCamera:
 
     @property
     def ifov_rad(self) -> float:
-        """Angle of one pixel [rad]."""
+        """Return the angle of one pixel [rad]."""
         return self.pitch_um * 1e-3 / self.focal_length_mm
 
     @property
     def slit_px(self) -> float:
-        """Width of the slit's image along the scan [px]."""
+        """Return the width of the slit's image along the scan [px]."""
         return self.slit_um / self.pitch_um
 
     @property
     def full_scale_dn(self) -> int:
-        """Largest number that the converter gives."""
+        """Return the largest number of the converter."""
         return (1 << self.bits) - 1
 
     @property
     def full_scale_e(self) -> float:
-        """Electrons at which a sample saturates (dark level taken off)."""
+        """Return the electrons at which a sample saturates, above the dark level."""
         return (self.full_scale_dn - self.dark_dn) * self.electrons_per_dn
 
     @property
     def frame_ms(self) -> float:
-        """Frame period: exposure and readout, never above the highest rate (erratum E13)."""
+        """Return the frame period: exposure and readout, limited by the highest rate (erratum E13)."""
         return max(self.exposure_ms + self.readout_ms, 1000.0 / self.max_rate_hz)
 
     def mid_exposure_s(self, line: Number) -> Number:
-        """Time of mid exposure of lines by their number, since the first one began [s]."""
+        """Return the time of mid exposure of lines by their number, since the start of the first [s]."""
         return (line * self.frame_ms + self.exposure_ms / 2) * 1e-3
 
     def scan_seconds(self, lines: int) -> float:
-        """Time to take ``lines`` lines in one uninterrupted sweep [s] (the paper's t_img = N t_frame)."""
+        """Return the time for ``lines`` lines in one uninterrupted sweep [s] (the paper's t_img = N t_frame)."""
         return lines * self.frame_ms * 1e-3
 
     @property
     def most_binning(self) -> int:
-        """Largest number of samples whose sum always fits 16 bits."""
+        """Return the largest number of samples whose sum always fits 16 bits."""
         return LARGEST_SUM_DN // self.full_scale_dn
 
     def pixel_slopes(self, binning: int = 1) -> NDArray[np.float64]:
-        """Tangent k_y/k_z of each (binned) sample's ray, (sample,) float64."""
+        """Return the tangent k_y/k_z of each (binned) sample's ray, (sample,) float64."""
         count = self.samples // binning
         centre = (self.samples - 1) / 2
         middle = (np.arange(count, dtype=np.float64) + 0.5) * binning - 0.5
         return (middle - centre) * self.ifov_rad
 
     def sample_at(self, slopes: NDArray[np.float64], binning: int = 1) -> NDArray[np.float64]:
-        """Continuous (binned) sample that looks along each slope, integers at centres: undoes ``pixel_slopes``."""
+        """Return the continuous (binned) sample of each slope, integers at centres: the inverse of ``pixel_slopes``."""
         return (slopes / self.ifov_rad + self.samples / 2) / binning - 0.5
 
 
 def footprint_kernel(width_px: float) -> NDArray[np.float64]:
-    """Weights of a box of ``width_px`` over a scene that is linear between its pixels, centred on a pixel.
+    """Return the weights of a box of ``width_px`` over a scene that is linear between its pixels, centred on a pixel.
 
-    Odd length, sum 1, none below 0. The simulator has the same product at any position; this is its closed form at
-    pixel centres.
+    Odd length, sum 1, none negative. The simulator computes the same product at any position; this is the closed form
+    at pixel centres.
     """
     half = int(np.ceil(width_px / 2 + 1))
     edges = np.arange(-half, half + 1, dtype=np.float64)
@@ -101,7 +101,7 @@ def footprint_kernel(width_px: float) -> NDArray[np.float64]:
 
 
 def _linear_integral(t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Integral of the kernel of linear interpolation from minus infinity to t."""
+    """Return the integral of the kernel of linear interpolation from minus infinity to t."""
     a = np.minimum(np.abs(t), 1.0)
     return 0.5 + np.sign(t) * a * (1 - a / 2)
 
@@ -109,10 +109,10 @@ def _linear_integral(t: NDArray[np.float64]) -> NDArray[np.float64]:
 def digitise(
     electrons: NDArray[np.floating], camera: LineCamera, rng: np.random.Generator | None
 ) -> NDArray[np.uint16]:
-    """Turn expected electrons (..., band) of one exposure into DN: shot noise, read noise, dark level, saturation.
+    """Convert expected electrons (..., band) of one exposure to DN: shot noise, read noise, dark level, saturation.
 
-    Negative electrons count as 0; DN are clipped to the converter's range and rounded half to even. ``rng`` None leaves
-    the noise out.
+    Negative electrons count as 0. DN are clipped to the converter's range and rounded half to even. ``rng`` None means
+    no noise.
     """
     signal = np.maximum(electrons, 0).astype(np.float32, copy=False)
     if rng is not None and camera.read_noise_e >= ONE_DRAW_READ_NOISE_E:
@@ -126,10 +126,11 @@ def digitise(
 
 
 def _shot_and_read(expected: NDArray[np.float32], camera: LineCamera, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Shot plus read noise from one normal draw z: mean + sqrt(V) z + (k3 / 6V)(z^2 - 1).
+    """Return shot plus read noise from one normal draw z: mean + sqrt(V) z + (k3 / 6V)(z^2 - 1).
 
-    The first three cumulants are exact (Cornish and Fisher, 1938, second order). What is left is the excess kurtosis
-    lambda / V^2 <= 1 / (4 read^2): 6e-4 at 20 e-, unseen in 1e6 draws; hence the least read noise for this branch.
+    The first three cumulants are exact (Cornish and Fisher, 1938, second order). The remaining excess kurtosis is
+    lambda / V^2 <= 1 / (4 read^2): 6e-4 at 20 e-, not detectable in 1e6 draws. Hence the least read noise for this
+    branch.
     """
     variance = expected + np.float32(camera.read_noise_e**2)
     z = rng.standard_normal(expected.shape, dtype=np.float32)
@@ -144,9 +145,9 @@ def _shot_and_read(expected: NDArray[np.float32], camera: LineCamera, rng: np.ra
 def bin_samples(dn: NDArray[np.uint16], binning: int) -> NDArray[np.uint16]:
     """Sum ``binning`` neighbouring samples, (..., sample, band) -> (..., sample // binning, band).
 
-    A remainder is dropped.
+    Samples that do not fill a bin are dropped.
 
-    Raises ShapeError: fewer samples than ``binning``, or a sum that 16 bits do not hold.
+    Raises ShapeError: fewer samples than ``binning``, or a sum exceeds 16 bits.
     """
     if binning == 1:
         return dn
@@ -165,20 +166,20 @@ def bin_samples(dn: NDArray[np.uint16], binning: int) -> NDArray[np.uint16]:
 
 
 def footprint(light: NDArray[np.floating], camera: LineCamera) -> NDArray[np.float32]:
-    """Blur a grid-aligned scene by the slit along y and the pixel along x; any linear measure of light, (y, x, k)."""
+    """Blur a grid-aligned scene by the slit along y and the pixel along x; (y, x, k) in any linear unit."""
     return _convolve(_convolve(light, footprint_kernel(camera.slit_px), 0), footprint_kernel(1.0), 1)
 
 
 def expose(
     seen: NDArray[np.floating], camera: LineCamera, *, step: int, rng: np.random.Generator | None
 ) -> NDArray[np.float32]:
-    """Return one exposure a line of a grid-aligned scene (y, x, band) [e-] behind the footprint; scan along y.
+    """Return one exposure by line of a grid-aligned scene (y, x, band) [e-] after the footprint; scan along y.
 
-    The coarse pass takes every ``step``-th line: the mirror moves ``step`` px during the one exposure and ``step``
-    neighbouring samples are averaged, so that noise falls by sqrt(step), not by step. ``step=1`` is the fine pass.
-    (y / step, x / step, band) float32 electrons, dark level taken off.
+    The coarse pass takes every ``step``-th line. The mirror moves ``step`` px during one exposure, and ``step``
+    neighbouring samples are averaged, so that noise falls by sqrt(step), not by step. ``step=1`` is the fine pass. The
+    result is (y / step, x / step, band) float32 electrons without the dark level.
 
-    Raises ShapeError: a size does not divide by ``step``, or a binned sum does not fit 16 bits.
+    Raises ShapeError: a size is not a multiple of ``step``, or a binned sum exceeds 16 bits.
     """
     y, x, bands = seen.shape
     if y % step or x % step:

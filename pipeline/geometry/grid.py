@@ -1,4 +1,4 @@
-"""The scene grid: its pixels, patches of the fine pass, coarse pixels, and how sizes that do not divide are padded."""
+"""Define the scene grid: pixels, patches, coarse pixels and padding."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 from pipeline.errors import ShapeError
 
 Kind = TypeVar("Kind", bound=np.generic)
-UNLABELLED = 255  # in (y, x) uint8 images of class indices: this pixel has none
+UNLABELLED = 255  # pixel without a class, in (y, x) uint8 images of class indices
 
 
 @dataclass(frozen=True)
 class SceneGrid:
-    """A scene of ``height`` x ``width`` px cut into patches of ``patch`` px, coarse pixels of ``factor`` px.
+    """A scene of ``height`` x ``width`` px with patches of ``patch`` px and coarse pixels of ``factor`` px.
 
-    The padded grid is the smallest multiple of ``patch * factor`` that holds the scene, so that a coarse patch
-    (``patch`` coarse pixels a side) covers ``factor`` x ``factor`` whole patches. Patches are numbered row by row over
-    the padded grid; those without a valid pixel are never bought.
+    The padded grid is the smallest multiple of ``patch * factor`` that holds the scene. A coarse patch (``patch``
+    coarse pixels a side) then covers ``factor`` x ``factor`` whole patches. Patches are numbered row by row over the
+    padded grid; patches without a valid pixel are never captured.
     """
 
     height: int
@@ -31,38 +31,38 @@ class SceneGrid:
     def __post_init__(self) -> None:
         for name in ("height", "width", "patch", "factor"):
             if getattr(self, name) < 1:
-                raise ShapeError(f"{name} of the scene grid must be at least 1, got {getattr(self, name)}")
+                raise ShapeError(f"the scene grid's {name} must be at least 1, got {getattr(self, name)}")
 
     @property
     def padded_shape(self) -> tuple[int, int]:
-        """(y, x) of the padded fine grid [px]."""
+        """Return (y, x) of the padded fine grid [px]."""
         cell = self.patch * self.factor
         return -(-self.height // cell) * cell, -(-self.width // cell) * cell
 
     @property
     def patch_shape(self) -> tuple[int, int]:
-        """(rows, columns) of patches on the padded grid."""
+        """Return (rows, columns) of patches on the padded grid."""
         y, x = self.padded_shape
         return y // self.patch, x // self.patch
 
     @property
     def coarse_shape(self) -> tuple[int, int]:
-        """(y, x) of the coarse pixels that hold part of the scene."""
+        """Return (y, x) of the coarse pixels that hold part of the scene."""
         return -(-self.height // self.factor), -(-self.width // self.factor)
 
     def valid_fraction(self) -> NDArray[np.float64]:
-        """Fraction of each patch's pixels that lie on the scene, (rows, columns) in 0..1."""
+        """Return the fraction of each patch's pixels that lie on the scene, (rows, columns) in 0..1."""
         rows, columns = self.patch_shape
         down = np.clip(self.height - np.arange(rows) * self.patch, 0, self.patch)
         across = np.clip(self.width - np.arange(columns) * self.patch, 0, self.patch)
         return down[:, None] * across[None, :] / self.patch**2
 
     def valid_patches(self) -> NDArray[np.intp]:
-        """Numbers of the patches that hold a valid pixel, ascending."""
+        """Return the numbers of the patches that hold a valid pixel, ascending."""
         return np.flatnonzero(self.valid_fraction().ravel() > 0)
 
     def patch_origin(self, patch_index: NDArray[np.integer]) -> NDArray[np.intp]:
-        """(patch, 2) y and x of the first pixel of each patch."""
+        """Return (patch, 2) y and x of the first pixel of each patch."""
         rows, columns = np.divmod(np.asarray(patch_index), self.patch_shape[1])
         return np.stack([rows, columns], axis=-1).astype(np.intp) * self.patch
 
@@ -76,7 +76,7 @@ def patch_pixels(grid: SceneGrid, image: NDArray[Kind], beyond: int = 0) -> NDAr
 
 
 def pad_by_reflection(image: NDArray[np.generic], shape: tuple[int, int]) -> NDArray[np.generic]:
-    """Grow the first two axes to ``shape`` by reflection (by the edge pixel where reflection has nothing to show)."""
+    """Extend the first two axes to ``shape`` by reflection; one single pixel is repeated."""
     grown = image
     for axis, size in enumerate(shape):
         while grown.shape[axis] < size:
@@ -90,9 +90,9 @@ def pad_by_reflection(image: NDArray[np.generic], shape: tuple[int, int]) -> NDA
 def block_means(
     values: NDArray[np.float32], coverage: NDArray[np.intp], times: int
 ) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
-    """Mean of every ``times`` x ``times`` pixels that are no NaN, (y, x, band), and the most sweeps that saw one.
+    """Return the mean of ``times`` x ``times`` pixels without NaN, (y, x, band), and the largest coverage of a block.
 
-    Sides that ``times`` does not divide end in a smaller block. NaN where nothing of a block was seen.
+    Blocks at the end may be smaller. NaN where a block has no value.
     """
     beyond = [(0, -size % times) for size in coverage.shape]
     if any(more for _, more in beyond):
@@ -102,7 +102,7 @@ def block_means(
     covered = coverage.reshape(*blocks.shape[:4]).max(axis=(1, 3))
     with np.errstate(over="ignore", invalid="ignore"):
         total = blocks.sum(axis=(1, 3), dtype=np.float32)
-    if np.isfinite(total).all():  # the rule: all was seen
+    if np.isfinite(total).all():  # the usual case: all pixels have a value
         return total / np.float32(times**2), covered
     seen = np.isfinite(blocks)
     count = seen.sum(axis=(1, 3), dtype=np.float32)

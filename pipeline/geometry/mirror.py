@@ -1,11 +1,12 @@
-"""The two-axis mirror: device position, normal, view direction, and how the line turns. Closed forms.
+"""Convert between device position, mirror normal, view direction and scene point of the two-axis mirror.
 
-Camera frame: the chief ray leaves along k = (0, 0, 1) and the undeflected scene direction is (1, 0, 0); y is the normal
-of the plane of incidence. Scene tangents are xi = o_y / o_x (along the line) and eta = o_z / o_x (the scan). The device
-reports the point, in units of tan 50 deg, where a ray falling along the rest normal would go (position (0, 0) is rest).
+All conversions are closed forms. Camera frame: the chief ray leaves along k = (0, 0, 1), and the undeflected scene
+direction is (1, 0, 0). The y axis is the normal of the plane of incidence. Scene tangents are xi = o_y / o_x (along the
+line) and eta = o_z / o_x (the scan). A device position is where a ray along the rest normal would go, in units of tan
+50 deg; (0, 0) is rest.
 
-float32 arrays stay float32, as devices keep them; everything else is worked out in float64. What the paper prints
-instead is in ``tests/pipeline/geometry/paper_equations.py``, and docs/background/errata.md lists the errata E1 to E18.
+float32 arrays stay float32, as devices keep them; all else is computed in float64. The printed equations of the paper
+are in ``tests/pipeline/geometry/paper_equations.py``, and docs/background/errata.md lists the errata E1 to E18.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from pipeline.errors import PoseError, SettingsError, ShapeError
 Floats = NDArray[Any]  # float64, or float32 where that came in
 
 REST_TANGENT = float(np.tan(np.deg2rad(50.0)))
-# Rounding that may put a vector beyond the rim, or off length 1, by the precision that it came in.
+# Rounding by which a vector may lie beyond the rim, or differ from length 1, by its precision.
 RIM_SLACK = {"float64": 1e-12, "float32": 1e-6}
 LENGTH_SLACK = {"float64": 1e-6, "float32": 1e-5}
 _HALF = float(np.sqrt(0.5))
@@ -32,9 +33,9 @@ _DEVICE_AXES = np.array([[-_HALF, 0.0, -_HALF], [0.0, 1.0, 0.0], [_HALF, 0.0, -_
 
 
 def check_reach(position: ArrayLike) -> Floats:
-    """Give device positions (..., 2) back as floats; refuse those beyond the unit disk (erratum E3).
+    """Return device positions (..., 2) as floats, none beyond the unit disk (erratum E3).
 
-    A device would clamp them to its rim unasked.
+    A device would clamp such positions to its rim without notice.
 
     Raises PoseError: a position is not finite or beyond the rim; the message names the first.
     """
@@ -45,7 +46,7 @@ def check_reach(position: ArrayLike) -> Floats:
 
 
 def position_to_normal(position: ArrayLike) -> Floats:
-    """Give the unit mirror normals (..., 3), in the camera frame, of device positions (..., 2) in the closed unit disk.
+    """Return the unit mirror normals (..., 3), in the camera frame, of device positions (..., 2) in the unit disk.
 
     Raises PoseError: a position is not finite or beyond the rim; the message names the first.
     """
@@ -59,11 +60,11 @@ def position_to_normal(position: ArrayLike) -> Floats:
 
 
 def normal_to_position(normal: ArrayLike) -> Floats:
-    """Give the device positions (..., 2) of unit normals (..., 3): the inverse of ``position_to_normal``.
+    """Return the device positions (..., 2) of unit normals (..., 3): the inverse of ``position_to_normal``.
 
-    Raises PoseError: a normal is not finite, not of length 1, or turned beyond the rim. The disk is checked before
-    anything
-        is divided, since X overflows as the tilt nears 45 deg (erratum E2).
+    The disk is checked before the division, since X overflows as the tilt nears 45 deg (erratum E2).
+
+    Raises PoseError: a normal is not finite, not of length 1, or beyond the rim.
     """
     n = _units(normal, "mirror normal")
     device = normal_to_device(n)
@@ -77,16 +78,16 @@ def normal_to_position(normal: ArrayLike) -> Floats:
 
 
 def normal_to_device(normal: ArrayLike) -> Floats:
-    """Give the parts (..., 3) of normals along the device's X and Y axes and along the rest normal."""
+    """Return the components (..., 3) of normals along the device's X and Y axes and along the rest normal."""
     n = _vectors(normal, 3, "mirror normal")
     device: Floats = n @ _DEVICE_AXES.T.astype(n.dtype)
     return device
 
 
 def direction_to_normal(direction: ArrayLike) -> Floats:
-    """Give the normals (..., 3) that send the chief ray along unit directions (..., 3), n ~ o - k.
+    """Return the normals (..., 3) that send the chief ray along unit directions (..., 3), n ~ o - k.
 
-    Stable up to grazing (o_z -> 1, erratum E7): there 1 - o_z is taken as (o_x^2 + o_y^2) / (1 + o_z).
+    Stable up to grazing (o_z -> 1, erratum E7): there 1 - o_z is computed as (o_x^2 + o_y^2) / (1 + o_z).
 
     Raises PoseError: a direction is not finite, not of length 1, or is the chief ray itself, which no mirror makes.
     """
@@ -105,25 +106,25 @@ def reflect(ray: ArrayLike, normal: ArrayLike) -> Floats:
 
 
 def position_to_direction(position: ArrayLike) -> Floats:
-    """Give the unit direction (..., 3) in which the chief ray looks from device positions (..., 2)."""
+    """Return the unit view direction (..., 3) of the chief ray at device positions (..., 2)."""
     return reflect((0.0, 0.0, 1.0), position_to_normal(position))
 
 
 def direction_to_position(direction: ArrayLike) -> Floats:
-    """Give the device position (..., 2) that points the chief ray along unit directions (..., 3)."""
+    """Return the device position (..., 2) that points the chief ray along unit directions (..., 3)."""
     return normal_to_position(direction_to_normal(direction))
 
 
 def scene_to_direction(tangents: ArrayLike) -> Floats:
-    """Give unit directions (..., 3) of scene tangents (..., 2), xi along the line and eta along the scan."""
+    """Return unit directions (..., 3) of scene tangents (..., 2), xi along the line and eta along the scan."""
     t = _vectors(tangents, 2, "scene tangent")
     return _unit(np.concatenate([np.ones((*t.shape[:-1], 1), t.dtype), t], axis=-1))
 
 
 def direction_to_scene(direction: ArrayLike) -> Floats:
-    """Give scene tangents (..., 2) of directions (..., 3).
+    """Return scene tangents (..., 2) of directions (..., 3).
 
-    Raises PoseError: a direction does not look at the scene plane (o_x <= 0).
+    Raises PoseError: a direction does not meet the scene plane (o_x <= 0).
     """
     o = _vectors(direction, 3, "view direction")
     _refuse(o[..., 0] <= 0, o, "looks away from the scene plane (its x must be above 0)")
@@ -131,12 +132,12 @@ def direction_to_scene(direction: ArrayLike) -> Floats:
 
 
 def line_rotation(direction: ArrayLike) -> Floats:
-    """Give the angle by which the slit's image is turned in the scene tangent plane, for unit directions (..., 3).
+    """Return the rotation of the slit's image in the scene tangent plane, for unit directions (..., 3) [rad].
 
-    A property of the pose and not of the path (erratum E8): psi = atan2(o_y, 1 - o_z), anticlockwise from xi to eta,
-    for a slit along y. The line stays straight and runs along (cos psi, sin psi) in (xi, eta), exactly. [rad]
+    It depends on the pose and not on the path (erratum E8). For a slit along y it is psi = atan2(o_y, 1 - o_z),
+    anticlockwise from xi to eta. The line is exactly straight and runs along (cos psi, sin psi) in (xi, eta).
 
-    A survey never asks for it: `scan.points_of_scan` turns lines, and `line_centre` with `camera_slope` undo that.
+    A survey uses `scan.points_of_scan` instead, which includes the rotation; `line_centre` and `camera_slope` undo it.
 
     Raises PoseError: a direction is not finite, not of length 1, or is the camera's own ray.
     """
@@ -145,10 +146,10 @@ def line_rotation(direction: ArrayLike) -> Floats:
 
 
 def mirror_throughput(position: ArrayLike) -> Floats:
-    """Give the light that the mirror passes at device positions (..., 2), over that at rest (erratum E16).
+    """Return the light that the mirror passes at device positions (..., 2), relative to rest (erratum E16).
 
-    |n_z| / |n_z at rest|: the mirror is the aperture stop, and what it passes goes with its area as the camera sees it.
-    1 at rest, 0.48 to 1.33 over the disk.
+    |n_z| / |n_z at rest|: the mirror is the aperture stop, and passes light in proportion to its projected area. It is
+    1 at rest and 0.48 to 1.33 over the disk.
 
     Raises PoseError: a position is not finite or beyond the rim.
     """
@@ -158,12 +159,12 @@ def mirror_throughput(position: ArrayLike) -> Floats:
 
 
 def line_centre(along: Floats, scan: Floats, across: ArrayLike) -> Floats:
-    """Give where the line that passes through a point has its centre, as a tangent on the scan axis.
+    """Return the centre of the line that passes through a point, as a tangent on the scan axis.
 
-    The ray to a point meets the slit's plane for exactly one tilt of the mirror. With a and b the tangents of the point
-    ``along`` the line and on the ``scan``, c (``across``) that of the line's centre along the line, P = c (c - a) and
-    D = 1 + a^2 - (a - c)^2, the centre lies at ``b + P (b + sqrt(D + b^2)) / D``; nothing cancels within the mirror's
-    reach. Arrays broadcast; NaN where no line passes: beyond 45 deg to the side.
+    The ray to a point meets the slit's plane for exactly one tilt of the mirror. Let a and b be the tangents of the
+    point ``along`` the line and on the ``scan``. Let c (``across``) be that of the line's centre along the line. With
+    P = c (c - a) and D = 1 + a^2 - (a - c)^2 the centre lies at ``b + P (b + sqrt(D + b^2)) / D``. Nothing cancels
+    within the mirror's reach. Arrays broadcast; NaN where no line passes: beyond 45 deg to the side.
     """
     c = np.asarray(across, _kept(along, scan, across))
     gap = along - c
@@ -174,12 +175,11 @@ def line_centre(along: Floats, scan: Floats, across: ArrayLike) -> Floats:
 
 
 def camera_slope(along: Floats, scan: Floats, across: ArrayLike, centre: Floats) -> Floats:
-    """Give the slope k_y / k_z of the camera ray that the mirror, aimed at (across, centre), sends to each point.
+    """Return the slope k_y / k_z of the camera ray that the mirror, aimed at (across, centre), sends to each point.
 
-    With :func:`line_centre` it undoes the turn of the lines.
-
-    The reflection of the ray (1, along, scan) in the normal c - k0, written out for the unit vector c to the line's
-    centre. All are tangents; ``centre`` is that of :func:`line_centre`, the point's own line.
+    With :func:`line_centre` it undoes the rotation of the lines. It is the reflection of the ray (1, along, scan) in
+    the normal c - k0, for the unit vector c to the line's centre. All are tangents; ``centre`` is that of
+    :func:`line_centre` for the same point.
     """
     c = np.asarray(across, _kept(along, scan, across))
     r = np.sqrt(1 + c * c + centre * centre)
@@ -189,7 +189,7 @@ def camera_slope(along: Floats, scan: Floats, across: ArrayLike, centre: Floats)
 
 
 def _one_minus_z(o: Floats) -> Floats:
-    """1 - o_z of unit vectors without cancellation on either side; refused where it is 0."""
+    """Return 1 - o_z of unit vectors without cancellation; PoseError where it is 0."""
     z = o[..., 2]
     across = o[..., 0] ** 2 + o[..., 1] ** 2
     _refuse((o[..., 0] == 0) & (o[..., 1] == 0) & (z > 0), o, "is the camera's own ray, which no mirror makes")
@@ -197,20 +197,20 @@ def _one_minus_z(o: Floats) -> Floats:
 
 
 def _unit(vectors: Floats) -> Floats:
-    # The largest part is taken out first: near grazing the squares of small vectors would lose digits or vanish.
+    # Divide by the largest component first: near grazing the squares of small vectors lose digits or vanish.
     scaled = vectors / np.max(np.abs(vectors), axis=-1, keepdims=True)
     unit: Floats = scaled / np.sqrt(np.sum(scaled**2, axis=-1, keepdims=True))
     return unit
 
 
 def _kept(*values: ArrayLike) -> np.dtype[Any]:
-    """float32 where all arrays among the values are of that precision, else float64; plain numbers do not count."""
+    """Return float32 if all arrays among the values are float32, else float64; plain numbers do not count."""
     found = {value.dtype for value in values if isinstance(value, np.ndarray | np.generic)}
     return np.dtype(np.float32 if found == {np.dtype(np.float32)} else np.float64)
 
 
 def _vectors(values: ArrayLike, size: int, name: str) -> Floats:
-    """Read ``values`` as (..., size) finite floats."""
+    """Return ``values`` as (..., size) finite floats."""
     array = np.asarray(values, _kept(values))
     if array.ndim == 0 or array.shape[-1] != size:
         raise ShapeError(f"a {name} needs {size} numbers on the last axis, got shape {array.shape}")
@@ -219,7 +219,7 @@ def _vectors(values: ArrayLike, size: int, name: str) -> Floats:
 
 
 def _units(values: ArrayLike, name: str) -> Floats:
-    """Read ``values`` as (..., 3) vectors of length 1."""
+    """Return ``values`` as (..., 3) vectors of length 1."""
     array = _vectors(values, 3, name)
     off = np.abs(np.sum(array**2, axis=-1) - 1) > LENGTH_SLACK[array.dtype.name]
     _refuse(off, array, f"is not of length 1, as a {name} must be")
@@ -227,7 +227,7 @@ def _units(values: ArrayLike, name: str) -> Floats:
 
 
 def _refuse(bad: NDArray[np.bool_] | np.bool_, values: Floats, reason: str) -> None:
-    """Raise for the first bad vector, saying which one it was."""
+    """Raise PoseError for the first bad vector, with its index."""
     if not np.any(bad):
         return
     first = np.argwhere(bad)[0]
@@ -239,12 +239,12 @@ def _refuse(bad: NDArray[np.bool_] | np.bool_, values: Floats, reason: str) -> N
 
 @dataclass(frozen=True)
 class Mounting:
-    """Between the XY of a device and of the model: device = axes @ rotation(clocking_deg) @ model + offset.
+    """Convert between the XY of a device and of the model: device = axes @ rotation(clocking_deg) @ model + offset.
 
-    The paper leaves out which axis of the device is which and which way it turns (erratum E6). ``axes`` says what the
-    device's X and Y are: "y,-x" that its X is the model's Y and its Y the model's -X. ``clocking_deg`` is the small
-    turn of the mirror about its rest normal, anticlockwise from X to Y, and the offset the device's XY at the model's
-    rest.
+    The paper does not say which axis of the device is which, and which way it turns (erratum E6). ``axes`` names the
+    device's X and Y: "y,-x" means that its X is the model's Y and its Y the model's -X. ``clocking_deg`` is the small
+    rotation of the mirror about its rest normal, anticlockwise from X to Y. The offset is the device's XY at the
+    model's rest.
     """
 
     axes: str = "x,y"
@@ -259,9 +259,10 @@ class Mounting:
             raise SettingsError(f"a mirror's clocking and offset must be finite, got {self}")
 
     def to_device(self, position: ArrayLike) -> NDArray[np.floating]:
-        """Give what to send to the device for model positions (..., 2).
+        """Return the device positions of model positions (..., 2).
 
-        Raises PoseError: a position is beyond the disk for the model, or for the device, which would clamp it unasked.
+        Raises PoseError: a position is beyond the disk of the model, or of the device, which would clamp it without
+        notice.
         """
         model = check_reach(position)
         if self == STRAIGHT:
@@ -276,16 +277,16 @@ class Mounting:
             ) from error
 
     def to_model(self, device: ArrayLike) -> NDArray[np.float64]:
-        """Give the model positions (..., 2) of what the device reports: the inverse of ``to_device``.
+        """Return the model positions (..., 2) of device positions: the inverse of ``to_device``.
 
-        What was measured may lie a little beyond the rim, and is not refused.
+        Measured positions may lie slightly beyond the rim, and are accepted.
         """
         given = np.asarray(device, np.float64)
         model: NDArray[np.float64] = (given - (self.offset_x, self.offset_y)) @ self._matrix()
         return given if self == STRAIGHT else model
 
     def _matrix(self) -> NDArray[np.float64]:
-        """The orthogonal part, whose transpose undoes it."""
+        """Return the orthogonal part; its transpose is its inverse."""
         turn = np.deg2rad(self.clocking_deg)
         rotation = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
         return np.array([_ROWS[axis] for axis in self.axes.split(",")]) @ rotation

@@ -1,7 +1,8 @@
-"""Scan paths: sweeps of lines, where they fall on the scene, their seconds, and how they fill the mirror's memory.
+"""Define sweeps of lines: their places on the scene, their capture time, and their share of the mirror's memory.
 
 Points of a sweep are (along, scan) in px from the undeflected direction: (x, y) of the scene for ``along="x"``,
-(y, x) for ``along="y"``. A line is the straight image of the slit, so scene and sweep map to each other in closed form.
+(y, x) for ``along="y"``. A line is the straight image of the slit, so the mapping between scene and sweep is a closed
+form.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ class Sweep:
     """A run of lines, straight in the scene: all line centres lie on one parallel to the scan axis.
 
     Scene coordinates are in px from the scene's centre, the undeflected direction. The mirror holds ``positions``
-    positions, 1 px apart, during each exposure: as many as lines are apart (a staircase from its vector memory), or
-    ``held`` of them. ``held=1`` stares at one position a line, so that later lines fit between.
+    positions, 1 px apart, during each exposure. These are as many as lines are apart (a staircase from its vector
+    memory), or ``held`` of them. ``held=1`` holds one position for each line, so that later lines fit between.
     """
 
     name: str
@@ -47,8 +48,8 @@ class Sweep:
     lines: int
     step: int = 1
     binning: int = 1
-    exposure_ms: float | None = None  # of a line; the camera's own where it is None
-    held: int | None = None  # positions that an exposure holds; None: ``step`` of them
+    exposure_ms: float | None = None  # of a line; None: the camera's
+    held: int | None = None  # positions of an exposure; None: ``step``
 
     @property
     def positions(self) -> int:
@@ -66,12 +67,12 @@ class Sweep:
 
 
 def exposing(camera: LineCamera, sweep: Sweep) -> LineCamera:
-    """Give the camera as it takes the lines of a sweep: with the sweep's exposure, if it has one of its own."""
+    """Return the camera with the exposure of a sweep, if the sweep has its own."""
     return camera if sweep.exposure_ms in (None, camera.exposure_ms) else replace(camera, exposure_ms=sweep.exposure_ms)
 
 
 def count_by_exposure(sweeps: Sequence[Sweep], camera: LineCamera) -> dict[LineCamera, tuple[int, int]]:
-    """Count lines and sweeps of each exposure, by the camera as it takes them, in the order in which they come."""
+    """Count lines and sweeps of each exposure, by the camera with that exposure, in order of capture."""
     counts: dict[LineCamera, tuple[int, int]] = {}
     for sweep in sweeps:
         exposed = exposing(camera, sweep)
@@ -82,26 +83,26 @@ def count_by_exposure(sweeps: Sequence[Sweep], camera: LineCamera) -> dict[LineC
 
 @dataclass(frozen=True)
 class CostModel:
-    """Seconds that a plan takes. Assumed until measured on a rig; settings carry the provenance."""
+    """Capture time of a plan. Values are assumed until measured on a rig; settings name their source."""
 
     slew_s: float = stated(0.05, "Time to turn the mirror to a sweep's first line", "s", 0, 10)
     settle_frames: float = stated(2.0, "Frames that the mirror takes to come to rest", "", 0, 1000)
     capture_start_s: float = stated(0.2, "Time to start a capture", "s", 0, 60)
     reload_s: float = stated(1.6, "Time to load vector_pairs positions into the mirror's memory", "s", 0, 60)
     vector_pairs: int = stated(1500, "Positions that the mirror's memory holds", "", 1, 10_000_000)
-    provenance: str = stated("assumed", "Where measured values come from")
+    provenance: str = stated("assumed", "Source of the measured values")
 
     def setup_seconds(self, camera: LineCamera) -> float:
-        """Slew, settling and start of one sweep [s]."""
+        """Return the time of slew, settling and start of one sweep [s]."""
         return self.slew_s + self.capture_start_s + self.settle_frames * camera.frame_ms * 1e-3
 
     def seconds(self, sweeps: list[Sweep], camera: LineCamera) -> float:
-        """Price of the sweeps in the given order [s]: lines, a set-up each, and reloads of the vector memory."""
-        reloads = count_loads(sweeps, self.vector_pairs)
+        """Return the time of the sweeps in the given order [s]: lines, set-ups, and reloads of the vector memory."""
+        reloads = len(memory_loads(sweeps, self.vector_pairs))
         return self.line_seconds(count_by_exposure(sweeps, camera)) + reloads * self.reload_s
 
     def line_seconds(self, counts: Mapping[LineCamera, tuple[int, int]]) -> float:
-        """Price of so many lines of each exposure, with the set-ups of so many sweeps [s]."""
+        """Return the time of so many lines and sweeps of each exposure, set-ups included [s]."""
         return sum(
             exposed.scan_seconds(lines) + sweeps * self.setup_seconds(exposed)
             for exposed, (lines, sweeps) in counts.items()
@@ -109,7 +110,7 @@ class CostModel:
 
 
 def sweep_positions(sweep: Sweep, camera: LineCamera) -> Floats:
-    """Give the mirror positions that a sweep holds, (line, step, 2) device X and Y.
+    """Return the mirror positions that a sweep holds, (line, step, 2) device X and Y.
 
     Raises PoseError: a position is beyond the mirror's disk.
     """
@@ -117,7 +118,7 @@ def sweep_positions(sweep: Sweep, camera: LineCamera) -> Floats:
 
 
 def line_positions(sweep: Sweep, camera: LineCamera) -> Floats:
-    """Give the mirror position at mid exposure of every line, (line, 2) device X and Y.
+    """Return the mirror position at mid exposure of every line, (line, 2) device X and Y.
 
     Raises PoseError: a position is beyond the mirror's disk.
     """
@@ -130,7 +131,7 @@ def _aim(sweep: Sweep, camera: LineCamera, scan_px: Floats) -> Floats:
 
 
 def shifted_position(position: Floats, shift_px: Floats, camera: LineCamera) -> Floats:
-    """Give positions whose line centres lie ``shift_px`` (along the line and the scan) beside those of ``position``.
+    """Return positions whose line centres are shifted by ``shift_px`` (along the line and the scan) from ``position``.
 
     Both are (..., 2) and broadcast.
 
@@ -143,10 +144,10 @@ def shifted_position(position: Floats, shift_px: Floats, camera: LineCamera) -> 
 def scan_of_points(
     swath_px: float, camera: LineCamera, along_px: ArrayLike, scan_px: ArrayLike
 ) -> tuple[Floats, Floats]:
-    """Give the line through scene points and where on it they lie, for line centres on ``swath_px``.
+    """Return the line through scene points and their place on it, for line centres on ``swath_px``.
 
-    Scan coordinate of the line's centre [px], and the slope k_y / k_z at which the camera sees the point; the points
-    ``along_px`` and ``scan_px`` broadcast [px].
+    The result is the scan coordinate of the line's centre [px], and the slope k_y / k_z at which the camera sees the
+    point. The points ``along_px`` and ``scan_px`` broadcast [px].
     """
     xi0 = swath_px * camera.ifov_rad
     xi, eta = np.asarray(along_px, np.float64) * camera.ifov_rad, np.asarray(scan_px, np.float64) * camera.ifov_rad
@@ -155,10 +156,10 @@ def scan_of_points(
 
 
 def points_of_scan(swath_px: float, camera: LineCamera, scan_px: ArrayLike, slope: ArrayLike) -> tuple[Floats, Floats]:
-    """Give the scene points (along, scan) [px] that rays of ``slope`` see from line centres at ``scan_px``.
+    """Return the scene points (along, scan) [px] that rays of ``slope`` see from line centres at ``scan_px``.
 
-    The inverse of ``scan_of_points``. With xi0 the strip, e the scan tangent of the line's centre,
-    N = sqrt(1 + xi0^2 + e^2) and q = N - e, the line is eta = e + (xi - xi0) xi0 / q (its slope is tan psi).
+    The inverse of ``scan_of_points``. Let xi0 be the swath's tangent, e the scan tangent of the line's centre,
+    N = sqrt(1 + xi0^2 + e^2) and q = N - e. The line is eta = e + (xi - xi0) xi0 / q; its slope is tan psi.
     """
     xi0 = swath_px * camera.ifov_rad
     e, u = np.asarray(scan_px, np.float64) * camera.ifov_rad, np.asarray(slope, np.float64)
@@ -169,14 +170,14 @@ def points_of_scan(swath_px: float, camera: LineCamera, scan_px: ArrayLike, slop
 
 
 def scene_to_sweep(sweep: Sweep, camera: LineCamera, along_px: ArrayLike, scan_px: ArrayLike) -> Floats:
-    """Give continuous (line, sample) of scene points on a sweep as planned, (..., 2) float64; integers are centres."""
+    """Return continuous (line, sample) of scene points on a planned sweep, (..., 2) float64; integers are centres."""
     centre, slope = scan_of_points(sweep.swath_px, camera, along_px, scan_px)
     line = (centre - sweep.start_px - (sweep.positions - 1) / 2) / sweep.step
     return np.stack([line, camera.sample_at(slope, sweep.binning)], axis=-1)
 
 
 def sweep_to_scene(sweep: Sweep, camera: LineCamera) -> tuple[Floats, Floats]:
-    """Give the scene points of every sample at mid exposure: along and scan, (line, sample) each [px]."""
+    """Return the scene points of every sample at mid exposure: along and scan, (line, sample) each [px]."""
     slopes = camera.pixel_slopes(sweep.binning)
     return points_of_scan(sweep.swath_px, camera, sweep.line_px()[:, None], slopes[None, :])
 
@@ -192,17 +193,17 @@ class MemoryPart:
 
 @dataclass(frozen=True)
 class Load:
-    """Content of the memory at one time. A pair is an X and a Y; both channels lie in one vector, Y behind X."""
+    """One content of the memory. A pair is an X and a Y; both channels lie in one vector, Y behind X."""
 
     parts: tuple[MemoryPart, ...]
 
     @property
     def pairs(self) -> int:
-        """Pairs in the memory."""
+        """Return the number of pairs in the memory."""
         return self.parts[-1].pairs[1]
 
     def channels(self, part: MemoryPart) -> tuple[tuple[int, int], tuple[int, int]]:
-        """Give the cells (start, stop) of a part's X and of its Y in the one vector, half open."""
+        """Return the cells (start, stop) of a part's X and of its Y in the vector, half open."""
         start, stop = part.pairs
         return (start, stop), (self.pairs + start, self.pairs + stop)
 
@@ -210,7 +211,7 @@ class Load:
 def memory_loads(sweeps: Sequence[Sweep], vector_pairs: int) -> list[Load]:
     """Lay the positions of sweeps into a memory of ``vector_pairs`` pairs, each load as full as whole lines allow.
 
-    A load takes what is left of one sweep and begins the next; a line's held positions are never parted.
+    A load takes the rest of one sweep and begins the next; the positions of one line stay in one load.
 
     Raises SettingsError: the positions of one line do not fit the memory.
     """
@@ -218,7 +219,11 @@ def memory_loads(sweeps: Sequence[Sweep], vector_pairs: int) -> list[Load]:
     parts: list[MemoryPart] = []
     used = 0
     for number, sweep in enumerate(sweeps):
-        _check_line(sweep, vector_pairs)
+        if sweep.positions > vector_pairs:
+            raise SettingsError(
+                f"sweep {sweep.name} holds {sweep.positions} positions in each line, the mirror's vector memory "
+                f"{vector_pairs} pairs; take a smaller coarse factor"
+            )
         line = 0
         while line < sweep.lines:
             room = (vector_pairs - used) // sweep.positions
@@ -232,34 +237,11 @@ def memory_loads(sweeps: Sequence[Sweep], vector_pairs: int) -> list[Load]:
     return [*loads, Load(tuple(parts))] if parts else loads
 
 
-def count_loads(sweeps: Sequence[Sweep], vector_pairs: int) -> int:
-    """Count the loads of :func:`memory_loads`, without laying them out; raises as that does."""
-    loads, used = 0, vector_pairs
-    for sweep in sweeps:
-        _check_line(sweep, vector_pairs)
-        rest = sweep.lines - min((vector_pairs - used) // sweep.positions, sweep.lines)
-        if rest == 0:
-            used += sweep.lines * sweep.positions
-            continue
-        most = vector_pairs // sweep.positions
-        more = -(-rest // most)
-        loads, used = loads + more, (rest - (more - 1) * most) * sweep.positions
-    return loads
-
-
-def _check_line(sweep: Sweep, vector_pairs: int) -> None:
-    if sweep.positions > vector_pairs:
-        raise SettingsError(
-            f"sweep {sweep.name} holds {sweep.positions} positions in each line, the mirror's vector memory "
-            f"{vector_pairs} pairs; take a smaller coarse factor"
-        )
-
-
 def device_range(cells: tuple[int, int], ends: Ends) -> tuple[int, int]:
-    """Give a half-open range as the device counts it: the end is the cell after the last, or the last itself.
+    """Return a half-open range as the device counts it: the end is the cell after the last, or the last itself.
 
-    Which of the two the device means is not settled (erratum E14), so it is a setting of the driver; everything else
-    here is half open.
+    The device's convention is not confirmed (erratum E14), so it is a setting of the driver; all other ranges are half
+    open.
 
     Raises SettingsError: the range is empty or begins below 0.
     """

@@ -1,1 +1,1 @@
-"""The ground under a posed rig: scene to metres, to map coordinates, and the map's pixels."""
+"""Convert between the scene, the ground under a posed rig, and the pixels of a map."""

@@ -1,6 +1,6 @@
-"""Places of fields, for polygons: from map coordinates to pixels of the scene; size and scale of a field.
+"""Place fields on the ground: map coordinates to pixels of the scene, and the size and scale of a field.
 
-Polygons in pixels count from the scene's upper left corner, x to the right and y down; the first goes from 0 to 1.
+Polygons in pixels count from the scene's upper left corner, x to the right and y down; the first pixel is 0 to 1.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ Floats = NDArray[np.float64]
 
 M2_PER_HECTARE = 10_000.0
 SECONDS_PER_HOUR = 3600.0
-BORDER_PX = 4.0  # beside the field up to which polygons are followed, so that its outermost pixels are right
-EDGE_PARTS = 64  # of a side of the outline: straight on the ground, bent on a map
+BORDER_PX = 4.0  # around the field within which polygons are converted, for exact outermost pixels
+EDGE_PARTS = 64  # of a side of the outline: straight on the ground, curved on a map
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class GroundFootprint:
 
 @dataclass(frozen=True)
 class FieldScale:
-    """A field in pixels and degrees, and in metres where something says how large a pixel is."""
+    """The size of a field in pixels and degrees, and in metres if the size of a pixel is known."""
 
     shape: tuple[int, int]  # (y, x) [px]
     view_deg: tuple[float, float]  # (y, x) of the field of view, edge to edge
@@ -63,37 +63,34 @@ class FieldScale:
 
     @property
     def hectares(self) -> float | None:
-        """The ground that the field shows; None where nothing says how large a pixel is."""
+        """Return the area of the field; None if the size of a pixel is unknown."""
         return None if self.area_m2 is None else self.area_m2 / M2_PER_HECTARE
 
     def hectares_per_hour(self, seconds: float) -> float | None:
-        """Return the hectares per hour of the camera for a field of so many seconds; None without seconds or metres."""
+        """Return the hectares per hour for a field captured in so many seconds; None without seconds or metres."""
         return None if self.hectares is None or seconds <= 0 else self.hectares / seconds * SECONDS_PER_HOUR
 
 
-def field_of_view_deg(shape: tuple[int, int], ifov_rad: float) -> tuple[float, float]:
+def scale_of_pixels(shape: tuple[int, int], ifov_rad: float, pixel_m: float | None) -> FieldScale:
+    """Return the scale of a field with square pixels of one side [m]; without metres if that is None."""
+    area = None if pixel_m is None else shape[0] * shape[1] * pixel_m**2
+    return FieldScale(shape, _view_deg(shape, ifov_rad), pixel_m, area)
+
+
+def scale_of_view(view: GroundView, shape: tuple[int, int]) -> FieldScale:
+    """Return the scale of a field of (y, x) px before a posed rig (PoseError: no ray meets the ground)."""
+    found = footprint_of(view, shape)
+    return FieldScale(shape, _view_deg(shape, view.ifov_rad), found.pixel_m, found.area_m2, found)
+
+
+def _view_deg(shape: tuple[int, int], ifov_rad: float) -> tuple[float, float]:
     """Return the angles between the outer edges of a field of (y, x) px around the undeflected direction [deg]."""
     down, across = (2 * np.arctan(size / 2 * ifov_rad) for size in shape)
     return float(np.rad2deg(down)), float(np.rad2deg(across))
 
 
-def scale_of_pixels(shape: tuple[int, int], ifov_rad: float, pixel_m: float | None) -> FieldScale:
-    """Return the scale of a field whose pixels are all squares of one side [m]; without metres where that is None."""
-    area = None if pixel_m is None else shape[0] * shape[1] * pixel_m**2
-    return FieldScale(shape, field_of_view_deg(shape, ifov_rad), pixel_m, area)
-
-
-def scale_of_view(view: GroundView, shape: tuple[int, int]) -> FieldScale:
-    """Return the scale of a field of (y, x) px before a rig of which the place is known.
-
-    Raises PoseError: no ray of the field meets the ground.
-    """
-    found = footprint_of(view, shape)
-    return FieldScale(shape, field_of_view_deg(shape, view.ifov_rad), found.pixel_m, found.area_m2, found)
-
-
 def footprint_of(view: GroundView, shape: tuple[int, int]) -> GroundFootprint:
-    """Find what of the ground a field of (y, x) px shows. Straight lines of the scene are straight on the ground.
+    """Return the ground that a field of (y, x) px shows. Straight lines of the scene are straight on the ground.
 
     Raises PoseError: no ray of the field meets the ground.
     """
@@ -115,7 +112,7 @@ def footprint_of(view: GroundView, shape: tuple[int, int]) -> GroundFootprint:
 
 
 def areas_by_number(place: FieldPlace, numbers: NDArray[np.integer], count: int) -> Floats | None:
-    """Return the ground area of a field's numbers in (y, x), (count,) [m2]; None where it is unknown.
+    """Return the ground area of each number of a field's pixels (y, x), (count,) [m2]; None if it is unknown.
 
     Pixels with a number below 0 or from ``count`` on are left out, and those that show no ground.
     """
@@ -140,17 +137,17 @@ class NoPlace:
 
     @property
     def outline(self) -> BaseGeometry:
-        """Return the outline of the field, in the coordinates that polygons are given in."""
+        """Return the outline of the field, in the coordinates of polygons."""
         return shapely.box(0, 0, self.shape[1], self.shape[0])
 
     def to_pixels(self, shape: BaseGeometry) -> BaseGeometry:
-        """Bring a polygon from these coordinates to the scene's pixels."""
+        """Convert a polygon from these coordinates to the scene's pixels."""
         return shape
 
     def pixel_areas_m2(self, rows: slice, columns: slice) -> Floats | None:
-        """Return the ground under some pixels (row, column) [m2]; None where it is unknown.
+        """Return the ground area of some pixels (row, column) [m2]; None if it is unknown.
 
-        Pixels that show none are NaN.
+        Pixels that show no ground are NaN.
         """
         size = rows.stop - rows.start, columns.stop - columns.start
         return None if self.pixel_m is None else np.full(size, self.pixel_m**2)
@@ -194,7 +191,7 @@ class PlacedPicture:
 
 @dataclass(frozen=True)
 class PosedField:
-    """A field before a rig of which the place is known."""
+    """A field before a rig with a known pose."""
 
     grid: GroundGrid
 
@@ -223,7 +220,7 @@ class PosedField:
         return shapely.Polygon(self.view.outline_px(size, self.grid.least_sink)[:, ::-1])
 
     def to_pixels(self, shape: BaseGeometry) -> BaseGeometry:
-        """Project by the ground's plane the part that the field shows: what lies behind the rig has no pixels."""
+        """Project the part of a polygon that the field shows; the ground behind the rig has no pixels."""
         shown = shapely.transform(
             self._seen(BORDER_PX), lambda points: self.view.scene_to_ground(points[:, ::-1])[:, :2]
         )
@@ -234,14 +231,12 @@ class PosedField:
         normal = self.view.normal
         ground = np.column_stack([plane, -(plane @ normal[:2]) / normal[2]])
         seen = self.view.ground_to_scene(ground)
-        pixels: Floats = seen[:, ::-1] + np.array([self.shape[1] / 2, self.shape[0] / 2])
-        return pixels
+        return np.asarray(seen[:, ::-1] + np.array([self.shape[1] / 2, self.shape[0] / 2]))
 
     def pixel_areas_m2(self, rows: slice, columns: slice) -> Floats | None:
         y, x = pixel_places(self.shape)
         points = np.stack(np.meshgrid(y[rows], x[columns], indexing="ij"), axis=-1)
-        areas: Floats = np.where(self.view.sink(points) > self.grid.least_sink, self.view.area_m2(points), np.nan)
-        return areas
+        return np.asarray(np.where(self.view.sink(points) > self.grid.least_sink, self.view.area_m2(points), np.nan))
 
     def scale(self, ifov_rad: float) -> FieldScale:
         return scale_of_view(self.view, self.shape)

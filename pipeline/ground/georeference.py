@@ -1,4 +1,4 @@
-"""Georeference of a scene, as its file says: GeoBox, entries of keys, coarser grids, areas, degrees."""
+"""Use the georeference of a scene's file: its grid, CRS and pixel areas, in metres and degrees."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ else:
 Floats = NDArray[np.float64]
 Places = Callable[[Floats, Floats], Floats]  # of x and y
 WGS84 = 4326  # by EPSG
-APART_DEG = 1e-3  # of places between which a degree is measured
-STEP_M = 100.0  # over which the slopes of a projection are taken
+APART_DEG = 1e-3  # between places for the length of a degree
+STEP_M = 100.0  # for the slopes of a projection
 TIE_POINTS = 9  # along each side of a grid, between which the scale of its map is linear
-OFF_GRID_PX = 0.02  # by which pixels of one grid may lie beside it: places are written with rounded numbers
-SAME_SIZE = 1e-6  # by which pixels of one size may differ
+OFF_GRID_PX = 0.02  # allowed offset of pixels on one grid: coordinates in files are rounded
+SAME_SIZE = 1e-6  # allowed difference of pixels of one size
 
 
 def zoomed_out(geobox: GeoBox, factor: int, shape: tuple[int, int]) -> GeoBox:
@@ -42,29 +42,29 @@ def zoomed_out(geobox: GeoBox, factor: int, shape: tuple[int, int]) -> GeoBox:
 
 
 def shift_px(grid: GeoBox, other: GeoBox) -> tuple[float, float] | None:
-    """Return the pixels (x, y) by which another grid of the same CRS begins beside a grid.
+    """Return the offset (x, y) of another grid of the same CRS from a grid [px].
 
-    None where its pixels have another size or direction.
+    None if its pixels have another size or direction.
     """
     a, b, c, d, e, f = (~grid.affine * other.affine)[:6]
     return None if max(abs(a - 1), abs(b), abs(d), abs(e - 1)) > SAME_SIZE else (float(c), float(f))
 
 
 def georeference_record(geobox: GeoBox | None) -> dict[str, Any]:
-    """Return the place in the keys of stores; empty for a scene without one, so that its keys stay."""
+    """Return the georeference for the keys of stores; empty for a scene without one, so that its keys stay."""
     if geobox is None:
         return {}
     return {"georeference": {"crs": crs_key(geobox), "transform": [float(number) for number in geobox.affine[:6]]}}
 
 
 def crs_key(geobox: GeoBox) -> str:
-    """Return a grid's CRS as one word: its EPSG code, or all of it as WKT where it has none."""
+    """Return a grid's CRS as text: its EPSG code, or its WKT if it has none."""
     assert geobox.crs is not None
     return geobox.crs.to_wkt() if geobox.crs.epsg is None else f"EPSG:{geobox.crs.epsg}"
 
 
 def crs_name(geobox: GeoBox) -> str:
-    """Return the usual name of a grid's CRS: its EPSG code, or its name where it has none."""
+    """Return the usual name of a grid's CRS: its EPSG code, or its name if it has none."""
     assert geobox.crs is not None
     return str(geobox.crs.proj.name) if geobox.crs.epsg is None else crs_key(geobox)
 
@@ -79,10 +79,8 @@ def pixel_side_m(geobox: GeoBox) -> float:
 def pixel_rows_m2(geobox: GeoBox) -> Iterator[Floats]:
     """Yield the ground area of the pixels of each row, (x,) [m2], from the first row down.
 
-    It is measured on the ellipsoid, at any scale of the map.
-
-    A projection's scale is asked for at `TIE_POINTS` places along each side, and linear between: off by 2e-5 in a UTM
-    zone.
+    Areas are those on the ellipsoid, at any scale of the map. The scale of the projection is computed at `TIE_POINTS`
+    places along each side, and linear between: the error is 2e-5 in a UTM zone.
     """
     rows, columns = geobox.shape
     tie_points_y, tie_points_x = np.linspace(0, rows, TIE_POINTS), np.linspace(0, columns, TIE_POINTS)
@@ -143,7 +141,7 @@ def degree_m(geobox: GeoBox) -> tuple[float, float]:
 def to_plane(geobox: GeoBox) -> tuple[Places, str]:
     """Return a function from a map's x and y to (..., 2) metres east and north, and the CRS (WKT) of these.
 
-    The map's own where it is projected in metres, else the UTM zone of its middle.
+    It is the map's own CRS if that is projected in metres, else the UTM zone of its middle.
     """
     crs = pyproj.CRS.from_wkt(crs_wkt(geobox))
     if crs.is_projected and all(axis.unit_conversion_factor == 1 for axis in crs.axis_info[:2]):
@@ -156,7 +154,7 @@ def to_plane(geobox: GeoBox) -> tuple[Places, str]:
 
 
 def plane_pixel_m(geobox: GeoBox) -> float:
-    """Return the side of the square that is as large as the middle pixel in the plane of `to_plane` [m]."""
+    """Return the side of the square with the area of the middle pixel in the plane of `to_plane` [m]."""
     rows, columns = geobox.shape
     column, row = columns // 2 + np.array([0.0, 1.0, 0.0]), rows // 2 + np.array([0.0, 0.0, 1.0])
     a, b, c, d, e, f = geobox.affine[:6]

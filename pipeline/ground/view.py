@@ -1,7 +1,7 @@
-r"""The ground under a posed rig: scene points to metres east, north and up of its foot, and back, in closed form.
+r"""Convert scene points to metres east, north and up of the foot of a posed rig, and back, in closed form.
 
-Scene points are (y, x) px from the scene's centre, the undeflected view direction v. Seen along v, x goes right and y
-goes down, whichever way the lines lie; row 0 of an image is up. The foot is the ground straight below the pivot::
+Scene points are (y, x) px from the scene's centre, the undeflected view direction v. Seen along v, x points right and y
+points down for any direction of the lines; row 0 of an image is up. The foot is the ground straight below the pivot::
 
        the scene, along v           from the side: tilt t          from above: heading h
 
@@ -12,7 +12,7 @@ goes down, whichever way the lines lie; row 0 of an image is up. The foot is the
       |       y       |        ---------+-------x--- ground              | /
       +---------------+               foot                           foot o------ east
 
-A heading of 0 looks north and grows clockwise; a tilt of 0 looks at the horizon, of 90 straight down, where the
+A heading of 0 looks north and grows clockwise. A tilt of 0 looks at the horizon, and of 90 straight down, where the
 heading is that of the image's upper edge. A positive roll turns the rig's right side down. The ground is a plane
 through the foot that falls by ``slope_deg`` towards ``aspect_deg`` (clockwise from north).
 """
@@ -62,13 +62,13 @@ class RigPose:
     )
     roll_deg: float = stated(0.0, "Turn about the view direction; positive turns the right side down", "deg", -180, 180)
     slope_deg: float = stated(0.0, "Slope of the ground", "deg", 0, 80)
-    aspect_deg: float = stated(0.0, "Where the slope goes down to, clockwise from north", "deg", -360, 360)
+    aspect_deg: float = stated(0.0, "Direction in which the slope falls, clockwise from north", "deg", -360, 360)
     # 1000 m are 1.6e-4 of the map's scale
     elevation_m: float = stated(0.0, "Height of the ground below the rig above the ellipsoid", "m", -500, 9000)
 
     def __post_init__(self) -> None:
         for name, words in misfits(self):
-            raise PoseError(f"{name} of the rig's pose {words}")
+            raise PoseError(f"the rig's pose: {name} {words}")
         if (self.height_m is None) == (self.range_m is None):
             got = f"height_m = {self.height_m}, range_m = {self.range_m}"
             raise PoseError(f"the rig's pose needs height_m or range_m, one of the two; got {got}")
@@ -81,9 +81,9 @@ class RigPose:
 class GroundView:
     """A posed rig with its pixel's angle: every scene point's ray and where it meets the ground.
 
-    A ray v + x r + y d (tangents x and y, r right, d down) sinks by w = -n . ray per unit of depth, n being the
-    ground's normal with n_up = 1. It meets the ground at the depth height / w. All of this class follows from w being
-    linear in the scene.
+    A ray is v + x r + y d, with tangents x and y, and r right, d down. It sinks by w = -n . ray per unit of depth, with
+    the ground's normal n, n_up = 1. It meets the ground at the depth height / w. All methods use that w is linear in
+    the scene.
     """
 
     pose: RigPose
@@ -91,7 +91,7 @@ class GroundView:
 
     @cached_property
     def axes(self) -> Floats:
-        """(3, 3) view, right and down as rows, in east, north, up."""
+        """Return (3, 3) view, right and down as rows, in east, north, up."""
         heading, tilt, roll = np.deg2rad([self.pose.heading_deg, self.pose.tilt_deg, self.pose.roll_deg])
         away = np.array([np.sin(heading), np.cos(heading), 0.0])
         up = np.array([0.0, 0.0, 1.0])
@@ -103,18 +103,18 @@ class GroundView:
 
     @cached_property
     def normal(self) -> Floats:
-        """(3,) normal of the ground with 1 upwards, in east, north, up."""
+        """Return the (3,) normal of the ground with 1 upwards, in east, north, up."""
         slope, aspect = np.deg2rad([self.pose.slope_deg, self.pose.aspect_deg])
         return np.array([np.tan(slope) * np.sin(aspect), np.tan(slope) * np.cos(aspect), 1.0])
 
     @cached_property
     def sinks(self) -> Floats:
-        """(3,) w of view, right and down."""
+        """Return (3,) w of view, right and down."""
         return -self.axes @ self.normal
 
     @cached_property
     def height_m(self) -> float:
-        """Height of the pivot above the foot.
+        """Return the height of the pivot above the foot.
 
         Raises PoseError: a range is given, and the undeflected direction does not meet the ground.
         """
@@ -148,10 +148,10 @@ class GroundView:
         return points
 
     def ground_to_scene(self, ground_m: ArrayLike) -> Floats:
-        """Return the scene points (..., 2) [px] at which points (..., 3) east, north, up of the foot [m] are seen.
+        """Return the scene points (..., 2) [px] of points (..., 3) east, north, up of the foot [m].
 
-        The inverse of ``scene_to_ground``, and right for points above or below the plane too. NaN for points that lie
-        beside or behind the pivot.
+        The inverse of ``scene_to_ground``, also for points above or below the plane. NaN for points beside or behind
+        the pivot.
         """
         seen = (np.asarray(ground_m, np.float64) - np.array([0.0, 0.0, self.height_m])) @ self.axes.T
         depth = np.where(seen[..., :1] > 0, seen[..., :1], np.nan)
@@ -159,10 +159,10 @@ class GroundView:
         return points
 
     def area_m2(self, points_px: ArrayLike) -> Floats:
-        """Return the ground under a pixel as a map shows it (of a slope its level share), (...) [m2]; NaN off it.
+        """Return the ground area of a pixel on a map (of a slope its level part), (...) [m2]; NaN off the ground.
 
-        The cross product of the two sides of the footprint is -n (height ifov)^2 / w^3. Its level part has no other
-        dependence on the direction.
+        The cross product of the two sides of the footprint is -n (height ifov)^2 / w^3. Its level part depends on the
+        direction through w only.
         """
         w = self.sink(points_px)
         return (self.height_m * self.ifov_rad) ** 2 / np.where(w > LEAST_SINK, w, np.nan) ** 3

@@ -1,4 +1,4 @@
-"""Polygons on a field, brought there from any coordinates: the pixels they hold, what a survey keeps to, and plots."""
+"""Convert polygons from any coordinates to a field: their pixels, the zones of a survey, and figures of plots."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ else:
     shapely = deferred("shapely")
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float64]
-ROUND_THE_FIELD = 1.0  # times its size, on every side, up to which polygons are followed
-EDGE_PARTS = 256  # of that: a straight edge of one map is bent on another
+ROUND_THE_FIELD = 1.0  # times its size, on every side, within which polygons are converted
+EDGE_PARTS = 256  # of that: a straight edge of one map is curved on another
 FAR_EAST_DEG = 90.0  # beyond this longitude of the field, those of polygons count from it and not from Greenwich
 
 
 def on_field(shape: BaseGeometry, crs: pyproj.CRS | None, place: FieldPlace) -> BaseGeometry:
-    """Bring a polygon to the pixels of a field, as far as it lies there or near; empty where it does not.
+    """Convert a polygon to the pixels of a field, as far as it lies there or near; empty if it does not.
 
-    ``crs`` is that of the polygon, x before y, None where it is in pixels already. Edges are straight in ``crs``.
+    ``crs`` is that of the polygon, x before y, or None if it is in pixels. Edges are straight in ``crs``.
     """
     if crs is None or place.crs is None:
         return shapely.intersection(shape, _grown(shapely.box(*place.outline.bounds), BORDER_PX))
@@ -43,7 +43,7 @@ def on_field(shape: BaseGeometry, crs: pyproj.CRS | None, place: FieldPlace) -> 
     middle = _middle_deg(place) if crs.is_geographic else None
     back = pyproj.Transformer.from_crs(place.crs, crs, always_xy=True)
     outline = shapely.transform(place.outline, lambda at: np.stack(back.transform(at[:, 0], at[:, 1]), axis=-1))
-    there, given = (_told_from(one, middle) for one in (outline, shape))
+    there, given = (_unwrapped(one, middle) for one in (outline, shape))
     around = _grown(there, ROUND_THE_FIELD * max(np.ptp(np.reshape(there.bounds, (2, 2)), axis=0)))
     near = shapely.intersection(given, around)
     if near.is_empty:
@@ -69,8 +69,8 @@ def _middle_deg(place: FieldPlace) -> float | None:
     return middle if abs(middle) > FAR_EAST_DEG else None
 
 
-def _told_from(shape: BaseGeometry, middle_deg: float | None) -> BaseGeometry:
-    """Return a polygon with longitudes within 180 degrees of ``middle_deg``; unchanged where that is None."""
+def _unwrapped(shape: BaseGeometry, middle_deg: float | None) -> BaseGeometry:
+    """Return a polygon with longitudes within 180 degrees of ``middle_deg``; unchanged if that is None."""
     if middle_deg is None:
         return shape
 
@@ -91,7 +91,7 @@ def pixels_inside(
 ) -> Mask:
     """Return which of (y, x) ``size`` pixels from row and column ``origin`` on lie in polygons given in pixels.
 
-    A pixel belongs where its centre lies; with ``touched`` every pixel that a polygon touches does.
+    A pixel belongs to a polygon by its centre; with ``touched`` all pixels that a polygon touches do.
     """
     given = [one for one in shapes if not one.is_empty]
     if not given:
@@ -103,14 +103,14 @@ def pixels_inside(
 
 @dataclass(frozen=True)
 class FieldZones:
-    """Pixels that a survey keeps: those inside the area, where one is given, and in no zone that is left out."""
+    """Pixels that a survey maps: those inside the area, if one is given, and in no no-go zone."""
 
     kept: Mask  # (y, x)
     no_go: Mask | None = None  # (y, x), every pixel touched
 
     @property
     def left_out(self) -> Mask:
-        """(y, x) pixels of which no map is drawn."""
+        """Return the (y, x) pixels without a map."""
         return ~self.kept
 
     def patch_fractions(self, grid: SceneGrid) -> Floats:
@@ -122,7 +122,7 @@ class FieldZones:
         return fractions if self.no_go is None else np.where(_patch_means(self.no_go, grid) > 0, 0.0, fractions)
 
     def shown_patches(self, grid: SceneGrid) -> Mask:
-        """Return the patches (patch,) that are read together and hold a pixel that is kept: lines have to show them."""
+        """Return the patches (patch,) that are read together and hold a pixel to map: lines have to show them."""
         rows, columns = grid.patch_shape
         kept = _patch_means(self.kept, grid).reshape(rows // grid.factor, grid.factor, columns // grid.factor, -1) > 0
         shown: Mask = np.repeat(np.repeat(kept.any(axis=(1, 3)), grid.factor, axis=0), grid.factor, axis=1)
@@ -130,7 +130,7 @@ class FieldZones:
 
 
 def field_zones(area: Mask | None, no_go: Mask | None) -> FieldZones | None:
-    """Put an area and no-go zones together; None where they leave nothing out, so that nothing changes."""
+    """Combine an area and no-go zones; None if they leave nothing out, so that nothing changes."""
     kept = np.ones_like(no_go) if area is None and no_go is not None else area
     if kept is None:
         return None
@@ -141,20 +141,19 @@ def field_zones(area: Mask | None, no_go: Mask | None) -> FieldZones | None:
 def _patch_means(mask: Mask, grid: SceneGrid) -> Floats:
     """Return the mean over the pixels of each patch that lie on the scene, (patch,)."""
     total, fraction = patch_pixels(grid, mask).mean(axis=(1, 2)), grid.valid_fraction().ravel()
-    means: Floats = np.divide(total, fraction, out=np.zeros(fraction.shape), where=fraction > 0)
-    return means
+    return np.asarray(np.divide(total, fraction, out=np.zeros(fraction.shape), where=fraction > 0))
 
 
 @dataclass(frozen=True)
 class PlotFigures:
-    """One plot, as far as it lies on the field and is mapped. Without a mapped pixel nothing is said of it."""
+    """Figures of one plot, as far as it lies on the field and is mapped."""
 
     plot: str
-    pixels: int  # whose centres lie in it
+    pixels: int  # with their centres in it
     mapped_pixels: int  # of them, those with a class
-    area_m2: float | None  # of the mapped pixels; None where their size is unknown
-    confidence: float | None  # mean over the mapped pixels that have one
-    fractions: dict[str, float | None]  # of the mapped ground, by class; of the pixels where that is not known
+    area_m2: float | None  # of the mapped pixels; None if their size is unknown
+    confidence: float | None  # mean over the mapped pixels with a confidence
+    fractions: dict[str, float | None]  # of the mapped area by class, or of the pixels if it is unknown
 
 
 def figures_of_plot(
@@ -175,7 +174,7 @@ def figures_of_plot(
     weight = np.where(mapped, 1.0 if ground is None else np.nan_to_num(ground), 0.0)
     by_class, total = np.bincount(drawn[mapped], weight[mapped], len(names)), float(weight.sum())
     count, sure = int(mapped.sum()), confidence[rows, columns][mapped]
-    sure = sure[np.isfinite(sure)]  # what is unknown has no confidence
+    sure = sure[np.isfinite(sure)]  # unknown pixels have no confidence
     return PlotFigures(
         plot,
         int(inside.sum()),
@@ -187,7 +186,7 @@ def figures_of_plot(
 
 
 def _window(shape: BaseGeometry, size: tuple[int, ...]) -> tuple[slice, slice]:
-    """Return the rows and columns of a map of ``size`` that a polygon can hold, one at least."""
+    """Return the rows and columns of a map of ``size`` around a polygon, at least one each."""
     bounds = np.zeros(4) if shape.is_empty else np.array(shape.bounds)
     firsts = (min(max(int(np.floor(low)), 0), most - 1) for low, most in zip(bounds[[1, 0]], size, strict=True))
     lasts = (min(max(int(np.ceil(high)), 1), most) for high, most in zip(bounds[[3, 2]], size, strict=True))

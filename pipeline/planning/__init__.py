@@ -1,1 +1,1 @@
-"""Capture planning: sweeps that cover a field, and the runs of lines that are worth their seconds."""
+"""Plan captures: sweeps that cover a field, and the runs of lines with the most expected gain."""

@@ -1,7 +1,7 @@
-"""The most worth for a budget of seconds, and the least seconds for all worth: covers at falling prices of a second.
+"""Search for the cover of most expected gain within a budget of seconds, over falling prices of a second.
 
-Covers are made without regard to the budget, from the dearest second down, and either fit or do not; so a bigger budget
-chooses among more of them and never buys less.
+Covers are computed independently of the budget, from the highest price of a second down. A larger budget chooses
+among more of them, so that it never has less gain.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ MOST_STEPS = 40
 RATE_SLACK = 1e-9
 STEP = 0.88  # from one price of a second to the next
 WIDE_STEP = 0.7
-LEAST_RATE = 1e-10  # of the total worth over the price of all lines, to stand for "whatever it costs"
+LEAST_RATE = 1e-10  # of the total gain over the time of all lines: a price at which every line pays
 
 
 def spend(field: Field, budget_s: float) -> Cover:
-    """Choose the runs with the most worth found whose true price is at most ``budget_s``.
+    """Choose the runs with the most expected gain whose exact time is at most ``budget_s``.
 
-    Between the two covers that the budget lies between, the price of a second is halved down; what then is left goes
-    to one run more, or to one run made longer. ``expected_gain`` counts what was bought for its worth, at least.
+    The budget lies between two covers; bisection of the price of a second narrows them. The remaining time goes to one
+    more run, or to one longer run. ``expected_gain`` counts at least the patches that the runs were chosen for.
     """
     low, low_rate = Cover(), np.inf
     best = low
@@ -42,9 +42,9 @@ def _better(one: Cover, other: Cover) -> Cover:
 
 
 def _between(field: Field, covers: tuple[Cover, Cover], rates: tuple[float, float], budget_s: float) -> Cover:
-    """Narrow down the edge from a cover that the budget allows to one that it does not.
+    """Narrow the interval from a cover within the budget to one above it.
 
-    No cover is taken that is worth more than a dearer one: with a bigger budget only the dearer one is looked at.
+    No cover with more gain than the one above is taken: a larger budget would not find it.
     """
     (low, high), (low_rate, high_rate) = covers, rates
     best = low
@@ -66,7 +66,7 @@ def _between(field: Field, covers: tuple[Cover, Cover], rates: tuple[float, floa
 
 
 def _peeled(field: Field, cover: Cover) -> Iterator[Cover]:
-    """Covers with ever less of one: whole runs or their ends go, those first that are worth least per second."""
+    """Yield ever smaller covers: whole runs or their ends are removed, those with the least gain per second first."""
     for _ in range(PEELS):
         patch_index, times = np.unique(
             np.concatenate([field.shown_patches(run) for run in cover.runs]), return_counts=True
@@ -82,7 +82,7 @@ def _peeled(field: Field, cover: Cover) -> Iterator[Cover]:
 
 
 def _cuts(field: Field, run: ScanRun, own: Floats) -> list[tuple[float, list[ScanRun]]]:
-    """Best way to shorten a run from its start, from its end, and to drop it: worth lost per second, what remains."""
+    """Return ways to shorten a run from its start, from its end, and to drop it: gain lost per second, and the rest."""
     views, prices = field.shown(run), field.prices
     expected_gain = own[field.views.patch_number[views]]
     whole = prices.even_seconds(run.stop - run.first, 1)
@@ -101,23 +101,8 @@ def _cuts(field: Field, run: ScanRun, own: Floats) -> list[tuple[float, list[Sca
     return found
 
 
-def cheapest_cover(field: Field) -> Cover:
-    """Find the least seconds for all patches that are worth something.
-
-    Begun from strips side by side, from each patch on its own, and by the falling prices; the cheapest end is taken.
-    """
-    if field.total <= 0:
-        return Cover()
-    rate, starts = _least_rate(field), ((), tuple(_completed(field, ())))
-    ends = [best_cover(field, start, rate) for start in starts]
-    for cover, _ in covers(field):
-        last = cover
-    found = [field.cover(_completed(field, cover.runs)) for cover in (last, *ends, field.cover(starts[1]))]
-    return min(found, key=lambda cover: cover.seconds(field.prices))
-
-
 def covers(field: Field) -> Iterator[tuple[Cover, float]]:
-    """Covers and the price of a second [worth/s] they are best for, falling; the last shows all patches."""
+    """Yield covers and the price of a second [gain/s] that they are best for, falling; the last shows all patches."""
     cover = Cover()
     if field.total <= 0:
         return
@@ -135,7 +120,7 @@ def covers(field: Field) -> Iterator[tuple[Cover, float]]:
 
 
 def _first_rate(field: Field) -> float:
-    """The most worth per second that a single run has: where the first of them pays (Dinkelbach, 1967)."""
+    """Return the largest gain per second of a single run (Dinkelbach, 1967)."""
     tables, prices = field.tables(field.expected_gain), field.prices
     seconds = prices.even_line_s * tables.unit * np.arange(tables.closed.shape[1])
     rate = 0.0
@@ -146,7 +131,7 @@ def _first_rate(field: Field) -> float:
         if net[swath, stop] <= 0:
             break
         first = int(toll[swath, : stop + 1].argmin())
-        if first == stop:  # nothing but rounding is left to gain
+        if first == stop:  # only rounding is left
             break
         expected_gain = float(tables.closed[swath, stop] - tables.begun[swath, first])
         density = expected_gain / float(seconds[stop] - seconds[first] + prices.run_s)
@@ -157,14 +142,14 @@ def _first_rate(field: Field) -> float:
 
 
 def _least_rate(field: Field) -> float:
-    """A rate at which no patch is too dear."""
+    """Return a price of a second at which every patch pays."""
     every = field.prices.even_seconds(field.views.lines * len(field.side_by_side), len(field.side_by_side))
     lowest = float(field.expected_gain[field.expected_gain > 0].min(initial=field.total))
     return max(LEAST_RATE * field.total, lowest / 2) / max(every, field.prices.line_s)
 
 
 def _one_more(field: Field, cover: Cover, budget_s: float) -> Cover:
-    """Spend what a cover leaves on a run more or a run made longer, whichever shows more."""
+    """Spend the remaining time on one more run or one longer run, whichever shows more."""
     prices, views, runs = field.prices, field.views, list(cover.runs)
     tables = field.tables(field.left(runs))
     options: list[tuple[float, list[ScanRun]]] = []

@@ -1,4 +1,4 @@
-"""Sweeps that cover a whole scene: how many strips, where they lie, how far each has to scan, and what falls beside."""
+"""Lay sweeps that cover a whole scene, and find the pixels and patches that sweeps show."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from pipeline.geometry.scan import (
 
 TAPS_BEFORE, TAPS_AFTER = 1, 2  # lines that the resampling kernel reads beside the one at or before a point
 ROUNDING_PX = 1e-6
-_PROBES = 65  # scan positions at which a strip's reach is taken; it changes by 1e-3 px between two
+_PROBES = 65  # scan positions at which a swath's reach is computed; it changes by 1e-3 px between two
 
 
 def full_sweeps(grid: SceneGrid, camera: LineCamera, along: Axis, *, overlap_px: float = 0) -> list[Sweep]:
-    """Cover the whole scene at full resolution with the fewest strips of lines along one axis.
+    """Cover the whole scene at full resolution with the fewest swaths of lines along one axis.
 
-    ``overlap_px`` is the least width that neighbouring strips share, and half of it beyond either end of the field.
+    ``overlap_px`` is the least width that neighbouring swaths share, and half of it beyond either end of the field.
 
     Raises PoseError: the field is beyond the mirror's range.
-    Raises SettingsError: an overlap that is negative or leaves nothing of a line.
+    Raises SettingsError: the overlap is negative or as wide as a line.
     """
     return _cover(grid, camera, along, step=1, overlap_px=overlap_px)
 
@@ -48,13 +48,13 @@ def uniform_sweeps(
     exposure_ms: float | None = None,
     overlap_px: float = 0,
 ) -> list[Sweep]:
-    """Cover the whole scene with lines of ``step`` held positions that are not binned.
+    """Cover the whole scene with lines of ``step`` held positions without binning.
 
-    ``overlap_px`` is that of :func:`full_sweeps`, in px of the full resolution; ``exposure_ms`` the camera's own where
-    it is None.
+    ``overlap_px`` is that of :func:`full_sweeps`, in px of the full resolution; ``exposure_ms`` None takes the
+    camera's.
 
-    Raises SettingsError: the overlap is negative or leaves nothing of a line.
-    Raises PoseError: the field is beyond the mirror's range.
+    Raises SettingsError: the overlap is negative or as wide as a line. Raises PoseError: the field is beyond the
+    mirror's range.
     """
     covering = _cover(grid, camera, along, step=step, overlap_px=overlap_px)
     return [
@@ -72,12 +72,11 @@ def cheapest_full(
     cut: Callable[[list[Sweep]], list[Sweep]] = lambda sweeps: sweeps,
     axes: Sequence[Axis] = ("x", "y"),
 ) -> tuple[Axis, list[Sweep], float]:
-    """Choose the orientation of the full scan that takes the least time: axis of the lines, sweeps, seconds.
+    """Return the faster orientation of the full scan: axis of the lines, sweeps, seconds.
 
-    ``cut`` leaves of the sweeps what is to be captured, where that is not all; ``axes`` are those that lines may lie
-    along.
+    ``cut`` keeps the part of the sweeps that is captured; ``axes`` are the axes that lines may lie along.
 
-    Raises PoseError: neither orientation is within the mirror's range.
+    Raises PoseError: no orientation is within the mirror's range.
     """
     found: list[tuple[Axis, list[Sweep], float]] = []
     for along in axes:
@@ -92,7 +91,7 @@ def cheapest_full(
 
 
 def with_margin(sweeps: Sequence[Sweep], camera: LineCamera, margin_px: float) -> list[Sweep]:
-    """Begin every sweep so much earlier and end it so much later, for a mirror that may look beside the plan.
+    """Extend every sweep by a margin at either end, for a mirror that may look beside the plan.
 
     Raises PoseError: a sweep then leaves the mirror's range.
     """
@@ -106,23 +105,23 @@ def with_margin(sweeps: Sequence[Sweep], camera: LineCamera, margin_px: float) -
 
 
 def on_scene(shape: tuple[int, int], camera: LineCamera, sweep: Sweep) -> NDArray[np.bool_]:
-    """Tell which (binned) samples (line, sample) of a sweep look at a pixel of a (y, x) scene.
+    """Return which (binned) samples (line, sample) of a sweep show a pixel of a (y, x) scene.
 
-    By their rays at mid exposure, which are exact: line rotation and stretch included.
+    The rays at mid exposure are exact, with line rotation and stretch.
     """
     height, width = shape
     across, scan = (width, height) if sweep.along == "x" else (height, width)
     along_px, scan_px = sweep_to_scene(sweep, camera)
     inside = np.ones(along_px.shape, bool)
     for place, size in ((along_px, across), (scan_px, scan)):
-        # Half open: a sample on the border between two pixels falls into the second, and rounding has no say in it.
+        # Half open: a sample on the border between two pixels belongs to the second, whatever the rounding.
         pixel = np.floor(place + size / 2 + ROUNDING_PX)
         inside &= (pixel >= 0) & (pixel < size)
     return inside
 
 
 def sweep_outline(sweep: Sweep, camera: LineCamera) -> NDArray[np.float64]:
-    """Give what a sweep's lines show as a polygon, (point, 2) x and y from the scene's centre [px]."""
+    """Return the outline of a sweep's lines as a polygon, (point, 2) x and y from the scene's centre [px]."""
     scan = np.linspace(sweep.start_px - 0.5, sweep.start_px + sweep.lines * sweep.step - 0.5, 33)
     edges = np.array([-camera.samples / 2, camera.samples / 2]) * camera.ifov_rad
     along, across = points_of_scan(sweep.swath_px, camera, scan[:, None], edges)
@@ -131,14 +130,14 @@ def sweep_outline(sweep: Sweep, camera: LineCamera) -> NDArray[np.float64]:
 
 
 def field_px(grid: SceneGrid, along: Axis) -> tuple[int, int]:
-    """Give the scene's size along the line and along the scan [px]."""
+    """Return the scene's size along the line and along the scan [px]."""
     return (grid.width, grid.height) if along == "x" else (grid.height, grid.width)
 
 
 def _cover(grid: SceneGrid, camera: LineCamera, along: Axis, *, step: int, overlap_px: float) -> list[Sweep]:
     if not 0 <= overlap_px < camera.samples // step * step:
         raise SettingsError(
-            f"strips of lines of {camera.samples} samples can overlap by 0 px or more and less than a line, "
+            f"swaths of lines of {camera.samples} samples can overlap by 0 px or more and less than a line, "
             f"got {overlap_px} px; choose a smaller overlap"
         )
     across, scan = field_px(grid, along)
@@ -159,10 +158,10 @@ def _cover(grid: SceneGrid, camera: LineCamera, along: Axis, *, step: int, overl
 def _swath_centres(
     field: tuple[float, float], scan: int, camera: LineCamera, binning: int, least_overlap: float
 ) -> NDArray[np.float64]:
-    """Place the fewest strips that cover ``field``, all overlaps equal and half as much beyond either end.
+    """Place the fewest swaths that cover ``field``, with equal overlaps and half as much beyond either end.
 
-    A strip's reach depends on where it lies (the line's image is stretched, more so away from the axis), hence the
-    fixed point; it moves strips by less than 1 % and settles at once.
+    A swath's reach depends on its place, since the line's image is stretched away from the axis. Hence the fixed-point
+    iteration; it moves swaths by less than 1 % and converges at once.
     """
     low, high = field
     count = 0
@@ -182,7 +181,7 @@ def _swath_centres(
 
 
 def reach_px(swath: float, scan: int, camera: LineCamera, binning: int) -> NDArray[np.float64]:
-    """Tell how far the outer edges of a line's samples lie from its centre, at least: (2,) below and above 0 [px]."""
+    """Return the least distance from a line's centre to the edges of its samples, (2,) below and above 0 [px]."""
     count = camera.samples // binning
     edges = np.array([-camera.samples / 2, count * binning - camera.samples / 2]) * camera.ifov_rad
     probes = np.append(np.linspace(-scan / 2, scan / 2, _PROBES), 0.0)
@@ -191,9 +190,9 @@ def reach_px(swath: float, scan: int, camera: LineCamera, binning: int) -> NDArr
 
 
 def _scan_range(swath: float, seen: NDArray[np.float64], scan: int, camera: LineCamera, step: int) -> tuple[float, int]:
-    """First held position [px] and number of lines that show all rows of ``seen``, rotation and taps included.
+    """Return the first held position [px] and number of lines that show all rows of ``seen``, with rotation and taps.
 
-    Lines stand on the scene's own rows, so that a strip through the axis needs no interpolation along the scan.
+    Lines lie on the scene's own rows, so that a swath through the axis needs no interpolation along the scan.
     """
     origin = (step - 1 - (scan - 1)) / 2  # centre of the first (coarse) row
     rows = origin + step * np.array([0, -(-scan // step) - 1])
@@ -218,24 +217,24 @@ def check_reach(sweeps: Sequence[Sweep], camera: LineCamera) -> None:
 
 
 def sweeps_over(sweeps: Sequence[Sweep], grid: SceneGrid, camera: LineCamera, shown: NDArray[np.bool_]) -> list[Sweep]:
-    """Give the lines of sweeps that show some of the ``shown`` (patch,) patches; sweeps that show none are left out.
+    """Return the lines of sweeps that show some of the ``shown`` (patch,) patches; sweeps that show none are left out.
 
-    Lines stay where they lie and keep their order, between the first and the last that is needed none is left out, and
-    the lines that resampling reads beside a pixel are among them. Of a sweep with all its lines nothing changes.
+    Lines keep their place and order. All lines between the first and the last needed one are included, also those that
+    resampling reads beside a pixel.
     """
     cut = ((sweep, lines_showing(sweep, grid, camera, np.flatnonzero(shown))) for sweep in sweeps)
     return [some_lines(sweep, *lines) for sweep, lines in cut if lines is not None]
 
 
 def some_lines(sweep: Sweep, first: int, stop: int) -> Sweep:
-    """Give a sweep with its lines from ``first`` to before ``stop`` alone, where they lie."""
+    """Return a sweep with its lines from ``first`` to before ``stop`` only, at their place."""
     return replace(sweep, start_px=sweep.start_px + first * sweep.step, lines=stop - first)
 
 
 def lines_showing(
     sweep: Sweep, grid: SceneGrid, camera: LineCamera, patch_index: NDArray[np.intp]
 ) -> tuple[int, int] | None:
-    """Give the first line that shows something of the patches and the one after the last; None where none does."""
+    """Return the first line that shows part of the patches and the one after the last; None if no line does."""
     at = _corners_on(sweep, grid, camera, patch_index)
     ends = -0.5 - TAPS_BEFORE, camera.samples // sweep.binning - 0.5 + TAPS_AFTER
     seen = (at[..., 1].max(axis=0) >= ends[0]) & (at[..., 1].min(axis=0) <= ends[1])
@@ -248,7 +247,7 @@ def lines_showing(
 
 
 def patches_shown(sweeps: Sequence[Sweep], grid: SceneGrid, camera: LineCamera) -> NDArray[np.bool_]:
-    """Tell of which patches (patch,) samples of some sweeps show something, without what is read beside them."""
+    """Return which patches (patch,) the samples of some sweeps show, without the taps of resampling."""
     patch_index, shown = grid.valid_patches(), np.zeros(int(np.prod(grid.patch_shape)), np.bool_)
     for sweep in sweeps:
         at = _corners_on(sweep, grid, camera, patch_index)
@@ -260,9 +259,9 @@ def patches_shown(sweeps: Sequence[Sweep], grid: SceneGrid, camera: LineCamera) 
 def _corners_on(
     sweep: Sweep, grid: SceneGrid, camera: LineCamera, patch_index: NDArray[np.intp]
 ) -> NDArray[np.float64]:
-    """Line and sample of the corners of patches on a sweep, (corner, patch, 2).
+    """Return line and sample of the corners of patches on a sweep, (corner, patch, 2).
 
-    Either is monotone in either coordinate, so that a rectangle's corners hold its extremes.
+    Both are monotone in either coordinate, so that a rectangle's corners hold its extremes.
     """
     origin, size = grid.patch_origin(patch_index), np.array([grid.height, grid.width])
     low, high = origin - size / 2, np.minimum(origin + grid.patch, size) - size / 2

@@ -1,4 +1,4 @@
-"""Prices of capture: seconds of lines and runs, what a budget leaves for the fine pass, and what was saved."""
+"""Compute capture times of lines and runs, check budgets, and compare a capture with the full scan."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from math import ceil, isfinite
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.errors import BudgetError
 from pipeline.geometry.camera import LineCamera
@@ -15,16 +16,15 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.planning.coverage import on_scene
 
-FullIs = Literal["measured", "predicted"]
-
 BYTES_PER_SAMPLE = 2  # raw samples are uint16
-LEAST_DIGITS = 4  # of the least budget that a refusal names
+LEAST_DIGITS = 4  # of the least budget in a message
 ROUNDING = 1e-9
+GOLDEN = (5**0.5 - 1) / 2
 
 
 @dataclass(frozen=True)
 class ScanPrices:
-    """Seconds of a line, of opening a run, and of a reload that is due once every ``lines_per_reload`` lines."""
+    """Seconds of a line, of the set-up of a run, and of a reload after every ``lines_per_reload`` lines."""
 
     line_s: float
     run_s: float
@@ -33,19 +33,19 @@ class ScanPrices:
 
     @property
     def even_line_s(self) -> float:
-        """Price of a line with its fraction of a reload: additive, and below the true price by less than a reload."""
+        """Return the time of a line with its part of a reload: additive, and too low by less than a reload in all."""
         return self.line_s + self.reload_s / self.lines_per_reload
 
     def seconds(self, lines: int, runs: int) -> float:
-        """True price of so many lines in so many runs [s]."""
+        """Return the exact time of so many lines in so many runs [s]."""
         return lines * self.line_s + runs * self.run_s + -(-lines // self.lines_per_reload) * self.reload_s
 
     def even_seconds(self, lines: int, runs: int) -> float:
-        """Additive price [s]."""
+        """Return the additive time [s]."""
         return lines * self.even_line_s + runs * self.run_s
 
     def most_lines(self, seconds: float, runs: int) -> int:
-        """Most lines that so many runs may have for a true price of at most ``seconds``; below 0 where none may."""
+        """Return the most lines that so many runs can have in ``seconds``; negative if the runs alone take longer."""
         left = seconds - runs * self.run_s
         load = self.lines_per_reload * self.line_s + self.reload_s
         loads = int(left // load)
@@ -57,21 +57,16 @@ class ScanPrices:
 
 
 def prices_of(camera: LineCamera, cost: CostModel) -> ScanPrices:
-    """Give the cost model's prices of fine lines (one held position each) and runs."""
+    """Return the cost model's prices of fine lines (one held position each) and runs."""
     return ScanPrices(camera.frame_ms * 1e-3, cost.setup_seconds(camera), cost.reload_s, cost.vector_pairs)
 
 
-def least_budget(coarse_seconds: float, full_seconds: float) -> float:
-    """Give the least budget that pays for the coarse pass alone, rounded up to four digits; above 1 none does."""
-    return ceil(coarse_seconds / full_seconds * 10.0**LEAST_DIGITS - ROUNDING) / 10.0**LEAST_DIGITS
-
-
 def check_budget(budget: float, coarse_seconds: float, full_seconds: float) -> float:
-    """Give the seconds that ``budget`` leaves for the fine pass.
+    """Return the seconds that ``budget`` leaves for the fine pass.
 
-    The budget is the seconds of coarse and fine capture over those of the full scan, above 0 and at most 1.
+    The budget is the time of coarse and fine capture over that of the full scan, above 0 and at most 1.
 
-    Raises BudgetError: the budget is not a number in that range, or less than the coarse pass alone; names the least.
+    Raises BudgetError: the budget is out of that range, or does not pay for the coarse pass; names the least.
     """
     if not isfinite(budget) or not 0 < budget <= 1:
         raise BudgetError(f"--budget must be a fraction of the full scan's time above 0 and at most 1, got {budget}")
@@ -82,64 +77,83 @@ def check_budget(budget: float, coarse_seconds: float, full_seconds: float) -> f
         )
     left = budget * full_seconds - coarse_seconds
     if left < -ROUNDING * full_seconds:
+        least = ceil(coarse_seconds / full_seconds * 10.0**LEAST_DIGITS - ROUNDING) / 10.0**LEAST_DIGITS
         raise BudgetError(
             f"--budget {budget} gives {budget * full_seconds:.1f} s, but the coarse pass alone takes "
             f"{coarse_seconds:.1f} of the full scan's {full_seconds:.1f} s; "
-            f"the least possible is {least_budget(coarse_seconds, full_seconds)}, or less with a shorter "
-            "--coarse-exposure-ms"
+            f"the least possible is {least}, or less with a shorter --coarse-exposure-ms"
         )
     return max(left, 0.0)
 
 
+def select_patches(score: NDArray[np.floating], count: int, valid: NDArray[np.bool_] | None = None) -> NDArray[np.intp]:
+    """Return the ``count`` valid patches with the highest ``score`` (patch,), best first.
+
+    Equal scores go to the lowest number, +inf comes first, NaN and -inf last. A smaller count gives the first patches
+    of a larger one. If no score is a number, patches are spread evenly over the valid ones.
+
+    Raises BudgetError: ``count`` is not a whole number from 0 to the number of valid patches.
+    """
+    allowed = np.arange(len(score)) if valid is None else np.flatnonzero(valid)
+    if count not in range(len(allowed) + 1):
+        raise BudgetError(f"expected a whole number of patches to buy from 0 to {len(allowed)}, got {count!r}")
+    given = np.asarray(score, np.float64)[allowed]
+    order = np.argsort(np.where(np.isnan(given), np.inf, -given), kind="stable")
+    if not np.any(given > -np.inf):
+        # multiples of the golden ratio leave gaps of at most three sizes, for every count and any row length
+        order = np.argsort((np.arange(len(given)) * GOLDEN) % 1.0, kind="stable")
+    return allowed[order[:count]]
+
+
+def frame_patches(
+    score: NDArray[np.floating], fraction: float, valid: NDArray[np.bool_] | None = None
+) -> NDArray[np.intp]:
+    """Return a fraction of the valid patches, chosen by `select_patches`; half a patch is rounded up.
+
+    Raises BudgetError: the fraction is not a number from 0 to 1.
+    """
+    number = len(score) if valid is None else int(np.count_nonzero(valid))
+    if not 0 <= fraction <= 1:  # NaN too
+        raise BudgetError(f"the fraction of patches to buy must be from 0 to 1, got {fraction} (of {number} patches)")
+    return select_patches(score, min(int(np.floor(fraction * number + 0.5)), number), valid)
+
+
 @dataclass(frozen=True)
 class SavingEntry:
-    """One line of the receipt's savings: what was done, what full resolution takes, and how that figure is known."""
+    """One line of the receipt's savings: the capture's value, that of full resolution, and how the latter is known."""
 
     done: float
     full: float
-    full_is: FullIs
+    full_is: Literal["measured", "predicted"] = "predicted"
 
     @property
     def ratio(self) -> float | None:
-        """Done over full; None where full is 0."""
+        """Return done over full; None where full is 0."""
         return self.done / self.full if self.full else None
 
     def as_dict(self) -> dict[str, float | str | None]:
-        """Give the entry as the receipt stores it."""
+        """Return the entry in the receipt's form."""
         return {"done": self.done, "full": self.full, "ratio": self.ratio, "full_is": self.full_is}
 
 
-def count_lines(sweeps: Sequence[Sweep]) -> int:
-    """Count the lines of sweeps; a coarse line counts as one."""
-    return sum(sweep.lines for sweep in sweeps)
-
-
 def count_samples(sweeps: Sequence[Sweep], camera: LineCamera, grid: SceneGrid) -> int:
-    """Count the (binned) samples that look at the scene; those beside it cost time and are left out."""
+    """Count the (binned) samples that show the scene; those beside it are left out."""
     shape = (grid.height, grid.width)
     return sum(int(np.count_nonzero(on_scene(shape, camera, sweep))) for sweep in sweeps)
 
 
 def raw_bytes(sweeps: Sequence[Sweep], camera: LineCamera, bands: int) -> int:
-    """Count the bytes of the captured lines: a line takes all its samples, whatever was asked of it."""
+    """Count the bytes of the captured lines, with all of their samples."""
     samples = sum(sweep.lines * (camera.samples // sweep.binning) for sweep in sweeps)
     return samples * bands * BYTES_PER_SAMPLE
 
 
 def capture_savings(
-    done: Sequence[Sweep],
-    full: Sequence[Sweep],
-    camera: LineCamera,
-    grid: SceneGrid,
-    *,
-    cost: CostModel,
-    full_is: FullIs = "predicted",
+    done: Sequence[Sweep], full: Sequence[Sweep], camera: LineCamera, grid: SceneGrid, *, cost: CostModel
 ) -> dict[str, SavingEntry]:
     """Compare sweeps with those of a full scan: lines, samples on the scene, seconds by the cost model."""
-    both = (done, full)
-    counted: dict[str, list[float]] = {
-        "lines": [count_lines(sweeps) for sweeps in both],
-        "samples": [count_samples(sweeps, camera, grid) for sweeps in both],
-        "capture_s": [cost.seconds(list(sweeps), camera) for sweeps in both],
+    return {
+        "lines": SavingEntry(sum(one.lines for one in done), sum(one.lines for one in full)),
+        "samples": SavingEntry(count_samples(done, camera, grid), count_samples(full, camera, grid)),
+        "capture_s": SavingEntry(cost.seconds(list(done), camera), cost.seconds(list(full), camera)),
     }
-    return {name: SavingEntry(of_done, of_full, full_is) for name, (of_done, of_full) in counted.items()}

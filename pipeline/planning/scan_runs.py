@@ -1,8 +1,8 @@
-"""Runs of lines, the best chains of them at a price of a second, and covers: runs that show the most for their price.
+"""Find covers: sets of runs of lines with the most expected gain less price, at a given price of a second.
 
-Strips overlap and lie at any offset, so a patch is seen from several and counts once. A cover is several chains of
-runs, one run after the other along the scan; each chain in turn is chosen anew over all offsets, exactly (a dynamic
-programme), with the others held, until none gets better.
+Swaths overlap and lie at any offset, so several show the same patch, which counts once. A cover consists of chains of
+runs, one run after the other along the scan. A dynamic programme chooses one chain exactly, over all offsets, while
+the others are fixed. This is repeated until no chain improves.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ NEGLIGIBLE = 1e-12  # of the total worth
 
 @dataclass(frozen=True, order=True)
 class ScanRun:
-    """Lines ``first`` to ``stop`` (half open) of one strip."""
+    """Lines ``first`` to ``stop`` (half open) of one swath."""
 
     swath: int
     first: int
@@ -36,10 +36,10 @@ class ScanRun:
 
 @dataclass(frozen=True)
 class Tables:
-    """Worth of views by line, cumulated: (strip, border) each, borders ``unit`` lines apart from line 0.
+    """Gain of views by line, cumulated: (swath, border) each, borders ``unit`` lines apart from line 0.
 
-    ``closed`` counts views that end at or before a border, ``begun`` those that begin before it, hence
-    closed(e) - begun(c) is the worth of the run c..e where no view is longer than the run, and never more than it.
+    ``closed`` counts views that end at or before a border, ``begun`` those that begin before it. So closed(e) -
+    begun(c) is the gain of the run c..e, or less if a view is longer than the run.
     """
 
     closed: Floats
@@ -49,13 +49,13 @@ class Tables:
 
 
 def best_chains(tables: Tables, windows: Ints, line_price: float, run_price: float) -> list[list[ScanRun]]:
-    """Find, for each window of strips, the chain of runs with the most worth less price, one run after the other.
+    """Return, for each window of swaths, the chain of runs with the most gain less price, one run after the other.
 
-    best(e) = max(best(e - 1), max over strips and c of best(c) + closed(e) - begun(c) - (e - c) line - run), a block
-    of borders at a time: no run opens and closes within one.
+    best(e) = max(best(e - 1), max over swaths and c of best(c) + closed(e) - begun(c) - (e - c) line - run). It is
+    computed for a block of borders at a time: no run opens and closes within one.
 
-    ``windows`` are (window, strip) numbers of strips, the prices of one line and of one run in units of worth. A patch
-    that two runs of a chain show, which only lines turned far apart allow, was counted twice: the caller has to check.
+    ``windows`` are (window, swath) numbers of swaths; prices of a line and a run are in units of gain. Only lines that
+    are turned far apart let two runs of a chain show one patch, which then counts twice: the caller has to check.
     """
     borders = tables.closed.shape[1]
     ramp = line_price * tables.unit * np.arange(borders)
@@ -81,7 +81,7 @@ def best_chains(tables: Tables, windows: Ints, line_price: float, run_price: flo
 
 
 def _traced(swaths: Ints, pick: Ints, since: Ints, unit: int) -> list[ScanRun]:
-    """Runs of a chain, found from the last one back."""
+    """Return the runs of a chain, traced back from the last one."""
     closes = np.maximum.accumulate(np.where(pick >= 0, np.arange(len(pick)), 0))
     runs, at = [], int(closes[-1])
     while at > 0:
@@ -92,7 +92,7 @@ def _traced(swaths: Ints, pick: Ints, since: Ints, unit: int) -> list[ScanRun]:
 
 
 def joined(runs: Sequence[ScanRun], gap: int) -> list[ScanRun]:
-    """Join runs of one strip that meet or lie at most ``gap`` lines apart, sorted."""
+    """Join runs of one swath that meet or lie at most ``gap`` lines apart, sorted."""
     found: list[ScanRun] = []
     for run in sorted(runs):
         if found and found[-1].swath == run.swath and run.first <= found[-1].stop + gap:
@@ -104,7 +104,7 @@ def joined(runs: Sequence[ScanRun], gap: int) -> list[ScanRun]:
 
 @dataclass(frozen=True)
 class Cover:
-    """Runs, what the patches they show are worth together, and their additive price."""
+    """Runs, the expected gain of the patches that they show, and their additive time."""
 
     runs: tuple[ScanRun, ...] = ()
     expected_gain: float = 0.0
@@ -112,48 +112,48 @@ class Cover:
 
     @property
     def lines(self) -> int:
-        """Lines of all runs."""
+        """Return the lines of all runs."""
         return sum(run.stop - run.first for run in self.runs)
 
     def seconds(self, prices: ScanPrices) -> float:
-        """True price, whole reloads [s]."""
+        """Return the exact time, with whole reloads [s]."""
         return prices.seconds(self.lines, len(self.runs))
 
 
 @dataclass(frozen=True)
 class Field:
-    """Field as strips see it: what each shows, what that is worth, and what lines cost."""
+    """A field as swaths show it: views of patches, their expected gain, and the prices of lines."""
 
     views: Views
     expected_gain: Floats  # (patch,), 0 for patches that are not wanted
-    column: Ints  # (patch,) place along the line: swaths that share none are planned apart
+    column: Ints  # (patch,) place along the line: swaths without a common column are planned separately
     prices: ScanPrices
 
     @cached_property
     def total(self) -> float:
-        """Worth of all patches that some strip shows."""
+        """Return the gain of all patches that some swath shows."""
         return float(self.expected_gain[np.unique(self.views.patch_number)].sum())
 
     @property
     def gap(self) -> int:
-        """Lines between two runs of a strip that cost no more than a second set-up."""
+        """Return the lines between two runs of a swath that take as long as a second set-up."""
         return int(self.prices.run_s / self.prices.even_line_s)
 
     @cached_property
     def unit(self) -> int:
-        """Lines between two borders of the tables: 1 unless the field is too large for that."""
+        """Return the lines between two borders of the tables: more than 1 only for very large fields."""
         return max(-(-(self.views.lines + 1) * len(self.views.swaths) // TABLE_CELLS), 1)
 
     @cached_property
     def _cells(self) -> tuple[int, Ints, Ints]:
-        """Borders along the scan, and the flat table cells of the views' stops (rounded up) and first lines (down)."""
+        """Return the number of borders, and the flat table cells of the views' stops and first lines."""
         borders = -(-self.views.lines // self.unit) + 1
         row = self.views.swath * borders
         begun = np.minimum(self.views.first // self.unit + 1, borders - 1)
         return borders, row - (-self.views.stop // self.unit), row + begun
 
     def tables(self, left: Floats) -> Tables:
-        """Cumulate what is left to show, (patch,), over the lines of every strip."""
+        """Cumulate the remaining gain (patch,) over the lines of every swath."""
         borders, *places = self._cells
         weight, shape = left[self.views.patch_number], (len(self.views.swaths), borders)
         closed, begun = (np.bincount(at, weight, shape[0] * borders).reshape(shape) for at in places)
@@ -162,40 +162,39 @@ class Field:
         return Tables(np.cumsum(closed, axis=1), np.cumsum(begun, axis=1), self.unit, block)
 
     def shown(self, run: ScanRun) -> Ints:
-        """Numbers of the views that lie in a run, (view,)."""
+        """Return the numbers of the views within a run, (view,)."""
         low, high = self.views.edges[run.swath : run.swath + 2]
         inside = (self.views.first[low:high] >= run.first) & (self.views.stop[low:high] <= run.stop)
-        shown: Ints = low + np.flatnonzero(inside)
-        return shown
+        return np.asarray(low + np.flatnonzero(inside))
 
     def shown_patches(self, run: ScanRun) -> Ints:
-        """Patches that lie in a run, (patch,)."""
+        """Return the patches within a run, (patch,)."""
         return self.views.patch_number[self.shown(run)]
 
     def left(self, runs: Sequence[ScanRun]) -> Floats:
-        """Worth of each patch that no run shows, 0 for the others, (patch,)."""
+        """Return the gain of each patch that no run shows, 0 for the others, (patch,)."""
         left = self.expected_gain.copy()
         for run in runs:
             left[self.shown_patches(run)] = 0.0
         return left
 
     def cover(self, runs: Sequence[ScanRun]) -> Cover:
-        """Price runs and count what they show."""
+        """Return runs with their gain and additive time."""
         lines = sum(run.stop - run.first for run in runs)
         return Cover(tuple(runs), self._seen(runs, self.expected_gain), self.prices.even_seconds(lines, len(runs)))
 
     def net(self, runs: Sequence[ScanRun], left: Floats, rate: float) -> float:
-        """Worth less price of runs, given what is left to show and that a second costs ``rate``."""
+        """Return gain less price of runs, for the remaining gain and a price of a second ``rate``."""
         lines = sum(run.stop - run.first for run in runs)
         return self._seen(runs, left) - rate * self.prices.even_seconds(lines, len(runs))
 
     def _seen(self, runs: Sequence[ScanRun], expected_gain: Floats) -> float:
-        """Worth of all patches that runs show, each counted once."""
+        """Return the gain of all patches that runs show, each counted once."""
         patch_index = np.unique(np.concatenate([np.zeros(0, np.intp), *map(self.shown_patches, runs)]))
         return float(expected_gain[patch_index].sum())
 
     def trimmed(self, runs: Sequence[ScanRun], left: Floats) -> list[ScanRun]:
-        """Shorten runs to the views that each adds to what is left, one after the other; drop those that add none."""
+        """Shorten runs to the views that each adds to the remaining gain, in order; drop runs that add none."""
         left, kept = left.copy(), []
         for run in runs:
             views = self.shown(run)
@@ -208,9 +207,9 @@ class Field:
 
     @cached_property
     def windows(self) -> tuple[Ints, ...]:
-        """Sets of windows, (window, strip) each, that together hold every strip; those of a set share no patch column.
+        """Return sets of windows, (window, swath) each, that hold every swath, without common columns in a set.
 
-        One window of all strips where the field is up to about three of them wide.
+        A field of up to about three swaths' width has one window of all swaths.
         """
         low, high = self._spans
         count, width = len(low), int((high - low).max(initial=0)) + 1
@@ -227,7 +226,7 @@ class Field:
 
     @cached_property
     def side_by_side(self) -> Ints:
-        """Strips that share no patch column, from the lower end up, (window, 1): the layout of a full scan."""
+        """Return swaths without a common patch column, (window, 1) from the lower end up: the layout of a full scan."""
         low, high = self._spans
         found, last = [0], len(low) - 1
         while high[found[-1]] < high[-1]:
@@ -236,7 +235,7 @@ class Field:
 
     @cached_property
     def _spans(self) -> tuple[Ints, Ints]:
-        """First and last column of the patches that each strip shows, made ascending."""
+        """Return the first and last column of the patches that each swath shows, made ascending."""
         column, count = self.column[self.views.patch_number], len(self.views.swaths)
         low, high = np.full(count, int(column.max(initial=0))), np.zeros(count, np.intp)
         np.minimum.at(low, self.views.swath, column)
@@ -245,10 +244,10 @@ class Field:
 
 
 def best_cover(field: Field, start: Sequence[ScanRun], rate: float) -> Cover:
-    """Find the runs with the most worth less price when a second costs ``rate`` of worth.
+    """Return the runs with the most gain less price when a second costs ``rate`` of gain.
 
-    The search goes from ``start``, and from the strips of a full scan where the field is up to about three of them wide
-    or ``start`` has no runs; each step is better than the one before, and it ends where no chain can be bettered.
+    The search starts from ``start``. Narrow fields, and a ``start`` without runs, also start from the swaths of a full
+    scan. Each step improves the cover, and the search ends where no chain improves.
     """
     starts = [list(start)]
     if len(field.windows) == 1 or not start:
@@ -259,7 +258,7 @@ def best_cover(field: Field, start: Sequence[ScanRun], rate: float) -> Cover:
 
 
 def _settle(field: Field, start: Sequence[ScanRun], rate: float) -> list[ScanRun]:
-    """Choose chain after chain anew until a round changes none."""
+    """Choose chain after chain again until a round changes none."""
     runs = joined(start, field.gap)
     for _ in range(MOST_ROUNDS if len(field.windows) == 1 else WIDE_ROUNDS):
         before = runs
@@ -271,7 +270,7 @@ def _settle(field: Field, start: Sequence[ScanRun], rate: float) -> list[ScanRun
 
 
 def _round(field: Field, runs: list[ScanRun], windows: Ints, rate: float) -> list[ScanRun]:
-    """Choose each chain of each window anew, and try one chain more."""
+    """Choose each chain of each window again, and try one more chain."""
     members = [set(window.tolist()) for window in windows]
     layer, layers = 0, 1
     while layer < layers:
@@ -284,7 +283,7 @@ def _round(field: Field, runs: list[ScanRun], windows: Ints, rate: float) -> lis
 
 
 def _chains(runs: Sequence[ScanRun]) -> list[list[ScanRun]]:
-    """Share runs among as few chains as it takes."""
+    """Divide runs among as few chains as possible."""
     chains: list[list[ScanRun]] = []
     for run in sorted(runs, key=lambda run: (run.first, run.swath)):
         home = next((chain for chain in chains if chain[-1].stop <= run.first), None)
@@ -295,7 +294,7 @@ def _chains(runs: Sequence[ScanRun]) -> list[list[ScanRun]]:
 
 
 def _again(field: Field, runs: list[ScanRun], windows: Ints, chosen: list[list[ScanRun]], rate: float) -> list[ScanRun]:
-    """Choose one chain of each window anew, the other runs held; keep the old one where it is not bettered."""
+    """Choose one chain of each window again, with the other runs fixed; keep the old one if it is as good."""
     old = {run for chain in chosen for run in chain}
     kept = [run for run in runs if run not in old]
     left = field.left(kept)
@@ -308,5 +307,5 @@ def _again(field: Field, runs: list[ScanRun], windows: Ints, chosen: list[list[S
 
 
 def _priced(field: Field, rate: float) -> tuple[float, float]:
-    """Line and set-up in units of worth."""
+    """Return the price of a line and of a set-up in units of gain."""
     return rate * field.prices.even_line_s, rate * field.prices.run_s

@@ -1,4 +1,4 @@
-"""Strips of lines: the lines that each patch needs, strips at every offset worth trying, their reach."""
+"""Find the lines that each patch needs, swaths at every useful offset, and the mirror's reach."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.errors import SettingsError, ShapeError
+from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.mirror import scene_to_direction
@@ -24,10 +24,10 @@ _PROBES = 9
 
 @dataclass(frozen=True)
 class Views:
-    """Every sight of a patch that a line strip offers: strip s shows patch i on lines ``first`` to ``stop``.
+    """All views of patches: swath s shows patch i on lines ``first`` to ``stop``.
 
-    Lines of all strips count on one lattice, 0 the first that any strip needs, ``lines`` of them. ``swaths[s]`` sweeps
-    from line 0. Views are sorted by strip: those of s are ``edges[s]`` to ``edges[s + 1]``.
+    Lines of all swaths count from the first line that any swath needs; there are ``lines`` of them. ``swaths[s]``
+    sweeps from line 0. Views are sorted by swath: those of s are ``edges[s]`` to ``edges[s + 1]``.
     """
 
     swaths: tuple[Sweep, ...]
@@ -39,25 +39,21 @@ class Views:
 
     @property
     def swath(self) -> NDArray[np.intp]:
-        """Strip of each view, (view,)."""
+        """Return the swath of each view, (view,)."""
         return np.repeat(np.arange(len(self.swaths)), np.diff(self.edges))
 
 
 def patch_lines(
     grid: SceneGrid, camera: LineCamera, sweep: Sweep, patch_index: NDArray[np.integer], *, margin_px: float = 0.0
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Give the lines of a fine sweep that each patch needs, resampling taps included.
+    """Return the lines of a sweep of step 1 that each patch needs, resampling taps included.
 
     Lines count from the sweep's first and need not exist: compare with ``sweep.lines``. Only pixels on the scene count.
-    ``margin_px`` is how far beside the plan the mirror may look: so many lines and samples more are needed all around.
+    ``margin_px`` is the distance beside the plan that the mirror may look, which adds lines and samples all around.
 
-    (patch, 2) first line and the one after the last; (patch,) whether the line's samples reach all pixels. A patch
-    without a pixel on the scene is never reached.
-
-    Raises ShapeError: the sweep is not fine.
+    The result is (patch, 2) first line and the one after the last, and (patch,) whether the samples reach all pixels.
+    A patch without a pixel on the scene is never reached.
     """
-    if sweep.step != 1:
-        raise ShapeError(f"patches are cut from fine sweeps of step 1, got {sweep.name} with step {sweep.step}")
     origin, size = grid.patch_origin(patch_index), np.array([grid.height, grid.width])
     middle = (size - 1) / 2
     low, high = origin - middle, np.minimum(origin + grid.patch, size) - 1 - middle  # first and last pixel centre
@@ -77,7 +73,7 @@ def patch_lines(
 def covered_patches(
     grid: SceneGrid, camera: LineCamera, sweeps: Sequence[Sweep], *, margin_px: float = 0.0
 ) -> PatchIndex:
-    """Give the valid patches that lie wholly, taps and margin included, in one of the fine sweeps, ascending."""
+    """Return the valid patches that lie wholly, taps and margin included, in one of the fine sweeps, ascending."""
     shown = np.zeros(int(np.prod(grid.patch_shape)), bool)
     for sweep in sweeps:
         patch_index = patches_near(grid, camera, sweep)
@@ -87,7 +83,7 @@ def covered_patches(
 
 
 def patches_near(grid: SceneGrid, camera: LineCamera, sweep: Sweep) -> PatchIndex:
-    """Give the valid patches that the rectangle around a sweep's footprint touches, ascending."""
+    """Return the valid patches that the rectangle around a sweep's footprint touches, ascending."""
     edges = np.array([-camera.samples / 2, camera.samples / 2]) * camera.ifov_rad
     scan = np.linspace(sweep.start_px, sweep.start_px + max(sweep.lines, 1), _PROBES)
     if scan[0] < 0 < scan[-1]:
@@ -103,9 +99,9 @@ def patches_near(grid: SceneGrid, camera: LineCamera, sweep: Sweep) -> PatchInde
 
 
 def swaths_at_patches(grid: SceneGrid, camera: LineCamera, along: Axis, *, margin_px: float = 0.0) -> list[Sweep]:
-    """Lay a strip with its lower end on the edge of each patch column, kept on the scene where it can be.
+    """Return a swath with its lower end at the edge of each patch column, kept on the scene where possible.
 
-    With a margin the ends lie so far outside the columns and the scene. A line shows whole patches only, so a strip
+    A margin moves the ends that far outside the columns and the scene. A line shows whole patches only, so a swath
     between two such offsets shows no patch that one of them does not. The sweeps have no lines yet; they start on the
     scene's first row, ascending along the line.
 
@@ -129,9 +125,9 @@ def swaths_at_patches(grid: SceneGrid, camera: LineCamera, along: Axis, *, margi
 
 
 def _swath_from(low: float, end: float, scan: int, camera: LineCamera) -> float:
-    """Centre of the strip whose lines reach down to ``low`` all along the scan, but not beyond the field for nothing.
+    """Return the centre of a swath whose lines reach down to ``low`` all along the scan, on the field if possible.
 
-    Reach changes slowly with the offset: three rounds settle it to less than 1e-3 px.
+    Reach changes slowly with the offset: three rounds are exact to 1e-3 px.
     """
     if 2 * end <= camera.samples:
         return 0.0
@@ -145,9 +141,9 @@ def _swath_from(low: float, end: float, scan: int, camera: LineCamera) -> float:
 def edges_from(
     grid: SceneGrid, camera: LineCamera, swaths: Sequence[Sweep], wanted: NDArray[np.bool_], *, margin_px: float = 0.0
 ) -> Views:
-    """List what strips show of the ``wanted`` (patch,) patches with lines that the mirror can point.
+    """List the views of the ``wanted`` (patch,) patches that swaths have with lines within the mirror's range.
 
-    The strips are sweeps of one axis with the same start; their number of lines does not matter.
+    The swaths are sweeps of one axis with the same start; their number of lines does not matter.
     """
     parts = []
     for number, swath in enumerate(swaths):
@@ -168,12 +164,11 @@ def edges_from(
 
 
 def within_reach(swath_px: ArrayLike, scan_px: ArrayLike, camera: LineCamera) -> NDArray[np.bool_]:
-    """Tell which line centres, (along, scan) px that broadcast, the mirror can point at: no farther than its rim.
+    """Return which line centres, (along, scan) px that broadcast, lie within the mirror's rim.
 
     The normal n ~ o - k is at most 25 deg from rest. A line at the very rim (1e-9) counts as beyond.
     """
     along, scan = np.broadcast_arrays(np.asarray(swath_px, np.float64), np.asarray(scan_px, np.float64))
     o = scene_to_direction(np.stack([along, scan], axis=-1) * camera.ifov_rad)
     cosine = (o[..., 0] + 1 - o[..., 2]) / (2 * np.sqrt(1 - o[..., 2]))
-    inside: NDArray[np.bool_] = cosine >= RIM_TILT + RIM_MARGIN
-    return inside
+    return np.asarray(cosine >= RIM_TILT + RIM_MARGIN)

@@ -1,7 +1,7 @@
-"""Uniform scans: one pass over the field for each line spacing and exposure, and the one that is worth its price.
+"""Choose a uniform scan: one pass over the field by line spacing and exposure, within limits of time and data.
 
-What a scan's map is likely to score stands in a record that was made with the weights: a table by step and exposure.
-Between two exposures the logarithm of the exposure counts; outside the table nothing is said.
+The expected scores come from the scan performance that was measured with the weights: a table by step and exposure.
+Between two exposures interpolation is linear in the logarithm; beyond the table there is no score.
 """
 
 from __future__ import annotations
@@ -19,32 +19,37 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.planning.prices import raw_bytes
 
-EXPOSURES_AN_OCTAVE = 8  # that are tried
-LOSS = 0.001  # of mIoU: a scan that is as much worse than another is as good
-REFERENCE_LOSS = 0.005  # of mIoU: so near the best is the scan that savings are told against
+EXPOSURES_AN_OCTAVE = 8  # candidates
+LOSS = 0.001  # of mIoU: scans that differ by less count as equal
+REFERENCE_LOSS = 0.005  # of mIoU: the reference for savings is this near the best scan
 MIOU = "mIoU"  # as a goal: the mean over classes
 _DIGITS = 1  # of an exposure in ms, so that settings can be read
 
 
 @dataclass(frozen=True)
 class UniformScan:
-    """A scan of the whole field, what it costs, and what its map is likely to score."""
+    """A scan of the whole field, its costs and the expected scores of its map."""
 
     step: int  # pixels from line to line
     exposure_ms: float
     seconds: float
     bytes_raw: int
     expected: Mapping[str, float]  # mIoU, 0..1, by the key `MIOU`, and IoU by the names of classes
-    spread: float | None = None  # of the mIoU from scene to scene, as a standard deviation; None where not known
+    spread: float | None = None  # standard deviation of the mIoU from scene to scene; None if unknown
 
     @property
     def words(self) -> str:
-        """Such as "every 2nd line, 25 ms"."""
+        """Return a summary, such as "every 2nd line, 25 ms"."""
         return format_scan(self.step, self.exposure_ms)
+
+    @property
+    def price(self) -> tuple[float, int, float]:
+        """Return a key that sorts scans by seconds, then bytes, then falling mIoU."""
+        return self.seconds, self.bytes_raw, -self.expected[MIOU]
 
 
 def format_scan(step: int, exposure_ms: float) -> str:
-    """A uniform scan in words, such as "every 2nd line, 25 ms"."""
+    """Return a summary of a uniform scan, such as "every 2nd line, 25 ms"."""
     every = {1: "every line", 2: "every 2nd line", 3: "every 3rd line"}.get(step, f"every {step}th line")
     return f"{every}, {exposure_ms:g} ms"
 
@@ -58,13 +63,13 @@ class ScanPerformance:
     scores: Mapping[str, NDArray[np.float64]]  # by the goals' names, (step, exposure) 0..1
     scenes: int
     spread: NDArray[np.float64] | None = None  # of mIoU, (step, exposure), from scene to scene
-    light_fraction: float = 1.0  # in which these are the exposures, over a clear sky's, in which scenes were scanned
+    light_fraction: float = 1.0  # of today's light over a clear sky's, in which the scenes were scanned
 
     @staticmethod
     def read(content: Mapping[str, Any], light_fraction: float = 1.0) -> ScanPerformance:
-        """Take the table from a record of weights, in whatever order its exposures are.
+        """Return the table of a record of weights, with its exposures in ascending order.
 
-        In a fraction of a clear sky's light an exposure scores what the record has of one shorter by that fraction.
+        At a fraction of a clear sky's light an exposure has the score of one that is shorter by that fraction.
         """
         order = np.argsort(content["exposures_ms"])
         tables = {MIOU: content["miou"], **content["per_class_iou"]}
@@ -82,29 +87,29 @@ class ScanPerformance:
         return self.exposures_ms[0], min(camera.exposure_ms / self.light_fraction, self.exposures_ms[-1])
 
     def knows(self, exposure_ms: float) -> bool:
-        """Return whether an exposure, rounded as those that are offered, lies within the record."""
+        """Return whether a rounded exposure lies within the table."""
         rounding = 0.5 * 10.0**-_DIGITS
         return self.exposures_ms[0] - rounding <= exposure_ms <= self.exposures_ms[-1] + rounding
 
     def expected(self, step: int, exposure_ms: float) -> dict[str, float]:
-        """Scores of a scan of a step and exposure within the record."""
+        """Return the scores of a scan of a step and exposure within the table."""
         return {name: self.between(table, step, exposure_ms) for name, table in self.scores.items()}
 
     def between(self, table: NDArray[np.float64], step: int, exposure_ms: float) -> float:
-        """Return a table's value for a step, between its exposures by their logarithm."""
+        """Return a table's value for a step, interpolated over the logarithm of the exposure."""
         return float(np.interp(math.log(exposure_ms), np.log(self.exposures_ms), table[self.steps.index(step)]))
 
 
 @dataclass(frozen=True)
 class ScanLimits:
-    """Limits of a scan's cost, and goals of its score; None and {} set no limit."""
+    """Limits of a scan's costs, and goals of its scores; None and {} set no limit."""
 
     seconds: float | None = None
     bytes_raw: float | None = None
     goals: Mapping[str, float] = field(default_factory=dict)  # by name, 0..1
 
     def afford(self, scan: UniformScan) -> bool:
-        """Return whether a scan costs no more."""
+        """Return whether a scan is within the limits of its costs."""
         return (self.seconds is None or scan.seconds <= self.seconds) and (
             self.bytes_raw is None or scan.bytes_raw <= self.bytes_raw
         )
@@ -124,11 +129,10 @@ def uniform_scans(
     seconds: float | None = None,
     exposures_ms: Sequence[float] | None = None,
 ) -> list[UniformScan]:
-    """Price scans of every step of a record and many exposures, none that takes more light than the camera's own.
+    """Return candidate scans of every step and many exposures, none longer than the camera's own.
 
-    ``sweeps`` cover the field, by those steps of the record that can be taken, whatever their exposure. With
-    ``seconds`` the longest exposure of each step that ends in time is among the scans. Where ``exposures_ms`` are
-    given, no others are tried than those of them that the record knows.
+    ``sweeps`` cover the field, by steps of the record, whatever their exposure. With ``seconds`` the longest exposure
+    of each step that ends in time is a candidate. With ``exposures_ms`` only those are tried that the record knows.
     """
     found = []
     shortest, longest = record.offered_ms(camera)
@@ -151,7 +155,7 @@ def priced_scan(
     bands: int,
     exposure_ms: float,
 ) -> UniformScan:
-    """Price one scan, by its sweeps and an exposure, of a step that the record has."""
+    """Return one scan with its costs and scores, by its sweeps and an exposure, of a step that the record has."""
     step, exposed = sweeps[0].step, [replace(sweep, exposure_ms=exposure_ms) for sweep in sweeps]
     size, expected = raw_bytes(exposed, camera, bands), record.expected(step, exposure_ms)
     spread = None if record.spread is None else record.between(record.spread, step, exposure_ms)
@@ -159,7 +163,7 @@ def priced_scan(
 
 
 def exposures_between(shortest: float, longest: float) -> list[float]:
-    """Give exposures to try, evenly by their logarithm, both ends among them; none from a longer to a shorter."""
+    """Return candidate exposures, even in their logarithm, with both ends; empty if ``longest`` is the shorter one."""
     if longest < shortest:
         return []
     count = max(math.ceil(EXPOSURES_AN_OCTAVE * math.log2(longest / shortest)), 1)
@@ -169,41 +173,44 @@ def exposures_between(shortest: float, longest: float) -> list[float]:
 def longest_exposure(
     seconds: float, sweeps: Sequence[Sweep], camera: LineCamera, cost: CostModel, shortest: float, longest: float
 ) -> float | None:
-    """Return the longest exposure of such sweeps that ends in time, to .1 ms; None where none does."""
-    ends = [cost.seconds([replace(sweep, exposure_ms=one) for sweep in sweeps], camera) for one in (shortest, longest)]
-    if not ends[0] <= seconds:
+    """Return the longest exposure of such sweeps that ends in time, to .1 ms; None if none does."""
+
+    def taken_s(exposure_ms: float) -> float:
+        return cost.seconds([replace(sweep, exposure_ms=exposure_ms) for sweep in sweeps], camera)
+
+    if taken_s(shortest) > seconds:
         return None
     scale = 10.0**_DIGITS
     low, high = math.ceil(shortest * scale), math.floor(longest * scale)
-    while low < high:  # the camera's highest rate bends the line
+    while low < high:  # bisection, since time is not linear at the camera's highest rate
         middle = (low + high + 1) // 2
-        taken_s = cost.seconds([replace(sweep, exposure_ms=middle / scale) for sweep in sweeps], camera)
-        low, high = (middle, high) if taken_s <= seconds else (low, middle - 1)
+        low, high = (middle, high) if taken_s(middle / scale) <= seconds else (low, middle - 1)
     return low / scale
 
 
 def choose_scan(scans: Sequence[UniformScan], limits: ScanLimits) -> UniformScan:
-    """Choose the scan within the limits that is expected to score most; with goals the cheapest that reaches them.
+    """Return the scan within the limits with the highest expected mIoU; with goals the cheapest that reaches them.
 
-    Of those that are as good but for `LOSS` the cheapest is taken, and of those as cheap the better one; ties go to the
-    first. Raises NoScanPaidFor: no scan is within the limits; names the least that would be. BudgetError: none reaches
-    the goals; names the best there is.
+    Scans within `LOSS` of the best count as equal, and the cheapest of them is taken. Ties go to the higher mIoU, then
+    to the first.
+
+    Raises NoScanPaidFor: no scan is within the limits; names the least costs.
+    Raises BudgetError: no scan reaches the goals; names the best.
     """
     paid = [scan for scan in scans if limits.afford(scan)]
     if not paid:
         raise NoScanPaidFor(_too_little(scans, limits))
     reaching = [scan for scan in paid if limits.reached_by(scan)]
     if not reaching:
-        raise BudgetError(_too_much(scans, paid, limits))
+        raise BudgetError(_too_much(scans, limits))
     if limits.goals:
-        return min(reaching, key=lambda scan: (scan.seconds, scan.bytes_raw, -scan.expected[MIOU]))
+        return min(reaching, key=lambda scan: scan.price)
     best = max(scan.expected[MIOU] for scan in reaching)
-    near = [scan for scan in reaching if scan.expected[MIOU] >= best - LOSS]
-    return min(near, key=lambda scan: (scan.seconds, scan.bytes_raw, -scan.expected[MIOU]))
+    return min((scan for scan in reaching if scan.expected[MIOU] >= best - LOSS), key=lambda scan: scan.price)
 
 
 def reference_scan(scans: Sequence[UniformScan]) -> UniformScan:
-    """The cheapest scan within `REFERENCE_LOSS` of the best: what a scan of everything need not cost more than."""
+    """Return the cheapest scan within `REFERENCE_LOSS` of the best, the reference for savings."""
     best = max(scan.expected[MIOU] for scan in scans)
     return min((scan for scan in scans if scan.expected[MIOU] >= best - REFERENCE_LOSS), key=lambda scan: scan.seconds)
 
@@ -218,7 +225,7 @@ def frontier(scans: Sequence[UniformScan]) -> list[UniformScan]:
 
 
 def _too_little(scans: Sequence[UniformScan], limits: ScanLimits) -> str:
-    """Name the limit that no scan meets, with the least that one takes."""
+    """Return a message that names the limits and the least costs of a scan."""
     fastest, smallest = min(scans, key=lambda scan: scan.seconds), min(scans, key=lambda scan: scan.bytes_raw)
     asked, least = [], []
     if limits.seconds is not None:
@@ -230,8 +237,8 @@ def _too_little(scans: Sequence[UniformScan], limits: ScanLimits) -> str:
     return f"no uniform scan that the weights know pays with {' and '.join(asked)}; the least is {', '.join(least)}"
 
 
-def _too_much(scans: Sequence[UniformScan], paid: Sequence[UniformScan], limits: ScanLimits) -> str:
-    """Name the goal beyond the weights' record, or beyond what the limits pay for."""
+def _too_much(scans: Sequence[UniformScan], limits: ScanLimits) -> str:
+    """Return a message that names the goal beyond the weights' record, or beyond the limits."""
     for name, least in limits.goals.items():
         best = max(scan.expected[name] for scan in scans)
         if best < least:

@@ -1,1 +1,1 @@
-"""Products of a map: spectral indices, regions, prescriptions, areas."""
+"""Compute products of a map: spectral indices, regions, prescriptions, areas."""

@@ -1,4 +1,4 @@
-"""Estimate how much of each class a map has, and how surely: from a confusion matrix, or by its own probabilities."""
+"""Estimate the fractions of classes on a map and their errors, from a confusion matrix or class probabilities."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ from pipeline.errors import ShapeError
 
 Floats = NDArray[np.float64]
 
-BLOCK_PX = 16  # a side: errors within such a block are taken to come together, those of different blocks alone
+BLOCK_PX = 16  # a side: errors are taken as equal within a block, and as independent between blocks
 
 
 @dataclass(frozen=True)
 class FractionEstimate:
-    """Shares of the classes in what is mapped, and their standard errors."""
+    """Fractions of the classes in the mapped area, and their standard errors."""
 
     fractions: Floats  # (class,)
     errors: Floats  # (class,)
 
 
 def judged_enough(confusion: ArrayLike) -> NDArray[np.bool_]:
-    """Return which mapped classes (class,) have the two judged pixels that an estimate with its error takes."""
+    """Return which mapped classes (class,) have the two judged pixels that an estimate needs."""
     return np.asarray(np.asarray(confusion).sum(axis=0) >= 2, np.bool_)
 
 
 def stratified_fractions(
     mapped: ArrayLike, confusion: ArrayLike, others: FractionEstimate | None = None
 ) -> FractionEstimate:
-    """Estimate fractions from a map's and what pixels of each mapped class turned out to be.
+    """Estimate fractions from those of a map and the confusion matrix of judged pixels.
 
     ``mapped`` is (class,) fractions of the map, ``confusion`` (label, mapped class) counts, as
-    `models.evaluation.metrics.confusion` gives them. The judged pixels are taken for a random sample of each mapped
-    class. ``others`` are the fractions within all pixels mapped as classes that are not `judged_enough`, by other
-    means; NaN without them where there are such pixels. Raises ShapeError: the sizes differ.
+    `models.evaluation.metrics.confusion` returns them. The judged pixels count as a random sample of each mapped class.
+    ``others`` are the fractions within all pixels mapped as classes that are not `judged_enough`, by other means.
+    Without them the result is NaN if there are such pixels. Raises ShapeError: the sizes differ.
 
     References
     ----------
@@ -60,11 +60,11 @@ def stratified_fractions(
 
 
 def probable_fractions(swaths: Iterable[NDArray[np.floating]], classes: int) -> FractionEstimate:
-    """Estimate shares from probabilities (y, x, class), given as strips of a map from the top down.
+    """Estimate fractions from probabilities (y, x, class), given as swaths of a map from the top down.
 
-    NaN where a pixel has no class. Strips are as high as a multiple of ``BLOCK_PX``, but for the last. Each pixel is
-    one draw by its probabilities. Within a block of 16 x 16 px all draws go the same way, and blocks are independent.
-    So a map in large patches is not taken for surer than it is. NaN without any pixel.
+    NaN where a pixel has no class. Swaths are a multiple of ``BLOCK_PX`` high, but for the last. Each pixel is one draw
+    by its probabilities. Within a block of 16 x 16 px all draws are equal, and blocks are independent. Otherwise a map
+    in large patches would get too small an error. NaN without any pixel.
     """
     total, expected, variance = 0, np.zeros(classes), np.zeros(classes)
     for swath in swaths:

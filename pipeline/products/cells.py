@@ -1,4 +1,4 @@
-"""Cells of a prescription: a grid along a heading, the exact part of each cell that pixels cover, doses, outlines.
+"""Compute the cells of a prescription: a grid along a heading, the covered part of each cell, doses, outlines.
 
 Areas are those of the pixels' outlines, so that cells finer than pixels, and cells across them, are covered in full.
 """
@@ -7,26 +7,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import shapely
 from affine import Affine
 from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError
-from pipeline.lazy import deferred
-
-if TYPE_CHECKING:
-    import shapely
-else:
-    shapely = deferred("shapely")
 
 Floats = NDArray[np.float64]
 ToAxes = Callable[[Floats, Floats], Floats]  # x and y of a map to (..., 2) along and across the cells
 
 ROWS_AT_ONCE = 64
 MOST_CELLS = 4_000_000
-LEAST_PART = 1e-6  # of a cell: a smaller part is rounding, of what is covered and of what is not
+LEAST_PART = 1e-6  # of a cell: a smaller part, covered or not, is rounding
 
 
 @dataclass(frozen=True)
@@ -83,7 +78,7 @@ class CellGrid:
 def pixel_sides(mask: NDArray[np.bool_], transform: Affine, to_axes: ToAxes) -> Iterator[Floats]:
     """Yield the outline of a mask's pixels (y, x), some rows at a time: (side, begin and end, along and across).
 
-    ``transform`` leads from pixel corners to the map's x and y. Each part is closed, its pixels to the right.
+    ``transform`` converts pixel corners to the map's x and y. Each part is closed, with its pixels to the right.
     """
     a, b, c, d, e, f = transform[:6]
     for top in range(0, mask.shape[0], ROWS_AT_ONCE):
@@ -103,15 +98,14 @@ def pixel_sides(mask: NDArray[np.bool_], transform: Affine, to_axes: ToAxes) -> 
 
 def _corners(sides: NDArray[np.bool_], begin: tuple[int, int], end: tuple[int, int]) -> Floats:
     """Return the corners (side, begin and end, row and column) of sides that are marked."""
-    found: Floats = (np.argwhere(sides)[:, None, :] + np.array([begin, end])).astype(np.float64)
-    return found
+    return np.asarray((np.argwhere(sides)[:, None, :] + np.array([begin, end])).astype(np.float64))
 
 
 def covered_fractions(grid: CellGrid, mask: NDArray[np.bool_], transform: Affine, to_axes: ToAxes) -> Floats:
     """Return the fraction of each cell, (row, column), that the pixels of a mask (y, x) cover.
 
     Exact for pixels with straight sides. Each side of the outline, cut at the cells' borders, is a trapezoid to the far
-    end of its row of cells. Added with their signs, these give the covered area (Green's theorem).
+    end of its row of cells. Their signed sum is the covered area (Green's theorem).
     """
     beside, beyond = np.zeros(grid.shape[0] * grid.shape[1]), np.zeros(grid.shape[0] * grid.shape[1])
     for sides in pixel_sides(mask, transform, to_axes):
@@ -139,15 +133,14 @@ def _cut(sides: Floats, axis: int) -> Floats:
     along = length[:, axis, None]
     fraction = np.divide(lines - begin[:, axis, None], along, out=np.tile([0.0, 1.0], (len(side), 1)), where=along != 0)
     fraction.sort(axis=1)
-    found: Floats = begin[:, None, :] + fraction[..., None] * length[:, None, :]
-    return found
+    return np.asarray(begin[:, None, :] + fraction[..., None] * length[:, None, :])
 
 
 def dose_cells(covered: Floats, treated: Sequence[tuple[Floats, float]], least_fraction: float) -> Floats:
-    """Return the dose of each cell, (row, column): of the classes above ``least_fraction`` of it the greatest.
+    """Return the dose of each cell, (row, column): the greatest of the classes above ``least_fraction`` of it.
 
-    ``covered`` is the fraction of each cell that the map covers, ``treated`` the same of each class with its dose. A
-    class's fraction is that of the covered part. 0 where no class has such a fraction, NaN where the map shows nothing.
+    ``covered`` is the fraction of each cell that the map covers, ``treated`` that of each class with its dose. A
+    class's fraction is that of the covered part. 0 if no class has such a fraction, NaN where the map shows nothing.
     """
     result = np.zeros(covered.shape)
     for fraction, dose in treated:
@@ -156,15 +149,15 @@ def dose_cells(covered: Floats, treated: Sequence[tuple[Floats, float]], least_f
 
 
 def cell_polygons(grid: CellGrid, heading: Heading, covered: Floats, field: NDArray[Any]) -> NDArray[Any]:
-    """Return the covered part of each cell of which any is, row by row, as shapely's polygons in x and y of the map.
+    """Return the covered part of each covered cell, row by row, as shapely's polygons in x and y of the map.
 
-    ``field`` are the polygons that ``covered`` was found of. A cell that is covered in full keeps its four corners.
+    ``field`` are the polygons that ``covered`` was computed from. A fully covered cell keeps its four corners.
     """
     row, column = np.nonzero(covered > 0)
     corners = grid.outlines(row, column)
     polygons: NDArray[Any] = shapely.polygons(heading.from_axes(corners[..., 0], corners[..., 1]))
     whole, partly = shapely.union_all(field), np.flatnonzero(covered[row, column] < 1)
-    for cells in np.split(partly, np.flatnonzero(np.diff(row[partly])) + 1):  # a row's
+    for cells in np.split(partly, np.flatnonzero(np.diff(row[partly])) + 1):  # of each row
         here = shapely.intersection(whole, shapely.convex_hull(shapely.multipolygons(polygons[cells])))
         cut = shapely.intersection(here, polygons[cells])
         polygons[cells] = shapely.buffer(cut, 0)  # without points and lines where outlines touch

@@ -1,8 +1,8 @@
-"""Spectral indices by name: which bands each wants, and its values from a cube's.
+"""Compute spectral indices by name: the bands that each needs, and its values from those of a cube.
 
 Names, formulas and the ranges of bands are those of Awesome Spectral Indices (Montero et al. 2023, doi:
-10.1038/s41597-023-02096-0), as the package spyndex has them; four that need narrower bands than satellites have are
-added from their papers.
+10.1038/s41597-023-02096-0) in the package spyndex. Four indices of narrower bands than those of satellites are added
+from their papers.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ else:
 Floats = NDArray[np.float32]
 Formula = Callable[[Mapping[str, Any]], Any]
 
-DARK_FRACTION = 0.01  # of white: pixels whose bands are darker on the mean have no index
-NARROW_NM = 10.0  # how far a band may lie from the wavelength that a narrow one is meant at
-MOST_REFLECTANCE = 1.5  # a cube of which one value in a hundred is above this holds no reflectance
-LAMBDA = "lambda"  # begins the names of what stands for a band's wavelength in a formula
-CONSTANTS = {"SAVI": {"L": 0.5}}  # where the list's default is another index's
-PAPERS_NM = {  # centres of the papers, where the list has those of a satellite
+DARK_FRACTION = 0.01  # of white: pixels with a darker mean of bands have no index
+NARROW_NM = 10.0  # largest distance of a band from the wavelength of a narrow one
+MOST_REFLECTANCE = 1.5  # a cube with one value in a hundred above this is not reflectance
+LAMBDA = "lambda"  # prefix of a band's wavelength in a formula
+CONSTANTS = {"SAVI": {"L": 0.5}}  # instead of a default that belongs to another index
+PAPERS_NM = {  # centres of the papers instead of a satellite's
     "MCARI": {"RE1": 700.0, "R": 670.0, "G": 550.0},
     "TCARI": {"RE1": 700.0, "R": 670.0, "G": 550.0},
     "MCARIOSAVI": {"RE1": 700.0, "R": 670.0, "G": 550.0, "N": 800.0},
@@ -41,7 +41,7 @@ PAPERS_NM = {  # centres of the papers, where the list has those of a satellite
 
 @dataclass(frozen=True)
 class IndexBand:
-    """A band that an index wants: the one nearest to ``centre_nm`` that lies within ``low_nm`` to ``high_nm``."""
+    """A band that an index needs: the one nearest to ``centre_nm`` within ``low_nm`` to ``high_nm``."""
 
     symbol: str
     title: str
@@ -55,7 +55,7 @@ class IndexBand:
 
 @dataclass(frozen=True)
 class SpectralIndex:
-    """One index by its name, and how it is worked out of the bands that it wants."""
+    """One index: its name, bands and formula."""
 
     name: str
     title: str
@@ -65,7 +65,7 @@ class SpectralIndex:
 
     @property
     def wants_reflectance(self) -> bool:
-        """Return whether values of another scale than 0 to 1 give another index, as where numbers are added to them."""
+        """Return whether the index depends on the scale of the values, as with constants in its formula."""
         rising = {band.symbol: 0.2 + 0.05 * number for number, band in enumerate(self.bands)}
         nm = {LAMBDA + band.symbol: band.centre_nm for band in self.bands}
         twice = {symbol: 2 * value for symbol, value in rising.items()}
@@ -112,9 +112,9 @@ NARROW = (
 
 
 def find_index(name: str) -> SpectralIndex:
-    """Return an index by its name, in capitals or not.
+    """Return an index by its name, in any case.
 
-    Raises SettingsError: there is none of that name, or it needs what no camera gives; the message lists similar names.
+    Raises SettingsError: the name is unknown, or the index needs an input that no camera has; lists similar names.
     """
     own = {index.name.lower(): index for index in NARROW}
     if name.lower() in own:
@@ -164,9 +164,9 @@ def _centre_nm(index: str, symbol: str) -> float:
 
 
 def pick_bands(index: SpectralIndex, wavelength_nm: ArrayLike) -> tuple[int, ...]:
-    """Number, in a cube of (band,) wavelengths [nm], of the band that is taken for each that an index wants.
+    """Return the number of the band, in a cube of (band,) wavelengths [nm], for each band that an index needs.
 
-    Raises WavelengthError: the cube has no wavelength in the range of one; says which, and what the cube has.
+    Raises WavelengthError: the cube has no wavelength in the range of one; names it, and the cube's wavelengths.
     """
     there = np.asarray(wavelength_nm, np.float64)
     numbers, missing = [], []
@@ -192,23 +192,22 @@ def _spread(wavelength_nm: NDArray[np.float64]) -> str:
 def index_values(
     index: SpectralIndex, values: NDArray[np.floating], wavelength_nm: Sequence[float], *, white: float = 1.0
 ) -> Floats:
-    """Return an index from the values (..., band) of the bands that `pick_bands` gave, and their wavelengths [nm].
+    """Return an index from the values (..., band) of the bands of `pick_bands`, and their wavelengths [nm].
 
-    It is NaN where a band has no value, and where the bands are darker than 1 % of ``white`` on the mean. So it is
-    where the formula has no finite value, as by a division by zero.
+    It is NaN where a band has no value, and where the mean of the bands is below 1 % of ``white``. So it is where the
+    formula has no finite value, as in a division by zero.
     """
     usable: NDArray[np.bool_] = np.isfinite(values).all(axis=-1)
     usable &= np.where(usable, values.mean(axis=-1), -np.inf) >= DARK_FRACTION * white
     planes = {band.symbol: values[..., number].astype(np.float64) for number, band in enumerate(index.bands)}
     nm = {LAMBDA + band.symbol: float(wavelength_nm[number]) for number, band in enumerate(index.bands)}
-    with np.errstate(all="ignore"):  # what is not finite is NaN by rule
+    with np.errstate(all="ignore"):  # values that are not finite become NaN
         found = np.asarray(index.formula(planes | nm), np.float64)
-    result: Floats = np.where(usable & np.isfinite(found), found, np.nan).astype(np.float32)
-    return result
+    return np.asarray(np.where(usable & np.isfinite(found), found, np.nan).astype(np.float32))
 
 
 def white_level(values: NDArray[np.floating]) -> float:
-    """Return the white of a cube's values: 1 for reflectance, else the value that one in a hundred is above."""
+    """Return the white level of a cube's values: 1 for reflectance, else their 99th percentile."""
     known = values[np.isfinite(values)]
     bright = float(np.percentile(known, 99)) if known.size else 0.0
     return 1.0 if bright <= MOST_REFLECTANCE else bright

@@ -1,37 +1,30 @@
-"""Regions of a class map: small ones given to a neighbour, classes grown, and their outlines as polygons without gaps.
+"""Process the regions of a class map: merge small ones, grow classes, and outline them as polygons without gaps.
 
-A region is a set of pixels of one class that hang together by their sides. Pixels without a class (255) are no region.
-They are never given to a class, nor take from one, unless a class is grown over them on request.
+A region is a set of pixels of one class that are connected by their sides. Pixels without a class (255) are no region,
+and never change.
 
-Outlines go along the sides of pixels. Wherever three regions meet, all three have a vertex there. That makes the
-outlines a coverage in the words of shapely, whose simplification draws a border once for both its regions.
+Outlines follow the sides of pixels. Three regions that meet have a common vertex. So the outlines are a coverage
+as shapely defines it, whose simplification treats a border of two regions once.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import shapely
+import skimage
 from affine import Affine
 from numpy.typing import NDArray
+from rasterio import features
 from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.lazy import deferred
 
-if TYPE_CHECKING:
-    import rasterio.features as features
-    import shapely
-    import skimage.measure as skimage_measure
-else:
-    features = deferred("rasterio.features")
-    shapely = deferred("shapely")
-    skimage_measure = deferred("skimage.measure")
-
-MOST_AREA_ERROR = 0.01  # that simplified borders may change a class's area by, as a fraction of it
+MOST_AREA_ERROR = 0.01  # of a class's area, by simplified borders
 SMALL = (1, 32, 128, 512, 2048)  # px: regions smaller than so many squares of the tolerance keep their outlines
 Classes = NDArray[np.uint8]
 
@@ -49,17 +42,16 @@ class Coverage:
 
     def polygon_areas(self) -> NDArray[np.float64]:
         """Return the area of each polygon, (polygon,)."""
-        area: NDArray[np.float64] = shapely.area(self.polygons)
-        return area
+        return np.asarray(shapely.area(self.polygons))
 
     def moved(self, transform: Affine) -> Coverage:
-        """Return the same coverage in x and y of a map; ``transform`` leads there from pixel corners."""
+        """Return the coverage in x and y of a map; ``transform`` converts pixel corners to these."""
         a, b, c, d, e, f = transform[:6]
         turn, origin = np.array([[a, d], [b, e]]), np.array([c, f])
         return Coverage(self.classes, shapely.transform(self.polygons, lambda points: points @ turn + origin))
 
     def of_classes(self) -> Coverage:
-        """Return the same coverage without the parts that have no class."""
+        """Return the coverage without the parts that have no class."""
         known = self.classes != UNLABELLED
         return Coverage(self.classes[known], self.polygons[known])
 
@@ -67,11 +59,11 @@ class Coverage:
 def class_polygons(classes: Classes, tolerance_px: float = 1.0) -> Coverage:
     """Return the outlines of the regions of a class map (y, x), simplified by about ``tolerance_px``.
 
-    A region of a few pixels keeps its outline, as its area would be lost with its corners. These are regions below 32
-    squares of the tolerance where a class's area would else be off by more than 1 %. The limit rises to 128, 512 and
-    2048, and at last to all regions, while it is.
+    Small regions keep their outlines, as simplification would remove their area. The limit is the smallest of 1, 32,
+    128, 512 and 2048 squares of the tolerance that changes no class's area by more than 1 %. If all do, no region is
+    simplified.
     """
-    framed = np.pad(classes, 1, constant_values=UNLABELLED)  # what has no class is simplified with its neighbours
+    framed = np.pad(classes, 1, constant_values=UNLABELLED)  # pixels without a class are simplified as a region
     found = outline_regions(framed)
     found = Coverage(found.classes, shapely.transform(found.polygons, lambda points: points - 1))
     counts = np.bincount(classes.ravel(), minlength=UNLABELLED + 1)[:UNLABELLED].astype(np.float64)
@@ -109,7 +101,7 @@ class RegionGraph:
     def grouped(self, group: NDArray[np.integer]) -> RegionGraph:
         """Return the graph of groups of regions, (region,) numbers of groups from 0.
 
-        A group has its largest region's class. The first of equally large ones gives the class.
+        A group has the class of its largest region, or of the first of equally large ones.
         """
         count = int(group.max(initial=-1)) + 1
         sizes = np.bincount(group, self.sizes, count).astype(np.int64)
@@ -132,8 +124,8 @@ def _summed(
 
 
 def find_regions(classes: Classes) -> tuple[NDArray[np.int32], RegionGraph]:
-    """Number the regions of a class map, (y, x), and give their graph."""
-    label: Any = skimage_measure.label
+    """Number the regions of a class map, (y, x), and return their graph."""
+    label: Any = skimage.measure.label
     numbers: NDArray[np.int32] = label(classes.astype(np.int16) + 1, connectivity=1, background=0).astype(np.int32) - 1
     count = int(numbers.max(initial=-1)) + 1
     sizes = np.bincount(numbers.ravel(), minlength=count).astype(np.int64)
@@ -148,11 +140,11 @@ def find_regions(classes: Classes) -> tuple[NDArray[np.int32], RegionGraph]:
 
 
 def merge_small(classes: Classes, least_px: float) -> Classes:
-    """Return every region of less than ``least_px`` pixels to the neighbour that it shares the longest border with.
+    """Return the map with every region of less than ``least_px`` pixels merged into a neighbour.
 
-    Neighbours that are small as well stay together, as the class of the largest, until the whole is large enough.
-    Regions without a neighbour of a class stay, however small. Among borders equally long the neighbour numbered first
-    (from the upper left) is taken.
+    It is the neighbour with the longest common border, the first from the upper left if several are equally long. Small
+    neighbours are merged to the class of the largest until the whole is large enough. Regions without a neighbour of a
+    class stay.
     """
     if least_px <= 1:
         return classes.copy()
@@ -162,17 +154,13 @@ def merge_small(classes: Classes, least_px: float) -> Classes:
         group_of = _joined(links, len(graph.classes))
         graph, group = graph.grouped(group_of), group_of[group]
         same = graph.pairs[graph.classes[graph.pairs[:, 0]] == graph.classes[graph.pairs[:, 1]]]
-        group_of = _joined(same, len(graph.classes))  # what became the class next to it is one region with it
+        group_of = _joined(same, len(graph.classes))  # neighbours of one class become one region
         graph, group = graph.grouped(group_of), group_of[group]
-    merged: Classes = graph.classes[group][numbers]
-    return merged
+    return np.asarray(graph.classes[group][numbers])
 
 
 def _links_of_small(graph: RegionGraph, least_px: float) -> NDArray[np.int64]:
-    """Return (link, 2): each small region with its neighbour of the longest border.
-
-    Regions without a neighbour have no link.
-    """
+    """Return (link, 2): each small region with its neighbour of the longest border, if it has one."""
     known = (graph.classes[graph.pairs] != UNLABELLED).all(axis=1)
     pairs, sides = graph.pairs[known], np.tile(graph.sides[known], 2)
     ends = np.concatenate([pairs, pairs[:, ::-1]])
@@ -180,14 +168,12 @@ def _links_of_small(graph: RegionGraph, least_px: float) -> NDArray[np.int64]:
     ends, sides = ends[small], sides[small]
     order = np.lexsort((ends[:, 1], -sides, ends[:, 0]))
     first = np.unique(ends[order, 0], return_index=True)[1]
-    links: NDArray[np.int64] = ends[order][first]
-    return links
+    return np.asarray(ends[order][first])
 
 
 def _joined(links: NDArray[np.int64], count: int) -> NDArray[np.int32]:
     graph = coo_array((np.ones(len(links), np.int8), (links[:, 0], links[:, 1])), shape=(count, count))
-    groups: NDArray[np.int32] = connected_components(graph, directed=False)[1]
-    return groups
+    return np.asarray(connected_components(graph, directed=False)[1])
 
 
 def grow_class(classes: Classes, number: int, radius_px: float) -> Classes:

@@ -1,1 +1,1 @@
-"""From raw lines to pixels of the scene grid: calibration, geolocation grid, resampling, mosaic."""
+"""Rectify raw lines to pixels of the scene grid: geolocation grid, registration, resampling, mosaic."""

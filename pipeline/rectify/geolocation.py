@@ -1,7 +1,7 @@
-"""Lookup: where on a sweep, in lines and samples, each point of the scene was seen. Exact rays.
+"""Locate points of the scene on a sweep, in lines and samples, by exact rays.
 
-A straight even track has a closed form, any other is solved by Newton on its knots. For whole grids
-:mod:`pipeline.rectify.placed` keeps the exact answer at every few pixels.
+A straight scan path with even steps has a closed form; any other is solved by Newton's method on its knots. For whole
+grids :mod:`pipeline.rectify.placed` stores the exact result at every few pixels.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from pipeline.rectify.scan_paths import ScanPath
 NEWTON_ROUNDS = 4
 HALVINGS = 34  # from one knot to 1e-10 of it
 SEARCH_KNOTS = 12
-END_KNOTS = 4  # whose mean step is that beyond the end
-FAR_KNOTS = 1e6  # a step beyond is none that Newton could come back from
+END_KNOTS = 4  # whose mean step is used beyond the end
+FAR_KNOTS = 1e6  # Newton does not return from a larger step
 SETTLED_PX = 1e-7
 BLOCK_PX = 16384  # some twenty temporaries of this length stay in cache
 
@@ -30,31 +30,31 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class KnotCurve:
-    """The line's centre as a smooth function of the knot coordinate: what Catmull-Rom makes of a track's knots.
+    """The line's centre as a smooth function of the knot coordinate: the Catmull-Rom spline of a scan path's knots.
 
-    Values resampled by the Catmull-Rom kernel at the coordinate found here are then those of the point asked for,
-    where the scene is linear, however uneven the lines lie. Beyond the ends the curve is straight.
+    Resampling by Catmull-Rom at the coordinate found here is exact where the scene is linear, however uneven the lines
+    lie. Beyond the ends the curve is straight.
     """
 
     scan_path: ScanPath
 
     @cached_property
     def even(self) -> bool:
-        """Return whether the knot coordinate is a closed form."""
+        """Return whether the knot coordinate has a closed form."""
         return self.scan_path.straight and self.scan_path.uniform
 
     @cached_property
     def scan(self) -> Floats:
-        """(4, interval) polynomials of the tangent on the scan axis; interval k + 1 begins at knot k."""
+        """Return (4, interval) polynomials of the tangent on the scan axis; interval k + 1 begins at knot k."""
         return _catmull_rom_pieces(self.scan_path.scan, self.scan_path.width)
 
     @cached_property
     def across(self) -> Floats:
-        """(4, interval) polynomials of the tangent along the line."""
+        """Return (4, interval) polynomials of the tangent along the line."""
         return _catmull_rom_pieces(self.scan_path.across, 0.0)
 
     def at(self, knot: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Scan tangent, its slope, tangent along the line, and its slope, at (n,) finite knot coordinates."""
+        """Return scan tangent, its slope, tangent along the line, and its slope, at (n,) finite knot coordinates."""
         interval = np.clip(np.floor(knot), -1, len(self.scan_path) - 1)
         u, number = knot - interval, interval.astype(np.intp) + 1
         found: list[Floats] = []
@@ -65,23 +65,15 @@ class KnotCurve:
         return found[0], found[1], found[2], found[3]
 
     def rough_knot(self, centre: Floats) -> Floats:
-        """Knot coordinate of (n,) scan tangents by straight lines between the knots."""
+        """Return the knot coordinate of (n,) scan tangents by straight lines between the knots."""
         scan = self.scan_path.scan
         inside = np.interp(centre, scan, np.arange(len(scan), dtype=np.float64))
         before, after = np.minimum(centre - scan[0], 0), np.maximum(centre - scan[-1], 0)
-        knot: Floats = inside + before / self.scan[1, 0] + after / self.scan[1, -1]
-        return knot
-
-
-def grid_points(origin_px: tuple[float, float], spacing_px: float, shape: tuple[int, int]) -> Floats:
-    """Centres (y, x, 2) of a grid's pixels [px], of its first centre, their distance and how many."""
-    y = origin_px[0] + spacing_px * np.arange(shape[0])
-    x = origin_px[1] + spacing_px * np.arange(shape[1])
-    return np.stack(np.broadcast_arrays(y[:, None], x[None, :]), axis=-1)
+        return np.asarray(inside + before / self.scan[1, 0] + after / self.scan[1, -1])
 
 
 def knots_of_points(curve: KnotCurve, camera: LineCamera, points: Floats, along: Axis, binning: int) -> Floats:
-    """Give knot and sample of points (n, 2), y and x [px], continued beyond the track, block by block."""
+    """Return knot and sample of points (n, 2), y and x [px], extrapolated beyond the scan path, block by block."""
     out = np.empty(points.shape, np.float64)
     for start in range(0, len(points), BLOCK_PX):
         block = slice(start, start + BLOCK_PX)
@@ -91,7 +83,7 @@ def knots_of_points(curve: KnotCurve, camera: LineCamera, points: Floats, along:
 
 
 def drop_unseen(found: Floats, seen: NDArray[np.bool_], samples: int) -> None:
-    """Write NaN where coordinates (..., 2) lie off the track or next to a knot that nothing saw."""
+    """Write NaN where coordinates (..., 2) lie off the scan path or next to a knot that nothing saw."""
     knot, sample = found[..., 0], found[..., 1]
     on = (knot >= -0.5) & (knot <= len(seen) - 0.5) & (sample >= -0.5) & (sample <= samples - 0.5)
     if not seen.all():
@@ -102,9 +94,9 @@ def drop_unseen(found: Floats, seen: NDArray[np.bool_], samples: int) -> None:
 
 
 def _knot_and_sample(curve: KnotCurve, camera: LineCamera, a: Floats, b: Floats, binning: int) -> Floats:
-    """Knot coordinate and sample (n, 2) that see points of tangents a (along the line) and b (scan).
+    """Return knot coordinate and sample (n, 2) of points with tangents a (along the line) and b (scan).
 
-    Continued beyond the track's ends and the line's; NaN where no line passes or none was found.
+    Extrapolated beyond the scan path's ends and the line's; NaN where no line passes or no solution was found.
     """
     scan_path = curve.scan_path
     if curve.even:
@@ -124,7 +116,7 @@ def _knot_and_sample(curve: KnotCurve, camera: LineCamera, a: Floats, b: Floats,
 
 
 def _catmull_rom_pieces(knots: Floats, alone: float) -> Floats:
-    """Coefficients of 1, u, u^2, u^3 of all pieces; a straight one before the first knot and one after the last."""
+    """Return coefficients of 1, u, u^2, u^3 of all pieces; straight ones before the first knot and after the last."""
     reach = min(END_KNOTS, len(knots) - 1)
     before, after = (alone, alone) if not reach else (knots[reach] - knots[0], knots[-1] - knots[-1 - reach])
     before, after = before / max(reach, 1), after / max(reach, 1)
@@ -140,7 +132,7 @@ def _catmull_rom_pieces(knots: Floats, alone: float) -> Floats:
 
 
 def _find_knots(curve: KnotCurve, a: Floats, b: Floats, tolerance: float) -> Floats:
-    """Knot coordinate (n,) of the line that sees each point: Newton, and where that does not settle, bisection."""
+    """Return the knot coordinate (n,) of the line that sees each point: by Newton, or by bisection if that fails."""
     scan_path = curve.scan_path
     middle = np.full_like(a, scan_path.across[len(scan_path) // 2])
     rough = curve.rough_knot(line_centre(a, b, middle))
@@ -167,7 +159,7 @@ def _miss(curve: KnotCurve, a: Floats, b: Floats, knot: Floats) -> tuple[Floats,
 
 
 def _centre_and_slope(a: Floats, b: Floats, c: Floats) -> tuple[Floats, Floats]:
-    """:func:`pipeline.geometry.mirror.line_centre` and its derivative by c."""
+    """Return :func:`pipeline.geometry.mirror.line_centre` and its derivative by c."""
     reach = 1 + a * a - (a - c) ** 2
     reach = np.where(reach > 0, reach, np.nan)
     root = np.sqrt(reach + b * b)
@@ -178,7 +170,7 @@ def _centre_and_slope(a: Floats, b: Floats, c: Floats) -> tuple[Floats, Floats]:
 
 
 def _bisect(curve: KnotCurve, a: Floats, b: Floats, rough: Floats) -> Floats:
-    """Halve the interval between two knots on either side of the centre, the nearest to a rough start; NaN if none."""
+    """Halve the interval between two knots on either side of the centre, nearest to a rough start; NaN without one."""
     _, _, across, _ = curve.at(rough)
     rough = curve.rough_knot(line_centre(a, b, across))
     known = np.isfinite(rough)
@@ -200,12 +192,12 @@ def _bisect(curve: KnotCurve, a: Floats, b: Floats, rough: Floats) -> Floats:
 def path_geolocation(
     scan_path: ScanPath, camera: LineCamera, points_px: Floats, *, along: Axis, binning: int = 1
 ) -> Floats:
-    """Find the knot and sample at which a track saw each of some points (..., 2), y and x from the scene's centre [px].
+    """Return knot and sample at which a scan path saw some points (..., 2), y and x from the scene's centre [px].
 
-    (..., 2) float64 knot coordinate and sample, integers at centres. Resampling by Catmull-Rom at it gives the values
-    of a linear scene whatever the knots' distances, to the second order of how a line's image stretches. NaN where
-    the point is off the track by more than half a step or half a sample, where the nearest knot is one that nothing
-    saw, and where no crossing with the path was found.
+    The result is (..., 2) float64 knot coordinate and sample, integers at centres. Catmull-Rom resampling at it gives
+    the values of a linear scene for any distances of the knots, to the second order of the line's stretch. It is NaN
+    where the point is off the scan path by more than half a step or half a sample. It is also NaN where nothing saw the
+    nearest knot, or no crossing with the path was found.
     """
     found = knots_of_points(KnotCurve(scan_path), camera, points_px.reshape(-1, 2), along, binning)
     drop_unseen(found, scan_path.seen, camera.samples // binning)

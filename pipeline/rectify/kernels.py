@@ -1,7 +1,7 @@
-"""Short separable kernels: which pixels a position reads, with which weights, and the weighted sum of table rows.
+"""Define short separable kernels: the pixels and weights of a position, and weighted sums of table rows.
 
-The sums run on ``torch.nn.functional.embedding_bag``. Its threads are left as the process has set them: a worker that
-is to use one core says so once (``models.network.machine.use_one_thread``).
+The sums use ``torch.nn.functional.embedding_bag`` with the threads of the process; a worker with one core calls
+``models.network.machine.use_one_thread``.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.lazy import deferred
 
-if TYPE_CHECKING:  # a second to import: the functions that use it do so, and a plan of a survey never needs it
+if TYPE_CHECKING:  # takes a second to import, and the plan of a survey never needs it
     import torch
 else:
     torch = deferred("torch")
@@ -23,7 +23,7 @@ else:
 Kernel = Literal["catmull-rom", "bilinear", "nearest"]
 Rows: TypeAlias = NDArray[np.intp]
 
-BAG_VALUES = 2**18  # per call: the sums are still in the cache when they are copied to where they belong
+BAG_VALUES = 2**18  # per call: sums are copied while they are still in the cache
 TAPS = {"catmull-rom": 4, "bilinear": 2, "nearest": 1}
 
 
@@ -36,35 +36,34 @@ class Windows:
 
     @property
     def points(self) -> int:
-        """Return how many points there are."""
+        """Return the number of points."""
         return int(self.weight.shape[2])
 
     @property
     def taps(self) -> int:
-        """Taps along one axis."""
+        """Return the taps along one axis."""
         return int(self.weight.shape[1])
 
     def chosen(self, which: Rows) -> Windows:
-        """The windows of some of the points."""
+        """Return the windows of some of the points."""
         return Windows(self.corner[:, which], self.weight[:, :, which])
 
     def inside(self, shape: tuple[int, int]) -> NDArray[np.bool_]:
-        """(n,) whether the whole window lies on an image of this (line, sample) shape."""
+        """Return (n,) whether the whole window lies on an image of this (line, sample) shape."""
         last = np.array(shape)[:, None] - self.taps
         least, most = self.corner.min(axis=1, initial=0), self.corner.max(axis=1, initial=0)
-        if (least >= 0).all() and (most <= last[:, 0]).all():  # the rule, in the middle of a sweep; never with a NaN
+        if (least >= 0).all() and (most <= last[:, 0]).all():  # usual in the middle of a sweep; False with a NaN
             return np.ones(self.points, np.bool_)
-        within: NDArray[np.bool_] = np.logical_and(*((self.corner >= 0) & (self.corner <= last)))
-        return within
+        return np.asarray(np.logical_and(*((self.corner >= 0) & (self.corner <= last))))
 
     def touches(self, shape: tuple[int, int]) -> NDArray[np.bool_]:
-        """(n,) whether any tap lies on an image of this (line, sample) shape."""
+        """Return (n,) whether any tap lies on an image of this (line, sample) shape."""
         size = np.array(shape)[:, None]
         touching: NDArray[np.bool_] = np.logical_and(*((self.corner > -self.taps) & (self.corner < size)))
         return touching & bool(size.all())
 
     def joint_weight(self) -> torch.Tensor:
-        """(n, tap * tap) products of the weights along both axes, lines first."""
+        """Return (n, tap * tap) products of the weights along both axes, lines first."""
         down, across = _spread(self.taps)
         along_lines, along_samples = (torch.from_numpy(part) for part in self.weight)
         # Products with zeros and ones are exact, in whatever order they are summed, and much faster than broadcasting
@@ -72,7 +71,7 @@ class Windows:
         return torch.mm(along_lines.T, down).mul_(torch.mm(along_samples.T, across))
 
     def flat_index(self, shape: tuple[int, int]) -> torch.Tensor:
-        """(n, tap * tap) rows of a (line * sample) table of this shape, for windows that lie inside."""
+        """Return (n, tap * tap) rows of a (line * sample) table of this shape, for windows that lie inside."""
         lines, samples = shape
         kind = np.int32 if lines * samples < 2**31 else np.int64  # half the bytes
         first = (self.corner[0] * samples + self.corner[1]).astype(kind)
@@ -80,21 +79,13 @@ class Windows:
         return torch.from_numpy(first)[:, None] + torch.from_numpy(step)
 
     def taps_by_axis(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """(n, tap) lines and samples, not clipped to any image; the corners must be finite."""
+        """Return (n, tap) lines and samples, not clipped to any image; the corners must be finite."""
         line, sample = self.corner.astype(np.int64)[:, :, None] + np.arange(self.taps)
         return line, sample
 
 
-def taps_of(kernel: Kernel) -> int:
-    """Taps of a kernel along one axis: 4, 2 or 1."""
-    if kernel not in TAPS:
-        raise ValueError(f"kernel must be 'catmull-rom', 'bilinear' or 'nearest', got {kernel!r}")
-    return TAPS[kernel]
-
-
 def windows(coordinates: NDArray[np.float64], kernel: Kernel) -> Windows:
     """Place the kernel around points, (n, 2) line and sample; integers are pixel centres. [px]"""
-    taps = taps_of(kernel)
     position = np.array(coordinates.T, dtype=np.float64, order="C")
     if kernel == "nearest":
         return Windows(np.floor(position + 0.5), np.ones((2, 1, position.shape[1]), np.float32))
@@ -102,7 +93,7 @@ def windows(coordinates: NDArray[np.float64], kernel: Kernel) -> Windows:
         base = np.floor(position)
         position -= base
     t = position.astype(np.float32)
-    weight = np.empty((2, taps, t.shape[1]), np.float32)
+    weight = np.empty((2, TAPS[kernel], t.shape[1]), np.float32)
     if kernel == "bilinear":
         np.subtract(1, t, out=weight[:, 0])
         weight[:, 1] = t
@@ -113,7 +104,7 @@ def windows(coordinates: NDArray[np.float64], kernel: Kernel) -> Windows:
 
 
 def kernel_taps(position: NDArray[np.float64], kernel: Kernel) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Give the pixels that each of (n,) finite positions reads and their weights, along one axis.
+    """Return the pixels that each of (n,) finite positions reads and their weights, along one axis.
 
     (n, tap) indices, not clipped to any image, and (n, tap) weights that sum to 1; 4, 2 or 1 taps.
     """
@@ -139,7 +130,7 @@ def weighted_rows(
 
 
 class Unlocked:
-    """Memory of a read-only array as if it were not: torch warns of it, and warnings cannot be held off per thread."""
+    """View of a read-only array as writable memory: torch warns otherwise, and a thread cannot silence warnings."""
 
     def __init__(self, array: NDArray[np.float32]) -> None:
         self.array = array  # keeps the memory
@@ -159,6 +150,6 @@ def _catmull_rom(t: NDArray[np.float32], weight: NDArray[np.float32]) -> None:
 
 @cache
 def _spread(taps: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Matrices (tap, tap * tap) of zeros and ones that repeat weights for every tap of the other axis."""
+    """Return matrices (tap, tap * tap) of zeros and ones that repeat weights for every tap of the other axis."""
     one, row = np.eye(taps, dtype=np.float32), np.ones((1, taps), np.float32)
     return torch.from_numpy(np.kron(one, row)), torch.from_numpy(np.kron(row, one))

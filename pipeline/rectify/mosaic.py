@@ -1,4 +1,4 @@
-"""One track's values at points, from only the lines and samples that they need, and their blend with others'."""
+"""Read one scan path's values at points, from the needed lines and samples only, and blend several sweeps."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.rectify.kernels import Kernel
-from pipeline.rectify.placed import TAPS, Placed, member_lines
+from pipeline.rectify.placed import TAPS, PlacedSweep, member_lines
 from pipeline.rectify.resample import merge_lines, resample
 from pipeline.rectify.scan_paths import ScanPath
 from pipeline.signal.lines import ReadWindow
 
-LEAST_EDGE_PX = 1e-3  # the very edge of a sweep counts where nothing else reaches
-RUN_ELEMENTS = 250_000  # what one more window costs, in elements (sample and band of a line) calibrated
-BLOCK_POINTS = 1024  # what is mixed at once stays in cache
+LEAST_EDGE_PX = 1e-3  # the very edge of a sweep counts where no other sweep reaches
+RUN_ELEMENTS = 250_000  # cost of one more window, in calibrated elements (sample and band of a line)
+BLOCK_POINTS = 1024  # points blended at once stay in cache
 
 
 @dataclass(frozen=True)
 class MosaicPart:
     """One sweep on the mosaic's pixels: (n, band) values, (n,) weight of the resampling, (n,) distance to its edge.
 
-    A point of weight 0 has no value at all; one of more may still be NaN in single bands.
+    A point of weight 0 has no value. One with weight may still be NaN in single bands.
     """
 
     values: NDArray[np.float32]
@@ -45,12 +45,11 @@ def edge_distance(coordinates: NDArray[np.float64], lines: int, samples: int) ->
 def mosaic(parts: Sequence[MosaicPart]) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
     """Blend sweeps, resampled at the same n points, by weights that grow linearly from each sweep's edge.
 
-    The weights are the same for all bands, so every spectrum is a convex mixture of captured ones; only a band that a
-    sweep has no value in is the others' alone. One sweep alone comes back unchanged, bit by bit (it may be the very
-    array that went in). What a part holds where its weight is 0 does not matter. Where lines of several distances
-    reach a point, the closest count alone.
+    The weights are equal for all bands, so every spectrum is a convex mixture of captured ones. A band without a value
+    in one sweep is that of the others. A single sweep is returned unchanged, bit by bit, possibly as the same array.
+    Values of weight 0 do not matter. At points that lines of several distances reach, only the closest lines count.
 
-    (n, band) float32, NaN where no sweep reached, and (n,) how many sweeps did.
+    The result is (n, band) float32, NaN where no sweep reached, and (n,) how many sweeps did.
     """
     parts = _closest(parts)
     reached = [part.weight > 0 for part in parts]
@@ -68,7 +67,7 @@ def mosaic(parts: Sequence[MosaicPart]) -> tuple[NDArray[np.float32], NDArray[np
 
 
 def _closest(parts: Sequence[MosaicPart]) -> Sequence[MosaicPart]:
-    """Take the weight of parts away where another has closer lines."""
+    """Set the weight of parts to 0 where another part has closer lines."""
     if len({part.step for part in parts}) == 1:
         return parts
     steps = np.stack([np.where(part.weight > 0, part.step, np.inf) for part in parts])
@@ -79,7 +78,7 @@ def _closest(parts: Sequence[MosaicPart]) -> Sequence[MosaicPart]:
 
 
 def _blend_shared(blended: NDArray[np.float32], parts: Sequence[MosaicPart], points: NDArray[np.intp]) -> None:
-    """Write the mixtures at ``points``, which several parts reach."""
+    """Write the mixtures at ``points`` that several parts reach."""
     weight = np.stack([part.weight[points] for part in parts])
     edge = np.stack([part.edge_px[points] for part in parts])
     fractions = np.where(weight > 0, weight * np.maximum(np.nan_to_num(edge), LEAST_EDGE_PX), 0.0)
@@ -100,7 +99,7 @@ def _blend_shared(blended: NDArray[np.float32], parts: Sequence[MosaicPart], poi
 def _by_band(
     parts: Sequence[MosaicPart], weights: NDArray[np.floating], points: NDArray[np.intp]
 ) -> NDArray[np.floating]:
-    """Mixtures at points where a part has no value in some bands: there the others count alone."""
+    """Return mixtures at points where a part has no value in some bands; the others count there."""
     values = np.stack([part.values[points] for part in parts])
     counts = np.where(np.isnan(values), 0, weights[..., None])
     total = reduce(np.add, counts)
@@ -112,9 +111,9 @@ def _by_band(
 
 @dataclass(frozen=True)
 class LocatedSweep:
-    """A track and the (..., 2) knots and samples at which it saw some points, NaN off it."""
+    """A scan path and the (..., 2) knots and samples at which it saw some points, NaN off it."""
 
-    placed: Placed
+    placed: PlacedSweep
     scan_path: ScanPath
     coordinates: NDArray[np.float64]
     read: ReadWindow
@@ -123,9 +122,9 @@ class LocatedSweep:
 def read_part(
     located: LocatedSweep, coordinates: NDArray[np.float64], camera: LineCamera, kernel: Kernel
 ) -> MosaicPart | None:
-    """Resample one scan path at coordinates (n, 2) of the geolocation grid; None where it reaches none of them.
+    """Resample one scan path at coordinates (n, 2) of the geolocation grid; None if it reaches none of them.
 
-    Lines that are not valid or that nothing saw, saturated and uncalibrated elements count nothing; where they leave
+    Lines that are not valid or that nothing saw, and saturated or uncalibrated elements, do not count. If they leave
     less than half of a kernel's weight the point is NaN with weight 0. The result at a point does not depend on the
     other points.
     """
@@ -134,7 +133,7 @@ def read_part(
         return None
     signal, scan_path = located.placed.signal, located.scan_path
     count = signal.samples
-    knots, samples = _span(box[0], box[1], len(scan_path)), signal.alone(_span(box[2], box[3], count))
+    knots, samples = _span(box[0], box[1], len(scan_path)), _span(box[2], box[3], count)
     members = member_lines(scan_path, knots)
     values, valid = signal.values(located.read, members, samples, camera.full_scale_dn)
     starts = scan_path.starts[knots] - scan_path.starts[knots.start]
@@ -149,17 +148,14 @@ def read_part(
 
 
 def cut_runs(located: Sequence[NDArray[np.float64]], bands: int) -> list[slice]:
-    """Cut groups of points into runs (slices, in order) such that little is calibrated that no point needs.
+    """Cut groups of points into runs (slices, in order) such that few unneeded elements are calibrated.
 
-    Where lines are turned against the grid, the lines and samples behind a long run of pixels are many times as many
-    as the pixels; short runs have less beside, but each has a price of its own. ``located`` holds the (group, n, 2)
-    geolocation grid of each scan path.
+    If lines are turned against the grid, a long run of pixels needs many times as many lines and samples. Short runs
+    need fewer, but each has a fixed cost. ``located`` holds the (group, n, 2) coordinates of each scan path.
     """
     boxes = np.stack([_boxes(coordinates) for coordinates in located])
 
-    def price(
-        run: slice,
-    ) -> float:  # elements to calibrate, and what a run costs by itself; none where no track reaches
+    def price(run: slice) -> float:  # elements to calibrate and the cost of a run; 0 where no scan path reaches
         low = np.fmin.reduce(boxes[:, run][:, :, [0, 2]], axis=1)  # NaN aside
         high = np.fmax.reduce(boxes[:, run][:, :, [1, 3]], axis=1)
         return float(np.nansum(np.prod(high - low + 2 * TAPS, axis=1) * bands + RUN_ELEMENTS))
@@ -168,7 +164,7 @@ def cut_runs(located: Sequence[NDArray[np.float64]], bands: int) -> list[slice]:
         if run.stop - run.start == 1:
             return [run]
         middle = (run.start + run.stop) // 2
-        # both halves first: one cut may gain nothing by itself, as where two sweeps meet, and those within them much
+        # both halves first: one cut may gain nothing, as where two sweeps meet, but those within it much
         parts = cut(slice(run.start, middle)) + cut(slice(middle, run.stop))
         return parts if sum(map(price, parts)) < price(run) else [run]
 
@@ -176,10 +172,10 @@ def cut_runs(located: Sequence[NDArray[np.float64]], bands: int) -> list[slice]:
 
 
 def _boxes(coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
-    """First and last knot, first and last sample of each group, (group, 4); NaN where the track reaches none of it."""
+    """Return first and last knot, first and last sample of each group, (group, 4); NaN if it is off the scan path."""
     flat = coordinates.reshape(len(coordinates), -1, 2)
     edges = []
-    for place in (flat[..., 0].copy(), flat[..., 1].copy()):  # minima of what lies side by side are ten times as fast
+    for place in (flat[..., 0].copy(), flat[..., 1].copy()):  # minima of contiguous values are ten times as fast
         off = np.isnan(place)
         for extreme, away in ((np.min, np.inf), (np.max, -np.inf)):
             edge = extreme(np.where(off, away, place) if off.any() else place, axis=1)
@@ -188,5 +184,5 @@ def _boxes(coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _span(low: float, high: float, size: int) -> slice:
-    """Whole pixels from low to high with the kernel's taps, within 0..size."""
+    """Return whole pixels from low to high with the kernel's taps, within 0..size."""
     return slice(max(int(np.floor(low)) - TAPS, 0), min(int(np.ceil(high)) + TAPS + 1, size))

@@ -1,6 +1,6 @@
-"""Placed sweeps: lines, the tracks on which they lie, the pixel grid, and what of it each track can reach.
+"""Place sweeps on a pixel grid: their scan paths, the tie points of the grid, and the pixels that lines reach.
 
-A grid's geolocation grid is kept as ties at every few of its pixels, bilinear between, within a bound that was checked.
+The geolocation of a grid is stored as tie points at every few of its pixels, bilinear between, with a checked error.
 """
 
 from __future__ import annotations
@@ -14,39 +14,39 @@ from numpy.typing import NDArray
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, points_of_scan
-from pipeline.rectify.geolocation import KnotCurve, drop_unseen, grid_points, knots_of_points, path_geolocation
+from pipeline.rectify.geolocation import KnotCurve, drop_unseen, knots_of_points, path_geolocation
 from pipeline.rectify.scan_paths import ScanPath, make_scan_paths
 from pipeline.signal.lines import CondensedSignal, Signal, signal_of
 from pipeline.source import SweepLines
 
-SAFETY = 1.05  # on the bound of ties, which holds to the second order
+SAFETY = 1.05  # on the bound of tie points, which holds to the second order
 PIECE_SAMPLES = 64
 MARGIN_PX = 2.0  # of the grid: half a pixel, half a sample, and rounding
 TAPS = 3  # knots and samples that a kernel reads beyond the outermost coordinate
-LEAST_TIE_PX = 4  # closer ties take a byte a pixel and more
+LEAST_TIE_PX = 4  # closer tie points take a byte a pixel and more
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class TieTable:
-    """Knot and sample of a grid's pixels, kept at every ``spacing``-th one and bilinear between.
+    """Knot and sample of a grid's pixels, stored at every ``spacing``-th one and bilinear between.
 
-    Only the part of the grid is kept that the track can have seen. Ties beyond the track's ends and sides are
-    continued, so that pixels inside next to its border have four.
+    Only the part of the grid that the scan path can show is stored. Tie points beyond its ends and sides are
+    extrapolated, so that every pixel near its border has four.
     """
 
-    tie_points: Floats  # (row, column, 2) knot coordinate and sample; tie (i, j) is pixel ``corner`` + (i, j) * spacing
-    spacing: int  # 1: every pixel is a tie, and NaN where it is off the track
+    tie_points: Floats  # (row, column, 2) knot and sample of the pixels ``corner`` + (row, column) * spacing
+    spacing: int  # 1: every pixel is a tie point, and NaN where it is off the scan path
     shape: tuple[int, int]  # (y, x) of the grid
     bound_px: float  # largest error of a coordinate [px of the sweep]
-    seen: NDArray[np.bool_]  # (knot,) of the track
+    seen: NDArray[np.bool_]  # (knot,) of the scan path
     samples: int  # of a line
-    corner: tuple[int, int]  # first row and column of the part of the grid that is kept
+    corner: tuple[int, int]  # first row and column of the stored part of the grid
     kept: tuple[int, int]  # rows and columns of it
 
     def coordinates(self, rows: slice, columns: slice) -> Floats:
-        """Coordinates of a contiguous part of the grid, (y, x, 2), as of ``path_geolocation``."""
+        """Return the coordinates of a contiguous part of the grid, (y, x, 2), as ``path_geolocation`` does."""
         asked = [range(size)[one] for one, size in zip((rows, columns), self.shape, strict=True)]
         here = [
             slice(min(max(one.start - first, 0), count), max(min(one.stop - first, count), 0))
@@ -62,9 +62,8 @@ class TieTable:
                 tuple(slice(one.start // self.spacing, -(-one.stop // self.spacing) + 1) for one in here)
             ]
             most = np.array([len(self.seen), self.samples]) - 0.5
-            if not (
-                self.seen.all() and (tie_points >= -0.5).all() and (tie_points <= most).all()
-            ):  # else all between lie on the track
+            # with all tie points on the scan path, all pixels between are
+            if not (self.seen.all() and (tie_points >= -0.5).all() and (tie_points <= most).all()):
                 drop_unseen(found, self.seen, self.samples)
         if found.shape[:2] == (len(asked[0]), len(asked[1])):
             return found
@@ -74,7 +73,7 @@ class TieTable:
         return whole
 
     def _between(self, rows: slice, columns: slice) -> Floats:
-        """Straight lines along the few rows of ties first, then, in long runs of memory, down the columns."""
+        """Interpolate along the few rows of tie points first, then down the columns, which are contiguous in memory."""
         first, last = rows.start // self.spacing, (rows.stop - 1) // self.spacing
         cell, part = np.divmod(np.arange(columns.start, columns.stop), self.spacing)
         tie_points = self.tie_points[first : last + 2]
@@ -105,17 +104,18 @@ def tie_table(
 ) -> TieTable:
     """Tabulate the geolocation of a scan path over a grid: its first centre, the distance of centres [px], (y, x).
 
-    The distance of ties starts at ``tie`` pixels and is halved until the error of the pixels between, in lines and in
-    samples, is bound by ``tolerance_px`` [px of the sweep]. The bound is an eighth of the ties' second differences (of
-    both axes together) and how far the knots lie off straight lines of a tie's length, which shows a single line out of
-    place that no tie may meet; or the error found half-way between ties, if that is more.
+    The distance of tie points starts at ``tie`` pixels. It is halved until the error of the pixels between, in lines
+    and in samples, is at most ``tolerance_px`` [px of the sweep]. The bound is an eighth of the tie points' second
+    differences (of both axes together). The deviation of the knots from straight lines of that length is added, which
+    finds a single line out of place between tie points. The error half-way between tie points is used instead if it is
+    larger.
     """
     curve, samples = KnotCurve(scan_path), camera.samples // binning
     corner, kept = _within_reach(curve, camera, along, (binning, origin_px, spacing_px, shape))
 
     def exact(first: float, step: int, counts: tuple[int, int]) -> Floats:
         origin = (origin_px[0] + spacing_px * (corner[0] + first), origin_px[1] + spacing_px * (corner[1] + first))
-        points = grid_points(origin, step * spacing_px, counts)
+        points = PixelGrid(origin, step * spacing_px, counts).points(slice(0, counts[0]), slice(0, counts[1]))
         return knots_of_points(curve, camera, points.reshape(-1, 2), along, binning).reshape(*counts, 2)
 
     step_px = spacing_px * camera.ifov_rad / scan_path.width
@@ -126,9 +126,7 @@ def tie_table(
             tie_points = exact(0, tie, (rows, columns))
             corners = _corners(tie_points)
             ends = np.array([len(scan_path), samples]) - 0.5
-            cells = ((corners.max(axis=0) >= -0.5) & (corners.min(axis=0) <= ends)).all(
-                axis=-1
-            )  # hold points of the track
+            cells = ((corners.max(axis=0) >= -0.5) & (corners.min(axis=0) <= ends)).all(axis=-1)  # with points of it
             bound = SAFETY * (bound + _tie_bound(tie_points, cells))
             if bound <= tolerance_px:
                 middle = exact(tie / 2, tie, (rows - 1, columns - 1))
@@ -144,7 +142,7 @@ def tie_table(
 def _within_reach(
     curve: KnotCurve, camera: LineCamera, along: Axis, grid: tuple[int, tuple[float, float], float, tuple[int, int]]
 ) -> tuple[tuple[int, int], tuple[int, int]]:
-    """First row and column of the pixels that lie between the ends of any of the track's lines, and how many."""
+    """Return the first row and column of the pixels between the ends of any line of the scan path, and how many."""
     binning, origin_px, spacing_px, shape = grid
     knots = np.concatenate([[-0.5], np.arange(len(curve.scan_path)), [len(curve.scan_path) - 0.5]])
     scan, _, across, _ = (tangent[:, None] / camera.ifov_rad for tangent in curve.at(knots))
@@ -160,7 +158,7 @@ def _within_reach(
 
 
 def _knot_bound(scan_path: ScanPath, knots: float) -> float:
-    """Return how far knots lie off the middle of straight lines between two others, up to ``knots`` apart [step]."""
+    """Return the deviation of knots from the middle of straight lines, up to ``knots`` long [step]."""
     if scan_path.uniform and scan_path.straight:
         return 0.0
     worst = 0.0
@@ -172,7 +170,7 @@ def _knot_bound(scan_path: ScanPath, knots: float) -> float:
 
 
 def _tie_bound(tie_points: Floats, cells: NDArray[np.bool_]) -> float:
-    """Largest error of bilinear interpolation in the given cells, by the second differences at their corners."""
+    """Return the largest error of bilinear interpolation in the given cells, by their corners' second differences."""
     total = np.zeros_like(tie_points)
     for axis in (0, 1):
         if tie_points.shape[axis] > 2:
@@ -182,38 +180,38 @@ def _tie_bound(tie_points: Floats, cells: NDArray[np.bool_]) -> float:
 
 
 def _corners(tie_points: Floats) -> Floats:
-    """The four ties of each cell, (4, row, column, 2)."""
+    """Return the four tie points of each cell, (4, row, column, 2)."""
     return np.stack([tie_points[:-1, :-1], tie_points[:-1, 1:], tie_points[1:, :-1], tie_points[1:, 1:]])
 
 
 @dataclass(frozen=True)
 class PixelGrid:
-    """Pixels to be filled: y and x of the first centre from the scene's centre, their distance, and how many."""
+    """Pixels of a grid: y and x of the first centre from the scene's centre, their distance, and their number."""
 
     origin_px: tuple[float, float]
-    spacing_px: int
+    spacing_px: float
     shape: tuple[int, int]
 
     @classmethod
     def of_scene(cls, grid: SceneGrid, step: int) -> PixelGrid:
-        """The scene's own pixels for step 1, its coarse ones for ``grid.factor``."""
+        """Return the scene's own pixels for step 1, its coarse ones for ``grid.factor``."""
         shape = (grid.height, grid.width) if step == 1 else grid.coarse_shape
         return cls(((step - grid.height) / 2, (step - grid.width) / 2), step, shape)
 
     def points(self, rows: slice, columns: slice) -> NDArray[np.float64]:
-        """Centres of a part of the pixels, (y, x, 2) from the scene's centre [px]."""
+        """Return the centres of a part of the pixels, (y, x, 2) from the scene's centre [px]."""
         y = self.origin_px[0] + self.spacing_px * np.arange(rows.start, rows.stop)
         x = self.origin_px[1] + self.spacing_px * np.arange(columns.start, columns.stop)
         return np.stack(np.broadcast_arrays(y[:, None], x[None, :]), axis=-1)
 
 
 @dataclass(frozen=True)
-class Placed:
-    """One sweep and where its lines lie: scan paths, each with tie points of a grid, or None to locate directly."""
+class PlacedSweep:
+    """One sweep and its scan paths, each with tie points of a grid, or None to locate points directly."""
 
     lines: SweepLines
     scan_paths: tuple[tuple[ScanPath, TieTable | None], ...]
-    gain: NDArray[np.float32] | None = None  # (band,) what the sweep's values are multiplied by
+    gain: NDArray[np.float32] | None = None  # (band,) factor of the sweep's values
 
     @cached_property
     def signal(self) -> Signal | CondensedSignal:
@@ -223,7 +221,7 @@ class Placed:
     def coordinates(
         self, number: int, camera: LineCamera, grid: PixelGrid, rows: slice, columns: slice
     ) -> NDArray[np.float64]:
-        """Knot and sample at which track ``number`` saw a part of the grid's pixels, (y, x, 2); NaN off it."""
+        """Return knot and sample at which scan path ``number`` saw part of the grid's pixels, (y, x, 2); NaN off it."""
         scan_path, table = self.scan_paths[number]
         if table is not None:
             return table.coordinates(rows, columns)
@@ -232,7 +230,7 @@ class Placed:
     def locate_point(
         self, scan_path: ScanPath, camera: LineCamera, points_px: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Knot and sample at which a track saw any points, (..., 2); NaN off it."""
+        """Return knot and sample at which a scan path saw any points, (..., 2); NaN off it."""
         sweep = self.lines.sweep
         return path_geolocation(scan_path, camera, points_px, along=sweep.along, binning=sweep.binning)
 
@@ -245,46 +243,41 @@ def place(
     usable: NDArray[np.bool_] | None = None,
     shift_px: NDArray[np.float64] | None = None,
     gain: NDArray[np.float32] | None = None,
-) -> Placed:
+) -> PlacedSweep:
     """Find where the lines of a sweep lie.
 
-    ``grid`` are pixels to make tie tables for, which a large mosaic is made with; None looks every point up directly.
-    ``usable`` (line,) are lines with a trusted position, None takes ``lines.valid_line``; ``shift_px`` (line, 2)
-    pointing corrections along the line and along the scan [px]; ``gain`` (band,) the illumination correction of the
-    sweep.
+    ``grid`` are the pixels of a large mosaic, for which tie tables are made; None locates every point directly.
+    ``usable`` (line,) are lines with a trusted position, by default ``lines.valid_line``. ``shift_px`` (line, 2) are
+    pointing corrections along the line and along the scan [px], ``gain`` (band,) is the illumination correction.
 
     Raises PoseError: a line's position is beyond the mirror's disk, or its path has no direction.
     """
-    sweep = lines.sweep
+    sweep, usable = lines.sweep, lines.valid_line if usable is None else usable
     scan_paths = make_scan_paths(
-        lines.position,
-        camera,
-        usable=lines.valid_line if usable is None else usable,
-        shift_px=shift_px,
-        binning=sweep.binning,
-        step_px=sweep.step,
+        lines.position, camera, usable=usable, shift_px=shift_px, binning=sweep.binning, step_px=sweep.step
     )
-    tables = [None if grid is None else _table(scan_path, lines, camera, grid) for scan_path in scan_paths]
-    return Placed(lines, tuple(zip(scan_paths, tables, strict=True)), gain)
 
+    def table(scan_path: ScanPath) -> TieTable | None:
+        """Return a table of the whole grid; None if lines lie too unevenly for tie points to save memory."""
+        if grid is None:
+            return None
+        of_grid = partial(tie_table, scan_path, camera, along=sweep.along, binning=sweep.binning)
+        of_shape = partial(of_grid, origin_px=grid.origin_px, spacing_px=grid.spacing_px)
+        return None if of_shape(shape=(1, 1)).spacing < LEAST_TIE_PX else of_shape(shape=grid.shape)
 
-def _table(scan_path: ScanPath, lines: SweepLines, camera: LineCamera, grid: PixelGrid) -> TieTable | None:
-    """A table of the whole grid; None where lines lie too unevenly for ties to save anything."""
-    of_grid = partial(tie_table, scan_path, camera, along=lines.sweep.along, binning=lines.sweep.binning)
-    of_shape = partial(of_grid, origin_px=grid.origin_px, spacing_px=grid.spacing_px)
-    return None if of_shape(shape=(1, 1)).spacing < LEAST_TIE_PX else of_shape(shape=grid.shape)
+    return PlacedSweep(lines, tuple((scan_path, table(scan_path)) for scan_path in scan_paths), gain)
 
 
 @dataclass(frozen=True)
 class ColumnReach:
-    """Knots and samples that one track shows of some columns of the grid: the rows between which each knot lies."""
+    """Knots and samples of one scan path in some columns of the grid, and the rows between which each knot lies."""
 
     top: NDArray[np.float32]  # (knot,) first row, inf where the knot shows none of the columns
     bottom: NDArray[np.float32]
     samples: slice
 
     def knots(self, rows: slice) -> slice:
-        """Knots that may show these rows, kernel's taps included; empty where none does."""
+        """Return knots that may show these rows, with the kernel's taps; empty if none does."""
         hit = np.flatnonzero((self.top < rows.stop) & (self.bottom >= rows.start))
         if not len(hit):
             return slice(0, 0)
@@ -292,11 +285,10 @@ class ColumnReach:
 
 
 class ScanPathReach:
-    """Place of a track's lines on a grid, in pieces of 64 samples. Never too little, at most a piece too much."""
+    """Place of a scan path's lines on a grid, in pieces of 64 samples. Never too small, at most a piece too large."""
 
-    def __init__(self, placed: Placed, scan_path: ScanPath, camera: LineCamera, grid: PixelGrid) -> None:
+    def __init__(self, placed: PlacedSweep, scan_path: ScanPath, camera: LineCamera, grid: PixelGrid) -> None:
         sweep = placed.lines.sweep
-        self._placed = placed
         self._count = camera.samples // sweep.binning
         self._ends = np.append(np.arange(0, self._count, PIECE_SAMPLES), self._count)
         slope = ((self._ends - camera.samples / 2 / sweep.binning) * sweep.binning) * camera.ifov_rad
@@ -310,7 +302,7 @@ class ScanPathReach:
         self._left, self._right = _spans((x - grid.origin_px[1]) / grid.spacing_px, margin)
 
     def in_columns(self, columns: slice) -> ColumnReach | None:
-        """Return what the track shows of some columns, or None where it shows nothing."""
+        """Return the reach of the scan path in some columns, or None if it shows none of them."""
         hit = (self._left < columns.stop) & (self._right >= columns.start)
         pieces = np.flatnonzero(hit.any(axis=0))
         if not len(pieces):
@@ -319,18 +311,18 @@ class ScanPathReach:
         return ColumnReach(
             top=np.where(hit, self._top, np.inf).min(axis=1),
             bottom=np.where(hit, self._bottom, -np.inf).max(axis=1),
-            samples=self._placed.signal.alone(slice(max(first - TAPS, 0), min(last + TAPS, self._count))),
+            samples=slice(max(first - TAPS, 0), min(last + TAPS, self._count)),
         )
 
 
 def _spans(place: NDArray[np.float64], margin: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Least and greatest place of each piece, (knot, piece) each; float32, for they are kept for every sweep."""
+    """Return the least and greatest place of each piece, (knot, piece) each, as float32 to save memory."""
     one, other = place[:, :-1], place[:, 1:]
     low, high = np.minimum(one, other) - margin, np.maximum(one, other) + margin
     return low.astype(np.float32), high.astype(np.float32)
 
 
 def member_lines(scan_path: ScanPath, knots: slice) -> NDArray[np.intp]:
-    """Numbers of the lines that some knots are made of, knot by knot."""
+    """Return the numbers of the lines of some knots, knot by knot."""
     stop = scan_path.starts[knots.stop] if knots.stop < len(scan_path) else len(scan_path.lines)
     return scan_path.lines[scan_path.starts[knots.start] : stop]

@@ -1,9 +1,14 @@
-"""Pixels of a grid from the lines of sweeps: tiles of a mosaic, rows of it, and single patches."""
+"""Rectify sweeps to pixels of a grid: tiles of a mosaic, rows of it, and single patches.
+
+A maker of tiles opens its sweeps once in every process, and keeps their raw lines from tile to tile.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +17,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.mosaic import LocatedSweep, cut_runs, mosaic, read_part
-from pipeline.rectify.placed import TAPS, ColumnReach, PixelGrid, Placed, ScanPathReach, member_lines, place
+from pipeline.rectify.placed import TAPS, ColumnReach, PixelGrid, PlacedSweep, ScanPathReach, member_lines, place
 from pipeline.rectify.scan_paths import ScanPath
 from pipeline.signal.lines import BLOCK_LINES, LineCache, Raw, ReadWindow, held_samples, line_blocks
 from pipeline.source import SweepLines
@@ -22,11 +27,11 @@ GROUP_COLUMNS = 32  # tiles are cut between groups of so many columns
 
 Values = NDArray[np.float32]
 Counts = NDArray[np.intp]
-Reaches = Sequence[Sequence[ColumnReach | None]]  # of each sweep, of each of its tracks
+Reaches = Sequence[Sequence[ColumnReach | None]]  # of each sweep, of each of its scan paths
 
 
-def column_reach(placed: Sequence[Placed], camera: LineCamera, grid: PixelGrid, columns: slice) -> Reaches:
-    """Return what every track of every sweep shows of some columns: made once, it serves all tiles of these columns."""
+def column_reach(placed: Sequence[PlacedSweep], camera: LineCamera, grid: PixelGrid, columns: slice) -> Reaches:
+    """Return the reach of every scan path of every sweep in some columns, for all tiles of these columns."""
     return [
         [ScanPathReach(one, scan_path, camera, grid).in_columns(columns) for scan_path, _ in one.scan_paths]
         for one in placed
@@ -34,7 +39,7 @@ def column_reach(placed: Sequence[Placed], camera: LineCamera, grid: PixelGrid, 
 
 
 def mosaic_tile(
-    placed: Sequence[Placed],
+    placed: Sequence[PlacedSweep],
     camera: LineCamera,
     grid: PixelGrid,
     rows: slice,
@@ -46,12 +51,12 @@ def mosaic_tile(
 ) -> tuple[Values, Counts]:
     """Rectify and blend the sweeps on a part of a grid, given by slices with start and stop.
 
-    What comes out for a pixel does not depend on how the grid is cut into tiles, bit for bit. ``cache`` holds raw lines
-    that earlier tiles read, None reads what is needed, once; ``reach`` is that of :func:`column_reach` for these
-    columns or more, None makes it.
+    A pixel's value does not depend on the division into tiles, bit for bit. ``cache`` holds raw lines that earlier
+    tiles read; None reads the needed lines once. ``reach`` is that of :func:`column_reach` for these columns or more;
+    None computes it.
 
-    (y, x, band) float32 with NaN where no line reached, (y, x) how many sweeps did (a sweep that turns may count
-    once for each of its runs).
+    The result is (y, x, band) float32 with NaN where no line reached, and (y, x) how many sweeps did. A sweep that
+    turns may count once for each of its runs.
     """
     located = []
     for one, scan_paths in zip(placed, reach or column_reach(placed, camera, grid, columns), strict=True):
@@ -61,18 +66,13 @@ def mosaic_tile(
                 continue
             scan_path = one.scan_paths[number][0]
             coordinates = one.coordinates(number, camera, grid, rows, columns)
-            located.append(
-                LocatedSweep(one, scan_path, coordinates, _reader(one, scan_path, coordinates, cache, near.samples))
-            )
-    shape = rows.stop - rows.start, columns.stop - columns.start
-    bands = placed[0].signal.bands
-    values, coverage = np.empty((*shape, bands), np.float32), np.zeros(shape, np.intp)
-    if not located:
-        values[...] = np.nan
+            read = _reader(one, scan_path, coordinates, cache, near.samples)
+            located.append(LocatedSweep(one, scan_path, coordinates, read))
+    shape, bands = (rows.stop - rows.start, columns.stop - columns.start), placed[0].signal.bands
+    values, coverage = np.full((*shape, bands), np.nan, np.float32), np.zeros(shape, np.intp)
     for run in cut_runs([_column_groups(one.coordinates) for one in located], bands) if located else []:
-        part = slice(run.start * GROUP_COLUMNS, min(run.stop * GROUP_COLUMNS, shape[1]))
-        seen, counts = _blend([(one, one.coordinates[:, part]) for one in located], camera, kernel)
-        values[:, part], coverage[:, part] = seen.reshape(shape[0], -1, bands), counts.reshape(shape[0], -1)
+        part = np.s_[:, run.start * GROUP_COLUMNS : min(run.stop * GROUP_COLUMNS, shape[1])]
+        values[part], coverage[part] = _blend(located, part, camera, kernel)
     return values, coverage
 
 
@@ -81,40 +81,31 @@ def mosaic_rows(
 ) -> Iterator[tuple[int, Values, Counts]]:
     """Rectify and blend the sweeps of one pass onto its grid, ``rows`` rows at a time.
 
-    The pass's step says which grid: 1 the scene's pixels, ``grid.factor`` the coarse ones. Yields the first row,
+    The pass's step selects the grid: 1 the scene's pixels, ``grid.factor`` the coarse ones. Yields the first row,
     (row, x, band) float32 with NaN where no line reached, and (row, x) how many sweeps did.
     """
     pixels = PixelGrid.of_scene(grid, sweeps[0].sweep.step)
     placed = [place(lines, camera) for lines in sweeps]
     columns = slice(0, pixels.shape[1])
     reach = column_reach(placed, camera, pixels, columns)
-    for first in range(0, pixels.shape[0], rows):
-        part = slice(first, min(first + rows, pixels.shape[0]))
-        yield first, *mosaic_tile(placed, camera, pixels, part, columns, reach=reach)
+    for part in _cuts(pixels.shape[0], rows):
+        yield part.start, *mosaic_tile(placed, camera, pixels, part, columns, reach=reach)
 
 
 def patch_pixels(grid: SceneGrid, patch_index: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Give the points to look up for whole patches, (patch, p, p, 2), and which of them lie on the scene.
+    """Return the points of whole patches, (patch, p, p, 2), and which of them lie on the scene.
 
     A pixel beyond the scene's border repeats one inside by reflection within the patch, or the border pixel.
     """
-    p = grid.patch
-    inside = []
-    places = []
+    inside, places = [], []
     for axis, size in enumerate((grid.height, grid.width)):
-        kept, there = _on_the_scene(grid.patch_origin(patch_index)[:, axis, None], p, size)
-        inside.append(there)
-        places.append(kept - (size - 1) / 2)
-    y = np.broadcast_to(places[0][:, :, None], (len(patch_index), p, p))
-    x = np.broadcast_to(places[1][:, None, :], (len(patch_index), p, p))
-    return np.stack([y, x], axis=-1), inside[0][:, :, None] & inside[1][:, None, :]
-
-
-def _on_the_scene(first: NDArray[np.integer], patch: int, size: int) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Return the pixels of patches along one axis from ``first`` (patch, 1): numbers on the scene, and validity."""
-    pixel = first + np.arange(patch)
-    mirrored = 2 * (size - 1) - pixel
-    return np.where(pixel < size, pixel, np.where(mirrored >= first, mirrored, size - 1)), pixel < size
+        first = grid.patch_origin(patch_index)[:, axis, None]
+        pixel = first + np.arange(grid.patch)
+        mirrored = 2 * (size - 1) - pixel
+        inside.append(pixel < size)
+        places.append(np.where(pixel < size, pixel, np.where(mirrored >= first, mirrored, size - 1)) - (size - 1) / 2)
+    points = np.stack(np.broadcast_arrays(places[0][:, :, None], places[1][:, None, :]), axis=-1)
+    return points, inside[0][:, :, None] & inside[1][:, None, :]
 
 
 def read_patches(
@@ -126,10 +117,10 @@ def read_patches(
 ) -> tuple[Values, NDArray[np.bool_]]:
     """Rectify whole patches from the sweeps that saw them.
 
-    Best in the order in which the sweeps pass the patches: neighbours share what is read and calibrated.
+    The order in which the sweeps pass the patches is the fastest: neighbours share the lines that are read.
 
-    (patch, p, p, band) float32, NaN where no line reached, and (patch, p, p) pixels that lie on the scene and were
-    seen.
+    The result is (patch, p, p, band) float32, NaN where no line reached. The mask (patch, p, p) marks pixels of the
+    scene that were seen.
     """
     placed = [place(one, camera) for one in sweeps]
     points, on_scene = patch_pixels(grid, patch_index)
@@ -138,29 +129,24 @@ def read_patches(
         for scan_path, _ in one.scan_paths:
             coordinates = one.locate_point(scan_path, camera, points)
             if np.isfinite(coordinates[..., 0]).any():
-                whole = slice(0, one.signal.samples)
-                located.append(
-                    LocatedSweep(one, scan_path, coordinates, _reader(one, scan_path, coordinates, None, whole))
-                )
+                read = _reader(one, scan_path, coordinates, None, slice(0, one.signal.samples))
+                located.append(LocatedSweep(one, scan_path, coordinates, read))
     bands = placed[0].signal.bands
-    values = np.full((*points.shape[:3], bands), np.nan, np.float32)
-    coverage = np.zeros(points.shape[:3], np.intp)
+    values, coverage = np.full((*points.shape[:3], bands), np.nan, np.float32), np.zeros(points.shape[:3], np.intp)
     for run in cut_runs([one.coordinates for one in located], bands) if located else []:
-        seen, counts = _blend([(one, one.coordinates[run]) for one in located], camera, kernel)
-        values[run], coverage[run] = seen.reshape(values[run].shape), counts.reshape(coverage[run].shape)
+        values[run], coverage[run] = _blend(located, run, camera, kernel)
     return values, on_scene & (coverage > 0)
 
 
-def _blend(
-    located: Sequence[tuple[LocatedSweep, NDArray[np.float64]]], camera: LineCamera, kernel: Kernel
-) -> tuple[Values, Counts]:
-    """Read every track that reaches some of the points and blend them, (n, band) and (n,)."""
-    read = [read_part(one, coordinates.reshape(-1, 2), camera, kernel) for one, coordinates in located]
-    parts = [part for part in read if part is not None]
-    if parts:
-        return mosaic(parts)
-    count, bands = located[0][1].size // 2, located[0][0].placed.signal.bands
-    return np.full((count, bands), np.nan, np.float32), np.zeros(count, np.intp)
+def _blend(located: Sequence[LocatedSweep], part: Any, camera: LineCamera, kernel: Kernel) -> tuple[Values, Counts]:
+    """Read every scan path at a part of the points and blend the values, (..., band), and count the sweeps, (...)."""
+    shape, bands = located[0].coordinates[part].shape[:-1], located[0].placed.signal.bands
+    read = [read_part(one, one.coordinates[part].reshape(-1, 2), camera, kernel) for one in located]
+    parts = [found for found in read if found is not None]
+    if not parts:
+        return np.full((*shape, bands), np.nan, np.float32), np.zeros(shape, np.intp)
+    values, counts = mosaic(parts)
+    return values.reshape(*shape, bands), counts.reshape(shape)
 
 
 def _column_groups(coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -175,9 +161,9 @@ def _column_groups(coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _reader(
-    one: Placed, scan_path: ScanPath, coordinates: NDArray[np.float64], cache: LineCache | None, likely: slice
+    one: PlacedSweep, scan_path: ScanPath, coordinates: NDArray[np.float64], cache: LineCache | None, likely: slice
 ) -> ReadWindow:
-    """Return how to read windows of a sweep: from the cache, or from one read of all lines that the points need."""
+    """Return a function that reads windows of a sweep: from the cache, or from one read of all needed lines."""
     if cache is not None:
         return lambda wanted, samples: cache.window(one.lines, wanted, samples, likely=likely)
     knot = coordinates[..., 0]
@@ -192,21 +178,21 @@ def _reader(
 
 @dataclass(frozen=True)
 class Tile:
-    """A part of a mosaic that is made and written at once. ``reach`` is what each track of each sweep shows there."""
+    """A part of a mosaic that is made and written at once. ``reach`` is that of each scan path of each sweep."""
 
     rows: slice
     columns: slice
-    reach: tuple[tuple[ColumnReach | None, ...], ...]
+    reach: Reaches
 
 
 def plan_tiles(
-    placed: Sequence[Placed], camera: LineCamera, grid: PixelGrid, tile_shape: tuple[int, int]
+    placed: Sequence[PlacedSweep], camera: LineCamera, grid: PixelGrid, tile_shape: tuple[int, int]
 ) -> list[Tile]:
-    """List a grid's tiles in the order to make them: down the columns, so that lines read once serve the next tiles."""
+    """List a grid's tiles down the columns, so that lines are read once for the next tiles."""
     reaches = [[ScanPathReach(one, scan_path, camera, grid) for scan_path, _ in one.scan_paths] for one in placed]
     tiles = []
     for columns in _cuts(grid.shape[1], tile_shape[1]):
-        shown = tuple(tuple(reach.in_columns(columns) for reach in scan_paths) for scan_paths in reaches)
+        shown = [[reach.in_columns(columns) for reach in scan_paths] for scan_paths in reaches]
         tiles += [Tile(rows, columns, shown) for rows in _cuts(grid.shape[0], tile_shape[0])]
     return tiles
 
@@ -215,15 +201,15 @@ def _cuts(size: int, step: int) -> Iterator[slice]:
     return (slice(first, min(first + step, size)) for first in range(0, size, step))
 
 
-def cache_bytes(placed: Sequence[Placed], tiles: Sequence[Tile], at_once: int) -> int:
-    """Memory for the raw lines that any ``at_once`` tiles in a row need together [bytes]."""
+def cache_bytes(placed: Sequence[PlacedSweep], tiles: Sequence[Tile], at_once: int) -> int:
+    """Return the memory for the raw lines that any ``at_once`` tiles in a row need together [bytes]."""
     needed = [_blocks_of(placed, tile) for tile in tiles]
     runs = (needed[first : first + at_once] for first in range(max(len(needed) - at_once, 0) + 1))
     return max((sum({key: size for part in run for key, size in part.items()}.values()) for run in runs), default=0)
 
 
-def _blocks_of(placed: Sequence[Placed], tile: Tile) -> dict[tuple[int, int, int, int], int]:
-    """Sizes of the blocks of raw lines behind a tile, by sweep, block and samples."""
+def _blocks_of(placed: Sequence[PlacedSweep], tile: Tile) -> dict[tuple[int, int, int, int], int]:
+    """Return the sizes of the blocks of raw lines of a tile, by sweep, block and samples."""
     blocks = {}
     for sweep, (one, scan_paths) in enumerate(zip(placed, tile.reach, strict=True)):
         bands = one.signal.bands
@@ -236,3 +222,60 @@ def _blocks_of(placed: Sequence[Placed], tile: Tile) -> dict[tuple[int, int, int
             for number in line_blocks(slice(int(members.min()), int(members.max()) + 1)):
                 blocks[sweep, number, held.start, held.stop] = BLOCK_LINES * (held.stop - held.start) * bands * 2
     return blocks
+
+
+@dataclass(frozen=True)
+class MosaicWork:
+    """PlacedSweep sweeps, camera and grid of a mosaic."""
+
+    placed: Sequence[PlacedSweep]
+    camera: LineCamera
+    grid: PixelGrid
+    kernel: Kernel = "catmull-rom"
+
+    def tile_memory(self, tiles: Sequence[Tile], tile_shape: tuple[int, int], at_once: int) -> tuple[int, int]:
+        """Return the bytes of one tile of (y, x) ``tile_shape``, and of the stored lines that tiles share."""
+        bands = self.placed[0].signal.bands if self.placed else 1
+        return COPIES * tile_shape[0] * tile_shape[1] * bands * 4, cache_bytes(self.placed, tiles, at_once)
+
+
+OpenWork = Callable[[], MosaicWork]  # hashable, and picklable for worker processes: it holds paths
+
+
+@dataclass(frozen=True)
+class TileMaker:
+    """Makes tiles in any process, with ``cache`` bytes of raw lines kept from tile to tile."""
+
+    open: OpenWork
+    cache: int
+
+    def __call__(self, rows: slice, columns: slice) -> tuple[Values, Counts]:
+        """Return the (y, x, component) scores and (y, x) coverage of a part, NaN and 0 where nothing is seen."""
+        work, lines, reach = opened_tiles(self)
+        shown = reach(columns.start, columns.stop)
+        return mosaic_tile(
+            work.placed, work.camera, work.grid, rows, columns, kernel=work.kernel, cache=lines, reach=shown
+        )
+
+
+@lru_cache(maxsize=1)
+def opened_work(open_work: OpenWork) -> MosaicWork:
+    """Open work once in this process."""
+    return open_work()
+
+
+@lru_cache(maxsize=1)
+def opened_tiles(maker: TileMaker) -> tuple[MosaicWork, LineCache, Callable[[int, int], Reaches]]:
+    """Return the work, the cache of lines and the reach of columns; only those of the last maker are kept."""
+    work = opened_work(maker.open)
+
+    def reach(start: int, stop: int) -> Reaches:
+        return column_reach(work.placed, work.camera, work.grid, slice(start, stop))
+
+    return work, LineCache(maker.cache), lru_cache(maxsize=2)(reach)
+
+
+def free_tiles() -> None:
+    """Free the memory of the last mosaic's raw lines in this process."""
+    opened_tiles.cache_clear()
+    opened_work.cache_clear()

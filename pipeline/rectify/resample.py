@@ -1,131 +1,92 @@
-"""Resampling at scattered points: a sweep's lines with masks, as rows of one table."""
+"""Resample a sweep's lines, with masks, at scattered points."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import reduce
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.lazy import deferred
-from pipeline.rectify.kernels import Kernel, Rows, Unlocked, Windows, taps_of, weighted_rows, windows
+from pipeline.rectify.kernels import TAPS, Kernel, Rows, Unlocked, Windows, weighted_rows, windows
 
 if TYPE_CHECKING:
     import torch
 else:
     torch = deferred("torch")
 
-Values: TypeAlias = NDArray[np.float32] | NDArray[np.uint16]
-
 LEAST_WEIGHT = 0.5
 ROUNDING = 1e-6
-BLOCK_PX = 16384  # smaller blocks pay calls, and larger ones gain nothing
+BLOCK_PX = 16384  # points at once: smaller blocks cost calls, larger ones gain nothing
+
+Values = NDArray[np.floating] | NDArray[np.integer]
+Floats32 = NDArray[np.float32]
 
 
-def divisor(total: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the divisor of a sum, from the weight that was usable: 1 for all of it, up to rounding; NaN below half."""
+def divisor(total: Floats32) -> Floats32:
+    """Return the divisor of a sum by its usable weight: 1 for all of the weight, up to rounding; NaN below a half."""
     whole = np.where(np.abs(total - 1) <= ROUNDING, np.float32(1), total)
     return np.where(whole >= LEAST_WEIGHT, whole, np.float32(np.nan))
 
 
-def divide_rows(out: NDArray[np.float32], at: Rows, by: NDArray[np.float32]) -> None:
-    """Divide the rows ``at`` of ``out``, in place, where there is something to divide by other than 1."""
-    other = np.flatnonzero(by != 1)
-    out[at[other]] /= by[other, None]
-
-
-@dataclass(frozen=True)
-class Damage:
-    """Single elements that may not be used, in samples of which other bands may."""
-
-    bands: Rows  # (k,) that have any
-    kind: NDArray[np.int32]  # (line * sample,) row of ``usable``; 0 where a sample has none
-    usable: torch.Tensor  # (kind, k) float32, 1 or 0
-    sound: NDArray[np.bool_]  # (line, sample) of a window's corner: it has none
-
-    def mend(
-        self, out: NDArray[np.float32], at: Rows, index: torch.Tensor, weight: torch.Tensor, total: NDArray[np.float32]
-    ) -> NDArray[np.bool_]:
-        """Divide the weighted sums in the rows ``at`` of ``out`` by the weight that was usable in each band.
-
-        ``total`` (n,) is the weight on usable samples; unusable elements have entered the sums as 0. Tells of each
-        point whether it has a value in any band.
-        """
-        fraction = np.empty((len(at), len(self.bands)), np.float32)
-        weighted_rows(self.usable, torch.from_numpy(self.kind[index.numpy()]), weight, fraction)
-        point, column = _places(np.abs(fraction - total[:, None]) > ROUNDING)  # few: the rest is divided as samples are
-        own, rest = divisor(fraction[point, column]), divisor(total)
-        apart = at[point], self.bands[column]
-        mended = out[apart] / own
-        divide_rows(out, at, rest)
-        out[apart] = mended
-        failed = np.where(np.isnan(rest), out.shape[1] - np.bincount(point, minlength=len(at)), 0)
-        failed += np.bincount(point[np.isnan(own)], minlength=len(at))
-        known: NDArray[np.bool_] = failed < out.shape[1]
-        return known
-
-
 @dataclass(frozen=True)
 class LineTable:
-    """A sweep, ready to be read by one kernel."""
+    """Lines of a sweep as rows of a table, with their masks."""
 
     shape: tuple[int, int]  # lines, samples
-    rows: NDArray[Any]  # (line * sample, band) as captured, for a kernel of one tap
-    terms: torch.Tensor  # the same in float32, for weighted sums
-    usable: NDArray[np.bool_] | None  # (line * sample,); None: all are
-    whole: NDArray[np.bool_] | None  # (line, sample) of a window's corner: all its samples are usable
-    damage: Damage | None
+    terms: torch.Tensor  # (line * sample, band) float32
+    usable: NDArray[np.bool_] | None = None  # (line * sample,) with a valid band; None: all
+    whole: NDArray[np.bool_] | None = None  # (line, sample) of a window's corner: all its samples are usable
+    elements: torch.Tensor | None = None  # (line * sample, band) float32, 1 for valid elements; None: valid by sample
 
-    def read(self, placed: Windows, out: NDArray[Any], fraction: NDArray[np.float32]) -> None:
+    def read(self, placed: Windows, out: Floats32, fraction: Floats32) -> None:
         """Write the points' values (n, band), and (n,) the usable fraction of the kernel's weight."""
-        whole = _lies_on(placed, self.shape, self.whole)
-        if placed.taps == 1:
-            if whole.any():
-                corner = placed.corner if whole.all() else np.where(whole, placed.corner, 0)
-                index = (corner[0] * self.shape[1] + corner[1]).astype(np.intp)
-                np.take(self.rows, index, axis=0, out=out, mode="clip")  # numpy copies once more in its other modes
-            out[~whole] = np.nan if out.dtype == np.float32 else 0
-            fraction[:] = whole
-        elif whole.all():
-            self._read_whole(placed, out, fraction)
-        else:
-            for which, read in ((whole, self._read_whole), (~whole, self._read_partial)):
-                points = np.flatnonzero(which)
-                read(placed.chosen(points), out, fraction, points)
+        whole = placed.inside(self.shape)
+        if self.whole is not None and whole.any():
+            line, sample = np.where(whole, placed.corner, 0).astype(np.intp)
+            whole &= self.whole[line, sample]
+        if whole.all():
+            fraction[:] = self._read_whole(placed, out)
+            return
+        points = np.flatnonzero(whole)
+        out[~whole], fraction[~whole] = np.nan, 0
+        fraction[points] = self._read_whole(placed.chosen(points), out, points)
+        points = np.flatnonzero(~whole & placed.touches(self.shape))
+        flat, joint = self._usable_taps(placed.chosen(points))
+        total = reduce(np.add, joint.T)  # tap by tap, in the order of `weighted_rows`
+        index, weight = torch.from_numpy(flat), torch.from_numpy(joint)
+        fraction[points] = self._read(index, weight, total, out, points)
 
-    def _read_whole(
-        self, placed: Windows, out: NDArray[np.float32], fraction: NDArray[np.float32], at: Rows | None = None
-    ) -> None:
-        """Points (the block's ``at``, or all) whose windows lie on usable samples altogether."""
-        index, weight = placed.flat_index(self.shape), placed.joint_weight()
+    def _read_whole(self, placed: Windows, out: Floats32, at: Rows | None = None) -> Floats32:
+        """Write points whose windows lie wholly on usable samples."""
+        total = np.ones(placed.points, np.float32)
+        return self._read(placed.flat_index(self.shape), placed.joint_weight(), total, out, at)
+
+    def _read(
+        self, index: torch.Tensor, weight: torch.Tensor, total: Floats32, out: Floats32, at: Rows | None
+    ) -> Floats32:
+        """Write weighted sums, over their usable weight, to the rows ``at`` of ``out``; return the usable fraction.
+
+        ``total`` (n,) is the weight on usable samples.
+        """
         weighted_rows(self.terms, index, weight, out, at)
-        fraction[... if at is None else at] = 1
-        if self.damage is not None:
-            touched = np.flatnonzero(~_lies_on(placed, self.shape, self.damage.sound))
-            here, taps = touched if at is None else at[touched], torch.from_numpy(touched)
-            one = np.ones(len(touched), np.float32)
-            fraction[here] = self.damage.mend(out, here, index[taps], weight[taps], one)
-
-    def _read_partial(self, placed: Windows, out: NDArray[np.float32], fraction: NDArray[np.float32], at: Rows) -> None:
-        """Points that miss taps: NaN and 0 where they fail, else what is there, renormalised."""
-        out[at], fraction[at] = np.nan, 0
-        near = np.flatnonzero(placed.touches(self.shape))
-        flat, joint = self._usable_taps(placed.chosen(near))
-        total = reduce(np.add, joint.T)  # tap by tap, as the sums of a mask by element run: the same to the last bit
-        index, weight, at = torch.from_numpy(flat), torch.from_numpy(joint), at[near]
-        weighted_rows(self.terms, index, weight, out, at)
-        if self.damage is None:
-            whole = divisor(total)
-            divide_rows(out, at, whole)
-            known = ~np.isnan(whole)
+        if self.elements is None:
+            by = divisor(total)
+            other = np.flatnonzero(by != 1)
+            out[other if at is None else at[other]] /= by[other, None]
+            known = ~np.isnan(by)
         else:
-            known = self.damage.mend(out, at, index, weight, total)
-        fraction[at] = np.where(known, np.minimum(total, 1), 0)
+            seen = np.empty((len(total), out.shape[1]), np.float32)
+            weighted_rows(self.elements, index, weight, seen)
+            by = divisor(seen)
+            out[slice(None) if at is None else at] /= by
+            known = np.asarray(~np.isnan(by).all(axis=1))
+        return np.where(known, np.minimum(total, 1), np.float32(0))
 
-    def _usable_taps(self, placed: Windows) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """(n, tap * tap) rows and weights; a tap that may not be used has weight 0 and the row of one that may."""
+    def _usable_taps(self, placed: Windows) -> tuple[NDArray[np.int64], Floats32]:
+        """Return (n, tap * tap) rows and weights; an unusable tap has weight 0 and the row of a usable one."""
         line, sample = placed.taps_by_axis()
         weight = placed.weight.copy()
         for along, index, size in ((weight[0], line, self.shape[0]), (weight[1], sample, self.shape[1])):
@@ -136,128 +97,61 @@ class LineTable:
         if self.usable is not None:
             usable = self.usable[flat]
             joint *= usable
-            flat[~usable] = np.argmax(self.usable)  # 0 times a NaN would still be a NaN
+            flat[~usable] = np.argmax(self.usable)  # 0 times NaN is NaN
         return flat, joint
 
 
-def table_for(values: Values, valid: NDArray[np.bool_], kernel: Kernel) -> LineTable:
-    """Make lines (line, sample, band), valid by sample or by element, ready for one kernel."""
-    taps = taps_of(kernel)
-    lines, samples, bands = values.shape
-    rows: NDArray[Any] = np.ascontiguousarray(values).reshape(lines * samples, bands)
-    if rows.dtype != np.uint16 or taps > 1:
-        rows = rows.astype(np.float32, copy=False)
-    damage = None
+def _table(values: Values, valid: NDArray[np.bool_], kernel: Kernel) -> LineTable:
+    """Make a table of lines (line, sample, band), valid by sample or by element."""
+    shape, elements = (values.shape[0], values.shape[1]), None
+    rows = np.ascontiguousarray(values, np.float32).reshape(-1, values.shape[2])
     if valid.ndim == 3:
-        rows, valid, damage = _apart(rows, valid, taps)
-    whole, usable = None, None
-    if not valid.all():
-        whole, usable = _windows_all(valid, taps), np.ascontiguousarray(valid).ravel()
-    terms = torch.empty(0)
-    if taps > 1:  # read-only memory is fine: nothing here writes to it
-        terms = torch.from_numpy(rows if rows.flags.writeable else np.asarray(Unlocked(rows)))
-    return LineTable((lines, samples), rows, terms, usable, whole, damage)
-
-
-def _apart(
-    rows: NDArray[Any], valid: NDArray[np.bool_], taps: int
-) -> tuple[NDArray[Any], NDArray[np.bool_], Damage | None]:
-    """Part a mask by element into one by sample (any band) and the damage of single elements.
-
-    Those are 0 in the rows given back, for sums; NaN for a kernel of one tap, which copies.
-    """
-    complete: NDArray[np.bool_] = np.all(valid, axis=2)
-    lacking = np.flatnonzero(~complete)
-    missing = ~valid.reshape(rows.shape)[lacking]
-    some = ~missing.all(axis=1)
-    usable = complete.copy()
-    usable.ravel()[lacking] = some
-    lacking, missing = lacking[some], missing[some]
-    if not len(lacking):
-        return rows, usable, None
-    sample, band = _places(missing)
-    place = lacking[sample], band
-    if taps == 1 or rows[place].any():  # zeros that the caller has written spare the copy
-        rows = rows.astype(np.float32)
-        rows[place] = np.nan if taps == 1 else 0
-    if taps == 1:
-        return rows, usable, None
-    bands, column = np.unique(band, return_inverse=True)
-    counts = np.ones((len(lacking) + 1, len(bands)), np.float32)
-    counts[sample + 1, column] = 0
-    kind = np.zeros(len(rows), np.int32)
-    kind[lacking] = np.arange(1, len(counts))
-    sound = _windows_all((kind == 0).reshape(usable.shape), taps)
-    return rows, usable, Damage(bands, kind, torch.from_numpy(counts), sound)
-
-
-def _places(mask: NDArray[np.bool_]) -> tuple[Rows, Rows]:
-    """Rows and columns where a mask holds; np.nonzero of two dimensions is far slower."""
-    row, column = np.divmod(np.flatnonzero(mask), max(mask.shape[1], 1))
-    return row, column
-
-
-def _windows_all(mask: NDArray[np.bool_], taps: int) -> NDArray[np.bool_]:
-    """Mark corners of windows within which the mask holds, (line, sample) -> less ``taps - 1`` both ways."""
+        usable = np.asarray(valid.any(axis=2))
+        if not (valid.all(axis=2) == usable).all():
+            flat = valid.reshape(rows.shape)
+            rows, elements = np.where(flat, rows, np.float32(0)), torch.from_numpy(flat.astype(np.float32))
+        valid = usable
+    # read-only memory is fine: nothing here writes to it
+    terms = torch.from_numpy(rows if rows.flags.writeable else np.asarray(Unlocked(rows)))
+    if valid.all():
+        return LineTable(shape, terms, elements=elements)
+    whole = valid
     for axis in (0, 1):
-        size = max(mask.shape[axis] - taps + 1, 0)
-        held = mask.take(range(size), axis=axis)
-        for tap in range(1, taps):
-            held &= mask.take(range(tap, tap + size), axis=axis)
-        mask = held
-    return mask
-
-
-def _lies_on(placed: Windows, shape: tuple[int, int], corners: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
-    """(n,) whether a window lies on the sweep, and its corner among those told."""
-    inside = placed.inside(shape)
-    if corners is not None and inside.any():
-        line, sample = np.where(inside, placed.corner, 0).astype(np.intp)
-        inside &= corners[line, sample]
-    return inside
+        size = max(shape[axis] - TAPS[kernel] + 1, 0)
+        shifted = (whole.take(range(tap, tap + size), axis=axis) for tap in range(TAPS[kernel]))
+        whole = np.asarray(reduce(np.logical_and, shifted))
+    return LineTable(shape, terms, np.ascontiguousarray(valid).ravel(), whole, elements)
 
 
 def resample(
-    values: Values,
-    valid: NDArray[np.bool_],
-    coordinates: NDArray[np.float64],
-    kernel: Kernel = "catmull-rom",
-    *,
-    out: NDArray[Any] | None = None,
-) -> tuple[NDArray[Any], NDArray[np.float32]]:
-    """Read a sweep (line, sample, band), float32 or uint16, at scattered coordinates, leaving out what is not valid.
+    values: Values, valid: NDArray[np.bool_], coordinates: NDArray[np.float64], kernel: Kernel = "catmull-rom"
+) -> tuple[Floats32, Floats32]:
+    """Read a sweep (line, sample, band) at scattered coordinates, without what is not valid.
 
-    Taps that are not valid or lie off the sweep count nothing and the rest is renormalised; a point whose valid taps
-    weigh less than a half fails. Where single elements are invalid this holds for each band on its own. Values of what
-    is invalid, NaN included, never reach the result. A point's result does not depend on the other points of the call.
+    Taps that are not valid or lie off the sweep are left out, and the other weights are renormalised. A point whose
+    valid taps weigh less than a half fails. With invalid elements this holds for each band separately. Invalid values,
+    NaN included, never reach the result. A point's result does not depend on the other points of the call.
 
     Parameters
     ----------
     valid
-        (line, sample) whether a sample may be used, or (line, sample, band) whether an element may. Where ``values``
-        holds 0 at single invalid elements the lines need not be copied.
+        (line, sample) whether a sample is valid, or (line, sample, band) whether an element is.
     coordinates
         (n, 2) float64 line and sample, NaN for points off the sweep. [px of the sweep]
-    out
-        (n, band) array of the result's type to write to; memory used before spares the page faults of fresh memory.
 
     Returns
     -------
-    (n, band) float32, NaN where the point failed in that band; ``nearest`` gives uint16 back as the same uint16, 0
-    where the point failed (float32 with NaN if single elements are invalid). And (n,) float32, the fraction of the
-    kernel's weight that lay on samples with a valid band (0..1): 0 where the point failed in every band.
+    (n, band) float32, NaN where the point failed in that band. And (n,) float32, the fraction of the kernel's weight
+    on samples with a valid band (0..1): 0 where the point failed in every band.
     """
     coordinates = np.asarray(coordinates, np.float64)
-    low, high = (
-        extreme.reduce(coordinates[:, 0], initial=away) for extreme, away in ((np.fmin, np.inf), (np.fmax, -np.inf))
-    )
+    low = np.fmin.reduce(coordinates[:, 0], initial=np.inf)
+    high = np.fmax.reduce(coordinates[:, 0], initial=-np.inf)
     first, stop = 0, 0  # of the lines that a tap of any point can lie on
     if low <= high:
         first, stop = np.clip((np.floor(low) - 1, np.floor(high) + 3), 0, len(values)).astype(int).tolist()
-    table = table_for(values[first:stop], valid[first:stop], kernel)
-    shape, kind = (len(coordinates), values.shape[2]), table.rows.dtype
-    out = np.empty(shape, kind) if out is None else out
-    fraction = np.zeros(len(coordinates), np.float32)
+    table = _table(values[first:stop], valid[first:stop], kernel)
+    out, fraction = np.empty((len(coordinates), values.shape[2]), np.float32), np.zeros(len(coordinates), np.float32)
     for start in range(0, len(out), BLOCK_PX):
         block = slice(start, start + BLOCK_PX)
         placed = windows(coordinates[block], kernel)
@@ -268,29 +162,17 @@ def resample(
 
 def merge_lines(
     values: Values, valid: NDArray[np.bool_], starts: NDArray[np.intp]
-) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """Average the lines of each dwell, those taken while the mirror stood still; they lie next to each other.
+) -> tuple[Floats32, NDArray[np.bool_]]:
+    """Average the lines of each dwell: those taken at one place, which lie next to each other.
 
-    ``starts`` (dwell,) are the ascending numbers of the first line of each, the first being 0. The mask is by sample or
-    by element.
+    ``starts`` (dwell,) are the ascending numbers of the first line of each, from 0. The mask is by sample or by
+    element.
 
-    (dwell, sample, band) float32 mean of the valid lines, NaN where there is none (a line alone as it was; the input
-    itself, uint16 too, where every line is alone); and whether there is any, with the dimensions of ``valid``.
+    The result is the (dwell, sample, band) float32 mean of the valid lines, NaN if there is none. Its mask has the
+    dimensions of ``valid``.
     """
-    counts = np.diff(starts, append=len(values))
-    if len(starts) == len(values):
-        return values, valid
-    merged, known = values[starts].astype(np.float32), valid[starts]
-    several = np.flatnonzero(counts > 1)
-    starts, counts = starts[several], counts[several]
     mask = valid if valid.ndim == 3 else valid[..., None]
-    total = np.zeros((len(starts), *values.shape[1:]))  # float64 holds the sums of any dwell's uint16
-    number = np.zeros((len(starts), *mask.shape[1:]), np.intp)
-    for member in range(counts.max(initial=0)):
-        held = np.flatnonzero(counts > member)
-        line = starts[held] + member
-        total[held] += np.where(mask[line], values[line], 0)
-        number[held] += mask[line]
-    merged[several] = np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
-    known[several] = (number > 0).reshape(len(starts), *valid.shape[1:])
-    return merged, known
+    total = np.add.reduceat(np.where(mask, values, 0), starts, axis=0, dtype=np.float64)
+    number = np.add.reduceat(mask, starts, axis=0, dtype=np.intp)
+    merged = np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
+    return merged.astype(np.float32), (number > 0).reshape(len(starts), *valid.shape[1:])

@@ -1,6 +1,6 @@
-"""Tracks: where the lines of a sweep lie, as runs that go one way, whatever path the mirror took, and which they are.
+"""Find scan paths: the places of a sweep's lines, as runs in one direction, and the line numbers of its frames.
 
-Which line of the plan an arriving frame is, its time stamp says.
+The time stamp of a frame gives its line of the plan.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from pipeline.readings import SIGMA_OF_MEDIAN
 STANDING_STEPS = 1e-3  # a mirror that moves less than this stands still
 DWELL_STEPS = 0.25  # lines closer than this show the same place
 GAP_STEPS = 1.5  # a wider distance misses a line; a smaller step back is noise
-NOISE_SIGMAS = 6.0  # nor does a path turn that goes back by less than this much of its own noise
-EVEN_STEPS = 1e-7  # a path this straight and even is looked up in closed form
+NOISE_SIGMAS = 6.0  # a step back of less than this much of the path's own noise is no turn
+EVEN_STEPS = 1e-7  # a path this straight and even has a closed form
 LATE_FRAMES = 0.25
-LEAST_FRAMES = 3  # below that none can be told to be the late one
-WILD_FRAMES = 1000  # a first or last stamp so far off the others is wrong, if they all lie nearer to each other
-FITS = 2  # the second without the frames that the first finds late
+LEAST_FRAMES = 3  # fewer cannot show which one is late
+WILD_FRAMES = 1000  # a first or last stamp this far off the others is wrong, if they lie nearer to each other
+FITS = 2  # the second without the frames that are late by the first
 
 Floats = NDArray[np.float64]
 
@@ -33,9 +33,9 @@ Floats = NDArray[np.float64]
 class ScanPath:
     """One run of a sweep along the scan: knots where lines lie, in ascending order. Tangents of the scene plane.
 
-    A knot is one line, or several that show the same place, whose values are averaged. Where lines are missing the
-    track is filled with knots at even distances that nothing saw (``seen`` False), so that an even track stays even;
-    their one member is the nearest line, and does not count.
+    A knot is one line, or several at the same place, whose values are averaged. Missing lines are replaced by knots at
+    even distances that nothing saw (``seen`` False), so that an even path stays even. Their one member is the nearest
+    line, and does not count.
     """
 
     scan: Floats  # (knot,) of the line centres on the scan axis, ascending
@@ -69,18 +69,18 @@ def make_scan_paths(
     binning: int = 1,
     step_px: float | None = None,
 ) -> tuple[ScanPath, ...]:
-    """Split a sweep into runs that go one way along the scan, and order the lines of each.
+    """Split a sweep into runs in one direction along the scan, and order the lines of each.
 
-    A path turns where it goes back by more than 1.5 steps, and by more than six times the noise that its own second
-    differences show; what goes back less is put in order. Lines closer than a quarter step are one knot (a dwell).
-    Lines that are not usable say nothing of the path; where one is missing, or was lost, knots that nothing saw stand
-    in its place. Resampling then counts their values nothing, and fails where what is left weighs less than a half.
+    A path turns where it goes back by more than 1.5 steps, and by more than six times its noise by second differences.
+    Smaller steps back are sorted. Lines closer than a quarter step are one knot (a dwell). Lines that are not usable do
+    not count for the path. A missing line is replaced by a knot that nothing saw. Resampling ignores its values, and
+    fails where the rest weighs less than a half.
 
-    ``position`` is (line, 2) mirror X and Y at mid exposure, ``shift_px`` (line, 2) pointing corrections along the line
-    and along the scan, added to the line centres. ``step_px`` is the planned distance of the lines; None takes the
-    median of the path's own steps, or where the path does not say the width of a sample of ``binning`` px.
+    ``position`` is (line, 2) mirror X and Y at mid exposure. ``shift_px`` (line, 2) are pointing corrections along the
+    line and along the scan, added to the line centres. ``step_px`` is the planned distance of the lines. None takes the
+    median of the path's own steps, or the width of a sample of ``binning`` px for a path that stands still.
 
-    Tracks in the order in which they were taken; none where no line is usable.
+    Returns the scan paths in order of capture; none if no line is usable.
 
     Raises PoseError: the position of a usable line is not finite or beyond the mirror's disk; names the first.
     """
@@ -100,7 +100,7 @@ def line_centres(
 ) -> tuple[Floats, Floats, NDArray[np.intp]]:
     """Return the centres of the usable lines of a sweep, in order of capture; raises as :func:`make_scan_paths`.
 
-    Tangents on the scan axis and along the line, (usable line,) each, and the numbers of these lines.
+    The result is tangents on the scan axis and along the line, (usable line,) each, and the numbers of these lines.
     """
     lines = np.arange(len(position)) if usable is None else np.flatnonzero(usable)
     place = np.asarray(position[lines], np.float64)
@@ -119,7 +119,7 @@ def line_centres(
 
 
 def _usual_step(scan: Floats, lines: NDArray[np.intp], apart: float) -> float:
-    """Median distance of lines that follow each other, standing ones left out; ``apart`` where none move."""
+    """Return the median distance of consecutive lines that move; ``apart`` if none moves."""
     steps = np.abs(np.diff(scan)) / np.diff(lines)
     steps = steps[steps > STANDING_STEPS * apart]
     if not len(steps):
@@ -128,9 +128,9 @@ def _usual_step(scan: Floats, lines: NDArray[np.intp], apart: float) -> float:
 
 
 def _runs(scan: Floats, most_back: float, still: float) -> list[slice]:
-    """Parts of the path that go one way, up to steps back of ``most_back``.
+    """Return parts of the path in one direction, up to steps back of ``most_back``.
 
-    The first line within ``still`` of the turn ends its part; those that stand there longer begin the next.
+    The first line within ``still`` of the turn ends its part; later lines at the turn begin the next.
     """
     runs = []
     up = scan - np.minimum.accumulate(scan) > most_back
@@ -147,7 +147,7 @@ def _runs(scan: Floats, most_back: float, still: float) -> list[slice]:
 
 
 def _scan_path(scan: Floats, across: Floats, lines: NDArray[np.intp], step: float) -> ScanPath:
-    """Order one run, average its dwells and fill its gaps."""
+    """Order one run, join its dwells and fill its gaps."""
     order = np.argsort(scan, kind="stable")
     scan, across, lines = scan[order], across[order], lines[order]
     starts = _dwell_starts(scan, DWELL_STEPS * step)
@@ -169,7 +169,7 @@ def _scan_path(scan: Floats, across: Floats, lines: NDArray[np.intp], step: floa
 
 
 def _dwell_starts(scan: Floats, reach: float) -> NDArray[np.intp]:
-    """First members of the groups of lines that lie less than ``reach`` beyond the first of their group."""
+    """Return first members of the groups of lines that lie less than ``reach`` beyond the first of their group."""
     if (np.diff(scan) >= reach).all():
         return np.arange(len(scan))
     starts = [0]
@@ -182,7 +182,7 @@ def _dwell_starts(scan: Floats, reach: float) -> NDArray[np.intp]:
 def _with_stand_ins(
     lines: NDArray[np.intp], counts: NDArray[np.intp], at: NDArray[np.intp], seen: NDArray[np.bool_]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Members and first members of all knots: those that nothing saw get the nearest knot's first line."""
+    """Return members and first members of all knots; knots that nothing saw get the nearest knot's first line."""
     sizes = np.ones(len(seen), np.intp)
     sizes[at] = counts
     empty = np.flatnonzero(~seen)
@@ -197,25 +197,25 @@ def _with_stand_ins(
 
 @dataclass(frozen=True)
 class LineNumbers:
-    """Numbers of the lines of a sweep, by the time stamps of its frames."""
+    """Line numbers of the frames of a sweep, by their time stamps."""
 
-    number: NDArray[np.intp]  # (frame,) line of the plan, counted from the first trusted frame; of that line's
-    # first frame where a frame came again; of the line before where the stamp is not trusted
+    number: NDArray[np.intp]  # (frame,) line of the plan from the first trusted frame; of a repeated frame that of the
+    # first, of a frame without a trusted stamp that of the line before
     usable: NDArray[np.bool_]  # (frame,)
-    lost: int  # lines between the first and the last for which no frame came
-    repeated: int  # frames that came again under the same stamp
-    backward: int  # frames whose stamp goes back, lies far off all others, or is no number
+    lost: int  # lines between the first and the last without a frame
+    repeated: int  # frames with a stamp that came before
+    backward: int  # frames whose stamp goes back, lies far off all others, or is not finite
     late: int  # usable frames more than a quarter period from their place
 
 
 def number_lines(time_s: Floats, frame_s: float) -> LineNumbers:
-    """Tell from time stamps (frame,), of mid exposure in the order of arrival [s], which line each frame is.
+    """Find the line of each frame from time stamps (frame,), of mid exposure in the order of arrival [s].
 
-    A gap of more than 1.5 periods leaves numbers out. Of frames with equal stamps the first is kept. A stamp that goes
-    back is not trusted: the longest ascending row of stamps is, and of equally long ones that with the earlier frames,
-    so that one wild stamp costs one line; so does a wild one that comes first or last. A late frame is used: its
-    position is that of its own time. ``frame_s`` is the planned frame period; its true value is taken from the stamps,
-    so that a slow clock makes no frame late.
+    A gap of more than 1.5 periods skips line numbers. The first of frames with equal stamps is used. Stamps that go
+    back are not trusted: the longest ascending row of stamps is, the one with the earlier frames if several are equally
+    long. So one wild stamp costs one line, also at either end. A late frame is used, with the position at its own time.
+    ``frame_s`` is the planned frame period. The true period is estimated from the stamps, so that a slow clock makes no
+    frame late.
     """
     known = np.isfinite(time_s)
     first = np.zeros(len(time_s), np.bool_)
@@ -242,7 +242,7 @@ def number_lines(time_s: Floats, frame_s: float) -> LineNumbers:
 
 
 def _longest_ascent(values: Floats) -> NDArray[np.intp]:
-    """Indices of the longest ascending row (patience sorting, from the back so that earlier frames are preferred)."""
+    """Return indices of the longest ascending row (patience sorting, from the back to prefer earlier frames)."""
     tops: list[float] = []
     piles: list[int] = []
     below = np.full(len(values), -1, np.intp)
@@ -261,7 +261,7 @@ def _longest_ascent(values: Floats) -> NDArray[np.intp]:
 
 
 def _without_wild_ends(time_s: Floats, frame_s: float) -> slice:
-    """Ascending stamps but for a first and a last one that lie farther off than the others from each other."""
+    """Return ascending stamps without a first or last one that lies farther off than the others from each other."""
     if len(time_s) < LEAST_FRAMES:
         return slice(None)
     far = max(WILD_FRAMES * frame_s, float(time_s[-2] - time_s[1]))
@@ -270,7 +270,7 @@ def _without_wild_ends(time_s: Floats, frame_s: float) -> slice:
 
 
 def _numbers(time_s: Floats, frame_s: float) -> NDArray[np.intp]:
-    """Line numbers of ascending stamps, the first being 0."""
+    """Return the line numbers of ascending stamps, the first being 0."""
     steps = np.ceil(np.diff(time_s) / frame_s - 0.5).astype(np.intp)  # half a period rounds down: 1.5 lose nothing
     count = np.concatenate([np.zeros(min(len(time_s), 1), np.intp), np.cumsum(steps)])
     # A frame that comes late by more than half a period looks like the next line; the one after shows that it is not.
@@ -280,7 +280,7 @@ def _numbers(time_s: Floats, frame_s: float) -> NDArray[np.intp]:
 
 
 def _count_late(time_s: Floats, count: NDArray[np.intp], frame_s: float) -> int:
-    """Frames more than a quarter period from the even clock that fits them best."""
+    """Count frames more than a quarter period from the even clock that fits them best."""
     near = np.ones(len(time_s), np.bool_)
     for _ in range(FITS):
         if near.sum() < LEAST_FRAMES:

@@ -1,1 +1,1 @@
-"""Signal: raw numbers of the camera to scene values, by what its references say of each element."""
+"""Calibrate raw lines to scene values, and condense them to components."""

@@ -1,21 +1,34 @@
-"""Calibration: what the references say of each element of a detector, raw DN to scene values, and what may be used."""
+"""Calibrate raw DN to scene values by dark and white frames, and judge the elements of the detector."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
 
-from pipeline.errors import PoseError, ShapeError
+from pipeline.errors import PoseError, RigError, ShapeError
 from pipeline.geometry.mirror import mirror_throughput
+from pipeline.readings import SIGMA_OF_MEDIAN
 from pipeline.source import References
 
-BLOCK_ELEMENTS = 1 << 18  # 1 MB of float32: cast, subtraction and product meet the block in the cache
-FILL_REACH = 8  # samples; what is good farther away has seen something else
+BLOCK_ELEMENTS = 1 << 18  # 1 MB of float32: cast, subtraction and product happen in the cache
+FILL_REACH = 8  # samples; elements farther away have seen something else
 
+# thresholds of `find_bad_elements`
+HOT_SIGMAS = 8.0  # dark above the band's median
+LIT_SIGMAS, LIT_FRACTION = 10.0, 0.1  # least response to judge, in spreads of the dark frame and of the band's median
+LEAST_RESPONSE = 0.1  # of the neighbours'
+ODD_SIGMAS, ODD_FRACTION = 8.0, 0.2  # off the window, in spreads of the band, and beyond the nearest neighbours
+WINDOW, NEAR = 15, 7  # neighbouring samples compared; nearest neighbours, the element among them
+MOST_BAD = 0.05  # of all elements, or one column; more mean that the frames are wrong, not the detector
+LEAST_NOISE_DN = 1.0  # dark frames are whole numbers: a smaller spread means nothing
+BANDS_FOR_COLUMN = 8  # fewer bands cannot separate an odd element from an odd column
+
+Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 
@@ -29,18 +42,13 @@ class Fill:
     after: NDArray[np.intp]
     fraction: Floats32  # of ``after``
 
-    def among(self, first: int, stop: int) -> Fill:
-        """Return the part from element ``first`` to before ``stop``."""
-        here = slice(*np.searchsorted(self.element, (first, stop)))
-        return Fill(self.element[here], self.before[here], self.after[here], self.fraction[here])
-
 
 @dataclass(frozen=True)
 class Elements:
-    """The elements of a detector as all of its references judge them, or those of some samples, judged no differently.
+    """The elements of a detector, judged by the references of the whole line.
 
-    Whether a band has light at all, whether most of a sample's bands are bad and what a bad element is filled from is
-    decided once for the whole line: some samples by themselves would say otherwise than others.
+    A part of the line would be judged differently: whether a band has light at all, and what a bad element is filled
+    from.
     """
 
     references: References
@@ -49,26 +57,8 @@ class Elements:
     lit: Bools  # (band,) at least one sample of the whole line has a calibration
     fill: Fill
 
-    def alone(self, samples: slice) -> slice:
-        """Grow a run of samples by those that its bad elements are filled from, at most 8 at either end."""
-        bands = len(self.lit)
-        here = self.fill.among(samples.start * bands, samples.stop * bands)
-        if not len(here.element):
-            return samples
-        first, last = int(here.before.min()) // bands, int(here.after.max()) // bands
-        return slice(min(samples.start, first), max(samples.stop, last + 1))
-
     def part(self, samples: slice) -> Elements:
-        """Some samples; of their bad elements those that are filled from beyond them are out."""
-        bands = len(self.lit)
-        first, stop = samples.start * bands, samples.stop * bands
-        fill, out = self.fill.among(first, stop), self.out[samples]
-        within = (fill.before >= first) & (fill.after < stop)
-        if not within.all():
-            out = out.copy()
-            out.flat[fill.element[~within] - first] = True
-        element, before, after = (at[within] - first for at in (fill.element, fill.before, fill.after))
-        kept = Fill(element, before, after, fill.fraction[within])
+        """Return some samples of a detector without elements to fill."""
         whole = self.references
         references = replace(
             whole,
@@ -77,15 +67,15 @@ class Elements:
             bad=None if whole.bad is None else whole.bad[samples],
             flat=None if whole.flat is None else whole.flat[samples],
         )
-        return Elements(references, self.gain[samples], out, self.lit, kept)
+        return replace(self, references=references, gain=self.gain[samples], out=self.out[samples])
 
 
 def judge_elements(references: References) -> Elements:
-    """Say of each element what it is worth: its gain, whether it is out, what it is filled from.
+    """Return the gain of each element, whether it is out, and the elements it is filled from.
 
-    Out are elements without a calibration, bad ones without a good one of their band within 8 samples, and whole
-    samples in which more than half of the bands are bad or without a calibration. A band that no sample is calibrated
-    in does not count, and nothing in it is out.
+    Elements without a calibration are out, and bad ones without a good one of their band within 8 samples. Whole
+    samples are out if more than half of their bands are bad or without a calibration. A band that no sample is
+    calibrated in does not count, and nothing in it is out.
     """
     span = references.white - references.dark
     if references.flat is not None:
@@ -101,12 +91,12 @@ def judge_elements(references: References) -> Elements:
     out: Bools = np.logical_or(lost, 2 * lost.sum(axis=1, keepdims=True) > lit.sum())
     fill = _fill_of(bad & lit & ~out.all(axis=1, keepdims=True), trusted & ~out)
     out.flat[fill.element] = False
-    gain[~trusted] = np.nan  # what overflowed, and what is bad: those that are filled are written over
+    gain[~trusted] = np.nan  # overflow, and bad elements; those with a fill are overwritten
     return Elements(references, gain, out, lit, fill)
 
 
-def number_values(references: References) -> NDArray[np.float64]:
-    """Scene value of one number of the camera, (band,): the median over the samples; NaN of bands without light."""
+def number_values(references: References) -> Floats:
+    """Return the scene value of one DN, (band,): the median over the samples; NaN of bands without light."""
     gain, known = judge_elements(references).gain.astype(np.float64), np.full(references.dark.shape[1], np.nan)
     lit = np.isfinite(gain).any(axis=0)
     known[lit] = np.abs(np.nanmedian(gain[:, lit], axis=0))
@@ -114,7 +104,7 @@ def number_values(references: References) -> NDArray[np.float64]:
 
 
 def _fill_of(wanted: Bools, good: Bools) -> Fill:
-    """Find the good neighbours of each wanted element in its band; an element without any near enough is left out."""
+    """Find the good neighbours of each wanted element in its band; elements without one nearby are left out."""
     samples, width = good.shape
     bands = np.flatnonzero(wanted.any(axis=0) & good.any(axis=0))
     number = np.arange(samples)[:, None]
@@ -130,26 +120,6 @@ def _fill_of(wanted: Bools, good: Bools) -> Fill:
     return Fill(sample * width + band, before * width + band, after * width + band, fraction.astype(np.float32))
 
 
-def reflectance(
-    raw: NDArray[np.integer[Any]], references: References, *, position: ArrayLike | None = None
-) -> Floats32:
-    """Turn raw lines into scene values, ``(raw - dark) / (white - dark) * white_reference / flat / throughput``.
-
-    A bad element takes the value between the nearest good samples of its line and band, at most 8 away, linear in
-    sample, so that it spoils only itself; in a sample with more than half of its bands bad none is filled.
-
-    ``raw`` is (line, sample, band) uint16 DN; ``position`` (line, 2) mirror X and Y, needed where the references say
-    ``by_mirror``: a line whose position is not finite becomes NaN there. (line, sample, band) float32 in the unit of
-    the white reference's values, negative below dark; NaN where the white frame is not above the dark one, a reference
-    is not finite, or a bad element is not filled.
-
-    Raises ShapeError: the references or the positions do not fit the lines.
-    Raises PoseError: positions are needed and missing, or one lies beyond the mirror's rim.
-    """
-    elements = _judged(raw, references)
-    return _scene_values(raw, elements, _line_gain(raw, references, position))
-
-
 def calibrate(
     raw: NDArray[np.integer[Any]],
     references: References | Elements,
@@ -157,20 +127,27 @@ def calibrate(
     saturated_dn: float,
     position: ArrayLike | None = None,
 ) -> tuple[Floats32, Bools]:
-    """Turn raw lines into scene values, as :func:`reflectance` does, and say which of them may be used.
+    """Return scene values ``(raw - dark) / (white - dark) * white_reference / flat / throughput``, and their validity.
 
-    Out are what :func:`judge_elements` puts out, saturated elements, and filled
-    ones whose neighbours are saturated. A band that no sample is calibrated in (no light at all) puts nothing out: it
-    stays NaN everywhere, on its own. Where every band is like that nothing is valid.
+    ``raw`` is (line, sample, band) uint16 DN. ``position`` (line, 2) mirror X and Y is needed for references with
+    ``by_mirror``; a line without a finite position is then NaN. A bad element takes the value between the nearest good
+    samples of its line and band, at most 8 away, linear in sample. It is not filled if more than half of its sample's
+    bands are bad.
 
-    Of a sum of n samples (the coarse pass) DN tell less than of one. Let F be full scale: at n F all of them were
-    saturated, above n (F - 1) one of them at least was, below F none was, and between nothing can be known. By how
-    much a sum is short is not known either, so it is no fault that shows as noise: a small bright thing beside dark
-    soil loses its peak unseen. ``saturated_dn`` is the least DN that counts: n F, or n (F - 1) + 1.
+    Not valid are elements that :func:`judge_elements` puts out, saturated elements, and filled ones with saturated
+    neighbours. A band without light in any sample puts nothing out, and is NaN; nothing is valid if all bands are.
 
-    The references are those of the whole line; or elements judged already, where ``raw`` holds some of the samples or
-    for the sake of time. Values (line, sample, band) float32, and bool of which are valid: (line, sample), or (line,
-    sample, band) where some but not all bands of a sample are out.
+    The DN of a sum of n samples (the coarse pass) show saturation less clearly. Let F be full scale: at n F all samples
+    were saturated, above n (F - 1) at least one was, below F none was. Between these the sum may be too low by an
+    unknown amount: a small bright object beside dark soil loses its peak without a sign. ``saturated_dn`` is the least
+    DN that counts: n F, or n (F - 1) + 1.
+
+    The references are those of the whole line, or elements that are judged already. Values are (line, sample, band)
+    float32 in the unit of the white reference, negative below dark, NaN without a calibration. The mask is (line,
+    sample), or (line, sample, band) if some but not all bands of a sample are out.
+
+    Raises ShapeError: the references or the positions do not fit the lines.
+    Raises PoseError: positions are needed and missing, or one lies beyond the mirror's rim.
     """
     elements = _judged(raw, references)
     line_gain = _line_gain(raw, elements.references, position)
@@ -182,7 +159,7 @@ def calibrate(
 
 
 def of_bands(references: References, bands: Sequence[int]) -> References:
-    """The references of some bands, in the order given."""
+    """Return the references of some bands, in the order given."""
     chosen = list(bands)
     return replace(
         references,
@@ -195,29 +172,23 @@ def of_bands(references: References, bands: Sequence[int]) -> References:
 
 
 def _line_gain(raw: NDArray[np.integer[Any]], references: References, position: ArrayLike | None) -> Floats32 | None:
-    """One over the mirror's throughput of each line, (line,), where the references ask for it."""
+    """Return one over the mirror's throughput of each line, (line,); None if the references do not need it."""
     if not references.by_mirror:
         return None
     if position is None:
         raise PoseError("the white frame was taken at rest (by_mirror), which needs the lines' mirror positions")
     at = np.asarray(position, np.float64)
-    if at.shape != (len(raw), 2):
-        raise ShapeError(f"expected a mirror position (X, Y) for each of {len(raw)} lines, got shape {at.shape}")
     known = np.isfinite(at).all(axis=1)
-    gain = np.full(len(at), np.nan, np.float32)
+    gain = np.full(len(raw), np.nan, np.float32)
     gain[known] = 1 / mirror_throughput(at[known])
     return gain
-
-
-def _blocks(raw: NDArray[np.integer[Any]]) -> Iterator[slice]:
-    lines = max(1, BLOCK_ELEMENTS // max(raw[0].size, 1)) if len(raw) else 1
-    return (slice(first, first + lines) for first in range(0, len(raw), lines))
 
 
 def _scene_values(raw: NDArray[np.integer[Any]], elements: Elements, line_gain: Floats32 | None) -> Floats32:
     values = np.empty(raw.shape, np.float32)
     dark, fill = elements.references.dark, elements.fill
-    for block in _blocks(raw):
+    lines = max(1, BLOCK_ELEMENTS // max(dark.size, 1))
+    for block in (slice(first, first + lines) for first in range(0, len(raw), lines)):
         part = values[block]
         part[...] = raw[block]
         part -= dark
@@ -232,43 +203,22 @@ def _scene_values(raw: NDArray[np.integer[Any]], elements: Elements, line_gain: 
 
 
 def _valid(raw: NDArray[np.integer[Any]], elements: Elements, saturated_dn: float) -> Bools:
-    """(line, sample), or (line, sample, band) where only some bands of a sample are out."""
-    out, lit = elements.out, elements.lit
-    found = [_saturated(raw, block, elements, saturated_dn) for block in _blocks(raw)]
-    line, sample = (np.concatenate([np.zeros(0, np.intp), *(part[k] for part in found)]) for k in (0, 1))
-    hot = np.concatenate([out[:0], *(part[2] for part in found)]) | out[sample]
-    whole, whole_hot = (np.all(mask | ~lit, axis=-1) for mask in (out, hot))  # every band with light is out
-    if np.any(out.any(axis=-1) & ~whole) or np.any(hot.any(axis=-1) & ~whole_hot):  # some but not all bands of a sample
-        valid = np.empty(raw.shape, np.bool_)
-        valid[...] = ~(out | whole[:, None])
-        valid[line, sample] = ~(hot | whole_hot[:, None])
-    else:
-        valid = np.empty(raw.shape[:2], np.bool_)
-        valid[...] = ~whole
-        valid[line, sample] = ~whole_hot
-    return valid
-
-
-def _saturated(
-    raw: NDArray[np.integer[Any]], block: slice, elements: Elements, saturated_dn: float
-) -> tuple[NDArray[np.intp], NDArray[np.intp], Bools]:
-    """Lines and samples with elements at or above the limit, or filled from them, and which, (n, band)."""
-    part = raw[block]
-    if not part.size or part.max() < saturated_dn:
-        nothing = np.zeros(0, np.intp)
-        return nothing, nothing, elements.out[:0]
-    hot = part >= saturated_dn
-    hot &= elements.lit
-    fill = elements.fill
-    if len(fill.element):
-        flat = hot.reshape(len(hot), -1)
-        flat[:, fill.element] = flat[:, fill.before] | flat[:, fill.after]
-    line, sample = np.nonzero(hot.any(axis=2))
-    return line + block.start, sample, hot[line, sample]
+    """Return (line, sample), or (line, sample, band) where only some bands of a sample are out."""
+    lit, fill, bad = elements.lit, elements.fill, elements.out[None]
+    if raw.size and raw.max() >= saturated_dn:
+        hot = (raw >= saturated_dn) & lit
+        if len(fill.element):
+            flat = hot.reshape(len(hot), -1)
+            flat[:, fill.element] = flat[:, fill.before] | flat[:, fill.after]
+        bad = hot | elements.out
+    whole = np.all(bad | ~lit, axis=-1)  # every band with light is out
+    partly = bad.any(axis=-1) & ~whole
+    valid = ~(bad | whole[..., None]) if partly.any() else ~whole
+    return np.array(np.broadcast_to(valid, raw.shape[: valid.ndim]))
 
 
 def _judged(raw: NDArray[np.integer[Any]], references: References | Elements) -> Elements:
-    """Elements judged already or now, once they are known to fit the lines."""
+    """Return the judged elements, if the references fit the lines."""
     plain = references.references if isinstance(references, Elements) else references
     if raw.ndim != 3:
         raise ShapeError(f"expected raw lines (line, sample, band), got {raw.shape}")
@@ -282,3 +232,81 @@ def _judged(raw: NDArray[np.integer[Any]], references: References | Elements) ->
     if plain.white_reference.shape != raw.shape[2:]:
         raise ShapeError(f"the lines have {raw.shape[2]} bands, the white reference {plain.white_reference.shape}")
     return references if isinstance(references, Elements) else judge_elements(references)
+
+
+def find_bad_elements(
+    dark: NDArray[np.floating], white: NDArray[np.floating], *, saturated_dn: float | None = None
+) -> Bools:
+    """Find unreliable elements (sample, band) of the detector from mean dark and white frames [DN].
+
+    An element is bad if a frame is not finite there, or if the white frame is at ``saturated_dn`` or more. It is also
+    bad if its dark level is above those of its band (hot), or if it hardly responds although its neighbours do (dead).
+    The last kind has a response that differs from its neighbours in the band by more than its column does in most bands
+    (odd). Dust on the slit darkens a column in all bands and is no fault, since the white frame corrects it. Nor is a
+    slope, as at the slit's ends. Responses are not judged where the neighbours see no light.
+
+    Spreads are medians of absolute deviations. With fewer than 7 samples no element is odd. A frame of one sample has
+    bad elements only where it is not finite or saturated.
+
+    Raises ShapeError: the frames are not (sample, band), or not of one size. Raises RigError: more than 5 % of the
+    elements, and more than one column, would be bad.
+    """
+    if dark.ndim != 2 or dark.shape != white.shape:
+        raise ShapeError(
+            f"expected dark and white frames (sample, band) of one size, got {dark.shape} and {white.shape}"
+        )
+    low, high = np.asarray(dark, np.float64), np.asarray(white, np.float64)
+    bad = ~(np.isfinite(low) & np.isfinite(high))
+    if saturated_dn is not None:
+        bad |= high >= saturated_dn
+    low = np.where(bad, np.nan, low)
+    above = low - _median(low, axis=0)
+    noise = np.maximum(SIGMA_OF_MEDIAN * _median(np.abs(above), axis=0), LEAST_NOISE_DN)
+    bad |= above > HOT_SIGMAS * noise
+    bad |= _off_neighbours(np.where(bad, np.nan, high - low), noise)
+    if np.count_nonzero(bad) > max(MOST_BAD * bad.size, bad.shape[1]):
+        raise RigError(
+            f"{100 * bad.mean():.1f} % of the elements look bad, at most {100 * MOST_BAD:g} % can be; is the white "
+            "frame lit evenly along the slit and the dark one taken with the same exposure? Take both again"
+        )
+    return bad
+
+
+def _off_neighbours(response: Floats, noise: Floats) -> Bools:
+    """Return elements whose response is missing or odd beside their neighbours'."""
+    size = min(WINDOW, len(response))
+    around = (max(size - 1 + size % 2, 1), 1)  # an odd number of samples
+    local: Floats = ndimage.median_filter(_without_gaps(response), around, mode="reflect")
+    least = np.maximum(LIT_SIGMAS * noise, LIT_FRACTION * _median(response, axis=0))
+    judged = np.isfinite(response) & (local > least)
+    relative = np.full(response.shape, np.nan)
+    np.divide(response, local, out=relative, where=judged)
+    dead = judged & (relative < LEAST_RESPONSE)
+    off = np.where(dead, np.nan, relative - 1)
+    if response.shape[1] >= BANDS_FOR_COLUMN:
+        off -= _median(off, axis=1)
+    spread = SIGMA_OF_MEDIAN * _median(np.abs(off), axis=0)
+    if len(response) < NEAR:
+        return dead
+    # Beyond the nearest neighbours as well; two odd elements side by side do not hide each other.
+    filled = _without_gaps(response)
+    low, high = (ndimage.rank_filter(filled, rank, (NEAR, 1), mode="reflect") for rank in (2, -3))
+    beyond = (response < low * (1 - ODD_FRACTION)) | (response > high * (1 + ODD_FRACTION))
+    odd: Bools = (np.abs(off) > ODD_SIGMAS * spread) & beyond
+    return dead | odd
+
+
+def _without_gaps(columns: Floats) -> Floats:
+    """Fill gaps with the median of their band, and bands without a value with 0."""
+    return np.where(np.isfinite(columns), columns, np.nan_to_num(_median(columns, axis=0)))
+
+
+def _median(values: Floats, axis: int) -> Floats:
+    """Return the median of what is not NaN, the axis kept; NaN without a value, and without a warning."""
+    ordered = np.sort(values, axis=axis)  # NaN last
+    count = np.count_nonzero(~np.isnan(values), axis=axis, keepdims=True)
+    if not values.shape[axis]:
+        return np.full(count.shape, np.nan)
+    low = np.take_along_axis(ordered, np.maximum(count - 1, 0) // 2, axis)
+    middle: Floats = (low + np.take_along_axis(ordered, np.minimum(count // 2, values.shape[axis] - 1), axis)) / 2
+    return np.where(count > 0, middle, np.nan)

@@ -1,4 +1,4 @@
-"""Components: the few numbers that hold the signal of a spectrum, and the linear law by which they give it back."""
+"""Define components: the few numbers that hold the signal of a spectrum, and the linear law that restores it."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ Scores = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Components:
-    """Directions of whitened spectra: ``spectrum = scores @ axes * noise + mean``. Scores count in noise's deviations.
+    """Directions of whitened spectra: ``spectrum = scores @ axes * noise + mean``, with scores in noise deviations.
 
     A band without any value is NaN in ``mean`` and ``noise``, and 0 in ``axes``.
     """
 
     mean: Floats  # (band,) scene value
     axes: Floats  # (component, band) orthonormal rows
-    noise: Floats  # (band,) standard deviation of one spectrum's noise [scene value]; of few bands the step they keep
-    covariance: Floats | None = None  # (band, band) of the spectra, by which few bands stand in for missing ones
+    noise: Floats  # (band,) standard deviation of one spectrum's noise [scene value]; the step of few bands
+    covariance: Floats | None = None  # (band, band) of spectra of few bands, which predicts missing ones
 
     @classmethod
     def empty(cls, bands: int) -> Components:
-        """Return no component, for lines without a single value."""
+        """Return no component, for lines without a value."""
         return cls(np.full(bands, np.nan), np.zeros((0, bands)), np.full(bands, np.nan))
 
     def __len__(self) -> int:
@@ -36,11 +36,11 @@ class Components:
 
     @property
     def bands(self) -> int:
-        """Bands of a spectrum."""
+        """Return the bands of a spectrum."""
         return len(self.mean)
 
     def white(self, values: NDArray[np.floating]) -> Scores:
-        """Return whitened spectra of scene values (..., band); 0 in bands without a value anywhere."""
+        """Return whitened spectra of scene values (..., band); 0 in bands without any value."""
         lit = np.isfinite(self.mean)
         scale = np.where(lit, 1 / np.where(lit, self.noise, 1), 0).astype(np.float32)
         found = np.asarray(values - np.nan_to_num(self.mean).astype(np.float32), np.float32)
@@ -50,25 +50,22 @@ class Components:
         return found
 
     def restore(self, scores: NDArray[np.floating]) -> Scores:
-        """Return scene values (..., band) of scores (..., component); NaN where a score is NaN, or a band has none."""
-        return np.asarray(scores, np.float32) @ self._rows + self.mean.astype(np.float32)
+        """Return scene values (..., band) of scores (..., component); NaN if a score is NaN, or a band has none."""
+        rows = np.asarray(self.axes * np.nan_to_num(self.noise), np.float32)
+        return np.asarray(scores, np.float32) @ rows + self.mean.astype(np.float32)
 
     def of_bands(self, bands: Sequence[int]) -> Components:
-        """Return the law of some bands alone; its axes are no longer orthonormal."""
+        """Return the law of some bands; its axes are not orthonormal."""
         chosen = list(bands)
         return Components(self.mean[chosen], self.axes[:, chosen], self.noise[chosen])
 
     def largest(self, values: Floats) -> float:
-        """Size that no score of spectra exceeds whose bands lie within (band,) ``values`` of the mean."""
+        """Return a bound of the scores of spectra whose bands lie within (band,) ``values`` of the mean."""
         lit = np.isfinite(self.mean)
         return float(np.linalg.norm(np.where(lit, values, 0) / np.where(lit, self.noise, 1)))
 
-    @property
-    def _rows(self) -> Scores:
-        return np.asarray(self.axes * np.nan_to_num(self.noise), np.float32)
-
     def completed(self, values: NDArray[np.floating]) -> Scores:
-        """Return spectra (n, band) with what the bands that are there let expect of those that are NaN.
+        """Return spectra (n, band) with the expected values, by the other bands, in those that are NaN.
 
         Every pattern of missing bands is solved by itself. A spectrum without any band takes the mean.
         """
@@ -84,7 +81,7 @@ class Components:
         return np.asarray(spectra + self.mean, np.float32)
 
     def onto(self, matrix: NDArray[np.floating]) -> tuple[Scores, Scores]:
-        """Weights (component, n) and offset (n,) that give ``spectrum @ matrix`` of scores, for a (band, n) matrix.
+        """Return weights (component, n) and offset (n,) that give ``spectrum @ matrix`` of scores, matrix (band, n).
 
         Bands without a value count nothing.
         """
@@ -93,7 +90,7 @@ class Components:
         return weights.astype(np.float32), (np.nan_to_num(self.mean) @ exact).astype(np.float32)
 
     def scaled(self, gain: NDArray[np.floating]) -> tuple[Scores, Scores]:
-        """Matrix (component, component) and offset (component,) that multiply spectra by a (band,) gain, in scores."""
+        """Return matrix (component, component) and offset (component,) that apply a (band,) gain to scores."""
         lit = np.isfinite(self.mean)
         factor = np.where(lit, gain, 0).astype(np.float64)
         matrix = (self.axes * factor) @ self.axes.T
@@ -102,7 +99,7 @@ class Components:
 
 
 def broad_weights(components: Components, bands: int = BROAD_BANDS) -> tuple[NDArray[np.float32], np.float32]:
-    """Weights (component,) and offset by which scores give the mean of some bands spread over all that have values."""
+    """Return weights (component,) and offset by which scores give the mean of some bands, spread evenly."""
     known = np.flatnonzero(np.isfinite(components.mean))
     chosen = spread_bands(known, bands) if len(known) else known
     matrix = np.zeros((components.bands, 1))
@@ -112,5 +109,5 @@ def broad_weights(components: Components, bands: int = BROAD_BANDS) -> tuple[NDA
 
 
 def spread_bands(known: NDArray[np.intp], bands: int) -> NDArray[np.intp]:
-    """Choose so many of some ascending bands, evenly spread."""
+    """Choose a number of some ascending bands, evenly spread."""
     return known[np.unique(np.linspace(0, len(known) - 1, max(bands, 1)).round().astype(np.intp))]

@@ -1,10 +1,11 @@
-"""Condensing: spectra to scores of the field's components, and the rare spectra that components do not hold.
+"""Condense lines: spectra to scores of the field's components, and the rare spectra that components do not hold.
 
-A spectrum whose residual is more than noise by a chi-square test, alone or with its neighbours, keeps its residual.
+A spectrum whose residual exceeds noise by a chi-square test, alone or with its neighbours, keeps its residual.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,27 +14,37 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 from scipy.special import chdtri
 
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep
 from pipeline.readings import SIGMA_OF_MEDIAN
+from pipeline.signal.calibrate import calibrate, judge_elements
 from pipeline.signal.components import Components
+from pipeline.signal.lines import BLOCK_LINES, CondensedLines
+from pipeline.signal.subspace import SignalStatistics
+from pipeline.source import Line, References, SweepLines
 
-WHOLE, PARTIAL, UNUSABLE = 0, 1, 2  # all bands seen; some restored from the others; less than half of the bands seen
+WHOLE, PARTIAL, UNUSABLE = 0, 1, 2  # all bands seen; some restored from the others; fewer than half of the bands seen
 JOINT = ((2, 2), (1, 8), (8, 1))  # (line, sample) of neighbours whose residuals are tested together
-ALONE = 1e-3  # what one spectrum of noise exceeds so rarely is the most that it counts beside its neighbours
+ALONE = 1e-3  # probability beyond which the residual of one spectrum is limited in tests with its neighbours
 LAW_ROUNDS, LAW_CLIP = 4, 4.0
-LEAST_EXPECTED = 0.2  # of the mean residual, whatever the law says of dark or bright spectra ...
+LEAST_EXPECTED = 0.2  # of the mean residual: least prediction of the law, ...
 LEAST_RESIDUAL = 0.02  # ... and of the noise's variance: less is rounding
 CANCELLED = 1e-4  # of a spectrum's square: a smaller difference of squares has lost digits of float32
 SPECTRA_AT_ONCE = 1024  # projected at a time: they stay in cache
 MEAN_SIDE = 4  # of the blocks of spectra whose means are kept where scores are rounded coarsely
 RESIDUAL_STEP = 0.5  # in which residuals of rare spectra are kept [noise's deviations]
 
+SLACK, DIGITS = 1e-3, 1e-5  # of a step, and of a score, by which sums of float32 may differ
+
 Scores = NDArray[np.float32]
 Bools = NDArray[np.bool_]
+Store = Callable[[int, Scores, NDArray[np.uint8]], None]
+Report = Callable[[float], None]
 
 
 @dataclass(frozen=True)
 class ScoredLines:
-    """Some lines in components: scores before rounding, what can be said of each spectrum, and what is left of it."""
+    """Lines in components: scores before rounding, quality of each spectrum, and its residual."""
 
     scores: Scores  # (line, sample, component) in noise's deviations; 0 where nothing was seen
     quality: NDArray[np.uint8]  # (line, sample) WHOLE, PARTIAL or UNUSABLE
@@ -43,9 +54,9 @@ class ScoredLines:
 def score_lines(values: NDArray[np.float32], valid: Bools, components: Components) -> ScoredLines:
     """Project (line, sample, band) scene values onto components, by the bands that `calibrate` calls valid.
 
-    A spectrum with missing bands gets the scores of least squares over its other bands. Few bands know their
-    covariance: there a missing band takes the value that the others let expect. ``valid`` is (line, sample) or (line,
-    sample, band).
+    A spectrum with missing bands gets the scores of least squares over its other bands. Spectra of few bands have a
+    known covariance: there a missing band takes its expected value. ``valid`` is (line, sample) or (line, sample,
+    band).
     """
     lit, count = np.isfinite(components.mean), len(components)
     bands = int(lit.sum())
@@ -72,7 +83,7 @@ def score_lines(values: NDArray[np.float32], valid: Bools, components: Component
 
 
 def _projected(values: NDArray[np.float32], components: Components) -> tuple[Scores, Scores]:
-    """Scores (..., component) of spectra (..., band), and the square of what they leave; NaN of broken spectra."""
+    """Return scores (..., component) of spectra (..., band), and the squares of their residuals; NaN if broken."""
     axes, flat = components.axes.T.astype(np.float32), values.reshape(-1, components.bands)
     scores, left = np.empty((len(flat), len(components)), np.float32), np.empty(len(flat), np.float32)
     with np.errstate(invalid="ignore", over="ignore"):
@@ -90,9 +101,9 @@ def _projected(values: NDArray[np.float32], components: Components) -> tuple[Sco
 
 
 def _least_squares(white: Scores, there: Bools, axes: Scores, bands: int) -> tuple[Scores, Scores]:
-    """Scores (n, component) and residuals (n,) of whitened spectra (n, band), by those of ``bands`` that are there.
+    """Return scores (n, component) and residuals (n,) of whitened spectra (n, band), by their valid bands.
 
-    Missing bands count as noise in the residual: it spreads no more than that of a whole spectrum.
+    Missing bands count as noise in the residual, so that it has the spread of a whole spectrum's.
     """
     count = axes.shape[1]
     products = (axes[:, :, None] * axes[:, None, :]).reshape(len(axes), -1)
@@ -111,7 +122,7 @@ def _least_squares(white: Scores, there: Bools, axes: Scores, bands: int) -> tup
 
 @dataclass(frozen=True, eq=False)
 class ResidualLaw:
-    """The mean square residual to expect of a spectrum: affine in its scores, for shot noise grows with the signal."""
+    """The expected mean square residual of a spectrum: affine in its scores, since shot noise grows with the signal."""
 
     constant: float
     slope: NDArray[np.float64]  # (component,)
@@ -119,7 +130,7 @@ class ResidualLaw:
 
     @classmethod
     def learned(cls, spectra: NDArray[np.float32], components: Components) -> ResidualLaw:
-        """Learn it of (n, band) spectra, outliers left out."""
+        """Fit the law to (n, band) spectra, without outliers."""
         freedom = max(int(np.isfinite(components.mean).sum()) - len(components), 1)
         seen = score_lines(spectra[None], np.ones((1, len(spectra)), np.bool_), components)
         known = np.isfinite(seen.residual[0])
@@ -138,16 +149,15 @@ class ResidualLaw:
         return cls(float(law[0]), law[1:], float(np.clip(2 / max(spread, 1e-6) ** 2, 1.0, freedom)))
 
     def expected(self, scores: Scores) -> Scores:
-        """(...) mean square residual to expect of (..., component) scores."""
+        """Return the (...) expected mean square residual of (..., component) scores."""
         least = max(LEAST_EXPECTED * self.constant, LEAST_RESIDUAL)
-        expected: Scores = np.maximum(self.constant + scores @ self.slope.astype(np.float32), np.float32(least))
-        return expected
+        return np.asarray(np.maximum(self.constant + scores @ self.slope.astype(np.float32), np.float32(least)))
 
 
 def find_rare(ratio: NDArray[np.float32], law: ResidualLaw, false_alarm: float) -> Bools:
-    """Find the (line, sample) spectra that have more residual than noise gives, alone or with their neighbours.
+    """Find the (line, sample) spectra with more residual than noise gives, alone or with their neighbours.
 
-    ``ratio`` is the residual over the expected one, NaN where unusable; ``false_alarm`` the number of spectra of the
+    ``ratio`` is the residual over the expected one, NaN where unusable. ``false_alarm`` is the number of spectra of the
     whole image that noise alone may mark, over all tests together.
     """
     known = np.isfinite(ratio)
@@ -170,17 +180,17 @@ def find_rare(ratio: NDArray[np.float32], law: ResidualLaw, false_alarm: float) 
 
 
 def _limit(freedom: float, false_alarm: float) -> float:
-    """Mean square of noise, over its expectation, that is exceeded with a probability."""
+    """Return the mean square of noise, over its expectation, that is exceeded with a probability."""
     return float(chdtri(freedom, min(false_alarm, 0.5)) / freedom)
 
 
 def whole_steps(scores: NDArray[np.floating], step: float) -> NDArray[np.floating]:
     """Round scores (line, sample, component) to whole steps; above the noise, blocks of 4 x 4 keep their means.
 
-    Rounding each score alone loses what is weaker than a coarse step, though it stands out of many spectra. So a
-    block's errors are added, and as many scores as that sum says, those nearest to the next number, are rounded the
-    other way (as controlled rounding of tables: Cox 1987). No score is off by more than one step, and the mean of a
-    block by more than 1/32. Blocks that are not whole, or have a score that is not finite, are rounded score by score.
+    Rounding each score alone loses signals below a coarse step, although many spectra show them. So the errors of a
+    block are added, and as many scores as that sum are rounded the other way. Those nearest to the next number come
+    first (controlled rounding of tables: Cox 1987). No score is off by more than one step, and the mean of a block by
+    more than 1/32. Blocks that are incomplete, or have a score that is not finite, are rounded score by score.
     """
     side, steps = MEAN_SIDE, scores / np.float32(step)
     rounded: NDArray[np.floating] = np.rint(steps)
@@ -205,7 +215,117 @@ def whole_steps(scores: NDArray[np.floating], step: float) -> NDArray[np.floatin
 def residual_steps(
     values: NDArray[np.float32], scores: Scores, components: Components, valid: Bools | None = None
 ) -> NDArray[np.int32]:
-    """Return what scores (n, component) leave of spectra (n, band), in half deviations; 0 in missing bands."""
+    """Return the residuals of spectra (n, band) from scores (n, component), in half deviations; 0 in missing bands."""
     left = components.white(values) - scores @ components.axes.astype(np.float32)
     there = np.isfinite(left) if valid is None else np.isfinite(left) & valid
     return np.rint(np.where(there, left, 0) / RESIDUAL_STEP).astype(np.int32)
+
+
+class LineStatistics:
+    """Add a sweep's lines to the statistics of a field as they arrive, 64 at a time."""
+
+    def __init__(self, found: SignalStatistics, sweep: Sweep, references: References, camera: LineCamera) -> None:
+        self._found, self._elements = found, judge_elements(references)
+        self._saturated = float(camera.full_scale_dn * sweep.binning)
+        self._waiting: list[Line] = []
+
+    def add(self, line: Line) -> None:
+        """Add the next line."""
+        self._waiting.append(line)
+        if len(self._waiting) == BLOCK_LINES:
+            self.flush()
+
+    def flush(self) -> None:
+        """Add the lines that wait for a block of 64."""
+        if not self._waiting:
+            return
+        raw = np.stack([line.data for line in self._waiting])
+        at = np.array([(line.mirror_x, line.mirror_y) if line.valid else (np.nan, np.nan) for line in self._waiting])
+        values, valid = calibrate(raw, self._elements, saturated_dn=self._saturated, position=at)
+        there = np.array([line.valid for line in self._waiting])
+        self._found.add(values, valid & there.reshape(-1, *[1] * (valid.ndim - 1)))
+        self._waiting.clear()
+
+
+@dataclass(frozen=True, eq=False)
+class CondensedSweep:
+    """Facts of a sweep after its scores are stored."""
+
+    rare: NDArray[np.intp]  # (rare, 2) line and sample, by line
+    residuals: NDArray[np.int32]  # (rare, band) in half deviations of the noise
+    known: int  # spectra with enough valid bands
+
+
+@dataclass(frozen=True, eq=False)
+class Condenser:
+    """Condense sweeps of a field by its components."""
+
+    components: Components
+    law: ResidualLaw
+    camera: LineCamera
+    false_alarm: float  # spectra of a sweep that noise alone may make rare
+    step: float = 1.0  # of rounded scores [noise's deviations]
+
+    def sweep(self, lines: SweepLines, store: Store, report: Report = lambda done: None) -> CondensedSweep:
+        """Pass the scores of all lines to ``store``, and find the rare spectra."""
+        count, samples = len(lines.valid_line), len(lines.references.dark)
+        ratio = np.empty((count, samples), np.float32)
+        for first, values, valid in calibrated_blocks(lines, self.camera):
+            seen = score_lines(values, valid, self.components)
+            store(first, seen.scores, seen.quality)
+            ratio[first : first + len(values)] = seen.residual / self.law.expected(seen.scores)
+            report((first + len(values)) / count)
+        rare = find_rare(ratio, self.law, self.false_alarm)
+        return CondensedSweep(np.argwhere(rare), self._residuals(lines, rare), int(np.isfinite(ratio).sum()))
+
+    def _residuals(self, lines: SweepLines, rare: NDArray[np.bool_]) -> NDArray[np.int32]:
+        """Return the (rare, band) residuals of rare spectra from their rounded scores; their lines are read again."""
+        found = [np.zeros((0, self.components.bands), np.int32)]
+        blocks = set((np.flatnonzero(rare.any(axis=1)) // BLOCK_LINES).tolist())
+        for first, values, valid in calibrated_blocks(lines, self.camera, blocks):
+            here = rare[first : first + len(values)]
+            scores = score_lines(values, valid, self.components).scores
+            rounded = whole_steps(scores, self.step)[here] * np.float32(self.step)
+            there = None if valid.ndim == 2 else valid[here]
+            found.append(residual_steps(values[here], rounded, self.components, there))
+        return np.concatenate(found)
+
+
+def calibrated_blocks(
+    lines: SweepLines, camera: LineCamera, chosen: Collection[int] | None = None
+) -> Iterator[tuple[int, NDArray[np.float32], NDArray[np.bool_]]]:
+    """Yield the first line, scene values and validity of 64 lines at a time; of ``chosen`` blocks only.
+
+    A line that is not valid because its position is unknown keeps its values. A lost line holds zeros, which are out.
+    """
+    elements, saturated = judge_elements(lines.references), float(camera.full_scale_dn * lines.sweep.binning)
+    for first in range(0, len(lines.valid_line), BLOCK_LINES):
+        if chosen is not None and first // BLOCK_LINES not in chosen:
+            continue
+        part = slice(first, min(first + BLOCK_LINES, len(lines.valid_line)))
+        raw = lines.read(part.start, part.stop)
+        values, valid = calibrate(raw, elements, saturated_dn=saturated, position=lines.position[part])
+        lost = ~lines.valid_line[part]
+        if lost.any():
+            valid[lost] &= raw[lost].any(axis=2).reshape(-1, raw.shape[1], *[1] * (valid.ndim - 2))
+        yield first, values, valid
+
+
+def differing_lines(
+    lines: SweepLines, stored: CondensedLines, camera: LineCamera, components: Components | None = None
+) -> list[int]:
+    """Return the lines with a stored score that differs by more than rounding from that of the raw line.
+
+    The rest of a spectrum is noise by the tests of condensing, or was stored. ``components`` are those that the lines
+    were condensed by, if they hold more than what is stored.
+    """
+    wrong = list[int]()
+    for first, values, valid in calibrated_blocks(lines, camera):
+        last = first + len(values)
+        seen = score_lines(values, valid, components or stored.components)
+        off = np.abs(stored.read(first, last) * np.float32(stored.step) - seen.scores)
+        usable = seen.quality != UNUSABLE
+        most = 0.5 if stored.step <= 1 else 1  # see `whole_steps`
+        same = (off <= (most + SLACK) * stored.step + DIGITS * np.abs(seen.scores)).all(axis=2) | ~usable
+        wrong += (first + np.flatnonzero(~(same & (usable == stored.usable[first:last])).all(axis=1))).tolist()
+    return wrong

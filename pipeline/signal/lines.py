@@ -1,6 +1,6 @@
-"""Lines of a sweep as scene values, from no more raw numbers than are asked for.
+"""Read lines of a sweep as scene values or scores, only those that are needed.
 
-Raw lines are kept while neighbouring tiles still need them: blocks of whole shards, least recently used out first.
+Raw lines are cached for neighbouring tiles in blocks of whole shards; the least recently used block is dropped first.
 """
 
 from __future__ import annotations
@@ -15,13 +15,12 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ShapeError
 from pipeline.signal.calibrate import Elements, calibrate, judge_elements, of_bands
 from pipeline.signal.components import BROAD_BANDS, Components, broad_weights, spread_bands
 from pipeline.source import References, SweepLines
 
-BLOCK_LINES = 64  # a shard of a stored sweep: reading one line of it costs as much as reading all
-CHUNK_SAMPLES = 32  # likewise across
+BLOCK_LINES = 64  # a shard of a stored sweep: one line of it takes as long to read as all
+CHUNK_SAMPLES = 32  # likewise along the line
 
 _Key = tuple[int, int, int, int]  # sweep, block, samples held
 Raw = NDArray[np.integer[Any]]  # numbers of the camera, or scores in steps
@@ -30,7 +29,7 @@ ReadWindow = Callable[[slice, slice], Raw]  # (lines, samples) -> (line, sample,
 
 @dataclass(frozen=True)
 class Signal:
-    """A sweep's lines in scene values: the one place where a survey calibrates."""
+    """A sweep's lines in scene values, calibrated as they are read."""
 
     lines: SweepLines
     gain: NDArray[np.float32] | None = None  # (band,) what the sweep's values are multiplied by
@@ -47,44 +46,40 @@ class Signal:
 
     @cached_property
     def elements(self) -> Elements:
-        """Judge the detector's elements by all of the references; the gain is in the white reference's values."""
+        """Return the detector's elements, judged by all of the references, with the gain in their white reference."""
         plain = self.lines.references
         if self.gain is None:
             return judge_elements(plain)
-        if self.gain.shape != plain.white_reference.shape:
-            raise ShapeError(
-                f"sweep {self.lines.sweep.name} has {len(plain.white_reference)} bands, its gain has shape "
-                f"{self.gain.shape}"
-            )
         return judge_elements(replace(plain, white_reference=(plain.white_reference * self.gain).astype(np.float32)))
 
     def spectra(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the scene values of resampled ones: these are."""
+        """Return the scene values of resampled ones: the same."""
         return values
-
-    def alone(self, samples: slice) -> slice:
-        """Grow a run of samples by those that its bad elements are filled from."""
-        return self.elements.alone(samples)
 
     def values(
         self, read: ReadWindow, numbers: NDArray[np.intp], samples: slice, full_scale_dn: float
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Read and calibrate some lines and samples; return what `calibrate` does, lines that are not valid put out.
+        """Read and calibrate some lines and samples; return values and validity as `calibrate` does.
 
-        ``samples`` is a run of whole neighbours, `Elements.alone`; ``full_scale_dn`` the camera's, of one sample.
+        Lines that are not valid are out. With elements to fill whole lines are read, since an element may be filled
+        from beyond the samples. ``full_scale_dn`` is the camera's, of one sample.
         """
-        raw, position = _raw_of(read, numbers, samples), self.lines.position[numbers]
-        saturated = full_scale_dn * self.lines.sweep.binning
-        values, valid = calibrate(raw, self.elements.part(samples), saturated_dn=saturated, position=position)
+        whole = len(self.elements.fill.element) > 0
+        elements = self.elements if whole else self.elements.part(samples)
+        raw = _raw_of(read, numbers, slice(0, self.samples) if whole else samples)
+        saturated, position = full_scale_dn * self.lines.sweep.binning, self.lines.position[numbers]
+        values, valid = calibrate(raw, elements, saturated_dn=saturated, position=position)
+        if whole:
+            values, valid = values[:, samples], valid[:, samples]
         usable = self.lines.valid_line[numbers]
-        return values, valid if usable.all() else valid & usable.reshape(-1, *[1] * (valid.ndim - 1))
+        return values, valid & usable.reshape(-1, *[1] * (valid.ndim - 1))
 
     def broad_image(
         self, usable: NDArray[np.bool_], full_scale_dn: float, bands: int = BROAD_BANDS
     ) -> NDArray[np.float32]:
         """Return the mean of ``bands`` bands spread over all, (line, sample); NaN where one is not valid.
 
-        Lines are read 64 at a time. ``usable`` (line,) are those whose position may be believed.
+        Lines are read 64 at a time. ``usable`` (line,) are those with a trusted position.
         """
         lines, chosen = self.lines, broad_bands(self.lines.references, bands)
         references, saturated = of_bands(lines.references, chosen.tolist()), full_scale_dn * lines.sweep.binning
@@ -101,22 +96,22 @@ class Signal:
 
 @runtime_checkable
 class CondensedLines(Protocol):
-    """The lines of a sweep as scores of components, wherever they are."""
+    """The lines of a sweep as scores of components."""
 
     @property
     def components(self) -> Components:
-        """The law that gives spectra back."""
+        """Return the law that restores spectra."""
 
     @property
     def step(self) -> float:
-        """Size of one step of a stored score."""
+        """Return the size of one step of a stored score."""
 
     @property
     def usable(self) -> NDArray[np.bool_]:
-        """(line, sample) spectra that may be used."""
+        """Return (line, sample) spectra that can be used."""
 
     def read(self, start: int, stop: int) -> Raw:
-        """Scores of the lines ``start`` to ``stop`` in steps, (line, sample, component)."""
+        """Return the scores of the lines ``start`` to ``stop`` in steps, (line, sample, component)."""
 
 
 @dataclass(frozen=True)
@@ -149,14 +144,10 @@ class CondensedSignal:
         """Return the scene values (..., band) of resampled scores (..., component)."""
         return self._condensed.components.restore(values)
 
-    def alone(self, samples: slice) -> slice:
-        """Return the run of samples: what was bad was mended as lines were condensed."""
-        return samples
-
     def values(
         self, read: ReadWindow, numbers: NDArray[np.intp], samples: slice, full_scale_dn: float
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Read (line, sample, component) scores of some lines, and which (line, sample) may be used."""
+        """Read (line, sample, component) scores of some lines, and which (line, sample) can be used."""
         scores = _raw_of(read, numbers, samples).astype(np.float32) * np.float32(self._condensed.step)
         if self._gain is not None:
             matrix, shift = self._gain
@@ -178,7 +169,7 @@ class CondensedSignal:
 
 
 def signal_of(lines: SweepLines, gain: NDArray[np.float32] | None = None) -> Signal | CondensedSignal:
-    """Return how a sweep's lines give values: raw numbers by its references, condensed ones as they are."""
+    """Return the calibrated values of raw lines, or the scores of condensed ones."""
     return CondensedSignal(lines, gain) if isinstance(lines, CondensedLines) else Signal(lines, gain)
 
 
@@ -193,15 +184,15 @@ def broad_bands(references: References, bands: int = BROAD_BANDS) -> NDArray[np.
 
 @runtime_checkable
 class WindowedLines(Protocol):
-    """A sweep that can be read a part of its samples at a time."""
+    """A sweep that can read a part of its samples."""
 
     def read_window(self, lines: slice, samples: slice) -> Raw:
-        """Raw numbers of some lines and samples, (line, sample, band)."""
+        """Return raw numbers of some lines and samples, (line, sample, band)."""
 
 
 @dataclass
 class _Block:
-    """One block of one sweep: its raw numbers once read, None before, and what threads wait on for them."""
+    """One block of one sweep: its raw numbers once read, and the lock of the thread that reads it."""
 
     lines: SweepLines  # held so that its id stays its own
     raw: Raw | None = None
@@ -209,9 +200,10 @@ class _Block:
 
 
 class LineCache:
-    """Blocks of 64 raw lines of any number of sweeps, at most ``most_bytes`` of them. Threads may share it.
+    """Cache of blocks of 64 raw lines of any number of sweeps, at most ``most_bytes``. Threads may share it.
 
-    Two threads that want the same block wait for one read. ``reads`` counts blocks read, ``bytes_held`` what is kept.
+    Two threads that need the same block wait for one read. ``reads`` counts blocks read, ``bytes_held`` the cached
+    bytes.
     """
 
     def __init__(self, most_bytes: int) -> None:
@@ -222,10 +214,10 @@ class LineCache:
         self._lock = threading.Lock()
 
     def window(self, lines: SweepLines, wanted: slice, samples: slice, *, likely: slice | None = None) -> Raw:
-        """Give raw numbers (line, sample, band) of some lines and samples, read before or now; not to be written to.
+        """Return raw numbers (line, sample, band) of some lines and samples, from the cache or read now; read-only.
 
-        ``likely`` are samples that later calls will want of the same lines: they are read together, and only calls that
-        name the same ones share what was read.
+        ``likely`` are samples that later calls will need of the same lines. They are read together, and calls that name
+        the same ones share them.
         """
         held = held_samples(lines, samples, likely)
         within = slice(samples.start - held.start, samples.stop - held.start)
@@ -260,12 +252,12 @@ class LineCache:
 
 
 def line_blocks(lines: slice) -> range:
-    """Numbers of the blocks that hold some lines."""
+    """Return the numbers of the blocks that hold some lines."""
     return range(lines.start // BLOCK_LINES, -(-lines.stop // BLOCK_LINES))
 
 
 def held_samples(lines: SweepLines, samples: slice, likely: slice | None = None) -> slice:
-    """Samples to read and hold: those wanted and likely, in whole chunks; all of a sweep read by whole lines."""
+    """Return the samples to read and cache: whole chunks of those wanted and likely, or all if there are no chunks."""
     count = signal_of(lines).samples
     if not isinstance(lines, WindowedLines):
         return slice(0, count)
@@ -275,7 +267,7 @@ def held_samples(lines: SweepLines, samples: slice, likely: slice | None = None)
 
 
 def _raw_of(read: ReadWindow, members: NDArray[np.intp], samples: slice) -> Raw:
-    """Raw numbers of the lines ``members``, in their order."""
+    """Return raw numbers of the lines ``members``, in their order."""
     first, last = int(members.min()), int(members.max()) + 1
     raw = read(slice(first, last), samples)
     if last - first == len(members):

@@ -1,9 +1,9 @@
-"""The signal subspace of a field: which directions of spectra rise above the noise, tested over the whole field.
+"""Find the signal subspace of a field: the directions of spectra above the noise, tested over the whole field.
 
-Second moments are accumulated while lines arrive. Means over 4 x 4 spectra carry 1/16 of the noise variance, so that a
-weak signal that neighbours share stands out of their covariance where single spectra hide it (a minimum noise fraction
-transform: Green et al. 1988). Eigenvalues of noise alone end at the edge of the Marchenko-Pastur law, and beyond it
-they fluctuate by the Tracy-Widom law (Johnstone 2001): that is the test.
+Second moments are accumulated as lines arrive. Means over 4 x 4 spectra have 1/16 of the noise variance. A weak signal
+that neighbours share then exceeds the noise in their covariance (a minimum noise fraction transform: Green et al.
+1988). Eigenvalues of noise alone end at the edge of the Marchenko-Pastur law, and fluctuate there by the Tracy-Widom
+law (Johnstone 2001). This gives the test.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from pipeline.readings import SIGMA_OF_MEDIAN
 from pipeline.signal.components import Components
 
 BLOCK = 4  # spectra a side of a mean
-SPECTRA_A_BAND = 200  # single spectra that a covariance is estimated from, for each band; more cost and tell little
-FEW_BANDS = 8  # fewer cannot predict each other: their noise comes from neighbouring pixels, and all are kept
-KEPT_SPECTRA = 8192  # of which the law of residuals is learned
-FINE = 1 / 16  # of the noise: the step in which few bands are kept, where nothing tells a better one
-SMALL_FIELD = 500_000  # spectra: of fewer all smooth directions are kept, for some megabytes
-SMOOTH = 24  # bumps over the wavelengths; as many columns as networks read
-LACKING = 0.3  # of the length of a bump: a direction with less of it is in the components already
+SPECTRA_A_BAND = 200  # single spectra for the covariance, for each band; more add time and little accuracy
+FEW_BANDS = 8  # fewer cannot predict each other: their noise comes from neighbouring pixels, and all are stored
+KEPT_SPECTRA = 8192  # from which the law of residuals is learned
+FINE = 1 / 16  # of the noise: the step of few bands, unless a better one is known
+SMALL_FIELD = 500_000  # spectra: smaller fields keep all smooth directions, for some megabytes
+SMOOTH = 24  # bumps over the wavelengths; as many as the columns that networks read
+LACKING = 0.3  # of the length of a bump: with less outside the components a direction is in them already
 NOISE_ROUNDS = 6
 MOST_SHARED = 32  # directions of rare spectra that become components
-LEAST_NOISE = 1e-6  # of a band's largest value: values that never change have no noise to divide by
-NEIGHBOURS = 4  # bands to either side that predict a band, where spectra are too few for all
+LEAST_NOISE = 1e-6  # of a band's largest value: constant values have no noise to divide by
+NEIGHBOURS = 4  # bands to either side that predict a band, if there are too few spectra for all
 # 1 - probability of the Tracy-Widom law (real matrices), and its quantiles
 TRACY_WIDOM = (
     (0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 1e-3, 1e-4, 1e-6),
@@ -45,10 +45,11 @@ Bools = NDArray[np.bool_]
 
 @dataclass
 class SignalStatistics:
-    """Second moments of spectra, of their means over 4 x 4 and of neighbours' differences, and some spectra as such.
+    """Second moments of spectra, of their means over 4 x 4 and of neighbours' differences, and some of the spectra.
 
     Spectra are centred on a mean of the first ones, so that nothing cancels. Those that miss bands are left out: they
-    would count as the mean there, and make a direction of it. Where most miss some, those with half of them count so.
+    would count as the mean there, and make a direction of it. If most spectra miss some, those with half of them count
+    so.
     """
 
     bands: int
@@ -75,7 +76,7 @@ class SignalStatistics:
         self._thin = max(1, round(self.expected / self._stride**2 / KEPT_SPECTRA))
 
     def add(self, values: Values, valid: Bools) -> None:
-        """Take some neighbouring lines: (line, sample, band) scene values, and `calibrate`'s validity of them."""
+        """Add some neighbouring lines: (line, sample, band) scene values, and their validity by `calibrate`."""
         if not values.size or not valid.any():
             return
         spectra, whole = self._centred(values, valid)
@@ -101,7 +102,7 @@ class SignalStatistics:
             self._add_rough(spectra, whole)
 
     def _centred(self, values: Values, valid: Bools) -> tuple[Values, Bools]:
-        """Return spectra from the origin with 0 for what is missing, and which of them count."""
+        """Return spectra from the origin with 0 for missing values, and which of them count."""
         by_band = valid if valid.ndim == 3 else valid[..., None]
         if self.origin is None or not self.lit.all():
             known = by_band & np.isfinite(values)
@@ -145,13 +146,13 @@ class SignalStatistics:
 
     @property
     def spectra(self) -> Values:
-        """(n, band) some spectra of all over the field, scene values."""
+        """Return (n, band) spectra spread over the field, scene values."""
         if self.origin is None or not self.kept:
             return np.zeros((0, self.bands), np.float32)
         return np.concatenate(self.kept) + self.origin
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
-        """All of it by names, to be stored."""
+        """Return all of it by names, to be stored."""
         none = np.zeros((0, self.bands), np.float32)
         return {
             "counts": np.array([self.expected, self.count, self.means]),
@@ -163,7 +164,7 @@ class SignalStatistics:
 
     @classmethod
     def of_arrays(cls, stored: Mapping[str, NDArray[np.generic]]) -> SignalStatistics:
-        """Make statistics of what `arrays` gave."""
+        """Return the statistics that `arrays` described."""
         expected, count, means = stored["counts"].tolist()
         found = cls(len(stored["origin"]), expected, count, means)
         found.origin = None if np.isnan(stored["origin"]).all() else stored["origin"].astype(np.float32)
@@ -173,7 +174,7 @@ class SignalStatistics:
         return found
 
     def _add_rough(self, spectra: Values, whole: Bools) -> None:
-        """Keep second differences in both directions: of a smooth field they hold 36 times the noise's variance."""
+        """Store second differences in both directions: for a smooth field they have 36 times the noise's variance."""
         if min(whole.shape) < 3:
             return
         across = spectra[:, :-2] - 2 * spectra[:, 1:-1] + spectra[:, 2:]
@@ -182,10 +183,10 @@ class SignalStatistics:
 
 
 def find_components(found: SignalStatistics, *, false_alarm: float = 0.01, least: int = 4) -> Components:
-    """Return the components of a field: directions whose variance exceeds that of noise, as the whole field shows.
+    """Return the components of a field: directions whose variance exceeds that of noise over the whole field.
 
-    ``false_alarm`` is the probability that noise alone gives a component, ``least`` how many are kept at any rate.
-    Bands without a value anywhere are NaN in the mean and have no part in a component.
+    ``false_alarm`` is the probability that noise alone gives a component, ``least`` the least number of components.
+    Bands without any value are NaN in the mean and have no part in a component.
     """
     lit = np.flatnonzero(found.lit)
     mean = np.full(found.bands, np.nan)
@@ -211,12 +212,12 @@ def find_components(found: SignalStatistics, *, false_alarm: float = 0.01, least
 def components_of_field(
     found: SignalStatistics, wavelength_nm: Floats, *, false_alarm: float, least: int
 ) -> Components:
-    """Find the components of a field; of a small one with all smooth directions.
+    """Find the components of a field; a small field gets all smooth directions too.
 
-    Materials differ smoothly, and a difference far below the noise of a spectrum tells two crops apart where it is
-    averaged over many spectra. No test of the whole field finds it where one of the two covers a small part: a
-    thirtieth of a million spectra, more of fewer. So small fields keep `SMOOTH` bumps, evenly spread over the
-    wavelengths, which is what networks read of a spectrum. ``wavelength_nm`` is (band,).
+    Materials differ smoothly. A difference far below the noise of a spectrum separates two crops where it is averaged
+    over many spectra. A test of the whole field misses it if one crop covers a small part: a thirtieth of a million
+    spectra, or more of fewer. So small fields keep `SMOOTH` bumps, evenly spread over the wavelengths, which is the
+    resolution of the networks. ``wavelength_nm`` is (band,).
     """
     components = find_components(found, false_alarm=false_alarm, least=least)
     lit = np.isfinite(components.mean)
@@ -234,9 +235,9 @@ def components_of_field(
 
 
 def bands_alone(found: SignalStatistics, unit: Floats | float | None = None) -> Components:
-    """Return components that are the bands themselves, in steps of ``unit`` (band,): few bands are kept as they are.
+    """Return components that are the bands themselves, in steps of ``unit`` (band,), for few bands.
 
-    A band's own steps, such as one of the camera's numbers, lose nothing; without them steps are far below the noise.
+    A band's own steps, such as one DN of the camera, lose nothing; without them steps are far below the noise.
     """
     usual = find_components(found)
     lit = np.isfinite(usual.mean)
@@ -255,7 +256,7 @@ def _covariance(products: Floats, total: Floats, count: int) -> tuple[Floats, Fl
 
 
 def _noise(found: SignalStatistics, covariance: Floats, lit: NDArray[np.intp], mean: Floats) -> Floats:
-    """First estimate of the noise's standard deviation, (band,): what the other bands, or neighbours, leave open."""
+    """Return a first estimate of the noise's standard deviation, (band,): unpredicted by other bands or neighbours."""
     variance = np.diag(covariance)
     floor = LEAST_NOISE * np.maximum(np.sqrt(variance), np.abs(mean)).max(initial=0.0) or 1.0
     if len(lit) <= FEW_BANDS:
@@ -271,7 +272,7 @@ def _noise(found: SignalStatistics, covariance: Floats, lit: NDArray[np.intp], m
 
 
 def _unpredicted(covariance: Floats, band: int) -> float:
-    """Standard deviation that a band's neighbours do not predict by a linear law."""
+    """Return the standard deviation of a band that its neighbours do not predict linearly."""
     near = np.arange(max(band - NEIGHBOURS, 0), min(band + NEIGHBOURS + 1, len(covariance)))
     near = near[near != band]
     weights = np.linalg.lstsq(covariance[np.ix_(near, near)], covariance[near, band], rcond=1e-10)[0]
@@ -279,18 +280,17 @@ def _unpredicted(covariance: Floats, band: int) -> float:
 
 
 def _left_over(white: Floats, axes: Floats) -> Floats:
-    """Standard deviation of what components leave of whitened bands, over what they leave of unit noise."""
+    """Return the standard deviation of the components' residuals of whitened bands, over that of unit noise."""
     rest = np.eye(len(white)) - axes @ axes.T
     left = np.einsum("ij,jk,ik->i", rest, white, rest)
     open_to = np.maximum(np.diag(rest), 1e-3)
-    factor: Floats = np.sqrt(np.clip(left / open_to, 0.25, 4.0))
-    return factor
+    return np.asarray(np.sqrt(np.clip(left / open_to, 0.25, 4.0)))
 
 
 def _axes(
     found: SignalStatistics, white: Floats, lit: NDArray[np.intp], scale: Floats, false_alarm: float, least: int
 ) -> Floats:
-    """Orthonormal directions (band, component) of whitened spectra: of their means first, then of single spectra."""
+    """Return orthonormal directions (band, component) of whitened spectra: of their means, then of single spectra."""
     bands = len(white)
     if bands <= FEW_BANDS:
         return np.linalg.eigh(white)[1][:, ::-1]
@@ -312,9 +312,9 @@ def _axes(
 
 
 def significant_axes(covariance: Floats, spectra: int, false_alarm: float, *, known: int = 0) -> Floats:
-    """Eigenvectors (band, n) of a covariance whose eigenvalues noise alone does not reach, by falling eigenvalue.
+    """Return eigenvectors (band, n) of a covariance with eigenvalues above those of noise, by falling eigenvalue.
 
-    The noise's own variance, and how many spectra there are in effect, are read off the lower half of the eigenvalues:
+    The noise's variance and the effective number of spectra come from the lower half of the eigenvalues, since
     neighbours share a part of their noise. ``known`` directions have been taken out of the covariance.
     """
     bands = len(covariance)
@@ -328,7 +328,8 @@ def significant_axes(covariance: Floats, spectra: int, false_alarm: float, *, kn
 def with_shared(components: Components, residuals: Values, false_alarm: float) -> Components:
     """Return components with the directions that residuals of rare spectra share.
 
-    The law of Kuybeda, Malah & Barzohar 2007 (MOCA). ``residuals`` are (rare, band) in deviations of the noise.
+    The method is that of Kuybeda, Malah & Barzohar 2007 (MOCA). ``residuals`` are (rare, band) in deviations of the
+    noise.
     """
     lit = np.flatnonzero(np.isfinite(components.mean))
     exact = residuals[:, lit].astype(np.float64)
@@ -343,9 +344,9 @@ def with_shared(components: Components, residuals: Values, false_alarm: float) -
 
 
 def noise_edge(values: Floats, ratio: float, false_alarm: float) -> float:
-    """Least eigenvalue that noise does not reach but with probability ``false_alarm``; ``values`` ascend.
+    """Return the eigenvalue that noise exceeds with probability ``false_alarm``; ``values`` ascend.
 
-    ``ratio`` is bands over spectra; more where the lower half of the eigenvalues spreads farther than it lets expect.
+    ``ratio`` is bands over spectra; it is raised if the lower half of the eigenvalues spreads farther than expected.
     """
     count = len(values)
     middle, low = float(np.median(values)), float(values[count // 10])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError, WavelengthError
 from pipeline.geometry.camera import LineCamera
 from pipeline.rig.camera.camera_texts import listed_numbers
-from pipeline.signal.detector import find_bad_elements
+from pipeline.signal.calibrate import find_bad_elements
 from pipeline.source import References
 from storage.readers.cube_sources import CubeSource
 from storage.readers.envi_files import DATA_ENDINGS, find_envi_pair, find_reference, load_envi_header

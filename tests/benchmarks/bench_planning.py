@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, CostModel
-from pipeline.planning.budget_search import cheapest_cover, spend
+from pipeline.planning.budget_search import _completed, _least_rate, covers, spend
 from pipeline.planning.coverage import cheapest_full, full_sweeps
-from pipeline.planning.fine_pass import plan_fine, runs_showing
-from pipeline.planning.interlaced import every_nth
-from pipeline.planning.prices import ScanPrices, check_budget, count_lines, prices_of
-from pipeline.planning.scan_runs import Field
+from pipeline.planning.fine_pass import plan_fine
+from pipeline.planning.partial_scans import every_nth
+from pipeline.planning.prices import ScanPrices, check_budget, prices_of
+from pipeline.planning.scan_runs import Cover, Field, best_cover
 from pipeline.planning.swaths import Views, edges_from, swaths_at_patches
 
 CAMERA, COST = LineCamera(), CostModel()
@@ -35,6 +35,22 @@ def _real_field(grid: SceneGrid, along: Axis, expected_gain: ExpectedGain, price
 def _columns(grid: SceneGrid, along: Axis) -> NDArray[np.intp]:
     row, column = np.divmod(np.arange(int(np.prod(grid.patch_shape))), grid.patch_shape[1])
     return column if along == "x" else row
+
+
+def _cheapest_cover(field: Field) -> Cover:
+    """The fewest seconds found that show all patches: from side by side, from each patch, and by falling prices."""
+    rate, starts = _least_rate(field), ((), tuple(_completed(field, ())))
+    *_, (last, _) = covers(field)
+    ends = [best_cover(field, start, rate) for start in starts]
+    found = [field.cover(_completed(field, cover.runs)) for cover in (last, *ends, field.cover(starts[1]))]
+    return min(found, key=lambda cover: cover.seconds(field.prices))
+
+
+def _lines_showing(grid: SceneGrid, patch_index: NDArray[np.integer]) -> int:
+    """Lines of the cheapest runs found that show these patches."""
+    expected_gain = np.zeros(int(np.prod(grid.patch_shape)))
+    expected_gain[patch_index] = 1
+    return _cheapest_cover(_real_field(grid, "x", expected_gain, prices_of(CAMERA, COST))).lines
 
 
 def _fixed(field: Field) -> Field:
@@ -60,14 +76,14 @@ def _patches() -> list[Row]:
     coarse = sum(sweep.lines for sweep in every_nth(full_sweeps(grid, CAMERA, "x")))
     patch_index = np.random.default_rng(0).choice(1024, 100, replace=False)
     began = time.process_time()
-    lines = count_lines(runs_showing(grid, CAMERA, COST, "x", patch_index))
+    lines = _lines_showing(grid, patch_index)
     took = time.process_time() - began
     expected_gain = np.zeros(1024)
     expected_gain[patch_index] = 1
     field = _real_field(grid, "x", expected_gain, prices_of(CAMERA, COST))
     need = field.views.stop - field.views.first
     single = sum(int(need[field.views.patch_number == patch_number].min()) for patch_number in patch_index)
-    swaths = cheapest_cover(_fixed(field))
+    swaths = _cheapest_cover(_fixed(field))
     fraction, alone, fixed = ((coarse + count) / full for count in (lines, single, swaths.lines))
     met = fraction <= min(alone, 0.498, 1.0) and lines <= 1.02 * swaths.lines
     text = f"{fraction:.1%} of {full} lines with the coarse pass ({lines} fine), {took:.1f} s"
@@ -86,7 +102,7 @@ def _many_patches(grid: SceneGrid, coarse: int, full: int) -> list[Row]:
     alone = sum(
         int((views.stop - views.first)[views.patch_number == patch_number].min()) for patch_number in patch_index
     )
-    fraction = (coarse + count_lines(runs_showing(grid, CAMERA, COST, "x", patch_index))) / full
+    fraction = (coarse + _lines_showing(grid, patch_index)) / full
     return [
         Row(
             "400 patches of 320 px, with the coarse pass",
@@ -113,7 +129,8 @@ def _farm() -> list[Row]:
     gains, fractions = [], []
     for seed in range(6):
         scores = _smooth(grid.patch_shape, seed=seed, sigma=(1.5, 3.0)[seed % 2]).ravel()
-        plan = plan_fine(grid, CAMERA, COST, along, scores, budget_s=left)
+        full = full_sweeps(grid, CAMERA, along)
+        plan = plan_fine(grid, CAMERA, COST, along, scores, budget_s=left, full=full)
         fixed = spend(_fixed(_real_field(grid, along, scores, prices_of(CAMERA, COST))), left)
         gains.append(plan.expected_gain / fixed.expected_gain - 1)
         fractions.append(plan.expected_gain / scores.sum())
@@ -125,10 +142,11 @@ def _speed() -> list[Row]:
     found = []
     for size, patch, goal in (((1024, 1280), 16, 2.0), ((10_240, 10_240), 32, 20.0), ((10_240, 10_240), 320, 20.0)):
         grid = SceneGrid(*size, patch, 4)
-        full_s = COST.seconds(full_sweeps(grid, CAMERA, "x"), CAMERA)
+        full = full_sweeps(grid, CAMERA, "x")
+        full_s = COST.seconds(full, CAMERA)
         scores = _smooth(grid.patch_shape, seed=0, sigma=3.0).ravel()
         began = time.process_time()
-        plan = plan_fine(grid, CAMERA, COST, "x", scores, budget_s=0.25 * full_s)
+        plan = plan_fine(grid, CAMERA, COST, "x", scores, budget_s=0.25 * full_s, full=full)
         took = time.process_time() - began
         what = f"planning {size[1]} x {size[0]} px, {patch} px patches, a quarter of the full scan's seconds"
         figure = f"{took:.2f} s of processor, {len(plan.sweeps)} runs"

@@ -21,7 +21,7 @@ from models.policies.policies import score_multiply_adds, score_patches
 from models.reading.inference import CoarsePass, DrawnMap, coarse_prediction, read_coarse_prediction, segment
 from models.weights.files import Weights
 from pipeline.geometry.grid import SceneGrid
-from pipeline.planning.selection import frame_patches
+from pipeline.planning.prices import frame_patches
 
 FRAME = SceneGrid(966, 1296, 32, 1)
 FRAME_SIZES = {"classes": 3, "columns": 2, "patch": 32}

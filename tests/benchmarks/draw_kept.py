@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from flows.tasks.stages.condense import camera_of
 from pipeline.signal.calibrate import judge_elements
-from pipeline.signal.condense import RESIDUAL_STEP, ResidualLaw
-from pipeline.signal.sweep_signal import Condenser, calibrated_blocks
+from pipeline.signal.condense import RESIDUAL_STEP, Condenser, ResidualLaw, calibrated_blocks
 from storage.archive.archive import Archive
 from storage.archive.records import read_run, read_store
 from storage.arrays.cubes import RawCube, open_raw_cubes

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.signal.calibrate import calibrate
-from pipeline.signal.detector import find_bad_elements
+from pipeline.signal.calibrate import calibrate, find_bad_elements
 from pipeline.source import References
 
 FULL = 4095
@@ -67,7 +66,7 @@ def test_dead_column(kind: str) -> None:
     references = frames()
     references.white[5] = references.dark[5]
     if kind == "flagged":
-        references = replace(references, bad=find_bad_elements(references.dark, references.white, criteria=None))
+        references = replace(references, bad=find_bad_elements(references.dark, references.white))
     raw = np.full((2, 12, 10), 500, np.uint16)
     values, valid = calibrate(raw, references, saturated_dn=FULL)
     assert np.isnan(values[:, 5]).all()

@@ -17,7 +17,6 @@ from pipeline.geometry.mirror import (
     position_to_normal,
     scene_to_direction,
 )
-from tests.pipeline.geometry.test_paper import slope_rotation
 
 PRECISIONS = [np.float64, np.float32]
 
@@ -115,22 +114,6 @@ def test_rotation_at_the_rim_is_finite_and_continuous(precision: type):
     assert np.abs(psi).max() < 90
     assert np.abs(np.diff(psi)).max() < 1.0
     assert psi + psi[::-1] == pytest.approx(0, abs=1e-4 if precision is np.float32 else 1e-11)
-
-
-def test_a_vertical_tangent_turns_no_line():
-    """Where the path has no dX the paper's slope is 90 deg; the pose says what the line really does."""
-    path = np.array([[0.1, -0.01], [0.1, 0.0], [0.1, 0.01]])
-    assert np.rad2deg(np.abs(slope_rotation(path))) == pytest.approx(90)
-    turned = np.rad2deg(line_rotation(position_to_direction(path)))
-    assert turned[1] == 0
-    assert np.abs(turned).max() < 0.6
-
-
-def test_repeated_positions_have_the_same_rotation():
-    """A dwell leaves the slope undefined (NaN), and the rotation by pose as it was."""
-    path = np.array([[0.1, 0.2]] * 3)
-    assert np.isnan(slope_rotation(path)).all()
-    assert np.ptp(line_rotation(position_to_direction(path))) == 0
 
 
 def test_single_precision_follows_double():

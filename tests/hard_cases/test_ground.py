@@ -123,7 +123,7 @@ def test_one_pixel_is_a_map():
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_what_is_no_number_is_no_pose(name: str, value: float):
     """The message names the field and what came."""
-    with pytest.raises(PoseError, match=rf"{name} of the rig's pose must be a number from .*, got {value!r}"):
+    with pytest.raises(PoseError, match=rf"the rig's pose: {name} must be a number from .*, got {value!r}"):
         view(**{name: value})
 
 

@@ -34,7 +34,7 @@ from models.training.objective import class_weights, draw_patches, map_loss, pha
 from models.training.train import TrainingSettings, train
 from models.weights.files import load_weights, save_weights
 from pipeline.geometry.grid import SceneGrid
-from pipeline.planning.selection import frame_patches, select_patches
+from pipeline.planning.prices import frame_patches, select_patches
 from tests.models.conftest import SMALL, make_network, noise, plain_weights
 
 NONE = torch.zeros(1, 0, dtype=torch.int64)

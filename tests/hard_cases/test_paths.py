@@ -9,8 +9,8 @@ from pipeline.errors import PoseError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_position, scene_to_direction
 from pipeline.geometry.scan import points_of_scan
-from pipeline.rectify.geolocation import grid_points, path_geolocation
-from pipeline.rectify.placed import tie_table
+from pipeline.rectify.geolocation import path_geolocation
+from pipeline.rectify.placed import PixelGrid, tie_table
 from pipeline.rectify.resample import merge_lines, resample
 from pipeline.rectify.scan_paths import ScanPath, make_scan_paths, number_lines
 
@@ -181,7 +181,8 @@ def test_grid_outside_the_swath_is_nan() -> None:
     (scan_path,) = make_scan_paths(position, CAMERA)
     for origin in ((0.0, 3100.0), (400.0, 2600.0), (-9000.0, -9000.0), (9000.0, 20_000.0)):
         grid = {"origin_px": origin, "spacing_px": 1.0, "shape": (40, 50)}
-        assert np.isnan(path_geolocation(scan_path, CAMERA, grid_points(**grid), along="x")).all()  # type: ignore[arg-type]
+        points = PixelGrid(**grid).points(*(slice(0, size) for size in grid["shape"]))  # type: ignore[arg-type,attr-defined]
+        assert np.isnan(path_geolocation(scan_path, CAMERA, points, along="x")).all()
         table = tie_table(scan_path, CAMERA, along="x", **grid)  # type: ignore[arg-type]
         assert np.isnan(table.coordinates(slice(None), slice(None))).all()
 

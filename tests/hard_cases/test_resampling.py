@@ -72,7 +72,6 @@ def test_nearest_rounds_halves_up(kind: type[np.generic]) -> None:
     at = np.array([[0.5, 0], [1.5, 0], [2.5, 0], [3, 0.5], [3, 1.5]])
     out, _ = resample(ramp(6, 4).astype(kind), np.ones((6, 4), bool), at, "nearest")
     assert out[:, 0].tolist() == [10, 20, 30, 31, 32]
-    assert out.dtype == kind
 
 
 def test_saturated_element_leaves_the_other_bands() -> None:
@@ -138,13 +137,12 @@ def test_right_and_bottom_border_are_part_of_the_sweep(kernel: Kernel) -> None:
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("kind", [np.float32, np.uint16])
 def test_block_without_any_point(kernel: Kernel, kind: type[np.generic]) -> None:
-    """A block of the grid that no line reaches is empty in the sweep's own type, without a warning."""
+    """A block of the grid that no line reaches is empty without a warning."""
     values = ramp(5, 5, 3).astype(kind)
     at = np.array([[np.nan, np.nan], [np.nan, 2], [np.inf, 1], [-np.inf, -np.inf], [1e300, 0]])
     out, fraction = resample(values, np.ones((5, 5), bool), at, kernel)
     assert out.shape == (5, 3)
-    assert not np.nan_to_num(out).any()
-    assert np.isnan(out).all() or out.dtype == np.uint16
+    assert np.isnan(out).all()
     assert not fraction.any()
 
 

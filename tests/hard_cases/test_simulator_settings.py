@@ -86,9 +86,8 @@ ASKED = st.builds(
 )
 
 
-@settings(max_examples=2, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))  # a case takes seconds
+@settings(max_examples=1, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))  # a case takes seconds
 @given(ASKED)
-@example(Asked())
 @example(Asked(pattern="columns", binning=14, noiseless=True))
 @example(Asked(exposure_ms=0.5, binning=1, wavelengths=(300.0, 1760.0), tolerance=1e-3, read_noise_e=0.0))
 @example(Asked(exposure_ms=9780.0, binning=1, wavelengths=(529.3, 998.0), tolerance=1e-3, distance_m=10.0))

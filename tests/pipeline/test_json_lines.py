@@ -7,7 +7,7 @@ import zlib
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.json_lines import read_checked, with_check
@@ -23,6 +23,7 @@ def line(content: dict[str, Any]) -> bytes:
     return with_check(json.dumps(content, ensure_ascii=False).encode())
 
 
+@settings(max_examples=30)
 @given(st.lists(objects, max_size=6))
 def test_lines_come_back(contents: list[dict[str, Any]]) -> None:
     """In order and numbered, as plain JSON too."""
@@ -33,6 +34,7 @@ def test_lines_come_back(contents: list[dict[str, Any]]) -> None:
     assert [{**json.loads(one), "check": 0} for one in text.splitlines()] == [{**one, "check": 0} for one in contents]
 
 
+@settings(max_examples=30)
 @given(st.lists(objects, min_size=1, max_size=5), st.data())
 def test_no_flipped_bit_is_silent(contents: list[dict[str, Any]], data: st.DataObject) -> None:
     """It costs one line at most, changes none, and is told, but for the end of the last line."""
@@ -45,6 +47,7 @@ def test_no_flipped_bit_is_silent(contents: list[dict[str, Any]], data: st.DataO
     assert any(one.state == "changed" for one in found) or (bit // 8 == len(text) - 1 and kept == contents)
 
 
+@settings(max_examples=30)
 @given(st.lists(objects, min_size=1, max_size=4), st.binary(max_size=60), st.data())
 def test_what_a_power_cut_leaves_costs_no_whole_line(
     contents: list[dict[str, Any]], rest: bytes, data: st.DataObject

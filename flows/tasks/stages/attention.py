@@ -25,7 +25,7 @@ from pipeline.geometry.grid import SceneGrid, patch_pixels
 from pipeline.geometry.scan import CostModel, Sweep, exposing
 from pipeline.planning.coverage import field_px, patches_shown
 from pipeline.planning.fine_pass import FinePlan, plan_fine
-from pipeline.planning.interlaced import lines_between, merged_ms, most_within
+from pipeline.planning.partial_scans import lines_between, merged_ms, most_within
 from pipeline.planning.uniform_scans import MIOU, ScanPerformance, format_scan, longest_exposure
 from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table, write_table

@@ -21,8 +21,8 @@ from flows.tasks.stages.attention import load_plan
 from flows.tasks.stages.effects import chosen_effects, load_manifest
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel, Sweep
+from pipeline.signal.condense import LineStatistics
 from pipeline.signal.subspace import SignalStatistics
-from pipeline.signal.sweep_signal import LineStatistics
 from pipeline.simulator.simulated import BLOCK_LINES, SimulatedSource, sweep_starts
 from pipeline.source import Line, Source
 from storage.archive.archive import Archive

@@ -22,10 +22,19 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.readings import MOST_VALUE, readings_alone
 from pipeline.signal.calibrate import number_values
 from pipeline.signal.components import Components
-from pipeline.signal.condense import RESIDUAL_STEP, UNUSABLE, ResidualLaw, score_lines, whole_steps
+from pipeline.signal.condense import (
+    RESIDUAL_STEP,
+    UNUSABLE,
+    CondensedSweep,
+    Condenser,
+    ResidualLaw,
+    calibrated_blocks,
+    differing_lines,
+    score_lines,
+    whole_steps,
+)
 from pipeline.signal.lines import BLOCK_LINES
 from pipeline.signal.subspace import FEW_BANDS, SignalStatistics, bands_alone, components_of_field, with_shared
-from pipeline.signal.sweep_signal import CondensedSweep, Condenser, calibrated_blocks, differing_lines
 from pipeline.simulator.scenes.scene import RasterScene
 from storage.archive.keys import StageRef
 from storage.archive.manifests import check_files, read_table, write_table

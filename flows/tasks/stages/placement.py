@@ -15,14 +15,14 @@ from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
 from models.network.spectral import LineSpec
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, exposing
-from pipeline.rectify.interlaced import capture_numbers
 from pipeline.rectify.kernels import Kernel
-from pipeline.rectify.placed import PixelGrid, Placed, TieTable
+from pipeline.rectify.placed import PixelGrid, PlacedSweep, TieTable
 from pipeline.rectify.registration.alignment import SweepShift
 from pipeline.rectify.registration.illumination import overlap_light, solve_lights
 from pipeline.rectify.registration.overlaps import BroadSweep
 from pipeline.rectify.registration.seams import Anchor, Registration, SeamWindow, anchor_sweep, register_sweeps
 from pipeline.rectify.scan_paths import ScanPath
+from pipeline.rectify.sweep_paths import capture_numbers
 from pipeline.signal.components import BROAD_BANDS, Components
 from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table, write_table
@@ -77,7 +77,7 @@ def register_coarse(
 
 
 def light_gains(
-    found: Registration, placed: Sequence[Placed], camera: LineCamera, wavelength_nm: NDArray[np.float64]
+    found: Registration, placed: Sequence[PlacedSweep], camera: LineCamera, wavelength_nm: NDArray[np.float64]
 ) -> dict[str, list[float]]:
     """Return the gain of each sweep by band that makes neighbours agree."""
     windows = [seen.window for seen in found.windows if seen.measured is not None]

@@ -1,1 +1,1 @@
-"""Registration of sweeps: shifts of overlaps, solved over all of them, and fine sweeps on the mosaic."""
+"""Register sweeps: shifts in overlaps, solved over all of them, and fine sweeps on the mosaic."""

@@ -1,4 +1,4 @@
-"""Illumination: how much brighter each sweep was lit than the others, per band, from what overlaps show twice."""
+"""Estimate the relative illumination of sweeps by band, from their overlaps."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.readings import SIGMA_OF_MEDIAN
-from pipeline.rectify.placed import PixelGrid, Placed
+from pipeline.rectify.placed import PixelGrid, PlacedSweep
 from pipeline.rectify.region import mosaic_tile
 from pipeline.rectify.registration.overlaps import Window
 
 Floats = NDArray[np.float64]
 
-ORDER = 3  # of the polynomial in wavelength: daylight drifts by colour, not by line
+ORDER = 3  # of the polynomial in wavelength: daylight drifts by colour, not by spectral line
 ERROR_FLOOR = 1e-3  # of a log ratio
 MEDIAN_LOSS = 1.2533  # standard error of a median over that of a mean
 PROBE_ROWS = 96  # at the middle of every window
@@ -26,7 +26,7 @@ LEAST_GROUPS = 5
 
 @dataclass(frozen=True)
 class LightRatio:
-    """Brightness of one sweep over that of another where both saw the same ground."""
+    """Brightness of one sweep over that of another at the same ground."""
 
     reference: int  # number of the sweep
     moving: int
@@ -36,24 +36,23 @@ class LightRatio:
 
 @dataclass(frozen=True)
 class SweepLights:
-    """Light of every sweep relative to the geometric mean of those that overlaps join."""
+    """Light of every sweep relative to the geometric mean of the sweeps that overlaps join."""
 
     light: NDArray[np.float32]  # (sweep, band), 1 on average
     untied: tuple[int, ...]  # sweeps in no ratio: left at 1
 
     def gain(self, sweep: int) -> NDArray[np.float32]:
-        """Give what a sweep's values are to be multiplied by, (band,): one over its light."""
-        one: NDArray[np.float32] = 1 / self.light[sweep]
-        return one
+        """Return the factor of a sweep's values, (band,): one over its light."""
+        return np.asarray(1 / self.light[sweep])
 
 
 def light_ratio(
     reference_values: NDArray[np.floating], moving_values: NDArray[np.floating], *, pair: tuple[int, int]
 ) -> LightRatio:
-    """Compare a ``pair`` of sweeps over the same points: calibrated values (group, point, band), NaN where not seen.
+    """Compare a ``pair`` of sweeps at the same points: calibrated values (group, point, band), NaN where not seen.
 
-    The points come in groups (squares of pixels). The ratio is the median over groups of the ratio of their sums: sums
-    first, so that noise has no say in the sign of a pixel; the median, so that what moved between the sweeps has none.
+    The points come in groups (squares of pixels). The ratio is the median over groups of the ratio of their sums. Sums
+    suppress the noise of single pixels, and the median suppresses objects that moved between the sweeps.
     """
     both = np.isfinite(reference_values) & np.isfinite(moving_values)
     sums = [np.where(both, values, 0).sum(axis=1, dtype=np.float64) for values in (reference_values, moving_values)]
@@ -93,12 +92,12 @@ def solve_lights(ratios: Sequence[LightRatio], sweeps: int, wavelength_nm: Float
     return SweepLights(np.exp(log_light).astype(np.float32), untied)
 
 
-def overlap_light(placed: Sequence[Placed], camera: LineCamera, windows: Sequence[Window]) -> list[LightRatio]:
-    """Read both sweeps of every pair at the middle rows of their windows, and compare them: one ratio for every pair.
+def overlap_light(placed: Sequence[PlacedSweep], camera: LineCamera, windows: Sequence[Window]) -> list[LightRatio]:
+    """Compare both sweeps of every pair at the middle rows of their windows: one ratio for every pair.
 
-    A window takes 96 rows from either sweep, every pixel of them, summed in squares of 16 px: single rows, or every
-    few pixels, would meet crop rows always at one place between two plants, which two sweeps do not blur alike, and
-    their ratio would pass for light. The sweeps are placed where registration has put them, without a gain.
+    A window takes all pixels of 96 rows, summed in squares of 16 px. A subset of pixels would always meet crop rows at
+    the same place between two plants. Two sweeps blur that place differently, which would look like a change of light.
+    The sweeps are placed as registered, without a gain.
     """
     ratios = []
     for pair in sorted({(window.reference, window.moving) for window in windows}):
@@ -110,8 +109,8 @@ def overlap_light(placed: Sequence[Placed], camera: LineCamera, windows: Sequenc
     return ratios
 
 
-def _probe(placed: Placed, camera: LineCamera, window: Window) -> NDArray[np.float32]:
-    """Values of one sweep in a window, (row along the scan, column along the line, band)."""
+def _probe(placed: PlacedSweep, camera: LineCamera, window: Window) -> NDArray[np.float32]:
+    """Return values of one sweep in a window, (row along the scan, column along the line, band)."""
     sweep = placed.lines.sweep
     spacing = sweep.step
     middle = sum(window.scan_px) / 2
@@ -126,7 +125,7 @@ def _probe(placed: Placed, camera: LineCamera, window: Window) -> NDArray[np.flo
 
 
 def _squares(values: NDArray[np.float32], rows: int, columns: int) -> NDArray[np.float32]:
-    """Cut (row, column, band) into groups of neighbours, (group, point, band); what is left at the ends falls away."""
+    """Cut (row, column, band) into groups of neighbours, (group, point, band); incomplete groups are dropped."""
     down, across, bands = values.shape[0] // rows, values.shape[1] // columns, values.shape[2]
     whole = values[: down * rows, : across * columns].reshape(down, rows, across, columns, bands)
     return whole.swapaxes(1, 2).reshape(down * across, rows * columns, bands)

@@ -1,4 +1,4 @@
-"""Overlaps of neighbouring sweeps: broad-band images of sweeps, and the windows in which two of them can be compared.
+"""Find overlaps of neighbouring sweeps: broad-band images of sweeps, and the windows that two of them share.
 
 Places are (along, scan) in px from the undeflected direction, as in ``pipeline.geometry.scan``.
 """
@@ -19,19 +19,18 @@ from pipeline.geometry.scan import Sweep, shifted_position
 from pipeline.rectify.geolocation import path_geolocation
 from pipeline.rectify.resample import resample
 from pipeline.rectify.scan_paths import ScanPath, make_scan_paths
-from pipeline.signal.components import BROAD_BANDS
 from pipeline.signal.lines import signal_of
 from pipeline.source import SweepLines
 
 Floats = NDArray[np.float64]
 
 LEAST_OVERLAP_PX = 64.0  # of the smaller side of a window, after the largest shift; below it errors grow fast
-EDGE_LINES = 16  # every how many lines a sweep's edges are taken; they bend by 1e-3 px between
+EDGE_LINES = 16  # a sweep's edges are computed at every 16th line; they bend by 1e-3 px between
 
 
 @dataclass(frozen=True)
 class BroadSweep:
-    """A sweep as its registration sees it: one image, the mean of a few bands, 4 bytes a sample."""
+    """A sweep for registration: one image, the mean of a few bands, 4 bytes a sample."""
 
     sweep: Sweep
     position: Floats  # (line, 2) mirror X and Y as reported
@@ -39,21 +38,19 @@ class BroadSweep:
     image: NDArray[np.float32]  # (line, sample), NaN where a band is not valid
 
     @classmethod
-    def read(
-        cls, lines: SweepLines, camera: LineCamera, *, bands: int = BROAD_BANDS, usable: NDArray[np.bool_] | None = None
-    ) -> BroadSweep:
-        """Read and calibrate a sweep's lines, 64 at a time, keeping the mean of ``bands`` bands spread over all.
+    def read(cls, lines: SweepLines, camera: LineCamera, *, usable: NDArray[np.bool_] | None = None) -> BroadSweep:
+        """Read and calibrate a sweep's lines, 64 at a time, and return the mean of 16 bands spread over all.
 
         ``usable`` (line,) are lines with a trusted position; None takes ``lines.valid_line``.
         """
         position = np.asarray(lines.position, np.float64)
         usable = (lines.valid_line if usable is None else usable) & np.isfinite(position).all(axis=1)
-        return cls(lines.sweep, position, usable, signal_of(lines).broad_image(usable, camera.full_scale_dn, bands))
+        return cls(lines.sweep, position, usable, signal_of(lines).broad_image(usable, camera.full_scale_dn))
 
 
 @dataclass(frozen=True)
 class PlacedImage:
-    """A broad-band image and where its lines lie after correction."""
+    """A broad-band image and the corrected places of its lines."""
 
     broad: BroadSweep
     camera: LineCamera
@@ -61,13 +58,13 @@ class PlacedImage:
 
     @cached_property
     def position(self) -> Floats:
-        """(usable line, 2) corrected mirror positions."""
+        """Return (usable line, 2) corrected mirror positions."""
         usable = self.broad.usable
         return shifted_position(self.broad.position[usable], self.shift_px[usable], self.camera)
 
     @cached_property
     def scan_paths(self) -> tuple[tuple[ScanPath, NDArray[np.float32]], ...]:
-        """Every track with its image, (knot, sample): lines that show one place are averaged."""
+        """Return every scan path with its image, (knot, sample); lines at one place are averaged."""
         broad, found = self.broad, []
         for scan_path in make_scan_paths(
             broad.position,
@@ -95,7 +92,7 @@ class PlacedImage:
     def _geolocations(
         self, along_px: Floats, scan_px: Floats
     ) -> Iterator[tuple[ScanPath, NDArray[np.float32], Floats]]:
-        """Every track, its image, and the knot and sample at which it saw the places of a window, row by row."""
+        """Yield every scan path, its image, and the knot and sample of the places of a window, row by row."""
         sweep = self.broad.sweep
         scan, line = (values.ravel() for values in np.meshgrid(scan_px, along_px, indexing="ij"))
         points = np.stack([scan, line] if sweep.along == "x" else [line, scan], axis=-1)
@@ -107,7 +104,7 @@ class PlacedImage:
             )
 
     def line_and_turn(self, along_px: float, scan_px: float) -> tuple[float, Floats] | None:
-        """The line that sees a place, and how the place moves with that line's centre, (2, 2); None off the sweep."""
+        """Return the line that sees a place, and the place's derivative (2, 2) by its centre; None off the sweep."""
         for scan_path, _, (at,) in self._geolocations(np.array([along_px]), np.array([scan_px])):
             if np.isfinite(at).all():
                 line = int(scan_path.lines[scan_path.starts[int(np.clip(np.rint(at[0]), 0, len(scan_path.scan) - 1))]])
@@ -116,7 +113,7 @@ class PlacedImage:
 
     @cached_property
     def turn_at_middle(self) -> Floats:
-        """Return how the place seen by the middle sample of the middle line moves with the line's centre, (2, 2)."""
+        """Return the derivative (2, 2) of the place of the middle sample of the middle line by the line's centre."""
         usable = np.flatnonzero(self.broad.usable)
         return self._turn(int(usable[len(usable) // 2]), (self.broad.image.shape[1] - 1) / 2)
 
@@ -129,7 +126,7 @@ class PlacedImage:
 
     @cached_property
     def edges(self) -> Floats:
-        """Places of both ends of every 16th line, (end, line, 2) along and scan, by ascending scan [px]."""
+        """Return the places of both ends of every 16th line, (end, line, 2) along and scan, by ascending scan [px]."""
         count = len(self.position)
         lines = np.unique(np.append(np.arange(0, count, EDGE_LINES), max(count - 1, 0)))[:count]
         half = self.camera.samples // self.broad.sweep.binning * self.broad.sweep.binning
@@ -140,7 +137,7 @@ class PlacedImage:
 
 @dataclass(frozen=True)
 class Window:
-    """A rectangle that two sweeps should both have seen, after the shift that is possible."""
+    """A rectangle that two sweeps should both have seen, after the largest possible shift."""
 
     reference: int
     moving: int
@@ -149,12 +146,12 @@ class Window:
 
     @property
     def width_px(self) -> float:
-        """The smaller side."""
+        """Return the smaller side."""
         return min(self.along_px[1] - self.along_px[0], self.scan_px[1] - self.scan_px[0])
 
 
 def places_seen(position: Floats, slopes: Floats, camera: LineCamera) -> Floats:
-    """Places along and scan that rays of some slopes meet from some mirror positions, (position, slope, 2) [px]."""
+    """Return places along and scan of rays with some slopes from some mirror positions, (position, slope, 2) [px]."""
     rays = np.stack([np.zeros_like(slopes), slopes, np.ones_like(slopes)], axis=-1)
     return direction_to_scene(reflect(rays, position_to_normal(position)[:, None])) / camera.ifov_rad
 
@@ -162,7 +159,7 @@ def places_seen(position: Floats, slopes: Floats, camera: LineCamera) -> Floats:
 def overlap_windows(images: Sequence[PlacedImage], *, window_px: float) -> list[Window]:
     """Cut the overlaps of all pairs of sweeps into windows of at most ``window_px`` along the scan.
 
-    A window is as wide as both sweeps reach all along it. Which of them are wide enough is for the caller to say.
+    A window is as wide as both sweeps reach along all of it; narrow ones are included.
     """
     if not window_px >= LEAST_OVERLAP_PX:
         raise SettingsError(f"windows must be at least {LEAST_OVERLAP_PX:.0f} px long, got {window_px} px")

@@ -1,4 +1,4 @@
-"""Registration: the pointing of a pass from the overlaps of its sweeps, and of a fine sweep from the coarse mosaic."""
+"""Register sweeps: a pass by the overlaps of its sweeps, and a fine sweep by the coarse mosaic."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from pipeline.rectify.resample import resample
 Floats = NDArray[np.float64]
 
 WINDOW_PX = 512.0
-SETTLED_PRIOR_PX = 3.0  # once the first round has brought the sweeps together
+SETTLED_PRIOR_PX = 3.0  # after the first round
 
 
 @dataclass(frozen=True)
 class SeamWindow:
-    """One window of one overlap: where it lies and what was found there."""
+    """One window of one overlap and the shift found there."""
 
     window: Window
-    found: PairShift | None  # in pixels of the pass, rows along the scan; None: too narrow to tell
+    found: PairShift | None  # in pixels of the pass, rows along the scan; None: too narrow
     measured: WindowShift | None  # in scene px; None unless found
-    residual_px: Floats  # (2,) along and scan: what the correction leaves; NaN unless found
+    residual_px: Floats  # (2,) along and scan, after the correction; NaN unless found
 
 
 @dataclass(frozen=True)
@@ -53,117 +53,98 @@ class NarrowOverlap:
 
 @dataclass(frozen=True)
 class Registration:
-    """Corrections of all sweeps of a pass, and what they rest on."""
+    """Corrections of all sweeps of a pass, and the windows that they come from."""
 
     shifts: tuple[SweepShift, ...]
-    reference: str | None  # the sweep that was held; None without sweeps
-    untied: tuple[str, ...]  # sweeps that no accepted window joins to it: left where they were, on average
-    narrow: tuple[NarrowOverlap, ...]  # where they leave sweeps apart
+    reference: str | None  # the fixed sweep; None without sweeps
+    untied: tuple[str, ...]  # sweeps that no accepted window joins to it: unchanged on average
+    narrow: tuple[NarrowOverlap, ...]  # of pairs that no other overlap joins
     windows: tuple[SeamWindow, ...]  # of the last round
 
     def of(self, name: str) -> SweepShift:
-        """Give the correction of one sweep."""
+        """Return the correction of one sweep."""
         return next(shift for shift in self.shifts if shift.name == name)
 
 
 def register_sweeps(
     sweeps: Sequence[BroadSweep], camera: LineCamera, *, prior_px: float, window_px: float = WINDOW_PX
 ) -> Registration:
-    """Find where the lines of all sweeps of one pass lie, relative to the middle one of the largest group that overlap.
+    """Find the places of the lines of one pass, relative to the middle sweep of the largest group that overlaps.
 
-    Neighbours are rectified where they should overlap, compared window by window (``window_px`` long), and one offset
-    and drift per sweep is solved for from all windows. A second round rectifies again with these corrections and looks
-    within 3 px: a line turns with its centre, and the first round cannot see by how much. No pixel is shifted twice:
-    the corrections go into ``place(shift_px=...)``, which makes the geolocation grid again.
+    Neighbours are rectified in their overlap and compared window by window (``window_px`` long). One offset and drift
+    per sweep is solved for from all windows. A second round rectifies again with these corrections and searches within
+    3 px. It is needed because a line turns with its centre, which the first round does not know. Pixels are resampled
+    once: the corrections go into ``place(shift_px=...)``, which computes the geolocation grid again.
 
-    ``prior_px`` is how far any sweep may look beside the position that it reports, in either axis; a pair may be apart
-    by twice that. Overlaps need 64 px beyond.
+    ``prior_px`` is the largest pointing error of a sweep in either axis; a pair may be apart by twice that. Overlaps
+    need 64 px beyond.
 
-    Raises SettingsError: windows that are too short.
-    Raises PoseError: a corrected position is beyond the mirror's rim.
+    Raises SettingsError: windows that are too short. Raises PoseError: a corrected position is beyond the mirror's rim.
     """
-    shifts, among = no_shifts([one.sweep.name for one in sweeps]), frozenset(range(len(sweeps)))
     names, lines = [one.sweep.name for one in sweeps], [len(one.position) for one in sweeps]
-    made: list[tuple[list[SeamWindow], SweepShifts]] = []
-    reference: int | None = None
-    for number in range(2):
-        reach = 2 * prior_px if number == 0 else min(SETTLED_PRIOR_PX, 2 * prior_px)
+    shifts, among, reference = no_shifts(names), frozenset(range(len(sweeps))), None
+    rounds: list[tuple[list[SeamWindow], SweepShifts]] = []
+    for reach in (2 * prior_px, min(SETTLED_PRIOR_PX, 2 * prior_px)):
         images = place_images(sweeps, shifts, camera)
-        seen = measure_windows(images, reach_px=reach, window_px=window_px, among=among)
+        seen = _measure_windows(images, reach, window_px, among)
         measured = [each.measured for each in seen if each.measured is not None]
         solved = solve_sweeps(measured, names, lines, reference=reference)
         shifts = tuple(old.plus(new) for old, new in zip(shifts, solved.shifts, strict=True))
         reference, among = solved.reference, among - set(solved.untied)
         left = iter(solved.residual)
         seen = [each if each.measured is None else replace(each, residual_px=next(left)) for each in seen]
-        made.append((seen, solved))
-    first, solved = made[0]
+        rounds.append((seen, solved))
+    first, solved = rounds[0]
     return Registration(
         shifts=shifts,
         reference=names[solved.reference] if names else None,
         untied=tuple(names[number] for number in solved.untied),
         narrow=tuple(_narrow(first, names, 2 * prior_px)),
-        windows=tuple(made[-1][0]),
+        windows=tuple(rounds[-1][0]),
     )
 
 
 def place_images(
     sweeps: Sequence[BroadSweep], shifts: Sequence[SweepShift], camera: LineCamera
 ) -> tuple[PlacedImage, ...]:
-    """Put broad-band images where corrections say that their lines lie."""
+    """Return the broad-band images at their corrected places."""
     return tuple(
         PlacedImage(one, camera, shift.of_lines(len(one.position))) for one, shift in zip(sweeps, shifts, strict=True)
     )
 
 
-def measure_windows(
-    images: Sequence[PlacedImage],
-    *,
-    reach_px: float,
-    window_px: float = WINDOW_PX,
-    among: Collection[int] | None = None,
+def _measure_windows(
+    images: Sequence[PlacedImage], reach_px: float, window_px: float, among: Collection[int]
 ) -> list[SeamWindow]:
-    """Compare all neighbours window by window, as they are placed; residuals are what was found.
+    """Compare all neighbours ``among`` the sweeps window by window; residuals are the shifts themselves.
 
-    ``reach_px`` is the largest shift of a pair; ``among`` the numbers of the sweeps to be compared, None takes all.
+    ``reach_px`` is the largest shift of a pair.
     """
     seen = []
     for window in overlap_windows(images, window_px=window_px):
-        if among is not None and not {window.reference, window.moving} <= set(among):
+        pair = (window.reference, window.moving)
+        if not set(pair) <= set(among):
             continue
         if window.width_px < LEAST_OVERLAP_PX + reach_px:
             seen.append(SeamWindow(window, None, None, np.full(2, np.nan)))
             continue
-        one, other = images[window.reference], images[window.moving]
+        one, other = (images[number] for number in pair)
         pitch = one.broad.sweep.step  # the distance of the pass's lines
         along, scan = (np.arange(low, high, pitch) for low, high in (window.along_px, window.scan_px))
         found = pair_shift(one.seen_at(along, scan), other.seen_at(along, scan), prior_px=reach_px / pitch)
-        measured = _measured(window, found, images)
+        measured, middle = None, [(low + high) / 2 for low, high in (window.along_px, window.scan_px)]
+        if found.status == "found":
+            here, there = one.line_and_turn(*middle), other.line_and_turn(*middle)
+            if here is not None and there is not None:
+                shift, error = found.shift[::-1] * pitch, found.error_px[::-1] * pitch
+                turn = np.stack([here[1], there[1]])
+                measured = WindowShift(*pair, line=(here[0], there[0]), turn=turn, shift=shift, error_px=error)
         seen.append(SeamWindow(window, found, measured, np.full(2, np.nan) if measured is None else measured.shift))
     return seen
 
 
-def _measured(window: Window, found: PairShift, images: Sequence[PlacedImage]) -> WindowShift | None:
-    """Return what a window says of its two sweeps, in scene px; None unless something was found."""
-    if found.status != "found":
-        return None
-    middle = [(low + high) / 2 for low, high in (window.along_px, window.scan_px)]
-    both = [images[number].line_and_turn(*middle) for number in (window.reference, window.moving)]
-    if both[0] is None or both[1] is None:
-        return None
-    pitch = images[window.reference].broad.sweep.step
-    return WindowShift(
-        reference=window.reference,
-        moving=window.moving,
-        line=(both[0][0], both[1][0]),
-        turn=np.stack([both[0][1], both[1][1]]),
-        shift=found.shift[::-1] * pitch,
-        error_px=found.error_px[::-1] * pitch,
-    )
-
-
 def _narrow(seen: Sequence[SeamWindow], names: Sequence[str], reach_px: float) -> Iterator[NarrowOverlap]:
-    """Pairs none of whose windows was wide enough, unless other overlaps join the two."""
+    """Yield pairs whose windows are all too narrow, unless other overlaps join the two."""
     measured = [each.measured for each in seen if each.measured is not None]
     for (one, other), group in groupby(seen, key=lambda each: (each.window.reference, each.window.moving)):
         windows = list(group)
@@ -175,7 +156,7 @@ def _narrow(seen: Sequence[SeamWindow], names: Sequence[str], reach_px: float) -
 
 @dataclass(frozen=True)
 class Anchor:
-    """A sweep's correction, and what the last comparison said; without ``found`` the correction is 0."""
+    """A sweep's correction and the last comparison; the correction is 0 unless one was found."""
 
     shift: SweepShift
     found: PairShift  # in scene px, rows along the scan
@@ -184,11 +165,11 @@ class Anchor:
 def anchor_sweep(
     sweep: BroadSweep, camera: LineCamera, grid: SceneGrid, mosaic: NDArray[np.floating], *, prior_px: float
 ) -> Anchor:
-    """Find where a fine sweep lies on the coarse mosaic, (y, x), the broad-band mean of the same bands as its image.
+    """Find the place of a fine sweep on the coarse mosaic, (y, x), the broad-band mean of the same bands as its image.
 
-    The sweep is rectified at the scene's pixels, blurred to what a coarse pixel sees, and compared with the mosaic
-    interpolated there, up to ``prior_px`` beside its reported positions in either axis [px]. One offset for the whole
-    sweep: runs of the fine pass are short.
+    The sweep is rectified at the scene's pixels, blurred to coarse pixels, and compared with the interpolated mosaic.
+    The search goes up to ``prior_px`` from its reported positions in either axis [px]. The result is one offset for
+    the whole sweep, since runs of the fine pass are short.
 
     Raises PoseError: a corrected position is beyond the mirror's rim.
     """
@@ -196,8 +177,7 @@ def anchor_sweep(
     lines = len(sweep.position)
     if not sweep.usable.any():
         return Anchor(shift, nothing_found("empty"))
-    for turn in range(2):  # the second looks again from where the first has put the sweep
-        reach = prior_px if turn == 0 else min(prior_px, SETTLED_PRIOR_PX)
+    for reach in (prior_px, min(prior_px, SETTLED_PRIOR_PX)):
         image = PlacedImage(sweep, camera, shift.of_lines(lines))
         found = _compare_with_mosaic(image, grid, mosaic, reach)
         if found.status != "found":
@@ -210,7 +190,7 @@ def anchor_sweep(
 def _compare_with_mosaic(
     image: PlacedImage, grid: SceneGrid, mosaic: NDArray[np.floating], reach_px: float
 ) -> PairShift:
-    """Compare a sweep with the mosaic under it, at the scene's pixels that it may have seen."""
+    """Compare a sweep with the mosaic at the scene's pixels that it may have seen."""
     places, shown = image.edges.reshape(-1, 2), []
     for axis, size in enumerate(field_px(grid, image.broad.sweep.along)):
         low, high = (float(end) + (size - 1) / 2 for end in (places[:, axis].min(), places[:, axis].max()))

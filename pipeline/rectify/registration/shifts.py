@@ -1,4 +1,4 @@
-"""Registration of two images of one overlap: the shift between them, or why it cannot be told."""
+"""Find the shift between two images of one overlap, or the reason why it cannot be found."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pipeline.rectify.kernels import kernel_taps
 Status = Literal["found", "undecidable", "flat", "empty"]
 Floats = NDArray[np.float64]
 
-LEAST_FRACTION = 0.25  # of the largest common area; below it a chance likeness wins over the true shift
+LEAST_FRACTION = 0.25  # of the largest common area; below it a chance correlation can exceed that of the true shift
 LEAST_SIDE_PX = 12  # of the pixels compared
 LOBE_PX = 3.0  # shifts nearer than this belong to one peak
 RIVALS = 4
@@ -43,8 +43,8 @@ class PairShift:
     """Shift between two images of an overlap; the figures are NaN where nothing was compared.
 
     ``found`` is the only status with a shift. ``undecidable``: another shift explains the overlap as well within the
-    noise (periodic texture), one direction has no structure (an edge, plain rows), or the best shift is beyond the
-    prior. ``flat``: no structure that reaches over more than a pixel. ``empty``: too few pixels in common.
+    noise (periodic texture), or one direction has no structure (an edge, plain rows). So is a best shift beyond the
+    prior. ``flat``: no structure wider than a pixel. ``empty``: too few pixels in common.
     """
 
     status: Status
@@ -68,13 +68,13 @@ class _Fit:
 def pair_shift(reference: NDArray[np.floating], moving: NDArray[np.floating], *, prior_px: float) -> PairShift:
     """Find the shift that brings ``moving`` onto ``reference``: ``reference(p) = moving(p - shift)``.
 
-    Phase correlation within the geometric prior, since crop rows alias. A normalised correlation over all integer
-    shifts within the prior, of the pixels that both see [1], gives the candidates. Each is refined by least squares of
-    grey values, for which the windowed phase correlation [2] is the start: on its own its window pulls the shift of
-    broad texture towards the integer. The best stands only if every other leaves clearly more unexplained.
+    The search stays within the geometric prior, since crop rows alias. Candidates are the peaks of the normalised
+    correlation over all integer shifts, of the pixels that both see [1]. Each is refined by least squares of grey
+    values. The windowed phase correlation [2] is only the start, as its window biases the shift of broad texture
+    towards the integer. The best candidate is accepted if every other leaves clearly more variance unexplained.
 
     Both are (row, column) broad-band images on the same grid, NaN where nothing was seen; gain and offset may differ.
-    ``prior_px`` is the largest shift possible in either direction.
+    ``prior_px`` is the largest possible shift in either direction.
 
     References
     ----------
@@ -98,7 +98,7 @@ def pair_shift(reference: NDArray[np.floating], moving: NDArray[np.floating], *,
 
 
 def _judge(fits: list[_Fit], prior_px: float) -> PairShift:
-    """Accept the best fit if no other comes near it, both directions are sure and it lies within the prior."""
+    """Accept the best fit if no other comes near it, both directions are certain and it lies within the prior."""
     best = fits[0]
     rival = min((fit.misfit for fit in fits if np.abs(fit.shift - best.shift).max() > LOBE_PX), default=1.0)
     ratio = (rival + INTERPOLATION_MISFIT) / (best.misfit + INTERPOLATION_MISFIT)
@@ -118,12 +118,12 @@ def _judge(fits: list[_Fit], prior_px: float) -> PairShift:
 
 
 def nothing_found(status: Status) -> PairShift:
-    """Give what a comparison without a result says."""
+    """Return a comparison without a result."""
     return PairShift(status, np.full(2, np.nan), np.full(2, np.nan))
 
 
 def _standardised(image: NDArray[np.floating]) -> Floats | None:
-    """Image of mean 0 and deviation 1, NaN kept; None where there is nothing or it does not vary."""
+    """Return the image with mean 0 and deviation 1, NaN kept; None if it is empty or constant."""
     seen = np.isfinite(image)
     if not seen.any():
         return None
@@ -135,7 +135,7 @@ def _standardised(image: NDArray[np.floating]) -> Floats | None:
 
 
 def _is_textured(image: Floats) -> bool:
-    """Tell whether near pixels are alike, or opposite; white noise is no texture: a footprint is wider than a pixel."""
+    """Return whether near pixels correlate; white noise is no texture, since a footprint is wider than a pixel."""
     for lag in (1, 2):
         for one, other in ((image[lag:], image[:-lag]), (image[:, lag:], image[:, :-lag])):
             both = np.isfinite(one) & np.isfinite(other)
@@ -146,7 +146,7 @@ def _is_textured(image: Floats) -> bool:
 
 
 def _correlate(first: Floats, second: Floats, reach: int) -> tuple[Floats, Floats]:
-    """Correlation and number of common pixels for every integer shift up to ``reach``, (2 reach + 1, same) each [1].
+    """Return correlation and common pixels for every integer shift up to ``reach``, (2 reach + 1, same) each [1].
 
     Shifts with too little in common, or without variance there, get a correlation of -1.
     """
@@ -161,8 +161,7 @@ def _correlate(first: Floats, second: Floats, reach: int) -> tuple[Floats, Float
 
     def at_shifts(one: int, other: int) -> Floats:
         product = scipy.fft.irfft2(spectra[0][one] * np.conj(spectra[1][other]), size)
-        picked: Floats = product[np.ix_(lags % size[0], lags % size[1])] * (inside[0] & inside[1])
-        return picked
+        return np.asarray(product[np.ix_(lags % size[0], lags % size[1])] * (inside[0] & inside[1]))
 
     common = np.rint(at_shifts(0, 0))
     count = np.maximum(common, 1)
@@ -177,7 +176,7 @@ def _correlate(first: Floats, second: Floats, reach: int) -> tuple[Floats, Float
 
 
 def _candidates(correlation: Floats) -> Iterator[NDArray[np.intp]]:
-    """Integer shifts (2,) of the highest peaks, best first, none within another's lobe."""
+    """Yield the integer shifts (2,) of the highest peaks, best first, none within another's lobe."""
     reach = correlation.shape[0] // 2
     # The window is as wide as a lobe: noise on a broad peak makes no second one.
     peaks = np.argwhere(
@@ -188,7 +187,7 @@ def _candidates(correlation: Floats) -> Iterator[NDArray[np.intp]]:
 
 
 def _refine(first: Floats, second: Floats, integer: NDArray[np.intp]) -> _Fit | None:
-    """Least squares around an integer shift; None where too little is common or it does not settle near by."""
+    """Return the fit around an integer shift; None if too little is common or it does not converge nearby."""
     for _ in range(REALIGNMENTS):
         moves = list(zip(first.shape, integer.tolist(), strict=True))
         one = first[tuple(slice(max(move, 0), max(size + min(move, 0), 0)) for size, move in moves)]
@@ -208,17 +207,16 @@ def _refine(first: Floats, second: Floats, integer: NDArray[np.intp]) -> _Fit | 
 
 
 def _phase_shift(one: Floats, other: Floats) -> Floats:
-    """Shift by phase correlation under a Hann window [2], not normalised: noise has all phases alike."""
+    """Return the shift by phase correlation under a Hann window [2], not normalised: noise has equal amplitudes."""
     window = np.outer(*(np.hanning(size + 2)[1:-1] for size in one.shape))
     shift, *_ = skimage.registration.phase_cross_correlation(  # type: ignore[no-untyped-call]
         one * window, other * window, normalization=None, upsample_factor=UPSAMPLE
     )
-    near: Floats = np.clip(shift, -REALIGN_PX, REALIGN_PX)
-    return near
+    return np.asarray(np.clip(shift, -REALIGN_PX, REALIGN_PX))
 
 
 def _least_squares(one: Floats, other: Floats, kept: NDArray[np.bool_], shift: Floats) -> _Fit | None:
-    """Gauss-Newton for shift, gain and offset of grey values, from a start within a pixel; None if it runs away."""
+    """Fit shift, gain and offset of grey values by Gauss-Newton, from a start within a pixel; None if gain < 0."""
     target = one[kept]
     if np.var(target) <= FLAT_SPREAD:
         return None
@@ -227,7 +225,7 @@ def _least_squares(one: Floats, other: Floats, kept: NDArray[np.bool_], shift: F
         slopes = _slopes(moved, kept)
         system = np.stack([-slopes[0], -slopes[1], moved[kept], np.ones(len(target))], axis=1)
         answer, *_ = np.linalg.lstsq(system.T @ system, system.T @ target, rcond=SINGULAR)
-        if answer[2] <= 0:  # a likeness turned to its negative is none
+        if answer[2] <= 0:  # a negative image is no match
             return None
         change = answer[:2] / answer[2]
         left = target - system @ answer
@@ -240,7 +238,7 @@ def _least_squares(one: Floats, other: Floats, kept: NDArray[np.bool_], shift: F
 
 
 def _fit_of(shift: Floats, target: Floats, left: Floats, slopes: Floats, others: Floats) -> _Fit:
-    """Error and quality of a fit. Only slopes that both images share say where it lies: noise has slopes as well."""
+    """Return error and quality of a fit. Only slopes that both images share count, since noise has slopes as well."""
     misfit = min(float(np.var(left) / np.var(target)), 1.0)
     shared: Floats = np.asarray(slopes @ others.T + others @ slopes.T) / 2
     value, direction = np.linalg.eigh(shared)
@@ -253,19 +251,19 @@ def _fit_of(shift: Floats, target: Floats, left: Floats, slopes: Floats, others:
 
 
 def _slopes(image: Floats, kept: NDArray[np.bool_]) -> Floats:
-    """Slopes by rows and by columns, (2, kept pixel)."""
+    """Return slopes by rows and by columns, (2, kept pixel)."""
     return np.stack([np.gradient(image, axis=axis)[kept] for axis in (0, 1)])
 
 
 def _smoothed(image: Floats) -> Floats:
-    """Damp what is too fine to interpolate, and noise."""
+    """Damp noise and details that are too fine to interpolate."""
     for axis in (0, 1):
         image = scipy.ndimage.convolve1d(image, SMOOTHING, axis=axis, mode="nearest")
     return image
 
 
 def _moved(image: Floats, shift: Floats) -> Floats:
-    """Image moved by less than a lobe, ``image(p - shift)`` by Catmull-Rom; the borders repeat."""
+    """Return the image moved by less than a lobe, ``image(p - shift)`` by Catmull-Rom; the borders repeat."""
     for axis in (0, 1):
         index, weight = kernel_taps(np.arange(image.shape[axis]) - shift[axis], "catmull-rom")
         np.clip(index, 0, image.shape[axis] - 1, out=index)

@@ -18,7 +18,7 @@ from pipeline.errors import RigError, SceneError, ShapeError
 from pipeline.readings import SIGMA_OF_MEDIAN
 from pipeline.rig.camera.camera_texts import FRAME_INDEX, LineTimes, parse_frame_index, place_parts, times_of_lines
 from pipeline.rig.camera.envi_headers import EnviHeader, parse_envi_header
-from pipeline.signal.detector import find_bad_elements
+from pipeline.signal.calibrate import find_bad_elements
 from pipeline.source import References
 
 _PART = re.compile(r"raw_(\d{1,12})", re.IGNORECASE)
@@ -230,7 +230,7 @@ def as_references(
     """Join dark and white into the references of a sweep, and say what was found.
 
     An element is bad where its dark frame is stuck, where either jumps amid its frames, or where
-    :func:`pipeline.signal.detector.find_bad_elements` says so.
+    :func:`pipeline.signal.calibrate.find_bad_elements` says so.
 
     ``white_reference`` is the value of the white reference, one or (band,). RigError where the frames are of two sizes,
     swapped, without light, do not show the same throughout, or too many elements would be bad.

@@ -25,9 +25,8 @@ from models.reading.inference import DrawnMap, coarse_prediction_of_patches, seg
 from pipeline.geometry.grid import SceneGrid
 from pipeline.rectify.region import read_patches
 from pipeline.signal.components import Components
-from pipeline.signal.condense import score_lines, whole_steps
+from pipeline.signal.condense import calibrated_blocks, score_lines, whole_steps
 from pipeline.signal.subspace import SignalStatistics, find_components
-from pipeline.signal.sweep_signal import calibrated_blocks
 from storage.arrays.layout import numbers_in_memory
 
 SEEDS = (0, 1, 2)

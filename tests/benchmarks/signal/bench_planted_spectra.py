@@ -22,9 +22,16 @@ from scipy.ndimage import gaussian_filter1d, uniform_filter
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.signal.components import Components
-from pipeline.signal.condense import RESIDUAL_STEP, UNUSABLE, ResidualLaw, find_rare, residual_steps, score_lines
+from pipeline.signal.condense import (
+    RESIDUAL_STEP,
+    UNUSABLE,
+    ResidualLaw,
+    calibrated_blocks,
+    find_rare,
+    residual_steps,
+    score_lines,
+)
 from pipeline.signal.subspace import SignalStatistics, find_components
-from pipeline.signal.sweep_signal import calibrated_blocks
 from storage.arrays.cubes import open_raw_cubes
 
 SHAPES = {"1 px": (1, 1), "2 x 2 px": (2, 2), "line of 8 px": (1, 8)}

@@ -19,8 +19,7 @@ from pipeline.errors import SettingsError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.rectify.placed import PixelGrid, place
-from pipeline.rectify.region import plan_tiles
-from pipeline.rectify.tiles import MosaicWork, TileMaker, let_tiles_go, opened_tiles
+from pipeline.rectify.region import MosaicWork, TileMaker, free_tiles, opened_tiles, plan_tiles
 from pipeline.source import References
 from storage.arrays.cubes import SweepHeader
 from storage.arrays.mosaics import MosaicWriter
@@ -157,9 +156,9 @@ def test_a_worker_lets_tiles_go(cubes: list[SignalCube]) -> None:
     """Raw lines are kept from tile to tile of a mosaic, and no longer than the process is at tiles."""
     maker = TileMaker(recipe_of(cubes).open, 2**24)
     maker(slice(0, 64), slice(0, 640))
-    lines = weakref.ref(opened_tiles(maker).lines)
+    lines = weakref.ref(opened_tiles(maker)[1])
     assert lines() is not None
-    let_tiles_go()
+    free_tiles()
     assert lines() is None
 
 

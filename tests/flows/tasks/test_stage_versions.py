@@ -46,7 +46,7 @@ BARRIERS = {
     "StageRef": "where a store lies",
     "WorkerPool": "who does the work: blocks are the same by threads, by processes and on a cluster",
     "run_blocks": "as WorkerPool",
-    "let_tiles_go": "gives memory back",
+    "free_tiles": "gives memory back",
     "read_manifest": "whether a store is whole",
     "visible": "words of refusals",
     "StageProgress": "what the terminal shows",

@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from odc.geo.geobox import GeoBox
 
-from pipeline.errors import PoseError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.field_places import (
     NoPlace,
@@ -106,9 +105,3 @@ def test_a_view_of_the_horizon_ends_where_the_map_does():
     found = footprint_of(looking(1), (800, 400))
     assert np.isfinite(found.outline_m).all()
     assert found.range_m[2] < 100 * 12 / np.tan(np.deg2rad(1))
-
-
-def test_a_rig_that_looks_up_has_no_footprint():
-    """The message says where to tilt."""
-    with pytest.raises(PoseError, match="tilt it further down"):
-        footprint_of(looking(-30), (50, 50))

@@ -127,7 +127,7 @@ def test_the_outline_holds_exactly_the_pixels_that_sink_enough(rig: GroundView, 
 def test_values_out_of_range_or_not_finite_are_named(item: Field[float]):
     """Each field of the pose refuses NaN, infinity and what lies beyond its limits."""
     for value in (np.nan, np.inf, span_of(item)[1] * 1.01 + 1):
-        with pytest.raises(PoseError, match=rf"{item.name} of the rig's pose must be a number from .* got {value!r}"):
+        with pytest.raises(PoseError, match=rf"the rig's pose: {item.name} must be a number from .* got {value!r}"):
             view(**{item.name: value})
 
 

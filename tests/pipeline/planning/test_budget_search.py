@@ -5,13 +5,12 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse
 from scipy.optimize import Bounds, LinearConstraint, milp
 
-from pipeline.planning.budget_search import cheapest_cover, spend
+from pipeline.planning.budget_search import spend
 from pipeline.planning.prices import ScanPrices
 from tests.pipeline.planning.fields import blocks, drawn
 
@@ -20,10 +19,10 @@ LINES = 8  # of a patch
 patch_index = partial(blocks, prices=PRICES, lines=LINES)
 
 
-def optimum(expected_gain: np.ndarray, most: int, budget_s: float | None) -> float:
-    """Most worth for a budget, or with None the least seconds for all of it, by an integer programme.
+def optimum(expected_gain: np.ndarray, most: int, budget_s: float) -> float:
+    """Most gain for a budget, by an integer programme.
 
-    Unknowns: is a strip on in a row, does it start there, is a patch shown, loads of the memory.
+    Unknowns: is a swath on in a row, does it start there, is a patch shown, loads of the memory.
     """
     rows, columns = expected_gain.shape
     swaths = columns - most + 1
@@ -49,27 +48,24 @@ def optimum(expected_gain: np.ndarray, most: int, budget_s: float | None) -> flo
     value = np.zeros(loads + 1)
     value[2 * on : loads] = expected_gain.ravel()[patch_index]
     row, column, entry = zip(*cells, strict=True)
-    limits = [LinearConstraint(sparse.csr_matrix((entry, (row, column)), (len(top), loads + 1)), -np.inf, top)]
-    least = np.zeros(loads + 1)
-    if budget_s is None:
-        least[2 * on : loads] = 1
-    else:
-        limits.append(LinearConstraint(seconds[None], -np.inf, budget_s))
-    most_of = np.ones(loads + 1)
+    limits = [
+        LinearConstraint(sparse.csr_matrix((entry, (row, column)), (len(top), loads + 1)), -np.inf, top),
+        LinearConstraint(seconds[None], -np.inf, budget_s),
+    ]
+    most_of, whole = np.ones(loads + 1), np.zeros(loads + 1)
     most_of[loads] = 99
-    whole = np.zeros(loads + 1)
     whole[:on] = whole[loads] = 1
     found = milp(
-        seconds if budget_s is None else -value,
+        -value,
         constraints=limits,
-        bounds=Bounds(least, most_of),
+        bounds=Bounds(np.zeros(loads + 1), most_of),
         integrality=whole,
         options={"mip_rel_gap": 1e-6},
     )
-    return float(found.fun if budget_s is None else -found.fun)
+    return float(-found.fun)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.integers(2, 9), st.integers(3, 12), st.integers(0, 99), st.floats(0, 30), st.floats(0, 30))
 def test_a_bigger_budget_never_buys_less(rows: int, columns: int, seed: int, one: float, other: float):
     """The true price, reloads included, stays within the budget, and worth grows with it, in narrow fields and wide."""
@@ -94,18 +90,6 @@ def test_plans_are_near_the_optimum():
     assert min(fractions) > 0.95
     assert np.mean(fractions) > 0.99
     assert max(fractions) <= 1 + 1e-9
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_all_patches_at_nearly_the_least_price(seed: int):
-    """Covers of every patch take at most 2 % more seconds than the integer programme's."""
-    rng = np.random.default_rng(seed)
-    expected_gain = (rng.random((12, 9)) < 0.12).astype(float)
-    cover = cheapest_cover(patch_index(expected_gain, 4))
-    assert cover.expected_gain == expected_gain.sum()
-    assert (
-        optimum(expected_gain, 4, None) * (1 - 1e-9) <= cover.seconds(PRICES) <= optimum(expected_gain, 4, None) * 1.02
-    )
 
 
 def test_worths_far_apart_are_all_bought_in_the_end():

@@ -37,7 +37,7 @@ def unseen(sweeps: list[Sweep], grid: SceneGrid) -> int:
     return int(np.count_nonzero(~seen))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.integers(1, 1500), st.integers(1, 300), st.sampled_from(["x", "y"]), st.integers(1, 8))
 def test_every_pixel_is_seen(height: int, width: int, along: str, factor: int):
     """A full scan holds every pixel of its grid, with resampling taps, for any size and factor."""
@@ -152,7 +152,7 @@ def test_patches_beyond_the_samples_are_not_reached():
     assert not patch_lines(GRID, CAMERA, low, padding)[1].any()
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.integers(-4000, 4000), st.integers(-4000, 4000), st.integers(1, 900), st.sampled_from(["x", "y"]))
 def test_no_shown_patch_lies_beyond_the_rectangle(swath: int, start: int, lines: int, along: str):
     """Patches shown by a sweep anywhere in a wide field are among those near its footprint."""

@@ -6,7 +6,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import SettingsError
@@ -51,6 +51,7 @@ def test_every_patch_is_in_a_row_whose_lines_show_it(along: Axis, step: int) -> 
         assert shown[rows.row == number * rows.first.shape[1] + place].all()
 
 
+@settings(max_examples=40, deadline=None)
 @given(worths, st.floats(0.02, 1.2))
 def test_no_run_of_the_same_sweep_is_worth_more_in_its_seconds(expected_gain: np.ndarray, fraction: float) -> None:
     """Each chosen run is worth most of all runs of its sweep that have as many lines or fewer."""
@@ -64,6 +65,7 @@ def test_no_run_of_the_same_sweep_is_worth_more_in_its_seconds(expected_gain: np
                 assert values[begin:end].sum() <= taken * (1 + 1e-9)
 
 
+@settings(max_examples=40, deadline=None)
 @given(worths, st.floats(0.1, 1.0), st.floats(0.1, 4.0))
 def test_no_run_of_one_swath_that_ends_in_time_is_worth_more(
     expected_gain: np.ndarray, fraction: float, power: float
@@ -104,6 +106,18 @@ def test_hardly_any_runs_of_two_swaths_are_worth_more(seed: int, fraction: float
     assert 0.98 * best <= scan_pass.expected_gain <= best * (1 + 1e-9)
 
 
+def test_a_swath_that_does_not_pay_its_set_up_is_left_out() -> None:
+    """Two rows of two swaths are taken, and nothing of the third, where time is for these two."""
+    expected_gain, count = np.full(int(np.prod(GRID.patch_shape)), 1e-6), ROWS.first.shape[1]
+    for number in (0, 2):
+        expected_gain[ROWS.row == number * count + 5] = 1.0
+    wanted = tuple((number, int(ROWS.first[number, 5]), int(ROWS.stop[number, 5])) for number in (0, 2))
+    seconds = COST.seconds(sweeps_of_runs(ROWS.sweeps, wanted), CAMERA) + 0.01
+    found = partial_scan(ROWS, expected_gain, CAMERA, COST, exposure_ms=EXPOSURE_MS, seconds=seconds)
+    assert found is not None
+    assert found.runs == wanted
+
+
 def test_rows_worth_the_same_are_looked_at_as_far_as_time_goes() -> None:
     """Of a block that the seconds do not pay for as much as they do, and no lines beside it."""
     expected_gain = np.zeros(GRID.patch_shape)
@@ -129,6 +143,7 @@ def test_a_patch_that_two_swaths_show_is_of_the_nearer(along: Axis) -> None:
     assert (own <= off.min(axis=1) + 1).all()  # lines are turned by a pixel at most
 
 
+@settings(max_examples=40, deadline=None)
 @given(worths, st.floats(0.02, 1.2))
 def test_looks_end_in_time_and_are_worth_what_they_show(expected_gain: np.ndarray, fraction: float) -> None:
     """Seconds are those of the cost model, at most those given; the worth is that of the rows the lines show."""
@@ -141,6 +156,7 @@ def test_looks_end_in_time_and_are_worth_what_they_show(expected_gain: np.ndarra
     assert scan_pass.expected_gain <= expected_gain[patches_shown(sweeps, GRID, CAMERA)].sum() * (1 + 1e-9)
 
 
+@settings(max_examples=40, deadline=None)
 @given(worths)
 def test_more_seconds_are_worth_no_less(expected_gain: np.ndarray) -> None:
     """And all the seconds of the whole scan buy all that a scan is worth."""
@@ -167,7 +183,7 @@ def test_what_is_worth_much_is_looked_at_first() -> None:
 @pytest.mark.parametrize(
     ("runs", "told"),
     [
-        ([(3, 0, 5)], "look is at sweep 3, the scan has sweeps 0 to 2"),
+        ([(3, 0, 5)], "extent names sweep 3, the scan has sweeps 0 to 2"),
         ([(0, 0, 100_000)], "lines 0 to 100000 of sweep 0, which has lines 0 to"),
         ([(1, 0, 5), (1, 9, 12)], "names sweep 1 twice"),
     ],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -17,10 +18,10 @@ from pipeline.planning.prices import (
     SavingEntry,
     capture_savings,
     check_budget,
-    count_lines,
     count_samples,
-    least_budget,
+    frame_patches,
     raw_bytes,
+    select_patches,
 )
 
 CAMERA, COST = LineCamera(), CostModel()
@@ -57,7 +58,7 @@ def test_binned_lines_have_fewer_samples_and_bytes():
     full = full_sweeps(grid, CAMERA, "x")
     coarse = [replace(sweep, binning=4) for sweep in uniform_sweeps(grid, CAMERA, "x", step=4)]
     assert count_samples(coarse, CAMERA, grid) * 16 == count_samples(full, CAMERA, grid) == 400 * 640
-    assert raw_bytes(coarse, CAMERA, 270) == count_lines(coarse) * 160 * 270 * 2
+    assert raw_bytes(coarse, CAMERA, 270) == sum(one.lines for one in coarse) * 160 * 270 * 2
     assert raw_bytes(full, CAMERA, 270) == 403 * 640 * 270 * 2
 
 
@@ -68,9 +69,7 @@ def test_the_ledger_compares_like_with_like():
     same = capture_savings(full, full, CAMERA, grid, cost=COST)
     assert list(same) == ["lines", "samples", "capture_s"]
     assert [entry.ratio for entry in same.values()] == [1, 1, 1]
-    none = capture_savings([], full, CAMERA, grid, cost=COST, full_is="measured")
-    assert [entry.ratio for entry in none.values()] == [0, 0, 0]
-    assert none["lines"].full_is == "measured"
+    assert [entry.ratio for entry in capture_savings([], full, CAMERA, grid, cost=COST).values()] == [0, 0, 0]
 
 
 @pytest.mark.parametrize(
@@ -91,7 +90,44 @@ def test_budgets_that_cannot_be_met_are_refused(budget: float, coarse_s: float, 
 def test_the_least_budget_is_accepted_and_is_the_least(full: float, fraction: float):
     """It pays for the coarse pass, and one step of the last digit less does not."""
     assert check_budget(1.0, 56.93, 200.0) == pytest.approx(143.07)
-    least = least_budget(full * fraction, full)
+    with pytest.raises(BudgetError) as refused:
+        check_budget(fraction / 2, full * fraction, full)
+    least = float(str(refused.value).split("the least possible is ")[1].split(",")[0])
     assert 0 <= check_budget(min(least, 1.0), full * fraction, full) <= full * 1.01e-4
     with pytest.raises(BudgetError, match=f"the least possible is {least}"):
         check_budget(least - 1.01e-4, full * fraction, full)
+
+
+SCORES = st.lists(st.sampled_from([0.0, 1.0, 2.0, -1.0, np.nan, np.inf, -np.inf]), min_size=1, max_size=30)
+
+
+@given(SCORES, st.data())
+def test_a_smaller_choice_is_the_beginning_of_a_larger_one(values: list[float], data: st.DataObject):
+    """Top K lies in top K + 1, whatever the scores, and no patch comes twice."""
+    large = data.draw(st.integers(0, len(values)))
+    small = data.draw(st.integers(0, large))
+    chosen = select_patches(np.array(values), large)
+    assert select_patches(np.array(values), small).tolist() == chosen[:small].tolist()
+    assert len(set(chosen.tolist())) == large
+
+
+def test_only_valid_patches_are_chosen():
+    """Masked patches are neither chosen nor counted, however good."""
+    valid = np.array([False, True, True, False])
+    assert select_patches(np.array([9.0, 1, 2, 9]), 2, valid).tolist() == [2, 1]
+    with pytest.raises(BudgetError, match="from 0 to 2, got 3"):
+        select_patches(np.array([9.0, 1, 2, 9]), 3, valid)
+
+
+@given(st.floats(0, 1), st.integers(0, 500))
+def test_counts_follow_fractions(fraction: float, valid: int):
+    """The count is within half a patch of the fraction and within the patches."""
+    count = len(frame_patches(np.zeros(valid), fraction))
+    assert abs(count - fraction * valid) <= 0.5 + 1e-9
+    assert 0 <= count <= valid
+
+
+def test_frame_mode_counts_valid_patches_only():
+    """35 % of 20 valid patches are 7, whatever the padded grid holds."""
+    valid = np.arange(64) < 20
+    assert len(frame_patches(np.arange(64.0), 0.35, valid)) == 7

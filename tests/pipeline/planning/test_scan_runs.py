@@ -92,7 +92,7 @@ PRICES = ScanPrices(line_s=1.0, run_s=3.0, reload_s=0.0, lines_per_reload=1500)
 patch_index = partial(blocks, prices=PRICES, lines=4)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(st.integers(1, 8), st.integers(1, 9), st.integers(2, 4), st.integers(0, 99), st.floats(0.01, 2))
 def test_worth_and_price_are_those_of_the_runs(rows: int, columns: int, most: int, seed: int, rate: float):
     """Each patch that a run shows counts once; runs of a strip lie apart; the net is never below that of no runs."""
@@ -107,7 +107,7 @@ def test_worth_and_price_are_those_of_the_runs(rows: int, columns: int, most: in
     assert cover.expected_gain - rate * cover.even_s >= 0
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(st.integers(0, 99), st.floats(0.02, 1), st.floats(0.02, 1))
 def test_a_cheaper_second_buys_more(seed: int, one: float, other: float):
     """Begun from the cover of a dearer second, the cover of a cheaper one has as much worth or more."""

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Axis, Sweep
 from pipeline.planning.coverage import on_scene
-from pipeline.rectify.geolocation import grid_points
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
+from pipeline.rectify.placed import PixelGrid
 from pipeline.rectify.resample import resample
 from pipeline.signal.calibrate import calibrate
 from pipeline.simulator.rig_model import Rig
@@ -101,7 +101,8 @@ def rectified_swath(scene: Waves, swath: float, along: Axis, *, step: int, kerne
         inside = on_scene(scene.shape, CAMERA, sweep)
         values[~inside], valid = np.nan, valid & inside
     origin = (step - scene.shape[0]) / 2, (step - scene.shape[1]) / 2
-    points = grid_points(origin, step, (scene.shape[0] // step, scene.shape[1] // step)).reshape(-1, 2)
+    rows, columns = scene.shape[0] // step, scene.shape[1] // step
+    points = PixelGrid(origin, step, (rows, columns)).points(slice(0, rows), slice(0, columns)).reshape(-1, 2)
     at = geolocation(position, CAMERA, points, along=along, binning=step)
     return MosaicPart(*resample(values, valid, at, kernel), edge_distance(at, raw.shape[0], raw.shape[1]))
 

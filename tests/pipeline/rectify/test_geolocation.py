@@ -30,7 +30,7 @@ def see(position: np.ndarray, sample: np.ndarray, binning: int = 1) -> np.ndarra
 
 
 @given(st.floats(-5000, 5000), st.floats(-5000, 4600), st.sampled_from([1, 2, 4]), st.integers(0, 99))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_lookup_undoes_the_rays(swath: float, start: float, binning: int, seed: int) -> None:
     """What a sample between lines saw is found at that line and sample to 1e-7 px, anywhere in the disk."""
     rng = np.random.default_rng(seed)
@@ -42,7 +42,7 @@ def test_lookup_undoes_the_rays(swath: float, start: float, binning: int, seed: 
 
 
 @given(places, places, st.sampled_from(["x", "y"]), st.sampled_from([1, 4]), st.integers(0, 99))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_lookup_agrees_with_the_plan(swath: float, start: float, along: str, step: int, seed: int) -> None:
     """Where a planned sweep expects a point, the geolocation grid finds it from the mirror's positions alone."""
     sweep = Sweep("a", "coarse", along, swath, start, lines=30, step=step, binning=step)  # type: ignore[arg-type]
@@ -77,7 +77,7 @@ def test_points_off_the_sweep_are_nan() -> None:
 
 
 @given(st.floats(-5000, 5000), st.integers(0, 99))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_what_is_found_was_seen(swath: float, seed: int) -> None:
     """No point of a field wider than the mirror's disk is found where its ray did not pass."""
     scan = np.linspace(-5000, 4500, 300)
@@ -124,7 +124,7 @@ def test_linear_scene_comes_back_from_any_path(seed: int, amount: float, swath: 
 
 
 @given(st.integers(0, 999), st.floats(0, 0.45))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_knots_are_found_at_their_own_points(seed: int, amount: float) -> None:
     """A point that a line itself saw is found at this line or at another that saw it as well, on any path."""
     scan_path = wandering_scan_path(seed, amount)
@@ -196,7 +196,7 @@ def test_spacing_follows_the_path() -> None:
 
 
 @given(st.floats(-4500, 4500), st.floats(-4500, 4000), st.sampled_from(["x", "y"]), st.sampled_from([1.0, 3.0]))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_bound_holds_over_the_field(swath: float, start: float, along: str, spacing: float) -> None:
     """Anywhere in the field, in both orientations, the table keeps to its bound, and loses no pixel well inside."""
     scan_path = scan_path_of(swath, start + LINES)

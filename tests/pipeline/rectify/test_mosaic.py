@@ -46,7 +46,7 @@ def test_one_sweep_comes_back_bit_by_bit() -> None:
 
 
 @given(st.lists(st.integers(0, 10_000), min_size=1, max_size=4))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_spectra_are_convex_mixtures(seeds: list[int]) -> None:
     """Every blended value lies between the values that went in, and NaN marks exactly what no sweep reached."""
     parts = [part(seed) for seed in seeds]
@@ -193,7 +193,7 @@ class Numbered:
 
 
 @given(st.integers(0, LINES - 1), st.integers(1, LINES), st.integers(0, SAMPLES - 1), st.integers(1, SAMPLES))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_a_window_is_that_part_of_the_lines(first: int, count: int, left: int, width: int) -> None:
     """Any range of lines and samples comes back as it is, from however many blocks."""
     lines = Numbered()

@@ -118,14 +118,14 @@ def test_broad_image_is_the_mean_of_the_bands():
     holed = SimpleNamespace(
         sweep=sweep, references=lines.references, valid_line=kept, position=position, read=lines.read
     )
-    broad = BroadSweep.read(holed, CAMERA, bands=3)  # type: ignore[arg-type]
+    broad = BroadSweep.read(holed, CAMERA)  # type: ignore[arg-type]
     along, scan = sweep_to_scene(sweep, CAMERA)
     y, x = scan + (source.field_shape[0] - 1) / 2, along + (source.field_shape[1] - 1) / 2
     truth = seen_at(source.scene, y, x).mean(axis=-1)
     assert np.isnan(broad.image[7]).all()
     np.testing.assert_allclose(broad.image[kept], truth[kept], atol=2e-3)
     believed = np.arange(sweep.lines) != 9
-    doubted = BroadSweep.read(lines, CAMERA, bands=3, usable=believed)
+    doubted = BroadSweep.read(lines, CAMERA, usable=believed)
     np.testing.assert_array_equal(np.isnan(doubted.image).all(axis=1), ~believed)
 
 

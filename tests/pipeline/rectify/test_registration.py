@@ -60,7 +60,7 @@ def crop_rows(seed: int, shape: tuple[int, int], shift: np.ndarray, gaps: float,
 @pytest.mark.parametrize("periods", [(4, 40), (40, 400)])
 def test_narrow_overlaps_are_registered_to_a_tenth(periods: tuple[float, float]):
     """Over 64 px at a signal to noise of 50 the shift is found to 0.03 px, fine texture or broad."""
-    for seed in range(4):
+    for seed in range(2):
         shift = np.random.default_rng(seed).uniform(-6, 6, 2)
         found = pair_shift(*waves(seed, (512, 64), shift, 50, periods), prior_px=7)
         assert found.status == "found"
@@ -74,7 +74,7 @@ def test_gain_and_offset_do_not_matter():
     np.testing.assert_allclose(lit.shift, plain.shift, atol=1e-6)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(st.integers(-9, 9), st.integers(-9, 9), st.integers(0, 5))
 def test_whole_shifts_are_exact_and_swap_their_sign(down: int, right: int, seed: int):
     """Cuts of one image are a whole shift apart, to rounding; the other way round it is the opposite."""
@@ -87,7 +87,7 @@ def test_whole_shifts_are_exact_and_swap_their_sign(down: int, right: int, seed:
 
 def test_crop_rows_with_gaps_are_never_off_by_a_row():
     """The bare places tell which row is which; a shift of up to two rows is found right."""
-    for seed in range(12):
+    for seed in range(5):
         shift = np.random.default_rng(seed).uniform(-25, 25, 2)
         found = pair_shift(*crop_rows(seed, (256, 64), shift, gaps=0.2), prior_px=26)
         assert found.status == "found"
@@ -119,7 +119,7 @@ def test_error_is_the_scatter_of_the_shift():
 
 def test_negative_of_an_image_is_no_likeness():
     """An overlap that one sweep shows bright where the other shows it dark is not registered."""
-    for seed in range(4):
+    for seed in range(2):
         one, other = waves(seed, (128, 96), np.array([1.2, -0.7]), 50, (30, 300))
         assert pair_shift(one, other, prior_px=4).status == "found"
         assert pair_shift(one, -other, prior_px=4).status == "undecidable"
@@ -244,7 +244,7 @@ def cut(field: NDArray[np.float64], down: int = 0, across: int = 0) -> NDArray[n
     return field[30 - down : 150 - down, 30 - across : 180 - across]
 
 
-@settings(max_examples=6)
+@settings(max_examples=4)
 @given(seed=st.integers(0, 1000), down=st.integers(-11, 11), across=st.integers(-11, 11))
 def test_a_moved_field_is_found(seed: int, down: int, across: int) -> None:
     """To a tenth of a pixel, and not turned."""
@@ -254,8 +254,7 @@ def test_a_moved_field_is_found(seed: int, down: int, across: int) -> None:
     assert found.edge_px(SIZE) < 0.3
 
 
-@pytest.mark.parametrize("degrees", [-5.0, -2.0, 1.0, 3.0, 5.0])
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize(("seed", "degrees"), [(0, -5.0), (1, -2.0), (2, 1.0), (0, 3.0), (1, 5.0)])
 def test_a_turned_field_is_found(seed: int, degrees: float) -> None:
     """To a fifth of a degree, about its middle."""
     field = textured(seed, (180, 210))
@@ -265,7 +264,7 @@ def test_a_turned_field_is_found(seed: int, degrees: float) -> None:
     assert np.hypot(*found.shift) < 1.0
 
 
-@pytest.mark.parametrize("seed", [3, 4, 5])
+@pytest.mark.parametrize("seed", [3, 4])
 def test_what_changed_in_places_moves_nothing(seed: int) -> None:
     """A third of the field grown over by another, and noise everywhere."""
     field, rng = textured(seed), np.random.default_rng(seed)

@@ -57,7 +57,7 @@ def test_is_the_sum_written_out(kernel: Kernel, by_element: bool) -> None:
 
 
 @given(arrays(np.bool_, (9, 8)), st.floats(-1, 9), st.floats(-1, 8))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_constant_stays_constant_under_any_mask(valid: np.ndarray, line: float, sample: float) -> None:
     """Renormalised taps keep a constant, whichever samples are missing, or fail with weight 0."""
     values = np.full((9, 8, 2), 3.5, np.float32)
@@ -86,7 +86,7 @@ def test_catmull_rom_keeps_parabolas() -> None:
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-@pytest.mark.parametrize("bands", [1, 3, 300])
+@pytest.mark.parametrize("bands", [1, 80])
 def test_result_does_not_depend_on_the_blocks(kernel: Kernel, bands: int) -> None:
     """All points at once, each alone and in any order give the same bits: whole windows, borders and masks alike."""
     rng = np.random.default_rng(13)
@@ -99,19 +99,6 @@ def test_result_does_not_depend_on_the_blocks(kernel: Kernel, bands: int) -> Non
     np.testing.assert_array_equal(shuffled_fraction, fraction[order])
     for point in (*range(60), BLOCK_PX - 1, BLOCK_PX, len(at) - 1):
         np.testing.assert_array_equal(resample(values, valid, at[point : point + 1], kernel)[0], out[[point]])
-
-
-def test_raw_numbers_come_back_as_they_are() -> None:
-    """Nearest takes uint16 and gives the same uint16; 0 with no share where the sweep has nothing."""
-    values = np.random.default_rng(14).integers(0, 65_536, (6, 7, 3), dtype=np.uint16)
-    valid = np.ones((6, 7), bool)
-    valid[2, 2] = False
-    out, fraction = resample(values, valid, np.concatenate([everywhere(6, 7, 0.3), [[-3, 0], [np.nan, 1]]]), "nearest")
-    assert out.dtype == np.uint16
-    np.testing.assert_array_equal(out[:42].reshape(6, 7, 3)[valid], values[valid])
-    failed = [2 * 7 + 2, 42, 43]
-    assert np.flatnonzero(fraction == 0).tolist() == failed
-    assert not out[failed].any()
 
 
 def test_dwell_is_the_mean_of_its_valid_lines() -> None:
@@ -143,7 +130,7 @@ def test_dwell_by_element() -> None:
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("kind", [np.float32, np.uint16])
 def test_what_stands_at_an_invalid_element_does_not_matter(kernel: Kernel, kind: type[np.generic]) -> None:
-    """Zero, which spares a copy, and any other number at invalid elements give the same; nothing is written."""
+    """Zero and any other number at invalid elements give the same; nothing is written."""
     rng = np.random.default_rng(19)
     values, valid = rng.integers(1, 60_000, (9, 9, 3)).astype(kind), rng.random((9, 9, 3)) > 0.1
     kept, at = values.copy(), rng.uniform(-0.4, 8.4, (100, 2))

@@ -20,7 +20,7 @@ def members(scan_path: ScanPath) -> list[np.ndarray]:
 
 
 @given(STEPS, st.integers(0, 99))
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_every_usable_line_is_on_one_knot(steps: list[float], seed: int) -> None:
     """On any path each usable line is a member of one seen knot, at the mean of its members, and knots ascend."""
     position = aim(30.0, np.concatenate([[0.0], np.cumsum(steps)]))
@@ -39,7 +39,7 @@ def test_every_usable_line_is_on_one_knot(steps: list[float], seed: int) -> None
 
 
 @given(STEPS)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_no_gap_wider_than_a_step_and_a_half_is_left(steps: list[float]) -> None:
     """Neighbouring knots are at most 1.5 steps apart: where lines are missing knots that nothing saw stand in."""
     for scan_path in make_scan_paths(aim(0.0, np.concatenate([[0.0], np.cumsum(steps)])), CAMERA, step_px=1.0):
@@ -141,7 +141,7 @@ def test_line_out_of_reach_is_named() -> None:
 
 
 @given(st.lists(st.integers(0, 400), min_size=2, max_size=60, unique=True), st.floats(0.97, 1.03), st.integers(0, 99))
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_numbers_are_those_of_the_lines_that_came(lines: list[int], pace: float, seed: int) -> None:
     """Whatever frames are lost, with a clock off by 3 % and jitter of a tenth, short gaps are counted exactly."""
     came = np.sort(lines)

@@ -14,7 +14,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.rectify.kernels import kernel_taps
 from pipeline.rectify.mosaic import cut_runs
-from pipeline.rectify.placed import PixelGrid, Placed, ScanPathReach, place
+from pipeline.rectify.placed import PixelGrid, PlacedSweep, ScanPathReach, place
 from pipeline.rectify.region import cache_bytes, mosaic_tile, plan_tiles
 from pipeline.signal.lines import LineCache
 from pipeline.source import References
@@ -70,7 +70,7 @@ def taken(sweep: Sweep, *, bands: int = 3, seed: int = 0, kind: type[Taken] = Ta
 
 
 def in_tiles(
-    placed: list[Placed], grid: PixelGrid, shape: tuple[int, int], cache: LineCache | None = None
+    placed: list[PlacedSweep], grid: PixelGrid, shape: tuple[int, int], cache: LineCache | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """A grid's values and coverage, made in tiles of this shape."""
     values = np.zeros((*grid.shape, len(placed[0].lines.references.white_reference)), np.float32)
@@ -90,7 +90,7 @@ def partly_lit(lines: Taken) -> Taken:
     return replace(lines, references=replace(lines.references, white=white))
 
 
-def two_turned(grid: PixelGrid | None) -> list[Placed]:
+def two_turned(grid: PixelGrid | None) -> list[PlacedSweep]:
     """Two overlapping sweeps of turned lines with all kinds of faults, one by a slit lit in parts."""
     other = replace(TURNED, name="other", swath_px=-4600.0, start_px=3010.0)
     gain = np.array([1.0, 0.9, 1.1], np.float32)
@@ -101,7 +101,7 @@ def two_turned(grid: PixelGrid | None) -> list[Placed]:
 
 
 @given(st.tuples(st.integers(5, 90), st.integers(5, 140)), st.booleans(), st.booleans())
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=4, deadline=None)
 def test_any_tiling_gives_the_same_bits(shape: tuple[int, int], tied: bool, cached: bool) -> None:
     """Turned lines, an overlap, dead lines, bad and unlit elements: every tiling gives what one tile gives."""
     grid = PixelGrid(CORNER, 1, (90, 140))
@@ -165,7 +165,7 @@ def test_only_chunks_of_samples_that_a_column_needs_are_read() -> None:
 
 
 @given(st.integers(-100, 300), st.integers(-250, 250), st.integers(1, 60), st.integers(1, 60))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_reach_is_never_too_little(row: int, column: int, height: int, width: int) -> None:
     """All knots and samples at which pixels are looked up, with a margin for taps, are among those foretold."""
     grid = PixelGrid(CORNER, 1, (400, 400))

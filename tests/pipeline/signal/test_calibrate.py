@@ -13,9 +13,13 @@ from numpy.typing import NDArray
 
 from pipeline.errors import PoseError, RigError, ShapeError
 from pipeline.geometry.mirror import mirror_throughput
-from pipeline.signal.calibrate import calibrate, judge_elements, reflectance
-from pipeline.signal.detector import BadElementCriteria, find_bad_elements
+from pipeline.signal.calibrate import calibrate, find_bad_elements
 from pipeline.source import References
+
+
+def reflectance(raw: NDArray[np.uint16], references: References, position: object = None) -> NDArray[np.float32]:
+    """Scene values without saturation."""
+    return calibrate(raw, references, saturated_dn=np.inf, position=position)[0]
 
 
 def frames(samples: int = 4, bands: int = 3) -> References:
@@ -101,33 +105,6 @@ def test_bad_elements_are_filled_from_near() -> None:
     assert np.isnan(values[0, 11:13, 1]).all()
 
 
-@given(st.integers(0, 99), st.integers(0, 39), st.integers(1, 40))
-def test_some_samples_under_the_judgement_of_all(seed: int, first: int, count: int) -> None:
-    """Samples calibrated by themselves, grown by what fills them, are what they are within the whole line."""
-    rng = np.random.default_rng(seed)
-    white = np.where(rng.random((40, 5)) < 0.3, 60, 1060).astype(np.float32)
-    references = replace(frames(40, 5), white=white, bad=rng.random((40, 5)) < 0.2)
-    elements = judge_elements(references)
-    wanted = slice(first, min(first + count, 40))
-    grown = elements.alone(wanted)
-    raw = rng.integers(0, 4096, (3, 40, 5), dtype=np.uint16)
-    values, valid = calibrate(raw, references, saturated_dn=4000)
-    some, known = calibrate(raw[:, grown], elements.part(grown), saturated_dn=4000)
-    here = slice(wanted.start - grown.start, wanted.stop - grown.start)
-    np.testing.assert_array_equal(some[:, here], values[:, wanted])
-    by_element = (mask if mask.ndim == 3 else np.repeat(mask[..., None], 5, axis=2) for mask in (known, valid))
-    np.testing.assert_array_equal(*(mask[:, part] for mask, part in zip(by_element, (here, wanted), strict=True)))
-
-
-def test_filled_from_beyond_a_part_is_out() -> None:
-    """Of samples taken without those that fill them, the elements to be filled are out and NaN."""
-    bad = np.zeros((6, 3), np.bool_)
-    bad[2, 1] = True
-    part = judge_elements(replace(frames(6), bad=bad)).part(slice(2, 5))
-    values, valid = calibrate(np.full((1, 3, 3), 500, np.uint16), part, saturated_dn=4095)
-    assert np.argwhere(np.isnan(values)).tolist() == np.argwhere(~valid).tolist() == [[0, 0, 1]]
-
-
 @given(arrays(np.bool_, (5, 4)), st.integers(0, 9))
 def test_bad_elements_change_nothing_else(bad: NDArray[np.bool_], seed: int) -> None:
     """Good elements keep their values; a sample is out when more than half of its bands are bad."""
@@ -162,8 +139,6 @@ def test_lines_without_a_position_are_out() -> None:
     assert valid.tolist() == [[True] * 4, [False] * 4]
     with pytest.raises(PoseError, match="needs the lines' mirror positions"):
         calibrate(raw, references, saturated_dn=4095)
-    with pytest.raises(ShapeError, match="each of 2 lines"):
-        reflectance(raw, references, position=np.zeros((3, 2)))
 
 
 def test_blocks_do_not_show() -> None:
@@ -232,9 +207,8 @@ def test_saturated_white_is_bad() -> None:
 
 
 def test_more_than_a_detector_can_have_is_refused() -> None:
-    """Frames that would put out too many elements are named as the fault; the limit can be set."""
+    """Frames that would put out too many elements are named as the fault."""
     dark, white = simulated()
     white[4::9] = dark[4::9]
     with pytest.raises(RigError, match=r"1[01]\.\d % of the elements look bad, at most 5 % can be"):
         find_bad_elements(dark, white)
-    assert find_bad_elements(dark, white, criteria=BadElementCriteria(most=0.2))[4::9].all()

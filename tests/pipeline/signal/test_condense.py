@@ -35,7 +35,7 @@ def condensed() -> tuple[Field, SignalStatistics, Components]:
     return made, found, find_components(found)
 
 
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(seed=SEEDS)
 def test_scores_with_missing_bands_are_those_of_least_squares(seed: int) -> None:
     """Whichever bands are missing, up to half of them, numpy's least squares over the others gives the same scores."""
@@ -276,7 +276,7 @@ def test_missing_bands_have_no_residual(condensed: tuple) -> None:
 
 
 @given(seed=SEEDS, step=st.sampled_from([1.5, 3.0, 6.0]), shape=st.tuples(*[st.integers(0, 13)] * 2, st.integers(0, 3)))
-@settings(max_examples=40)
+@settings(max_examples=20)
 def test_coarse_steps_keep_the_means_of_blocks(seed: int, step: float, shape: tuple[int, int, int]) -> None:
     """No score is off by more than a step, and the mean of a whole block of 4 x 4 by more than 1/32 of one."""
     scores = np.random.default_rng(seed).normal(0, 4, shape).astype(np.float32)

@@ -22,7 +22,7 @@ from pipeline.signal.subspace import (
 )
 from tests.pipeline.signal.made_spectra import field_of, marked, restored, scored, statistics_of, with_noise
 
-FALSE_ALARM, TRIALS = 0.1, 120
+FALSE_ALARM, TRIALS = 0.1, 60
 
 
 @settings(max_examples=12)
@@ -41,6 +41,26 @@ def test_statistics_do_not_depend_on_how_many_lines_come_at_a_time(cuts: list[in
     np.testing.assert_allclose(other.mean, one.mean, rtol=1e-6)
     np.testing.assert_allclose(other.noise, one.noise, rtol=1e-4)
     np.testing.assert_allclose(other.axes.T @ other.axes, one.axes.T @ one.axes, atol=1e-4)
+
+
+def test_merged_statistics_are_those_of_all_lines() -> None:
+    """Two passes of different brightness have together the mean, moments and largest values of one after the other."""
+    values = field_of(3, (64, 40), 9).values
+    values[32:] += 0.5
+    passes = [statistics_of(values[:32]), statistics_of(values[32:])]
+    merged, whole = passes[0].merged(passes[1]), statistics_of(values)
+    assert (merged.count, merged.means) == (whole.count, whole.means)
+    assert merged.origin is not None
+    assert whole.origin is not None
+    for total, products, count in (("total", "single", merged.count), ("block_total", "block", merged.means)):
+        one, other = (getattr(found, total) / count + found.origin for found in (merged, whole))
+        np.testing.assert_allclose(one, other, rtol=1e-5)
+        one, other = (
+            getattr(found, products) / count - np.outer(getattr(found, total), getattr(found, total)) / count**2
+            for found in (merged, whole)
+        )
+        np.testing.assert_allclose(one, other, atol=1e-4 * np.abs(other).max())
+    np.testing.assert_allclose(np.sort(merged.spectra, axis=0), np.sort(whole.spectra, axis=0), atol=1e-5)
 
 
 @pytest.mark.parametrize("bands", [2, 12])

@@ -10,9 +10,17 @@ from numpy.typing import NDArray
 
 from pipeline.signal.calibrate import calibrate
 from pipeline.signal.components import Components
-from pipeline.signal.condense import RESIDUAL_STEP, UNUSABLE, ResidualLaw, whole_steps
+from pipeline.signal.condense import (
+    RESIDUAL_STEP,
+    UNUSABLE,
+    CondensedSweep,
+    Condenser,
+    LineStatistics,
+    ResidualLaw,
+    differing_lines,
+    whole_steps,
+)
 from pipeline.signal.subspace import SignalStatistics, find_components
-from pipeline.signal.sweep_signal import CondensedSweep, Condenser, LineStatistics, differing_lines
 from pipeline.source import Line
 from tests.pipeline.signal.made_spectra import CAMERA, MadeLines, field_of, raw_of
 

@@ -16,9 +16,8 @@ from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.mirror import mirror_throughput
 from pipeline.signal.calibrate import calibrate
 from pipeline.signal.components import Components
-from pipeline.signal.condense import RESIDUAL_STEP, ResidualLaw
+from pipeline.signal.condense import RESIDUAL_STEP, CondensedSweep, Condenser, ResidualLaw, differing_lines
 from pipeline.signal.subspace import SignalStatistics, find_components
-from pipeline.signal.sweep_signal import CondensedSweep, Condenser, differing_lines
 from storage.arrays.cubes import SweepHeader
 from storage.arrays.layout import read_array
 from storage.arrays.signal_cubes import (

@@ -1,0 +1,99 @@
+"""Passes over one swath: later lines lie between those of the first, and are read in the order of their places."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep, line_positions
+from pipeline.planning.partial_scans import every_nth, lines_between
+from pipeline.rectify.placed import PixelGrid
+from pipeline.rectify.sweep_paths import capture_numbers, interlaced_paths, sweep_paths
+from pipeline.signal.components import Components
+from pipeline.source import References
+
+CAMERA = LineCamera()
+SCALE = 8  # steps of a stored score for a pixel along the scan
+FIRST = every_nth([Sweep("full-0", "fine", "x", 0.0, -40.0, 81)], 4, 50.0)  # lines at -40, -36 ... 40
+RUN = Sweep("fine-0", "fine", "x", 0.0, -20.0, 21)
+ONE = Components(np.zeros(1), np.eye(1), np.ones(1))
+
+
+@dataclass(frozen=True)
+class PlaceLines:
+    """Condensed lines whose score is their own place along the scan."""
+
+    sweep: Sweep
+    source: str = "sim"
+    step: float = 1 / SCALE
+    components: Components = ONE
+
+    @cached_property
+    def references(self) -> References:
+        frame = np.zeros((CAMERA.samples, 1), np.float32)
+        return References(frame, frame + 1, frame[0] + 1)
+
+    @cached_property
+    def position(self) -> NDArray[np.float64]:
+        return line_positions(self.sweep, CAMERA)
+
+    @cached_property
+    def time_s(self) -> NDArray[np.float64]:
+        return 0.1 * np.arange(self.sweep.lines)
+
+    @cached_property
+    def valid_line(self) -> NDArray[np.bool_]:
+        return np.ones(self.sweep.lines, np.bool_)
+
+    @cached_property
+    def usable(self) -> NDArray[np.bool_]:
+        return np.ones((self.sweep.lines, CAMERA.samples), np.bool_)
+
+    def read(self, start: int, stop: int) -> NDArray[np.int32]:
+        places = np.rint(self.sweep.line_px()[start:stop] * SCALE).astype(np.int32)
+        return np.repeat(places[:, None, None], CAMERA.samples, axis=1)
+
+
+@pytest.mark.parametrize("step", [1, 2])
+def test_later_lines_and_those_of_the_first_pass_are_one_sweep(step: int) -> None:
+    """The run has every line of its distance once, in order, with its own place, time and score."""
+    later = lines_between([RUN], FIRST, step=step, exposure_ms=100.0)
+    lines = [PlaceLines(sweep) for sweep in (*later, *FIRST)]
+    placed = interlaced_paths(sweep_paths(lines, CAMERA), CAMERA)
+    assert [one.lines.sweep.kind for one in placed] == ["coarse", "fine"]
+    run = placed[1].lines
+    assert (run.sweep.step, run.sweep.start_px, run.sweep.lines) == (step, -20.0, 20 // step + 1)
+    here = np.arange(-20, 1, step)
+    np.testing.assert_array_equal(run.read(0, len(here))[:, 5, 0], here * SCALE)
+    np.testing.assert_array_equal(run.read(3, 7)[:, 5, 0], here[3:7] * SCALE)
+    wanted = Sweep("run", "fine", "x", 0.0, -20.0, len(here), step, held=1)
+    np.testing.assert_allclose(run.position, line_positions(wanted, CAMERA), atol=1e-12)
+    first = np.isin(here, FIRST[0].line_px())
+    assert run.sweep.exposure_ms == pytest.approx(1 / np.where(first, 1 / 50.0, 1 / 100.0).mean())
+
+
+def test_the_closest_lines_take_a_pixel() -> None:
+    """Pixels within the run are of its lines, all others of the first pass."""
+    lines = [PlaceLines(sweep) for sweep in (*FIRST, *lines_between([RUN], FIRST))]
+    placed = interlaced_paths(sweep_paths(lines, CAMERA), CAMERA)
+    number = capture_numbers(placed, CAMERA, PixelGrid((-38.0, -50.0), 1, (76, 100)))
+    assert number.shape == (76, 100)
+    assert (number[20:36] == 1).all()
+    assert (number[:16] == 0).all()
+    assert (number[42:] == 0).all()
+
+
+def test_corrections_come_back_by_name() -> None:
+    """A record's offset, drift and gain are those of its sweep; other sweeps have none."""
+    found = {"coarse-0": {"offset_px": [1.0, -2.0], "drift_px_per_line": [0.0, 0.1], "gain": [2.0]}}
+    one, other = sweep_paths([PlaceLines(FIRST[0]), PlaceLines(RUN)], CAMERA, found)
+    np.testing.assert_allclose(one.shift_px[[0, -1]], [[1, -3], [1, -1]])
+    assert one.gain is not None
+    assert one.gain.tolist() == [2.0]
+    assert other.gain is None
+    assert not other.shift_px.any()
