@@ -17,8 +17,7 @@ import torch.nn.functional as F  # noqa: N812 - its usual name
 from numpy.typing import NDArray
 from torch import Tensor
 
-from models.network.layers import cut
-from models.network.segmenter import Segmenter
+from models.network.segmenter import Segmenter, cut
 from models.network.sizes import MOST_GAIN, SegmenterConfig
 from models.training.examples import Batch
 from pipeline.geometry.grid import UNLABELLED

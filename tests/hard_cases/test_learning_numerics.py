@@ -13,8 +13,7 @@ from torch import nn
 
 from models.evaluation.metrics import mean_iou
 from models.evaluation.placement import captured_gain, gain_sums, oracle_gain
-from models.network.layers import ChannelNorm, TokenAttention
-from models.network.segmenter import Segmenter
+from models.network.segmenter import ChannelNorm, Segmenter, TokenAttention
 from models.network.sizes import MOST_GAIN, PLANES, SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
 from models.reading.inference import coarse_prediction_of_columns

@@ -17,17 +17,11 @@ import torch
 from torch import Tensor
 
 from models.evaluation.metrics import average_accuracy, confusion, iou_per_class, kappa, mean_iou, overall_accuracy
-from models.network.layers import Encoder, code_2d, cut
+from models.network.segmenter import Encoder, code_2d, cut
 from models.network.sizes import PLANES, SegmenterConfig
 from models.network.spectral import LineSpec, Normalisation, with_planes
 from models.policies.policies import pixel_entropy, score_patches
-from models.reading.inference import (
-    CoarsePrediction,
-    check_patch_index,
-    coarse_prediction,
-    coarse_prediction_of_columns,
-    segment,
-)
+from models.reading.inference import CoarsePrediction, check_patch_index, coarse_prediction_of_columns, segment
 from models.training import train as training
 from models.training.examples import Example
 from models.training.objective import class_weights, draw_patches, map_loss, phase_at, pixel_losses
@@ -35,7 +29,7 @@ from models.training.train import TrainingSettings, train
 from models.weights.files import load_weights, save_weights
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.selection import frame_patches, select_patches
-from tests.models.conftest import SMALL, make_network, noise, plain_weights
+from tests.models.conftest import SMALL, coarse_prediction, make_network, noise, plain_weights
 
 NONE = torch.zeros(1, 0, dtype=torch.int64)
 PLACE = torch.zeros(1, 2)

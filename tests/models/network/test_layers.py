@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.network.layers import Encoder, Head, Stem, cut, joined
+from models.network.segmenter import Encoder, Head, Stem, cut, joined
 from models.network.sizes import level_widths
 from tests.models.conftest import noise
 

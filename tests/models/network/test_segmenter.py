@@ -7,14 +7,12 @@ import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 
-from models.network.layers import cut
-from models.network.segmenter import PatchScorer, Segmenter
+from models.network.segmenter import PatchScorer, Segmenter, cut
 from models.network.sizes import PLANES, SegmenterConfig
 from models.policies.policies import score_patches
-from models.reading.inference import coarse_prediction
 from models.training.objective import scoring_loss
 from pipeline.geometry.grid import SceneGrid
-from tests.models.conftest import SMALL, Maker, make_network, noise
+from tests.models.conftest import SMALL, Maker, coarse_prediction, make_network, noise
 
 IMAGE = noise(0, 1, 4 + PLANES, 64, 96)  # 2 x 3 tokens, 8 x 12 patches
 

@@ -14,7 +14,6 @@ from models.reading import inference
 from models.reading.inference import (
     CoarsePass,
     CoarsePrediction,
-    coarse_prediction,
     coarse_prediction_of_columns,
     coarse_prediction_of_patches,
     draw,
@@ -26,7 +25,7 @@ from models.reading.inference import (
 from models.weights.files import Weights, with_record
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
-from tests.models.conftest import Maker, noise, plain_weights, scene_columns
+from tests.models.conftest import Maker, coarse_prediction, noise, plain_weights, scene_columns
 
 NM = np.linspace(400, 1000, 9)
 NONE = np.empty(0, np.int64)
