@@ -13,7 +13,7 @@ from sklearn.linear_model import LogisticRegression
 from flows.training.data import Report
 from models.evaluation.metrics import confusion, mean_iou
 from models.training.examples import Example
-from models.training.spectral_start import LabelledPixels
+from models.training.start import LabelledPixels
 
 
 def judge_baselines(

@@ -19,8 +19,8 @@ from flows.terminal.progress import one_after_the_other
 from flows.training.data import Report, TrainingData, open_training_data, read_farm_name
 from flows.training.figures import judge_scans
 from flows.training.train_scenes import TrainRequest, as_read, observe_all
-from models.reading.inference import map_of_columns
 from models.evaluation.metrics import JudgedMap, judge_confidence
+from models.reading.inference import map_of_columns
 from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from models.training.examples import Example
 from models.training.ood_fit import fit_ood

@@ -26,8 +26,7 @@ from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation
 from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from models.training.examples import Example, measured_normalisation
-from models.training.spectral_start import LabelledPixels, better_reading, linear_discriminants
-from models.training.start_weights import Start, StartFile
+from models.training.start import LabelledPixels, Start, StartFile, better_reading, linear_discriminants
 from models.training.train import Progress, train
 from models.weights.checksummed_files import read_checkpoint
 from models.weights.files import CALIBRATION, CASCADE, Weights, save_weights, with_record

@@ -48,9 +48,7 @@ class CoarsePass:
     capture: Capture = field(default=LineSpec(), kw_only=True)
     origin: tuple[int, int] = field(default=(0, 0), kw_only=True)  # row and column of its first patch in the field
     living: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (token,) tokens that are read; None: all
-    out_of_range: NDArray[np.bool_] | None = field(
-        default=None, kw_only=True
-    )  # (y, x) of the scene: captured, invalid
+    out_of_range: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (y, x) of the scene: captured, invalid
     filled: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (y, x) pixels without data; None: no pixel
 
     @property

@@ -29,7 +29,7 @@ from flows.training.train import joined_split, run_train, train_weights
 from flows.training.train_scenes import TrainRequest, observe_all, suggested_patch
 from models.evaluation.expected_scores import MapScores
 from models.training.examples import Example
-from models.training.start_weights import StartFile
+from models.training.start import StartFile
 from models.training.train import TrainingSettings
 from models.weights.files import describe_weights, load_ood, load_weights
 from models.weights.parts import TrainedOn

@@ -82,7 +82,7 @@ def test_a_damaged_checkpoint_is_refused(tmp_path: Path, damage: str) -> None:
     assert changed != raw
     file.write_bytes(changed)
     for identity in ("x", "another"):
-        with pytest.raises(WeightsError, match=r"the state of training in .*/c cannot .*; bring back .* or del"):
+        with pytest.raises(WeightsError, match=r"the checkpoint .*/c cannot be resumed.*; restore .* or del"):
             load_checkpoint(file, identity)
     assert file.read_bytes() == changed
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from models.network.spectral import Normalisation, SpectralBasis
-from models.training.start_weights import StartFile, column_change
+from models.training.start import StartFile, column_change
 from models.weights.files import Weights, save_weights
 from pipeline.errors import SettingsError, WeightsError
 from tests.models.conftest import Maker
