@@ -17,9 +17,9 @@ from flows.terminal.progress import table
 SHOWN_FRACTION = 0.10  # of the patches: the nearest fraction judged is in the table of classes
 CAPTION = (
     "K: fraction of the valid patches. mIoU: of the counts of all frames, mean over the classes of the labels. "
-    "overall: fraction of right pixels. ±: standard deviation over seeds, else over random draws. [ ]: 95 % of {draws} draws, "
-    "paired bootstrap over frames, and over seeds if there are several. * uses labels. captured: gain of the chosen "
-    "patches over that of the oracle's. MACs: multiply-adds a frame."
+    "overall: fraction of right pixels. ±: standard deviation over seeds, else over random draws. [ ]: 95 % of "
+    "{draws} draws, paired bootstrap over frames, and over seeds if there are several. * uses labels. captured: gain "
+    "of the chosen patches over that of the oracle's. MACs: multiply-adds a frame."
 )
 
 

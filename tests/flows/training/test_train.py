@@ -22,8 +22,8 @@ from flows.tasks.run import open_run
 from flows.tasks.survey_model import shipped_weights
 from flows.training import train as flow
 from flows.training import train_scenes
-from flows.training.baselines import judge_baselines
 from flows.training.data import pack_mask, unpack_mask
+from flows.training.figures import judge_baselines
 from flows.training.fit_ood import OodRequest, measure_ood
 from flows.training.train import joined_split, run_train, train_weights
 from flows.training.train_scenes import TrainRequest, observe_all, suggested_patch
@@ -278,7 +278,7 @@ def test_frames_that_the_start_has_seen_validate_nothing(
     if fraction == "in part":
         masks = {key: pack_mask(np.eye(16, dtype=bool)) for key in split["train"].values()}
         monkeypatch.setattr(StartFile, "earlier", property(lambda file: {"split": {**split, "pixels": masks}}))
-    with pytest.raises(SettingsError, match="was trained on the scene 001, which is kept for validation"):
+    with pytest.raises(SettingsError, match="was trained on the scene 001, which is for validation"):
         train_weights(_begun(folder, out, validation=1, init=earlier))
 
 
@@ -341,7 +341,7 @@ def test_weights_that_will_choose_no_scan_say_so(folder: Path, out: Path, darkes
     shown, settings = io.StringIO(), replace(SETTINGS, darkest_ms=darkest_ms)
     request = _request(folder, out, validation=0, settings=settings)
     run_train(request, Console(file=shown, width=100))
-    assert ("nor has the file a record of uniform scans" in shown.getvalue()) == said
+    assert ("the file has no scan performance" in shown.getvalue()) == said
 
 
 def test_whitening_knows_the_noise_of_short_exposures(folder: Path, out: Path):
