@@ -1,7 +1,7 @@
 """Choose the frames on which weights are judged: those whose labels they were not trained on.
 
-With frames held out in turn (folds) each file is judged on its own held-out frames, and not on its validation frames,
-which another file holds out.
+With frames held out in turn (folds) each file is judged on its own held-out frames. Its validation frames are held out
+by another file.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class Candidate:
             raise WeightsError(f"{self.path}: its camera is damaged ({error}); copy or train the file again") from error
 
     def trained_on(self, scene: RasterScene, name: str, law: str, *, bands_chosen: bool = False) -> bool:
-        """Return whether all labels of the scene were used to train these weights.
+        """Return whether these weights were trained on all labels of the scene.
 
         The key of a scene depends on its bands. If bands or wavelengths were chosen, here or in the training, a frame
         of the data set ``law`` is also recognised by its name.

@@ -136,7 +136,7 @@ def file_data(files: DataSet, validation: int, camera: LineCamera) -> TrainingDa
 def _labelled_names(files: DataSet) -> tuple[str, ...]:
     names = tuple(name for name in files.train_names if name not in files.unlabelled)
     if not names:
-        raise SceneError(f"{files.path}: {'; '.join(files.notes)}; of those that are held out none can be trained on")
+        raise SceneError(f"{files.path}: {'; '.join(files.notes)}; held-out scenes cannot be trained on")
     return names
 
 
@@ -145,7 +145,7 @@ def open_training_data(
 ) -> TrainingData:
     """Open built-in scenes, separated by commas, or a path with the choices of `load_data_set`.
 
-    By default one scene in eight (at most 4) is for validation. Raises SettingsError: a choice of files for built-in
+    One scene in eight (at most 4) is for validation by default. Raises SettingsError: a choice of files for built-in
     scenes, or the other way round.
     """
     if laws := built_in_laws(dataset):

@@ -104,7 +104,7 @@ def _label_lines(draft: SceneDraft) -> list[str]:
     if draft.pattern is None:
         pair = next(iter(labels.items()))
         return [
-            f"# {len(labels)} of {len(images)} images have labels, found by their names: {printable(pair[0].name)}"
+            f"# labels of {len(labels)} of {len(images)} images were found by their names: {printable(pair[0].name)}"
             f" has {printable(pair[1].name)}"
         ]
     return [f"labels = {_quoted(draft.pattern)}   # of {len(labels)} of {len(images)} images"]
@@ -128,7 +128,7 @@ def _wavelength_lines(draft: SceneDraft) -> list[str]:
 def _value_lines(draft: SceneDraft) -> list[str]:
     lines = []
     if draft.missing:
-        lines.append(f"# {draft.missing:.1%} of the inspected values are NaN, and count as missing")
+        lines.append(f"# NaN counts as missing: {draft.missing:.1%} of the inspected values")
     if draft.nodata is not None:
         lines.append(f"# the file states that {draft.nodata:g} is nodata")
     elif draft.edge is not None:

@@ -1,6 +1,6 @@
 """Image scenes for training and evaluation by every line, as spectral features.
 
-Built-in farms are captured by the simulated rig as in a survey: effects are chosen by the defaults, and the full scan
+Built-in farms are captured by the simulated rig as in a survey. Effects are chosen by the defaults, and the full scan
 is rendered, calibrated and rectified. Scene files are images of a camera already: they pass only the footprint and
 noise of `models.training.examples.observe`.
 """

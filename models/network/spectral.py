@@ -49,7 +49,7 @@ class SpectralBasis:
         """Return weights from bands to columns, (band, column), and which columns a band reaches, (column,).
 
         Weights of a reached column sum to 1, others are 0. A band is weighted by its width (trapezoid rule on the
-        sorted wavelengths): 15 or 270 bands give columns of the same scale, and repeated bands share their weight.
+        sorted wavelengths). So 15 or 270 bands give columns of the same scale, and repeated bands share a weight.
 
         Raises WavelengthError for a wavelength that is not finite, or outside 200-3000 nm (micrometres?).
         """

@@ -29,11 +29,11 @@ def score_patches(
 
     ``policy`` is one of `POLICIES`:
 
-    - ``gain``: expected gain, by the weights;
-    - ``entropy``: of the class probabilities;
-    - ``sobel``: edges of the coarse image (the paper's ED);
-    - ``random``: by ``seed``;
-    - ``mask``: a (y, x) image of the scene's size (the paper's fixed attention policy); NaN counts as 0.
+    - ``gain``: Expected gain, by the weights.
+    - ``entropy``: Entropy of the class probabilities.
+    - ``sobel``: Edges of the coarse image (the paper's ED).
+    - ``random``: Random numbers by ``seed``.
+    - ``mask``: A (y, x) image of the scene's size (the paper's fixed attention policy); NaN counts as 0.
 
     Raises SettingsError for an unknown policy, or ``mask`` without a mask; ShapeError for a mask of another size.
     """

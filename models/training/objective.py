@@ -2,7 +2,7 @@
 
 A crop is segmented by the overview alone, and with a fraction of the patches drawn from ``FRACTIONS``. The scorer
 learns the decrease of the loss at a labelled patch. There are three phases. Patches are placed at random and by the
-entropy of the overview; then also by the scorer; then in larger crops, of which a batch has fewer.
+entropy of the overview. Later they are also placed by the scorer. At last crops are larger and batches smaller.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def scoring_loss(score: Tensor, gain: Tensor, known: Tensor | None = None) -> Te
     """Return the loss of scores (B, K) against gains (B, K), in size and order.
 
     It is Huber's loss plus, with a fifth of the weight, that of pairs in the wrong order. Patches that are not
-    ``known`` (B, K) have no label and are left out; without a known one it is 0, with a gradient of 0.
+    ``known`` (B, K) have no label and are left out. Without a known one the loss and its gradient are 0.
     """
     known_gain = torch.ones_like(score, dtype=torch.bool) if known is None else known
     if not known_gain.any():

@@ -162,7 +162,7 @@ class Trainer:
         save_checkpoint(path, identity, {"course": asdict(self.course), "rng": self.rng.bit_generator.state}, tensors)
 
     def resume(self, path: Path, identity: str) -> bool:
-        """Load a checkpoint of the same run; return False where there is none, or its shapes differ."""
+        """Load a checkpoint of the same run; return False where there is none."""
         found = load_checkpoint(path, identity)
         if found is None:
             return False
@@ -176,9 +176,6 @@ class Trainer:
                 state.setdefault(int(number), {})[moment] = tensor
             else:
                 parts[part][rest] = tensor
-        own = {name: tensor.shape for name, tensor in self.model.state_dict().items()}
-        if any({name: tensor.shape for name, tensor in part.items()} != own for part in parts.values()):
-            return False
         self.model.load_state_dict(parts["model"])
         self.averaged.load_state_dict(parts["averaged"])
         groups = self.optimiser.state_dict()["param_groups"]

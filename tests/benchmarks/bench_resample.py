@@ -1,56 +1,69 @@
-"""Resampling: cost beside a copy of the same rows, beside other libraries, and beside the order-3 spline."""
+"""Resampling: the cost of each kernel beside a copy of the same rows.
+
+`spectralzoom tradeoff rectify` measures the errors of the kernels.
+"""
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Callable
+from typing import Any, get_args
 
 import numpy as np
-import torch
-from beside.resample_peers import BANDS, Peer, Turned, cv2_parts, peers, spline, turned_waves
-from measure import Row, Timing, ratio, time_in_turn
+from measure import Row, ratio, time_in_turn
 from numpy.typing import NDArray
 
+from flows.tradeoff.stages import draw_waves
+from models.network.machine import one_thread
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.resample import resample
 
-KERNELS: dict[Kernel, tuple[int, str]] = {
-    "nearest": (0, "nearest"),
-    "bilinear": (1, "linear"),
-    "catmull-rom": (3, "cubic"),
-}
+SIDE, BANDS, EDGE = 256, 270, 176  # of the sweep, of the output grid inside it
+TURN_DEG = 14.0
 BLOCK = 2048
-ALIKE = 1.001  # errors that differ by less are those of rounding
-ROUNDS = 3
-TILES = 3  # in a row, as a worker does them
+TILES, ROUNDS = 3, 7
+MOST = 3.0  # of the time of a copy, for Catmull-Rom
 
 
 def rows() -> list[Row]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what the other libraries warn of
-            natural, flat = turned_waves(1), turned_waves(0)
-            beside = [row for kernel in KERNELS for row in _beside_peers(kernel, natural, flat)]
-            beside += [*_over_linear(natural, flat), _beside_spline(natural)]
-        return [*_over_take(natural), *beside]
-    finally:
-        torch.set_num_threads(before)
+    """Time all kernels and a copy of the nearest rows, on a grid turned by 14 degrees against the sweep."""
+    samples, coordinates = turned_grid()
+    out = np.empty((len(coordinates), BANDS), np.float32)
+    valid = np.ones(samples.shape[:2], bool)
+    calls: dict[str, Callable[[], Any]] = {"take": _take(samples, coordinates, out)}
+    for kernel in get_args(Kernel):
+        calls[kernel] = lambda kernel=kernel: resample(samples, valid, coordinates, kernel, out=out)
+    with one_thread():
+        clocks = time_in_turn({name: _repeated(call) for name, call in calls.items()}, ROUNDS)
+    ns = {name: clock.cpu_min_s / (TILES * out.size) * 1e9 for name, clock in clocks.items()}
+    found = []
+    for kernel in get_args(Kernel):
+        times, goal = ratio(clocks, kernel, "take"), MOST if kernel == "catmull-rom" else None
+        found.append(
+            Row(
+                f"{kernel}, {BANDS} bands, over np.take of the same rows",
+                f"{times:.2f} x",
+                f"<= {goal:g} x" if goal else "",
+                times <= goal if goal else None,
+                f"{ns[kernel]:.2f} ns/(px*band), np.take {ns['take']:.2f}",
+            )
+        )
+    return found
 
 
-def _call(scene: Turned, kernel: Kernel, out: NDArray[Any] | None = None, valid: Any = None) -> Callable[[], Any]:
-    valid = np.ones(scene.samples.shape[:2], bool) if valid is None else valid
-    return lambda: resample(scene.samples, valid, scene.coordinates, kernel, out=out)
+def turned_grid() -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Return samples (line, sample, band) of waves of 4 to 40 px, and coordinates (y * x, 2) of the turned grid."""
+    cos, sin = np.cos(np.deg2rad(TURN_DEG)), np.sin(np.deg2rad(TURN_DEG))
+    turn, middle = np.array([[cos, -sin], [sin, cos]]), np.array([SIDE / 2 + 0.2, SIDE / 2 - 0.3])
+    coordinates = (np.argwhere(np.ones((EDGE, EDGE), bool)) - (EDGE - 1) / 2) @ turn.T + middle
+    lines = np.argwhere(np.ones((SIDE, SIDE), bool)).astype(np.float64)
+    return draw_waves(0, BANDS, (4.0, 40.0)).at(lines).astype(np.float32).reshape(SIDE, SIDE, BANDS), coordinates
 
 
-def _take(scene: Turned, out: NDArray[np.float32]) -> Callable[[], None]:
-    """Copy each point's nearest row in blocks; mode="clip", for numpy copies once more in its default."""
-    table = scene.samples.reshape(-1, scene.samples.shape[2])
-    line, sample = np.rint(scene.coordinates).astype(np.intp).T
-    index = line * scene.samples.shape[1] + sample
+def _take(samples: NDArray[np.float32], coordinates: NDArray[np.float64], out: NDArray[np.float32]) -> Any:
+    """Copy each point's nearest row in blocks; mode="clip" avoids a second copy by numpy."""
+    table = samples.reshape(-1, samples.shape[2])
+    line, sample = np.rint(coordinates).astype(np.intp).T
+    index = line * samples.shape[1] + sample
 
     def call() -> None:
         for start in range(0, len(index), BLOCK):
@@ -59,124 +72,9 @@ def _take(scene: Turned, out: NDArray[np.float32]) -> Callable[[], None]:
     return call
 
 
-def _ns(clock: Timing, values: int) -> float:
-    return clock.cpu_min_s / values * 1e9
-
-
-def _over_take(scene: Turned) -> list[Row]:
-    """Each kernel over a copy of the same rows, on a sweep larger than the cache and on one that stays in it."""
-    out = np.empty(scene.truth.shape, np.float32)
-    calls = {"take": _take(scene, out)} | {kernel: _call(scene, kernel, out) for kernel in KERNELS}
-    clocks = time_in_turn({name: _often(call, TILES) for name, call in calls.items()}, 7)
-    take = _ns(clocks["take"], TILES * out.size)
-    found = []
-    for kernel in KERNELS:
-        times, goal = ratio(clocks, kernel, "take"), 3.0 if kernel == "catmull-rom" else None
-        found.append(
-            Row(
-                f"{kernel}, {BANDS} bands, over np.take of the same rows",
-                f"{times:.2f} x",
-                f"<= {goal:g} x" if goal else "",
-                times <= goal if goal else None,
-                f"{_ns(clocks[kernel], TILES * out.size):.2f} ns/(px*band), np.take {take:.2f}",
-            )
-        )
-    return [*found, _over_take_cached(scene)]
-
-
-def _over_take_cached(scene: Turned) -> Row:
-    """A corner of the sweep again and again: np.take then copies from cache to cache, which 16 taps cannot follow."""
-    middle, near = slice(100, 156), (np.abs(scene.coordinates - 127.5) < 20).all(axis=1)
-    samples, coordinates = np.ascontiguousarray(scene.samples[middle, middle]), scene.coordinates[near] - middle.start
-    small = replace(scene, samples=samples, coordinates=coordinates, truth=scene.truth[near])
-    out = np.empty(small.truth.shape, np.float32)
-    once = {"take": _take(small, out), "ours": _call(small, "catmull-rom", out)}
-    clocks = time_in_turn({name: _often(call, 20) for name, call in once.items()}, 5)
-    ours, take = (_ns(clocks[name], 20 * out.size) for name in ("ours", "take"))
-    return Row(
-        f"catmull-rom, {BANDS} bands, the same with rows and result in the cache",
-        f"{ratio(clocks, 'ours', 'take'):.2f} x",
-        peers=f"{ours:.2f} ns/(px*band), np.take {take:.2f}",
-    )
-
-
-def _often(call: Callable[[], Any], times: int) -> Callable[[], None]:
+def _repeated(call: Callable[[], Any]) -> Callable[[], None]:
     def repeated() -> None:
-        for _ in range(times):
+        for _ in range(TILES):
             call()
 
     return repeated
-
-
-def _beside_peers(kernel: Kernel, natural: Turned, flat: Turned) -> list[Row]:
-    """Time and error of one order, ours to used memory beside those that are given some, to fresh beside the rest."""
-    order, name = KERNELS[kernel]
-    others, out = peers(natural, order), np.empty(natural.truth.shape, np.float32)
-    ours = {"warm": _call(natural, kernel, out), "fresh": _call(natural, kernel)}
-    clocks = time_in_turn(ours | {peer.name: peer.call for peer in others}, ROUNDS)
-    warm, fresh = (_ns(clocks[memory], out.size) for memory in ours)
-    theirs = {peer.name: _ns(clocks[peer.name], peer.bands * len(natural.truth)) for peer in others}
-    met = all((warm if peer.warm else fresh) < theirs[peer.name] for peer in others)
-    listed = _listed(theirs, "{:.3g}") + _prepared(others, natural)
-    found = [
-        Row(f"{name}: ns/(px*band), given memory / fresh", f"{warm:.2f} / {fresh:.2f}", "less than each", met, listed)
-    ]
-    for what, scene, there in (("amplitude as period", natural, others), ("all waves alike", flat, peers(flat, order))):
-        error = scene.error(_call(scene, kernel)()[0])
-        errors = {peer.name: scene.error(peer.by_pixel(peer.call())) for peer in there}
-        met, listed = all(error <= other * ALIKE for other in errors.values()), _listed(errors, "{:.4f}")
-        found.append(Row(f"{name}: rmse / std, {what}", f"{error:.4f}", "no larger than each", met, listed))
-    return found
-
-
-def _over_linear(natural: Turned, flat: Turned) -> list[Row]:
-    """Catmull-Rom beside cv2's linear."""
-    found = []
-    for what, scene in (("amplitude as period", natural), ("all waves alike", flat)):
-        linear = peers(scene, 1, only="cv2.remap")[0]
-        ours, theirs = scene.error(_call(scene, "catmull-rom")()[0]), scene.error(linear.by_pixel(linear.call()))
-        listed = f"{ours:.4f}, cv2 linear {theirs:.4f}"
-        fraction = ours / theirs
-        found.append(
-            Row(
-                f"catmull-rom: error over cv2.remap linear, {what}",
-                f"{fraction:.3f}",
-                "<= 1/3",
-                fraction <= 1 / 3,
-                listed,
-            )
-        )
-    out = np.empty(natural.truth.shape, np.float32)
-    calls = {"ours": _call(natural, "catmull-rom", out), "joined": peers(natural, 1, only="cv2.remap")[0].call}
-    calls["parted"] = cv2_parts(natural, 1)
-    clocks = time_in_turn({name: _often(call, TILES) for name, call in calls.items()}, 7)
-    times, parted = ratio(clocks, "ours", "joined"), ratio(clocks, "ours", "parted")
-    listed = f"{times:.2f} x with its three parts of 90 bands joined, {parted:.2f} x with them left apart"
-    return [*found, Row("catmull-rom: time over cv2.remap linear", f"{times:.2f} x", "< 1 x", times < 1, listed)]
-
-
-def _beside_spline(natural: Turned) -> Row:
-    smooth = spline(natural)
-    clocks = time_in_turn({"ours": _call(natural, "catmull-rom"), "spline": smooth.call}, ROUNDS)
-    ours, theirs = _ns(clocks["ours"], natural.truth.size), _ns(clocks["spline"], smooth.bands * len(natural.truth))
-    errors = natural.error(_call(natural, "catmull-rom")()[0]), natural.error(smooth.by_pixel(smooth.call()))
-    return Row(
-        "catmull-rom beside the order-3 spline",
-        f"{ours:.2f} ns, {errors[0]:.4f}",
-        peers=f"scipy spline {theirs:.0f} ns, {errors[1]:.4f}",
-    )
-
-
-def _listed(figures: Mapping[str, float], form: str) -> str:
-    return ", ".join(f"{name} {form.format(figure)}" for name, figure in figures.items())
-
-
-def _prepared(others: Sequence[Peer], scene: Turned) -> str:
-    """What is not in the times: the building of an index, per output pixel."""
-    before = {f"{peer.name}'s index": peer.prepare for peer in others if peer.prepare}
-    if not before:
-        return ""
-    clocks = time_in_turn(before, 1)
-    return "; not counted: " + _listed(
-        {name: _ns(clock, len(scene.truth)) for name, clock in clocks.items()}, "{:.0f} ns/px"
-    )

@@ -7,13 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from models.network.segmenter import Segmenter
 from models.network.sizes import PLANES, SegmenterConfig
 from models.network.spectral import LineSpec
 from models.reading.inference import map_of_columns
-from models.training import objective
 from models.training import train as training
 from models.training.examples import CropSampler
 from models.training.objective import batch_loss, class_weights, draw_patches, map_loss, phase_at, pixel_losses
@@ -163,23 +161,3 @@ def test_unlabelled_pixels_have_no_say():
     assert map_loss(other, pixel_losses(other, labels), labels, torch.ones(3), soft_dice=True).item() == pytest.approx(
         loss.item(), abs=1e-6
     )
-
-
-def test_the_scorer_is_told_of_labelled_patches_alone(monkeypatch: pytest.MonkeyPatch):
-    """A patch with one labelled pixel is told of; one with none is not said to gain nothing."""
-    told: list[tuple[Tensor, ...]] = []
-
-    def scoring(*given: Tensor) -> Tensor:
-        told.append(given)
-        return given[0].sum() * 0
-
-    monkeypatch.setattr(objective, "scoring_loss", scoring)
-    monkeypatch.setattr(objective, "draw_patches", lambda *_: torch.arange(16)[None])
-    batch = CropSampler([block_example()], 8, 16).draw(1, np.random.default_rng(0), SHIFT)
-    batch.labels[:] = 255
-    batch.labels[0, 3, 12] = 1
-    with torch.no_grad():
-        batch_loss(Segmenter(CONFIG), batch, torch.ones(3), np.random.default_rng(0), phase_at(0.0), soft_dice=False)
-    score, gain, known = told[0]
-    assert score.shape == gain.shape == known.shape
-    assert known.tolist() == [[number == 1 for number in range(16)]]
