@@ -93,3 +93,10 @@ def test_the_same_seed_draws_the_same():
     first, second = _frames(1, 9, 1), _frames(1, 9, 2)
     same = [paired_interval(first, second, draws=60, seed=seed) for seed in (3, 3, 4)]
     assert same[0] == same[1] != same[2]
+
+
+def test_bounds_are_those_of_95_percent_of_the_draws():
+    """One of three frames is better: all draws take it in 1 of 27, which is more than 2.5 % and less than 5 %."""
+    poor, good = [[10, 0], [10, 0]], [[10, 0], [0, 10]]
+    found = paired_interval(np.array([[good, poor, poor]]), np.array([[poor, poor, poor]]))
+    assert (found.low, found.high) == (0.0, pytest.approx(1 - 0.25))
