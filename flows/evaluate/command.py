@@ -1,14 +1,10 @@
-"""`spectralzoom evaluate`: weights judged on frames that they were not trained on, with intervals and costs."""
+"""Run `spectralzoom evaluate`: judge weights on frames that they were not trained on, with intervals and costs."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import sys
-import zlib
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
@@ -18,9 +14,9 @@ from flows.evaluate.frames import (
     EvaluateRequest,
     Show,
     checked_request,
+    observe_frame,
     open_candidates,
     open_frames,
-    see_frame,
     sort_frames,
 )
 from flows.evaluate.judge import Record, Trial, judge_frame, seeds_of, summarise
@@ -28,10 +24,9 @@ from flows.terminal.processes import writing
 from flows.terminal.progress import StageProgress, on_stdout
 from flows.training.data import TrainingData, alike_notes, scene_notes
 from models.evaluation.metrics import LEVEL
-from models.network.machine import PROCESSOR, choose_device, keep_freed_memory
+from models.network.machine import choose_device, keep_freed_memory
 from models.weights.files import Weights, load_weights
 from pipeline.lazy import deferred
-from pipeline.simulator.scenes.scene import RasterScene
 from storage.archive.whole_files import to_json, write_whole
 
 if TYPE_CHECKING:
@@ -41,13 +36,11 @@ else:
     table = deferred("flows.evaluate.table")  # matplotlib
     panels = deferred("flows.publish.panels")
 
-KEPT_VERSION = 5  # of what a kept result says
-
 
 def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = False) -> dict[str, Any]:
-    """Judge with progress on ``console``; figures as a table or JSON on stdout, and all of them into the folder."""
+    """Judge with progress on ``console``; print the figures as a table or JSON, and write them to the folder."""
     with StageProgress(console) as progress:
-        content = evaluate_weights(request, lambda what, done, words: progress.show(what, done, words))
+        content = evaluate_weights(request, progress.show)
     if as_json:
         sys.stdout.write(to_json(content))
     else:
@@ -62,8 +55,8 @@ def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = 
 def evaluate_weights(request: EvaluateRequest, show: Show = lambda what, done, words: None) -> dict[str, Any]:
     """Judge weights on every frame of a data set that they were not trained on.
 
-    Raises SettingsError: shares, policies or weights that cannot be; SceneError: no frame is left, one that was asked
-    for by name has no weights left, or one has no labels.
+    Raises SettingsError: invalid fractions, policies or weights; SceneError: no frame is left, a named frame has no
+    weights left, or a frame has no labels.
     """
     request = checked_request(request)
     keep_freed_memory()
@@ -71,10 +64,10 @@ def evaluate_weights(request: EvaluateRequest, show: Show = lambda what, done, w
     data = open_frames(request.dataset, request.frames, request.scenes, candidates[0].camera, request.choices)
     if request.out is not None:
         with writing(request.out):
-            request.out.mkdir(parents=True, exist_ok=True)  # before minutes are spent on what cannot be kept
+            request.out.mkdir(parents=True, exist_ok=True)  # fails before minutes are spent
     jobs = sort_frames(request, data, candidates, show)
     trial = Trial(request.fractions, request.policies, request.seed)
-    runs = _judged(request, data, candidates, jobs.frames, trial, show)
+    runs = _judge_frames(request, data, candidates, jobs.frames, trial, show)
     names = [*jobs.frames, *jobs.left_out]
     asked = {**asdict(trial), "draws": request.draws, "level": LEVEL}
     content = {
@@ -105,7 +98,7 @@ def evaluate_weights(request: EvaluateRequest, show: Show = lambda what, done, w
     return content
 
 
-def _judged(
+def _judge_frames(
     request: EvaluateRequest,
     data: TrainingData,
     candidates: Sequence[Candidate],
@@ -113,54 +106,17 @@ def _judged(
     trial: Trial,
     show: Show,
 ) -> list[list[Record]]:
-    """Judge every frame by its weights, of each weights the records; what was kept is not made again."""
+    """Judge every frame by its weights; return the records of each of the weights."""
     device, loaded = choose_device(request.device), dict[int, Weights]()
-    kept = KeptResults(None if request.out is None else request.out / "frames")
     runs: list[list[Record]] = [[] for _ in candidates]
-    for number, (name, fit) in enumerate(frames.items()):
+    for number, (name, judges) in enumerate(frames.items()):
         scene = data.scene(name)
-        for at, index in enumerate(fit):
+        for at, index in enumerate(judges):
             one = candidates[index]
-            show("judging frames", (number + at / len(fit)) / len(frames), f"{name}, {one.path.name}")
-
-            def judged(
-                scene: RasterScene = scene, index: int = index, one: Candidate = one, name: str = name
-            ) -> Record:
-                if index not in loaded:
-                    loaded[index] = load_weights(one.path).on(device)
-                seen = see_frame(scene, name, loaded[index], one.camera, request.seed)
-                return judge_frame(trial, seen, loaded[index])
-
-            # the farm's labels follow from its key and are not drawn for this
-            labels = None if data.files is None or scene.labels is None else zlib.crc32(scene.labels.tobytes())
-            follows_from = {
-                **{"weights": one.key, "frame": name, "scene": scene.key, "labels": labels, **asdict(trial)},
-                "camera": asdict(one.camera),
-                **({} if device == PROCESSOR else {"device": device}),
-            }
-            runs[index].append(kept.made(follows_from, judged))
+            show("judging frames", (number + at / len(judges)) / len(frames), f"{name}, {one.path.name}")
+            if index not in loaded:
+                loaded[index] = load_weights(one.path).on(device)
+            observed = observe_frame(scene, name, loaded[index], one.camera, request.seed)
+            runs[index].append(judge_frame(trial, observed, loaded[index]))
     show("judging frames", 1.0, f"{len(frames)} frames")
     return runs
-
-
-@dataclass(frozen=True)
-class KeptResults:
-    """A folder of results by their inputs: a run that was killed continues. Without a folder nothing is kept."""
-
-    folder: Path | None
-
-    def made(self, follows_from: Record, make: Callable[[], Record]) -> Record:
-        """Give the result that was kept, or make it and keep it: whole or not at all. A damaged one is made again."""
-        if self.folder is None:
-            return make()
-        text = json.dumps([KEPT_VERSION, follows_from], sort_keys=True)
-        path = self.folder / f"{hashlib.sha256(text.encode()).hexdigest()[:20]}.json"
-        try:
-            known: Record = json.loads(path.read_text(encoding="utf-8"))["result"]
-            return known
-        except (OSError, ValueError, LookupError, TypeError):
-            result = make()
-        with writing(self.folder):
-            self.folder.mkdir(parents=True, exist_ok=True)
-        write_whole(path, json.dumps({"follows_from": follows_from, "result": result}))
-        return result

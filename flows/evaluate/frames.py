@@ -1,7 +1,7 @@
-"""Frames and weights of `spectralzoom evaluate`: which weights are judged on which frames.
+"""Choose the frames on which weights are judged: those whose labels they were not trained on.
 
-Each frame is judged by those that never saw its labels. Of frames left out in turn each file is judged on its own: what
-it kept for validation is held out by another of them.
+With frames held out in turn (folds) each file is judged on its own held-out frames. Its validation frames are held out
+by another file.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from pipeline.simulator.scenes.built_in import built_in_laws
 from pipeline.simulator.scenes.scene import RasterScene
 
 FRACTIONS = (0.05, 0.10, 0.15, 0.20, 0.35)
-JUDGED = tuple(name for name in POLICIES if name != "mask")  # that needs a file of one's own
+JUDGED = tuple(name for name in POLICIES if name != "mask")  # needs a file
 USUAL = ("gain", "entropy", "sobel", "random")
 
 
@@ -45,23 +45,23 @@ class EvaluateRequest:
     out: Path | None = None
     fractions: tuple[float, ...] = FRACTIONS
     policies: tuple[str, ...] = USUAL
-    frames: tuple[str, ...] = ()  # all, without one
+    frames: tuple[str, ...] = ()  # empty: all
     scenes: int | None = None  # of the built-in farm
     seed: int = 0
     draws: int = DRAWS
     choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths
-    device: str = PROCESSOR  # where the networks of surveys compute; or auto
+    device: str = PROCESSOR  # or auto
 
 
 def checked_request(request: EvaluateRequest) -> EvaluateRequest:
-    """Put shares in order, drop what is there anyway, and refuse what cannot be judged (SettingsError, its flag)."""
+    """Sort fractions and drop those that are always judged. Raises SettingsError for invalid values."""
     for fraction in request.fractions:
         if not 0 <= fraction <= 1:
             raise SettingsError(f"--fractions are fractions of the patches from 0 to 1 (0.1 is 10 %), got {fraction:g}")
     for policy in request.policies:
         if policy not in JUDGED and policy != "oracle":
             raise SettingsError(
-                f"--policies: {policy!r} is none that can be judged on a data set; choose of {', '.join(JUDGED)}"
+                f"--policies: {policy!r} cannot be judged on a data set; choose from {', '.join(JUDGED)}"
             )
     for flag, value, least in (("--seed", request.seed, 0), ("--draws", request.draws, 1)):
         if value < least:
@@ -76,7 +76,7 @@ FARM_TEST_SCENES = 4
 
 @dataclass(frozen=True)
 class Candidate:
-    """Weights to judge: the file's name, what it says of itself, and a hash of its bytes."""
+    """Weights to judge: their file, its description and hash."""
 
     path: Path
     described: Description
@@ -84,7 +84,7 @@ class Candidate:
 
     @staticmethod
     def of(path: Path) -> Candidate:
-        """Describe a file; WeightsError where it cannot be read. None of its tensors is read yet."""
+        """Read the description of a file. Raises WeightsError."""
         described = describe_weights(path)
         return Candidate(path, described, described.key[:16])
 
@@ -97,10 +97,10 @@ class Candidate:
             raise WeightsError(f"{self.path}: its camera is damaged ({error}); copy or train the file again") from error
 
     def trained_on(self, scene: RasterScene, name: str, law: str, *, bands_chosen: bool = False) -> bool:
-        """Return whether labels of the scene taught these weights; not so where a mask kept some of its pixels out.
+        """Return whether these weights were trained on all labels of the scene.
 
-        Seen in other bands a scene has another identity: where bands or wavelengths were given, here or to the
-        training, a frame of the data set ``law`` is also told by its name.
+        The key of a scene depends on its bands. If bands or wavelengths were chosen, here or in the training, a frame
+        of the data set ``law`` is also recognised by its name.
         """
         train, record = self.split.get("train", {}), self.described.record
         if scene.key in train.values():
@@ -109,25 +109,25 @@ class Candidate:
         return chosen and record.get("data") == law and name in train
 
     def pixels_of(self, scene: RasterScene) -> str | None:
-        """Return the pixels of a scene that these weights were trained on, packed; None where it was all of them."""
+        """Return the packed mask of a scene's training pixels; None for all pixels."""
         pixels: str | None = self.split.get("pixels", {}).get(scene.key)
         return pixels
 
     @property
     def held_out(self) -> tuple[str, ...]:
-        """Frames of its data set that were kept from training by name."""
+        """Return the frames held out of the training."""
         return tuple(self.split.get("held_out", ()))
 
     @property
     def split(self) -> dict[str, Any]:
-        """Return what training saw, validated on and left out."""
+        """Return the training, validation and held-out scenes of the record."""
         split: dict[str, Any] = self.described.record.get("split", {})
         return split
 
 
 @dataclass(frozen=True)
-class SeenFrame:
-    """One frame in the spectral features of certain weights, with their coarse prediction."""
+class ObservedFrame:
+    """One frame in the spectral features of some weights, with their coarse prediction."""
 
     name: str
     seen: CoarsePrediction
@@ -137,10 +137,10 @@ class SeenFrame:
 
 
 def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
-    """Describe the weights; none of their tensors is read yet.
+    """Read the descriptions of the weights.
 
-    Raises SettingsError: none given, or weights that are not seeds of one another: other sizes or classes;
-    WeightsError: a file that cannot be read.
+    Raises SettingsError: no weights, or weights of different cameras, sizes or classes; WeightsError: a file cannot be
+    read.
     """
     if not paths:
         raise SettingsError("evaluate needs --weights FILE; train some with: spectralzoom train DATASET -o FILE")
@@ -149,13 +149,13 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
     for other in found[1:]:
         if other.camera != found[0].camera:
             raise SettingsError(
-                f"{other.path} was trained through another camera than {found[0].path}; evaluate them one by one"
+                f"{other.path} and {found[0].path} were trained with different camera models; evaluate them separately"
             )
         described = other.described
         if (described.config, described.class_names) != (first.config, first.class_names):
             raise SettingsError(
                 f"{other.path} differs from {found[0].path} in sizes or classes; several --weights are seeds of one "
-                "training: evaluate different ones one by one"
+                "training: evaluate different ones separately"
             )
     if len({one.key for one in found}) < len(found):
         raise SettingsError("the same weights are given twice in --weights, which would count as two seeds")
@@ -165,7 +165,7 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
 def open_frames(
     dataset: str, frames: tuple[str, ...], scenes: int | None, camera: LineCamera, choices: dict[str, Any]
 ) -> TrainingData:
-    """Name the frames to judge on, in ``train``. SettingsError: choices of other data, SceneError: no such frame."""
+    """Return the data with the frames to judge in ``train``. Raises SettingsError, or SceneError: no such frame."""
     built_in = bool(built_in_laws(dataset))
     data = open_training_data(dataset, 0, 1 if built_in else scenes, camera, **choices)
     if built_in:
@@ -180,8 +180,8 @@ def open_frames(
     return TrainingData(data.law, names, (), (), data.camera, data.files, data.notes)
 
 
-def see_frame(scene: RasterScene, name: str, weights: Weights, camera: LineCamera, seed: int) -> SeenFrame:
-    """Look at a frame with the camera of the training; the noise follows from the seed and the frame's name."""
+def observe_frame(scene: RasterScene, name: str, weights: Weights, camera: LineCamera, seed: int) -> ObservedFrame:
+    """Image a frame by the camera of the training; the noise depends on the seed and the frame's name."""
     config = weights.config
     grid = SceneGrid(*scene.shape, config.patch, 1)
     rng = np.random.default_rng([seed, 0xE7A1, zlib.crc32(name.encode())])
@@ -192,7 +192,7 @@ def see_frame(scene: RasterScene, name: str, weights: Weights, camera: LineCamer
     assert labels is not None  # sort_frames
     seen = coarse_prediction_of_columns(weights, example.columns, grid)
     fine = patches_of(example.columns, config.patch).astype(np.float32)
-    return SeenFrame(name, seen, fine, labels, len(scene.wavelength_nm))
+    return ObservedFrame(name, seen, fine, labels, len(scene.wavelength_nm))
 
 
 Show = Callable[[str, float, str], None]
@@ -200,23 +200,24 @@ Show = Callable[[str, float, str], None]
 
 @dataclass(frozen=True)
 class Jobs:
-    """Frames to judge with the numbers of the weights that judge them, and those that all weights were trained on."""
+    """Frames with the indices of their weights, and frames that all weights were trained on."""
 
     frames: dict[str, tuple[int, ...]] = field(default_factory=dict)
     left_out: list[str] = field(default_factory=list)
-    alike: dict[str, str] = field(default_factory=dict)  # frame -> class, where all its labels are one
-    empty: list[str] = field(default_factory=list)  # frames left out, which have no value anywhere
+    alike: dict[str, str] = field(default_factory=dict)  # frame -> class, for frames with a single class
+    empty: list[str] = field(default_factory=list)  # frames without any value, left out
     regridded: list[str] = field(default_factory=list)  # frames whose labels came on another grid
 
     def covered(self, number: int) -> list[str]:
+        """Return the frames that these weights judge."""
         return [name for name, fit in self.frames.items() if number in fit]
 
 
 def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[Candidate], show: Show) -> Jobs:
-    """Sort the frames by the weights that were not trained on them.
+    """Assign to each frame the weights that were not trained on it.
 
-    Raises SceneError: no frame or no labelled pixel is left, a frame that was asked for by name has no weights left, or
-    a frame that cannot be judged; SettingsError: files that were trained on different pixels of one frame.
+    Raises SceneError: no frame or labelled pixel is left, a named frame has no weights left, or a frame has no labels;
+    SettingsError: weights were trained on different pixels of a frame.
     """
     jobs, labelled = Jobs(), False
     chosen = any(request.choices.get(what) is not None for what in ("bands", "wavelengths"))
@@ -230,7 +231,7 @@ def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[
             continue
         if scene.labels is None:
             raise SceneError(
-                f"frame {scene.name} has no labels, and a map is judged by labels: give --labels or a scene.toml"
+                f"frame {scene.name} has no labels, which a map is judged by; give --labels or a scene.toml"
             )
         if (alone := only_class(scene)) is not None:
             jobs.alike[name] = alone
@@ -251,8 +252,8 @@ def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[
         for one in (weights[at] for at in fit[1:]):
             if one.pixels_of(scene) != first.pixels_of(scene):
                 raise SettingsError(
-                    f"{one.path} and {first.path} were trained on different pixels of {scene.name}, so that others "
-                    "are left to judge each of them on; evaluate them one by one"
+                    f"{one.path} and {first.path} were trained on different pixels of {scene.name}; evaluate them "
+                    "separately"
                 )
         jobs.frames[name] = tuple(fit)
         if scene.regridded:

@@ -1,8 +1,7 @@
-"""One frame judged by one set of weights, and the figures of many: means over seeds, intervals over frames and seeds.
+"""Judge a frame by some weights, and summarise many: means over seeds, intervals over frames and seeds.
 
-A record holds plain lists and numbers: counts of labels and map by every policy at each fraction of the patches, which
-add up over frames, and what each map costs. Weights of frames left out in turn have no frame in common: together they
-are one seed of the training, judged on all of their frames. Weights that share a frame are different seeds.
+A record has the confusion counts and costs of every policy at each fraction of the patches. Weights without a common
+frame are folds of one training and count as one seed. Weights that share a frame are different seeds.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.evaluate.frames import SeenFrame
+from flows.evaluate.frames import ObservedFrame
 from models.evaluation.metrics import (
     average_accuracy,
     confusion,
@@ -41,7 +40,7 @@ PatchIndex = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class Trial:
-    """Shares of the patches and policies to try on every frame; no patch, every patch and the oracle are always there.
+    """Fractions of the patches and policies to judge, beside no patch, all patches and the oracle.
 
     The oracle chooses by the labels.
     """
@@ -51,12 +50,12 @@ class Trial:
     seed: int = 0
 
 
-def judge_frame(trial: Trial, frame: SeenFrame, weights: Weights) -> Record:
-    """Judge the map of every row, with its multiply-adds."""
+def judge_frame(trial: Trial, frame: ObservedFrame, weights: Weights) -> Record:
+    """Return the confusion counts, gain and multiply-adds of every policy and fraction."""
     grid = frame.seen.grid
     gain = oracle_gain(weights, frame.seen, frame.fine, frame.labels)
     rows = []
-    for policy, draw, fraction, patch_index in _placed(trial, frame, gain):
+    for policy, draw, fraction, patch_index in _rows(trial, frame, gain):
         scored = 0 if policy in (*ENDS, ORACLE) else score_multiply_adds(policy, weights.config, grid)
         bought, best = gain_sums(gain, patch_index, grid.valid_patches())
         drawn = segment(weights, frame.seen, frame.fine[patch_index], patch_index).classes
@@ -74,8 +73,10 @@ def judge_frame(trial: Trial, frame: SeenFrame, weights: Weights) -> Record:
     return {"frame": frame.name, "shape": [grid.height, grid.width], "rows": rows}
 
 
-def _placed(trial: Trial, frame: SeenFrame, gain: NDArray[np.float64]) -> Iterator[tuple[str, int, float, PatchIndex]]:
-    """Give (policy, draw, share, patches) of each row; chance is drawn several times."""
+def _rows(
+    trial: Trial, frame: ObservedFrame, gain: NDArray[np.float64]
+) -> Iterator[tuple[str, int, float, PatchIndex]]:
+    """Yield policy, draw, fraction and patches of each row; the random policy has several draws."""
     allowed = frame.seen.grid.valid_fraction().ravel() > 0
     yield "none", 0, 0.0, np.empty(0, np.intp)
     yield "all", 0, 1.0, np.flatnonzero(allowed)
@@ -87,13 +88,13 @@ def _placed(trial: Trial, frame: SeenFrame, gain: NDArray[np.float64]) -> Iterat
                 yield policy, draw, fraction, frame_patches(scores, fraction, allowed)
 
 
-Runs = Sequence[Sequence[Record]]  # of each weights, or of each seed, the records of its frames
+Runs = Sequence[Sequence[Record]]  # records of the frames, of each of the weights or seeds
 COSTS = ("patches", "multiply_adds")
 
 
 @dataclass(frozen=True)
 class Row:
-    """One policy at one share over all frames; a run is one seed with one draw. Zeros where a run has no frame."""
+    """Counts of one policy and fraction; a run is a seed and a draw. Frames that a run did not judge are zeros."""
 
     policy: str
     fraction: float
@@ -102,18 +103,18 @@ class Row:
     parts: list[Record]  # rows of the records
 
     def over_runs(self, figure: Callable[[Any], Any]) -> NDArray[np.float64]:
-        """A figure of each run's frames together, (run,) or (run, class)."""
+        """Return a figure of the summed counts of each run, (run,) or (run, class)."""
         return np.array([figure(run.sum(axis=0)) for run in self.counts])
 
     @property
     def judged(self) -> NDArray[np.bool_]:
-        """Frames that any run has, (frame,)."""
+        """Return which frames any run has judged, (frame,)."""
         found: NDArray[np.bool_] = self.counts.sum(axis=(0, 2, 3)) > 0
         return found
 
 
 def seeds_of(runs: Runs) -> list[list[int]]:
-    """Numbers of the weights of each seed: those with no frame in common, in the order given; without a frame none."""
+    """Group weights without a common frame into seeds; return their indices. Weights without a frame are left out."""
     seeds: list[tuple[set[str], list[int]]] = []
     for number, records in enumerate(runs):
         names = {record["frame"] for record in records}
@@ -130,7 +131,7 @@ def seeds_of(runs: Runs) -> list[list[int]]:
 
 
 def collect_row(seeds: Runs, policy: str, fraction: float) -> Row | None:
-    """Gather the counts of one row from the records of all seeds; None without any."""
+    """Collect the counts of one row from the records of all seeds; None without a record."""
     order = sorted({record["frame"] for records in seeds for record in records})
     found = [
         (number, order.index(record["frame"]), row)
@@ -150,7 +151,7 @@ def collect_row(seeds: Runs, policy: str, fraction: float) -> Row | None:
 
 
 def difference(row: Row, other: Row | None, trial: Trial, draws: int) -> Record | None:
-    """Paired interval of one row less another, over the frames that both have; None without another."""
+    """Return the paired interval of one row minus another, over their common frames; None without another."""
     if other is None or other is row:
         return None
     both = row.judged & other.judged
@@ -162,9 +163,9 @@ def difference(row: Row, other: Row | None, trial: Trial, draws: int) -> Record 
 
 
 def summarise(runs: Runs, class_names: Sequence[str], trial: Trial, draws: int) -> Record:
-    """Give the figures of every row against every patch and against chance.
+    """Return the figures of every row, compared with all patches and with the random policy.
 
-    ``runs`` are of each weights the records of `judge_frame`, ``draws`` those of the bootstrap.
+    ``runs`` are the records of `judge_frame` of each of the weights, ``draws`` those of the bootstrap.
     """
     seeds = [[record for number in members for record in runs[number]] for members in seeds_of(runs)]
     shared = [(policy, fraction) for policy in (*trial.policies, ORACLE) for fraction in trial.fractions]
@@ -212,7 +213,7 @@ def _accuracy(row: Row, class_names: Sequence[str]) -> Record:
 
 
 def _cost(row: Row, whole: Row) -> Record:
-    """Give what a frame takes in the mean, of each cost, and its fraction of that of every patch."""
+    """Return the mean costs of a frame, and their ratio to those of all patches."""
     found = {}
     for name in COSTS:
         done, full = (float(np.mean([one[name] for one in some.parts])) for some in (row, whole))
@@ -221,7 +222,7 @@ def _cost(row: Row, whole: Row) -> Record:
 
 
 def _mean(values: Sequence[float] | NDArray[np.float64]) -> float:
-    """Mean of what is known; NaN where nothing is."""
+    """Return the mean without NaN; NaN for no value."""
     known = np.asarray(values, np.float64)
     known = known[~np.isnan(known)]
     return float(known.mean()) if known.size else float("nan")

@@ -1,4 +1,4 @@
-"""An evaluation as tables and as a plot: accuracy with intervals, costs, classes."""
+"""Print an evaluation as tables, and draw it: accuracy with intervals, costs, classes."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from flows.publish.panels import GRID, INK, PAPER
 from flows.terminal.figures import counted, format_count, format_percent, format_points
 from flows.terminal.progress import table
 
-SHOWN_FRACTION = 0.10  # of the patches, or the nearest one tried: what is shown where one share has to do
+SHOWN_FRACTION = 0.10  # of the patches: the nearest fraction judged is in the table of classes
 CAPTION = (
-    "K: fraction of the valid patches, each free of the others. mIoU over the counts of all frames, mean over the "
-    "classes of the labels; overall: fraction of pixels that are right; ± the spread of seeds, else of random draws. "
-    "[ ] 95 % of {draws} draws: paired bootstrap over frames, and over seeds where there are several. * uses labels. "
-    "captured: the chosen patches' fraction of the gain of the oracle's. MACs: multiply-adds a frame, in closed form."
+    "K: fraction of the valid patches. mIoU: of the counts of all frames, mean over the classes of the labels. "
+    "overall: fraction of right pixels. ±: standard deviation over seeds, else over random draws. [ ]: 95 % of "
+    "{draws} draws, paired bootstrap over frames, and over seeds if there are several. * uses labels. captured: gain "
+    "of the chosen patches over that of the oracle's. MACs: multiply-adds a frame."
 )
 
 
 def print_evaluation(content: dict[str, Any], console: Console) -> None:
-    """Print what was judged, accuracy with costs and classes, and what the figures mean."""
+    """Print frames and weights, accuracy with costs, the classes, and an explanation."""
     weights = content["weights"]
     named = f"{len(weights)} sets of weights" if len(weights) > 1 else weights[0]["file"]
-    left = f"; left out as seen in training: {len(content['left_out'])}" if content["left_out"] else ""
+    left = f"; left out (training frames): {len(content['left_out'])}" if content["left_out"] else ""
     lines = [f"{content['dataset']}: {counted(len(content['frames']), 'frame')}, {named}{left}"]
     if len(weights) > 1:
         lines += [f"  {one['file']}: {one['frames']} frames: {', '.join(one['covers']) or 'none'}" for one in weights]
@@ -76,14 +76,14 @@ def _classes(content: dict[str, Any]) -> Table:
     for name, support in content["support"].items():
         cells = []
         for row in shown:
-            false = row["false_classes"].get(name)  # how often the map shows a class that the labels lack
+            false = row["false_classes"].get(name)  # pixels of a class that the labels lack
             cells += [format_points(row["per_class_iou"][name]) if false is None else f"{format_count(false)} px false"]
         rows.append([escape(name), format_count(support), *cells])
     return table(columns, rows, title="IoU by class", whole=columns)
 
 
 def format_difference(interval: dict[str, float | None] | None) -> str:
-    """Points of mIoU with the bounds of the interval, as far as there are any."""
+    """Format a difference in points of mIoU, with the bounds of its interval if there are any."""
     if interval is None or interval["difference"] is None:
         return ""
     text = f"{100 * interval['difference']:+.1f}"
@@ -92,7 +92,7 @@ def format_difference(interval: dict[str, float | None] | None) -> str:
 
 
 def evaluation_figure(content: dict[str, Any]) -> Figure:
-    """Draw mIoU over the multiply-adds a frame: a line a policy."""
+    """Plot mIoU over the multiply-adds a frame, a line for each policy."""
     figure = Figure(figsize=(8.0, 5.0), dpi=110, layout="constrained", facecolor=PAPER)
     axes = figure.subplots()
     ends = {row["policy"]: 100 * row["miou"] for row in content["rows"] if row["policy"] in ENDS}

@@ -1,4 +1,4 @@
-"""The verb `tradeoff`: a table for each stage (to be right to X you pay Y), JSON, and plots of error against time."""
+"""Run the verb `tradeoff`: a table for each stage, JSON, and plots of error against time."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from flows.terminal.figures import format_seconds
 from flows.terminal.processes import writing
 from flows.terminal.progress import table
 from flows.tradeoff.entries import Point, Result, Setting, Tradeoff, measure_tradeoff
-from flows.tradeoff.stages import SEGMENT, SURVEY, TRADEOFFS, find_tradeoff, segment_tradeoff, survey_tradeoff
+from flows.tradeoff.stages import SEGMENT, SURVEY, TRADEOFFS, segment_tradeoff, survey_tradeoff
 from flows.tradeoff.store import STORE, store_tradeoff
 from pipeline.errors import SettingsError
 from storage.archive.whole_files import to_json
@@ -43,19 +43,16 @@ def run_tradeoff(
 ) -> dict[str, Any]:
     """Measure the trade-off of one stage, or all; write tradeoff.json and .png into ``out`` and print the tables.
 
-    ``scene`` is what `segment`, `store` and `survey` take in place of a farm, ``weights`` those that read it. Raises
-    SettingsError: a stage that has no scene or weights, a scene without weights; else what the stages do.
+    ``scene`` replaces the farm of `segment`, `store` and `survey`; ``weights`` read it. Raises SettingsError: an
+    unknown stage, one that takes no scene, a scene or weights alone; else as the stages.
     """
     if repeats is not None and repeats < 1:
         raise SettingsError(f"--repeats must be at least 1, got {repeats}")
     if seed < 0:
         raise SettingsError(f"--seed must be 0 or more, got {seed}")
-    if scene or weights:
-        wanted = own_tradeoffs(stage, scene, weights)
-    else:
-        wanted = [find_tradeoff(stage)] if stage else list(TRADEOFFS.values())
+    wanted = choose_tradeoffs(stage, scene, weights)
     with writing(out):
-        out.mkdir(parents=True, exist_ok=True)  # before minutes are spent on what cannot be kept
+        out.mkdir(parents=True, exist_ok=True)  # fails before minutes are spent
     results = []
     for tradeoff in wanted:
         with console.status(f"measuring {tradeoff.stage}: {tradeoff.knob}"):
@@ -69,11 +66,12 @@ def run_tradeoff(
     return content
 
 
-def own_tradeoffs(stage: str | None, scene: str | None, weights: Path | None) -> list[Tradeoff]:
-    """Return the trade-offs of one's own scene and weights: of a stage, or of `segment` and `survey`.
-
-    Raises SettingsError: the stage has neither, or one of the two is missing.
-    """
+def choose_tradeoffs(stage: str | None, scene: str | None, weights: Path | None) -> list[Tradeoff]:
+    """Return the trade-offs of a stage, or of all; with a scene those of `segment` and `survey`. SettingsError."""
+    if scene is None and weights is None:
+        if stage is not None and stage not in TRADEOFFS:
+            raise SettingsError(f"no trade-off for stage {stage!r}; there are: {', '.join(TRADEOFFS)}")
+        return [TRADEOFFS[stage]] if stage else list(TRADEOFFS.values())
     if stage == STORE.stage and scene:
         return [store_tradeoff(scene, weights)]
     own = {SEGMENT.stage: segment_tradeoff, SURVEY.stage: survey_tradeoff}
@@ -86,7 +84,7 @@ def own_tradeoffs(stage: str | None, scene: str | None, weights: Path | None) ->
 
 
 def print_tradeoff(result: Result, console: Console) -> None:
-    """Print the settings from the most to the least exact; those that no other beats are marked."""
+    """Print the settings from the most to the least exact, with the Pareto front marked."""
     points = sorted(result.points, key=lambda point: point.error)
     rows, figures = [_row(point, result) for point in points], ("error", *result.points[0].beside)
     times = ("time",) if result.paid else ("price", "x first")
@@ -94,16 +92,16 @@ def print_tradeoff(result: Result, console: Console) -> None:
     headings = [name.replace(" ", "\n") for name in (*figures, *times)]
     pairs = zip(rows, points, strict=True)
     shown = [[f"{'' if point.pareto else '[dim]'}{escape(cell)}" for cell in row] for row, point in pairs]
-    title = f"{escape(result.stage)}, {escape(result.knob)}: to be right to ... you pay ..."
+    title = f"{escape(result.stage)}, {escape(result.knob)}: error and cost"
     columns = ("", result.knob, *headings)
     console.print(table(columns, shown, left=2, title=title, whole=columns), _caption(result))
 
 
 def _row(point: Point, result: Result) -> list[str]:
     times = [_short(point.ns_per_unit * 1e-9), _short(point.price_s), f"{point.ratio:.2f}"]
-    if point.paid is not None:  # what is paid stands among the figures
+    if point.paid is not None:  # the cost is one of the other figures
         times = times[1:2]
-    elif result.modelled:  # seconds of a camera are none of a pixel
+    elif result.modelled:
         times = times[1:]
     further = [f"{one:.2g}" if abs(one) < 10 else f"{one:.1f}" for one in point.beside.values()]
     name = _named(point.setting, result.default)
@@ -130,18 +128,17 @@ def _caption(result: Result) -> str:
         found = "no setting" if best is None else f"{best.setting}, {_short(best.ns_per_unit * 1e-9)}"
         within = f"within {name} ({error:.2g}): {found}\n"
     priced = result.paid or ("the cost model" if result.modelled else "processor time")
-    without = "".join(f"{name} did not run: {why}\n" for name, why in result.missing.items())
     rounds = f"{result.repeats} repeat{'s' if result.repeats > 1 else ''} in turn"
     return escape(
-        f"error: {result.error}, against {result.reference}; price: {priced}; ● no other setting beats it\n"
-        f"{within}{without}"
+        f"error: {result.error}, against {result.reference}; price: {priced}; ● Pareto front\n"
+        f"{within}"
         f"{rounds}, {machine['threads']} thread, load {machine['load_before']} to {machine['load_after']}, "
         f"{machine['processor']}"
     )
 
 
 def tradeoff_figure(results: Sequence[Result]) -> Figure:
-    """Return a figure of one panel for each trade-off: points that no other beats are filled, others hollow."""
+    """Return a figure of one panel for each trade-off: points of the Pareto front are filled, others hollow."""
     across = min(_ACROSS, len(results))
     down = -(-len(results) // across)
     figure = Figure(figsize=(6.0 * across, 4.9 * down + 0.5), dpi=120, layout="constrained", facecolor=PAPER)
@@ -154,7 +151,7 @@ def tradeoff_figure(results: Sequence[Result]) -> Figure:
 
 
 def _draw_tradeoff(axes: Axes, result: Result) -> None:
-    """Draw one line for each family of settings, named "FAMILY, MEMBER"; other settings are one family."""
+    """Draw one line for each family of settings; "FAMILY, MEMBER" is a member's name, other names are one family."""
     least = min(point.ns_per_unit for point in result.points)
     size, unit = next((one for one in _UNITS if least >= one[0]), _UNITS[-1])
     families: dict[str, list[tuple[float, float, Point]]] = {}
@@ -184,7 +181,7 @@ def _draw_tradeoff(axes: Axes, result: Result) -> None:
         axes.axhline(result.level[1], color=_LEVEL, linewidth=1.1, linestyle=(0, (5, 3)), zorder=1)
         place: Any = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
         axes.annotate(result.level[0], (1, result.level[1]), (-2, 3), **place, ha="right", color=_LEVEL, size=9)
-    exact = any(point.error == 0 for point in result.points)  # which has no logarithm
+    exact = any(point.error == 0 for point in result.points)  # 0 has no logarithm
     axes.set(xscale="log", yscale="linear" if exact else "log")
     if exact:
         smallest = min((point.error for point in result.points if point.error > 0), default=1.0)

@@ -1,6 +1,6 @@
-"""The measure of each stage: kernel, tolerance of effects, plan, fraction of patches, what is kept of lines.
+"""Define the trade-off of each stage: resampling, tolerance of effects, plan, fraction of patches.
 
-`tests/benchmarks` measures plans and kernels with the same scenes and readers.
+`tests/benchmarks` uses the same scenes and readers.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from models.network.spectral import LineSpec
 from models.policies.policies import score_patches
 from models.reading.inference import CoarsePrediction, DrawnMap, coarse_prediction_of_patches, segment
 from models.weights.files import Weights, load_weights
-from pipeline.errors import SceneError, SettingsError
+from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
-from pipeline.geometry.scan import Axis, CostModel, Sweep
+from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.planning.coverage import cheapest_full, full_sweeps, uniform_sweeps
 from pipeline.planning.prices import frame_patches, raw_bytes
 from pipeline.planning.uniform_scans import format_scan
@@ -54,7 +54,7 @@ Values = NDArray[np.float32]
 Floats = NDArray[np.float64]
 MEMORY = 2**30  # bytes that rectifying may take
 
-# rectify: kernels on plane waves, which are known at every point
+# rectify: kernels on plane waves, whose values are known at every point
 
 SIDE, BANDS, POINTS = 256, 64, 40_000
 PERIODS_PX = (4.0, 40.0)
@@ -64,7 +64,7 @@ WAVES = 24
 
 @dataclass(frozen=True)
 class Waves:
-    """Sum of plane waves, in every band with other phases and amplitudes: a scene known at every point."""
+    """Sum of plane waves with phases and amplitudes of their own in each band."""
 
     frequency: Floats  # (wave, 2) cycles per px down and across
     cosine: Floats  # (wave, band)
@@ -96,7 +96,7 @@ class Scattered:
 
 
 def scatter_points(seed: int) -> Scattered:
-    """Draw point samples of waves, and points at least 2 px inside, in the order of lines of a geolocation grid."""
+    """Draw samples of waves, and points at least 2 px inside, in the row order of a geolocation grid."""
     waves, rng = draw_waves(seed, BANDS, PERIODS_PX), np.random.default_rng([seed, 1])
     grid = np.argwhere(np.ones((SIDE, SIDE), bool)).astype(np.float64)
     samples = waves.at(grid).astype(np.float32).reshape(SIDE, SIDE, BANDS)
@@ -147,11 +147,11 @@ class FarmLines:
     rig: Rig
     blocks: tuple[SweepBlock, ...]
     decisions: Mapping[Setting, Decision]
-    exact: Values  # (line, sample, band) [e-], those of the dark among them
+    exact: Values  # (line, sample, band) [e-], with the dark signal
     noise: Values  # one sigma at each
 
     def greatest_change(self, setting: Setting, made: tuple[Values, Any]) -> float:
-        """Return the greatest change against everything on, in sigmas of the noise at the sample."""
+        """Return the greatest change against all effects at their exact variants, in sigmas of the sample's noise."""
         shown = made[0] + _dark(self.blocks[0], self.decisions[setting].chosen)
         return float(np.abs((shown - self.exact) / self.noise).max())
 
@@ -170,14 +170,14 @@ def _dark(block: SweepBlock, chosen: Mapping[Effect, str]) -> Values:
 
 
 def decide_for_lines(seed: int) -> FarmLines:
-    """Draw a farm, plan its full scan, and decide for every tolerance; take lines of the first sweep."""
+    """Plan the full scan of a farm, decide on effects for every tolerance, and take lines of the first sweep."""
     scene, rig = farm_scene(seed, LAND_SHAPE), Rig()
     sweeps = full_sweeps(SceneGrid(*LAND_SHAPE, PATCH, FACTOR), rig.camera, "x")
     probe = probe_scene(scene, rig, sweeps)
     starts = (0, (sweeps[0].lines - LINES) // 2, sweeps[0].lines - LINES)
     blocks = tuple(sweep_block(scene, rig, sweeps[0], range(at, at + LINES), seed=seed) for at in starts)
-    decisions: dict[Setting, Decision] = {EXACT: decide(probe, rig, EFFECTS, 0.0)}
-    decisions |= {one: decide(probe, rig, EFFECTS, one) for one in TOLERANCES}
+    limits: dict[Setting, float] = {EXACT: 0.0} | {one: one for one in TOLERANCES}
+    decisions = {one: decide(probe, rig, EFFECTS, limit) for one, limit in limits.items()}
     chosen = decisions[EXACT].chosen
     exact = _simulate(scene, blocks, chosen)[0] + _dark(blocks[0], chosen)
     return FarmLines(scene, rig, blocks, decisions, exact, noise_electrons(exact, rig))
@@ -188,7 +188,7 @@ SIMULATE = Tradeoff(
     knob="tolerance",
     error="greatest change of a sample [σ of its noise]",  # noqa: RUF001
     unit="px*band",
-    reference="everything that the rig has, exact; on average over the noise",
+    reference="all effects of the rig, exact; mean over the noise",
     settings=(EXACT, *TOLERANCES),
     default=lambda _state: Settings().tol.value,
     prepare=decide_for_lines,
@@ -200,84 +200,66 @@ SIMULATE = Tradeoff(
 )
 
 
-# survey: uniform scans and two passes, by the camera's seconds
+# survey: uniform scans and parts of one, by the camera's seconds
 
 SURVEY_SHAPE = (384, 512)
 SCANS = {format_scan(step, ms): (step, ms) for step in (1, 2, 4) for ms in (100.0, 50.0, 25.0, 12.0, 6.0)}
-PART_OF = (1, 25.0)  # step and exposure [ms] of the scan of which parts are read in detail
+PART_OF = (1, 25.0)  # step and exposure [ms] of the scan of which parts are read in full
 PARTS = {f"{format_scan(*PART_OF)}, {fraction} of multiply-adds": fraction for fraction in ("50%", "35%", "25%")}
+POLICY = "gain"
 
 
 @dataclass(frozen=True)
 class PlannedPass:
-    """The coarse pass of a plan, its patches with their spectral features, and its cost."""
+    """A coarse prediction, the patches to read in full with their spectral features, and the cost of the scan."""
 
-    seen: CoarsePrediction
+    coarse: CoarsePrediction
     patch_index: NDArray[np.intp]
     columns: Values  # (patch, p, p, column)
-    weights: Weights  # that read it
+    weights: Weights
     seconds: float = 0.0
     bytes_raw: int = 0
-    capture: LineSpec | None = None  # of the patches, where they were captured otherwise than what the overview reads
 
 
 @dataclass(frozen=True)
 class PlannedField:
-    """A farm that training never saw, by every plan."""
+    """A field with labels, scanned or read by several plans."""
 
     labels: NDArray[np.uint8]
     bands: int
-    scan_passes: Mapping[Setting, PlannedPass]
-    default: Setting | None = None  # the plan of a survey that asks for none
-
-    @property
-    def plans(self) -> tuple[Setting, ...]:
-        """All plans, in the order in which they were laid out."""
-        return tuple(self.scan_passes)
+    passes: Mapping[Setting, PlannedPass]
+    default: Setting | None = None  # the plan of a survey by its defaults
 
     def read(self, plan: Setting) -> DrawnMap:
         """Return the class map of a plan."""
-        scan_pass = self.scan_passes[plan]
-        return segment(
-            scan_pass.weights, scan_pass.seen, scan_pass.columns, scan_pass.patch_index, capture=scan_pass.capture
-        )
+        one = self.passes[plan]
+        return segment(one.weights, one.coarse, one.columns, one.patch_index)
 
     def miss(self, plan: Setting, drawn: DrawnMap) -> float:
         """Return 1 - mIoU of a map."""
-        return 1 - mean_iou(confusion(self.labels, drawn.classes, self.scan_passes[plan].weights.config.classes))
+        return 1 - mean_iou(confusion(self.labels, drawn.classes, self.passes[plan].weights.config.classes))
 
     def billion_multiply_adds(self, plan: Setting, _drawn: DrawnMap) -> float:
         """Return the multiply-adds of the network for a plan, in billions."""
-        scan_pass = self.scan_passes[plan]
-        return (
-            multiply_adds(scan_pass.weights.config, scan_pass.seen.grid, len(scan_pass.patch_index), self.bands).total
-            / 1e9
-        )
+        one = self.passes[plan]
+        return multiply_adds(one.weights.config, one.coarse.grid, len(one.patch_index), self.bands).total / 1e9
 
 
 def uniform_pass(
     weights: Weights, source: SimulatedSource, sweeps: list[Sweep], grid: SceneGrid, cost: CostModel, capture: LineSpec
 ) -> PlannedPass:
-    """Read a uniform scan whole."""
+    """Plan to read all patches of a uniform scan."""
     columns = columns_of_all_patches(source, sweeps, grid, weights, memory=MEMORY, resampling="catmull-rom")
     patch_index, size = grid.valid_patches(), raw_bytes(sweeps, source.camera, len(source.wavelength_nm))
     seconds = cost.seconds(sweeps, source.camera)
-    seen = coarse_prediction_of_patches(weights, columns, grid, capture)
-    return PlannedPass(seen, patch_index, columns[patch_index], weights, seconds, size)
-
-
-def part_of(scan_pass: PlannedPass, bands: int, compute: str) -> PlannedPass:
-    """Return the same scan with the patches alone of the highest expected gain, for a fraction of the multiply-adds."""
-    costs = ReadingCosts(scan_pass.weights.config, scan_pass.seen.grid, bands)
-    budget = PatchBudget(costs, scan_pass.patch_index, POLICY, compute)
-    kept = np.sort(budget.choose(score_patches(POLICY, scan_pass.seen)))
-    return replace(scan_pass, patch_index=kept, columns=scan_pass.columns[np.searchsorted(scan_pass.patch_index, kept)])
+    coarse = coarse_prediction_of_patches(weights, columns, grid, capture)
+    return PlannedPass(coarse, patch_index, columns[patch_index], weights, seconds, size)
 
 
 def open_field(seed: int, scene: str | None, weights: Path | None, source: str) -> SurveyRun:
     """Open a field as a survey by its defaults does, or a farm without a ``scene``; nothing is written.
 
-    Raises SceneError: nobody says what is right on it; else as `flows.tasks.run.open_run`.
+    Raises SceneError: it has no labels; else as `flows.tasks.run.open_run`.
     """
     farm = {"scene": "farm", "size": "{1}x{0}".format(*SURVEY_SHAPE)}
     asked = {**(farm if scene is None else {"scene": scene}), "source": source, "seed": seed, "weights": weights}
@@ -290,7 +272,7 @@ def open_field(seed: int, scene: str | None, weights: Path | None, source: str) 
 
 
 def default_plan(run: SurveyRun) -> tuple[str, tuple[int, float] | None]:
-    """Return in words what a survey takes that asks for no plan, with step and exposure [ms] where it is one scan."""
+    """Return the name of the plan of a survey by its defaults, and its step and exposure [ms] if it is one scan."""
     if not run.plan.plain:
         return "every 4th line, then lines between", None
     scan = run.settings.scan_step or 1, run.settings.scan_exposure_ms or run.camera.exposure_ms
@@ -298,21 +280,25 @@ def default_plan(run: SurveyRun) -> tuple[str, tuple[int, float] | None]:
 
 
 def plan_every_way(seed: int, scene: str | None = None, weights: Path | None = None) -> PlannedField:
-    """Take a farm, or one's own scene, by every uniform scan and by parts of one."""
+    """Scan a farm or another scene by every uniform scan, and read parts of one of them."""
     run = open_field(seed, scene, weights, "sim")
     camera, cost, source, bands = run.camera, run.settings.cost, run.simulated, len(run.scene.wavelength_nm)
-    grid, read_with = SceneGrid(*run.scene.shape, run.described.config.patch, 1), run.weights
+    grid = SceneGrid(*run.scene.shape, run.described.config.patch, 1)
     along, _, _ = cheapest_full(grid, camera, cost)
     default, chosen = default_plan(run)
-    scan_passes: dict[Setting, PlannedPass] = {}
+    passes: dict[Setting, PlannedPass] = {}
     for words, (step, exposure_ms) in (SCANS | ({} if chosen is None else {default: chosen})).items():
         sweeps = uniform_sweeps(grid, camera, along, step=step, exposure_ms=exposure_ms)
         scan = LineSpec(exposure_ms / DEFAULT_EXPOSURE_MS, step)
-        scan_passes[words] = uniform_pass(read_with, source, sweeps, grid, cost, scan)
-    whole = scan_passes[format_scan(*PART_OF)]
-    scan_passes |= {words: part_of(whole, bands, fraction) for words, fraction in PARTS.items()}
+        passes[words] = uniform_pass(run.weights, source, sweeps, grid, cost, scan)
+    whole = passes[format_scan(*PART_OF)]
+    costs, scores = ReadingCosts(run.weights.config, grid, bands), score_patches(POLICY, whole.coarse)
+    for words, fraction in PARTS.items():
+        kept = np.sort(PatchBudget(costs, whole.patch_index, POLICY, fraction).choose(scores))
+        columns = whole.columns[np.searchsorted(whole.patch_index, kept)]
+        passes[words] = replace(whole, patch_index=kept, columns=columns)
     assert run.labels is not None
-    return PlannedField(run.labels, bands, scan_passes, default)
+    return PlannedField(run.labels, bands, passes, default)
 
 
 SURVEY = Tradeoff(
@@ -322,47 +308,54 @@ SURVEY = Tradeoff(
     unit="scene px",
     reference=f"labels of a farm of {SURVEY_SHAPE[1]} x {SURVEY_SHAPE[0]} px; parts by expected gain",
     settings=(),
-    settings_of=lambda field: field.plans,
+    settings_of=lambda field: tuple(field.passes),
     default=lambda field: field.default,
     prepare=plan_every_way,
     run=PlannedField.read,
     judge=PlannedField.miss,
     work=lambda field: float(field.labels.size),
-    modelled_s=lambda field, plan, _drawn: field.scan_passes[plan].seconds,
+    modelled_s=lambda field, plan, _drawn: field.passes[plan].seconds,
     beside={
-        "MB raw": lambda field, plan, _drawn: field.scan_passes[plan].bytes_raw / 1e6,
+        "MB raw": lambda field, plan, _drawn: field.passes[plan].bytes_raw / 1e6,
         "billion multiply-adds": PlannedField.billion_multiply_adds,
     },
 )
 
 
-# segment: a farm of which a part is read in full
+# segment: fractions of the patches read in full
 
 FARM_SHAPE = (384, 480)
 FRACTIONS = (1.0, 0.35, 0.2, 0.15, 0.1, 0.05, 0.0)
-POLICY = "gain"
-
-
-def sources_of_farm(seed: int) -> tuple[Weights, SceneGrid, SimulatedSource, Axis, list[Sweep]]:
-    """Draw a farm and plan its full scan; gives weights, grid, source, direction of the lines and sweeps."""
-    weights, camera = load_weights(shipped_weights()), LineCamera()
-    grid = SceneGrid(*FARM_SHAPE, weights.config.patch, 1)
-    along, full, _ = cheapest_full(grid, camera, CostModel())
-    return weights, grid, SimulatedSource(farm_scene(seed, FARM_SHAPE), Rig(camera), seed), along, list(full)
 
 
 def plan_every_fraction(seed: int) -> PlannedField:
-    """Scan a farm by every line, and choose every fraction of its patches by their scores."""
+    """Scan a farm by every line, and choose every fraction of its patches by expected gain."""
+    weights, camera = load_weights(shipped_weights()), LineCamera()
+    grid = SceneGrid(*FARM_SHAPE, weights.config.patch, 1)
+    _, full, _ = cheapest_full(grid, camera, CostModel())
+    source = SimulatedSource(farm_scene(seed, FARM_SHAPE), Rig(camera), seed)
+    columns = columns_of_all_patches(source, list(full), grid, weights, memory=MEMORY, resampling="catmull-rom")
+    passes = _fractions_of(weights, columns, grid)
+    return PlannedField(np.asarray(source.scene.labels, np.uint8), len(source.wavelength_nm), passes)
+
+
+def fractions_of_raster(scene: str, weights: Path) -> PlannedField:
+    """Take a raster as it is, and choose every fraction of its patches, as `survey --macs` does."""
+    run = open_field(0, scene, weights, RASTER)
+    assert run.raster is not None
+    assert run.labels is not None
+    columns = columns_of_raster(run.raster, run.weights, run.scene.wavelength_nm, memory=run.settings.memory)
+    passes = _fractions_of(run.weights, columns, run.grid)
+    return PlannedField(run.labels, len(run.scene.wavelength_nm), passes, default=FRACTIONS[0])
+
+
+def _fractions_of(weights: Weights, columns: Values, grid: SceneGrid) -> dict[Setting, PlannedPass]:
+    """Choose every fraction of the patches by expected gain; ``columns`` are of all patches of the padded grid."""
     keep_freed_memory()  # as surveys do
-    weights, grid, source, _, full = sources_of_farm(seed)
-    columns = columns_of_all_patches(source, full, grid, weights, memory=MEMORY, resampling="catmull-rom")
-    seen = coarse_prediction_of_patches(weights, columns, grid)
-    scores, valid = score_patches(POLICY, seen), grid.valid_fraction().ravel() > 0
-    scan_passes: dict[Setting, PlannedPass] = {}
-    for fraction in FRACTIONS:
-        patch_index = frame_patches(scores, fraction, valid) if fraction < 1 else np.flatnonzero(valid)
-        scan_passes[fraction] = PlannedPass(seen, patch_index, columns[patch_index], weights)
-    return PlannedField(np.asarray(source.scene.labels, np.uint8), len(source.wavelength_nm), scan_passes)
+    coarse = coarse_prediction_of_patches(weights, columns, grid)
+    scores, valid = score_patches(POLICY, coarse), grid.valid_fraction().ravel() > 0
+    chosen = {one: frame_patches(scores, one, valid) if one < 1 else np.flatnonzero(valid) for one in FRACTIONS}
+    return {one: PlannedPass(coarse, index, columns[index], weights) for one, index in chosen.items()}
 
 
 SEGMENT = Tradeoff(
@@ -380,29 +373,13 @@ SEGMENT = Tradeoff(
 
 
 def survey_tradeoff(scene: str, weights: Path) -> Tradeoff:
-    """Return the trade-off of `survey` on one's own scene, at which the simulated rig looks."""
-    words = f"labels of {Path(scene).name}, seen by the simulated rig; two passes and parts by expected gain"
+    """Return the trade-off of `survey` on a given scene, captured by the simulated rig."""
+    words = f"labels of {Path(scene).name}, captured by the simulated rig; parts by expected gain"
     return replace(SURVEY, prepare=lambda seed: plan_every_way(seed, scene, weights), reference=words)
 
 
-def fractions_of_raster(scene: str, weights: Path) -> PlannedField:
-    """Take a raster as it is, and choose every fraction of its patches by expected gain, as `survey --macs` does."""
-    keep_freed_memory()
-    run = open_field(0, scene, weights, RASTER)
-    assert run.raster is not None
-    assert run.labels is not None
-    columns = columns_of_raster(run.raster, run.weights, run.scene.wavelength_nm, memory=run.settings.memory)
-    seen = coarse_prediction_of_patches(run.weights, columns, run.grid)
-    scores, valid = score_patches(POLICY, seen), run.grid.valid_fraction().ravel() > 0
-    scan_passes: dict[Setting, PlannedPass] = {}
-    for fraction in FRACTIONS:
-        patch_index = frame_patches(scores, fraction, valid) if fraction < 1 else np.flatnonzero(valid)
-        scan_passes[fraction] = PlannedPass(seen, patch_index, columns[patch_index], run.weights)
-    return PlannedField(run.labels, len(run.scene.wavelength_nm), scan_passes, default=FRACTIONS[0])
-
-
 def segment_tradeoff(scene: str, weights: Path) -> Tradeoff:
-    """Return the trade-off of `segment` on the pixels of one's own raster."""
+    """Return the trade-off of `segment` on the pixels of a given raster."""
     return replace(
         SEGMENT,
         prepare=lambda _seed: fractions_of_raster(scene, weights),
@@ -413,10 +390,3 @@ def segment_tradeoff(scene: str, weights: Path) -> Tradeoff:
 
 
 TRADEOFFS = {one.stage: one for one in (RECTIFY, SEGMENT, SIMULATE, STORE, SURVEY)}
-
-
-def find_tradeoff(stage: str) -> Tradeoff:
-    """Return the measure of one stage; SettingsError naming the stages there are."""
-    if stage not in TRADEOFFS:
-        raise SettingsError(f"no trade-off for stage {stage!r}; there are: {', '.join(TRADEOFFS)}")
-    return TRADEOFFS[stage]

@@ -1,8 +1,7 @@
-"""The trade-off of storing lines: components of whitened spectra beside what else may be kept of raw lines.
+"""The trade-off of storing lines: condensed spectra beside other methods.
 
-Opponents: binned bands, rounded numbers (each by the codec of scores), pcodec, principal components without
-whitening, those as JPEG 2000 (Du & Fowler 2007), and ZFP. All come back as scene values, which are rectified and read
-as a survey reads them.
+The other methods are binned bands, rounded numbers, pcodec, ZFP, principal components without whitening, and those
+as JPEG 2000 (Du & Fowler 2007). Each gives scene values back, which are rectified and read as in a survey.
 """
 
 from __future__ import annotations
@@ -20,93 +19,259 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.settings.survey_settings import SignalChoice
+from flows.tasks.scene import judged_labels
+from flows.tasks.stages.accuracy import columns_of_raster, columns_of_sweeps
 from flows.tasks.stages.condense import with_shared_directions
+from flows.tasks.survey_model import shipped_weights
 from flows.tradeoff.entries import Setting, Tradeoff
-from flows.tradeoff.scan_lines import BLOCK_PX, EXPOSURE_MS, FIELD_SHAPE, ScanLines, Values, scan_farm, scan_raster
+from flows.training.data import scene_of_file
+from models.evaluation.metrics import confusion, mean_iou
+from models.network.spectral import LineSpec
+from models.reading.inference import coarse_prediction_of_patches, segment
+from models.weights.files import Weights, describe_weights, load_weights
+from pipeline.errors import SceneError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import CostModel, Sweep
+from pipeline.planning.coverage import cheapest_full, uniform_sweeps
+from pipeline.signal.calibrate import calibrate
 from pipeline.signal.components import Components
 from pipeline.signal.condense import CondensedSweep, Condenser, ResidualLaw, calibrated_blocks, score_lines
 from pipeline.signal.subspace import SignalStatistics, find_components
+from pipeline.simulator.effects.probe import noise_electrons
+from pipeline.simulator.readout import dark_frame, read_out
+from pipeline.simulator.render import expected_light
+from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.scenes.farm.farm_scene import farm_scene
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS
+from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_block
+from pipeline.source import References
 from storage.arrays.cubes import SweepHeader
 from storage.arrays.layout import numbers_in_memory
 from storage.arrays.signal_cubes import LineRows, SignalCubeInMemory
+from storage.readers.raster_fields import RasterPixels
+from storage.readers.scene_files import load_scene_file
 
+Values = NDArray[np.float32]
+FIELD_SHAPE = (256, 600)  # one swath
+EXPOSURE_MS = 10.0
+BLOCK_PX = 64  # to a side, over which residuals are averaged
+MEMORY = 2**30  # bytes that rectifying may take
 STEPS = (0.5, 1.0, 2.0, 3.0)  # deviations of the noise
 FEWER = (8, 6, 4)  # components
 BINS = (2, 4, 8, 17)  # bands
 ROUNDED = (0.25, 0.5, 1.0)  # deviations of the noise
 RATES = (1.0, 2.0, 4.0)  # bytes a spectrum
-TOLERANCES = (4.0, 8.0, 16.0)  # deviations of the noise that no sample is off by more than
-JP2_STEP = 0.25  # in which scores become whole numbers before JPEG 2000 [deviations of the noise]
-JP2_LARGEST, JP2_ZERO = 32_000, 1 << 15
-JP2_DRIVER = "JP2OpenJPEG"
+TOLERANCES = (4.0, 8.0, 16.0)  # largest error of a sample, in deviations of the noise
 BLOCK_LINES = 64
-EXTRA = {"pcodec": "pcodec", "ZFP": "zfpy"}  # packages by family
+JP2_DRIVER = "JP2OpenJPEG"
+JP2_STEP = 0.25  # of scores before JPEG 2000 [deviations of the noise]
+JP2_LARGEST, JP2_ZERO = 32_000, 1 << 15
+
+
+# lines of a scan, and the error of restored ones
+
+
+@dataclass(frozen=True, eq=False)
+class HeldLines:
+    """The lines of one sweep in memory, raw or in scene values."""
+
+    sweep: Sweep
+    references: References
+    position: NDArray[np.float64]  # (line, 2) mirror X and Y
+    time_s: NDArray[np.float64]  # (line,)
+    data: NDArray[Any]  # (line, sample, band)
+
+    @property
+    def valid_line(self) -> NDArray[np.bool_]:
+        """Return that all lines are valid, (line,)."""
+        return np.ones(len(self.data), np.bool_)
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Return the numbers of the lines ``start`` to ``stop``, (line, sample, band)."""
+        return self.data[start:stop]
+
+    def calibrated(self, dn: NDArray[Any]) -> Values:
+        """Return the scene values of raw numbers in place of its own, (line, sample, band)."""
+        return calibrate(dn, self.references, saturated_dn=np.inf, position=self.position)[0]
+
+
+@dataclass(frozen=True)
+class Fidelity:
+    """Distance of restored spectra from the truth, in deviations of the noise, and the score of their map."""
+
+    error: float  # root mean square
+    block_mean: float  # largest mean of a band over 64 x 64 spectra
+    miou: float  # in %; NaN without labels
+
+
+@dataclass(frozen=True, eq=False)
+class ScanLines:
+    """Raw lines of a scan, their scene values, and the truth about both."""
+
+    lines: HeldLines  # raw numbers, uint16
+    camera: LineCamera
+    wavelength_nm: NDArray[np.float64]
+    values: Values  # (line, sample, band) scene values of the raw lines
+    truth: Values  # the same without noise; ``values`` where it is unknown
+    sigma: Values  # deviation of the noise of a value, as large or (band,)
+    noise_dn: NDArray[np.float64]  # (band,) of raw numbers, on average
+    miou: Callable[[Values], float]
+    judged: dict[object, Fidelity]  # by setting
+
+    def fidelity(self, restored: Values) -> Fidelity:
+        """Compare restored scene values, (line, sample, band), with the truth."""
+        off = (restored - self.truth) / self.sigma
+        error = float(np.sqrt(np.mean(np.square(off), dtype=np.float64)))
+        return Fidelity(error, float(np.abs(block_means_of(off, BLOCK_PX)).max()), 100 * self.miou(restored))
+
+
+def block_means_of(values: Values, side: int) -> NDArray[np.float32]:
+    """Return means of whole blocks of lines and samples, (block, block, band); a smaller image is one block."""
+    down, across = (min(side, size) for size in values.shape[:2])
+    lines, samples = values.shape[0] // down, values.shape[1] // across
+    cut = values[: lines * down, : samples * across].reshape(lines, down, samples, across, -1)
+    means: NDArray[np.float32] = cut.mean(axis=(1, 3), dtype=np.float64).astype(np.float32)
+    return means
+
+
+def scan_farm(seed: int, shape: tuple[int, int] = FIELD_SHAPE, camera: LineCamera | None = None) -> ScanLines:
+    """Scan a farm of one swath by every line at 10 ms; the simulator also gives the values without noise."""
+    camera, weights = camera or LineCamera(), load_weights(shipped_weights())
+    grid = SceneGrid(*shape, weights.config.patch, 1)
+    source = SimulatedSource(farm_scene(seed, shape, camera=camera), Rig(camera), seed)
+    along, _, _ = cheapest_full(grid, camera, CostModel())
+    (sweep,) = uniform_sweeps(grid, camera, along, step=1, exposure_ms=EXPOSURE_MS)
+    block = sweep_block(source.scene, source.rig, sweep, range(sweep.lines), seed=seed)
+    light = expected_light(source.scene, block, source.choice)
+    simulated, per_dn = SimulatedSweep(source, sweep), np.float32(camera.electrons_per_dn)
+    raw, noise_dn = read_out(light, block, source.choice), noise_electrons(light, block.rig) / per_dn
+    lines = HeldLines(sweep, simulated.references, simulated.position, simulated.time_s, raw)
+    labels = np.asarray(source.scene.labels, np.uint8)
+
+    def miou(values: Values) -> float:
+        """Rectify scene values and read them, as a survey does."""
+        plain = replace(lines, references=_unit_references(values.shape), data=values)
+        nm, options = source.wavelength_nm, {"memory": MEMORY, "resampling": "catmull-rom"}
+        columns = columns_of_sweeps([plain], camera, nm, grid, weights, **options)  # type: ignore[arg-type]
+        return _miou(weights, columns, grid, labels, LineSpec(EXPOSURE_MS / DEFAULT_EXPOSURE_MS))
+
+    dark = dark_frame(block, source.choice)
+    truth, sigma = lines.calibrated(light / per_dn + dark), lines.calibrated(noise_dn + dark)
+    mean_dn = np.sqrt(np.mean(np.square(noise_dn), axis=(0, 1), dtype=np.float64))
+    return ScanLines(lines, camera, source.wavelength_nm, lines.calibrated(raw), truth, sigma, mean_dn, miou, {})
+
+
+def scan_raster(path: str, weights_path: Path | None) -> ScanLines:
+    """Take the pixels of a raster as lines, with an estimate of their noise.
+
+    Raises SceneError: a value is missing, or is no whole number of 16 bits.
+    """
+    file = load_scene_file(path, labels_needed=False)
+    values = file.values
+    if not np.isfinite(values).all() or values.min() < 0 or values.max() > 65_534 or (values != np.rint(values)).any():
+        raise SceneError(
+            f"{path} holds missing values, or numbers other than whole ones from 0 to 65534. Choose a cube of raw "
+            "numbers, or scale it"
+        )
+    sweep = Sweep("raster", "coarse", "x", 0.0, 0.0, len(values))
+    position, time_s = np.zeros((len(values), 2)), np.arange(len(values), dtype=np.float64)
+    lines = HeldLines(sweep, _unit_references(values.shape), position, time_s, values.astype(np.uint16))
+    statistics, choice = SignalStatistics(values.shape[2], values[..., 0].size), SignalChoice()
+    statistics.add(values, np.ones(values.shape[:2], np.bool_))
+    noise = find_components(statistics, false_alarm=choice.false_alarm, least=choice.least).noise
+    known = np.where(np.isfinite(noise) & (noise > 0), noise, 1.0)
+
+    def miou(restored: Values) -> float:
+        """Read the pixels where they are."""
+        if weights_path is None or file.labels is None:
+            return float("nan")
+        weights = load_weights(weights_path)
+        grid = SceneGrid(*file.shape, weights.config.patch, 1)
+        raster = RasterPixels(lambda first, last: restored[first:last].copy(), file.missing, restored.shape[2], grid)
+        columns = columns_of_raster(raster, weights, file.wavelength_nm, memory=4 * MEMORY)
+        labels = judged_labels(scene_of_file(file, LineCamera()), describe_weights(weights_path))
+        assert labels is not None
+        return _miou(weights, columns, grid, labels, LineSpec())
+
+    sigma = known.astype(np.float32)
+    return ScanLines(lines, LineCamera(bits=16), file.wavelength_nm, values, values, sigma, known, miou, {})
+
+
+def _unit_references(shape: tuple[int, ...]) -> References:
+    """Return references by which numbers are scene values."""
+    frame = np.zeros(shape[1:], np.float32)
+    return References(frame, frame + 1, np.ones(shape[2], np.float32))
+
+
+def _miou(weights: Weights, columns: Values, grid: SceneGrid, labels: NDArray[np.uint8], capture: LineSpec) -> float:
+    """Return the mIoU of the map of all patches."""
+    patch_index = grid.valid_patches()
+    coarse = coarse_prediction_of_patches(weights, columns, grid, capture)
+    drawn = segment(weights, coarse, columns[patch_index], patch_index)
+    return mean_iou(confusion(labels, drawn.classes, weights.config.classes))
+
+
+# methods of storing them
 
 
 @dataclass(frozen=True, eq=False)
 class KeptLines:
-    """Stored lines: their bytes, and a function that gives scene values (line, sample, band) back."""
+    """Stored lines: their bytes, and a function that restores scene values (line, sample, band)."""
 
     size: int
     restore: Callable[[], Values]
 
 
 def keep_raw(scan: ScanLines) -> KeptLines:
-    """Store raw lines as they are, by the codec of scores, which packs them closer than that of raw lines on disk."""
+    """Store raw lines by the codec of scores, which packs them closer than the codec of raw lines on disk."""
     size, array = numbers_in_memory(scan.lines.data)
-    return KeptLines(size, lambda: scan.calibrated(np.asarray(array[...])))
+    return KeptLines(size, lambda: scan.lines.calibrated(np.asarray(array[...])))
 
 
 def condense(scan: ScanLines, step: float, most: int | None = None) -> KeptLines:
-    """Condense the lines as a survey does; with ``most`` by the leading components alone."""
-    choice, found = SignalChoice(), _statistics(scan)
-    components = find_components(found, false_alarm=choice.false_alarm, least=choice.least)
+    """Condense the lines as a survey does; with ``most`` keep only that many components."""
+    choice, statistics = SignalChoice(), _statistics(calibrated_blocks(scan.lines, scan.camera), scan)
+    components = find_components(statistics, false_alarm=choice.false_alarm, least=choice.least)
     if most is not None:
         components = replace(components, axes=components.axes[:most])
-    law = ResidualLaw.learned(found.spectra, components)
+    law = ResidualLaw.learned(statistics.spectra, components)
     condenser = Condenser(components, law, scan.camera, choice.rare_spectra, step)
-    stored = _condensed(scan, condenser, found)
+    kept, condensed = _condensed(scan, condenser, statistics)
     if most is None:
-        better = with_shared_directions(condenser, [stored[1]], found, choice.false_alarm)
-        stored = stored if better is None else _condensed(scan, better, found)
-    return stored[0]
+        better = with_shared_directions(condenser, [condensed], statistics, choice.false_alarm)
+        kept = kept if better is None else _condensed(scan, better, statistics)[0]
+    return kept
 
 
-def _blocks(scan: ScanLines, raw: bool) -> Iterator[tuple[int, Values, NDArray[np.bool_]]]:
-    """Yield the first line, scene values or ``raw`` numbers, and validity of some lines at a time."""
-    if not raw:
-        yield from calibrated_blocks(scan.lines, scan.camera)
-        return
+Block = tuple[int, Values, NDArray[np.bool_]]  # first line, values (line, sample, band), valid (line, sample)
+
+
+def _statistics(blocks: Iterator[Block], scan: ScanLines) -> SignalStatistics:
+    lines, samples, bands = scan.values.shape
+    statistics = SignalStatistics(bands, lines * samples)
+    for _, values, valid in blocks:
+        statistics.add(values, valid)
+    return statistics
+
+
+def _raw_blocks(scan: ScanLines) -> Iterator[Block]:
     for first in range(0, len(scan.lines.data), BLOCK_LINES):
         numbers = scan.lines.data[first : first + BLOCK_LINES].astype(np.float32)
         yield first, numbers, np.ones(numbers.shape[:2], np.bool_)
 
 
-def _statistics(scan: ScanLines, raw: bool = False) -> SignalStatistics:
-    lines, samples, bands = scan.values.shape
-    found = SignalStatistics(bands, lines * samples)
-    for _, values, valid in _blocks(scan, raw):
-        found.add(values, valid)
-    return found
-
-
-def _scores(scan: ScanLines, components: Components, raw: bool) -> Iterator[tuple[int, Values]]:
-    for first, values, valid in _blocks(scan, raw):
-        yield first, score_lines(values, valid, components).scores
-
-
-def _condensed(scan: ScanLines, condenser: Condenser, found: SignalStatistics) -> tuple[KeptLines, CondensedSweep]:
+def _condensed(scan: ScanLines, condenser: Condenser, statistics: SignalStatistics) -> tuple[KeptLines, CondensedSweep]:
     """Store the scores of all lines and the residuals of rare spectra."""
-    components = condenser.components
-    cube = _new_cube(scan, components, condenser.step, found)
+    cube = _new_cube(scan, condenser.components, condenser.step, statistics)
     done = condenser.sweep(scan.lines, cube.writer.write)
     return _closed(scan, cube, done.rare, done.residuals), done
 
 
-def _new_cube(scan: ScanLines, components: Components, step: float, found: SignalStatistics) -> SignalCubeInMemory:
-    assert found.origin is not None
+def _new_cube(scan: ScanLines, components: Components, step: float, statistics: SignalStatistics) -> SignalCubeInMemory:
+    assert statistics.origin is not None
     header = SweepHeader(scan.lines.sweep, scan.lines.references, scan.wavelength_nm)
-    largest = components.largest(found.largest + np.abs(found.origin - components.mean))
+    largest = components.largest(statistics.largest + np.abs(statistics.origin - components.mean))
     return SignalCubeInMemory(header, components, step=step, largest=largest)
 
 
@@ -120,7 +285,7 @@ def _closed(
 
 
 def bin_bands(scan: ScanLines, width: int) -> KeptLines:
-    """Store the means of neighbouring bands as whole numbers; linear between their middles when they come back."""
+    """Store means of neighbouring bands as whole numbers; interpolate linearly between their centres."""
     bands = scan.values.shape[2]
     first = np.arange(0, bands, width)
     count = np.diff(np.append(first, bands))
@@ -128,90 +293,96 @@ def bin_bands(scan: ScanLines, width: int) -> KeptLines:
     size, array = numbers_in_memory(np.rint(sums / count.astype(np.float32)).astype(np.uint16))
     middle, each = first + (count - 1) / 2, np.eye(len(first))
     weights = np.stack([np.interp(np.arange(bands), middle, one) for one in each]).astype(np.float32)
-    return KeptLines(size, lambda: scan.calibrated(np.asarray(array[...], np.float32) @ weights))
+    return KeptLines(size, lambda: scan.lines.calibrated(np.asarray(array[...], np.float32) @ weights))
 
 
 def round_numbers(scan: ScanLines, step: float) -> KeptLines:
-    """Store raw numbers in steps of a part of each band's noise, by the codec of scores."""
+    """Store raw numbers in whole steps, each a fraction of its band's noise."""
     unit, steps = _in_steps(scan, step)
     size, array = numbers_in_memory(steps)
-    return KeptLines(size + unit.nbytes, lambda: scan.calibrated(np.asarray(array[...]) * unit))
+    return KeptLines(size + unit.nbytes, lambda: scan.lines.calibrated(np.asarray(array[...]) * unit))
 
 
 def _in_steps(scan: ScanLines, step: float) -> tuple[Values, NDArray[np.unsignedinteger[Any]]]:
-    """Return steps (band,) and raw numbers in whole ones."""
+    """Return the step of each band (band,) and raw numbers in whole steps."""
     unit = (step * scan.noise_dn).astype(np.float32)
     steps = np.rint(scan.lines.data / unit).astype(np.uint32)
     return unit, steps.astype(np.uint16) if steps.max() <= np.iinfo(np.uint16).max else steps
 
 
 def pack_pcodec(scan: ScanLines, step: float | None) -> KeptLines:
-    """Store raw numbers, or steps of a part of each band's noise, by pcodec."""
+    """Store raw numbers by pcodec, exactly or in whole steps, each a fraction of its band's noise."""
     pcodec = importlib.import_module("pcodec")
     unit, numbers = (np.ones(1, np.float32), scan.lines.data) if step is None else _in_steps(scan, step)
     packed: bytes = pcodec.standalone.simple_compress(numbers.ravel(), pcodec.ChunkConfig())
 
     def restore() -> Values:
-        return scan.calibrated(pcodec.standalone.simple_decompress(packed).reshape(numbers.shape) * unit)
+        return scan.lines.calibrated(pcodec.standalone.simple_decompress(packed).reshape(numbers.shape) * unit)
 
     return KeptLines(len(packed) + unit.nbytes, restore)
 
 
 def compress_zfp(scan: ScanLines, tolerance: float) -> KeptLines:
-    """Store raw numbers over each band's noise by ZFP, none off by more than a tolerance."""
+    """Store raw numbers over each band's noise by ZFP, within a tolerance."""
     zfpy = importlib.import_module("zfpy")
     unit = scan.noise_dn.astype(np.float32)
     packed: bytes = zfpy.compress_numpy(scan.lines.data / unit, tolerance=tolerance)
-    return KeptLines(len(packed) + unit.nbytes, lambda: scan.calibrated(zfpy.decompress_numpy(packed) * unit))
+    return KeptLines(len(packed) + unit.nbytes, lambda: scan.lines.calibrated(zfpy.decompress_numpy(packed) * unit))
 
 
 def keep_principal(scan: ScanLines, step: float) -> KeptLines:
-    """Store as many principal components of raw numbers as condensing keeps, not whitened, none rare."""
-    found = _statistics(scan, raw=True)
-    components = _principal(scan, found)
-    cube = _new_cube(scan, components, step, found)
-    for first, scores in _scores(scan, components, raw=True):
-        cube.writer.write(first, scores, np.zeros(scores.shape[:2], np.uint8))
-    nothing = np.zeros((0, components.bands), np.int32)
-    stored = _closed(scan, cube, np.zeros((0, 2), np.intp), nothing)
-    return KeptLines(stored.size, lambda: scan.calibrated(stored.restore()))
+    """Store principal components of raw numbers, as many as condensing keeps, without whitening or rare spectra."""
+    statistics = _statistics(_raw_blocks(scan), scan)
+    components = _principal(scan, statistics)
+    cube = _new_cube(scan, components, step, statistics)
+    for first, numbers, valid in _raw_blocks(scan):
+        cube.writer.write(first, score_lines(numbers, valid, components).scores, np.zeros(valid.shape, np.uint8))
+    stored = _closed(scan, cube, np.zeros((0, 2), np.intp), np.zeros((0, components.bands), np.int32))
+    return KeptLines(stored.size, lambda: scan.lines.calibrated(stored.restore()))
 
 
-def _principal(scan: ScanLines, found: SignalStatistics) -> Components:
-    """Principal components of raw numbers; their scores count in the mean noise of all bands."""
-    assert found.origin is not None
-    mean = found.total / found.count
-    axes = np.linalg.eigh(found.single / found.count - np.outer(mean, mean))[1][:, ::-1]
-    noise = np.full(found.bands, np.sqrt(np.mean(scan.noise_dn**2)))
-    return Components(found.origin + mean, axes[:, : scan.rank].T, noise)
+def _principal(scan: ScanLines, statistics: SignalStatistics) -> Components:
+    """Return the principal components of raw numbers, with the mean noise of all bands as unit of their scores."""
+    assert statistics.origin is not None
+    choice = SignalChoice()
+    condensed = _statistics(calibrated_blocks(scan.lines, scan.camera), scan)
+    rank = len(find_components(condensed, false_alarm=choice.false_alarm, least=choice.least))
+    mean = statistics.total / statistics.count
+    axes = np.linalg.eigh(statistics.single / statistics.count - np.outer(mean, mean))[1][:, ::-1]
+    noise = np.full(statistics.bands, np.sqrt(np.mean(scan.noise_dn**2)))
+    return Components(statistics.origin + mean, axes[:, :rank].T, noise)
 
 
 def compress_jpeg2000(scan: ScanLines, rate: float, raw: bool) -> KeptLines:
-    """Store components as the bands of a JPEG 2000 image of ``rate`` bytes a spectrum, which it shares out.
+    """Store components as the bands of a JPEG 2000 image of ``rate`` bytes a spectrum.
 
-    Of ``raw`` numbers they are principal components (Du & Fowler 2007), else those that condensing finds.
+    They are the principal components of ``raw`` numbers (Du & Fowler 2007), or the components of condensing.
     """
-    choice, found = SignalChoice(), _statistics(scan, raw)
-    if raw:
-        components = _principal(scan, found)
-    else:
-        components = find_components(found, false_alarm=choice.false_alarm, least=choice.least)
-    scores = np.concatenate([part for _, part in _scores(scan, components, raw)]).transpose(2, 0, 1)
+    choice = SignalChoice()
+
+    def blocks() -> Iterator[Block]:
+        return _raw_blocks(scan) if raw else calibrated_blocks(scan.lines, scan.camera)
+
+    statistics = _statistics(blocks(), scan)
+    found = None if raw else find_components(statistics, false_alarm=choice.false_alarm, least=choice.least)
+    components = found or _principal(scan, statistics)
+    parts = [score_lines(values, valid, components).scores for _, values, valid in blocks()]
+    scores = np.concatenate(parts).transpose(2, 0, 1)
     step = np.float32(max(JP2_STEP, float(np.abs(scores).max()) / JP2_LARGEST))
     numbers = (np.rint(scores / step) + JP2_ZERO).astype(np.uint16)
     packed = _to_jpeg2000(numbers, 100 * rate / (2 * len(components)))
-    law = 4 * (len(components) + 1) * components.bands  # axes and mean, float32
+    law = 4 * (len(components) + 1) * components.bands  # bytes of axes and mean, float32
 
     def restore() -> Values:
         back = (_from_jpeg2000(packed).astype(np.float32) - JP2_ZERO) * step
         restored = components.restore(back.transpose(1, 2, 0))
-        return scan.calibrated(restored) if raw else restored
+        return scan.lines.calibrated(restored) if raw else restored
 
     return KeptLines(len(packed) + law, restore)
 
 
 def _to_jpeg2000(numbers: NDArray[np.uint16], percent: float) -> bytes:
-    """An image (band, y, x) in that part of its bytes."""
+    """Return an image (band, y, x) as JPEG 2000, in a percentage of its bytes."""
     rasterio = importlib.import_module("rasterio")
     count, height, width = numbers.shape
     shape: dict[str, Any] = {"count": count, "height": height, "width": width, "dtype": "uint16"}
@@ -232,39 +403,29 @@ def _from_jpeg2000(packed: bytes) -> NDArray[np.uint16]:
     return numbers
 
 
+_PCODEC: Mapping[Setting, Callable[[ScanLines], KeptLines]] = {
+    "pcodec, exact": partial(pack_pcodec, step=None),
+    **{f"pcodec, rounded {step:g}": partial(pack_pcodec, step=step) for step in ROUNDED},
+}
+_ZFP: Mapping[Setting, Callable[[ScanLines], KeptLines]] = {
+    f"ZFP, tolerance {most:g}": partial(compress_zfp, tolerance=most) for most in TOLERANCES
+}
 WAYS: Mapping[Setting, Callable[[ScanLines], KeptLines]] = {
     "raw": keep_raw,
     **{f"condensed, step {step:g}": partial(condense, step=step) for step in STEPS},
     **{f"fewer components, {most}": partial(condense, step=1.0, most=most) for most in FEWER},
     **{f"binned, {width} bands": partial(bin_bands, width=width) for width in BINS},
     **{f"rounded, {step:g}": partial(round_numbers, step=step) for step in ROUNDED},
-    "pcodec, exact": partial(pack_pcodec, step=None),
-    **{f"pcodec, rounded {step:g}": partial(pack_pcodec, step=step) for step in ROUNDED},
+    **(_PCODEC if importlib.util.find_spec("pcodec") else {}),  # packages of the extra `bench`
     **{f"PCA, step {step:g}": partial(keep_principal, step=step) for step in STEPS},
     **{f"PCA, JPEG 2000, {rate:g} B": partial(compress_jpeg2000, rate=rate, raw=True) for rate in RATES},
     **{f"condensed, JPEG 2000, {rate:g} B": partial(compress_jpeg2000, rate=rate, raw=False) for rate in RATES},
-    **{f"ZFP, tolerance {most:g}": partial(compress_zfp, tolerance=most) for most in TOLERANCES},
+    **(_ZFP if importlib.util.find_spec("zfpy") else {}),
 }
 
 
-def not_here(setting: Setting) -> str | None:
-    """Say why a way of storing cannot run on this machine; None where it can."""
-    family = str(setting).partition(",")[0]
-    package = EXTRA.get(family)
-    if package is not None and importlib.util.find_spec(package) is None:
-        return f"the package {package} is not installed; it comes with: pip install 'spectralzoom[bench]'"
-    if "JPEG 2000" in str(setting) and not _writes_jpeg2000():
-        return f"rasterio's GDAL has no driver {JP2_DRIVER}"
-    return None
-
-
-def _writes_jpeg2000() -> bool:
-    with importlib.import_module("rasterio").Env() as env:
-        return JP2_DRIVER in env.drivers()
-
-
 def judge(scan: ScanLines, setting: Setting, stored: KeptLines) -> float:
-    """Restore the lines, note all that is said of them, and return their spectral error."""
+    """Restore the lines, keep their fidelity for the other figures, and return the spectral error."""
     scan.judged[setting] = scan.fidelity(stored.restore())
     return scan.judged[setting].error
 
@@ -287,13 +448,12 @@ STORE = Tradeoff(
         "mIoU [%]": lambda scan, setting, _stored: scan.judged[setting].miou,
     },
     paid="bytes a spectrum",
-    missing=not_here,
     repeats=1,
 )
 
 
 def store_tradeoff(scene: str, weights: Path | None) -> Tradeoff:
-    """Return the same trade-off on the pixels of a raster, read with weights of its classes; None: without a map."""
+    """Return the same trade-off on the pixels of a raster; without weights no map is judged."""
     labels = "no map" if weights is None else "its labels"
     return replace(
         STORE, prepare=lambda _seed: scan_raster(scene, weights), reference=f"pixels of {Path(scene).name}; {labels}"

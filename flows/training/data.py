@@ -1,4 +1,4 @@
-"""Data of `spectralzoom train`: the built-in farm, a folder of labelled scenes, or one scene with a mask."""
+"""Open the data of `spectralzoom train`: the built-in farm, a folder of labelled scenes, or one scene with a mask."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from storage.readers.datasets import DataSet, load_data_set
 from storage.readers.scene_files import SceneFile
 
 FARM_SCENES, FARM_VALIDATION = 48, 3
-FARM_SHAPE = (512, 640)  # of a training scene [px]
-FARM_TRAIN_SEED, FARM_VALIDATION_SEED = 100_000, 200_000  # surveys are shown on small seeds
-FARM_TEST_SEED = 300_000  # of farm scenes to judge on: neither trained on, nor validated on, nor shown
+FARM_SHAPE = (512, 640)  # of a scene [px]
+FARM_TRAIN_SEED, FARM_VALIDATION_SEED = 100_000, 200_000  # examples use small seeds
+FARM_TEST_SEED = 300_000  # of `evaluate`
 SEASON_DAYS = (96, 304)  # of training scenes: April to October
-SCOUTED_DAYS = (136, 200)  # of scouted fields: every crop stands
+SCOUTED_DAYS = (136, 200)  # of scouted fields
 SEASON_HOURS = (9, 15)  # true solar time
-_SCOUTED = "scouting-"  # begins the names of scouted fields
-_GOLDEN, _SILVER = 0.6180339887, 0.4142135624  # steps round a circle that no number of points comes back on
-Report = Callable[[str, float, str], None]  # what is done, how far 0..1, a figure
+_SCOUTED = "scouting-"  # prefix of the names of scouted fields
+_GOLDEN, _SILVER = 0.6180339887, 0.4142135624  # steps that cover a circle evenly
+Report = Callable[[str, float, str], None]  # activity, fraction done, figure
 
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Named scenes to train on and to validate on, made one at a time, and what the weights should say of them."""
+    """Names of training, validation and held-out scenes, which are opened one at a time."""
 
     law: str
     train: tuple[str, ...]
@@ -44,10 +44,10 @@ class TrainingData:
     held_out: tuple[str, ...]
     camera: LineCamera
     files: DataSet | None = None
-    notes: tuple[str, ...] = ()  # what was left out, for people
+    notes: tuple[str, ...] = ()  # messages on left-out scenes
 
     def scene(self, name: str) -> RasterScene:
-        """Make one scene. Raises SceneError: its file; EmptySceneError: it has no value anywhere."""
+        """Open one scene. Raises SceneError: an invalid file; EmptySceneError: no value anywhere."""
         if self.files is None:
             seed, day, hour = read_farm_name(name)
             law = SCOUTING_LAW if name.startswith(_SCOUTED) else FARM_LAW
@@ -56,7 +56,7 @@ class TrainingData:
 
 
 def scene_of_file(file: SceneFile, camera: LineCamera) -> RasterScene:
-    """Light a scene file as the simulator does."""
+    """Turn a scene file into a scene of the simulator."""
     scene = raster_from_values(
         file.values,
         camera,
@@ -73,13 +73,13 @@ def scene_of_file(file: SceneFile, camera: LineCamera) -> RasterScene:
 
 
 def farm_test_data(scenes: int, camera: LineCamera, dataset: str = FARM_LAW) -> TrainingData:
-    """Scenes of the built-in data to judge weights on, all of them in ``train``."""
+    """Return built-in scenes to judge weights on, all in ``train``."""
     laws = built_in_laws(dataset)
     return TrainingData(",".join(laws), _built_in_days(laws, FARM_TEST_SEED, scenes, odd=True), (), (), camera)
 
 
 def _built_in_days(laws: tuple[str, ...], first_seed: int, count: int, *, odd: bool = False) -> tuple[str, ...]:
-    """Name so many scenes, of each law in turn."""
+    """Name ``count`` scenes, of each law in turn."""
     names: list[str] = []
     for number, law in enumerate(laws):
         own = len(range(number, count, len(laws)))
@@ -93,10 +93,10 @@ def _built_in_days(laws: tuple[str, ...], first_seed: int, count: int, *, odd: b
 def farm_days(
     first_seed: int, count: int, *, odd: bool = False, season: tuple[int, int] = SEASON_DAYS
 ) -> tuple[str, ...]:
-    """Name scenes of the farm: seeds one after the other, a day of the season and an hour to each.
+    """Name scenes of the farm by consecutive seeds, each with a day of the season and an hour.
 
-    Days go round the season by the golden section, so that any number of scenes covers it evenly. Weights learn on even
-    days and are judged on odd ones.
+    Days follow the golden section, which covers the season evenly for any number of scenes. Training has even days,
+    evaluation ``odd`` ones.
     """
     (first, last), (morning, evening) = season, SEASON_HOURS
     names = []
@@ -108,15 +108,15 @@ def farm_days(
 
 
 def read_farm_name(name: str) -> tuple[int, int, float]:
-    """Seed, day and hour of a name that `farm_days` gave."""
+    """Return seed, day and hour of a name of `farm_days`."""
     seed, _, day, _, hour = name.removeprefix(_SCOUTED).split("-")
     return int(seed), int(day), float(hour)
 
 
 def file_data(files: DataSet, validation: int, camera: LineCamera) -> TrainingData:
-    """Scenes of a data set; every ``n``-th of those not held out goes to validation, split by scene, never by pixel.
+    """Split the scenes of a data set; every n-th of those not held out is for validation.
 
-    Scenes without labels are left out where others have some, and ``notes`` say so.
+    Scenes without labels are left out, with a note, where others have some.
     """
     names = _labelled_names(files)
     if validation >= len(names) and validation:
@@ -136,17 +136,17 @@ def file_data(files: DataSet, validation: int, camera: LineCamera) -> TrainingDa
 def _labelled_names(files: DataSet) -> tuple[str, ...]:
     names = tuple(name for name in files.train_names if name not in files.unlabelled)
     if not names:
-        raise SceneError(f"{files.path}: {'; '.join(files.notes)}; of those that are held out none can be trained on")
+        raise SceneError(f"{files.path}: {'; '.join(files.notes)}; held-out scenes cannot be trained on")
     return names
 
 
 def open_training_data(
     dataset: str, validation: int | None, scenes: int | None, camera: LineCamera, **choices: object
 ) -> TrainingData:
-    """Name the data: built-in scenes with commas between them, or a path with the choices of `load_data_set`.
+    """Open built-in scenes, separated by commas, or a path with the choices of `load_data_set`.
 
-    Without a number, one scene in eight (4 at most) goes to validation; a data set of one scene has none. Raises
-    SettingsError: a choice that is for files was made for a farm, or the other way round.
+    One scene in eight (at most 4) is for validation by default. Raises SettingsError: a choice of files for built-in
+    scenes, or the other way round.
     """
     if laws := built_in_laws(dataset):
         for choice, value in choices.items():
@@ -166,24 +166,24 @@ def open_training_data(
 
 
 def pack_mask(mask: NDArray[np.bool_]) -> str:
-    """Pixels as text for the weights' record: bits, deflated, base64."""
+    """Encode a mask for the record of weights: bits, deflated, base64."""
     return base64.b64encode(zlib.compress(np.packbits(mask).tobytes(), 9)).decode("ascii")
 
 
 def unpack_mask(text: str, shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Undo `pack_mask`."""
+    """Decode a mask of `pack_mask`."""
     bits = np.frombuffer(zlib.decompress(base64.b64decode(text)), np.uint8)
     return np.unpackbits(bits, count=shape[0] * shape[1]).reshape(shape).astype(bool)
 
 
 def either_mask(one: str | None, other: str | None) -> str:
-    """Pixels of either of two packed masks of one scene; None holds none."""
+    """Return the union of two packed masks of one scene; None is empty."""
     bits = [np.frombuffer(zlib.decompress(base64.b64decode(mask)), np.uint8) for mask in (one, other) if mask]
     return base64.b64encode(zlib.compress(np.bitwise_or.reduce(bits).tobytes(), 9)).decode("ascii")
 
 
 def only_class(scene: RasterScene) -> str | None:
-    """The class that all labels of a scene are; None where they are of several, or there is none."""
+    """Return the class of all labels of a scene; None for several classes, or no label."""
     if scene.labels is None:
         return None
     there = np.unique(scene.labels[scene.labels != UNLABELLED])
@@ -191,7 +191,7 @@ def only_class(scene: RasterScene) -> str | None:
 
 
 def alike_notes(alone: Mapping[str, str]) -> tuple[str, ...]:
-    """Question scenes whose labels are all one class, given by their names: it may mean unlabelled."""
+    """Return notes on scenes with a single class, which may stand for unlabelled."""
     by_class: dict[str, list[str]] = {}
     for name, kind in alone.items():
         by_class.setdefault(kind, []).append(name)
@@ -203,12 +203,12 @@ def alike_notes(alone: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def listed_scenes(names: Sequence[str]) -> str:
-    """Name the first of some scenes, and how many more there are."""
+    """Format the first of some names, and the number of the others."""
     return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
 def scene_notes(empty: Sequence[str], regridded: Sequence[str]) -> tuple[str, ...]:
-    """Name scenes that are left out, having no value anywhere, and those whose labels came on another grid."""
+    """Return notes on scenes without any value, and on scenes whose labels have another grid."""
     left_out = f"{counted(len(empty), 'scene')} without any value left out: {listed_scenes(empty)}"
     moved = (
         f"labels of {listed_scenes(regridded)} have another place, CRS or pixels than their images: they are brought to"
@@ -218,7 +218,7 @@ def scene_notes(empty: Sequence[str], regridded: Sequence[str]) -> tuple[str, ..
 
 
 def trained_pixels(scene: RasterScene) -> NDArray[np.bool_]:
-    """Pixels whose label training sees."""
+    """Return the labelled pixels of a scene. Raises SceneError: it has no labels."""
     if scene.labels is None:
         raise SceneError(
             f"scene {scene.name} has no labels; training needs them: give --labels, or call"

@@ -1,4 +1,4 @@
-"""Figures of new weights: agreement with the labels of scenes kept for validation."""
+"""Judge new weights on validation scenes: placements, cascade, uniform scans and baselines."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.ensemble import RandomForestClassifier
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.linear_model import LogisticRegression
 
 from flows.training.data import Report
 from models.evaluation.cascade import CascadeTable, ReadTwice
@@ -28,6 +31,7 @@ from models.policies.policies import score_patches
 from models.reading.inference import coarse_prediction_of_columns, map_of_columns, segment
 from models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation
 from models.training.examples import Example
+from models.training.start import LabelledPixels
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 
@@ -36,7 +40,7 @@ Patches = NDArray[np.float32]  # (patch, p, p, column) of every patch of the pad
 
 
 def validate(weights: Weights, examples: Iterable[Example], seed: int, show: Show) -> dict[str, Any] | None:
-    """`agreement` over all scenes together, at one fraction of the patches; None without a scene."""
+    """Return `agreement` over all scenes by each policy at one fraction of the patches; None without a scene."""
     rows = []
     for example in examples:
         grid, cells, labels = _parts(weights, example)
@@ -50,7 +54,7 @@ def validate(weights: Weights, examples: Iterable[Example], seed: int, show: Sho
         _added([row.none for row in rows]),
         _added([row.every for row in rows]),
         {name: _added([row.policies[name] for row in rows]) for name in rows[0].policies},
-        [_added([row.random[draw] for row in rows]) for draw in range(len(rows[0].random))],
+        [_added(list(draws)) for draws in zip(*(row.random for row in rows), strict=True)],
     )
     return {
         "scenes": len(rows),
@@ -62,7 +66,7 @@ def validate(weights: Weights, examples: Iterable[Example], seed: int, show: Sho
 
 
 def judge_cascade(weights: Weights, examples: Iterable[Example]) -> dict[str, Any] | None:
-    """Return what reading a part of the patches in full loses, as a `CascadeTable`; None without a scene."""
+    """Return the loss of reading some patches in full, as a `CascadeTable`; None without a scene."""
     scenes = []
     for example in examples:
         grid, cells, labels = _parts(weights, example)
@@ -74,24 +78,24 @@ def judge_cascade(weights: Weights, examples: Iterable[Example]) -> dict[str, An
     return asdict(CascadeTable.judged(scenes, weights.config.classes)) if scenes else None
 
 
-SCAN_EXPOSURES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # of the reference; the last judged is the darkest trained
+SCAN_EXPOSURES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # of the reference; the darkest of the training is judged, too
 
 
 @dataclass(frozen=True)
 class ScanFigures:
-    """Figures of uniform scans on scenes kept from training."""
+    """Figures of uniform scans on validation scenes."""
 
-    record: dict[str, Any]  # what their maps scored, for the record of the weights
-    scores: MapScores  # how what maps expected of themselves came true
+    record: dict[str, Any]  # their scores, for the record of the weights
+    scores: MapScores  # corrections of expected scores
 
 
 @dataclass(frozen=True)
 class _JudgedScan:
-    """A map of a uniform scan that was read whole, beside its labels."""
+    """Counts of the map of a uniform scan, read in full."""
 
     counts: Counts
-    sure: NDArray[np.float64]  # its labelled pixels by their confidence
-    expected: Floats  # counts as the map expects them
+    sure: NDArray[np.float64]  # `confidence_counts`
+    expected: Floats  # `expected_counts`
 
 
 def judge_scans(
@@ -101,12 +105,12 @@ def judge_scans(
     seed: int,
     report: Report = lambda what, done, figure: None,
 ) -> ScanFigures | None:
-    """Return what maps of uniform scans that are read whole score on each scene, by step and exposure.
+    """Return the scores of uniform scans, read in full, by line spacing and exposure.
 
-    None without a scene, and without ``augmentation``: then training saw none but those of the reference. In the record
-    ``miou`` and the IoU of each class are tables (step, exposure) of the scenes' means, ``spread`` the standard
-    deviation of their mIoU, ``calibration_error`` that of all pixels together. A scan is shown by the law of noise that
-    training shows crops by.
+    None without a scene, or without an ``augmentation``: the training then had the reference exposure alone. In the
+    record ``miou`` and the IoU of each class are tables (step, exposure) of means over the scenes. ``spread`` is the
+    standard deviation of their mIoU, ``calibration_error`` that of all pixels together. Scans are simulated by the
+    augmentation of the training.
     """
     known = [example for example in examples if example.noise is not None]
     if not known or augmentation is None:
@@ -127,11 +131,11 @@ def judge_scans(
             calibration[i, j] = calibration_error(np.sum([one.sure for one in judged], axis=0))
             own = [mean_iou(one) for one in counts]
             miou[i, j], spread[i, j] = np.nanmean(own), np.nanstd(own, ddof=1) if len(own) > 1 else np.nan
-            with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # a class that no scene has
+            with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of an absent class
                 of_classes[:, i, j] = np.nanmean([iou_per_class(one) for one in counts], axis=0)
             maps[step, exposure_ms] = [ScoredMap(one.counts, one.expected) for one in judged]
-            valid = f"lines {step} px apart, {exposure_ms:g} ms: {100 * miou[i, j]:.1f}"
-            report("judging scans", len(maps) / miou.size, valid)
+            figure = f"lines {step} px apart, {exposure_ms:g} ms: {100 * miou[i, j]:.1f}"
+            report("judging scans", len(maps) / miou.size, figure)
     record = {
         "scenes": len(known),
         "steps": steps,
@@ -156,7 +160,7 @@ def _scanned(
     light: float,
     rng: np.random.Generator,
 ) -> _JudgedScan:
-    """Draw the map of a scene's uniform scan, read whole, and set it beside the labels."""
+    """Simulate a uniform scan of a scene, segment it in full and compare the map with the labels."""
     assert example.noise is not None
     grid, _, labels = _parts(weights, example)
     plain, classes = example.columns.astype(np.float32), weights.config.classes
@@ -176,3 +180,27 @@ def _parts(weights: Weights, example: Example) -> tuple[SceneGrid, Patches, NDAr
 def _added(parts: list[Counts]) -> Counts:
     counts: Counts = np.sum(parts, axis=0)
     return counts
+
+
+def judge_baselines(
+    train: Sequence[Example], validation: Sequence[Example], classes: int, seed: int, report: Report
+) -> dict[str, float] | None:
+    """Return the mIoU of logistic regression and a random forest on pixels of validation scenes.
+
+    Their features are those of `linear_discriminants`. None without a validation scene, or with a single class.
+    """
+    rng = np.random.default_rng([seed, 0xBA5])
+    if not validation or len(np.unique((learnt := LabelledPixels.drawn(train, rng)).labels)) < 2:
+        return None
+    judged = LabelledPixels.drawn(validation, rng)
+    found = dict[str, float]()
+    for name, classifier in {
+        "logistic regression": LogisticRegression(max_iter=200),
+        "random forest": RandomForestClassifier(100, min_samples_leaf=2, random_state=seed),
+    }.items():
+        report("fitting baseline classifiers", len(found) / 2, name)
+        with warnings.catch_warnings(action="ignore", category=ConvergenceWarning):  # nearly converged suffices
+            classifier.fit(learnt.features, learnt.labels)
+        drawn = classifier.predict(judged.features).astype(np.uint8)
+        found[name] = mean_iou(confusion(judged.labels, drawn, classes))
+    return found

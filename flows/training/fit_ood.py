@@ -1,7 +1,7 @@
-"""The weights' own statements on their training and on what is in distribution, measured at its end, or later.
+"""Describe the training data of weights, fit their out-of-distribution detector and measure their calibration.
 
-`spectralzoom train --fit-ood` measures it for weights that are there: it looks at the scenes of their training again,
-as their record names them, and adds it to their file. The weights and all that was made with them stay what they are.
+`spectralzoom train --fit-ood` does so for existing weights: it images the scenes of their training again and adds the
+detector to their file. The weights themselves do not change.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from flows.terminal.progress import one_after_the_other
 from flows.training.data import Report, TrainingData, open_training_data, read_farm_name
 from flows.training.figures import judge_scans
 from flows.training.train_scenes import TrainRequest, as_read, observe_all
+from models.evaluation.metrics import JudgedMap, judge_confidence
 from models.reading.inference import map_of_columns
-from models.training.calibration import JudgedMap, judge_confidence
 from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from models.training.examples import Example
 from models.training.ood_fit import fit_ood
@@ -37,7 +37,7 @@ from pipeline.simulator.scenes.farm.land import sun_over_farm
 
 @dataclass(frozen=True)
 class SeenScenes:
-    """Scenes as training saw them, and those kept from it."""
+    """Training and validation scenes, with their bands and exposures."""
 
     train: Sequence[Example]
     validation: Sequence[Example]
@@ -47,7 +47,7 @@ class SeenScenes:
 
 
 def trained_on(data: TrainingData, seen: SeenScenes, classes: tuple[str, ...]) -> TrainedOn:
-    """Ranges of what training saw; season, sun and scale of the farm alone, which states them."""
+    """Return the ranges of the training data; season, sun and scale are known for built-in farms alone."""
     low, high = float(seen.wavelength_nm.min()), float(seen.wavelength_nm.max())
     exposures = (seen.darkest_ms, max(seen.darkest_ms, data.camera.exposure_ms))
     bands_nm = tuple(seen.wavelength_nm.tolist())
@@ -62,7 +62,7 @@ def trained_on(data: TrainingData, seen: SeenScenes, classes: tuple[str, ...]) -
 
 
 def measured_calibration(weights: Weights, frames: Sequence[Example], seed: int) -> dict[str, Any] | None:
-    """Return how sure of itself the map of a full scan may be, by scenes kept from training; None without one."""
+    """Return the calibration of maps of full scans on validation scenes; None without one."""
     maps = []
     for frame in frames:
         grid = SceneGrid(*frame.shape, weights.config.patch, 1)
@@ -81,9 +81,9 @@ def measure_and_add(
     *,
     out: Path | None = None,
 ) -> str | None:
-    """Measure what is familiar to the weights of the file ``path``, and add it there, or in a copy at ``out``.
+    """Fit the out-of-distribution detector of the weights in ``path``, and add it there, or in a copy at ``out``.
 
-    Returns why there is nothing to add, in words; None where it was added.
+    Returns a message where it cannot be fitted, else None.
     """
     try:
         ood_detector = fit_ood(
@@ -93,17 +93,17 @@ def measure_and_add(
             darkest_ms=seen.darkest_ms,
             bands=len(seen.wavelength_nm),
             seed=seen.seed,
-            report=lambda done: report("measuring what is familiar", done, ""),
+            report=lambda done: report("fitting the out-of-distribution detector", done, ""),
         )
     except SceneError as error:
-        return f"nothing will be called unknown: {error}"
+        return f"no pixel will be classified as unknown: {error}"
     add_ood(path, out or path, ood_detector, trained, record)
     return None
 
 
 @dataclass(frozen=True)
 class OodRequest:
-    """For which weights, where to, and the data that they were trained on."""
+    """Request to fit a detector: weights, their data set, and the file to write."""
 
     dataset: str
     weights: Path
@@ -113,17 +113,17 @@ class OodRequest:
 
 
 def measure_ood(request: OodRequest, report: Report = lambda what, done, figure: None) -> dict[str, Any]:
-    """Measure what is familiar to some weights and save it; give the record that stands in the file.
+    """Fit the out-of-distribution detector of weights and save it; return its record.
 
-    Raises SettingsError: a place that cannot be written to, other data than the weights were trained on, or no scene
-    that was kept for validation; WeightsError: the weights cannot be read.
+    Raises SettingsError: an invalid output path, other data than those of the training, or no validation scene;
+    WeightsError: the weights cannot be read.
     """
     if not request.out.parent.is_dir() or request.out.is_dir():
         raise SettingsError(f"-o {request.out}: expected the name of a file in a folder that exists")
     weights = load_weights(request.weights)
     data = _data_of(weights, request)
     seen = _observed(weights, data, request, report)
-    report("drawing maps of validation scenes", 0.0, "")
+    report("segmenting validation scenes", 0.0, "")
     trained = trained_on(data, seen, weights.class_names)
     augmentation = (
         CaptureAugmentation(weights.normalisation, darkest_ms=seen.darkest_ms)
@@ -145,9 +145,9 @@ def measure_ood(request: OodRequest, report: Report = lambda what, done, figure:
 
 
 def _data_of(weights: Weights, request: OodRequest) -> TrainingData:
-    """The scenes of the weights' training. Raises SettingsError: the data set is another."""
+    """Open the data of the training. Raises SettingsError: the data set is another."""
     split = weights.record.get("split") or {}
-    own = [name for name in split.get("train", {}) if ": " not in name]  # others are those of what they began from
+    own = [name for name in split.get("train", {}) if ": " not in name]  # others belong to the initial weights
     scenes = len(own) if built_in_laws(request.dataset) else None
     camera = LineCamera(**weights.record.get("camera", {}))
     held_out = {} if scenes else {"hold_out": tuple(split.get("held_out", ()))}
@@ -177,11 +177,11 @@ def _observed(weights: Weights, data: TrainingData, request: OodRequest, report:
     )
     examples: list[list[Example]] = []
     about = None
-    for what, names in (("looking at scenes", data.train), ("looking at validation scenes", data.validation)):
+    for what, names in (("imaging scenes", data.train), ("imaging validation scenes", data.validation)):
         if not names:
             raise SettingsError(
-                f"--fit-ood {request.weights}: no scene was kept for validation when these weights were trained, so"
-                " that their false-alarm rate is unknown; train them with --validation 1 or more"
+                f"--fit-ood {request.weights}: no scene was kept for validation when these weights were trained, which"
+                " the false-alarm rate needs; train them with --validation 1 or more"
             )
         found, about = observe_all(how, data, names, what, report, about)
         examples.append(as_read(found, weights.normalisation))
@@ -192,11 +192,11 @@ def _observed(weights: Weights, data: TrainingData, request: OodRequest, report:
 
 
 def run_measure_ood(request: OodRequest, console: Console) -> dict[str, Any]:
-    """Measure with a progress bar on ``console``; give the record kept in the file."""
+    """Fit with a progress bar on ``console``; return the record."""
     with one_after_the_other(console) as report:
         record = measure_ood(request, report)
-    words = f"weights with what is familiar to them: {request.out}, of {record['scenes']} scenes"
-    console.print(words, markup=False, soft_wrap=True)
+    summary = f"weights with an out-of-distribution detector: {request.out}, fitted to {record['scenes']} scenes"
+    console.print(summary, markup=False, soft_wrap=True)
     error = record[CALIBRATION]["expected_error"]
-    console.print(f"confidence is off by {100 * error:.2f} points on {record['validation']} scenes", soft_wrap=True)
+    console.print(f"calibration error: {100 * error:.2f} points on {record['validation']} scenes", soft_wrap=True)
     return record

@@ -1,48 +1,47 @@
-"""The verb `init`: it looks at images and labels, and writes a scene.toml of what they do not say.
-
-Of a folder of recorded sweeps it writes a survey.toml.
-"""
+"""Run the verb `init`: inspect images and labels, and draft a scene.toml; for recorded sweeps a survey.toml."""
 
 from __future__ import annotations
 
 import json
 import re
 import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 
 from flows.cli.app import AsJson, Switch, stderr
 from flows.terminal.figures import counted
 from flows.terminal.processes import DONE, writing
 from flows.terminal.progress import StageProgress, put_out
-from flows.training.survey_draft import (
-    draft_sweeps,
-    printable,
-    set_aside,
-    show_draft,
-    show_survey_draft,
-    write_survey_draft,
-)
+from pipeline.errors import PipelineError, SettingsError
 from pipeline.readings import MOST_VALUE
 from storage.archive.whole_files import write_whole
-from storage.readers.label_files import is_store, listed_names
-from storage.readers.open_cubes import split_variable
+from storage.readers.envi_files import find_reference
+from storage.readers.label_files import image_folder, is_store, listed_names, match_folder
+from storage.readers.open_cubes import open_cube, reader_of, split_variable
+from storage.readers.pointing_tables import ENDINGS
 from storage.readers.polygons import is_polygon_file
+from storage.readers.recorded_cubes import find_cubes
+from storage.readers.recordings import Recording, open_recording
 from storage.readers.scene_drafts import FoundClass, SceneDraft, draft_scene
 from storage.readers.scene_toml import SETTINGS_NAME
 
-TITLES = {"extent": "looking at labels"}
-NO_READING = -999.0  # at and below it an edge is filled, not seen
+SURVEY_NAME = "survey.toml"
+CAMERA_NUMBERS = ("uint8", "uint16", "int16")
+TITLES = {"extent": "reading labels"}
+NO_READING = -999.0  # at and below it an edge is nodata
 
 
 def init(source: str, *, force: Switch = False, as_json: AsJson = False) -> int:
-    """Look at the images and labels of SOURCE, and write a scene.toml beside them that can be read and changed.
+    """Inspect the images and labels of SOURCE, and write a scene.toml beside them to edit.
 
-    Of a folder of recorded sweeps it is a survey.toml. Asks nothing, and says what it could not see and which command
-    comes next.
+    For a folder of recorded sweeps it is a survey.toml. The output lists what is missing, and the next command.
 
     Parameters
     ----------
@@ -50,7 +49,7 @@ def init(source: str, *, force: Switch = False, as_json: AsJson = False) -> int:
         A folder of images with their labels, one image or cube, or a folder of sweeps: ENVI cubes with pointing tables
         or reference frames, or those of a Headwall camera.
     force
-        Write a new file in the place of one that is there, which is kept as scene.toml.old or survey.toml.old.
+        Replace an existing file, which is kept as scene.toml.old or survey.toml.old.
     """
     if (draft := draft_sweeps(Path(source))) is not None:
         put_out(write_survey_draft(draft, force=force), show_survey_draft, as_json=as_json)
@@ -60,21 +59,20 @@ def init(source: str, *, force: Switch = False, as_json: AsJson = False) -> int:
 
 
 def run_init(source: str, console: Console, *, force: bool = False) -> dict[str, Any]:
-    """Write a scene.toml for a folder or file, with progress on ``console``; give what was found, as --json prints it.
+    """Write a scene.toml for a folder or file, with progress on ``console``; return the findings for --json.
 
-    Raises SettingsError: there is a scene.toml and ``force`` is not given; ArchiveError: the folder cannot be written
-    to; else as `draft_scene`.
+    Raises SettingsError: a scene.toml exists and ``force`` is not given; ArchiveError: the folder cannot be written to;
+    else as `draft_scene`.
     """
     place, _ = split_variable(source)
     path = (place if place.is_dir() and not is_store(place) else place.parent) / SETTINGS_NAME
     with writing(path.parent, "folder"), set_aside(path, force=force):
         with StageProgress(console, TITLES) as progress:
             draft = draft_scene(source, lambda done, name: progress.show("extent", done, name, ended=done == 1))
-        # The lines of a scene.toml, each with a comment on where it comes from.
         parts = [
             [
-                f"# What {counted(len(draft.files.images), 'image')} here cannot say, as `spectralzoom init` saw it.",
-                "# Any line may be changed or taken away; what comes after a # is a comment.",
+                f"# Properties of {counted(len(draft.files.images), 'image')} by `spectralzoom init`.",
+                "# Any line may be changed or removed; text after a # is a comment.",
             ],
             _label_lines(draft),
             _wavelength_lines(draft),
@@ -106,7 +104,7 @@ def _label_lines(draft: SceneDraft) -> list[str]:
     if draft.pattern is None:
         pair = next(iter(labels.items()))
         return [
-            f"# {len(labels)} of {len(images)} images have labels, found by their names: {printable(pair[0].name)}"
+            f"# labels of {len(labels)} of {len(images)} images were found by their names: {printable(pair[0].name)}"
             f" has {printable(pair[1].name)}"
         ]
     return [f"labels = {_quoted(draft.pattern)}   # of {len(labels)} of {len(images)} images"]
@@ -116,8 +114,7 @@ def _wavelength_lines(draft: SceneDraft) -> list[str]:
     bands = draft.shape[2]
     if draft.wavelength_nm is None:
         return [
-            f"# {bands} bands, and nothing says their wavelengths. Fill in one of these two lines, and take the # in",
-            "# front of it away:",
+            f"# {bands} bands without wavelengths. Fill in one of these two lines, and remove the # in front of it:",
             f"# wavelengths_nm = []   # {bands} numbers [nm] between the brackets, with commas",
             f'# wavelengths_file = "bands.txt"   # a text file beside this one of {bands} rows, which begin with nm',
         ]
@@ -125,20 +122,20 @@ def _wavelength_lines(draft: SceneDraft) -> list[str]:
         low, high = draft.wavelength_nm.min(), draft.wavelength_nm.max()
         return [f"# {bands} bands, {low:g}-{high:g} nm: {printable(draft.wavelength_origin)}"]
     listed = ", ".join(repr(float(nm)) for nm in draft.wavelength_nm)
-    return [f"# wavelengths_nm = [{listed}]   # assumed of its colours: if you know better, take away the first #"]
+    return [f"# wavelengths_nm = [{listed}]   # assumed from the colours; remove the first # to change them"]
 
 
 def _value_lines(draft: SceneDraft) -> list[str]:
     lines = []
     if draft.missing:
-        lines.append(f"# {draft.missing:.1%} of the values looked at are NaN, and count as missing")
+        lines.append(f"# NaN counts as missing: {draft.missing:.1%} of the inspected values")
     if draft.nodata is not None:
-        lines.append(f"# the file itself says that {draft.nodata:g} is no data")
+        lines.append(f"# the file states that {draft.nodata:g} is nodata")
     elif draft.edge is not None:
         value, fraction = draft.edge
         sure = value <= NO_READING or value > MOST_VALUE
         parts = f"nodata = {value!r}   # {fraction:.0%} of the first image's edge"
-        lines.append(parts if sure else f"# {parts}; if it stands for no data there, take away the first #")
+        lines.append(parts if sure else f"# {parts}; if it means nodata, remove the first #")
     if draft.dtype.itemsize == 2:
         lines.append("# scale = 0.0001   # if these numbers are reflectance times 10000")
     if not draft.placed:
@@ -152,12 +149,11 @@ def _class_lines(draft: SceneDraft) -> list[str]:
         return []
     guess = [one for one in classes if one.value in (0, 255, (0, 0, 0), (255, 255, 255))]
     lines = [
-        f"# unlabelled = {_value(one)}   # if it stands for no class: take away the #, and its line below"
-        for one in guess[:1]
+        f"# unlabelled = {_value(one)}   # if it means no class: remove the #, and its line below" for one in guess[:1]
     ]
     parts = "name = value in the label files, fraction of all pixels; rename them as you like"
     if all(is_polygon_file(label) for label in draft.files.labels.values()):
-        parts = "name = number, fraction of the labelled pixels; polygons say the name or the number"
+        parts = "name = number, fraction of the labelled pixels; polygons have the name or the number"
     lines += ["", f"[classes]   # {parts}"]
     return lines + [f"{_key(one.name)} = {_value(one)}   # {one.fraction:.1%}" for one in classes]
 
@@ -175,7 +171,7 @@ def _quoted(text: str) -> str:
 
 
 def _unseen(draft: SceneDraft) -> list[str]:
-    """Return what needs a look: what the files do not say, or does not fit."""
+    """Return the missing or inconsistent properties."""
     found, parts = draft.files, []
     if found.labels and found.bare:
         images = counted(len(found.bare), "image")
@@ -192,7 +188,7 @@ def _unseen(draft: SceneDraft) -> list[str]:
 
 
 def _first(path: Path, draft: SceneDraft) -> str | None:
-    """Return what has to be written before the next command runs; None where it runs at once."""
+    """Return what has to be written before the next command; None if nothing."""
     if draft.wavelength_nm is not None:
         return None
     return f"write the {draft.shape[2]} wavelengths into {path}: wavelengths_nm or wavelengths_file, as its lines say"
@@ -215,3 +211,167 @@ def _show(record: dict[str, Any], console: Console) -> None:
     more = f" and {len(record['classes']) - 8} more" if len(record["classes"]) > 8 else ""
     found = [f"{images}, {record['labelled']} with labels; the first has {height} x {width} px, {bands} bands"]
     show_draft(record, [*found, *([f"classes: {names}{more}"] if names else [])], console)
+
+
+# survey.toml of a folder of recorded sweeps
+
+
+@contextmanager
+def set_aside(path: Path, *, force: bool) -> Iterator[None]:
+    """Rename an existing file within the context; restore it where no new one is written.
+
+    Raises SettingsError: it exists and ``force`` is not given.
+    """
+    there = path.exists()
+    if there and not force:
+        raise SettingsError(f"{path} exists; edit it, or replace it with --force")
+    kept = path.with_name(path.name + ".old")
+    if there:
+        path.replace(kept)
+    try:
+        yield
+    except BaseException:
+        if there:
+            kept.replace(path)
+        raise
+
+
+def write_survey_draft(draft: SweepsDraft, *, force: bool = False) -> dict[str, Any]:
+    """Write survey.toml into the folder of the sweeps; return the findings for --json.
+
+    Raises SettingsError: it exists and ``force`` is not given; ArchiveError: the folder cannot be written to.
+    """
+    path = draft.folder / SURVEY_NAME
+    with writing(draft.folder, "folder"), set_aside(path, force=force):
+        parts = [
+            [
+                "# A survey of the recorded sweeps in this folder, by `spectralzoom init`.",
+                "# Any line may be changed or removed; text after a # is a comment.",
+            ],
+            ['source = "recorded"', f'sweeps = "."   # {counted(len(draft.cubes), "cube")}: {_listed(draft)}'],
+            _pointing_lines(draft),
+            _frame_lines(draft),
+            []
+            if draft.has_wavelengths
+            else [f"# wavelengths = [450.0, ...]   # those of the {draft.bands} bands are missing: write them [nm]"],
+            [
+                "# budget = 0.5   # zoom in half of the seconds of a full scan; without it every line is used",
+                '# weights = "WEIGHTS.safetensors"   # trained on such data; "farm" is built in',
+            ],
+        ]
+        write_whole(path, ("\n\n".join("\n".join(lines) for lines in parts if lines) + "\n"))
+    return {
+        "file": str(path),
+        "sweeps": [cube.name for cube in draft.cubes],
+        "lines": None if draft.recording is None else sum(one.sweep.lines for one in draft.recording.sweeps),
+        "bands": draft.bands,
+        "notes": [] if draft.recording is None else list(draft.recording.notes),
+        "unseen": [draft.problem] if draft.problem else [],
+        "next": shlex.join(["spectralzoom", "survey", str(path), "--weights", "WEIGHTS.safetensors"]),
+    }
+
+
+def _pointing_lines(draft: SweepsDraft) -> list[str]:
+    recording = draft.recording
+    found = [one for one in draft.pointing if any(one.name.startswith(f"{cube.stem}.") for cube in draft.cubes)]
+    if found:
+        more = " and so on, by the cubes' names" if found[1:] else ""
+        return [f"# pointing is taken from {printable(found[0].name)}{more}"]
+    if draft.pointing:
+        return [f"pointing = {json.dumps(draft.pointing[0].name)}   # a row for each line"]
+    assumed = "" if recording is None else "; without it one straight, even scan is assumed"
+    return [f'# pointing = "pointing.csv"   # where each line looked, a row a line{assumed}']
+
+
+def _frame_lines(draft: SweepsDraft) -> list[str]:
+    if draft.recording is None:
+        return []
+    missing = {kind: any(f"no {kind} frame" in note for note in draft.recording.notes) for kind in ("dark", "white")}
+    assumed = {"dark": "a dark level of 0 is assumed", "white": "full scale is assumed to be white"}
+    return [
+        f'# {kind} = "{kind}.hdr"   # none was found: {assumed[kind]}'
+        if missing[kind]
+        else f"# the {kind} frame is here"
+        for kind in missing
+    ]
+
+
+def _listed(draft: SweepsDraft) -> str:
+    names = [printable(cube.name) for cube in draft.cubes[:4]]
+    return ", ".join(names) + (", ..." if len(draft.cubes) > len(names) else "")
+
+
+def printable(text: str) -> str:
+    """Return text for a comment, with a question mark for what cannot be printed."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
+
+
+def show_survey_draft(record: Mapping[str, Any], console: Console) -> None:
+    """Print the findings and the next command."""
+    lines = "" if record["lines"] is None else f" with {record['lines']} lines"
+    show_draft(record, [f"{counted(len(record['sweeps']), 'sweep')}{lines}, {record['bands']} bands"], console)
+
+
+def show_draft(record: Mapping[str, Any], found: Sequence[str], console: Console) -> None:
+    """Print the findings, what is missing, the file, and the next command."""
+    first = record.get("first")
+    lines = [
+        *found,
+        *(f"note: {note}" for note in record["notes"]),
+        *(f"missing: {one}" for one in record["unseen"]),
+        f"written: {record['file']}",
+        *([f"first: {first}"] if first else []),
+        f"{'then' if first else 'next'}: {record['next']}",
+    ]
+    for line in lines:
+        console.print(escape(line), soft_wrap=True)
+
+
+@dataclass(frozen=True)
+class SweepsDraft:
+    """Findings on the sweeps of a folder."""
+
+    folder: Path
+    cubes: tuple[Path, ...]
+    pointing: tuple[Path, ...]  # tables and vectors, by any name
+    recording: Recording | None  # None where it cannot be opened
+    bands: int
+    has_wavelengths: bool
+    problem: str = ""  # reason that it cannot be opened
+
+
+def draft_sweeps(folder: Path) -> SweepsDraft | None:
+    """Inspect a folder; return None where it has no recorded sweeps: no cubes of raw numbers, or labelled ones.
+
+    Cubes are sweeps if there are pointing tables or reference frames, or if they are ENVI cubes of whole numbers
+    without georeference.
+    """
+    if not folder.is_dir() or is_store(folder):
+        return None
+    try:
+        cubes = find_cubes(folder)
+        if match_folder(image_folder(folder)).labels:
+            return None
+        sources = [open_cube(cube) for cube in cubes]
+    except (PipelineError, OSError):
+        return None
+    if any(source.dtype.name not in CAMERA_NUMBERS for source in sources):
+        return None
+    endings = tuple(f"pointing{ending}" for ending in ENDINGS)
+    pointing = tuple(sorted(one for one in folder.iterdir() if one.name.lower().endswith(endings)))
+    frames = any(find_reference(folder, kind) is not None for kind in ("dark", "white"))
+    beside = any(folder.glob("*.dark.hdr")) or any(folder.glob("*.white.hdr"))
+    unplaced_envi = all(
+        reader_of(cube) in ("envi", "headwall") and source.geobox is None
+        for cube, source in zip(cubes, sources, strict=True)
+    )
+    if not (pointing or frames or beside or unplaced_envi):
+        return None
+    recording, problem = None, ""
+    try:
+        recording = open_recording(folder)
+    except PipelineError as error:
+        problem = str(error)
+    first = sources[0]
+    known = all(source.bands.wavelength_nm is not None for source in sources)
+    return SweepsDraft(folder, tuple(cubes), pointing, recording, first.shape[2], known, problem)

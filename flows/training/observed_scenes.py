@@ -1,8 +1,8 @@
-"""Looks at scenes in training and where weights are judged: by every line, as spectral features.
+"""Image scenes for training and evaluation by every line, as spectral features.
 
-Built-in farms are seen through the rig as a survey captures them: effects are chosen for each scene as surveys choose
-them by default, then the scan of everything is rendered, calibrated and rectified. A camera has
-looked at scene files already: they pass the footprint and the noise alone, by `models.training.examples.observe`.
+Built-in farms are captured by the simulated rig as in a survey. Effects are chosen by the defaults, and the full scan
+is rendered, calibrated and rectified. Scene files are images of a camera already: they pass only the footprint and
+noise of `models.training.examples.observe`.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from pipeline.simulator.selection.survey_probe import probe_survey
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_starts
 from pipeline.source import References
 
-TOLERANCE_SIGMA = 0.1  # of a survey, unless it says otherwise
+TOLERANCE_SIGMA = 0.1  # default of a survey
 _ROWS = 64  # rectified at a time
 
 Columns = NDArray[np.float32]
 
 
 class _Taken(SimulatedSweep):
-    """A sweep whose lines are kept once they are made."""
+    """A sweep that keeps its rendered lines."""
 
     @cached_property
     def raw(self) -> NDArray[np.uint16]:
@@ -55,31 +55,22 @@ class _Taken(SimulatedSweep):
 def observe_scene(
     scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis, rng: np.random.Generator
 ) -> Example:
-    """Look at a labelled scene on the basis, noise by ``rng``; a farm by all lines. SceneError: no labels, or a gap."""
+    """Image a labelled scene on the basis, with noise by ``rng``. Raises SceneError: no labels, or a gap."""
     if not is_built_in_key(scene.key):
         return observe(scene, camera, grid, basis, rng)
-    seed = int(rng.integers(2**31))
     if scene.labels is None:
         raise SceneError(f"scene {scene.name} has no labels; training needs them")
-    rig, cost = Rig(camera), CostModel()
-    _, full, _ = cheapest_full(grid, camera, cost)
-    source = SimulatedSource(scene, rig, seed, chosen_effects(scene, rig, full), clock=sweep_starts(full, camera, cost))
-    matrix, _ = basis.matrix(scene.wavelength_nm)
+    columns, noise = observe_finely(scene, camera, grid, basis, int(rng.integers(2**31)))
     labels = np.full(grid.padded_shape, UNLABELLED, np.uint8)
     labels[: grid.height, : grid.width] = scene.labels
-    return Example(
-        scene.name,
-        np.asarray(pad_by_reflection(_columns(source, full, grid, matrix), grid.padded_shape), np.float32),
-        labels,
-        (grid.height, grid.width),
-        noise_of(scene, matrix, camera),
-    )
+    padded = np.asarray(pad_by_reflection(columns, grid.padded_shape), np.float32)
+    return Example(scene.name, padded, labels, (grid.height, grid.width), noise)
 
 
 def observe_finely(
     scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis, seed: int
 ) -> tuple[Columns, ColumnNoise]:
-    """Scan a farm by every line: columns on the basis, (y, x, column), and the noise that they have."""
+    """Scan a farm by every line; return columns on the basis, (y, x, column), and their noise."""
     rig, cost = Rig(camera), CostModel()
     _, full, _ = cheapest_full(grid, camera, cost)
     clock = sweep_starts(full, camera, cost)
@@ -89,12 +80,12 @@ def observe_finely(
 
 
 def chosen_effects(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep]) -> Choice:
-    """Choose effects as a survey does that takes these sweeps, without its look at the worst lines."""
+    """Choose effects as a survey of these sweeps does, without its check of the worst lines."""
     return Choice.of(decide(probe_survey(scene, rig, sweeps, "sigma"), rig, EFFECTS, TOLERANCE_SIGMA).chosen)
 
 
 def _columns(source: SimulatedSource, sweeps: Sequence[Sweep], grid: SceneGrid, matrix: Columns) -> Columns:
-    """The rectified pass on the basis, (y, x, column)."""
+    """Return the rectified pass on the basis, (y, x, column)."""
     taken = [_Taken(source, sweep) for sweep in sweeps]
     rows = [project(part, matrix) for _, part, _ in mosaic_rows(taken, source.camera, grid, rows=_ROWS)]
     seen = np.concatenate(rows)

@@ -1,4 +1,4 @@
-"""`spectralzoom train`: labelled scenes in, one file of weights out, with the split and the figures kept in it."""
+"""Run `spectralzoom train`: train weights on labelled scenes and write them with split and figures."""
 
 from __future__ import annotations
 
@@ -15,9 +15,8 @@ import numpy as np
 from rich.console import Console
 
 from flows.terminal.progress import one_after_the_other, table
-from flows.training.baselines import judge_baselines
 from flows.training.data import Report, TrainingData, alike_notes, either_mask, open_training_data
-from flows.training.figures import judge_cascade, judge_scans, validate
+from flows.training.figures import judge_baselines, judge_cascade, judge_scans, validate
 from flows.training.fit_ood import SeenScenes, measure_and_add, measured_calibration, trained_on
 from flows.training.train_scenes import About, TrainRequest, as_read, network_config, observe_all
 from models.evaluation.expected_scores import MapScores
@@ -26,8 +25,7 @@ from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation
 from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from models.training.examples import Example, measured_normalisation
-from models.training.spectral_start import LabelledPixels, better_reading, linear_discriminants
-from models.training.start_weights import Start, StartFile
+from models.training.start import LabelledPixels, Start, StartFile, better_reading, linear_discriminants
 from models.training.train import Progress, train
 from models.weights.checksummed_files import read_checkpoint
 from models.weights.files import CALIBRATION, CASCADE, Weights, save_weights, with_record
@@ -44,15 +42,14 @@ def train_weights(
     report: Report = lambda what, done, figure: None,
     tell: Callable[[str], None] = lambda note: None,
 ) -> dict[str, Any]:
-    """Train, validate and save; give the record that stands in the file. ``tell`` is called with what was left out.
+    """Train, validate and save weights; return their record. ``tell`` gets notes on left-out scenes.
 
-    Raises SceneError: no labels, one class only, or scenes whose bands or classes differ; SettingsError: a folder to
-    write to that does not exist, a folder in the place of a file, sizes that do not fit, or a device that the machine
-    lacks.
+    Raises SceneError: no labels, a single class, or scenes of different bands or classes; SettingsError: an invalid
+    output path, sizes that do not fit, or an unavailable device.
     """
     checkpoint = request.out.with_name(request.out.name + ".checkpoint")
     _check_places(request.out, checkpoint)
-    read_checkpoint(checkpoint)  # refuses a damaged one before minutes are spent
+    read_checkpoint(checkpoint)  # a damaged one fails before minutes are spent
     device = choose_device(request.device)
     start = open_start(request.init, request.tokens)
     data = open_training_data(
@@ -68,16 +65,15 @@ def train_weights(
         tell(note)
     lesson = _lesson(request, data, start, report, tell)
     about = lesson.about
-    own = {
+    split = {  # before validation scenes are added to it
         "train": dict(about.keys),
         "content": list(about.content),
         "validation": list(data.validation),
         "held_out": list(data.held_out),
+        "pixels": dict(about.pixels),
     }
-    # before validation scenes are looked at: what was trained on
-    split = joined_split(own | {"pixels": dict(about.pixels)}, start)
     weights, summary = _learned(request, lesson, checkpoint, report)
-    kept, _ = observe_all(request, data, data.validation, "looking at validation scenes", report, about)
+    kept, _ = observe_all(request, data, data.validation, "imaging validation scenes", report, about)
     for note in about.notes(data.validation):
         tell(note)
     frames = as_read(kept, lesson.normalisation)
@@ -94,7 +90,7 @@ def train_weights(
         "command": request.command,
         "data": data.law,
         TRAINED_ON: trained.as_dict(),
-        "split": split,
+        "split": joined_split(split, start),
         "settings": asdict(request.settings),
         "camera": asdict(request.camera),
         "training": summary,
@@ -105,25 +101,25 @@ def train_weights(
     }
     save_weights(with_record(weights, **record), request.out)
     checkpoint.unlink(missing_ok=True)
-    own = {"command": request.command, **({} if scores is None else {MAP_SCORES: scores.as_dict()})}
-    why = measure_and_add(weights, request.out, whole, trained, own, report)
+    ood_record = {"command": request.command, **({} if scores is None else {MAP_SCORES: scores.as_dict()})}
+    why = measure_and_add(weights, request.out, whole, trained, ood_record, report)
     return record if why is None else {**record, "familiar": why}
 
 
 @dataclass(frozen=True)
 class Lesson:
-    """A lesson: scenes as the network reads them, and the tensors that it begins with."""
+    """Normalised scenes, sizes of the network and its initial tensors."""
 
     about: About
     config: SegmenterConfig
     normalisation: Normalisation
     examples: list[Example]
-    augmentation: CaptureAugmentation | None  # None where all light is that of the reference
+    augmentation: CaptureAugmentation | None  # None: the reference exposure alone
     begun: Start | None
 
     @cached_property
     def start(self) -> Mapping[str, Any]:
-        """Tensors that the network begins with: earlier weights, or the linear discriminants of its scenes."""
+        """Return the initial tensors: earlier weights, or the linear discriminants of the scenes."""
         begun = {} if self.begun is None else self.begun.state
         if "spectral.weight" in begun:
             return begun
@@ -134,8 +130,8 @@ class Lesson:
 def _lesson(
     request: TrainRequest, data: TrainingData, start: StartFile | None, report: Report, tell: Callable[[str], None]
 ) -> Lesson:
-    """Look at the scenes to train on, and lay the start's tensors into the network that is wanted."""
-    seen, about = observe_all(request, data, data.train, "looking at scenes", report)
+    """Image the scenes to train on, and fit the initial tensors to the network."""
+    seen, about = observe_all(request, data, data.train, "imaging scenes", report)
     notes = alike_notes(about.alike)
     if len(about.alike) == len(about.keys) and len(notes) == 1:
         raise SceneError(f"{request.dataset}: training needs two or more classes, and {notes[0]}")
@@ -153,7 +149,7 @@ def _lesson(
 def _learned(
     request: TrainRequest, lesson: Lesson, checkpoint: Path, report: Report
 ) -> tuple[Weights, dict[str, float | int]]:
-    """Train the network; weights, and a summary of the training."""
+    """Train the network; return weights and a summary of the training."""
 
     def progress(now: Progress) -> None:
         report("training", now.done, f"step {now.step}, loss {now.loss:.3f}")
@@ -176,7 +172,7 @@ def _learned(
 def _figures(
     weights: Weights, frames: list[Example], augmentation: CaptureAugmentation | None, seed: int, report: Report
 ) -> tuple[dict[str, Any], MapScores | None]:
-    """Return the record's figures of scenes kept for validation; of uniform scans too, where training saw such."""
+    """Return the figures of validation scenes for the record, and the corrections of expected scores."""
     figures = {"validation": validate(weights, frames, seed, lambda row: report("validating", 0.0, row))}
     if (cascade := judge_cascade(weights, frames)) is not None:
         figures[CASCADE] = cascade
@@ -195,13 +191,12 @@ def _check_places(out: Path, checkpoint: Path) -> None:
     for path in (checkpoint, *(path.with_name(path.name + ".part") for path in (out, checkpoint))):
         if path.is_dir():
             raise SettingsError(
-                f"-o {out}: {path} is a folder, and training keeps a file of that name; move it away, or name other "
-                "weights"
+                f"-o {out}: {path} is a folder, and training writes a file of that name; move it, or rename the weights"
             )
 
 
 def open_start(init: Path | None, tokens: Mapping[str, Any]) -> StartFile | None:
-    """The file to begin from, if any. SettingsError: not there, or another network; WeightsError: no known kind."""
+    """Open the initial weights, if any. Raises SettingsError: no file, or another network; WeightsError."""
     if init is None:
         return None
     start = StartFile(init)
@@ -213,21 +208,21 @@ def open_start(init: Path | None, tokens: Mapping[str, Any]) -> StartFile | None
 
 
 def refuse_seen(start: StartFile | None, data: TrainingData) -> None:
-    """Refuse to validate on scenes that the start was trained on. Raises SettingsError with the first of them."""
+    """Raise SettingsError where the initial weights were trained on a validation scene."""
     earlier: Split = {} if start is None else start.earlier.get("split", {})
-    seen = set(earlier.get("train", {}).values())  # with a mask too: validation counts every labelled pixel
+    seen = set(earlier.get("train", {}).values())  # with a mask, too: validation uses all labelled pixels
     if start is None or not seen:
         return
     for name in data.validation:
         if data.scene(name).key in seen:
             raise SettingsError(
-                f"--init {start.path} was trained on the scene {name}, which is kept for validation here: figures on it"
-                " would say nothing; pass --validation 0 and judge on others with evaluate"
+                f"--init {start.path} was trained on the scene {name}, which is for validation here; pass"
+                " --validation 0 and judge on other scenes with evaluate"
             )
 
 
 def joined_split(split: Split, start: StartFile | None) -> Split:
-    """Add what the start was trained on: weights begun from others have seen what these have seen."""
+    """Add the scenes and pixels of the initial weights' training to a split."""
     earlier: Split = {} if start is None else start.earlier.get("split", {})
     if start is None or not earlier.get("train"):
         return split
@@ -243,12 +238,12 @@ def joined_split(split: Split, start: StartFile | None) -> Split:
 
 
 def usual_crop(dataset: str) -> int:
-    """Size of the crops to train on [px]."""
+    """Return the default size of crops [px]."""
     return FARM_CROP if built_in_laws(dataset) else FRAME_CROP
 
 
 def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
-    """Train with a progress bar on ``console``; give the record kept in the weights."""
+    """Train with a progress bar on ``console``; print and return the record."""
     _check_counts(request)
     request = replace(request, command=request.command or asked_command())
     with one_after_the_other(console) as report:
@@ -283,13 +278,13 @@ def _check_counts(request: TrainRequest) -> None:
             raise SettingsError(f"{name} must be 0 or more, got {number}")
     if not 0 < settings.darkest_ms <= REFERENCE_MS:
         raise SettingsError(
-            f"--min-exposure-ms must be above 0 and at most {REFERENCE_MS:g}, the exposure that scenes are looked at "
-            f"with, got {settings.darkest_ms}"
+            f"--min-exposure-ms must be above 0 and at most {REFERENCE_MS:g}, the reference exposure, got"
+            f" {settings.darkest_ms}"
         )
 
 
 def asked_command() -> str:
-    """The command without folders: a machine's paths do not belong in weights."""
+    """Return the command without folders, for the record."""
     words = [Path(word).name if "/" in word else word for word in sys.argv[1:]]
     return shlex.join(["spectralzoom", *words])
 
@@ -304,15 +299,13 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
         left = built_in_laws(request.dataset) or request.hold_out or request.choices.get("train_mask") is not None
         on = request.dataset if left else "OTHER_SCENES"
         console.print(
-            "no scene was kept for validation; to judge the weights on scenes that they were not trained on: "
+            "no scene was kept for validation; to judge the weights on other scenes: "
             f"spectralzoom evaluate {on} --weights {out}"
             + ("" if left or len(record["split"]["train"]) < 2 else "; or train with some held out: --hold-out NAMES"),
             soft_wrap=True,
         )
         if request.settings.darkest_ms < REFERENCE_MS:
-            console.print(
-                "nor has the file a record of uniform scans, by which survey --seconds chooses", soft_wrap=True
-            )
+            console.print("the file has no scan performance, by which survey --seconds chooses", soft_wrap=True)
         return
     title = f"{figures['scenes']} scene{'s' if figures['scenes'] > 1 else ''} kept for validation"
     rows = [
@@ -320,7 +313,7 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
         for name in ("none", "random", "sobel", "entropy", "gain", "all")
     ]
     console.print(table(("placement", "mIoU", "overall"), rows, title=title))
-    console.print(f"none: the overview alone; all: everything read in full; else {figures['share_of_seats']:.0%}")
+    console.print(f"none: overview alone; all: every patch in full; others: {figures['share_of_seats']:.0%}")
     if "readings" in record:
         readings = record["readings"]
         scores = readings["miou"] | (record["baselines"] or {})
@@ -329,7 +322,7 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
 
 
 def print_start(begun: Mapping[str, Any], console: Console) -> None:
-    """Say what became of the tensors of the file."""
+    """Print which tensors of the initial weights were used."""
     skipped: Mapping[str, list[str]] = begun["skipped"]
     counts = f"{begun['matched']} tensors matched, {len(begun['resized'])} resized"
     console.print(f"begun from {begun['file']}: {counts}, {sum(map(len, skipped.values()))} skipped")

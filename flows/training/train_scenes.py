@@ -1,4 +1,4 @@
-"""Request and scenes of a training: looks at its scenes, and what all have in common."""
+"""Define the request of a training, and image its scenes."""
 
 from __future__ import annotations
 
@@ -35,29 +35,29 @@ from pipeline.simulator.scenes.scene import RasterScene
 
 @dataclass(frozen=True)
 class TrainRequest:
-    """Request of a training; ``patch`` and ``columns`` follow from the data where None."""
+    """Request of a training; a ``patch`` of None follows from the data."""
 
     dataset: str
     out: Path
     hold_out: tuple[str, ...] = ()
     validation: int | None = None
-    scenes: int | None = None  # of a built-in farm; by its law where None
+    scenes: int | None = None  # of a built-in farm; None: its default
     patch: int | None = None
     columns: int = 24
     width: int = 20
     overview_width: int = 8
-    tokens: dict[str, Any] = field(default_factory=dict)  # dim, layers, heads, mlp_ratio, where not the usual ones
-    init: Path | None = None  # weights to begin from
+    tokens: dict[str, Any] = field(default_factory=dict)  # dim, layers, heads, mlp_ratio
+    init: Path | None = None  # initial weights
     choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths, masks
     settings: TrainingSettings = field(default_factory=TrainingSettings)
     camera: LineCamera = field(default_factory=LineCamera)
     command: str = ""
-    device: str = PROCESSOR  # where the network computes; or auto
+    device: str = PROCESSOR  # or auto
 
 
 @dataclass
 class About:
-    """Facts that all scenes of a data set have in common, and what training saw of each."""
+    """Properties of all scenes of a data set, and the training pixels of each."""
 
     basis: SpectralBasis
     names: tuple[str, ...]
@@ -72,7 +72,7 @@ class About:
     regridded: list[str] = field(default_factory=list)  # scenes whose labels came on another grid
 
     def notes(self, names: Sequence[str]) -> tuple[str, ...]:
-        """Say which of some scenes are left out, and whose labels came on another grid."""
+        """Return `scene_notes` of some scenes."""
         empty, regridded = ([one for one in of if one in names] for of in (self.empty, self.regridded))
         return scene_notes(empty, regridded)
 
@@ -85,7 +85,7 @@ def observe_all(
     report: Report,
     about: About | None = None,
 ) -> tuple[list[Example], About]:
-    """Look at named scenes of the data, and say what they have in common with each other, and with earlier ones."""
+    """Image named scenes, and check that they have the bands and classes of earlier ones. Raises SceneError."""
     seen, empty = [], list[str]()
     for number, name in enumerate(names):
         report(what, number / len(names), name)
@@ -122,20 +122,20 @@ def observe_all(
 
 
 def as_read(seen: Sequence[Example], normalisation: Normalisation) -> list[Example]:
-    """Return the looks as a network reads them, by a basis that spans their bands and so reaches every column."""
+    """Normalise the scenes; their basis spans their bands and reaches every column."""
     reached = np.ones(len(normalisation.centre), np.bool_)
     return [normalised(one, normalisation, reached) for one in seen]
 
 
 def _common(request: TrainRequest, scene: RasterScene) -> About:
-    trained_pixels(scene)  # refuses a scene without labels
+    trained_pixels(scene)  # raises for a scene without labels
     if len(scene.class_names) < 2:
         notes = alike_notes({scene.name: scene.class_names[0]})
         raise SceneError(f"{request.dataset}: training needs two or more classes, and {notes[0]}")
     basis = SpectralBasis.spanning(scene.wavelength_nm, request.columns)
     patch = request.patch or suggested_patch(scene.shape, built_in=bool(built_in_laws(request.dataset)))
     about = About(basis, scene.class_names, scene.class_colours, patch, scene.wavelength_nm)
-    network_config(request, about)  # refuses sizes that do not fit before the first look
+    network_config(request, about)  # raises for invalid sizes before the first scene is imaged
     return about
 
 
@@ -147,7 +147,7 @@ def suggested_patch(shape: tuple[int, int], *, built_in: bool) -> int:
 
 
 def network_config(request: TrainRequest, about: About) -> SegmenterConfig:
-    """Sizes of the network that is asked for, for these scenes. Raises SettingsError where they do not fit."""
+    """Return the sizes of the network. Raises SettingsError where they do not fit each other."""
     try:
         return SegmenterConfig(
             classes=len(about.names),

@@ -1,4 +1,4 @@
-"""Loss of reading a part of the patches in full, by the least gain that a patch has to promise."""
+"""Measure the loss of reading only the patches in full whose expected gain reaches a threshold."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from models.evaluation.metrics import confusion, mean_iou
 
-LEAST_GAINS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2)  # that are judged [nat per px]
+LEAST_GAINS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2)  # thresholds [nat per px]
 
 
 @dataclass(frozen=True)
 class CascadeTable:
-    """Losses on scenes kept from training, for each least gain."""
+    """Losses on validation scenes, for each threshold of the expected gain."""
 
     least_gain: tuple[float, ...]  # ascending [nat per px]
-    loss: tuple[float, ...]  # mIoU of everything read in full minus that of the part
+    loss: tuple[float, ...]  # mIoU of the map read in full minus that of the part
     fraction: tuple[float, ...]  # of the patches that are read in full
 
     @staticmethod
@@ -29,7 +29,7 @@ class CascadeTable:
 
     @staticmethod
     def judged(scenes: Sequence[ReadTwice], classes: int) -> CascadeTable:
-        """Judge the maps of scenes together."""
+        """Judge the maps of all scenes together."""
         whole = mean_iou(np.sum([one.counts(0.0, classes)[0] for one in scenes], axis=0))
         losses, fractions = [], []
         for least in LEAST_GAINS:
@@ -39,9 +39,9 @@ class CascadeTable:
         return CascadeTable(LEAST_GAINS, tuple(losses), tuple(fractions))
 
     def within(self, loss: float) -> tuple[float, float] | None:
-        """Return the highest least gain that loses no more, and the fraction that is read by it; None where each does.
+        """Return the highest threshold within a loss, and the fraction of patches read by it; None where all lose more.
 
-        Between the last row within the loss and the first beyond it, gains are interpolated by their logarithm.
+        Between the last row within the loss and the first beyond it, logarithms of the gain are interpolated.
         """
         rows = int(np.cumprod(np.asarray(self.loss) <= loss).sum())
         if rows == 0:
@@ -53,7 +53,7 @@ class CascadeTable:
 
 @dataclass(frozen=True)
 class ReadTwice:
-    """A scene's map by the overview and by the full network everywhere."""
+    """The map of a scene by the overview, and by the full network everywhere."""
 
     overview: NDArray[np.uint8]  # (y, x) classes
     full: NDArray[np.uint8]  # (y, x)
@@ -62,9 +62,9 @@ class ReadTwice:
     patch: int
 
     def counts(self, least_gain: float, classes: int) -> tuple[NDArray[np.int64], int]:
-        """Return the confusion of the map with patches of at least this gain read in full, and how many these are.
+        """Return the confusion of the map with patches of at least this gain read in full, and their number.
 
-        A least gain of 0 reads all of them.
+        A threshold of 0 reads all of them.
         """
         chosen = (self.gain >= least_gain) | (least_gain == 0)
         y, x = self.labels.shape

@@ -1,12 +1,10 @@
-"""Expected scores of a map without labels: counts by its own probabilities, corrected by earlier maps.
+"""Expected scores of a map without labels: counts by its own probabilities, corrected by validation scenes.
 
-The probabilities of a map say how many pixels of each class it is likely to have right, wrong and missed, and so the
-IoU of each class without a label. Maps are surer along borders and of rare classes than they may be, the more so the
-darker and the wider apart the lines, so that this IoU is put right by what scenes with labels showed: one number for
-each class and look, added to its logit.
+The class probabilities of a map give the expected confusion counts, and from these the IoU of each class. Maps are
+overconfident at borders and for rare classes, most of all for short exposures and wide line spacings. A bias of each
+class, step and exposure corrects the logit of its IoU; it is fitted to validation scenes.
 
-A class of a few expected pixels may be there or not: it counts in the mean by the odds that it is, and the error that
-is told grows with them.
+A class of few expected pixels may be absent: its weight in the mean is the probability that it is present.
 """
 
 from __future__ import annotations
@@ -23,11 +21,11 @@ from numpy.typing import NDArray
 from models.evaluation.metrics import iou_per_class, labelled_classes, mean_iou
 
 Floats = NDArray[np.float64]
-THERE_PX = 100.0  # expected pixels of a class that is as likely to be there as not
-SURE_PX = 2000.0  # of a class: from so many on a scene counts in full, and fewer of all scenes put less right
-SMALL_PX, SMALL_ERROR = 300.0, 0.3  # the IoU of a class of so few pixels is off by half of so much
+THERE_PX = 100.0  # expected pixels of a class that is present with probability 1/2
+SURE_PX = 2000.0  # of a class: a scene with so many counts in full; fewer in all scenes shrink the bias
+SMALL_PX, SMALL_ERROR = 300.0, 0.3  # the IoU of a class of so few pixels has half of this error
 LEAST_IOU = 0.005  # IoU is kept as far from 0 and 1
-LEAST_ERROR = 0.005  # of mIoU: nobody knows better, whatever a few scenes say
+LEAST_ERROR = 0.005  # of mIoU: lower bound of the estimate from a few scenes
 
 
 def expected_counts(swaths: Iterable[NDArray[np.floating]], classes: int) -> Floats:
@@ -55,9 +53,9 @@ class ExpectedScore:
 
 
 def expected_score(counts: Floats, bias: Floats, error: float = LEAST_ERROR) -> ExpectedScore:
-    """Put `expected_counts` right by a ``bias`` of each class (class,), in logits; ``error`` is that of such looks.
+    """Correct `expected_counts` by a ``bias`` of each class (class,), in logits; ``error`` is that of such scans.
 
-    NaN where nothing is known of any class.
+    NaN where no class has a pixel.
     """
     area = counts.sum(axis=1)
     iou = scipy.special.expit(_logit(iou_per_class(counts)) + bias)
@@ -73,27 +71,27 @@ def expected_score(counts: Floats, bias: Floats, error: float = LEAST_ERROR) -> 
 
 @dataclass(frozen=True)
 class ScoredMap:
-    """A map of a scene with labels: its counts, and what it said of them itself."""
+    """Counts of a map by the labels, and by its own probabilities."""
 
     counts: NDArray[np.integer]  # (class, class) by label and mapped class
     expected: Floats  # the same by `expected_counts`
 
 
 def fitted_bias(maps: Sequence[ScoredMap]) -> Floats:
-    """Return the mean excess of the logits of the classes' IoU over what maps expected of themselves, (class,).
+    """Return the mean difference of true and expected logits of the IoU of each class, (class,).
 
-    Scenes count by the pixels that they were expected to have; a class that is rare in all of them is put right less.
+    Scenes are weighted by their expected pixels of the class; a class that is rare in all of them has a smaller bias.
     """
     expected = np.stack([one.expected for one in maps])
     counts = np.stack([one.counts for one in maps])
     weight = np.minimum(expected.sum(axis=-1), SURE_PX) * labelled_classes(counts)
-    came, said = (_logit(iou_per_class(one)) for one in (counts, expected))
-    bias: Floats = ((came - said) * weight).sum(axis=0) / (weight.sum(axis=0) + SURE_PX)
+    true, predicted = (_logit(iou_per_class(one)) for one in (counts, expected))
+    bias: Floats = ((true - predicted) * weight).sum(axis=0) / (weight.sum(axis=0) + SURE_PX)
     return bias
 
 
 def error_of_passes(maps: Sequence[ScoredMap]) -> float:
-    """Return the error of expected mIoU beyond what small classes explain; each scene is judged by the others."""
+    """Return the error of expected mIoU that small classes do not explain, by leaving out one scene at a time."""
     beyond = []
     for i, one in enumerate(maps):
         others = [*maps[:i], *maps[i + 1 :]]
@@ -104,7 +102,7 @@ def error_of_passes(maps: Sequence[ScoredMap]) -> float:
 
 @dataclass(frozen=True)
 class MapScores:
-    """Corrections of expected scores, by step and exposure of uniform scans."""
+    """Corrections of expected scores, by line spacing and exposure of uniform scans."""
 
     steps: tuple[int, ...]
     exposures_ms: tuple[float, ...]  # ascending
@@ -114,28 +112,25 @@ class MapScores:
 
     @staticmethod
     def fitted(maps: Mapping[tuple[int, float], Sequence[ScoredMap]]) -> MapScores:
-        """Fit corrections to maps by step and exposure, of the same scenes for every pair of both."""
+        """Fit corrections to maps by step and exposure; each pair has maps of the same scenes."""
         steps, exposures = sorted({step for step, _ in maps}), sorted({exposure for _, exposure in maps})
         scan_passes = [[maps[step, exposure] for exposure in exposures] for step in steps]
-        return MapScores(
-            tuple(steps),
-            tuple(exposures),
-            np.array([[fitted_bias(coarse_pass) for coarse_pass in row] for row in scan_passes]),
-            np.array([[error_of_passes(coarse_pass) for coarse_pass in row] for row in scan_passes]),
-            len(scan_passes[0][0]),
+        bias, error = (
+            np.array([[fit(one) for one in row] for row in scan_passes]) for fit in (fitted_bias, error_of_passes)
         )
+        return MapScores(tuple(steps), tuple(exposures), bias, error, len(scan_passes[0][0]))
 
     @staticmethod
     def read(content: Mapping[str, Any]) -> MapScores:
-        """Take them from a record; KeyError, TypeError or ValueError where it is none."""
+        """Read the corrections from a record. Raises KeyError, TypeError or ValueError where it is malformed."""
         steps, exposures = tuple(map(int, content["steps"])), tuple(map(float, content["exposures_ms"]))
         bias, error = np.asarray(content["bias"], np.float64), np.asarray(content["error"], np.float64)
         if not (bias.ndim == 3 and bias.shape[:2] == error.shape == (len(steps), len(exposures))):
-            raise ValueError(f"biases {bias.shape} and errors {error.shape} of {len(steps)} x {len(exposures)} looks")
+            raise ValueError(f"biases {bias.shape} and errors {error.shape} of {len(steps)} x {len(exposures)} scans")
         return MapScores(steps, exposures, bias, error, int(content["scenes"]))
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the corrections as a record keeps them."""
+        """Return the corrections for a record."""
         return {
             "scenes": self.scenes,
             "steps": list(self.steps),
@@ -157,6 +152,6 @@ class MapScores:
 
 
 def _logit(fraction: Floats) -> Floats:
-    """Logits of shares 0..1, kept from both ends; a fraction that is NaN counts as 0."""
+    """Return logits of fractions 0..1, clipped away from both ends; NaN counts as 0."""
     found: Floats = scipy.special.logit(np.clip(np.nan_to_num(fraction), LEAST_IOU, 1 - LEAST_IOU))
     return found

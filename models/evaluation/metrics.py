@@ -1,98 +1,104 @@
-"""Agreement of a class map with labels: confusion counts and what follows from them; how sure a difference is.
+"""Compute the agreement of a class map with labels, from confusion counts, and its calibration.
 
-A mean over classes is over those that the labels have among the pixels judged (the mean IU of Long et al., arXiv
-1411.4038, with the classes of the truth for its n_cl), so that all maps judged by the same labels share one set of
-classes, whatever they show. A class that a map shows and the labels lack is a false class: it has no IoU of its own,
-`false_pixels` counts it, and each of its pixels is one that the class below it has missed.
-
-How sure a difference of two rows is, draws of frames and seeds say, again and again: both rows are judged on the same
-draw, and the classes of its mean are those that the labels of its frames have.
+A mean over classes is over the classes of the labels (Long et al., arXiv 1411.4038). All maps judged by the same labels
+therefore share one set of classes. A class that only the map has is a false class. It has no IoU of its own; its
+pixels count as missed pixels of the true class.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import UNLABELLED
 
-DRAWS = 2000
+DRAWS = 2000  # of the bootstrap
 LEVEL = 0.95
+CONFIDENCE_BINS = 20
+BAD_ERROR = 0.02  # expected calibration error above which a temperature is fitted
+COOLEST, HOTTEST = 0.2, 5.0
+FITTED_PIXELS = 20_000  # random pixels of a scene to fit a temperature to
 Counts = NDArray[np.int64]
 Numbers = NDArray[np.integer]
+Floats = NDArray[np.float64]
 
 
-def confusion(labels: NDArray[np.integer], predicted: NDArray[np.integer], classes: int) -> NDArray[np.int64]:
+def confusion(labels: Numbers, predicted: Numbers, classes: int) -> Counts:
     """Count pixels by label (row) and prediction (column), (classes, classes) int64; counts of parts add up.
 
-    Labels of 255 are left out before counting. Raises ShapeError for different shapes, or a label or prediction outside
-    0..classes-1 (255 allowed in labels).
+    Pixels with the label 255 are left out. Raises ShapeError for different shapes, or a label or prediction outside
+    0..classes-1 (labels may be 255).
     """
     if labels.shape != predicted.shape:
         raise ShapeError(f"labels are {labels.shape}, the class map is {predicted.shape}; they must be equal")
     counted = labels != UNLABELLED
     truth, guess = labels[counted].astype(np.int64), predicted[counted].astype(np.int64)
     for name, values in (("label", truth), ("prediction", guess)):
-        if values.size and (values.min() < 0 or values.max() >= classes):
-            wrong = values[(values < 0) | (values >= classes)][0]
-            raise ShapeError(f"{name} {wrong} is none of the {classes} classes 0..{classes - 1}")
+        if (outside := values[(values < 0) | (values >= classes)]).size:
+            raise ShapeError(f"{name} {outside[0]} is none of the {classes} classes 0..{classes - 1}")
     return np.bincount(truth * classes + guess, minlength=classes**2).reshape(classes, classes)
 
 
 def labelled_classes(counts: NDArray[np.number]) -> NDArray[np.bool_]:
-    """Return which classes the labels have among the pixels judged, (..., class, class) -> (..., class)."""
+    """Return which classes the labels have, (..., class, class) -> (..., class)."""
     held: NDArray[np.bool_] = counts.sum(axis=-1) > 0
     return held
 
 
-def false_pixels(counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Pixels of each class that the map shows although the labels have none of it; 0 for a class that they have."""
+def false_pixels(counts: Counts) -> Counts:
+    """Return the pixels of each class that the map shows without a label of it; 0 for a class of the labels."""
     return np.where(labelled_classes(counts), 0, counts.sum(axis=0))
 
 
-def iou_per_class(counts: NDArray[np.number]) -> NDArray[np.float64]:
-    """Intersection over union of each class, (..., class, class) -> (..., class); NaN for one that the labels lack."""
+def iou_per_class(counts: NDArray[np.number]) -> Floats:
+    """Return the IoU of each class, (..., class, class) -> (..., class); NaN for one that the labels lack."""
     hit = np.diagonal(counts, axis1=-2, axis2=-1).astype(np.float64)
     union = counts.sum(axis=-2) + counts.sum(axis=-1) - hit
-    iou: NDArray[np.float64] = np.divide(hit, union, out=np.full(hit.shape, np.nan), where=labelled_classes(counts))
-    return iou
+    return _divided(hit, union, where=labelled_classes(counts))
 
 
-def mean_iou(counts: NDArray[np.integer]) -> float:
-    """Mean IoU over the classes that the labels have, whatever the map shows; NaN when nothing is labelled."""
+def _divided(total: NDArray[np.number], number: NDArray[np.number], where: NDArray[np.bool_]) -> Floats:
+    """Return a quotient, NaN elsewhere."""
+    quotient: Floats = np.divide(total, number, out=np.full(np.shape(total), np.nan), where=where)
+    return quotient
+
+
+def mean_iou(counts: Numbers) -> float:
+    """Return the mean IoU over the classes of the labels; NaN when nothing is labelled."""
     return float(mean_iou_of_each(counts))
 
 
-def mean_iou_of_each(counts: NDArray[np.integer]) -> NDArray[np.float64]:
-    """`mean_iou` of many confusion counts at once, (..., class, class) -> (...)."""
+def mean_iou_of_each(counts: Numbers) -> Floats:
+    """Return `mean_iou` of many confusion counts at once, (..., class, class) -> (...)."""
     held = labelled_classes(counts)
     total, number = np.where(held, iou_per_class(counts), 0).sum(axis=-1), held.sum(axis=-1)
-    mean: NDArray[np.float64] = np.divide(total, number, out=np.full(number.shape, np.nan), where=number > 0)
-    return mean
+    return _divided(total, number, where=number > 0)
 
 
-def agreement(counts: NDArray[np.int64]) -> dict[str, float]:
-    """Give the figures that stand side by side wherever a map is scored: mIoU and the fraction of right pixels."""
+def agreement(counts: Counts) -> dict[str, float]:
+    """Return mIoU and overall accuracy."""
     return {"miou": mean_iou(counts), "overall_accuracy": overall_accuracy(counts)}
 
 
-def overall_accuracy(counts: NDArray[np.int64]) -> float:
-    """Fraction of labelled pixels with the right class; NaN when nothing is labelled."""
+def overall_accuracy(counts: Counts) -> float:
+    """Return the fraction of labelled pixels with the right class; NaN when nothing is labelled."""
     total = counts.sum()
     return float(np.trace(counts) / total) if total else float("nan")
 
 
-def average_accuracy(counts: NDArray[np.int64]) -> float:
-    """Mean over the labelled classes of the fraction of their pixels found; NaN when nothing is labelled."""
+def average_accuracy(counts: Counts) -> float:
+    """Return the mean over the labelled classes of their fraction of right pixels; NaN when nothing is labelled."""
     held = labelled_classes(counts)
     return float((np.diag(counts)[held] / counts.sum(axis=1)[held]).mean()) if held.any() else float("nan")
 
 
-def kappa(counts: NDArray[np.int64]) -> float:
-    """Cohen's kappa: agreement beyond what the class shares alone would give."""
+def kappa(counts: Counts) -> float:
+    """Return Cohen's kappa: the agreement beyond that of independent maps of the same class fractions."""
     total = counts.sum()
     if not total:
         return float("nan")
@@ -102,37 +108,17 @@ def kappa(counts: NDArray[np.int64]) -> float:
 
 
 def gap_closed(reached: float, none: float, all_patches: float) -> float | None:
-    """Fraction of the way from no fine patch to every fine patch; None where that way is not one point up or more."""
+    """Return the fraction of the gain of all patches over none that is reached; None for a gain below one point."""
     way = all_patches - none
     return (reached - none) / way if way >= 0.01 else None  # NaN is None too
 
 
-CONFIDENCE_BINS = 20
-
-
-def confidence_counts(confidence: NDArray[np.floating], right: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Pixels by their confidence 0..1 in `CONFIDENCE_BINS` equal steps: (3, bin) how many, how many right, and the sum.
-
-    ``confidence`` and ``right`` are (pixel,). Counts of several maps add up.
-    """
-    place = np.clip((confidence * CONFIDENCE_BINS).astype(np.intp), 0, CONFIDENCE_BINS - 1)
-    weights = (None, right.astype(np.float64), confidence.astype(np.float64))
-    return np.stack([np.bincount(place, one, CONFIDENCE_BINS).astype(np.float64) for one in weights])
-
-
-def calibration_error(counts: NDArray[np.float64]) -> float:
-    """Return the expected calibration error of `confidence_counts`, 0..1: confidence less the fraction that is right.
-
-    Mean over the bins by their pixels, of |share right - mean confidence|; NaN without a pixel. (Naeini et al. 2015)
-    """
-    pixels, right, confidence = counts
-    total = float(pixels.sum())
-    return float(np.abs(right - confidence).sum() / total) if total else float("nan")
+# intervals of a difference
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A difference of mIoU (first minus second) and the bounds that ``LEVEL`` of the draws lie within."""
+    """Difference of mIoU (first minus second) with the bounds of its ``LEVEL`` interval."""
 
     difference: float
     low: float | None  # None with fewer than two frames, or where no draw has a difference
@@ -142,15 +128,14 @@ class Interval:
 def paired_interval(
     first: Counts, second: Counts, *, seeds: tuple[Numbers, Numbers] | None = None, draws: int = DRAWS, seed: int = 0
 ) -> Interval:
-    """Bootstrap the difference of two rows over frames, and over seeds of the training where there are several.
+    """Bootstrap the difference of two rows over frames, and over the seeds of trainings where there are several.
 
-    ``first`` and ``second`` are (run, frame, class, class) confusion counts. A run is a seed of the training or of the
-    placement; a row's figure is the mean over its runs of the mIoU of the drawn frames together. The rows may differ in
-    runs, not in frames. A frame that a run did not judge is all zeros. ``draws`` times as many frames as there are are
-    drawn, with replacement. ``seeds`` say of each row which seed of the training every run is of, (run,) from 0: seeds
-    are drawn with replacement too, and rows of equally many share the draw; without them all runs count alike.
+    ``first`` and ``second`` are (run, frame, class, class) confusion counts of the same frames. The figure of a row is
+    the mean over its runs of the mIoU of all frames together. A frame that a run did not judge is all zeros. ``seeds``
+    number the training of each run, (run,) from 0. Frames and trainings are drawn with replacement, the same for both
+    rows; without ``seeds`` all runs count alike.
 
-    Raises ShapeError where the rows differ in frames or classes, or seeds are not given for every run.
+    Raises ShapeError where the rows differ in frames or classes, or a run has no seed.
     """
     if first.shape[1:] != second.shape[1:] or first.ndim != 4:
         raise ShapeError(f"expected two rows of the same frames and classes, got {first.shape} and {second.shape}")
@@ -158,17 +143,16 @@ def paired_interval(
     if (len(of_runs[0]), len(of_runs[1])) != (len(first), len(second)):
         raise ShapeError(f"expected a seed for each of {len(first)} and {len(second)} runs, got {len(of_runs[0])}")
     frames = first.shape[1]
-    whole = np.ones((1, frames), np.int64)
-    difference = float((_means(first, whole) - _means(second, whole))[0])
+    once = np.ones((1, frames), np.int64)
+    difference = float((_means(first, once) - _means(second, once))[0])
     if frames < 2:
         return Interval(difference, None, None)
-    drawn = _drawn(frames, draws, [seed, 0xB007])
-    often = {count: _drawn(count, draws, [seed, 0x5EED, count]) for count in {int(of.max()) + 1 for of in of_runs}}
-    one, other = (
-        _means(counts, drawn, often[int(of.max()) + 1][:, of])
-        for counts, of in zip((first, second), of_runs, strict=True)
-    )
-    moved = one - other
+    times = _drawn(frames, draws, [seed, 0xB007])
+    changes = []
+    for counts, of in zip((first, second), of_runs, strict=True):
+        trainings = int(of.max()) + 1
+        changes.append(_means(counts, times, _drawn(trainings, draws, [seed, 0x5EED, trainings])[:, of]))
+    moved = changes[0] - changes[1]
     moved = moved[~np.isnan(moved)]
     if not moved.size:
         return Interval(difference, None, None)
@@ -176,21 +160,91 @@ def paired_interval(
     return Interval(difference, float(low), float(high))
 
 
-def _drawn(count: int, draws: int, seed: list[int]) -> NDArray[np.int64]:
-    """Return the number of times that each of ``count`` is drawn in as many goes, (draw, count)."""
+def _drawn(count: int, draws: int, seed: list[int]) -> Counts:
+    """Return how often each of ``count`` is drawn in as many draws with replacement, (draw, count)."""
     return np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=draws)
 
 
-def _means(counts: Counts, times: Numbers, often: Numbers | None = None) -> NDArray[np.float64]:
-    """Mean over runs of the mIoU of frames taken ``times`` (draw, frame) each; NaN where no run has a frame.
+def _means(counts: Counts, times: Numbers, often: Numbers | int = 1) -> Floats:
+    """Return the mean over runs of the mIoU of frames taken ``times`` (draw, frame) each; NaN without a frame.
 
-    ``often`` (draw, run) says how often each run counts; once, without it.
+    A run counts ``often`` (draw, run).
     """
-    sums = np.einsum("df,rfij->drij", times, counts)
-    each = mean_iou_of_each(sums)
-    fraction = (~np.isnan(each)) * (1 if often is None else often)
-    number = fraction.sum(axis=1)
-    means: NDArray[np.float64] = np.divide(
-        (np.nan_to_num(each) * fraction).sum(axis=1), number, out=np.full(len(each), np.nan), where=number > 0
-    )
-    return means
+    each = mean_iou_of_each(np.einsum("df,rfij->drij", times, counts))
+    weight = (~np.isnan(each)) * often
+    number = weight.sum(axis=1)
+    return _divided((np.nan_to_num(each) * weight).sum(axis=1), number, where=number > 0)
+
+
+# calibration: confidence against the fraction of right pixels
+
+
+def confidence_counts(confidence: NDArray[np.floating], right: NDArray[np.bool_]) -> Floats:
+    """Count pixels in `CONFIDENCE_BINS` equal bins of confidence: (3, bin) pixels, right pixels, sum of confidence.
+
+    ``confidence`` and ``right`` are (pixel,). Counts of several maps add up.
+    """
+    place = np.clip((confidence * CONFIDENCE_BINS).astype(np.intp), 0, CONFIDENCE_BINS - 1)
+    weights = (None, right.astype(np.float64), confidence.astype(np.float64))
+    return np.stack([np.bincount(place, one, CONFIDENCE_BINS).astype(np.float64) for one in weights])
+
+
+def calibration_error(counts: Floats) -> float:
+    """Return the expected calibration error of `confidence_counts`, 0..1; NaN without a pixel. (Naeini et al. 2015)"""
+    pixels, right, confidence = counts
+    total = float(pixels.sum())
+    return float(np.abs(right - confidence).sum() / total) if total else float("nan")
+
+
+@dataclass(frozen=True)
+class JudgedMap:
+    """Log-probabilities of the labelled pixels of a map."""
+
+    log_probability: NDArray[np.float32]  # (pixel, class)
+    labels: NDArray[np.uint8]  # (pixel,)
+
+    @staticmethod
+    def of(log_probability: NDArray[np.float32], labels: NDArray[np.uint8]) -> JudgedMap:
+        """Take the labelled pixels of (y, x, class) and (y, x)."""
+        valid = (labels != UNLABELLED) & np.isfinite(log_probability[..., 0])
+        return JudgedMap(log_probability[valid], labels[valid])
+
+
+def judge_confidence(maps: list[JudgedMap], seed: int) -> dict[str, Any]:
+    """Return the expected calibration error of maps for a record, with a ``temperature`` where it is above 0.02.
+
+    The temperature divides logits, which keeps the likeliest class. ``expected_error_before`` is the error without it.
+    """
+    error = _error(maps, 1.0)
+    if not error > BAD_ERROR:
+        return {"scenes": len(maps), "expected_error": error}
+    temperature = fitted_temperature(maps, seed)
+    return {
+        "scenes": len(maps),
+        "expected_error": _error(maps, temperature),
+        "expected_error_before": error,
+        "temperature": temperature,
+    }
+
+
+def fitted_temperature(maps: list[JudgedMap], seed: int) -> float:
+    """Return the temperature with the highest likelihood of the labels."""
+    rng = np.random.default_rng([seed, 0x7E3])
+    drawn = [rng.choice(len(one.labels), min(FITTED_PIXELS, len(one.labels)), replace=False) for one in maps]
+    values = np.concatenate([one.log_probability[i] for one, i in zip(maps, drawn, strict=True)]).astype(np.float64)
+    labels = np.concatenate([one.labels[i] for one, i in zip(maps, drawn, strict=True)])
+
+    def loss(log_temperature: float) -> float:
+        scaled = scipy.special.log_softmax(values / np.exp(log_temperature), axis=1)
+        return float(-scaled[np.arange(len(labels)), labels].mean())
+
+    bounds = np.log(COOLEST), np.log(HOTTEST)
+    return float(np.exp(scipy.optimize.minimize_scalar(loss, bounds=bounds, method="bounded").x))
+
+
+def _error(maps: list[JudgedMap], temperature: float) -> float:
+    counts = np.zeros((3, CONFIDENCE_BINS))
+    for one in maps:
+        probability = scipy.special.softmax(one.log_probability / np.float32(temperature), axis=1)
+        counts += confidence_counts(probability.max(axis=1), probability.argmax(axis=1) == one.labels)
+    return calibration_error(counts)

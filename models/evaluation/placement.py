@@ -1,11 +1,11 @@
-"""Quality of a placement of patches: beside the ideal one, which knows the loss, and beside other policies.
+"""Compare placements of patches with the ideal one and with other policies.
 
-Evaluation only: all of it needs labels and the whole scene at full resolution, none of it is a survey's own cost.
+This is evaluation only: it needs labels and the whole scene at full resolution.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -37,14 +37,13 @@ Counts = NDArray[np.int64]
 def oracle_gain(
     weights: Weights, seen: CoarsePrediction, fine: NDArray[np.floating], labels: NDArray[np.uint8]
 ) -> NDArray[np.float64]:
-    """Loss with no fine patch minus loss with all of them, (patch,) [nat], mean over a patch's pixels.
+    """Return the loss without fine patches minus the loss with all of them, (patch,) [nat], mean over its pixels.
 
-    The loss is the cross-entropy of the labelled pixels; others, and those beside the scene, add 0 to the mean.
-    Clipped to -5..5; negative where the fine look makes the map worse. A patch that shows too little to be read is
-    left out, as in the map.
+    The loss is the cross-entropy of the labelled pixels; other pixels add 0 to the mean. It is clipped to -5..5, and
+    negative where the full network makes the map worse. A patch with too few valid pixels is left out, as in the map.
 
     ``fine`` (patch, p, p, column) are normalised columns of every patch of the padded grid, ``labels`` (y, x) class
-    indices of the scene's own size, 255 unlabelled.
+    indices of the scene, 255 unlabelled.
     """
     grid, p = seen.grid, seen.grid.patch
     truth = patch_pixels(grid, labels, UNLABELLED)
@@ -62,7 +61,7 @@ def oracle_gain(
 
 
 def _losses(logits: NDArray[np.float32], truth: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Cross-entropy of each pixel, (patch, class, y, x) and (patch, y, x) -> (patch, y, x); 0 where unlabelled."""
+    """Return the cross-entropy of each pixel, (patch, class, y, x) -> (patch, y, x); 0 if unlabelled."""
     labelled = truth != UNLABELLED
     index = np.where(labelled, truth, 0).astype(np.intp)[:, None]
     exact = logits.astype(np.float64)
@@ -71,13 +70,13 @@ def _losses(logits: NDArray[np.float32], truth: NDArray[np.uint8]) -> NDArray[np
 
 
 def gain_sums(gain: Values, chosen: NDArray[np.integer], valid: NDArray[np.integer]) -> tuple[float, float]:
-    """Gain of the chosen patches, and of as many of the best valid ones; add frames up before dividing."""
+    """Return the gain of the chosen patches, and of as many of the best valid ones; sum over frames, then divide."""
     best = np.sort(gain[valid])[::-1][: len(chosen)]
     return float(gain[chosen].sum()), float(best.sum())
 
 
 def captured_gain(bought: float, best: float) -> float | None:
-    """Fraction of the best patches' gain that the chosen ones have; None where there is none to be had."""
+    """Return the gain of the chosen patches as a fraction of the best ones'; None where that is 0."""
     return bought / best if best > 0 else None
 
 
@@ -93,22 +92,15 @@ class Controls:
     random: list[Counts]
 
     def as_dict(self) -> dict[str, dict[str, Any]]:
-        """Return `agreement` of every row, the fraction of the gap closed, mean and spread of the random placements.
-
-        All rows are judged by the same labels, and so over the same classes.
-        """
+        """Return `agreement` and the fraction of the gap closed of every row; mean and spread of the random ones."""
         none, every = mean_iou(self.none), mean_iou(self.every)
-        placed = {name: [counts] for name, counts in self.policies.items()} | {"random": self.random}
-        rows = {policy: agreement_of_draws(draws) for policy, draws in placed.items()}
-        return {policy: {**row, "gap_closed": gap_closed(row["miou"], none, every)} for policy, row in rows.items()}
-
-
-def agreement_of_draws(draws: Sequence[Counts]) -> dict[str, Any]:
-    """Give the mean of `agreement` over the draws of a placement, and the spread of their mIoU; None of one alone."""
-    each = [agreement(counts) for counts in draws]
-    means = {name: float(np.mean([one[name] for one in each])) for name in each[0]}
-    spread = float(np.std([one["miou"] for one in each], ddof=1)) if len(each) > 1 else None
-    return {**means, "spread": spread}
+        rows: dict[str, dict[str, Any]] = {}
+        for policy, draws in {**{name: [one] for name, one in self.policies.items()}, "random": self.random}.items():
+            each = [agreement(counts) for counts in draws]
+            means = {name: float(np.mean([one[name] for one in each])) for name in each[0]}
+            spread = float(np.std([one["miou"] for one in each], ddof=1)) if len(each) > 1 else None
+            rows[policy] = {**means, "spread": spread, "gap_closed": gap_closed(means["miou"], none, every)}
+        return rows
 
 
 def run_controls(
@@ -124,11 +116,11 @@ def run_controls(
     among: NDArray[np.bool_] | None = None,
     report: Callable[[str], None] = lambda row: None,
 ) -> Controls:
-    """Segment with no patch, every patch, and ``fraction`` of the valid patches placed by each policy and at random.
+    """Segment with no patch, every patch, and ``fraction`` of the valid patches by each policy and at random.
 
     ``fine`` (patch, p, p, column) are normalised columns of every patch of the padded grid, ``labels`` (y, x) class
-    indices, 255 unlabelled. ``capture`` says how they were captured, None as the overview's pixels; ``among`` which
-    (patch,) may be chosen, None for all.
+    indices, 255 unlabelled. ``capture`` describes their capture (None: that of the overview), ``among``
+    (patch,) which of them may be chosen (None: all).
     """
     valid = seen.grid.valid_fraction().ravel() > 0
     valid = valid if among is None else valid & among

@@ -1,4 +1,4 @@
-"""Use of the machine by networks: processor or accelerator, torch's threads, and freed memory."""
+"""Choose device, threads and memory policy of the networks."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pipeline.lazy import deferred
 if TYPE_CHECKING:
     import torch
 else:
-    torch = deferred("torch")  # a scan is simulated without
+    torch = deferred("torch")  # not needed for a simulation
 
 Device = Literal["auto", "cpu", "cuda", "mps"]
 Present = Literal["cpu", "cuda", "mps"]
@@ -22,11 +22,11 @@ KEPT = ((-3, 2**30), (-1, 2**31 - 1), (-2, 2**26))  # mallopt: mmap threshold, t
 
 
 def choose_device(asked: str) -> Present:
-    """Name the device that is asked for; of ``auto`` the first accelerator that torch can use here, else ``cpu``.
+    """Return the device to use; for ``auto`` the first accelerator that torch can use, else ``cpu``.
 
-    Raises SettingsError: torch can use no such device on this machine; says which there are.
+    Raises SettingsError: torch cannot use this device here; the message lists the available ones.
     """
-    if asked == PROCESSOR:  # known without torch
+    if asked == PROCESSOR:  # without loading torch
         return PROCESSOR
     there: list[Present] = [PROCESSOR]
     if torch.backends.mps.is_available():
@@ -42,13 +42,13 @@ def choose_device(asked: str) -> Present:
 
 
 def use_one_thread() -> None:
-    """Hold torch to one thread: on a shared machine two spend their time waiting for each other."""
+    """Limit torch to one thread: on a shared machine more threads wait for each other."""
     torch.set_num_threads(1)
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Hold torch to one thread for a while, for a measurement; to as many as before afterwards."""
+    """Limit torch to one thread within the context."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -58,17 +58,17 @@ def one_thread() -> Iterator[None]:
 
 
 def keep_freed_memory() -> None:
-    """Ask the C library to keep freed memory: large arrays otherwise cost more page faults than arithmetic."""
+    """Let the C library keep freed memory: page faults of large arrays would take longer than the arithmetic."""
     try:
         libc = ctypes.CDLL("libc.so.6")
         for option, value in KEPT:
             libc.mallopt(option, value)
     except (OSError, AttributeError):
-        return  # another C library: slower, nothing else
+        return  # another C library is slower
 
 
 def give_back_freed_memory() -> None:
-    """Return the memory that the C library kept, when a stage is done: the next one takes pieces of other sizes."""
+    """Return kept memory to the system at the end of a stage: the next one needs blocks of other sizes."""
     try:
         ctypes.CDLL("libc.so.6").malloc_trim(0)
     except (OSError, AttributeError):

@@ -1,36 +1,190 @@
-"""The segmenter: an overview of every pixel, and a full reading of the patches where it is likely to change the map.
+"""The segmenter: an overview of every pixel, and a full network for chosen patches.
 
-The overview is a linear classifier of mean spectra, which a small U-Net corrects. A transformer reads that one's lowest
-level: each token stands for ``TOKEN_PX`` pixels a side.
-The full network is a wider U-Net that reads a patch beside what the overview found there, and corrects its logits.
+The overview is a linear classifier of mean spectra, which a small U-Net corrects. A transformer works on the lowest
+level of this U-Net; a token covers ``TOKEN_PX`` pixels a side. The full network is a wider U-Net: it reads a patch and
+the features of the overview there, and corrects the logits of the overview.
 
 Shapes: B scenes of H x W px, J spectral features, K patches a scene of p x p px. An input image has J + ``PLANES``
-channels; the last ones are those of `models.network.spectral.LineSpec`.
+channels; the last ones describe the capture (`models.network.spectral.LineSpec`).
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
 
-from models.network.layers import ChannelNorm, Encoder, Head, Stem, code_2d, cut, joined
 from models.network.sizes import AROUND_PX, BOTTOM, PLANES, SCORER_WIDTH, TOKEN_PX, level_widths, scorer_inputs
 from models.network.sizes import SegmenterConfig as SegmenterConfig
+from pipeline.errors import ShapeError
+
+LONGEST_PERIOD = 128.0  # cells of a token; the shortest is 2
+
+
+def code_2d(yx: Tensor, dim: int) -> Tensor:
+    """Return sines and cosines of both coordinates, (..., 2) cells -> (..., dim) float32.
+
+    Periods run geometrically from 2 to 128 cells. Angles are float64 and cast once: the error stays below 1e-6 at
+    1e7 px, where float32 angles would be wrong by half a turn.
+    Raises ShapeError for a width that does not divide by 4, or places in half precision.
+    """
+    if dim % 4:
+        raise ShapeError(f"a 2-D code needs a width that divides by 4, got {dim}")
+    if yx.dtype in (torch.float16, torch.bfloat16):  # exact up to 2048 and 256 only
+        raise ShapeError(f"places of tokens must be float32, float64 or whole numbers, got {yx.dtype}")
+    count = dim // 4
+    periods = torch.linspace(math.log(2.0), math.log(LONGEST_PERIOD), count, dtype=torch.float64).exp()
+    turns = yx.to(torch.float64)[..., None] / periods.to(yx.device)
+    angle = 2 * math.pi * (turns - turns.round())
+    return torch.cat([angle.sin(), angle.cos()], dim=-1).flatten(-2).to(torch.float32)
+
+
+class TokenAttention(nn.Module):
+    """Multi-head attention with normalised queries and keys: bounded logits, safe in half precision."""
+
+    def __init__(self, dim: int, heads: int) -> None:
+        super().__init__()
+        if dim % heads:
+            raise ShapeError(f"tokens of width {dim} do not divide by {heads} heads; choose another number of heads")
+        self.heads = heads
+        self.qkv = nn.Linear(dim, 3 * dim)
+        self.out = nn.Linear(dim, dim)
+        self.query_norm = nn.RMSNorm(dim // heads, eps=1e-6)
+        self.key_norm = nn.RMSNorm(dim // heads, eps=1e-6)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Let tokens (B, N, d) attend to each other -> (B, N, d)."""
+        b, n, d = x.shape
+        q, k, v = self.qkv(x).view(b, n, 3, self.heads, d // self.heads).permute(2, 0, 3, 1, 4)
+        mixed = F.scaled_dot_product_attention(self.query_norm(q), self.key_norm(k), v)
+        joined: Tensor = self.out(mixed.transpose(1, 2).reshape(b, n, d))
+        return joined
+
+
+class EncoderBlock(nn.Module):
+    """Pre-norm transformer block, (B, N, d) -> (B, N, d)."""
+
+    def __init__(self, dim: int, heads: int, mlp_ratio: int) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(dim)
+        self.attention = TokenAttention(dim, heads)
+        self.norm2 = nn.LayerNorm(dim)
+        self.mlp = nn.Sequential(nn.Linear(dim, mlp_ratio * dim), nn.GELU(), nn.Linear(mlp_ratio * dim, dim))
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = x + self.attention(self.norm1(x))
+        mixed: Tensor = x + self.mlp(self.norm2(x))
+        return mixed
+
+
+class Encoder(nn.Module):
+    """Stack of transformer blocks."""
+
+    def __init__(self, dim: int, layers: int, heads: int, mlp_ratio: int) -> None:
+        super().__init__()
+        self.blocks = nn.ModuleList(EncoderBlock(dim, heads, mlp_ratio) for _ in range(layers))
+        self.norm = nn.LayerNorm(dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Encode tokens, (B, N, d) -> (B, N, d)."""
+        for block in self.blocks:
+            x = block(x)
+        encoded: Tensor = self.norm(x)
+        return encoded
+
+
+def cut(image: Tensor, patch: int) -> Tensor:
+    """Cut an image into patches, row by row: (B, c, y, x) -> (B, N, c, p, p)."""
+    b, c, y, x = image.shape
+    cells = image.view(b, c, y // patch, patch, x // patch, patch).permute(0, 2, 4, 1, 3, 5)
+    return cells.reshape(b, y // patch * (x // patch), c, patch, patch)
+
+
+def joined(patches: Tensor, columns: int) -> Tensor:
+    """Undo ``cut``: patches in rows of ``columns``, (B, N, c, p, p) -> (B, c, y, x)."""
+    b, n, c, p, _ = patches.shape
+    cells = patches.view(b, n // columns, columns, c, p, p).permute(0, 3, 1, 4, 2, 5)
+    return cells.reshape(b, c, n // columns * p, columns * p)
+
+
+class ChannelNorm(nn.Module):
+    """Root-mean-square norm over the channels of each pixel, (P, c, y, x)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        exact = torch.promote_types(x.dtype, torch.float32)
+        scale = torch.rsqrt(x.to(exact).square().mean(dim=1, keepdim=True) + 1e-6)
+        return x * scale * self.weight[None, :, None, None]
+
+
+class Residual(nn.Module):
+    """Residual block of one 3 x 3 convolution, (P, c, y, x)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.norm = ChannelNorm(channels)
+        self.conv = nn.Conv2d(channels, channels, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        mixed: Tensor = x + self.conv(F.gelu(self.norm(x)))
+        return mixed
+
+
+class Stem(nn.Module):
+    """Encoder of a U-Net: an image to features at every level, each half as large as the last."""
+
+    def __init__(self, inputs: int, widths: list[int]) -> None:
+        super().__init__()
+        self.enter = nn.Conv2d(inputs, widths[0], 1)
+        self.blocks = nn.ModuleList(Residual(width) for width in widths)
+        self.down = nn.ModuleList(nn.Conv2d(upper, lower, 2, stride=2) for upper, lower in pairwise(widths))
+
+    def forward(self, image: Tensor) -> list[Tensor]:
+        """Compute the features of each level, finest first, from (B, inputs, y, x)."""
+        x = self.enter(image.contiguous(memory_format=torch.channels_last))  # up to 3 times as fast
+        features = []
+        for level, block in enumerate(self.blocks):
+            if level:
+                x = self.down[level - 1](x)
+            x = block(x)
+            features.append(x)
+        return features
+
+
+class Head(nn.Module):
+    """Decoder of a U-Net: features of each level to features of each pixel."""
+
+    def __init__(self, widths: list[int]) -> None:
+        super().__init__()
+        self.up = nn.ModuleList(nn.Conv2d(lower, 4 * upper, 1) for upper, lower in pairwise(widths))
+        self.blocks = nn.ModuleList(Residual(width) for width in widths[:-1])
+
+    def forward(self, features: list[Tensor]) -> Tensor:
+        """Combine the features of each level, finest first, (B, c, y, x) -> (B, width, y, x) of the finest."""
+        x = features[-1]
+        for level in range(len(features) - 2, -1, -1):
+            x = features[level] + F.pixel_shuffle(self.up[level](F.gelu(x)), 2)
+            x = self.blocks[level](x)
+        return x
 
 
 @dataclass(frozen=True)
 class Overview:
-    """The overview of a scene, which the full network corrects."""
+    """Features and logits of the overview, which the full network corrects."""
 
     features: Tensor  # (B, c, H, W)
     logits: Tensor  # (B, classes, H, W)
 
 
 class Segmenter(nn.Module):
-    """Read a scene: `read_overview` every pixel, `read_patches` those patches that are chosen."""
+    """Segment a scene: `read_overview` classifies every pixel, `read_patches` corrects chosen patches."""
 
     def __init__(self, config: SegmenterConfig) -> None:
         super().__init__()
@@ -43,14 +197,14 @@ class Segmenter(nn.Module):
         self.from_token = nn.Conv2d(dim, widths[-1] * BOTTOM**2, 1)
         self.overview_head = Head(widths)
         self.overview_classes = nn.Conv2d(config.overview_width, config.classes, 1)
-        self.spectral = nn.Conv2d(config.columns, config.classes, 1)  # a linear classifier that the rest corrects
+        self.spectral = nn.Conv2d(config.columns, config.classes, 1)  # linear classifier that the U-Net corrects
         widths = level_widths(config.width, config.patch)
         self.full_stem = Stem(inputs + config.overview_width, widths)
         self.full_head = Head(widths)
         self.full_classes = nn.Conv2d(config.width, config.classes, 1)
         self.scorer = PatchScorer(config)
         with torch.no_grad():
-            for stem in (self.overview_stem, self.full_stem):  # without other exposures training leaves planes so
+            for stem in (self.overview_stem, self.full_stem):  # planes of the capture have no effect unless trained
                 stem.enter.weight[:, config.columns : inputs] = 0
             for last in (self.spectral, self.overview_classes, self.full_classes):
                 last.weight.zero_()
@@ -58,14 +212,14 @@ class Segmenter(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Device on which its numbers lie and it computes."""
+        """Return the device of the parameters."""
         return self.full_classes.weight.device
 
     def forward(self, image: Tensor, detail: Tensor, patch_index: Tensor, origin: Tensor) -> tuple[Tensor, Tensor]:
-        """Logits of the overview (B, classes, H, W) and of the patches (B, K, classes, p, p).
+        """Return logits of the overview (B, classes, H, W) and of the patches (B, K, classes, p, p).
 
-        ``image`` is what the overview reads, ``detail`` what the full network does: the same, but for two passes.
-        ``patch_index`` (B, K) are int64 patch numbers, ``origin`` (B, 2) the tokens above and left of a crop.
+        ``image`` is the input of the overview, ``detail`` that of the full network. ``patch_index`` (B, K) are int64
+        patch numbers, ``origin`` (B, 2) the tokens above and left of a crop.
         """
         overview = self.read_overview(image, origin)
         cells = cut(detail, self.config.patch)
@@ -73,9 +227,9 @@ class Segmenter(nn.Module):
         return overview.logits, self.read_patches(overview, cells.gather(1, index), patch_index)
 
     def read_overview(self, image: Tensor, origin: Tensor | None = None, living: Tensor | None = None) -> Overview:
-        """Read (B, J + PLANES, H, W).
+        """Compute the overview of an image (B, J + PLANES, H, W).
 
-        Tokens that are not ``living``, (tokens,) bool of the one scene, are left out: no other token reads them.
+        Tokens that are not ``living``, (tokens,) bool of a single scene, take no part in the attention.
         """
         image = image.contiguous()  # two layers read it
         height, width = image.shape[2:]
@@ -101,7 +255,7 @@ class Segmenter(nn.Module):
         return Overview(drawn, logits)
 
     def _coded(self, grid: Tensor, origin: Tensor | None) -> Tensor:
-        """Tokens (B, d, rows, columns) with the codes of their places, (B, rows * columns, d)."""
+        """Add the code of its place to each token, (B, d, rows, columns) -> (B, rows * columns, d)."""
         rows, columns = grid.shape[2:]
         places = torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).double() + 0.5
         if origin is not None:
@@ -110,15 +264,15 @@ class Segmenter(nn.Module):
         return coded
 
     def score(self, overview: Overview) -> Tensor:
-        """Return the gain that is expected of reading each patch in full, (B, H/p, W/p) [nat per px]."""
+        """Return the expected gain of reading each patch in full, (B, H/p, W/p) [nat per px]."""
         gain: Tensor = self.scorer(overview.features, overview.logits)
         return gain
 
     def read_patches(self, overview: Overview, patches: Tensor, patch_index: Tensor) -> Tensor:
-        """Logits (B, K, classes, p, p) of the patches (B, K, J + PLANES, p, p), numbered by ``patch_index`` (B, K)."""
+        """Return logits (B, K, classes, p, p) of patches (B, K, J + PLANES, p, p) at ``patch_index`` (B, K)."""
         b, k = patch_index.shape
         p = self.config.patch
-        if k == 0:  # convolutions take an empty batch forward but not backward
+        if k == 0:  # convolutions have no backward pass of an empty batch
             return overview.logits.new_zeros(b, 0, self.config.classes, p, p)
         across = overview.logits.shape[-1] // p
         within = torch.arange(p, device=patch_index.device)
@@ -135,14 +289,14 @@ class Segmenter(nn.Module):
         return logits.view(b, k, *logits.shape[1:])
 
     def composite(self, logits: Tensor, patches: Tensor, patch_index: Tensor) -> Tensor:
-        """Logits of the overview with those of the patches in their places, (B, classes, H, W) float32."""
+        """Insert the logits of patches into those of the overview, (B, classes, H, W) float32."""
         cells = cut(logits.float(), self.config.patch)
         index = patch_index[:, :, None, None, None].expand(-1, -1, *cells.shape[2:])
         return joined(cells.scatter(1, index, patches.float()), logits.shape[-1] // self.config.patch)
 
 
 class PatchScorer(nn.Module):
-    """A few convolutions on the grid of patches. Nothing is learned through it by the segmenter that it judges."""
+    """Predict the gain of each patch. Gradients stop here: the segmenter does not learn from its scores."""
 
     def __init__(self, config: SegmenterConfig) -> None:
         super().__init__()
@@ -155,17 +309,14 @@ class PatchScorer(nn.Module):
         self.leave = nn.Conv2d(SCORER_WIDTH, 1, 1)
         nn.init.zeros_(self.leave.weight)
         nn.init.zeros_(self.leave.bias)  # type: ignore[arg-type]
-        self.of_entropy = nn.Parameter(torch.tensor(0.2))  # what is learned is added to a fraction of the entropy
+        self.of_entropy = nn.Parameter(torch.tensor(0.2))  # factor of the entropy, to which the network adds
 
     def forward(self, features: Tensor, logits: Tensor) -> Tensor:
-        """Features and logits of the overview, (B, c, H, W) -> gain of each patch, (B, H/p, W/p) [nat per px].
-
-        No gradient goes back into either.
-        """
+        """Return the gain of each patch, (B, H/p, W/p) [nat per px], by features and logits (B, c, H, W)."""
         features, logits = features.detach(), logits.detach()
         probability = logits.float().softmax(dim=1).to(features.dtype)
         entropy = torch.special.entr(probability).sum(dim=1, keepdim=True)
-        images = (features, probability, entropy)  # pooled one by one: each as it lies in memory
+        images = (features, probability, entropy)  # pooled one by one, without a copy
         mean = torch.cat([F.avg_pool2d(image, self.patch) for image in images], dim=1)
         most = torch.cat([F.max_pool2d(image, self.patch) for image in (features, entropy)], dim=1)
         x = self.enter(self.norm(torch.cat([mean, most], dim=1)))

@@ -1,6 +1,6 @@
-"""The spectral stem: any number of bands, in any order, onto a fixed number of columns by wavelength.
+"""Project any number of bands, in any order, onto a fixed number of spectral features (columns) by wavelength.
 
-Pixels without a reading are filled from the rest of their patch; of which more than half is dead is not read.
+Invalid pixels are filled from the rest of their patch; a patch with more than half of its pixels invalid is not read.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ SPREAD_FLOOR = 1e-3  # least spread of a column, as a fraction of the median spr
 VARIANCE_FLOOR = 1e-5  # least variance of a direction that whitening brings to 1, as a fraction of the largest
 Kind = TypeVar("Kind", bound=np.generic)
 PLANE_SCALES = np.array([4.0, 2.0, 2.0])  # of the logarithms of exposure, line spacing, binned samples
-MOST_DEAD = 0.5  # a token with more dead pixels than this fraction is not read
-MOST_COLUMN = 1e12  # of normalised columns: no reading gives more, and squares of more would end the range of float32
+MOST_DEAD = 0.5  # largest fraction of invalid pixels in a token or patch
+MOST_COLUMN = 1e12  # of valid normalised columns; squares of larger values would overflow float32
 
 
 @dataclass(frozen=True)
 class SpectralBasis:
-    """Bumps evenly spread over ``low_nm``..``high_nm``, the wavelengths that the weights are for."""
+    """Gaussian bumps evenly spaced over ``low_nm``..``high_nm``, the wavelength range of the weights."""
 
     low_nm: float
     high_nm: float
@@ -34,24 +34,22 @@ class SpectralBasis:
 
     @staticmethod
     def spanning(wavelength_nm: NDArray[np.floating], most_columns: int = 24) -> SpectralBasis:
-        """Give the basis for data of these bands: no more columns than bands."""
+        """Return a basis for these bands, with at most one column a band."""
         wavelength = checked_wavelengths(wavelength_nm, len(wavelength_nm))
         distinct = len(np.unique(wavelength))
         return SpectralBasis(float(wavelength.min()), float(wavelength.max()), min(most_columns, distinct))
 
     @property
     def spacing_nm(self) -> float:
-        """Distance of neighbouring column centres [nm]; one column alone takes everything."""
+        """Return the distance of neighbouring column centres [nm]; a single column covers all wavelengths."""
         span = self.high_nm - self.low_nm
         return span / (self.columns - 1) if self.columns > 1 else max(span, LONGEST_NM)
 
     def matrix(self, wavelength_nm: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Weights from bands to columns, each reached column summing to 1, and which columns are reached.
+        """Return weights from bands to columns, (band, column), and which columns a band reaches, (column,).
 
-        A band counts by the stretch of spectrum that it stands for (trapezoid on the sorted wavelengths), so that
-        15 or 270 bands give numbers of one scale, and repeated bands share their weight.
-
-        Returns (band, column) float32 and (column,) bool. Columns that no band reaches are all zero.
+        Weights of a reached column sum to 1, others are 0. A band is weighted by its width (trapezoid rule on the
+        sorted wavelengths). So 15 or 270 bands give columns of the same scale, and repeated bands share a weight.
 
         Raises WavelengthError for a wavelength that is not finite, or outside 200-3000 nm (micrometres?).
         """
@@ -66,22 +64,22 @@ class SpectralBasis:
 
 
 def project(values: NDArray[np.floating], matrix: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Bring (..., band) values onto columns, (..., column), by the weights of `SpectralBasis.matrix`.
+    """Project (..., band) values onto columns, (..., column), by the weights of `SpectralBasis.matrix`.
 
-    Bands of a pixel that are not finite are left out and the rest of a column's bands weigh for them; a column of which
-    no band is left is NaN, and so is every column of a pixel with more than half of its bands dead.
+    Bands that are not finite are left out, and the other bands of the column take their weight. A column without a
+    finite band is NaN. A pixel with more than half of its bands invalid is NaN in all columns.
     """
     exact = np.asarray(values, np.float32)
-    with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is mended afterwards
+    with np.errstate(invalid="ignore", over="ignore"):  # corrected below
         seen = np.asarray(exact @ matrix, np.float32)
     broken = ~np.isfinite(exact).all(axis=-1)
     if broken.any():
-        seen[broken] = _of_living_bands(exact[broken], matrix)
+        seen[broken] = _project_finite(exact[broken], matrix)
     return seen
 
 
-def _of_living_bands(values: NDArray[np.float32], matrix: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(pixel, band) -> (pixel, column) by the finite bands alone."""
+def _project_finite(values: NDArray[np.float32], matrix: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Project (pixel, band) -> (pixel, column) by the finite bands alone."""
     living = np.isfinite(values)
     weight = living.astype(np.float32) @ matrix
     whole = matrix.sum(axis=0) > 0
@@ -107,7 +105,7 @@ def checked_wavelengths(wavelength_nm: NDArray[np.floating], bands: int) -> NDAr
 
 
 def check_basis(basis: SpectralBasis, columns: int) -> None:
-    """Raise WavelengthError unless a basis has so many columns, between two wavelengths that there can be."""
+    """Raise WavelengthError unless a basis has this number of columns and a valid wavelength range."""
     checked_wavelengths(np.array([basis.low_nm, basis.high_nm]), 2)
     if basis.columns != columns or basis.low_nm > basis.high_nm:
         raise WavelengthError(
@@ -117,7 +115,7 @@ def check_basis(basis: SpectralBasis, columns: int) -> None:
 
 
 def band_widths(wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Stretch of spectrum that a band stands for [nm]: half the way to either neighbour; 1 for a single wavelength."""
+    """Return the width of each band [nm]: half the way to either neighbour; 1 for a single wavelength."""
     distinct, group, members = np.unique(wavelength_nm, return_inverse=True, return_counts=True)
     if len(distinct) == 1:
         return np.full(len(wavelength_nm), 1.0 / members[0])
@@ -128,10 +126,9 @@ def band_widths(wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Normalisation:
-    """Brings columns to one scale and takes their correlation out, as measured on the training data.
+    """Scale and decorrelate columns by statistics of the training data.
 
-    Neighbouring columns nearly repeat each other; what tells two crops apart is a small direction among them, which
-    whitening makes as large as the rest.
+    Neighbouring columns are nearly equal. Whitening enlarges the small directions that distinguish two crops.
     """
 
     centre: NDArray[np.float32]  # (column,) median
@@ -140,10 +137,10 @@ class Normalisation:
 
     @staticmethod
     def measured(sample: NDArray[np.floating], noise: NDArray[np.floating] | None = None) -> Normalisation:
-        """Measure on (pixel, column) values. Constant columns give 0, whatever the order of columns.
+        """Measure the statistics of (pixel, column) values. Constant columns are normalised to 0.
 
-        ``noise`` is the covariance (column, column) of what a shorter exposure than the sample's would add, in squares
-        of its values: directions that it hides are not made as large as the rest.
+        ``noise`` is the covariance (column, column) of the noise that a shorter exposure would add, in squares of
+        scene values. It keeps whitening from enlarging directions below the noise.
         """
         exact = sample.astype(np.float64)
         centre = np.median(exact, axis=0)
@@ -156,14 +153,14 @@ class Normalisation:
             covariance += noise / np.outer(spread, spread)
         power, axes = np.linalg.eigh(covariance)
         gain = 1 / np.sqrt(np.maximum(power, VARIANCE_FLOOR * max(float(power[-1]), 1e-12)))
-        whitening = (axes * gain) @ axes.T  # symmetric: no column changes its sign or its place
+        whitening = (axes * gain) @ axes.T  # symmetric: keeps sign and order of columns
         return Normalisation(centre.astype(np.float32), spread.astype(np.float32), whitening.astype(np.float32))
 
     def apply(self, columns: NDArray[np.floating], reached: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """(..., column) -> the same shape; columns that are unreached or not finite take what the others let expect.
+        """Normalise (..., column); columns that are unreached or not finite take their conditional mean.
 
-        Left at the median they would stand out among neighbours that they nearly repeat, and whitening would make that
-        larger than everything else. A pixel without a known column counts as the median.
+        Their median would differ from neighbouring columns, and whitening would enlarge this difference. A pixel
+        without a known column takes the median.
         """
         normal = (np.asarray(columns, np.float32) - self.centre) / self.spread
         there = reached & np.isfinite(normal)
@@ -176,30 +173,30 @@ class Normalisation:
         return np.asarray(known @ self.whitening, np.float32)
 
     def _complete(self, known: NDArray[np.float32], pixels: NDArray[np.bool_], reached: NDArray[np.bool_]) -> None:
-        """Put what the reached columns let expect into the others of some pixels, in place."""
+        """Write the conditional mean of the other columns, given the reached ones, into some pixels, in place."""
         if reached.all() or not reached.any() or not pixels.any():
             return
         rows = known[pixels]
         rest, whitening = ~reached, self.whitening.astype(np.float64)
         inverse = whitening @ whitening  # of the covariance of a normal law
         weights = -np.linalg.solve(inverse[np.ix_(rest, rest)], inverse[np.ix_(rest, reached)]).T
-        rows[:, rest] = rows[:, reached] @ np.asarray(weights, np.float32)  # its conditional mean
+        rows[:, rest] = rows[:, reached] @ np.asarray(weights, np.float32)  # conditional mean
         known[pixels] = rows
 
     @property
     def most_value(self) -> float:
-        """Size up to which a value may be a reading: as many spreads from the centre as a camera tells steps apart."""
+        """Return the largest valid value: as many spreads from the centre as a camera has steps."""
         reach = np.abs(self.centre.astype(np.float64)) + MOST_STEPS * self.spread.astype(np.float64)
         return float(min(reach.max(initial=0.0), np.finfo(np.float32).max))
 
     @property
     def gain_shift(self) -> NDArray[np.float32]:
-        """Return what 100 % more light adds to normalised columns beyond doubling them, (column,)."""
+        """Return the shift of normalised columns, beyond doubling, by twice the light, (column,)."""
         return np.asarray((self.centre / self.spread) @ self.whitening, np.float32)
 
 
 class LineSpec(NamedTuple):
-    """Capture of pixels: light, line spacing, binning; without arguments every line of the reference exposure."""
+    """Exposure, line spacing and binning of pixels; by default every line at the reference exposure."""
 
     light: float = 1.0  # exposure as a fraction of the reference
     step: float = 1  # line spacing [px]
@@ -207,46 +204,46 @@ class LineSpec(NamedTuple):
 
     @property
     def planes(self) -> NDArray[np.float32]:
-        """Return what the network reads beside spectral features, (3,): 0 for what is at least the reference."""
+        """Return the network's inputs beside spectral features, (3,); 0 is the reference or better."""
         return np.asarray(np.log2(np.maximum([1 / self.light, self.step, self.binned], 1)) / PLANE_SCALES, np.float32)
 
     @property
     def specs(self) -> tuple[LineSpec, ...]:
-        """Return the kinds of capture that there are: this one."""
+        """Return all captures of the image: this one."""
         return (self,)
 
     @property
     def usual(self) -> LineSpec:
-        """Return the capture that stands for all pixels."""
+        """Return the most frequent capture: this one."""
         return self
 
     def of_patches(self, patch_index: NDArray[np.integer], patch: int) -> LineSpec:
-        """Return the capture of some patches: that of all pixels."""
+        """Return the capture of some patches: this one."""
         return self
 
     def where(self, spec: LineSpec) -> None:
-        """Return None: every pixel was captured so."""
+        """Return None: every pixel has this capture."""
 
 
 @dataclass(frozen=True, eq=False)
 class CaptureMap:
-    """Capture of each pixel of an image, where that differs from pixel to pixel."""
+    """Captures of the pixels of an image."""
 
     specs: tuple[LineSpec, ...]
-    number: NDArray[np.uint8]  # (...) of each pixel's capture among them
+    number: NDArray[np.uint8]  # (...) index of each pixel's capture
 
     @property
     def planes(self) -> NDArray[np.float32]:
-        """Return what the network reads beside spectral features, (..., 3)."""
+        """Return the network's inputs beside spectral features, (..., 3)."""
         return np.stack([spec.planes for spec in self.specs])[self.number]
 
     @property
     def usual(self) -> LineSpec:
-        """Return the capture of most pixels."""
+        """Return the most frequent capture."""
         return self.specs[int(np.bincount(self.number.ravel(), minlength=1).argmax())]
 
     def padded(self, shape: tuple[int, int]) -> CaptureMap:
-        """Return the map of a padded image, by its border's pixels."""
+        """Extend the map to a padded image by repeating its border."""
         gap = [(0, whole - size) for whole, size in zip(shape, self.number.shape, strict=True)]
         return CaptureMap(self.specs, np.pad(self.number, gap, mode="edge"))
 
@@ -255,7 +252,7 @@ class CaptureMap:
         return CaptureMap(self.specs, patches_of(self.number, patch)[patch_index])
 
     def where(self, spec: LineSpec) -> NDArray[np.bool_]:
-        """Return the pixels (...) that were captured so."""
+        """Return which pixels (...) have this capture."""
         return np.asarray(self.number == self.specs.index(spec), np.bool_)
 
 
@@ -263,36 +260,36 @@ Capture = LineSpec | CaptureMap
 
 
 def with_planes(columns: NDArray[np.floating], capture: Capture) -> NDArray[np.float32]:
-    """Spectral features (..., column) with how they were captured behind them, (..., column + 3)."""
+    """Append the planes of the capture to spectral features, (..., column) -> (..., column + 3)."""
     planes = np.broadcast_to(capture.planes, (*columns.shape[:-1], len(PLANE_SCALES)))
     return np.concatenate([columns, planes], axis=-1, dtype=np.float32)
 
 
 def all_alive(columns: NDArray[np.floating]) -> bool:
-    """Return whether no pixel is dead, without a copy of the columns."""
+    """Return whether all pixels are valid, without a copy of the columns."""
     return not columns.size or bool(columns.min() >= -MOST_COLUMN and columns.max() <= MOST_COLUMN)
 
 
 def dead_pixels(columns: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Pixels with a column that is not finite, or larger than any reading gives, (..., column) -> (...)."""
+    """Return the invalid pixels, (..., column) -> (...): a column is not finite, or larger than any valid value."""
     if all_alive(columns):
         return np.zeros(columns.shape[:-1], np.bool_)
-    alive = columns <= MOST_COLUMN  # no copy of the columns: their size would be one
+    alive = columns <= MOST_COLUMN  # avoids a copy of the columns
     alive &= columns >= -MOST_COLUMN
     return np.asarray(~alive.all(axis=-1), np.bool_)
 
 
 def fill_dead(patches: NDArray[np.floating], dead: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Patches (P, y, x, column) with the mean of each one's living pixels in the dead ones; 0 where none lives."""
+    """Fill invalid pixels of patches (P, y, x, column) by the mean of the patch's valid ones, or by 0 without one."""
     filled = np.array(patches, np.float32)
-    for patch, holes in zip(filled, dead, strict=True):  # one by one: together they would take several copies of all
+    for patch, holes in zip(filled, dead, strict=True):  # one by one saves memory
         if holes.any():
             patch[holes] = 0 if holes.all() else patch[~holes].mean(axis=0, dtype=np.float64)
     return filled
 
 
 def readable(dead: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which patches can be read, (P, y, x) dead pixels -> (P,)."""
+    """Return which patches have enough valid pixels, (P, y, x) invalid pixels -> (P,)."""
     return np.asarray(dead.mean(axis=(1, 2)) <= MOST_DEAD, np.bool_)
 
 

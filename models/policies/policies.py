@@ -1,4 +1,4 @@
-"""Attention policies: how much a fine look at each patch is worth, judged from the coarse prediction alone."""
+"""Policies that score each patch for capture at full resolution, from the coarse prediction alone."""
 
 from __future__ import annotations
 
@@ -19,31 +19,34 @@ Pixels = NDArray[np.float64]
 Scores = NDArray[np.float64]
 Policy = Literal["gain", "entropy", "sobel", "random", "mask"]
 POLICIES: tuple[Policy, ...] = get_args(Policy)
-MOST_SUMMED = 1e280  # of a mask's values: larger ones are summed in a larger unit
+MOST_SUMMED = 1e280  # of a mask: larger values are scaled so that sums stay finite
 
 
 def score_patches(
     policy: str, seen: CoarsePrediction, *, seed: int = 0, mask: NDArray[np.generic] | None = None
 ) -> Scores:
-    """Score every patch of the padded grid, (patches,) float64, by the fraction of it that lies on the scene.
+    """Score every patch of the padded grid, (patches,) float64, weighted by its fraction on the scene.
 
-    ``policy`` is one of `POLICIES`: what the weights expect a look to gain (``gain``); by the coarse prediction's
-    classes ``entropy``; by the coarse image ``sobel`` edges (the paper's ED); ``random``, by ``seed``; ``mask``: a
-    given (y, x) image of the scene's size (the paper's fixed attention policy), in which NaN counts as 0.
+    ``policy`` is one of `POLICIES`:
 
-    Raises SettingsError for an unknown policy, or ``mask`` without a mask; ShapeError for a mask of another size than
-    the scene's.
+    - ``gain``: Expected gain, by the weights.
+    - ``entropy``: Entropy of the class probabilities.
+    - ``sobel``: Edges of the coarse image (the paper's ED).
+    - ``random``: Random numbers by ``seed``.
+    - ``mask``: A (y, x) image of the scene's size (the paper's fixed attention policy); NaN counts as 0.
+
+    Raises SettingsError for an unknown policy, or ``mask`` without a mask; ShapeError for a mask of another size.
     """
     if policy == "gain":
         if seen.gain is None:
-            raise SettingsError(f"the policy {policy!r} asks the weights, and nothing was read with them")
+            raise SettingsError(f"the policy {policy!r} needs a prediction by the weights; choose another policy")
         scores = seen.gain.astype(np.float64)
     elif policy == "random":
         scores = np.random.default_rng([seed, 0x5EA7]).random(seen.grid.patch_shape)
     elif policy == "mask":
         scores = _mask_scores(seen, mask)
-    elif policy in _PIXEL_SCORES:
-        scores = _patch_means(_PIXEL_SCORES[policy].of(seen), seen)
+    elif policy in PIXEL_SCORES:
+        scores = _patch_means(PIXEL_SCORES[policy].of(seen), seen)
     else:
         raise SettingsError(f"unknown policy {policy!r}; choose one of {', '.join(POLICIES)}")
     fraction = seen.grid.valid_fraction()
@@ -52,25 +55,20 @@ def score_patches(
 
 
 def score_multiply_adds(policy: str, config: SegmenterConfig, grid: SceneGrid) -> int:
-    """Multiply-adds of scoring every patch of a grid."""
+    """Return the multiply-adds of scoring every patch of a grid."""
     pixels = grid.padded_shape[0] * grid.padded_shape[1]
     if policy == "gain":  # entropy and pooling per pixel, then the network per patch
         inputs, patches = scorer_inputs(config), pixels // config.patch**2
         per_patch = SCORER_WIDTH * (inputs + 9 + SCORER_WIDTH + 1) + 1
         return pixels * (2 + config.classes + inputs) + patches * per_patch
-    score = _PIXEL_SCORES.get(policy)
-    if score is None:  # by place, or given
+    score = PIXEL_SCORES.get(policy)
+    if score is None:  # random or mask
         return 0
     return (score.adds + score.per_class * config.classes + score.per_column * config.columns) * pixels
 
 
-def pixel_scores(policy: str, seen: CoarsePrediction) -> Pixels:
-    """Score every pixel of the padded grid by ``entropy`` or ``sobel``, (y, x)."""
-    return _PIXEL_SCORES[policy].of(seen)
-
-
 def pixel_entropy(probability: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Entropy over the last axis [nat]; a probability of 0 adds 0."""
+    """Return the entropy over the last axis [nat]; a probability of 0 adds 0."""
     exact = probability.astype(np.float64)
     entropy: NDArray[np.float64] = -scipy.special.xlogy(exact, exact).sum(axis=-1)
     return entropy
@@ -84,7 +82,7 @@ def _edges(seen: CoarsePrediction) -> NDArray[np.float64]:
 
 
 class PixelScore(NamedTuple):
-    """A score of coarse pixels, and the multiply-adds that it takes of each."""
+    """Score of coarse pixels, with its multiply-adds a pixel."""
 
     of: Callable[[CoarsePrediction], Pixels]
     adds: int
@@ -92,16 +90,16 @@ class PixelScore(NamedTuple):
     per_class: int = 0
 
 
-_PIXEL_SCORES = {  # of the coarse prediction
+PIXEL_SCORES = {  # of the coarse prediction
     "entropy": PixelScore(lambda seen: pixel_entropy(seen.probability), 2, per_class=1),
     "sobel": PixelScore(_edges, 19, per_column=1),
 }
-SEEING_POLICIES = ("gain", *_PIXEL_SCORES)  # by what lies around each pixel: a large field may be scored in parts
-GLANCING_POLICIES = ("gain", "entropy")  # those that ask what the network made of it
+SEEING_POLICIES = ("gain", *PIXEL_SCORES)  # depend on the surroundings alone: a large field is scored in parts
+GLANCING_POLICIES = ("gain", "entropy")  # depend on the network's prediction
 
 
 def _patch_means(pixels: NDArray[np.float64], seen: CoarsePrediction) -> Scores:
-    """Mean over the pixels of each patch that lie on the scene."""
+    """Return the mean over the pixels of each patch that lie on the scene."""
     grid = seen.grid
     on_scene = np.zeros(grid.padded_shape)
     on_scene[: grid.height, : grid.width] = 1.0
@@ -119,7 +117,7 @@ def _mask_scores(seen: CoarsePrediction, mask: NDArray[np.generic] | None) -> Sc
         raise SettingsError("the policy 'mask' needs --mask FILE, an image of the scene's size")
     flat = mask.reshape(grid.height, grid.width, -1).astype(np.float64).mean(axis=-1)
     flat = np.where(np.isnan(flat), 0.0, flat)
-    unit = 2.0**-100 if np.abs(flat).max() > MOST_SUMMED else 1.0  # else sums would end the range of numbers
+    unit = 2.0**-100 if np.abs(flat).max() > MOST_SUMMED else 1.0  # else sums overflow
     total, fraction = patch_pixels(grid, flat * unit).sum(axis=(1, 2)), grid.valid_fraction().ravel() * grid.patch**2
     means: Scores = np.divide(total, fraction, out=np.zeros(fraction.shape), where=fraction > 0) / unit
     return means.reshape(grid.patch_shape)

@@ -1,4 +1,4 @@
-"""Expected errors of a remembered map, patch by patch, and the gain of capturing each patch again."""
+"""Expected errors of a prior map, patch by patch, and the expected gain of capturing each patch again."""
 
 from __future__ import annotations
 
@@ -11,15 +11,14 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.grid import SceneGrid
 
-LEAST_EXPECTED_ERROR, STEPS = 1e-4, 24  # expected errors are kept in so many steps by their logarithm
+LEAST_EXPECTED_ERROR, STEPS = 1e-4, 24  # of a histogram of expected errors, even in their logarithm
 Floats = NDArray[np.float64]
 
 
 def expected_error_of(log_probability: NDArray[np.floating]) -> Floats:
-    """Give the chance (y, x) that the likeliest class of a pixel is not its class.
+    """Return the probability (y, x) that the likeliest class of a pixel is wrong.
 
-    ``log_probability`` (y, x, class) is what is believed; NaN is a pixel of which nothing is known: each class is as
-    likely there.
+    ``log_probability`` is (y, x, class); in a pixel of NaN all classes are equally likely.
     """
     right = np.exp(np.minimum(log_probability.max(axis=-1).astype(np.float64), 0.0))
     nothing = 1 - 1 / log_probability.shape[-1]
@@ -29,11 +28,11 @@ def expected_error_of(log_probability: NDArray[np.floating]) -> Floats:
 
 @dataclass(frozen=True)
 class PatchExpectedErrors:
-    """Pixels of each patch by their believed class and doubt, and how old the oldest look at a patch is."""
+    """Pixels of each patch by their likeliest class and expected error, and the age of the oldest ones."""
 
     pixels: NDArray[np.float32]  # (patch, class, step) counts
-    expected_error: Floats  # (step,) of the pixels of a step, at most
-    age_days: Floats  # (patch,) of its oldest pixel of which anything is known; inf where of none is
+    expected_error: Floats  # (step,) upper bound of each step
+    age_days: Floats  # (patch,) of its oldest pixel with data; inf without one
 
     @staticmethod
     def of(
@@ -43,9 +42,10 @@ class PatchExpectedErrors:
         *,
         come_true: float = 1.0,
     ) -> PatchExpectedErrors:
-        """Sort the pixels of a field. ``strips`` are (y, x, class) probabilities and (y, x) ages [days] from the top.
+        """Sort the pixels of a field given in strips from the top: log-probabilities (y, x, class), ages (y, x) [days].
 
-        Every strip but the last is of whole patches high; ``come_true`` is the fraction of expected errors that do.
+        Every strip but the last is a number of whole patches high. ``come_true`` is the ratio of true to expected
+        errors.
         """
         expected_error = np.geomspace(LEAST_EXPECTED_ERROR, 1.0, STEPS)
         rows, columns = grid.patch_shape
@@ -54,14 +54,14 @@ class PatchExpectedErrors:
         for probabilities, age in strips:
             first = top // grid.patch
             down, across = (np.arange(size) // grid.patch for size in (len(probabilities), grid.width))
-            patch_number = down[:, None] * columns + across  # of each pixel, counted from the strip's first
+            patch_number = down[:, None] * columns + across  # of each pixel, from the first of the strip
             here = slice(first, first + math.ceil(len(probabilities) / grid.patch))
             wrong = come_true * expected_error_of(probabilities)
             step = np.minimum(np.searchsorted(expected_error, wrong), STEPS - 1)
-            believed = np.where(
+            likeliest = np.where(
                 np.isfinite(probabilities[..., 0]), np.nan_to_num(probabilities, nan=-np.inf).argmax(axis=-1), 0
             )
-            place = (patch_number * classes + believed) * STEPS + step
+            place = (patch_number * classes + likeliest) * STEPS + step
             counted = np.bincount(place.ravel(), minlength=pixels[here].size)
             pixels[here] = counted.reshape(pixels[here].shape)
             np.maximum.at(
@@ -72,21 +72,21 @@ class PatchExpectedErrors:
         return PatchExpectedErrors(pixels.reshape(-1, classes, STEPS), expected_error, known)
 
     def expected_wrong(self) -> float:
-        """Give the fraction of the field's pixels that are expected to be wrong."""
+        """Return the expected fraction of wrong pixels of the field."""
         return float(
-            (self.pixels.sum(axis=(0, 1), dtype=np.float64) @ self.expected_error) / self.pixels.sum(dtype=np.float64)
+            self.pixels.sum(axis=(0, 1), dtype=np.float64) @ self.expected_error / self.pixels.sum(dtype=np.float64)
         )
 
     def expected_wrong_pixels(self) -> Floats:
-        """Return how many pixels of each patch are expected to be wrong, (patch,)."""
+        """Return the expected number of wrong pixels of each patch, (patch,)."""
         found: Floats = self.pixels.sum(axis=1, dtype=np.float64) @ self.expected_error
         return found
 
     def expected_gain(self, wrong_after: Floats) -> Floats:
-        """Give what a look at each patch (patch,) is expected to add to the mean over classes, 0..1.
+        """Return the expected increase of the mean accuracy over classes by capturing each patch, (patch,) 0..1.
 
-        ``wrong_after`` (class,) is the fraction of a class's pixels that such a look calls otherwise. A pixel that is
-        surer than that gains nothing, and each class counts as much as any other, whatever its area.
+        ``wrong_after`` (class,) is the fraction of wrong pixels of each class in a map of the new capture. A pixel
+        with a smaller expected error gains nothing. All classes have the same weight.
         """
         count = self.pixels.sum(axis=(0, 2), dtype=np.float64)
         there = count > 0

@@ -1,4 +1,4 @@
-"""Use of a trained segmenter on one scene: an overview of everything, then a full reading of chosen patches."""
+"""Run a trained segmenter on one scene: an overview of everything, then the full network on chosen patches."""
 
 from __future__ import annotations
 
@@ -41,41 +41,41 @@ ROWS_DRAWN = 64  # at once
 
 @dataclass(frozen=True)
 class CoarsePass:
-    """Spectral features that the overview reads of a scene, or of a region of a field, on the padded grid."""
+    """Spectral features of a scene, or of a region of a field, on the padded grid."""
 
     grid: SceneGrid
     columns: NDArray[np.float32]  # (y, x, column) normalised
     capture: Capture = field(default=LineSpec(), kw_only=True)
-    origin: tuple[int, int] = field(default=(0, 0), kw_only=True)  # row and column of the field's patch it begins at
-    living: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (token,) which are read; None: all
-    out_of_range: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (y, x) of the scene: seen, and unread
-    filled: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (y, x) nothing was seen of; None: of all was
+    origin: tuple[int, int] = field(default=(0, 0), kw_only=True)  # row and column of its first patch in the field
+    living: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (token,) tokens that are read; None: all
+    out_of_range: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (y, x) of the scene: captured, invalid
+    filled: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (y, x) pixels without data; None: no pixel
 
     @property
     def seen_columns(self) -> NDArray[np.float32]:
-        """The columns with NaN where nothing was seen, and others only were filled in."""
-        return (
-            self.columns if self.filled is None else np.where(self.filled[..., None], np.float32(np.nan), self.columns)
-        )
+        """Return the columns with NaN in filled pixels."""
+        if self.filled is None:
+            return self.columns
+        return np.where(self.filled[..., None], np.float32(np.nan), self.columns)
 
     def patches(self, patch_index: NDArray[np.integer]) -> NDArray[np.float32]:
-        """The columns of some patches, (patch, p, p, column)."""
+        """Return the columns of some patches, (patch, p, p, column)."""
         return np.asarray(patches_of(self.columns, self.grid.patch)[patch_index], np.float32)
 
 
 @dataclass(frozen=True)
 class Read:
-    """An overview, by whom and of what: the full network corrects it."""
+    """An overview with its network and input."""
 
     by: Segmenter
     of: CoarsePass
     overview: Overview
 
     def counts_for(self, weights: Weights, coarse_pass: CoarsePass) -> bool:
-        """Return whether these weights would read the same of this coarse pass."""
-        alike = self.of.columns is coarse_pass.columns and self.of.living is coarse_pass.living
-        told = self.of.origin == coarse_pass.origin and self.of.capture == coarse_pass.capture
-        return self.by is weights.segmenter and alike and told
+        """Return whether it is the overview of this coarse pass by these weights."""
+        arrays = self.of.columns is coarse_pass.columns and self.of.living is coarse_pass.living
+        values = self.of.origin == coarse_pass.origin and self.of.capture == coarse_pass.capture
+        return self.by is weights.segmenter and arrays and values
 
 
 @dataclass(frozen=True)
@@ -89,34 +89,17 @@ class CoarsePrediction(CoarsePass):
 
 @dataclass(frozen=True)
 class DrawnMap:
-    """The map of a scene: class of each pixel and the probability given to it."""
+    """Class of each pixel of a scene and its probability."""
 
-    classes: NDArray[np.uint8]  # (y, x), 255 where nothing can be said
+    classes: NDArray[np.uint8]  # (y, x), 255 for no data
     confidence: NDArray[np.float32]  # (y, x), NaN there
-    log_probability: NDArray[np.float32] | None = None  # (y, x, class) of all classes, where that is asked for
+    log_probability: NDArray[np.float32] | None = None  # (y, x, class), on request
 
     def of_scene(self, grid: SceneGrid) -> DrawnMap:
-        """Give what of the map of a padded grid lies on the scene."""
+        """Crop the map of a padded grid to the scene."""
         scene = np.s_[: grid.height, : grid.width]
-        every = None if self.log_probability is None else self.log_probability[scene]  # a copy may not fit the memory
+        every = None if self.log_probability is None else self.log_probability[scene]  # no copy: it is large
         return DrawnMap(self.classes[scene].copy(), self.confidence[scene].copy(), every)
-
-
-def coarse_prediction(
-    weights: Weights,
-    values: NDArray[np.floating],
-    wavelength_nm: NDArray[np.floating],
-    grid: SceneGrid,
-    *,
-    capture: Capture = LineSpec(),  # noqa: B008 - a value
-    factor: int = 1,
-) -> CoarsePrediction:
-    """Read an overview of scene values (y, x, band), in pixels of ``factor`` fine ones; NaN where none was captured.
-
-    A value that is no reading by the weights' `most_value` counts as NaN.
-    """
-    seen = read_coarse_pass(weights, [values], wavelength_nm, grid, capture=capture, factor=factor)
-    return read_coarse_prediction(weights, seen)
 
 
 def read_coarse_pass(
@@ -130,11 +113,11 @@ def read_coarse_pass(
     origin: tuple[int, int] = (0, 0),
     components: Components | None = None,
 ) -> CoarsePass:
-    """Bring a mosaic to the spectral columns of the weights, some rows at a time; coarse pixels are repeated.
+    """Project a mosaic onto the spectral columns of the weights, some rows at a time; coarse pixels are repeated.
 
-    ``strips`` are (y, x, band) parts of the mosaic from the top down, together the scene in pixels of ``factor`` fine
-    ones a side, or (y, x, component) scores of ``components``; ``origin`` is the row and column of the patch of a
-    larger field in which the grid begins.
+    ``strips`` are parts of the mosaic from the top down: values (y, x, band), or scores (y, x, component) of
+    ``components``. A pixel is ``factor`` fine ones a side. ``origin`` is the row and column of the grid's first patch
+    in a larger field. A value beyond `Normalisation.most_value` counts as NaN.
     """
     s, (rows, width) = factor, (-(-grid.height // factor), -(-grid.width // factor))
     columns, filled = np.empty((rows, width, weights.config.columns), np.float32), 0
@@ -163,12 +146,12 @@ def read_coarse_pass(
 
 
 def _mend(columns: NDArray[np.float32], p: int) -> NDArray[np.bool_] | None:
-    """Fill dead pixels from their patch, in place, and tell which tokens live (None: all)."""
+    """Fill invalid pixels from their patch, in place; return which tokens are valid (None: all)."""
     dead = dead_pixels(columns)
     if not dead.any():
         return None
     holes = patches_of(dead, p)
-    for number in np.flatnonzero(holes.any(axis=(1, 2))):  # one by one: a copy of a field may not fit the memory
+    for number in np.flatnonzero(holes.any(axis=(1, 2))):  # one by one: a copy of a field is large
         y, x = (p * int(at) for at in divmod(number, columns.shape[1] // p))
         columns[y : y + p, x : x + p] = fill_dead(columns[None, y : y + p, x : x + p], holes[number][None])[0]
     whole = np.pad(dead, [(0, -size % TOKEN_PX) for size in dead.shape], mode="edge")
@@ -181,7 +164,7 @@ def coarse_prediction_of_columns(
     grid: SceneGrid,
     capture: Capture = LineSpec(),  # noqa: B008 - a value
 ) -> CoarsePrediction:
-    """Read normalised columns of the padded grid, (y, x, column); dead ones count as in a mosaic."""
+    """Predict from normalised columns of the padded grid, (y, x, column); invalid pixels are filled."""
     given = np.ascontiguousarray(columns, np.float32)
     mended = given if all_alive(given) else given.copy()
     living = _mend(mended, grid.patch)
@@ -194,14 +177,14 @@ def coarse_prediction_of_patches(
     grid: SceneGrid,
     capture: Capture = LineSpec(),  # noqa: B008 - a value
 ) -> CoarsePrediction:
-    """Read normalised columns of all patches of the padded grid, (patch, p, p, column)."""
+    """Predict from normalised columns of all patches of the padded grid, (patch, p, p, column)."""
     (down, across), (y, x) = grid.patch_shape, grid.padded_shape
     image = patches.reshape(down, across, grid.patch, grid.patch, -1).swapaxes(1, 2).reshape(y, x, -1)
     return coarse_prediction_of_columns(weights, image, grid, capture)
 
 
 def read_coarse_prediction(weights: Weights, coarse_pass: CoarsePass) -> CoarsePrediction:
-    """Read the overview of a coarse pass."""
+    """Predict class probabilities and expected gain from a coarse pass."""
     with torch.inference_mode():
         overview = overview_of(weights, coarse_pass)
         return CoarsePrediction(
@@ -227,12 +210,12 @@ def segment(
     capture: Capture | None = None,
     every_class: bool = False,
 ) -> DrawnMap:
-    """Draw the class map from the overview and the patches that are read in full, of the scene's own size.
+    """Return the class map of a scene by the overview and the patches read in full.
 
-    ``patches`` (patch, p, p, column) are normalised columns, captured as ``capture`` says, or as the overview's where
-    None. A dead pixel (see `dead_pixels`) counts as the mean of its patch; a patch of which more than half is dead
-    counts as not captured. ``patch_index`` (patch,) are their numbers on the grid, each once; without one the map is
-    the overview's. With ``every_class`` the map holds the log-probabilities of all classes too.
+    ``patches`` (patch, p, p, column) are normalised columns and ``patch_index`` (patch,) their numbers on the grid,
+    each once; without patches the map is the overview's. ``capture`` describes their capture; None is that of the
+    overview. Invalid pixels (`dead_pixels`) take the mean of their patch; a patch with more than half of its pixels
+    invalid is left out. With ``every_class`` the map has the log-probabilities of all classes.
 
     Raises ShapeError for a patch given twice or outside the grid.
     """
@@ -249,7 +232,9 @@ def segment(
             strict=True,
         ):
             logits[:, y : y + read.shape[1], x : x + read.shape[2]] = read
-        return draw(_tempered(logits, weights), every_class=every_class).of_scene(seen.grid)
+        if weights.temperature != 1:
+            logits /= weights.temperature
+        return draw(logits, every_class=every_class).of_scene(seen.grid)
 
 
 def patch_logits(
@@ -259,9 +244,9 @@ def patch_logits(
     patch_index: NDArray[np.int64],
     capture: Capture,
 ) -> Iterator[Tensor]:
-    """Give logits of patches (patch, p, p, column) that are read in full, (some, class, p, p) at a time.
+    """Yield logits of patches (patch, p, p, column) by the full network, (some, class, p, p) at a time.
 
-    Chunks fit the processor's caches; what is not finite counts as 0, the median.
+    Chunks fit the processor's caches. Values that are not finite count as 0, the median.
     """
     network = weights.segmenter
     for first in range(0, len(patches), PATCHES_AT_ONCE):
@@ -278,7 +263,7 @@ def map_of_columns(
     grid: SceneGrid,
     capture: Capture = LineSpec(),  # noqa: B008 - a value
 ) -> tuple[DrawnMap, NDArray[np.float32]]:
-    """Read a scene whole, by normalised columns (y, x, column) of the padded grid; its map, and all log-probabilities.
+    """Read all patches of normalised columns (y, x, column) of the padded grid; return map and log-probabilities.
 
     Raises as `segment`.
     """
@@ -289,15 +274,10 @@ def map_of_columns(
     return drawn, drawn.log_probability
 
 
-def _tempered(logits: Tensor, weights: Weights) -> Tensor:
-    """Logits by which maps are as sure of themselves as they may be; the likeliest class stays what it is."""
-    return logits if weights.temperature == 1 else logits / weights.temperature
-
-
 def captured(
     patches: NDArray[np.floating], patch_index: NDArray[np.int64]
 ) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
-    """Keep the patches that show something of their patches, dead pixels filled, and these patches."""
+    """Keep the patches with enough valid pixels, the others filled, and their numbers."""
     dead = dead_pixels(patches)
     if not dead.any():
         return patches, patch_index
@@ -306,17 +286,17 @@ def captured(
 
 
 def check_patch_index(patch_index: NDArray[np.int64], grid: SceneGrid) -> None:
-    """Refuse numbers that are none of the grid's patches, or given twice (ShapeError)."""
+    """Raise ShapeError for numbers outside the grid, or given twice."""
     count = grid.patch_shape[0] * grid.patch_shape[1]
     if outside := patch_index[(patch_index < 0) | (patch_index >= count)].tolist():
         raise ShapeError(f"patch {outside[0]} is none of the {count} patches of the scene, 0..{count - 1}")
     distinct, times = np.unique(patch_index, return_counts=True)
     if repeated := distinct[times > 1].tolist():
-        raise ShapeError(f"patch {repeated[0]} is given more than once; give each patch one patch")
+        raise ShapeError(f"patch {repeated[0]} is given more than once; give each patch once")
 
 
 def overview_of(weights: Weights, coarse_pass: CoarsePass) -> Overview:
-    """Read the overview of a coarse pass; one that a coarse prediction kept is not made twice."""
+    """Return the overview of a coarse pass; a coarse prediction has it already."""
     kept = coarse_pass.read if isinstance(coarse_pass, CoarsePrediction) else None
     if kept is not None and kept.counts_for(weights, coarse_pass):
         return kept.overview
@@ -329,7 +309,7 @@ def overview_of(weights: Weights, coarse_pass: CoarsePass) -> Overview:
 
 
 def draw(logits: Tensor, *, every_class: bool = False) -> DrawnMap:
-    """Decide on the class of each pixel by logits (class, y, x), some rows at a time."""
+    """Choose the class of each pixel by logits (class, y, x), some rows at a time."""
     _, y, x = logits.shape
     every = np.empty((y, x, len(logits)), np.float32) if every_class else None
     drawn = DrawnMap(np.empty((y, x), np.uint8), np.empty((y, x), np.float32), every)
@@ -343,6 +323,6 @@ def draw(logits: Tensor, *, every_class: bool = False) -> DrawnMap:
 
 
 def decide(logits: Tensor, dim: int) -> tuple[Tensor, Tensor]:
-    """The greatest probability and its class, uint8; NaN and 255 where a logit is not finite: that is no class."""
+    """Return the largest probability and its class, uint8; NaN and 255 where a logit is not finite."""
     confidence, classes = logits.softmax(dim=dim).max(dim=dim)
     return confidence, torch.where(confidence.isnan(), UNLABELLED, classes).to(torch.uint8)

@@ -1,8 +1,8 @@
-"""Distance of a pixel's spectrum from all training spectra, and the distance from which it is called unknown.
+"""Detect out-of-distribution pixels by the distance of their spectrum from the training spectra.
 
-What training saw is a number of components, each a middle and a covariance of normalised spectral columns, and what the
-light of a look adds to their spread. A pixel lies as far away as from the component whose middle is nearest. Columns
-hold brightness and shape alike: a known shape in a brightness that nobody saw is as strange as a shape nobody saw.
+Training spectra are modelled by components: a mean and a covariance of normalised spectral columns, to which the noise
+of the exposure is added. The distance of a pixel is that from the component with the nearest mean. Columns contain
+brightness and shape: a known shape at an unknown brightness is out of distribution, too.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from models.network.spectral import LineSpec
 
 Floats = NDArray[np.float32]
 Exact = NDArray[np.float64]
-PIXELS_AT_ONCE = 1 << 14  # so many lie in the processor's cache with their columns
-RATE = 0.001  # of known pixels that may be called unknown, unless the settings ask for another
+PIXELS_AT_ONCE = 1 << 14  # fit the processor's cache
+RATE = 0.001  # default false-alarm rate
 VARIANCE_FLOOR = 1e-5  # least variance of a direction, as a fraction of the largest: float32 keeps less only as noise
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Distances beyond which a fraction of the pixels of validation scenes lay, by the light that they were seen in."""
+    """Quantiles of the distances of validation pixels, by line spacing and exposure."""
 
-    rates: Exact  # (rate,) ascending shares
+    rates: Exact  # (rate,) ascending fractions
     light: Exact  # (light,) ascending, exposures as fractions of the reference
-    steps: tuple[int, ...]  # ascending pixels from line to line
+    steps: tuple[int, ...]  # ascending line spacings [px]
     fine: Exact  # (step, light, rate)
 
     def at(self, rate: float, light: float, step: float) -> float:
-        """Return the distance for a rate, even in the logarithms of rate and light.
+        """Return the distance for a false-alarm rate, interpolated in the logarithms of rate and light.
 
-        Light and rates beyond those that were measured count as the nearest that was, other steps as the next wider.
+        Light and rates are clipped to the measured range; other steps take the next wider one.
         """
         row = min(int(np.searchsorted(self.steps, step)), len(self.steps) - 1)
         by_rate = [float(np.interp(np.log(light), np.log(self.light), column)) for column in self.fine[row].T]
@@ -44,17 +44,17 @@ class Limits:
 
 @dataclass(frozen=True)
 class OodDetector:
-    """The components of what training saw at the reference exposure, and what less light adds."""
+    """Components of the training spectra at the reference exposure, and the noise of other exposures."""
 
     centres: Exact  # (component, column)
     covariance: Exact  # (component, column, column)
-    shot: Exact  # (component, column, column) what light leaves in a reading of the reference exposure
-    read: Exact  # (column, column) what the reading leaves in it
+    shot: Exact  # (component, column, column) shot noise at the reference exposure
+    read: Exact  # (column, column) read noise
     limits: Limits
-    bands: int  # of the camera in training; columns of fewer are noisier
+    bands: int  # of the camera in training
 
     def lit(self, light: float, readings: float = 1.0) -> LitDetector:
-        """The components as a look shows them whose pixels are means of so many readings of an exposure ``light``.
+        """Return the components with the noise of an exposure ``light``; a pixel is the mean of ``readings`` samples.
 
         Raises ValueError: a covariance has a negative variance.
         """
@@ -69,22 +69,22 @@ class OodDetector:
     def unknown(
         self, columns: NDArray[np.floating], *, rate: float, capture: LineSpec, bands: int
     ) -> NDArray[np.bool_]:
-        """Pixels (..., column) that lie farther away than all but a fraction ``rate`` of known ones, (...).
+        """Return which pixels (..., column) are out of distribution at a false-alarm rate, (...).
 
-        ``bands``: Of the camera. A pixel without columns is not unknown.
+        ``bands`` are those of the camera. A pixel of NaN is not out of distribution.
         """
         limit = self.limits.at(rate, capture.light, capture.step)
-        readings = min(1.0, bands / self.bands)  # fewer bands are as fewer readings
+        readings = min(1.0, bands / self.bands)  # fewer bands count as fewer samples
         distance = self.lit(capture.light, readings).distance(columns)
         with np.errstate(invalid="ignore"):
             return np.asarray(distance > limit, np.bool_)
 
 
 def _floored(covariance: Exact) -> Exact:
-    """Return a covariance without directions of less than `VARIANCE_FLOOR`; one that has none stays bit for bit.
+    """Return a covariance with variances of at least `VARIANCE_FLOOR`; one that has them stays bit for bit.
 
-    Columns that no band of the training reached, or that repeat each other, have such directions. Raises ValueError: a
-    variance is more negative than rounding makes it.
+    Columns that no band reaches, or that repeat each other, have smaller ones. Raises ValueError: a variance is
+    negative beyond rounding.
     """
     power, axes = np.linalg.eigh(covariance)
     least = VARIANCE_FLOOR * power[-1]
@@ -96,21 +96,21 @@ def _floored(covariance: Exact) -> Exact:
 
 
 def _whitening(covariance: Exact) -> Exact:
-    """Return the matrix that brings rows of this covariance to the covariance 1."""
+    """Return the matrix that whitens rows of this covariance."""
     lower = np.linalg.cholesky(covariance)
     return np.asarray(scipy.linalg.solve_triangular(lower, np.eye(len(lower)), lower=True).T)
 
 
 @dataclass(frozen=True)
 class LitDetector:
-    """Components in the light of one look."""
+    """Components with the noise of one exposure."""
 
-    base: Floats  # (column, column) brings columns to where the nearest middle is looked for
+    base: Floats  # (column, column) whitening in which the nearest mean is searched
     centres: Floats  # (component, column) there
-    whitening: Floats  # (component, column, column) from there; lengths of products with it are the distance
+    whitening: Floats  # (component, column, column) further whitening of each component
 
     def distance(self, columns: NDArray[np.floating]) -> Floats:
-        """Squared distance of pixels (..., column) from the nearest component a column, (...); NaN without columns."""
+        """Return squared distances of pixels (..., column) from the nearest component, per column, (...)."""
         flat = columns.reshape(-1, columns.shape[-1])
         found = np.empty(len(flat), np.float32)
         for first in range(0, len(flat), PIXELS_AT_ONCE):
@@ -122,7 +122,7 @@ class LitDetector:
 
     def _squares(self, known: Floats) -> Floats:
         near = (known @ self.centres.T - 0.5 * (self.centres**2).sum(axis=1)).argmax(axis=1)
-        order = np.argsort(near.astype(np.uint16), kind="stable")  # sorted by digits, in a tenth of the time
+        order = np.argsort(near.astype(np.uint16), kind="stable")  # radix sort: a tenth of the time
         ends, in_order = np.searchsorted(near[order], np.arange(len(self.centres) + 1)), known[order]
         squares = np.empty(len(known), np.float32)
         for number, (start, stop) in enumerate(pairwise(ends)):

@@ -1,9 +1,8 @@
-"""Regions: parts of a field that the segmenter reads as scenes of their own, so that memory has a bound.
+"""Cut a field into regions that the segmenter reads as scenes of their own, which bounds its memory.
 
-Attention is global, so what a token sees has to end somewhere. A field of up to 640 x 640 px is one region and is read
-whole. A larger one is cut; each part is read with a halo of pixels around it, of which nothing is kept. Attention
-takes multiply-adds quadratic in a region: three farms of 1280 x 1024 px, cut, score within .1 points of one region, for
-84 % of its multiply-adds (docs/measurements/benchmarks.md).
+A field of up to 640 x 640 px is one region. A larger one is cut; each region is read with a halo of pixels around it,
+which is discarded. The multiply-adds of attention are quadratic in the size of a region: three farms of 1280 x 1024 px
+score within 0.1 points for 84 % of the multiply-adds (docs/measurements/benchmarks.md).
 """
 
 from __future__ import annotations
@@ -21,10 +20,10 @@ from models.network.sizes import PATCHES_AT_ONCE, PLANES, TOKEN_PX, SegmenterCon
 from pipeline.geometry.grid import SceneGrid
 
 REGION_PX = 640  # a side, at most
-HALO_PX = TOKEN_PX  # around a region that is read with it; see bench_regions.py for more and for none
-IMAGE_COPIES, FEATURE_COPIES = 3, 4  # of an image and its features in memory at once
-MAP_COPIES = 4  # of every class's logits and probabilities, of this visit and of prior maps
-STRIP_COPIES = 3  # of values on their way from a store to spectral columns
+HALO_PX = TOKEN_PX  # around a region
+IMAGE_COPIES, FEATURE_COPIES = 3, 4  # in memory at once
+MAP_COPIES = 4  # of logits and probabilities, of this visit and of prior maps
+STRIP_COPIES = 3  # of values from a store to spectral columns
 STRIP_ROWS = 64  # at once: those of a shard
 Scalar = TypeVar("Scalar", bound=np.generic)
 
@@ -40,27 +39,27 @@ class Box:
 
     @property
     def rows(self) -> slice:
-        """Its rows."""
+        """Return its rows."""
         return slice(self.top, self.bottom)
 
     @property
     def columns(self) -> slice:
-        """Its columns."""
+        """Return its columns."""
         return slice(self.left, self.right)
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(y, x)."""
+        """Return its height and width."""
         return self.bottom - self.top, self.right - self.left
 
     def over(self, step: int) -> Box:
-        """Give the cells of ``step`` that hold part of it."""
+        """Return the cells of ``step`` px that overlap it."""
         return Box(self.top // step, self.left // step, -(-self.bottom // step), -(-self.right // step))
 
 
 @dataclass(frozen=True)
 class Region:
-    """A part of a field: what is kept of it, and what is read for that, both in fine pixels of the field."""
+    """A part of a field: the box that is kept and the larger one that is read, in fine pixels of the field."""
 
     field: SceneGrid
     kept: Box
@@ -68,21 +67,21 @@ class Region:
 
     @property
     def grid(self) -> SceneGrid:
-        """The scene that is read."""
+        """Return the grid of the box that is read."""
         return SceneGrid(*self.read.shape, self.field.patch, self.field.factor)
 
     @property
     def origin(self) -> tuple[int, int]:
-        """Row and column of the field's patch in which the scene begins: tokens keep the places of the field."""
+        """Return row and column, in the field, of the first patch that is read."""
         return self.read.top // self.field.patch, self.read.left // self.field.patch
 
     @property
     def kept_patches(self) -> Box:
-        """Return the patches of the field that are kept of this region."""
+        """Return the box of patches that are kept."""
         return self.kept.over(self.field.patch)
 
     def numbers_here(self, patch_index: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Give the scene's numbers of patches of the field; -1 where one lies outside."""
+        """Convert patch numbers of the field to those of the region; -1 outside."""
         (rows, columns), (top, left) = self.grid.patch_shape, self.origin
         row, column = np.divmod(np.asarray(patch_index, np.int64), self.field.patch_shape[1])
         row, column = row - top, column - left
@@ -90,25 +89,25 @@ class Region:
         return np.where(inside, row * columns + column, -1)
 
     def crop(self, image: NDArray[Scalar]) -> NDArray[Scalar]:
-        """Keep of a (y, x, ...) image of the scene what belongs to the region."""
+        """Crop a (y, x, ...) image of the box that is read to the box that is kept."""
         rows, columns = self.kept_here
         return image[rows, columns]
 
     @property
     def kept_here(self) -> tuple[slice, slice]:
-        """Return the rows and columns of what is read that belong to the region."""
+        """Return rows and columns of the kept box in the box that is read."""
         top, left = self.kept.top - self.read.top, self.kept.left - self.read.left
         return slice(top, top + self.kept.shape[0]), slice(left, left + self.kept.shape[1])
 
     def crop_patches(self, values: NDArray[Scalar]) -> NDArray[Scalar]:
-        """Keep of (patch,) values of the scene's padded grid what belongs to the region, (y, x)."""
+        """Crop values of all patches that are read, (patch,), to the kept ones, (y, x)."""
         (top, left), kept = self.origin, self.kept_patches
         image = values.reshape(self.grid.patch_shape)
         return image[kept.top - top : kept.bottom - top, kept.left - left : kept.right - left]
 
 
 def whole_field(field: SceneGrid) -> Region:
-    """Give the one region that is the field itself."""
+    """Return a single region that covers the field."""
     box = Box(0, 0, field.height, field.width)
     return Region(field, box, box)
 
@@ -116,11 +115,11 @@ def whole_field(field: SceneGrid) -> Region:
 def plan_regions(
     field: SceneGrid, shard: tuple[int, int], *, most_px: tuple[int, int] = (REGION_PX, REGION_PX), halo: int = HALO_PX
 ) -> list[Region]:
-    """Cut a field into regions of nearly equal size, row by row; one that is no larger than ``most_px`` stays whole.
+    """Cut a field into regions of nearly equal size, row by row; a field within ``most_px`` stays whole.
 
-    ``shard``: (y, x) of what is written at once [px]: regions hold whole ones, and whole tokens. ``most_px``: (y, x) of
-    the largest region, as far as one shard and one token allow. ``halo``: Pixels that are read around a region where
-    the field goes on, at least; up to whole tokens, patches and coarse pixels.
+    ``shard`` is the (y, x) size of the blocks of the store [px]: a region consists of whole shards and tokens.
+    ``most_px`` is the (y, x) size of the largest region, at least one shard and one token. ``halo`` [px] is read
+    around a region inside the field, rounded up to whole tokens, patches and coarse pixels.
     """
     cell, step = math.lcm(field.patch * field.factor, TOKEN_PX), math.lcm(field.patch, field.factor, TOKEN_PX)
     margin = -(-halo // step) * step
@@ -145,7 +144,7 @@ def plan_regions(
 
 
 def _cuts(size: int, unit: int, most: int) -> list[tuple[int, int]]:
-    """Starts and ends of as few parts as possible, of whole units but for the last."""
+    """Return starts and ends of the fewest parts, each of whole units but for the last."""
     if size <= most:
         return [(0, size)]
     units = -(-size // unit)
@@ -155,10 +154,10 @@ def _cuts(size: int, unit: int, most: int) -> list[tuple[int, int]]:
 
 
 def region_bytes(config: SegmenterConfig, region: Region, patch_index: int, bands: int) -> int:
-    """Memory that reading one region takes at most, ``patch_index`` fine patches of it in use [bytes].
+    """Return an upper bound of the memory to read one region with ``patch_index`` patches in full [bytes].
 
-    Counted: the image and its features, those of some patches, the map with every class's probability, and values on
-    their way from the stores, some rows at a time.
+    It counts the image and its features, those of some patches, all class probabilities, and rows of values from the
+    stores.
     """
     p, (y, x) = config.patch, region.grid.padded_shape
     inputs = config.columns + PLANES
@@ -174,7 +173,7 @@ def region_bytes(config: SegmenterConfig, region: Region, patch_index: int, band
 
 
 def most_bytes(config: SegmenterConfig, regions: Sequence[Region], patch_index: NDArray[np.integer], bands: int) -> int:
-    """Memory that the most expensive of several regions takes at most, ``patch_index`` of the field in use [bytes]."""
+    """Return the largest `region_bytes` of some regions; ``patch_index`` are the patches of the field read in full."""
     return max(
         region_bytes(config, region, int(np.count_nonzero(region.numbers_here(patch_index) >= 0)), bands)
         for region in regions

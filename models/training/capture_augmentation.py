@@ -1,4 +1,4 @@
-"""Crops as shorter exposures and wider line spacings would show them, with the noise of their light."""
+"""Simulate crops at shorter exposures and wider line spacings, with their noise."""
 
 from __future__ import annotations
 
@@ -11,61 +11,60 @@ from numpy.typing import NDArray
 from models.network.spectral import LineSpec, Normalisation, with_planes
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS
 
-REFERENCE_MS = DEFAULT_EXPOSURE_MS  # exposures are told as fractions of this one, at which looks are made
-STEPS = MappingProxyType({1: 0.4, 2: 0.25, 4: 0.27, 8: 0.08})  # how often crops have lines so many pixels apart
-INTERLACED = 0.5  # how many of the crops with lines apart show a first pass and closer lines across areas
-AREAS = (0.3, 0.4, 0.3)  # how often so many areas have closer lines
-ACROSS = 0.5  # how many of them are as wide as the crop
-TINY = 1e-9  # added to correlations, which rounding may leave with an eigenvalue below 0
+REFERENCE_MS = DEFAULT_EXPOSURE_MS  # exposures are fractions of this one
+STEPS = MappingProxyType({1: 0.4, 2: 0.25, 4: 0.27, 8: 0.08})  # line spacing [px]: fraction of crops
+INTERLACED = 0.5  # fraction of crops with lines apart that get closer lines in some areas
+AREAS = (0.3, 0.4, 0.3)  # probability of 0, 1, 2 areas with closer lines
+ACROSS = 0.5  # fraction of areas as wide as the crop
+TINY = 1e-9  # added to correlations against negative eigenvalues by rounding
 Matrix = NDArray[np.float64]
 Columns = NDArray[np.float32]  # (y, x, column)
 
 
 @dataclass(frozen=True)
 class ColumnNoise:
-    """Covariance of what one reading adds to columns, in squares of scene values.
+    """Covariance of the noise of columns, in squares of scene values.
 
-    At the fraction ``light`` of the reference exposure a pixel of spectrum v has the covariance shot(v) / light + read
-    / light^2: electrons grow with the exposure, the readings' noise does not. The mean of n samples, each read for
-    itself, has a n-th of both.
+    At the fraction ``light`` of the reference exposure a spectrum v has the covariance
+    shot(v) / light + read / light^2. The mean of n samples has 1 / n of it.
     """
 
-    shot: Matrix  # (column,) variance of each for a unit of its own light
+    shot: Matrix  # (column,) variance for a unit of light
     read: Matrix  # (column, column)
 
     @staticmethod
     def of_bands(
         matrix: NDArray[np.floating], value_of_electron: NDArray[np.floating], read_noise_e: float
     ) -> ColumnNoise:
-        """Make the noise of weights (band, column), by the value of an electron at the reference exposure, (band,)."""
+        """Return the noise of weights (band, column); an electron at the reference exposure has a value of (band,)."""
         weight, value = matrix.astype(np.float64), value_of_electron.astype(np.float64)
         shot = (weight**2).T @ value
         read = (weight * (read_noise_e * value[:, None]) ** 2).T @ weight
         return ColumnNoise(shot, read)
 
     def correlation(self) -> Matrix:
-        """Return the correlation of the columns' errors, (column, column): some columns share bands."""
+        """Return the correlation of the noise, (column, column): columns share bands."""
         size = np.sqrt(np.maximum(np.diag(self.read), 1e-300))
         correlation: Matrix = self.read / np.outer(size, size)
         return correlation
 
     def variance(self, columns: NDArray[np.floating], light: float) -> NDArray[np.floating]:
-        """Return the variance of columns (..., column) in scene values; light below 0 counts as none."""
+        """Return the variance of columns (..., column) in scene values; negative values have no shot noise."""
         read = np.diag(self.read).astype(columns.dtype) / light**2
         variance: NDArray[np.floating] = np.maximum(columns, 0) * (self.shot / light).astype(columns.dtype) + read
         return variance
 
     def covariance(self, columns: NDArray[np.floating], light: float, samples: float = 1.0) -> Matrix:
-        """(column, column) of the mean of ``samples`` samples of a spectrum (column,)."""
+        """Return the covariance (column, column) of the mean of ``samples`` samples of a spectrum (column,)."""
         size = np.sqrt(self.variance(columns.astype(np.float64), light) / samples)
         covariance: Matrix = self.correlation() * np.outer(size, size)
         return covariance
 
 
 class CaptureAugmentation:
-    """Turns crops of the reference exposure into what shorter exposures and wider line spacings would have shown.
+    """Turn crops of the reference exposure into captures of shorter exposures and wider line spacings.
 
-    What is given back has the planes of `models.network.spectral.LineSpec` behind the spectral features.
+    Results have the planes of `models.network.spectral.LineSpec` after the spectral features.
     """
 
     def __init__(self, normalisation: Normalisation, *, darkest_ms: float = 3.0) -> None:
@@ -73,9 +72,9 @@ class CaptureAugmentation:
         self.unwhiten = np.linalg.inv(normalisation.whitening.astype(np.float64)).astype(np.float32)
 
     def draw(self, columns: Columns, noise: ColumnNoise, rng: np.random.Generator) -> tuple[Columns, Columns]:
-        """Show a crop (y, x, column) as a capture drawn by chance: what the overview reads, and the full network.
+        """Return a crop (y, x, column) by a random capture, as inputs of the overview and the full network.
 
-        A uniform scan, or a first pass with closer lines across areas. Exposures are even in their logarithm.
+        It is a uniform scan, or a first pass with closer lines in some areas. Exposures are log-uniform.
         """
         odds = {step: often for step, often in STEPS.items() if len(columns) % step == 0}
         step = int(rng.choice(list(odds), p=np.array(list(odds.values())) / sum(odds.values())))
@@ -86,13 +85,13 @@ class CaptureAugmentation:
         return image, image
 
     def _light(self, rng: np.random.Generator) -> float:
-        """An exposure between the darkest and the reference, as a fraction of that."""
+        """Draw an exposure between the darkest and the reference, as a fraction of the latter."""
         return float(np.exp(rng.uniform(np.log(self.darkest_ms / REFERENCE_MS), 0.0)))
 
     def scan(
         self, columns: Columns, noise: ColumnNoise, *, light: float, step: int, rng: np.random.Generator
     ) -> Columns:
-        """Show a crop as a uniform scan of lines ``step`` px apart, rows between them by interpolation.
+        """Return a crop by a uniform scan of lines ``step`` px apart, with rows between them interpolated.
 
         ``light`` is the exposure as a fraction of the reference; ``step`` is a power of two that divides the rows.
         """
@@ -103,9 +102,9 @@ class CaptureAugmentation:
         return with_planes(between @ self.normalisation.whitening, LineSpec(light, step))
 
     def interlaced(self, columns: Columns, noise: ColumnNoise, *, step: int, rng: np.random.Generator) -> Columns:
-        """Show a crop as a first pass that stares at rows ``step`` px apart, and areas with later lines between them.
+        """Return a crop by a first pass of rows ``step`` px apart, and areas with later lines between them.
 
-        Where an area has closer lines, those of the first pass stay among them, each with its own exposure.
+        Lines of the first pass stay among the closer lines of an area, each with its own exposure.
         """
         scaled, size = columns @ self.unwhiten, len(columns)
         light, first = self._light(rng), int(rng.integers(step))
@@ -131,7 +130,7 @@ class CaptureAugmentation:
     def _noisy(
         self, scaled: Columns, noise: ColumnNoise, light: float, rng: np.random.Generator, *, samples: int = 1
     ) -> Columns:
-        """Add the noise of an exposure of ``light`` to means of ``samples`` pixels of the reference."""
+        """Add the noise of an exposure ``light`` to means of ``samples`` pixels of the reference exposure."""
         values = scaled * self.normalisation.spread + self.normalisation.centre
         more = noise.variance(values, light) - noise.variance(values, 1.0) / samples
         size = np.sqrt(np.maximum(more, 0)) / self.normalisation.spread

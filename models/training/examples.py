@@ -1,4 +1,4 @@
-"""Training data: labelled scenes as the camera would see them, and random crops of them."""
+"""Training data: labelled scenes imaged by the camera model, and random crops of them."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from pipeline.geometry.camera import LineCamera, expose, footprint
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 
-NOISY = 0.25  # fraction of the crops that get the noise of a shorter exposure
-HALO, STRIP_ROWS = 8, 64  # rows around a strip that the footprint reaches, and of a strip at most
+NOISY = 0.25  # fraction of crops with added noise
+HALO, STRIP_ROWS = 8, 64  # rows around a strip that its footprint reaches; most rows of a strip
 
 
 @dataclass(frozen=True)
 class Example:
-    """One labelled scene by every line of the reference exposure. Sizes are whole patches."""
+    """One labelled scene, captured by every line at the reference exposure; its sizes are whole patches."""
 
     name: str
     columns: NDArray[np.floating]  # (y, x, column) spectral features: float32, float16 once they are normalised
@@ -36,9 +36,9 @@ class Example:
 def observe(
     scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis, rng: np.random.Generator
 ) -> Example:
-    """Image a labelled scene with the camera's own operator, and project onto the basis.
+    """Image a labelled scene by the footprint and noise of the camera, and project it onto the basis.
 
-    Goes in strips of rows; each strip draws its noise from a stream of its own.
+    Strips of rows have random streams of their own.
 
     Raises SceneError where the scene has no labels.
     """
@@ -62,20 +62,20 @@ def observe(
 
 
 def noise_of(scene: RasterScene, matrix: NDArray[np.float32], camera: LineCamera) -> ColumnNoise:
-    """Return the noise of light and readings of a camera in the columns of a scene."""
+    """Return the shot and read noise of a camera in the columns of a scene."""
     return ColumnNoise.of_bands(matrix, scene.white_reference / scene.white_reference_electrons, camera.read_noise_e)
 
 
 def electrons_of(scene: RasterScene, planes: NDArray[np.float32], camera: LineCamera) -> NDArray[np.float32]:
-    """Expected electrons of component planes, (y, x, component) -> (y, x, band)."""
+    """Return expected electrons of component planes, (y, x, component) -> (y, x, band)."""
     exposure = np.float32(camera.exposure_ms / DEFAULT_EXPOSURE_MS)
-    if scene.electrons.ndim == 1:  # every band has a plane of its own
+    if scene.electrons.ndim == 1:  # a plane for each band
         return np.asarray(planes * scene.electrons * exposure, np.float32)
     return np.asarray(planes @ scene.electrons * exposure, np.float32)
 
 
 def measured_normalisation(observations: list[Example], exposure_ms: float = REFERENCE_MS) -> Normalisation:
-    """Normalisation over all scenes (every third pixel of every third row), for captures so exposed."""
+    """Measure the normalisation of all scenes (every third pixel of every third row) for an exposure."""
     sample = np.concatenate([seen.columns[::3, ::3].reshape(-1, seen.columns.shape[-1]) for seen in observations])
     noises = [seen.noise for seen in observations if seen.noise is not None]
     if exposure_ms >= REFERENCE_MS or not noises:
@@ -86,7 +86,7 @@ def measured_normalisation(observations: list[Example], exposure_ms: float = REF
 
 
 def normalised(seen: Example, normalisation: Normalisation, reached: NDArray[np.bool_]) -> Example:
-    """Return a scene with normalised columns."""
+    """Normalise the columns of a scene."""
     columns = np.clip(normalisation.apply(seen.columns, reached), -60000, 60000).astype(np.float16)
     return replace(seen, columns=columns)
 
@@ -101,12 +101,12 @@ class Batch:
     origin: Tensor  # (B, 2) random offsets of the places [tokens]
 
     def on(self, device: str) -> Batch:
-        """The same where a device computes."""
+        """Move the batch to a device."""
         return Batch(*(one.to(device) for one in (self.image, self.detail, self.labels, self.origin)))
 
 
 class CropSampler:
-    """Draws random crops: place, flips, transposition, brightness and noise all come from the given generator."""
+    """Draw random crops: place, flips, transposition, brightness and noise."""
 
     def __init__(
         self,
@@ -117,7 +117,7 @@ class CropSampler:
         noise: float = 0.0,
         augmentation: CaptureAugmentation | None = None,
     ) -> None:
-        """``noise`` is the most that is added, in spreads of the normalised columns, unless ``augmentation`` add it."""
+        """Set up the crops. ``noise`` [spreads of the columns] is the largest added without an ``augmentation``."""
         smallest = min(min(example.labels.shape) for example in examples)
         cell = max(TOKEN_PX, patch) if smallest >= TOKEN_PX else patch
         self.size = max(cell, min(crop, smallest) // cell * cell)
@@ -128,7 +128,7 @@ class CropSampler:
         self.fraction = areas / areas.sum()
 
     def draw(self, count: int, rng: np.random.Generator, gain_shift: NDArray[np.float32]) -> Batch:
-        """Give ``count`` crops. ``gain_shift`` is centre / spread: what brightness does to normalised columns."""
+        """Draw ``count`` crops. ``gain_shift`` is the shift of normalised columns by brightness."""
         crops = [self._crop(rng, gain_shift) for _ in range(count)]
         image, detail, labels = (torch.stack([torch.from_numpy(crop[i]) for crop in crops]) for i in range(3))
         return Batch(image, detail, labels, torch.from_numpy(rng.integers(0, 4096, (count, 2))))
@@ -136,7 +136,7 @@ class CropSampler:
     def _crop(self, rng: np.random.Generator, gain_shift: NDArray[np.float32]) -> tuple[NDArray[np.generic], ...]:
         size = self.size
         example = self.examples[rng.choice(len(self.examples), p=self.fraction)]
-        for _ in range(20):  # a crop without a label teaches nothing
+        for _ in range(20):  # until the crop has a label
             y, x = (int(rng.integers(0, side - size + 1)) for side in example.labels.shape)
             labels = example.labels[y : y + size, x : x + size]
             if (labels != UNLABELLED).any():

@@ -1,9 +1,8 @@
-"""Loss of a training step: patches drawn, the map with them and without, and the scorer's error.
+"""Compute the loss of a training step: of the map with and without patches, and of the scorer.
 
-A crop is read twice: with no fine patch, and with a fraction of the patches drawn from ``FRACTIONS``. What the loss
-falls by at a captured patch is what the scorer learns to tell; a patch without a label tells it nothing. Three phases
-follow each other: patches are placed at random and by the entropy of the first reading; then also by the scorer; then
-in larger crops, of which fewer make a batch, as far as the scenes have larger ones.
+A crop is segmented by the overview alone, and with a fraction of the patches drawn from ``FRACTIONS``. The scorer
+learns the decrease of the loss at a labelled patch. There are three phases. Patches are placed at random and by the
+entropy of the overview. Later they are also placed by the scorer. At last crops are larger and batches smaller.
 """
 
 from __future__ import annotations
@@ -17,40 +16,39 @@ import torch.nn.functional as F  # noqa: N812 - its usual name
 from numpy.typing import NDArray
 from torch import Tensor
 
-from models.network.layers import cut
-from models.network.segmenter import Segmenter
+from models.network.segmenter import Segmenter, cut
 from models.network.sizes import MOST_GAIN, SegmenterConfig
 from models.training.examples import Batch
 from pipeline.geometry.grid import UNLABELLED
 
-OVERVIEW_WEIGHT, SCORER_WEIGHT = 0.6, 1.0  # of the map without a patch, and of the scorer, beside that with patches
-FRACTIONS = ((0.1, 0.2), (0.25, 0.35), (0.5, 0.25), (1.0, 0.2))  # (of the patches, how often)
-HUBER_NAT = 0.1  # errors of the scorer above this count linearly
+OVERVIEW_WEIGHT, SCORER_WEIGHT = 0.6, 1.0  # of the overview and the scorer; the map with patches has 1
+FRACTIONS = ((0.1, 0.2), (0.25, 0.35), (0.5, 0.25), (1.0, 0.2))  # (of the patches, probability)
+HUBER_NAT = 0.1  # larger errors of the scorer count linearly
 RANK_WEIGHT = 0.2
-RANK_NAT = 0.05  # two patches that differ by less are hardly put in order
+RANK_NAT = 0.05  # pairs that differ by less hardly count
 
 
 @dataclass(frozen=True)
 class Phase:
-    """Odds of the placements of patches, and sizes of crops beside those of the settings, up to a part of the run."""
+    """Probabilities of the placements of patches, and size of crops, until a fraction of the run."""
 
     until: float
     random: float
     entropy: float
     gain: float
-    larger: int = 1  # crops have so many times the area, batches so much fewer of them
+    larger: int = 1  # factor of the area of crops; a batch has fewer by it
 
 
 PHASES = (Phase(0.5, 0.5, 0.5, 0.0), Phase(0.7, 0.3, 0.35, 0.35), Phase(1.0, 0.2, 0.4, 0.4, larger=2))
 
 
 def phase_at(done: float) -> Phase:
-    """Give the phase of a run that is ``done`` so far (0..1)."""
+    """Return the phase at the fraction ``done`` of a run."""
     return next((phase for phase in PHASES if done < phase.until), PHASES[-1])
 
 
 def class_weights(labels: Iterable[NDArray[np.uint8]], classes: int, cap: float) -> Tensor:
-    """Weights 1 / sqrt(frequency), mean 1 over the labelled pixels' classes, capped; 0 for a class without a pixel."""
+    """Return weights 1 / sqrt(frequency), with mean 1 over the labelled pixels, capped; 0 for an absent class."""
     counts = np.zeros(classes)
     for image in labels:
         counts += np.bincount(image[image != UNLABELLED], minlength=classes)
@@ -63,7 +61,7 @@ def class_weights(labels: Iterable[NDArray[np.uint8]], classes: int, cap: float)
 def batch_loss(
     model: Segmenter, batch: Batch, weight: Tensor, rng: np.random.Generator, phase: Phase, *, soft_dice: bool
 ) -> Tensor:
-    """Return the loss of one batch: of the map with some patches, of the coarse prediction, and of the scores."""
+    """Return the loss of one batch: of the map with patches, of the overview, and of the scores."""
     overview = model.read_overview(batch.image, batch.origin)
     score = model.score(overview).flatten(1)
     patch_index = draw_patches(overview.logits.detach(), score.detach(), model.config, rng, phase)
@@ -84,9 +82,9 @@ def batch_loss(
 def draw_patches(
     overview: Tensor, score: Tensor, config: SegmenterConfig, rng: np.random.Generator, phase: Phase
 ) -> Tensor:
-    """Draw (B, K) distinct patch numbers; with some chance they are placed by entropy or by gain.
+    """Draw (B, K) distinct patch numbers: at random, by entropy or by expected gain.
 
-    ``overview`` are its logits (B, classes, H, W), ``score`` the expected gain of the patches (B, patches).
+    ``overview`` are logits (B, classes, H, W), ``score`` the expected gain of the patches (B, patches).
     """
     fractions, odds = zip(*FRACTIONS, strict=True)
     count = max(1, round(float(rng.choice(fractions, p=odds)) * score.shape[1]))
@@ -100,12 +98,12 @@ def draw_patches(
 
 
 def pixel_losses(logits: Tensor, labels: Tensor) -> Tensor:
-    """Cross-entropy of each pixel, (B, classes, y, x) and (B, y, x) -> (B, y, x) float32; 0 where unlabelled."""
+    """Return the cross-entropy of each pixel, (B, classes, y, x) -> (B, y, x) float32; 0 where unlabelled."""
     return F.cross_entropy(logits.float(), labels, ignore_index=UNLABELLED, reduction="none")
 
 
 def map_loss(logits: Tensor, losses: Tensor, labels: Tensor, weight: Tensor, *, soft_dice: bool) -> Tensor:
-    """Class-weighted mean of the ``losses`` of labelled pixels, plus half the soft Dice loss where asked.
+    """Return the class-weighted mean of the ``losses`` of labelled pixels, plus half the soft Dice loss on request.
 
     0, with a gradient of 0, where no pixel is labelled or every label has weight 0.
     """
@@ -126,10 +124,10 @@ def map_loss(logits: Tensor, losses: Tensor, labels: Tensor, weight: Tensor, *, 
 
 
 def scoring_loss(score: Tensor, gain: Tensor, known: Tensor | None = None) -> Tensor:
-    """Return the loss of scores of patches beside what these gained, in size and in order, (B, K) and (B, K).
+    """Return the loss of scores (B, K) against gains (B, K), in size and order.
 
-    Huber's loss and, with a fifth of its weight, the pairs of a scene that stand in the wrong order. Patches that are
-    not ``known`` (B, K), which nothing is labelled in, have no say; 0, with a gradient of 0, where none is known.
+    It is Huber's loss plus, with a fifth of the weight, that of pairs in the wrong order. Patches that are not
+    ``known`` (B, K) have no label and are left out. Without a known one the loss and its gradient are 0.
     """
     known_gain = torch.ones_like(score, dtype=torch.bool) if known is None else known
     if not known_gain.any():

@@ -1,4 +1,4 @@
-"""Fit of the detector of unknown pixels: components of training spectra, and limits by other scenes."""
+"""Fit the out-of-distribution detector: components of training spectra, and limits by validation scenes."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
 
 OF_A_CLASS = 6  # components
-SPECTRA = 40_000  # that components are measured on, of all training scenes together and each class
+SPECTRA = 40_000  # of each class in all training scenes, to fit components to
 RATES = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05)
-LIGHT = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0)  # of the reference exposure, from the darkest that was trained on
+LIGHT = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0)  # fractions of the reference exposure
 GAIN = 0.04  # standard deviation of the brightness of crops in training
-USUAL = 0.98  # of a component's own spectra lie within its unit distance
-LEAST_SPECTRA = 200  # that anything can be measured on
-RIDGE = 1e-6  # of the mean variance, so that columns which repeat each other have a covariance with an inverse
+USUAL = 0.98  # fraction of a component's spectra within its unit distance
+LEAST_SPECTRA = 200  # least number to fit to
+RIDGE = 1e-6  # of the mean variance: makes the covariance of equal columns invertible
 Report = Callable[[float], None]
 Spectra = NDArray[np.float32]  # (pixel, column)
 Classes = NDArray[np.uint8]  # (pixel,)
@@ -40,12 +40,14 @@ def fit_ood(
     seed: int,
     report: Report = lambda done: None,
 ) -> OodDetector:
-    """Measure components on training scenes, and the limits on others, in the light that training showed.
+    """Fit components to training scenes, and limits to validation scenes, at the exposures of the training.
 
-    ``bands``: of the camera. Raises SceneError: no scene to measure the limits on, or too few labelled pixels.
+    ``bands`` are those of the camera. Raises SceneError: no validation scene, or too few labelled pixels.
     """
     if not validation:
-        raise SceneError("no scene was kept from training, so that nobody can say how often a known pixel is unknown")
+        raise SceneError(
+            "no scene was kept for validation, which the false-alarm rate needs; train with --validation 1 or more"
+        )
     rng = np.random.default_rng([seed, 0xFA3])
     augmentation = CaptureAugmentation(normalisation, darkest_ms=darkest_ms)
     gathered = []
@@ -65,10 +67,7 @@ def fit_ood(
 
 
 def _noise_of_columns(noise: ColumnNoise, centres: Exact, normalisation: Normalisation) -> tuple[Exact, Exact]:
-    """Return the noise in normalised columns: of light for each spectrum, (component, column, column), and of readings.
-
-    Both are of the reference exposure.
-    """
+    """Return shot noise (component, column, column) and read noise of normalised columns at the reference exposure."""
     whitening = normalisation.whitening.astype(np.float64)
     values = centres @ np.linalg.inv(whitening) * normalisation.spread + normalisation.centre
     mixing = whitening / normalisation.spread[:, None]
@@ -80,7 +79,7 @@ def _noise_of_columns(noise: ColumnNoise, centres: Exact, normalisation: Normali
 def _drawn_spectra(
     example: Example, normalisation: Normalisation, rng: np.random.Generator, most: int
 ) -> list[tuple[Spectra, Classes]]:
-    """Labelled pixels of a scene in a brightness drawn as for training, at most so many of a class."""
+    """Draw labelled pixels of a scene, at most ``most`` of each class, with the brightness jitter of training."""
     gain = np.float32(rng.normal(1.0, GAIN))
     image = np.asarray(example.columns, np.float32) * gain + (gain - 1) * normalisation.gain_shift
     parts = []
@@ -92,19 +91,19 @@ def _drawn_spectra(
 
 
 def components(pixels: Spectra, classes: Classes, seed: int) -> tuple[Exact, Exact]:
-    """Middles and covariances of spectra (pixel, column): k-means of each class, then all go to the nearest middle.
+    """Return means and covariances of components of spectra (pixel, column), by k-means in each class.
 
-    A component of few spectra has mostly the covariance that all have within theirs. Where `USUAL` of its own spectra
-    lie farther away than one of the normal law has on average, its covariance is widened until they do not. Raises
+    Spectra belong to the nearest mean of any class. The covariance of a small component is shrunk towards the common
+    one. It is widened until `USUAL` of its spectra have at most the expected distance of a normal distribution. Raises
     SceneError: too few spectra.
     """
     if len(pixels) < LEAST_SPECTRA:
-        raise SceneError(f"{len(pixels)} labelled pixels are too few to say what is familiar; it takes {LEAST_SPECTRA}")
+        raise SceneError(f"{len(pixels)} labelled pixels are too few to fit a detector; it takes {LEAST_SPECTRA}")
     exact, columns = pixels.astype(np.float64), pixels.shape[1]
     middles = []
     for number in np.unique(classes):
         own = exact[classes == number]
-        count = min(OF_A_CLASS, 1 + len(own) // (4 * columns))  # fewer of few spectra
+        count = min(OF_A_CLASS, 1 + len(own) // (4 * columns))
         rng = np.random.default_rng(seed + int(number))
         middles.append(scipy.cluster.vq.kmeans2(own, count, minit="++", rng=rng)[0])
     first = np.concatenate(middles)
@@ -114,7 +113,7 @@ def components(pixels: Spectra, classes: Classes, seed: int) -> tuple[Exact, Exa
     scatter = [(part - middle).T @ (part - middle) for part, middle in zip(parts, centres, strict=True)]
     common = np.sum(scatter, axis=0) / len(pixels)
     common += (RIDGE * float(np.trace(common)) / columns or RIDGE) * np.eye(columns)
-    weight = 2.0 * columns  # as many spectra as the common covariance counts for
+    weight = 2.0 * columns  # of the common covariance, in spectra
     covariance = []
     for part, middle, own in zip(parts, centres, scatter, strict=True):
         mixed = (own + weight * common) / (len(part) + weight)
@@ -131,7 +130,7 @@ def measured_limits(
     rng: np.random.Generator,
     report: Report = lambda done: None,
 ) -> Limits:
-    """Distances that fractions of labelled pixels of scenes lie beyond, for each step and light of the looks."""
+    """Return quantiles of the distances of labelled pixels, for each line spacing and exposure."""
     noisy = all(example.noise is not None for example in examples)
     light = [one for one in LIGHT if one * REFERENCE_MS >= augmentation.darkest_ms] if noisy else [1.0]
     varied = noisy and augmentation.darkest_ms < REFERENCE_MS

@@ -1,4 +1,4 @@
-"""Training of the segmenter on crops: steps, averages, checkpoints."""
+"""Train the segmenter on crops, with averaged weights and checkpoints."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from models.network.machine import PROCESSOR, keep_freed_memory
 from models.network.segmenter import Segmenter
 from models.network.sizes import SegmenterConfig
 from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
-from models.training.examples import Batch, CropSampler, Example
+from models.training.examples import CropSampler, Example
 from models.training.objective import PHASES, batch_loss, class_weights, phase_at
 from models.weights.checksummed_files import load_checkpoint, save_checkpoint
 from pipeline.errors import PipelineError, WeightsError
@@ -31,7 +31,7 @@ KEEP_EVERY_S = 120.0  # between checkpoints
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """Length and settings of a training. ``minutes`` ends the run early; the learning rate falls in time."""
+    """Settings of a training. ``minutes`` may end the run early; the learning rate follows."""
 
     steps: int = 2000
     batch: int = 4
@@ -41,14 +41,14 @@ class TrainingSettings:
     minutes: float = 36.0
     seed: int = 0
     average: float = 0.998  # decay of the averaged weights
-    noise: float = 0.3  # most that crops of shorter exposures get [spreads of the columns]
+    noise: float = 0.3  # largest added noise [spreads of the columns]
     weight_cap: float = 5.0
-    darkest_ms: float = REFERENCE_MS  # shortest exposure that crops are shown by
+    darkest_ms: float = REFERENCE_MS  # shortest simulated exposure of crops
 
 
 @dataclass(frozen=True)
 class Progress:
-    """State after a step, for a progress bar."""
+    """Progress after a step."""
 
     step: int
     steps: int
@@ -62,10 +62,10 @@ class TrainingError(PipelineError, RuntimeError):
 
 @dataclass
 class Course:
-    """Progress of a run: plain numbers, kept in its checkpoint."""
+    """Counters of a run, kept in its checkpoint."""
 
     step: int = 0
-    seconds: float = 0.0  # of earlier processes, up to the last checkpoint
+    seconds: float = 0.0  # up to the last checkpoint
     processor_seconds: float = 0.0  # the same
     skipped: int = 0
     unlabelled: int = 0  # steps whose crops had no label
@@ -74,7 +74,7 @@ class Course:
 
 
 class Trainer:
-    """A training run: where it stands, and one step further at a time."""
+    """Network, optimiser and counters of a training run."""
 
     def __init__(
         self,
@@ -92,11 +92,9 @@ class Trainer:
             torch.manual_seed(settings.seed)
             self.model = Segmenter(config)
         if start is not None:
-            out_of_range = self.model.load_state_dict(start, strict=False).unexpected_keys
-            if out_of_range:
-                raise WeightsError(
-                    f"the network has no place for {len(out_of_range)} tensors, the first {out_of_range[0]}"
-                )
+            unexpected = self.model.load_state_dict(start, strict=False).unexpected_keys
+            if unexpected:
+                raise WeightsError(f"the network has no place for {len(unexpected)} tensors, the first {unexpected[0]}")
         self.model.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.averaged = copy.deepcopy(self.model).eval()
         parameters = list(self.model.parameters())  # matrices and kernels decay, gains and shifts do not
@@ -113,7 +111,6 @@ class Trainer:
             )
         self.weight = class_weights([one.labels for one in examples], config.classes, settings.weight_cap).to(device)
         self.course = Course()
-        self.batch: Batch | None = None  # of the last step
         self._started, self._worked = time.monotonic(), time.process_time()
 
     @property
@@ -123,7 +120,7 @@ class Trainer:
         return max(self.course.step / self.settings.steps, seconds / (60 * self.settings.minutes))
 
     def step(self, done: float) -> None:
-        """Take one step of a run that is ``done`` so far (0..1): the learning rate follows from it.
+        """Take one step; the learning rate follows from the fraction of the run that is ``done``.
 
         Raises TrainingError where the loss or its gradient was not finite three steps in a row.
         """
@@ -132,10 +129,10 @@ class Trainer:
             group["lr"] = self.settings.learning_rate * rate_at(done)
         phase = phase_at(done)
         sampler = self.samplers[phase.larger]
-        fewer = phase.larger if sampler.size > self.samplers[1].size else 1  # small scenes have no larger crops
+        fewer = phase.larger if sampler.size > self.samplers[1].size else 1  # where scenes are large enough
         count = max(1, self.settings.batch // fewer)
-        self.batch = batch = sampler.draw(count, self.rng, self.gain_shift).on(self.device)
-        if not (batch.labels != UNLABELLED).any():  # nothing to learn; decay and momentum would move the weights
+        batch = sampler.draw(count, self.rng, self.gain_shift).on(self.device)
+        if not (batch.labels != UNLABELLED).any():  # decay and momentum alone would move the weights
             course.step, course.unlabelled = course.step + 1, course.unlabelled + 1
             return
         loss = batch_loss(self.model, batch, self.weight, self.rng, phase, soft_dice=done > 0.3)
@@ -164,15 +161,8 @@ class Trainer:
             tensors |= {f"optimiser.{number}.{name}": tensor for name, tensor in moments.items()}
         save_checkpoint(path, identity, {"course": asdict(self.course), "rng": self.rng.bit_generator.state}, tensors)
 
-    def keep_batch(self, path: Path) -> None:
-        """Write the last batch and the weights as they are, to find out what failed."""
-        tensors = {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
-        if self.batch is not None:
-            tensors |= vars(self.batch)
-        save_checkpoint(path, "batch", {"course": asdict(self.course)}, tensors)
-
-    def go_on(self, path: Path, identity: str) -> bool:
-        """Go on from a checkpoint of the same run; False where there is none, or one of a network of other shapes."""
+    def resume(self, path: Path, identity: str) -> bool:
+        """Load a checkpoint of the same run; return False where there is none."""
         found = load_checkpoint(path, identity)
         if found is None:
             return False
@@ -186,9 +176,6 @@ class Trainer:
                 state.setdefault(int(number), {})[moment] = tensor
             else:
                 parts[part][rest] = tensor
-        own = {name: tensor.shape for name, tensor in self.model.state_dict().items()}
-        if any({name: tensor.shape for name, tensor in part.items()} != own for part in parts.values()):
-            return False
         self.model.load_state_dict(parts["model"])
         self.averaged.load_state_dict(parts["averaged"])
         groups = self.optimiser.state_dict()["param_groups"]
@@ -198,7 +185,7 @@ class Trainer:
         return True
 
     def summary(self) -> dict[str, float | int]:
-        """Steps, skipped steps, the last smoothed loss, and seconds by the clock and of the processor."""
+        """Return steps, skipped steps, the smoothed loss, and wall and processor seconds."""
         course = self.course
         seconds = round(course.seconds + time.monotonic() - self._started)
         worked = round(course.processor_seconds + time.process_time() - self._worked)
@@ -225,34 +212,25 @@ def train(
     keep_every_s: float = KEEP_EVERY_S,
     device: str = PROCESSOR,
 ) -> tuple[Segmenter, dict[str, float | int]]:
-    """Train a segmenter of these sizes; give its averaged weights and a summary (steps, last loss, seconds).
+    """Train a segmenter; return its averaged weights, on the processor, and a summary (steps, last loss, seconds).
 
-    The same settings and examples start from the same weights and draw the same crops and patches. What follows is
-    equal to rounding only: sums differ in their last bit with where memory lies, and ``minutes`` may end the run
-    elsewhere.
+    The same settings and examples start from the same weights and draw the same crops and patches. Results are equal
+    up to rounding: the order of sums depends on memory alignment, and ``minutes`` may end the run elsewhere.
 
-    ``start``: Named tensors that the network begins with; others are drawn. ``checkpoint``: File that the state is kept
-    in; a killed run of the same settings and examples goes on from it. ``device``: where it computes, by
-    `models.network.machine.choose_device`; the network that is given lies in the processor's memory again.
+    ``start`` are named initial tensors; others are random. ``checkpoint`` is a file of the state, from which a killed
+    run of the same settings and examples continues. ``device`` is one of `models.network.machine.choose_device`.
 
-    Raises TrainingError where: the loss or its gradient was not finite three steps in a row; the last batch is kept
-    beside the checkpoint. WeightsError : a tensor of ``start`` that the network has no place for.
+    Raises TrainingError: the loss or its gradient was not finite three steps in a row; WeightsError: a tensor of
+    ``start`` is not one of the network's.
     """
     keep_freed_memory()
     trainer = Trainer(config, examples, gain_shift, settings, start, augmentation, device)
     identity = run_identity(config, examples, settings, start)
     if checkpoint is not None:
-        trainer.go_on(checkpoint, identity)
+        trainer.resume(checkpoint, identity)
     kept = time.monotonic()
     while (done := trainer.done) < 1:
-        try:
-            trainer.step(done)
-        except TrainingError as error:
-            if checkpoint is None:
-                raise
-            failed = checkpoint.with_name(checkpoint.name + ".batch")
-            trainer.keep_batch(failed)
-            raise TrainingError(f"{error}; the last batch and the weights that it met are in {failed}") from error
+        trainer.step(done)
         report(Progress(trainer.course.step, settings.steps, done, trainer.course.loss))
         if checkpoint is not None and time.monotonic() - kept >= keep_every_s:
             trainer.keep(checkpoint, identity)
@@ -266,7 +244,7 @@ def run_identity(
     settings: TrainingSettings,
     start: Mapping[str, Tensor] | None = None,
 ) -> str:
-    """Hash of all that makes a run what it is: a checkpoint of another run is not gone on from."""
+    """Return the hash of everything that a run depends on, which identifies its checkpoints."""
     digest = hashlib.sha256(json.dumps([asdict(config), asdict(settings)], sort_keys=True).encode())
     for example in examples:
         digest.update(example.name.encode())
@@ -279,14 +257,14 @@ def run_identity(
 
 
 def rate_at(done: float) -> float:
-    """Learning rate over the run as a fraction of the highest: 5 % warm-up, then a cosine down to 1 %."""
+    """Return the learning rate as a fraction of the highest: 5 % warm-up, then a cosine down to 1 %."""
     if done < 0.05:
         return 0.05 + 0.95 * done / 0.05
     return float(0.01 + 0.99 * 0.5 * (1 + np.cos(np.pi * (done - 0.05) / 0.95)))
 
 
 def _step(model: nn.Module, optimiser: torch.optim.Optimizer, loss: Tensor) -> bool:
-    """Take one optimiser step; False, and no step, when the loss or the gradient is not finite."""
+    """Take one optimiser step, unless the loss or the gradient is not finite; return whether it was taken."""
     optimiser.zero_grad(set_to_none=True)
     if not torch.isfinite(loss):
         return False

@@ -1,7 +1,7 @@
-"""Weights on disk: one checksummed file with the tensors, the spectral basis, the classes and how they were made.
+"""Read and write weights: one checksummed file with tensors, spectral basis, classes and the record of the training.
 
-The file may also hold what is familiar to the weights and their reader of prior maps: each adds a description and
-tensors of its own, and leaves the key of the weights as it was.
+The file may also hold an out-of-distribution detector and a temporal reader. Each has a description and tensors of its
+own, and does not change the key of the weights.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis, check_basis, project
 from models.reading.ood import Limits, OodDetector
 from models.weights import checksummed_files
-from models.weights.checksummed_files import NotChecksummedError, claimed_shapes, key_of, read_about, write_checksummed
+from models.weights.checksummed_files import NotChecksummedError, key_of, read_about, write_checksummed
 from models.weights.parts import OOD, READER, OodPart, ReaderPart, TrainedOn
 from pipeline.errors import WeightsError
 from pipeline.lazy import deferred
@@ -43,28 +43,27 @@ FORMAT = "spectralzoom-weights/4"
 OF_COMPONENTS = ("centres", "covariance", "shot", "read")
 OF_LIMITS = ("rates", "light", "fine")
 SPREAD = "normalisation.spread"
-CASCADE = "cascade"  # of a record: what reading a part of the patches in full loses
-CALIBRATION = "calibration"  # of a record: how sure of themselves maps may be, and the temperature, where one is needed
-KINDS = {"F32": "torch.float32", "U8": "torch.uint8"}  # by safetensors' names
+CASCADE = "cascade"  # of a record: loss of reading some patches in full
+CALIBRATION = "calibration"  # of a record: calibration error and temperature
 
 
 @dataclass(frozen=True)
 class Description:
-    """Description of a weights file; reading it takes neither its tensors nor torch."""
+    """Description of a weights file, read without its tensors and without torch."""
 
     config: SegmenterConfig
     basis: SpectralBasis
     class_names: tuple[str, ...]
     record: dict[str, Any]
-    key: str = ""  # names what the weights hold
+    key: str = ""  # hash of the weights
     ood_detector: OodPart | None = None
     reader: ReaderPart | None = None
-    about: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)  # all of it, hashes too
+    about: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)  # complete, with hashes
 
 
 @dataclass(frozen=True)
 class Weights:
-    """A segmenter with all it needs: basis, normalisation, classes, and the record of its training."""
+    """A segmenter with its spectral basis, normalisation, classes, and the record of its training."""
 
     segmenter: Segmenter
     basis: SpectralBasis
@@ -75,58 +74,53 @@ class Weights:
 
     @property
     def config(self) -> SegmenterConfig:
-        """Sizes of the network."""
+        """Return the sizes of the network."""
         return self.segmenter.config
 
     @property
     def temperature(self) -> float:
-        """Divisor of the logits of maps; 1 unless the record of training has another."""
+        """Return the divisor of the logits of maps, by the record; 1 by default."""
         return float((self.record.get(CALIBRATION) or {}).get("temperature", 1.0))
 
     def columns(self, values: NDArray[np.floating], wavelength_nm: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Normalised spectral columns of pixels, (..., band) -> (..., column) float32.
+        """Return normalised spectral columns of pixels, (..., band) -> (..., column) float32.
 
-        Columns that no band reaches take what the others let expect, and so do those of which all bands are dead.
-        A value that is no reading by `Normalisation.most_value` is dead. A pixel with more than half of its bands dead
-        is NaN.
+        Columns without a valid band take their conditional mean. Values beyond `Normalisation.most_value` are invalid.
+        A pixel with more than half of its bands invalid is NaN.
         """
         values = readings_alone(values, self.normalisation.most_value)
         matrix, reached = self.basis.matrix(wavelength_nm)
-        seen = project(values, matrix)
-        columns = self.normalisation.apply(seen, reached)
-        columns[~np.isfinite(seen[..., reached]).any(axis=-1)] = np.nan
-        return columns
+        return self._normalised(project(values, matrix), reached)
 
     def columns_of_scores(
         self, scores: NDArray[np.floating], components: Components, wavelength_nm: NDArray[np.floating]
     ) -> NDArray[np.float32]:
-        """Normalised spectral columns of pixels given by scores of components, (..., component) -> (..., column).
+        """Return normalised spectral columns of pixels by scores of components, (..., component) -> (..., column).
 
-        They are linear in scores. A column that is no reading by `Normalisation.most_value` is completed as one that no
-        band reaches; a pixel without scores is NaN.
+        Columns beyond `Normalisation.most_value` take their conditional mean; a pixel without scores is NaN.
         """
         lit = np.isfinite(components.mean)
         matrix = np.zeros((components.bands, self.config.columns), np.float32)
         matrix[lit], reached = self.basis.matrix(np.asarray(wavelength_nm)[lit])
         weights, offset = components.onto(matrix)
         with np.errstate(invalid="ignore", over="ignore"):
-            seen = np.asarray(scores, np.float32) @ weights + offset
-        seen = readings_alone(seen, self.normalisation.most_value)
-        columns = self.normalisation.apply(seen, reached)
-        columns[~np.isfinite(seen[..., reached]).any(axis=-1)] = np.nan
+            projected = np.asarray(scores, np.float32) @ weights + offset
+        return self._normalised(readings_alone(projected, self.normalisation.most_value), reached)
+
+    def _normalised(self, projected: NDArray[np.float32], reached: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Normalise columns; NaN in pixels without a finite one."""
+        columns = self.normalisation.apply(projected, reached)
+        columns[~np.isfinite(projected[..., reached]).any(axis=-1)] = np.nan
         return columns
 
     def on(self, device: str) -> Weights:
-        """The same where it computes on a device of this machine, by `models.network.machine.choose_device`."""
+        """Move the network to a device of `models.network.machine.choose_device`, and return the weights."""
         self.segmenter.to(device)
         return self
 
 
 def save_weights(weights: Weights, path: Path) -> None:
-    """Write the file, checksummed, by a temporary name and a rename, so that it is whole or absent.
-
-    Raises WeightsError where the disk refuses.
-    """
+    """Write a checksummed file by a temporary name and a rename. Raises WeightsError for an error of the disk."""
     tensors = dict(weights.segmenter.state_dict())
     for name in NORMALISATION:
         tensors[f"normalisation.{name}"] = torch.from_numpy(getattr(weights.normalisation, name).copy())
@@ -151,7 +145,7 @@ def _write(path: Path, about: Mapping[str, Any], tensors: Mapping[str, Tensor]) 
 def add_ood(
     weights: Path, out: Path, ood_detector: OodDetector, trained_on: TrainedOn, record: Mapping[str, Any]
 ) -> None:
-    """Write the weights of a file with what is familiar to them to ``out``, which may be the same file.
+    """Write the weights of a file with an out-of-distribution detector to ``out``, which may be the same file.
 
     Raises WeightsError: the weights cannot be read, or ``out`` not be written.
     """
@@ -164,14 +158,14 @@ def add_ood(
 
 
 def add_reader(weights: Path, out: Path, reader: TemporalReader, record: Mapping[str, Any]) -> None:
-    """Write the weights of a file with their reader of prior maps to ``out``. Raises as `add_ood`."""
+    """Write the weights of a file with a temporal reader to ``out``. Raises as `add_ood`."""
     about = {"sizes": asdict(reader.sizes), "record": dict(record)}
     _add_part(weights, out, READER, about, dict(reader.state_dict()))
 
 
 def _add_part(source: Path, out: Path, part: str, about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
     described = describe_weights(source)
-    with _told_as(source):
+    with _weights_error(source):
         whole = checksummed_files.read_tensors(source, described.about)
     kept = {name: tensor for name, tensor in whole.items() if not name.startswith(f"{part}.")}
     added = {f"{part}.{name}": tensor for name, tensor in tensors.items()}
@@ -180,11 +174,11 @@ def _add_part(source: Path, out: Path, part: str, about: Mapping[str, Any], tens
 
 
 def load_ood(weights: Path) -> OodDetector:
-    """Read what is familiar to weights. WeightsError: their file has no such part, or it is damaged."""
+    """Read the out-of-distribution detector of weights. WeightsError: their file has none, or it is damaged."""
     described = describe_weights(weights)
     if described.ood_detector is None:
         raise WeightsError(
-            f"{weights} does not say what is familiar to it; measure it with: spectralzoom train DATASET"
+            f"{weights} has no out-of-distribution detector; fit one with: spectralzoom train DATASET"
             f" --fit-ood {weights} -o {weights}"
         )
     tensors, about = _read_part(weights, described, OOD, spreads=("light", "rates")), described.ood_detector
@@ -192,18 +186,20 @@ def load_ood(weights: Path) -> OodDetector:
         arrays = {name: tensors[name].double().numpy() for name in (*OF_COMPONENTS, *OF_LIMITS)}
         limits = Limits(arrays["rates"], arrays["light"], about.steps, arrays["fine"])
         found = OodDetector(**{name: arrays[name] for name in OF_COMPONENTS}, limits=limits, bands=about.bands)
-        found.lit(float(limits.light[0]))  # refuses a covariance that is none
+        found.lit(float(limits.light[0]))  # raises for an invalid covariance
     except (KeyError, ValueError) as error:
-        raise WeightsError(f"{weights} is damaged: what is familiar: {error}; copy or measure it again") from error
+        raise WeightsError(
+            f"{weights} is damaged: its out-of-distribution detector: {error}; copy or measure it again"
+        ) from error
     return found
 
 
 def load_reader(weights: Path) -> TemporalReader:
-    """Read the reader of prior maps of weights. WeightsError: their file has none, or it is damaged."""
+    """Load the temporal reader of weights. WeightsError: their file has none, or it is damaged."""
     described = describe_weights(weights)
     if described.reader is None:
         raise WeightsError(
-            f"{weights} has no reader of prior maps; train one with: spectralzoom train DATASET --train-temporal "
+            f"{weights} has no temporal reader; train one with: spectralzoom train DATASET --train-temporal "
             f"{weights} -o {weights}"
         )
     tensors = _read_part(weights, described, READER)
@@ -213,14 +209,14 @@ def load_reader(weights: Path) -> TemporalReader:
         reader.load_state_dict(tensors, assign=True)
     except RuntimeError as error:
         why = str(error).splitlines()[-1].strip()
-        raise WeightsError(f"{weights} is damaged: its reader of prior maps: {why}; train it again") from error
+        raise WeightsError(f"{weights} is damaged: its temporal reader: {why}; train it again") from error
     return reader.eval()
 
 
 def _read_part(path: Path, described: Description, part: str, spreads: Sequence[str] = ()) -> dict[str, Tensor]:
-    """Tensors of a part by their own names. Raises WeightsError where one is not what was written, or unusable."""
+    """Read the tensors of a part by their own names. Raises WeightsError for a damaged one."""
     start = f"{part}."
-    with _told_as(path):
+    with _weights_error(path):
         tensors = checksummed_files.read_tensors(path, described.about, lambda name: name.startswith(start))
         own = {name.removeprefix(start): tensor for name, tensor in tensors.items()}
         check_numbers(own, spreads)
@@ -228,8 +224,8 @@ def _read_part(path: Path, described: Description, part: str, spreads: Sequence[
 
 
 @contextmanager
-def _told_as(path: Path) -> Iterator[None]:
-    """Raise WeightsError, with what to do, where a file of weights is not what was written."""
+def _weights_error(path: Path) -> Iterator[None]:
+    """Turn NotChecksummedError into WeightsError with the file's name and the remedy."""
     try:
         yield
     except NotChecksummedError as error:
@@ -237,10 +233,10 @@ def _told_as(path: Path) -> Iterator[None]:
 
 
 def load_weights(path: Path) -> Weights:
-    """Read a file that ``save_weights`` wrote. No pickle is involved.
+    """Read a file of `save_weights`; no pickle is involved.
 
-    Raises WeightsError where it is missing or of another format, or where a tensor (named) is not the one that was
-    written, does not fit its config, or holds what is no finite number.
+    Raises WeightsError: it is missing or of another format, or a tensor is damaged, does not fit the config, or has a
+    value that is not finite.
     """
     described = describe_weights(path)
     tensors = read_tensors(path, described)
@@ -258,27 +254,23 @@ def load_weights(path: Path) -> Weights:
 
 
 def read_tensors(path: Path, described: Description) -> dict[str, Tensor]:
-    """Read the network's tensors of a file, after its header was held against what the description asks for.
-
-    Raises WeightsError as ``load_weights``.
-    """
+    """Read the tensors of the network and its normalisation. Raises WeightsError as `load_weights`."""
     parts = (f"{OOD}.", f"{READER}.")
-    with _told_as(path):
-        check_shapes(described.config, claimed_shapes(path))
+    with _weights_error(path):
         tensors = checksummed_files.read_tensors(path, described.about, lambda name: not name.startswith(parts))
+        check_shapes(described.config, tensors)
         check_numbers(tensors, (SPREAD,))
     return tensors
 
 
 def describe_weights(path: Path) -> Description:
-    """Read what a file of weights says of itself, in milliseconds.
+    """Read the description of a weights file.
 
-    Raises WeightsError where it is missing, cut short, of another format, or where its description is damaged or asks
-    for what cannot be.
+    Raises WeightsError: it is missing, cut short or of another format, or its description is damaged or invalid.
     """
     if not path.is_file():
         raise WeightsError(f"no weights at {path}; train some with: spectralzoom train DATASET -o {path.name}")
-    with _told_as(path):
+    with _weights_error(path):
         about = read_about(path, FORMAT)
     try:
         config, basis = SegmenterConfig(**about["config"]), SpectralBasis(**about["basis"])
@@ -296,31 +288,29 @@ def describe_weights(path: Path) -> Description:
 
 
 def with_record(weights: Weights, **entries: Any) -> Weights:
-    """Give the same weights with entries added to their record."""
+    """Return the weights with entries added to their record."""
     return replace(weights, record={**weights.record, **entries})
 
 
-def check_shapes(config: SegmenterConfig, claimed: Mapping[str, tuple[tuple[int, ...], str]]) -> None:
-    """Refuse a file's header of which a tensor is not as the config asks (NotSealedError). Reads no numbers.
-
-    Shapes are those of the network on torch's meta device, where tensors have a size and no memory.
-    """
-    one, all_pairs = (config.columns,), (config.columns, config.columns)
+def check_shapes(config: SegmenterConfig, tensors: Mapping[str, Tensor]) -> None:
+    """Raise NotChecksummedError for a tensor that does not fit the config, by the network on torch's meta device."""
+    one = (config.columns,)
     with torch.device("meta"):
         network = segmenter.Segmenter(config)
-    wanted = {name: (tuple(value.shape), "F32") for name, value in network.state_dict().items()}
-    wanted |= {"normalisation.centre": (one, "F32"), SPREAD: (one, "F32")}
-    wanted |= {"normalisation.whitening": (all_pairs, "F32"), "class_colours": ((config.classes, 3), "U8")}
+    wanted = {name: (tuple(value.shape), torch.float32) for name, value in network.state_dict().items()}
+    wanted |= {"normalisation.centre": (one, torch.float32), SPREAD: (one, torch.float32)}
+    wanted |= {"normalisation.whitening": (one * 2, torch.float32), "class_colours": ((config.classes, 3), torch.uint8)}
     for name, (shape, kind) in wanted.items():
-        came, word = claimed.get(name, ("nothing", kind))
-        if came != shape:
-            raise NotChecksummedError(f"does not fit: tensor {name} should be {shape}, the file has {came}")
-        if word != kind:
-            raise NotChecksummedError(f"does not fit: tensor {name} should be of {KINDS[kind]}, the file has {word}")
+        found = tuple(tensors[name].shape) if name in tensors else "nothing"
+        if found != shape:
+            raise NotChecksummedError(f"does not fit: tensor {name} should be {shape}, the file has {found}")
+        if tensors[name].dtype != kind:
+            found_kind = tensors[name].dtype
+            raise NotChecksummedError(f"does not fit: tensor {name} should be of {kind}, the file has {found_kind}")
 
 
 def check_numbers(tensors: Mapping[str, Tensor], spreads: Sequence[str]) -> None:
-    """Refuse numbers that nothing can be computed with (NotSealedError); those of ``spreads`` are divided by."""
+    """Raise NotChecksummedError for values that are not finite, or a tensor of ``spreads`` that is not above 0."""
     for name, value in tensors.items():
         if value.is_floating_point() and not bool(torch.isfinite(value).all()):
             count = int((~torch.isfinite(value)).sum())

@@ -1,4 +1,4 @@
-"""Parts of a weights file beside the network: detector of unknown pixels, reader of prior maps."""
+"""Describe the parts of a weights file beside the network: out-of-distribution detector and temporal reader."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any
 from models.evaluation.expected_scores import MapScores
 from models.network.sizes import SegmenterConfig, TemporalSizes
 
-OOD, READER = "familiar", "memory"  # their entries in the description, and the beginnings of their tensors' names
-TRAINED_ON = "trained_on"  # its entry in a record
-MAP_SCORES = "map_scores"  # of the record: how what maps expect to score came true, where that was measured
+OOD, READER = "familiar", "memory"  # entries in the description, prefixes of tensor names
+TRAINED_ON = "trained_on"  # entry in a record
+MAP_SCORES = "map_scores"  # of a record: corrections of expected scores
 MOST_WIDTH = 1024
 
 Range = tuple[float, float]
@@ -19,7 +19,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class TrainedOn:
-    """Ranges of what training saw; None where that is not known."""
+    """Ranges of the training data; None where unknown."""
 
     bands: int
     wavelength_nm: Range
@@ -32,12 +32,12 @@ class TrainedOn:
     bands_nm: tuple[float, ...] | None = None  # centre of each band
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for a record; `read` gives them back."""
+        """Return plain values for a record."""
         return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
 
     @staticmethod
     def read(content: Mapping[str, Any]) -> TrainedOn:
-        """Read what `as_dict` gave. Raises KeyError, TypeError or ValueError where that is not what it is."""
+        """Read values of `as_dict`. Raises KeyError, TypeError or ValueError for others."""
 
         def span(name: str) -> Range:
             low, high = map(float, content[name])
@@ -58,9 +58,9 @@ class TrainedOn:
 
 @dataclass(frozen=True)
 class OodPart:
-    """Detector of unknown pixels, by its description."""
+    """Description of the out-of-distribution detector."""
 
-    key: str  # names what it holds
+    key: str  # hash
     trained_on: TrainedOn
     steps: tuple[int, ...]
     bands: int
@@ -68,7 +68,7 @@ class OodPart:
 
     @staticmethod
     def read(key: str, about: Mapping[str, Any]) -> OodPart:
-        """Read an entry of a description. Raises KeyError, TypeError or ValueError where something is missing."""
+        """Read an entry of a description. Raises KeyError, TypeError or ValueError for an invalid one."""
         trained_on, steps = TrainedOn.read(about[TRAINED_ON]), tuple(map(int, about["steps"]))
         found = OodPart(key, trained_on, steps, int(about["bands"]), about["record"])
         _ = found.map_scores
@@ -76,14 +76,14 @@ class OodPart:
 
     @property
     def map_scores(self) -> MapScores | None:
-        """Return the corrections of expected scores; None for weights that were trained in one light."""
+        """Return the corrections of expected scores; None for weights of a single exposure."""
         scores = self.record.get(MAP_SCORES)
         return None if scores is None else MapScores.read(scores)
 
 
 @dataclass(frozen=True)
 class ReaderPart:
-    """The reader of prior maps of weights, by its description."""
+    """Description of the temporal reader."""
 
     key: str
     sizes: TemporalSizes
@@ -91,10 +91,10 @@ class ReaderPart:
 
     @staticmethod
     def read(key: str, about: Mapping[str, Any], config: SegmenterConfig) -> ReaderPart:
-        """Read an entry of a description. KeyError, TypeError, ValueError: missing, or not for such a network."""
+        """Read an entry of a description. KeyError, TypeError, ValueError: invalid, or for another network."""
         sizes = TemporalSizes(**about["sizes"])
         if (sizes.classes, sizes.columns) != (config.classes, config.columns):
-            raise ValueError(f"its reader of prior maps is for another network: {sizes}")
+            raise ValueError(f"its temporal reader is for another network: {sizes}")
         if not 0 < sizes.width <= MOST_WIDTH or not 0 < sizes.coarse_width <= MOST_WIDTH:
-            raise ValueError(f"its reader of prior maps is {sizes.width} and {sizes.coarse_width} wide")
+            raise ValueError(f"its temporal reader is {sizes.width} and {sizes.coarse_width} wide")
         return ReaderPart(key, sizes, about["record"])

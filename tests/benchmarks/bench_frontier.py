@@ -184,7 +184,7 @@ def map_of(scene: RasterScene, seed: int, step: int, exposure_ms: float, weights
     source = SimulatedSource(scene, rig, seed, chosen, clock=sweep_starts(sweeps, CAMERA, COST))
     scan = LineSpec(exposure_ms / CAMERA.exposure_ms, step)
     scan_pass = uniform_pass(weights, source, sweeps, grid, COST, scan)
-    drawn = segment(weights, scan_pass.seen, scan_pass.columns, scan_pass.patch_index, every_class=True)
+    drawn = segment(weights, scan_pass.coarse, scan_pass.columns, scan_pass.patch_index, every_class=True)
     judged = _judged(scene, drawn.classes, weights)
     if others:
         return PlanMap(scan_pass.seconds, judged)

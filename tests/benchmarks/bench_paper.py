@@ -26,7 +26,7 @@ from models.evaluation.placement import CONTROL_FRACTION, RANDOM_DRAWS
 from models.network.machine import keep_freed_memory, one_thread
 from models.network.sizes import multiply_adds
 from models.network.spectral import LineSpec, patches_of
-from models.policies.policies import pixel_scores, score_multiply_adds, score_patches
+from models.policies.policies import PIXEL_SCORES, score_multiply_adds, score_patches
 from models.reading.inference import CoarsePrediction, coarse_prediction_of_columns, segment
 from models.training.examples import normalised, observe
 from models.weights.files import Weights
@@ -83,7 +83,7 @@ class Readings:
             before, after = (patch_pixels(self.seen.grid, one).sum(axis=(1, 2)) for one in wrong)
             return np.asarray(before - after, np.float64)
         if pooling == "maximum":
-            return patch_maxima(pixel_scores(policy, self.seen), self.seen.grid)
+            return patch_maxima(PIXEL_SCORES[policy].of(self.seen), self.seen.grid)
         return score_patches(policy, self.seen, seed=seed)
 
 

@@ -212,14 +212,14 @@ def _seen_by_camera(folder: Path) -> Values:
 
 
 def _through_camera(folder: Path, path: Path) -> list[Result]:
-    from flows.evaluate.frames import see_frame
+    from flows.evaluate.frames import observe_frame
     from models.weights.files import load_weights
     from pipeline.geometry.camera import LineCamera
 
     weights, scene = load_weights(path), _scene(folder)
     if scene.key not in weights.record.get("split", {}).get("pixels", {}):
         raise ValueError(f"{path} was not trained with --train-mask on {SCENE}: its test pixels may have taught it")
-    scan_pass = see_frame(scene, scene.name, weights, LineCamera(), 0)
+    scan_pass = observe_frame(scene, scene.name, weights, LineCamera(), 0)
     return _judged("camera", weights, scan_pass.seen, scan_pass.fine, scan_pass.labels)
 
 
@@ -230,7 +230,7 @@ def _of_the_file(folder: Path, split: Split) -> list[Result]:
     from models.network.spectral import SpectralBasis, patches_of
     from models.reading.inference import coarse_prediction_of_columns
     from models.training.examples import Example, measured_normalisation, normalised
-    from models.training.spectral_start import LabelledPixels, linear_discriminants
+    from models.training.start import LabelledPixels, linear_discriminants
     from models.training.train import train
     from models.weights.files import Weights
     from pipeline.geometry.grid import SceneGrid, pad_by_reflection

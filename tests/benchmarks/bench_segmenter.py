@@ -18,10 +18,11 @@ from models.network.segmenter import Segmenter
 from models.network.sizes import SegmenterConfig, multiply_adds
 from models.network.spectral import Normalisation, SpectralBasis
 from models.policies.policies import score_multiply_adds, score_patches
-from models.reading.inference import CoarsePass, DrawnMap, coarse_prediction, read_coarse_prediction, segment
+from models.reading.inference import CoarsePass, DrawnMap, read_coarse_prediction, segment
 from models.weights.files import Weights
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.prices import frame_patches
+from tests.models.conftest import coarse_prediction
 
 FRAME = SceneGrid(966, 1296, 32, 1)
 FRAME_SIZES = {"classes": 3, "columns": 2, "patch": 32}

@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from models.training.start_weights import StartFile
+from models.training.start import StartFile
 from models.weights.checksummed_files import load_checkpoint, save_checkpoint
 from models.weights.files import describe_weights, load_weights, save_weights
 from pipeline.errors import WeightsError

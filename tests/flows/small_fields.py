@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from flows.evaluate.frames import SeenFrame, open_frames, see_frame
+from flows.evaluate.frames import ObservedFrame, observe_frame, open_frames
 from models.weights.files import Weights, load_weights, save_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.scenes.scene import RasterScene
@@ -53,7 +53,7 @@ def scene_at(data: Path, name: str = "001") -> RasterScene:
     return opened.scene(opened.train[0])
 
 
-def observed_passes(data: Path, path: Path, seed: int = 0) -> tuple[SeenFrame, Weights]:
+def observed_passes(data: Path, path: Path, seed: int = 0) -> tuple[ObservedFrame, Weights]:
     """The first frame as small weights see it."""
     weights = load_weights(write_weights(path, seed))
-    return see_frame(scene_at(data), "001", weights, LineCamera(), 0), weights
+    return observe_frame(scene_at(data), "001", weights, LineCamera(), 0), weights

@@ -17,9 +17,9 @@ from models.evaluation.placement import oracle_gain
 from models.network.sizes import TOKEN_PX
 from models.network.spectral import fill_dead
 from models.policies.policies import score_patches
-from models.reading.inference import coarse_prediction, read_coarse_pass, read_coarse_prediction, segment
+from models.reading.inference import read_coarse_pass, read_coarse_prediction, segment
 from pipeline.geometry.grid import SceneGrid
-from tests.models.conftest import plain_weights
+from tests.models.conftest import coarse_prediction, plain_weights
 
 NM = np.linspace(400, 1000, 9)
 

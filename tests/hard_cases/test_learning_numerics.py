@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file
 from torch import nn
 
 from models.evaluation.metrics import mean_iou
 from models.evaluation.placement import captured_gain, gain_sums, oracle_gain
-from models.network.layers import ChannelNorm, TokenAttention
-from models.network.segmenter import Segmenter
+from models.network.segmenter import ChannelNorm, Segmenter, TokenAttention
 from models.network.sizes import MOST_GAIN, PLANES, SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
 from models.reading.inference import coarse_prediction_of_columns
@@ -176,16 +173,10 @@ def test_28_negative_gains_are_never_bought():
     assert plan.expected_gain == pytest.approx(5.0)
 
 
-def test_29_the_batch_of_a_failed_run_is_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Three bad steps in a row end a run; the last batch and the weights that it met are beside the checkpoint."""
+def test_29_a_loss_that_stays_infinite_ends_a_run(monkeypatch: pytest.MonkeyPatch):
+    """Three bad steps in a row end a run; the message names them and says what to do."""
     labels = np.random.default_rng(0).integers(0, 2, (16, 16)).astype(np.uint8)
-    honest = training.batch_loss
-    monkeypatch.setattr(training, "batch_loss", lambda *a, **k: honest(*a, **k) * float("nan"))
-    with pytest.raises(RuntimeError, match="not finite in steps 1 to 3") as failed:
-        train(SegmenterConfig(**SIZES), [_example(labels)], NO_SHIFT, SETTINGS, checkpoint=tmp_path / "w.checkpoint")
-    saved = load_file(tmp_path / "w.checkpoint.batch")
-    assert "w.checkpoint.batch" in str(failed.value)
-    assert saved["labels"].shape == (1, 16, 16)
-    assert saved["image"].shape == saved["detail"].shape == (1, 4 + PLANES, 16, 16)
-    assert saved["image"].isfinite().all()
-    assert saved["model.overview_classes.weight"].shape == (2, 8, 1, 1)
+    finite = training.batch_loss
+    monkeypatch.setattr(training, "batch_loss", lambda *a, **k: finite(*a, **k) * float("nan"))
+    with pytest.raises(RuntimeError, match="not finite in steps 1 to 3; lower the learning rate"):
+        train(SegmenterConfig(**SIZES), [_example(labels)], NO_SHIFT, SETTINGS)

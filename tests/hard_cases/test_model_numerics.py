@@ -17,17 +17,11 @@ import torch
 from torch import Tensor
 
 from models.evaluation.metrics import average_accuracy, confusion, iou_per_class, kappa, mean_iou, overall_accuracy
-from models.network.layers import Encoder, code_2d, cut
+from models.network.segmenter import Encoder, code_2d, cut
 from models.network.sizes import PLANES, SegmenterConfig
 from models.network.spectral import LineSpec, Normalisation, with_planes
 from models.policies.policies import pixel_entropy, score_patches
-from models.reading.inference import (
-    CoarsePrediction,
-    check_patch_index,
-    coarse_prediction,
-    coarse_prediction_of_columns,
-    segment,
-)
+from models.reading.inference import CoarsePrediction, check_patch_index, coarse_prediction_of_columns, segment
 from models.training import train as training
 from models.training.examples import Example
 from models.training.objective import class_weights, draw_patches, map_loss, phase_at, pixel_losses
@@ -35,7 +29,7 @@ from models.training.train import TrainingSettings, train
 from models.weights.files import load_weights, save_weights
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.prices import frame_patches, select_patches
-from tests.models.conftest import SMALL, make_network, noise, plain_weights
+from tests.models.conftest import SMALL, coarse_prediction, make_network, noise, plain_weights
 
 NONE = torch.zeros(1, 0, dtype=torch.int64)
 PLACE = torch.zeros(1, 2)
@@ -217,15 +211,24 @@ def test_10_a_patch_given_twice_is_refused():
 
 
 @torch.inference_mode()
-def test_11_bfloat16_agrees():
-    """Under autocast to bfloat16 the map differs by 2e-2 at most and nearly all classes agree."""
-    model, image, numbers = make_network(layers=2), _image(96, 128), torch.arange(0, 192, 3)[None]
-    exact = model.composite(*model(image, image, numbers, PLACE), numbers).softmax(dim=1)
+@pytest.mark.parametrize("size", [(32, 32), (64, 96), (96, 128)])
+def test_11_bfloat16_agrees(size: tuple[int, int]):
+    """Autocast to bfloat16 adds no more error than its rounding, and no class changes where one leads by 0.1.
+
+    A layer rounds input, weights and output, each by at most u = 2^-8 of its size, with a standard deviation below
+    u / sqrt(3). Independent errors of ``depth`` layers add up to u sqrt(depth). How large a single error may be differs
+    between processors: they sum in other orders and fuse other layers.
+    """
+    model, image, numbers = make_network(layers=2), _image(*size), torch.arange(0, size[0] * size[1] // 64, 3)[None]
+    exact = model.composite(*model(image, image, numbers, PLACE), numbers)
     with warnings.catch_warnings(), torch.autocast("cpu", dtype=torch.bfloat16):
         warnings.filterwarnings("ignore", "Mismatch dtype between input and weight")  # slower, not less exact
-        rough = model.composite(*model(image, image, numbers, PLACE), numbers).softmax(dim=1)
-    assert (exact - rough).abs().max() <= 2e-2
-    assert (exact.argmax(dim=1) == rough.argmax(dim=1)).float().mean() >= 0.995
+        rough = model.composite(*model(image, image, numbers, PLACE), numbers)
+    depth = sum(isinstance(part, torch.nn.Conv2d | torch.nn.Linear) for part in model.modules())
+    assert (exact - rough).square().mean().sqrt() <= 2.0**-8 * math.sqrt(depth) * exact.square().mean().sqrt()
+    best = exact.softmax(dim=1).topk(2, dim=1).values
+    sure = best[:, 0] - best[:, 1] >= 0.1
+    assert (exact.argmax(dim=1) == rough.argmax(dim=1))[sure].all()
 
 
 @torch.inference_mode()

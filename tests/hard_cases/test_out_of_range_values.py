@@ -16,7 +16,6 @@ from models.policies.policies import score_patches
 from models.reading.inference import (
     CoarsePrediction,
     DrawnMap,
-    coarse_prediction,
     coarse_prediction_of_columns,
     decide,
     read_coarse_pass,
@@ -25,7 +24,7 @@ from models.reading.inference import (
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.readings import MOST_VALUE, beyond_range, find_beyond, readings_alone
-from tests.models.conftest import make_weights
+from tests.models.conftest import coarse_prediction, make_weights
 
 WEIGHTS = make_weights(0)
 GRID, NM = SceneGrid(48, 64, 8, 1), np.linspace(420, 980, 7)

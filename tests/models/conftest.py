@@ -13,8 +13,8 @@ from torch import Tensor
 
 from models.network.segmenter import Segmenter
 from models.network.sizes import SegmenterConfig
-from models.network.spectral import Normalisation, SpectralBasis
-from models.reading.inference import CoarsePass
+from models.network.spectral import Capture, LineSpec, Normalisation, SpectralBasis
+from models.reading.inference import CoarsePass, CoarsePrediction, read_coarse_pass, read_coarse_prediction
 from models.training.examples import Example
 from models.training.train import Progress
 from models.weights.files import Weights
@@ -31,6 +31,20 @@ Maker = Callable[..., Weights]
 def noise(seed: int, *shape: int) -> Tensor:
     """Seeded normal numbers."""
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def coarse_prediction(
+    weights: Weights,
+    values: np.ndarray,
+    wavelength_nm: np.ndarray,
+    grid: SceneGrid,
+    *,
+    capture: Capture = LineSpec(),  # noqa: B008 - a value
+    factor: int = 1,
+) -> CoarsePrediction:
+    """Predict from scene values (y, x, band), in pixels of ``factor`` fine ones; NaN is no data."""
+    coarse = read_coarse_pass(weights, [values], wavelength_nm, grid, capture=capture, factor=factor)
+    return read_coarse_prediction(weights, coarse)
 
 
 def scene_columns(weights: Weights, height: int, width: int, seed: int = 0) -> tuple[CoarsePass, np.ndarray]:

@@ -168,7 +168,7 @@ CASES = {
     "init of a folder of dates": (1, "init season", "in its folders 2024-05-01, 2024-06-01: name one"),
     "training on a folder of dates": (1, TRAIN + "season", "in its folders 2024-05-01, 2024-06-01: name one"),
     "init of soft labels": (1, "init soft", "768 different colours.* hard edges"),
-    "init twice": (2, "init bad_key", "there is a bad_key/scene.toml already.*--force"),
+    "init twice": (2, "init bad_key", "bad_key/scene.toml exists.*--force"),
     "init of several label files": (1, "init several", "several files of labels"),
     # archives
     "no archive": (1, "export none -o maps", "none"),

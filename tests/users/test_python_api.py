@@ -207,7 +207,7 @@ def test_weights_are_trained_and_judged(tmp_path: Path) -> None:
     quick = {"fractions": [0.25], "policies": ["entropy"], "draws": 10}
     scores = spectralzoom.evaluate(data, weights=made, **quick, progress=told)
     assert scores["frames"] == ["003"]
-    assert {"training", "looking at scenes"} <= heard
+    assert {"training", "imaging scenes"} <= heard
 
 
 def test_what_cannot_be_is_one_error(make_weights: WeightsMaker, tmp_path: Path) -> None:

@@ -80,10 +80,10 @@ def seen_by(scene: RasterScene, seed: int, how: tuple[int, float]) -> Seen:
     clock = sweep_starts(sweeps, CAMERA, COST)
     source = SimulatedSource(scene, rig, seed, chosen_effects(scene, rig, sweeps), clock=clock)
     scan_pass = uniform_pass(weights, source, sweeps, grid, COST, LineSpec(exposure_ms / REFERENCE_MS, step))
-    drawn = segment(weights, scan_pass.seen, scan_pass.columns, scan_pass.patch_index, every_class=True)
+    drawn = segment(weights, scan_pass.coarse, scan_pass.columns, scan_pass.patch_index, every_class=True)
     assert drawn.log_probability is not None
     seen = np.ones(SHAPE, np.bool_)
-    columns = pooled(scan_pass.seen.columns)
+    columns = pooled(scan_pass.coarse.columns)
     observation = CurrentVisit(drawn.log_probability, seen, columns, exposure_ms / REFERENCE_MS, step)
     return Seen(observation, np.asarray(scene.labels, np.uint8), scan_pass.seconds)
 

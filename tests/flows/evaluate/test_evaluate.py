@@ -1,4 +1,4 @@
-"""`spectralzoom evaluate`: which frames are judged, what the figures hold, and that a killed run goes on."""
+"""`spectralzoom evaluate`: which frames are judged, what the figures hold and what is refused."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ import pytest
 from rich.console import Console
 
 from flows.cli.main import main
-from flows.evaluate import command as evaluate_command
-from flows.evaluate.command import KeptResults, evaluate_weights, run_evaluate
+from flows.evaluate.command import evaluate_weights, run_evaluate
 from flows.evaluate.frames import EvaluateRequest, open_candidates
 from flows.evaluate.judge import ORACLE, Trial, collect_row, difference, judge_frame, seeds_of, summarise
 from flows.evaluate.table import print_evaluation
@@ -49,7 +48,7 @@ def test_every_row_is_there(judged: Judged):
     assert keys == [("none", 0.0), *policies, ("all", 1.0)]
     assert content["frames"] == list(FRAMES)
     assert [one["frames"] for one in content["weights"]] == [3, 3]
-    assert {path.name for path in folder.iterdir()} == {"evaluation.json", "evaluation.png", "frames"}
+    assert {path.name for path in folder.iterdir()} == {"evaluation.json", "evaluation.png"}
     kept = json.loads((folder / "evaluation.json").read_text())
     assert kept["rows"][1]["miou"] == content["rows"][1]["miou"]
     row = _row(content, "entropy", 0.25)
@@ -69,44 +68,6 @@ def test_costs_stand_beside_all_and_the_oracle_has_all_the_gain(judged: Judged):
     row = _row(content, ORACLE, 0.5)
     assert row["uses_labels"]
     assert row["captured_gain"] in (None, pytest.approx(1))
-
-
-def test_a_killed_run_goes_on(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Frames that were judged are not judged again, and the figures are those of a run that was not killed."""
-    weights = (write_weights(tmp_path / "w.safetensors"),)
-    whole = evaluate_weights(EvaluateRequest(str(data), weights, **QUICK))
-    request = EvaluateRequest(str(data), weights, tmp_path / "out", **QUICK)
-    judged: list[str] = []
-
-    def killed(trial: Trial, scan_pass: Any, *rest: Any) -> dict[str, Any]:
-        if len(judged) == 2:
-            raise KeyboardInterrupt
-        judged.append(scan_pass.name)
-        return judge_frame(trial, scan_pass, *rest)
-
-    monkeypatch.setattr(evaluate_command, "judge_frame", killed)
-    with pytest.raises(KeyboardInterrupt):
-        evaluate_weights(request)
-    judged[:] = []
-    again = evaluate_weights(request)
-    assert judged == ["003"]
-    assert whole["rows"] == again["rows"]
-
-
-def test_a_damaged_result_is_made_again(tmp_path: Path):
-    """What was cut short by a kill, or is of something else, is not believed."""
-    kept, made = KeptResults(tmp_path / "frames"), []
-
-    def make() -> dict[str, Any]:
-        made.append(1)
-        return {"value": len(made)}
-
-    assert kept.made({"seed": 0}, make) == {"value": 1}
-    assert kept.made({"seed": 0}, make) == {"value": 1}
-    assert kept.made({"seed": 1}, make) == {"value": 2}
-    for path in (tmp_path / "frames").iterdir():
-        path.write_text(path.read_text()[:20])
-    assert kept.made({"seed": 0}, make) == {"value": 3}
 
 
 def test_frames_trained_on_are_left_out(data: Path, tmp_path: Path):
@@ -301,7 +262,7 @@ def test_the_farm_is_judged_on_seeds_of_its_own(tmp_path: Path, monkeypatch: pyt
     ("change", "words"),
     [
         ({"fractions": (10.0,)}, "--fractions are fractions of the patches from 0 to 1"),
-        ({"policies": ("mask",)}, "'mask' is none that can be judged"),
+        ({"policies": ("mask",)}, "'mask' cannot be judged"),
         ({"draws": 0}, "--draws must be at least 1"),
         ({"seed": -1}, "--seed must be at least 0"),
         ({"scenes": 2}, "--scenes is for built-in scenes"),

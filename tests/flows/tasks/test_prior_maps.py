@@ -227,7 +227,7 @@ def test_a_reader_in_the_weights_is_used(visited: Path, survey_png: Survey, weig
     decode = [one.receipt["savings"]["multiply_adds"]["detail"] for one in (published, first)]
     assert decode[0] - decode[1] == reader.sizes.multiply_adds(96 * 128)
     add_reader(own, own, TemporalReader(TemporalSizes(3, 7)), {})
-    with pytest.raises(WeightsError, match=r"own\.safetensors.* reader of prior maps is for another network"):
+    with pytest.raises(WeightsError, match=r"own\.safetensors.* temporal reader is for another network"):
         survey_png(visited, **flags)
 
 

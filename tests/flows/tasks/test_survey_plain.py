@@ -21,7 +21,7 @@ from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.tasks.scene import open_scene
 from models.network.spectral import LineSpec
-from models.reading.inference import coarse_prediction, segment
+from models.reading.inference import segment
 from models.weights.files import load_weights, save_weights
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
@@ -35,6 +35,7 @@ from storage.arrays.mosaics import open_mosaic
 from storage.remote.opening import verify_archive
 from tests.conftest import CLASSES, RGB_NM, patchy_scene, random_weights
 from tests.flows.conftest import FEW_BANDS, Page
+from tests.models.conftest import coarse_prediction
 from tests.receipts import comparable
 
 STAGES = [

@@ -42,6 +42,12 @@ class Clock:
         return 2 * self.cpu_s
 
 
+@pytest.fixture(autouse=True)
+def uncollected(monkeypatch):
+    """Skip the collection of garbage before each run, which takes most of the time here."""
+    monkeypatch.setattr(tradeoff_module.gc, "collect", lambda: 0)
+
+
 @pytest.fixture
 def clock(monkeypatch):
     """The clock that trade-offs are timed by."""

@@ -20,21 +20,24 @@ from flows.cli.main import main
 from flows.settings.load import load_settings
 from flows.tasks.run import open_run
 from flows.tasks.survey_model import shipped_weights
+from flows.training import figures, train_scenes
 from flows.training import train as flow
-from flows.training import train_scenes
-from flows.training.baselines import judge_baselines
 from flows.training.data import pack_mask, unpack_mask
+from flows.training.figures import judge_baselines
 from flows.training.fit_ood import OodRequest, measure_ood
 from flows.training.train import joined_split, run_train, train_weights
 from flows.training.train_scenes import TrainRequest, observe_all, suggested_patch
 from models.evaluation.expected_scores import MapScores
+from models.evaluation.metrics import mean_iou
+from models.evaluation.placement import Controls
 from models.training.examples import Example
-from models.training.start_weights import StartFile
+from models.training.start import StartFile
 from models.training.train import TrainingSettings
 from models.weights.files import describe_weights, load_ood, load_weights
 from models.weights.parts import TrainedOn
 from pipeline.errors import SceneError, SettingsError
 from tests.flows.small_fields import write_field
+from tests.models.conftest import make_weights
 
 SETTINGS = TrainingSettings(steps=1, batch=1, crop=16)
 
@@ -161,16 +164,34 @@ def test_training_shows_the_figures_of_validation(folder: Path, out: Path):
     """The table has a row for each placement."""
     shown, rows = io.StringIO(), {"none", "random", "sobel", "entropy", "gain", "all"}
     request = _request(folder, out, validation=1)
-    figures = run_train(request, Console(file=shown, width=100))["validation"]
-    assert set(figures) - {"scenes", "share_of_seats"} == rows
+    judged = run_train(request, Console(file=shown, width=100))["validation"]
+    assert set(judged) - {"scenes", "share_of_seats"} == rows
     for name in rows:
-        assert all(0 <= figures[name][figure] <= 1 for figure in ("miou", "overall_accuracy"))
+        assert all(0 <= judged[name][figure] <= 1 for figure in ("miou", "overall_accuracy"))
         assert name in shown.getvalue()
     record = describe_weights(out).record
     assert set(record["baselines"]) == {"logistic regression", "random forest"}
     assert set(record["readings"]["miou"]) == {"network", "linear discriminants"}
     beside = record["baselines"] | record["readings"]["miou"]
     assert all(f"{name} {100 * miou:.1f}" in shown.getvalue() for name, miou in beside.items())
+
+
+def test_counts_of_validation_scenes_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each row is judged on all scenes together, and each random draw with the same draw of the others."""
+    counts = [np.diag([number, 9]) + np.array([[0, 1], [number, 0]]) for number in range(1, 5)]
+    scenes = iter(
+        Controls(0.35, 1, counts[0], counts[1], {"gain": counts[2]}, [counts[at], counts[3]]) for at in (0, 2)
+    )
+    monkeypatch.setattr(figures, "_parts", lambda weights, example: (None, None, None))
+    monkeypatch.setattr(figures, "coarse_prediction_of_columns", lambda *given: None)
+    monkeypatch.setattr(figures, "run_controls", lambda *given, **named: next(scenes))
+    one = Example("e", np.zeros((1, 1, 1), np.float32), np.zeros((1, 1), np.uint8), (1, 1))
+    found = figures.validate(make_weights(), [one, one], 0, lambda row: None)
+    assert found is not None
+    assert found["gain"]["miou"] == mean_iou(2 * counts[2])
+    draws = [mean_iou(counts[0] + counts[2]), mean_iou(2 * counts[3])]
+    assert found["random"]["miou"] == pytest.approx(np.mean(draws))
+    assert found["random"]["spread"] == pytest.approx(np.std(draws, ddof=1))
 
 
 def test_classifiers_beside_a_training_know_spectra_that_differ() -> None:
@@ -278,7 +299,7 @@ def test_frames_that_the_start_has_seen_validate_nothing(
     if fraction == "in part":
         masks = {key: pack_mask(np.eye(16, dtype=bool)) for key in split["train"].values()}
         monkeypatch.setattr(StartFile, "earlier", property(lambda file: {"split": {**split, "pixels": masks}}))
-    with pytest.raises(SettingsError, match="was trained on the scene 001, which is kept for validation"):
+    with pytest.raises(SettingsError, match="was trained on the scene 001, which is for validation"):
         train_weights(_begun(folder, out, validation=1, init=earlier))
 
 
@@ -341,7 +362,7 @@ def test_weights_that_will_choose_no_scan_say_so(folder: Path, out: Path, darkes
     shown, settings = io.StringIO(), replace(SETTINGS, darkest_ms=darkest_ms)
     request = _request(folder, out, validation=0, settings=settings)
     run_train(request, Console(file=shown, width=100))
-    assert ("nor has the file a record of uniform scans" in shown.getvalue()) == said
+    assert ("the file has no scan performance" in shown.getvalue()) == said
 
 
 def test_whitening_knows_the_noise_of_short_exposures(folder: Path, out: Path):

@@ -187,5 +187,5 @@ def test_a_record_that_lacks_a_part_is_none(part: str):
     content = _scores().as_dict()
     with pytest.raises(KeyError, match=part):
         MapScores.read({name: value for name, value in content.items() if name != part})
-    with pytest.raises(ValueError, match="looks"):
+    with pytest.raises(ValueError, match="scans"):
         MapScores.read(content | {"error": [[0.1]]})

@@ -19,7 +19,6 @@ from models.evaluation.metrics import (
     kappa,
     labelled_classes,
     mean_iou,
-    mean_iou_of_each,
     overall_accuracy,
 )
 from pipeline.errors import ShapeError
@@ -118,25 +117,6 @@ def test_stray_pixels_cost_their_own_class_alone(pairs: list[tuple[int, int]], d
     counts = confusion(labels, drawn, 5)
     assert mean_iou(counts) == pytest.approx(1 - lost / len(present))
     assert false_pixels(counts).sum() == len(stray)
-
-
-@given(LABELLED, st.sampled_from([0, 1, 2, 3, 4]), st.sampled_from([3, 4]))
-def test_one_false_class_is_as_bad_as_another(pairs: list[tuple[int, int]], old: int, new: int):
-    """Which of the classes that the labels lack a wrong pixel shows, and how many of them there are, is no matter."""
-    labels, drawn = _maps(pairs)
-    wrong = (drawn == old) & (drawn != labels) & ~np.isin(drawn, labels)
-    before, after = (confusion(labels, shown, 5) for shown in (drawn, np.where(wrong, new, drawn)))
-    assert mean_iou(after) == mean_iou(before)
-
-
-@given(st.lists(PAIRS, min_size=1, max_size=4))
-def test_many_counts_at_once_give_the_mean_of_each(maps: list[list[tuple[int, int]]]):
-    """Counts in a stack have the means that they have alone, NaN where nothing is labelled."""
-    counts = np.stack([confusion(*_maps(pairs), 4) for pairs in maps])
-    each = mean_iou_of_each(counts[None])
-    assert each.shape == (1, len(maps))
-    assert each[0].tolist() == pytest.approx([mean_iou(one) for one in counts], nan_ok=True)
-    assert (np.isnan(each[0]) == ~counts.any(axis=(1, 2))).all()
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.int16, np.int64])

@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from models.network.layers import ChannelNorm, cut
 from models.network.machine import choose_device
+from models.network.segmenter import ChannelNorm, cut
 from models.network.spectral import LineSpec
 from models.reading.inference import overview_of, patch_logits
 from models.training.examples import Batch

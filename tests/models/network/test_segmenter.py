@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 
-from models.network.layers import cut
-from models.network.segmenter import PatchScorer, Segmenter
+from models.network.segmenter import PatchScorer, Segmenter, cut
 from models.network.sizes import PLANES, SegmenterConfig
 from models.policies.policies import score_patches
-from models.reading.inference import coarse_prediction
 from models.training.objective import scoring_loss
 from pipeline.geometry.grid import SceneGrid
-from tests.models.conftest import SMALL, Maker, make_network, noise
+from tests.models.conftest import SMALL, Maker, coarse_prediction, make_network, noise
 
 IMAGE = noise(0, 1, 4 + PLANES, 64, 96)  # 2 x 3 tokens, 8 x 12 patches
 
@@ -31,33 +27,6 @@ def test_an_image_of_parts_of_tokens_is_read_as_one_that_goes_on(size: tuple[int
     assert own.logits.shape[2:] == own.features.shape[2:] == size
     for one, other in ((own.logits, expected.logits), (own.features, expected.features)):
         assert (one - other[..., : size[0], : size[1]]).abs().max() <= 1e-5
-
-
-@torch.inference_mode()
-def test_tokens_have_the_places_of_the_field():
-    """A crop's tokens have the codes that the field's have there, however far out; another place is read otherwise."""
-    model = make_network(dim=32)
-    field, crop = (model._coded(torch.zeros(1, 32, *shape), None) for shape in ((5, 7), (2, 3)))
-    moved = model._coded(torch.zeros(1, 32, 2, 3), torch.tensor([[3, 4]]))
-    assert (moved[0] - field[0].view(5, 7, 32)[3:, 4:].flatten(0, 1)).abs().max() <= 1e-6
-    assert (moved - crop).abs().max() > 0.1
-    model = make_network()
-    here, there = (model.read_overview(IMAGE, torch.tensor([origin])).logits for origin in ((0, 0), (3, 4)))
-    assert torch.equal(here, model.read_overview(IMAGE).logits)
-    assert (here - there).abs().max() > 1e-4
-
-
-@torch.inference_mode()
-@pytest.mark.parametrize("dead", [[2], [0, 1, 2, 3, 4, 5]])
-def test_tokens_that_do_not_live_are_left_out(dead: list[int]):
-    """The transformer reads the others alone, be it none, and every pixel has logits."""
-    model, living, read = make_network(), torch.ones(6, dtype=torch.bool), list[int]()
-    living[dead] = False
-    model.encoder.register_forward_hook(lambda module, args, out: read.append(out.shape[1]))
-    logits = model.read_overview(IMAGE, None, living).logits
-    assert read == [6 - len(dead)]
-    assert logits.isfinite().all()
-    assert (logits - model.read_overview(IMAGE).logits).abs().max() > 1e-4
 
 
 @torch.inference_mode()
@@ -79,16 +48,6 @@ def test_a_patch_is_read_by_its_own_pixels_and_the_overview_of_them():
 
 
 @torch.inference_mode()
-def test_the_full_network_corrects_the_overview():
-    """Where it has nothing to say, the logits of a patch are those of the overview."""
-    model, numbers = make_network(patch=16), torch.tensor([[23, 0, 8]])
-    for parameter in model.full_classes.parameters():
-        parameter.zero_()
-    logits, patches = model(IMAGE, IMAGE, numbers, torch.zeros(1, 2))
-    assert torch.equal(patches, cut(logits, 16)[:, numbers[0]])
-
-
-@torch.inference_mode()
 def test_a_composite_holds_patches_where_numbers_say():
     """Captured patches show their patch, all else the logits of the overview, each scene its own; none: all of it."""
     model, overview, fine = make_network(), noise(0, 2, 3, 16, 32), noise(1, 2, 3, 3, 8, 8)
@@ -99,33 +58,6 @@ def test_a_composite_holds_patches_where_numbers_say():
             expected[scene, :, y : y + 8, x : x + 8] = fine[scene, place]
     assert torch.equal(model.composite(overview, fine, patch_index), expected)
     assert torch.equal(model.composite(overview, fine[:, :0], patch_index[:, :0]), overview)
-
-
-@pytest.mark.parametrize(("batch", "count"), [(2, 0), (0, 3), (0, 0)])
-def test_no_patch_and_no_scene_are_read_and_learned_from(batch: int, count: int):
-    """Empty results have their shapes; a gradient goes through scenes without a patch."""
-    model, image = make_network(), torch.zeros(batch, 7, 32, 32)
-    numbers = torch.zeros(batch, count, dtype=torch.int64)
-    logits, patches = model(image, image, numbers, torch.zeros(batch, 2))
-    assert patches.shape == (batch, count, 3, 8, 8)
-    whole = model.composite(logits, patches, numbers)
-    assert whole.shape == (batch, 3, 32, 32)
-    if batch:
-        torch.autograd.backward(whole.sum())
-
-
-@torch.inference_mode()
-@pytest.mark.parametrize("size", [(32, 32), (64, 96)])
-def test_half_precision_agrees(size: tuple[int, int]):
-    """Under autocast to bfloat16 probabilities differ by 2e-2 at most and nearly all classes agree."""
-    model, image, numbers = make_network(layers=2), IMAGE[..., : size[0], : size[1]], torch.arange(0, 16, 3)[None]
-    given = image, image, numbers, torch.zeros(1, 2)
-    exact = model.composite(*model(*given), numbers).softmax(dim=1)
-    with warnings.catch_warnings(), torch.autocast("cpu", dtype=torch.bfloat16):
-        warnings.filterwarnings("ignore", "Mismatch dtype between input and weight")  # slower, not less exact
-        rough = model.composite(*model(*given), numbers).softmax(dim=1)
-    assert (exact - rough).abs().max() <= 2e-2
-    assert (exact.argmax(dim=1) == rough.argmax(dim=1)).float().mean() >= 0.99
 
 
 @torch.inference_mode()

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.network.spectral import LineSpec, Normalisation, SpectralBasis, band_widths, project, with_planes
+from models.network.spectral import LineSpec, Normalisation, SpectralBasis, band_widths, project
 
 BASIS = SpectralBasis(400.0, 1000.0, 24)
 BANDS = st.lists(st.sampled_from(range(400, 1001, 3)), min_size=1, max_size=40)  # repeats are likely
@@ -125,11 +125,3 @@ def test_planes_are_0_at_the_reference_and_grow_with_what_it_lacks(light: float,
     assert (here.planes >= 0).all()
     assert not LineSpec().planes.any()
     assert not LineSpec(light=4.0).planes.any()  # what is better than the reference counts as that
-
-
-def test_planes_lie_behind_the_columns():
-    """Each pixel has its columns first, as they are, then the capture's planes."""
-    columns = np.random.default_rng(0).normal(size=(3, 2, 5)).astype(np.float32)
-    told = with_planes(columns, LineSpec(0.25, 4, 2))
-    assert (told[..., :5] == columns).all()
-    assert (told[..., 5:] == np.array([0.5, 1.0, 0.5], np.float32)).all()

@@ -14,7 +14,6 @@ from models.reading import inference
 from models.reading.inference import (
     CoarsePass,
     CoarsePrediction,
-    coarse_prediction,
     coarse_prediction_of_columns,
     coarse_prediction_of_patches,
     draw,
@@ -26,7 +25,7 @@ from models.reading.inference import (
 from models.weights.files import Weights, with_record
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
-from tests.models.conftest import Maker, noise, plain_weights, scene_columns
+from tests.models.conftest import Maker, coarse_prediction, noise, plain_weights, scene_columns
 
 NM = np.linspace(400, 1000, 9)
 NONE = np.empty(0, np.int64)
@@ -41,21 +40,6 @@ def _seen(weights: Weights, height: int = 32, width: int = 48) -> tuple[CoarsePr
     """The overview of a scene of noise, and other noise for every patch."""
     coarse_pass, fine = scene_columns(weights, height, width)
     return read_coarse_prediction(weights, coarse_pass), fine
-
-
-@pytest.mark.parametrize("size", [(37, 53), (1, 1), (32, 32), (33, 1), (1, 40)])
-@pytest.mark.parametrize("factor", [1, 2, 4])
-def test_maps_have_the_size_of_the_scene(tiny: Maker, size: tuple[int, int], factor: int):
-    """Any size works, with no patch, one patch and every patch, down to a single pixel."""
-    weights, grid = tiny(), SceneGrid(*size, 8, factor)
-    seen = coarse_prediction(weights, _values(*grid.coarse_shape), NM, grid, factor=factor)
-    fine = noise(1, int(np.prod(grid.patch_shape)), 8, 8, 4).numpy()
-    for patch_index in (NONE, grid.valid_patches()[-1:], grid.valid_patches()):
-        drawn = segment(weights, seen, fine[patch_index], patch_index)
-        assert drawn.classes.shape == drawn.confidence.shape == size
-        assert drawn.classes.dtype == np.uint8
-        assert drawn.classes.max() < 3
-        assert 1 / 3 - 1e-6 <= drawn.confidence.min() <= drawn.confidence.max() <= 1
 
 
 def test_a_map_without_a_patch_is_the_overviews(tiny: Maker):

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from models.evaluation.metrics import JudgedMap, fitted_temperature, judge_confidence
 from models.network.spectral import LineSpec, Normalisation
-from models.training.calibration import JudgedMap, fitted_temperature, judge_confidence
 from models.training.capture_augmentation import ColumnNoise
 from models.training.examples import Example
 from models.training.ood_fit import components, fit_ood

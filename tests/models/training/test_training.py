@@ -7,13 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from models.network.segmenter import Segmenter
 from models.network.sizes import PLANES, SegmenterConfig
 from models.network.spectral import LineSpec
 from models.reading.inference import map_of_columns
-from models.training import objective
 from models.training import train as training
 from models.training.examples import CropSampler
 from models.training.objective import batch_loss, class_weights, draw_patches, map_loss, phase_at, pixel_losses
@@ -65,14 +63,20 @@ def test_equal_seeds_give_equal_weights_and_leave_global_streams_alone():
 
 
 @pytest.mark.parametrize(("crop", "first", "last"), [(48, 32, (2, 64)), (64, 64, (4, 64)), (16, 32, (4, 32))])
-def test_batches_are_halved_where_crops_grow(crop: int, first: int, last: tuple[int, int]):
+def test_batches_are_halved_where_crops_grow(
+    crop: int, first: int, last: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+):
     """The last phase has larger crops and fewer of them; where scenes have no larger ones, as many as before."""
     trainer = training.Trainer(CONFIG, [block_example(64)], SHIFT, replace(SETTINGS, batch=4, crop=crop))
-    sizes = []
+    sizes, loss = [], training.batch_loss
+    monkeypatch.setattr(
+        training,
+        "batch_loss",
+        lambda model, batch, *a, **k: sizes.append(batch.labels.shape) or loss(model, batch, *a, **k),
+    )
     for done in (0.1, 0.9):
         trainer.step(done)
-        assert trainer.batch is not None
-        sizes.append((len(trainer.batch.labels), trainer.batch.labels.shape[-1]))
+    sizes = [(count, side) for count, side, _ in sizes]
     assert sizes == [(4, first), last]
 
 
@@ -157,23 +161,3 @@ def test_unlabelled_pixels_have_no_say():
     assert map_loss(other, pixel_losses(other, labels), labels, torch.ones(3), soft_dice=True).item() == pytest.approx(
         loss.item(), abs=1e-6
     )
-
-
-def test_the_scorer_is_told_of_labelled_patches_alone(monkeypatch: pytest.MonkeyPatch):
-    """A patch with one labelled pixel is told of; one with none is not said to gain nothing."""
-    told: list[tuple[Tensor, ...]] = []
-
-    def scoring(*given: Tensor) -> Tensor:
-        told.append(given)
-        return given[0].sum() * 0
-
-    monkeypatch.setattr(objective, "scoring_loss", scoring)
-    monkeypatch.setattr(objective, "draw_patches", lambda *_: torch.arange(16)[None])
-    batch = CropSampler([block_example()], 8, 16).draw(1, np.random.default_rng(0), SHIFT)
-    batch.labels[:] = 255
-    batch.labels[0, 3, 12] = 1
-    with torch.no_grad():
-        batch_loss(Segmenter(CONFIG), batch, torch.ones(3), np.random.default_rng(0), phase_at(0.0), soft_dice=False)
-    score, gain, known = told[0]
-    assert score.shape == gain.shape == known.shape
-    assert known.tolist() == [[number == 1 for number in range(16)]]

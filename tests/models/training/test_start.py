@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from models.network.spectral import Normalisation, SpectralBasis
-from models.training.start_weights import StartFile, column_change
+from models.training.start import LabelledPixels, StartFile, column_change, linear_discriminants
 from models.weights.files import Weights, save_weights
 from pipeline.errors import SettingsError, WeightsError
 from tests.models.conftest import Maker
@@ -127,3 +127,13 @@ def test_kernels_for_the_same_data_say_what_they_said(tmp_path: Path, tiny):
         for one, state in ((old, weights.segmenter.state_dict()), (new, start.state))
     )
     np.testing.assert_allclose(after.numpy(), before.numpy(), rtol=1e-3, atol=1e-4)
+
+
+def test_discriminants_of_absent_classes_are_out_of_reach():
+    """Two of three classes have pixels: each is told by its own channel, and the third is never the likeliest."""
+    rng, labels = np.random.default_rng(0), np.repeat(np.array([0, 2], np.uint8), 50)
+    features = (rng.normal(0, 1, (100, 4)) + 5 * labels[:, None]).astype(np.float32)
+    found = linear_discriminants(LabelledPixels(features, labels), 3)
+    logits = features @ found["spectral.weight"][:, :, 0, 0].numpy().T + found["spectral.bias"].numpy()
+    assert (logits.argmax(axis=1) == labels).all()
+    assert (logits[:, 1] == -20).all()
