@@ -28,8 +28,8 @@ from flows.terminal.progress import on_stdout, print_json
 from pipeline.errors import SettingsError
 from pipeline.geometry.mirror import STRAIGHT
 from pipeline.rig.device_settings import CameraLimits, SurveyRig
+from pipeline.rig.drivers import open_camera_driver, open_devices, open_mirror_driver
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock, ServedRig
-from pipeline.rig.opening import open_camera_driver, open_devices, open_mirror_driver
 from pipeline.rig.rig_check import TRIGGERS, CheckRow, Device, check_camera, check_mirror, check_triggers, works
 from pipeline.rig.transports import SYSTEM_CLOCK
 from pipeline.simulator.simulated import SimulatedSource

@@ -31,7 +31,6 @@ PLACES = {
     "lost_lines": "lost_lines:rows",
     "growing_files": "growing_files:rows",
     "spool_rate": "lost_lines:pace_rows",
-    "hostile_rig": "hostile_rig:rows",
     "checksummed_flips": "sealed_flips:weight_rows",
 }
 FAULTS = {name: rows_of(f"tests.faults.{place}") for name, place in PLACES.items()}

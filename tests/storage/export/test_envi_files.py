@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from pipeline.errors import PoseError, SceneError, ShapeError
-from pipeline.rig.camera.envi_headers import DATA_TYPES, INTERLEAVES
+from pipeline.rig.camera.camera_texts import DATA_TYPES, INTERLEAVES
 from storage.export.image_files import EnviFile, write_envi
 from storage.readers.envi_files import EnviCube, open_envi_cube
 from storage.readers.open_cubes import open_cube

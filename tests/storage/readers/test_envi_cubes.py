@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.rig.camera.envi_headers import parse_envi_header
+from pipeline.rig.camera.camera_texts import parse_envi_header
 from storage.readers.envi_files import load_envi_header, open_envi_cube
 from storage.readers.open_cubes import open_cube
 

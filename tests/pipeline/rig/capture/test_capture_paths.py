@@ -23,7 +23,7 @@ from pipeline.rig.capture.capture_paths import (
     next_path,
     place_lines,
 )
-from pipeline.rig.device_settings import check_capture
+from pipeline.rig.device_settings import check_prefix
 from tests.pipeline.rig.small_rig import CAMERA, COARSE, FINE
 
 
@@ -43,7 +43,7 @@ def test_every_sweep_comes_back() -> None:
         sweep = turned if number % 2 else replace(turned, kind="coarse", along="x")
         told = Announced(sweep, int(rng.integers(sweep.lines)))
         prefix = capture_prefix(*vars(told).values())
-        check_capture(1, 1, prefix)
+        check_prefix(prefix)
         assert announced(prefix) == told
         assert str(announced(prefix)) == str(told)  # the sign of zero
 
