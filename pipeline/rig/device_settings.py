@@ -74,12 +74,12 @@ def check_times(exposure_ms: float, frame_period_ms: float, limits: CameraLimits
             raise SettingsError(f"expected {name} above 0 ms, got {value_ms!r}; correct it")
         if value_ms < least_ms:
             raise SettingsError(
-                f"{name} of {value_ms:g} ms is below {least_ms:.4g} ms; it is given in ms: {value_ms:g} s would be "
+                f"{name} {value_ms:g} ms is below {least_ms:.4g} ms; it is given in ms: {value_ms:g} s would be "
                 f"{value_ms * 1000:g}"
             )
         if value_ms > MOST_PERIOD_MS:
             raise SettingsError(
-                f"{name} of {value_ms:g} ms is above {MOST_PERIOD_MS:g} ms; it is given in ms: {value_ms:g} us "
+                f"{name} {value_ms:g} ms is above {MOST_PERIOD_MS:g} ms; it is given in ms: {value_ms:g} us "
                 f"would be {value_ms / 1000:g}"
             )
     if exposure_ms > frame_period_ms:
@@ -111,18 +111,18 @@ class MirrorLink:
     port: str = stated("/dev/ttyACM0", "Port of the mirror controller; or socket://host:port")
     # public software opens 115200
     baud: int = assumed(
-        115200, "Bits a second; over USB any will do; the manual of a later model says 256000", "", 1200, 4_000_000
+        115200, "Bits per second; over USB any works; the manual of a later model says 256000", "", 1200, 4_000_000
     )
-    expected_id: str = stated("", "Part of what the controller calls itself; any by default", example="MR-E")
+    expected_id: str = stated("", "Part of the controller's id; any by default", example="MR-E")
     deadline_s: float = stated(
         Patience.deadline_s, "Time for one request to the mirror, retries included", "s", 0.01, 60
     )
-    retries: int = stated(Patience.retries, "Of requests that only read; motions are sent once", "", 0, 20)
+    retries: int = stated(Patience.retries, "Repetitions of a request that only reads", "", 0, 20)
     quiet_s: float = assumed(Patience.quiet_s, "Silence after which a late answer is given up", "s", 0, 5)
     with_crc: bool = assumed(False, "Requests carry a CRC; `rig check` tries both")
     strict_crc: bool = stated(False, "Refuse replies whose CRC does not fit; the default is a warning")
     ends: Ends = assumed("exclusive", "Whether the mirror's index ranges include their end")  # erratum E14
-    read_back: ReadBack = stated("sampled", "How much of a path is read back and compared")
+    read_back: ReadBack = stated("sampled", "Part of a path that is read back and compared")
     log_rate_hz: float = stated(
         10000.0, "Highest rate of measured positions; without pulses they place the lines", "Hz", 0.1, 10_000
     )
@@ -192,7 +192,7 @@ class SurveyRig(MirrorLink):
     settle_s: float = stated(2.0, "Longest time for the mirror to come to rest", "s", 0.01, 60)
     white_reference: float = stated(1.0, "Value of the white reference", "", 1e-6, 1e6)
     white_at_rest: bool = stated(True, "The white frame was taken through the mirror at 0; 0")
-    provenance: str = stated("assumed", "Who confirmed the assumed values")
+    provenance: str = stated("assumed", "Person who confirmed the assumed values")
 
     def mirror(self, vector_pairs: int) -> MirrorSettings:
         """Return the settings of the mirror's driver; SettingsError where they are out of range."""

@@ -237,6 +237,6 @@ def as_references(
     notes = (
         *(f"dark: {note}" for note in dark.notes),
         *(f"white: {note}" for note in white.notes),
-        f"{np.count_nonzero(bad)} of {bad.size} elements are bad",
+        f"bad elements: {np.count_nonzero(bad)} of {bad.size}",
     )
     return References(dark.mean, white.mean, np.broadcast_to(values, dark.mean.shape[1]).copy(), bad), notes

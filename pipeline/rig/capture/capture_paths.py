@@ -158,7 +158,7 @@ def lines_by_time(
     middle_s = exposed_s + frames.exposure_ms * 1e-3 / 2
     valid = (middle_s >= scan_path.time_s[0]) & (middle_s <= scan_path.time_s[-1])
     if not valid.all():
-        notes.append(f"{np.count_nonzero(~valid)} of {len(valid)} lines lie outside of the {method}'s time")
+        notes.append(f"outside of the {method}'s time: {np.count_nonzero(~valid)} of {len(valid)} lines")
     found = np.where(valid[:, None], _at(scan_path, middle_s), np.nan)
     unknown_s = float(np.ptp(began_s) + np.ptp(capture_s)) / 2
     px = _apart_px(scan_path, camera, (middle_s[valid], middle_s[valid] + unknown_s))

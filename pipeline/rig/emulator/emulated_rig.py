@@ -9,10 +9,10 @@ A line is that of the simulated source, bit for bit, where the mirror holds the 
 float32. Elsewhere the scene is imaged from where the mirror is. A capture whose prefix announces no sweep has noise of
 its own, by its folder and frame. A capture with the prefix ``references`` has dark and white cubes.
 
-The trigger input gets one pulse for each held position of the announced sweep, evenly over the exposure, as from a
-pulse generator between camera and mirror. It may also get one as each exposure begins, or none. A path that is played
-by trigger begins with a lead-in cell. Without trigger the path runs at (positions of a line) / (frame period). It is
-the planned one where it begins within half a held position of the first exposure.
+The trigger input gets one pulse for each held position of the announced sweep, evenly over the exposure, as a pulse
+generator would give them. It may also get one as each exposure begins, or none. A path that is played by trigger begins
+with a lead-in cell. Without trigger the path runs at (positions of a line) / (frame period). It is the planned one
+where it begins within half a held position of the first exposure.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ def _runs(number: Ints, alike: NDArray[np.bool_]) -> Iterator[slice]:
 class SceneCamera(CameraDevice):
     """A camera that images a scene where a mirror was sent.
 
-    How the mirror gets there is an effect of the simulator, so it is not emulated again.
+    The mirror's motion to that position is an effect of the simulator, so it is not emulated again.
 
     Parameters
     ----------

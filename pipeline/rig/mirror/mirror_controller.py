@@ -47,7 +47,7 @@ def wire_positions(positions: ArrayLike, mounting: Mounting = STRAIGHT) -> NDArr
 def upload(link: ProLink, cells: bytes, read_back: ReadBack, progress: Progress | None = None) -> None:
     """Write cells, X of all positions and then Y of all, to the vector memory, and compare what it holds then.
 
-    ``read_back`` is "none", "sampled" (every tenth frame and the ends of both channels) or "all"; ``progress`` gets
+    ``read_back`` is "none", "sampled" (every tenth frame and the ends of both channels) or "all". ``progress`` gets
     cells done and cells in all, including those read back. Raises RigError: a cell holds another value.
     """
     size = pro.VECTOR_CELLS * pro.CELL
@@ -175,7 +175,7 @@ class MirrorController(Closing):
 
     @property
     def found_in_pro(self) -> bool:
-        """Whether it was in pro mode at connect: an earlier session or another program left it so."""
+        """Return whether it was in pro mode at connect: an earlier session or another program left it so."""
         return self._modes.found_in_pro
 
     def status(self) -> pro.Status:

@@ -334,7 +334,7 @@ class Status(IntFlag):
 
     @property
     def stops_motion(self) -> bool:
-        """Whether a bit is on with which the mirror does not go where it is sent."""
+        """Return whether a bit is on with which the mirror does not go where it is sent."""
         return bool(self & _STOPS)
 
 

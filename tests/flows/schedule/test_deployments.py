@@ -375,5 +375,5 @@ def test_a_serve_goes_on_when_its_server_was_killed_and_is_back(
             finally:
                 process.kill()
     lines = (tmp_path / "said").read_text().splitlines()
-    assert lines[-1].endswith("stopped: nothing is due any more; the same command serves again"), lines
+    assert lines[-1].endswith("stopped: no run starts from now on; the same command serves again"), lines
     assert len(settings_of(tmp_path / "archive")) == 2

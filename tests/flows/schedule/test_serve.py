@@ -29,7 +29,7 @@ BAD = {
     "no zone": (("north",), "--cron 0_6_*_*_* --timezone Mars/Base", 2, "--timezone 'Mars/Base' is no time zone"),
     "no such file": (("nowhere",), "--every 30m", 2, "no settings file .*nowhere.toml"),
     "unknown key": (("typo",), "--every 30m", 2, "unknown setting 'sceene' in .*typo.toml; did you mean 'scene'"),
-    "neither scene nor rig": (("blind",), "--every 30m", 2, "blind.toml says neither scene nor source = 'rig'"),
+    "neither scene nor rig": (("blind",), "--every 30m", 2, "blind.toml has neither scene nor source = 'rig'"),
     "scene missing": (("gone",), "--every 30m", 1, "gone.toml: there is no file .*gone.png"),
     "twice": (("north", "north"), "--every 30m", 2, "are both called north"),
     "limit": (("north",), "--every 30m --limit 0", 2, "--limit 0: expected 1 or more"),
@@ -60,7 +60,7 @@ def test_two_serves_on_one_archive(field_file: Callable[..., Path], tmp_path: Pa
     release = take_lock(Archive.open(tmp_path / "archive").root / ".locks" / "serve.lock", wait=False)
     assert release is not None
     try:
-        command_line("serve", file, "--every", "30m").refused(1, "another serve works on the archive")
+        command_line("serve", file, "--every", "30m").refused(1, "another serve uses the archive")
     finally:
         release()
 

@@ -203,7 +203,7 @@ def test_missing_fields() -> None:
     """Lines, byte order and offset may be missing; sizes, data type and interleave may not, and are named."""
     header = parse_envi_header("ENVI\nsamples = 4\nbands = 2\ndata type = 12\ninterleave = bil\n")
     assert (header.lines, header.offset, header.dtype) == (None, 0, np.dtype("<u2"))
-    assert header.notes == ("the byte order is not said, taken as little endian",)
+    assert header.notes == ("the byte order is missing, little endian is assumed",)
     for key in ("samples", "bands", "data type"):
         text = "\n".join(line for line in PLAIN.splitlines() if not line.startswith(key))
         with pytest.raises(SceneError, match=f"does not say {key}"):
@@ -240,7 +240,7 @@ def test_what_is_no_text(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match="is empty, expected ENVI"):
         load_envi_header(path)
     path.write_bytes(b"\0\1\xff")
-    with pytest.raises(SceneError, match="expected ENVI on its own line; it is no ENVI header, name another"):
+    with pytest.raises(SceneError, match="expected ENVI on its own line; name an ENVI header"):
         load_envi_header(path)
     path.write_bytes(PLAIN.encode() + "sensor = Kamera f\xfcr \xb5m".encode("latin-1"))
     assert load_envi_header(path).fields["sensor"] == "Kamera f\xfcr \xb5m"

@@ -180,7 +180,7 @@ def test_stuck_and_dead_elements_are_told() -> None:
     assert np.argwhere(references.bad).tolist() == [[3, 4], [20, 5]]
     assert references.white_reference.tolist() == [0.5] * 10
     assert "dark: the mean of 40 frames; 1 of 400 elements are stuck" in notes
-    assert "2 of 400 elements are bad" in notes
+    assert "bad elements: 2 of 400" in notes
 
 
 def test_references_that_do_not_fit() -> None:

@@ -187,8 +187,8 @@ def test_stale_bytes_are_dropped(caplog: pytest.LogCaptureFixture) -> None:
 @pytest.mark.parametrize(
     ("exposure", "period", "words"),
     [
-        (0.003, 0.003, r"exposure of 0.003 ms is below 0.5 ms; it is given in ms: 0.003 s would be 3"),
-        (3, 0.003, r"frame period of 0.003 ms is below 2.857 ms"),
+        (0.003, 0.003, r"exposure 0.003 ms is below 0.5 ms; it is given in ms: 0.003 s would be 3"),
+        (3, 0.003, r"frame period 0.003 ms is below 2.857 ms"),
         (20, 10, r"exposure of 20 ms does not fit a frame period of 10 ms; take a period of at least 20"),
         (0, 10, "expected exposure above 0 ms, got 0"),
         (float("nan"), 10, "above 0 ms, got nan"),

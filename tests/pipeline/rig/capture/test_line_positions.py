@@ -103,7 +103,7 @@ def test_lines_beyond_a_scan_path() -> None:
     check_truth(found)
     assert np.count_nonzero(found.valid) == pytest.approx(226, abs=1)
     assert np.isnan(found.position[~found.valid]).all()
-    assert any("lie outside of the log's time" in note for note in found.notes)
+    assert any("outside of the log's time: " in note for note in found.notes)
     short = lines_by_time(frames(), CAMERA, played_scan_path(sweep(HELD[:2000]), 1000.0), BEGAN_S, CAPTURE_S, "command")
     assert 0 < np.count_nonzero(short.valid) < LINES
 
