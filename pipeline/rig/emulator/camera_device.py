@@ -285,17 +285,17 @@ class CameraConnection:
 
 
 class CameraServer(Closing):
-    """Free ports of this machine for a device's control socket and FTP, until ``close``. Also a context."""
+    """Ports of this machine for a device's control socket and FTP (0: a free one), until ``close``. Also a context."""
 
     handler: type[FileHandler] | None = None  # of the file server's sessions
     host = "127.0.0.1"
 
-    def __init__(self, device: CameraDevice) -> None:
+    def __init__(self, device: CameraDevice, ports: tuple[int, int] = (0, 0)) -> None:
         self.device = device
         self._ended = threading.Event()
         self._threads: list[threading.Thread] = []
-        self._listener = socket.create_server((self.host, 0))
-        self._files = _file_server(device, self.host, self.handler or FileHandler)
+        self._listener = socket.create_server((self.host, ports[0]))
+        self._files = _file_server(device, (self.host, ports[1]), self.handler or FileHandler)
         self._listener.settimeout(_SLICE_S)
         self.port = int(self._listener.getsockname()[1])
         self.file_port = int(self._files.socket.getsockname()[1])
@@ -351,7 +351,7 @@ class CameraServer(Closing):
         self._files.close_all()
 
 
-def _file_server(device: CameraDevice, host: str, kind: type[FileHandler]) -> FTPServer:
+def _file_server(device: CameraDevice, address: tuple[str, int], kind: type[FileHandler]) -> FTPServer:
     logger = logging.getLogger("pyftpdlib")
     logger.setLevel(logging.ERROR)
     if not logger.handlers:
@@ -359,7 +359,7 @@ def _file_server(device: CameraDevice, host: str, kind: type[FileHandler]) -> FT
     authorizer = DummyAuthorizer()
     authorizer.add_user(FileServer.user, FileServer.password, homedir=".", perm="elr")
     handler = type("CameraFileHandler", (kind,), {"device": device, "authorizer": authorizer})
-    return FTPServer((host, 0), handler, ioloop=IOLoop())
+    return FTPServer(address, handler, ioloop=IOLoop())
 
 
 class _FilesInMemory(AbstractedFS):  # type: ignore[misc]
