@@ -386,7 +386,7 @@ def bounded(files: Sequence[RemoteFile], claim: FrameClaim) -> list[RemoteFile]:
         if _RAW.fullmatch(file.base):
             most = claim.frames * claim.frame_bytes + MOST_OFFSET
             cubes_bytes += max(size - MOST_OFFSET, 0)
-            size = max(size, cubes_bytes)
+            size = max(size, cubes_bytes + MOST_OFFSET)
         elif _REFERENCE.fullmatch(file.base):
             most = MOST_REFERENCE_FRAMES * claim.frame_bytes + MOST_OFFSET
         if size > most:

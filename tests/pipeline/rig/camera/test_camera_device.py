@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from pipeline.rig.emulator.camera_device import CameraConnection, CameraDevice
-from pipeline.rig.transports import DeviceRefused
 from tests.pipeline.rig.camera.camera_line import LinesOf, control_of
 from tests.pipeline.rig.camera_faults import CameraFault, CameraFaults, FaultyCamera
 from tests.pipeline.rig.in_process import ManualClock
@@ -121,15 +120,3 @@ def test_what_it_sees_is_asked_once() -> None:
     (capture,) = device.captures
     begins = np.concatenate([capture.begins(*span) for span in pairwise(np.linspace(0, 2, 38))])
     np.testing.assert_allclose(begins, 0.01 + np.arange(100) * 0.01, atol=1e-12)
-
-
-@pytest.mark.parametrize(("fault", "words"), [(CameraFault.FULL, "disk full"), (CameraFault.BUSY, "busy capturing")])
-def test_captures_that_are_refused(fault: CameraFault, words: str) -> None:
-    """A camera that is full or busy says so; the next capture begins."""
-    device = device_with(fault)
-    clock = device.clock
-    control = control_of(device, clock)  # type: ignore[arg-type]
-    with pytest.raises(DeviceRefused, match=words):
-        control.capture(5)
-    assert device.captures == []
-    assert control.capture(30).folder == "/captured/000000"

@@ -9,7 +9,8 @@ import pytest
 
 from pipeline.errors import RigError, SettingsError
 from pipeline.rig.camera import headwall_camera
-from pipeline.rig.camera.headwall_camera import HeadwallCamera, ReplyReader
+from pipeline.rig.camera.camera_files import FrameClaim, RemoteFile
+from pipeline.rig.camera.headwall_camera import HeadwallCamera, ReplyReader, bounded
 from pipeline.rig.device_settings import ControlPatience, FileServer
 from pipeline.rig.transports import Clock, DeviceRefused, StateUnknown
 from tests.pipeline.rig.in_process import ManualClock
@@ -242,3 +243,26 @@ def test_no_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(headwall_camera, "LONGEST_REPLY", 100)
     with pytest.raises(RigError, match=r"bytes came without a prompt .* is this the camera's control port"):
         ReplyReader().feed(b"x" * 101)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "named"),
+    [
+        ({"raw_0": 1000, "darkReference": 2048 * 100, "raw_0.hdr": 500, "folder.txt": 1 << 20}, ""),
+        ({"raw_0": 1001 + (1 << 16)}, "raw_0"),
+        ({"raw_0": 1000 + (1 << 16), "raw_9": 1 + (1 << 16)}, "raw_9"),
+        ({"darkReference": 2048 * 100 + (1 << 16) + 1}, "darkReference"),
+        ({"frameIndex_0.txt": (1 << 26) + 1}, "frameIndex_0.txt"),
+    ],
+)
+def test_files_that_are_larger_than_a_capture_can_be(sizes: dict[str, int], named: str) -> None:
+    """A cube, all cubes together, a reference or a text may not exceed 10 frames of 5 x 10 numbers and some slack."""
+    files = [RemoteFile(f"/captured/a/{name}", size, False) for name, size in sizes.items()]
+    claim = FrameClaim(10, 5, 10)
+    if not named:
+        assert [file.size for file in bounded(files, claim)] == list(sizes.values())
+        return
+    with pytest.raises(
+        RigError, match=f"/captured/a/{named}, with the cubes before it, has .* nothing of it is fetched"
+    ):
+        bounded(files, claim)
