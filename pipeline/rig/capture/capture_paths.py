@@ -313,34 +313,34 @@ class LoggedPath:
     crc32: int
 
 
-class UntiedError(RigError):
+class UnusableCaptureError(RigError):
     """A capture gives no line, or no further one, and is taken again."""
 
 
 @dataclass(frozen=True)
-class PlacedLines:
+class LocatedLines:
     """A capture's lines, in the order of the sweep."""
 
     row: NDArray[np.int64]  # (line,) of the captured values; -1 of a line that the camera dropped
-    tied: LinePositions  # by row
+    positions: LinePositions  # by row
     stamp_us: NDArray[np.int64]  # (row,) by the camera's clock; -1 where it gives none
 
     def is_valid(self, line: int) -> bool:
         """Return whether a line, counted from the capture's first, was captured and has a position."""
         row = int(self.row[line])
-        return row >= 0 and bool(self.tied.valid[row])
+        return row >= 0 and bool(self.positions.valid[row])
 
 
-def place_lines(
+def locate_lines(
     captured: CapturedLines,
     path: CapturePath,
     taken: CaptureRecord,
     camera: LineCamera,
     scan_path: MirrorScanPath | None,
-) -> PlacedLines:
+) -> LocatedLines:
     """Return the row and position of each line of the path, up to the last complete one.
 
-    Raises UntiedError: frames cannot be assigned to mirror positions without contradiction.
+    Raises UnusableCaptureError: frames cannot be assigned to mirror positions without contradiction.
     """
     held = int(np.flatnonzero(captured.valid)[-1]) + 1
     number = captured.times.frame[:held]
@@ -353,11 +353,11 @@ def place_lines(
     try:
         tied = _positions(frames, path, taken, camera, scan_path, total=len(captured.values))
     except RigError as error:
-        raise UntiedError(f"{taken.folder}: {error}") from error
+        raise UnusableCaptureError(f"{taken.folder}: {error}") from error
     row = np.full(min(int(number.max()) + 1, path.lines), -1, np.int64)
     rows = np.flatnonzero(captured.valid[:held] & (number >= 0) & (number < path.lines))
     row[number[rows]] = rows
-    return PlacedLines(row, tied, frames.stamp_us)
+    return LocatedLines(row, tied, frames.stamp_us)
 
 
 def _positions(

@@ -31,7 +31,7 @@ from pipeline.rig.capture.capture_paths import (
     LinePositions,
     LoggedPath,
     MirrorScanPath,
-    UntiedError,
+    UnusableCaptureError,
     capture_prefix,
 )
 from pipeline.rig.device_settings import SurveyRig
@@ -41,7 +41,7 @@ from pipeline.rig.mirror.pro_mode import Trigger
 from pipeline.source import AT_REST
 
 LOG = logging.getLogger(__name__)
-_TIE_POINTS = ("method", "residual_us", "residual_px", "offset_s")
+_HOW = ("method", "residual_us", "residual_px", "offset_s")
 SLACK_S = 5.0  # by which a capture may take longer than its frames
 WRITING_S = 120.0  # that a camera may keep writing what it has after a stop
 POLL_S = 0.05
@@ -57,7 +57,7 @@ class CaptureJournal:
         self._kept = kept
         self._taken: dict[str, CaptureRecord] = {}
         self._origins: dict[str, int] = {}  # stamp of line 0 [us], by the sweep's name
-        self._tie_points: dict[str, dict[str, Any]] = {}
+        self._positions: dict[str, dict[str, Any]] = {}
         self._ended: set[str] = set()  # folders
         self.references: dict[float | None, str] = {}  # folders of dark and white frames, by a sweep's own exposure
         self.damage: list[str] = []
@@ -68,24 +68,24 @@ class CaptureJournal:
         fits = [one for one in self._taken.values() if one.sweep == sweep and one.first <= line < one.stop]
         return next((one for one in reversed(fits) if not one.spent), None)
 
-    def began(self, taken: CaptureRecord) -> None:
+    def record_capture(self, taken: CaptureRecord) -> None:
         """Record a capture that the camera acknowledged."""
         self._write({"what": "capture", **asdict(taken)})
 
-    def ended(self, taken: CaptureRecord) -> CaptureRecord:
+    def record_end(self, taken: CaptureRecord) -> CaptureRecord:
         """Record what was read from the mirror after the capture."""
         ended = {"folder": taken.folder, "index_at_end": taken.index_at_end}
         self._write({"what": "end", **ended, "log": None if taken.log is None else asdict(taken.log)})
         return self._taken[taken.folder]
 
-    def spend(self, taken: CaptureRecord, why: str) -> None:
+    def record_spent(self, taken: CaptureRecord, why: str) -> None:
         """Record that a capture gives no further line."""
         self._write({"what": "spent", "folder": taken.folder, "why": why})
 
-    def tied(self, taken: CaptureRecord, how: LinePositions, notes: Sequence[str]) -> None:
+    def record_positions(self, taken: CaptureRecord, how: LinePositions, notes: Sequence[str]) -> None:
         """Record once how a capture's lines got their positions."""
-        if taken.folder not in self._tie_points:
-            values = {name: getattr(how, name) for name in _TIE_POINTS}
+        if taken.folder not in self._positions:
+            values = {name: getattr(how, name) for name in _HOW}
             self._write({"what": "tied", "folder": taken.folder, **values, "notes": [*notes, *how.notes]})
 
     @property
@@ -93,12 +93,12 @@ class CaptureJournal:
         """Return every capture in order: sweep, lines, folder on the camera, method of positions, why it is spent."""
         return [
             {"folder": one.folder, "sweep": one.sweep.name, "first": one.first, "stop": one.stop}
-            | self._tie_points.get(one.folder, {})
+            | self._positions.get(one.folder, {})
             | ({"spent": one.spent} if one.spent else {})
             for one in self._taken.values()
         ]
 
-    def refer(self, folder: str, exposure_ms: float | None = None) -> None:
+    def record_references(self, folder: str, exposure_ms: float | None = None) -> None:
         """Record the folder of the dark and white frames of an exposure; None is the camera's own."""
         exposure = {} if exposure_ms is None else {"exposure_ms": exposure_ms}
         self._write({"what": "references", "folder": folder, **exposure})
@@ -136,7 +136,7 @@ class CaptureJournal:
         match record["what"]:
             case "capture":
                 self._taken.pop(record["folder"], None)  # an emptied camera uses the names of its folders again
-                self._tie_points.pop(record["folder"], None)
+                self._positions.pop(record["folder"], None)
                 self._ended.discard(record["folder"])
                 self._taken[record["folder"]] = CaptureRecord(
                     Sweep(**record["sweep"]),
@@ -155,7 +155,7 @@ class CaptureJournal:
             case "spent":
                 self._taken[record["folder"]] = replace(self._taken[record["folder"]], spent=record["why"])
             case "tied":
-                self._tie_points[record["folder"]] = {name: record[name] for name in (*_TIE_POINTS, "notes")}
+                self._positions[record["folder"]] = {name: record[name] for name in (*_HOW, "notes")}
             case "references":
                 self.references[record.get("exposure_ms")] = record["folder"]
             case "origin":
@@ -207,14 +207,14 @@ class CaptureRunner:
                 run_s = self._run(path)
             at_s = (capture.sent_s, capture.acknowledged_s)
             taken = CaptureRecord(path.sweep, path.first, path.stop, capture.folder, path.triggered, run_s, at_s)
-            self._journal.began(taken)
+            self._journal.record_capture(taken)
             self.wait(taken)
         if taken.triggered:
             taken = replace(taken, index_at_end=steering.index())
         else:
             taken = replace(taken, log=self._keep_log(taken.folder, steering.read_log()))
         steering.halt()
-        return self._journal.ended(taken)
+        return self._journal.record_end(taken)
 
     def wait(self, taken: CaptureRecord) -> None:
         """Wait until a capture is over; one that takes too long is stopped, and its frames count.
@@ -242,7 +242,7 @@ class CaptureRunner:
         self.wait(taken)
         if not taken.triggered or taken.index_at_end is not None:
             return taken
-        return self._journal.ended(replace(taken, index_at_end=self.devices.steering.index()))
+        return self._journal.record_end(replace(taken, index_at_end=self.devices.steering.index()))
 
     def capture_at_rest(self, prefix: str, exposure_ms: float | None = None) -> str:
         """Take one frame with the mirror at 0; 0 (if ``white_at_rest``), and return its folder.
@@ -261,12 +261,12 @@ class CaptureRunner:
         return capture.folder
 
     def log_of(self, taken: CaptureRecord) -> MirrorScanPath | None:
-        """Return the mirror's log of a capture; None without one, UntiedError where it has changed."""
+        """Return the mirror's log of a capture; None without one, UnusableCaptureError where it has changed."""
         if taken.log is None:
             return None
         log = self._kept.read(taken.log.name, 0, self._kept.size(taken.log.name))
         if zlib.crc32(log) != taken.log.crc32:
-            raise UntiedError(f"the mirror's log {taken.log.name} has changed (its CRC-32 differs)")
+            raise UnusableCaptureError(f"the mirror's log {taken.log.name} has changed (its CRC-32 differs)")
         position = np.frombuffer(log, _CELL).reshape(-1, 2).astype(np.float64)
         return MirrorScanPath(np.arange(len(position)) / taken.log.rate_hz, position)
 

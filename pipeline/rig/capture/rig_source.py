@@ -32,11 +32,11 @@ from pipeline.rig.camera.camera_files import NOT_LOGGED_IN, Kept
 from pipeline.rig.capture.capture_paths import (
     REFERENCES,
     CaptureRecord,
-    UntiedError,
+    UnusableCaptureError,
     can_trigger,
+    locate_lines,
     next_path,
     path_of,
-    place_lines,
 )
 from pipeline.rig.capture.capture_runner import CaptureJournal, CaptureRunner, Say, say_nothing
 from pipeline.rig.device_settings import SurveyRig
@@ -162,13 +162,13 @@ class RigSource:
                     for found in self._read(runner, taken, line):
                         yield found
                         line += 1
-                except (UntiedError, DeviceRefused) as error:
+                except (UnusableCaptureError, DeviceRefused) as error:
                     if isinstance(error, DeviceRefused) and error.code == NOT_LOGGED_IN:
                         raise  # the camera still has the capture
                     reason = str(error)
                 barren = 0 if line > before else barren + 1
                 if line < taken.stop:
-                    self._journal.spend(taken, reason)
+                    self._journal.record_spent(taken, reason)
                     if barren >= BARREN:
                         raise RigError(
                             f"sweep {sweep.name}: {BARREN} captures in a row gave no line {line}; the last, "
@@ -198,7 +198,7 @@ class RigSource:
             for line in self._read(runner, runner.recovered(held), wanted[0]):
                 if line.number in wanted:
                     found[line.number] = line
-        except (UntiedError, DeviceRefused) as error:
+        except (UnusableCaptureError, DeviceRefused) as error:
             if getattr(error, "code", None) == NOT_LOGGED_IN:
                 raise
             LOG.warning("%s, from line %d on: lost; %s: %s", held.sweep.name, wanted[0], held.folder, error)
@@ -218,7 +218,7 @@ class RigSource:
             with self.session() as runner:
                 known = self._known_references(runner, folders[exposure_ms]) if exposure_ms in folders else None
                 if not known:
-                    self._journal.refer(runner.capture_at_rest(REFERENCES, exposure_ms), exposure_ms)
+                    self._journal.record_references(runner.capture_at_rest(REFERENCES, exposure_ms), exposure_ms)
                     known = self._whole_references(runner, folders[exposure_ms])
                 self._whole[folders[exposure_ms]] = known
         whole, _ = self._whole[folders[exposure_ms]]
@@ -261,22 +261,22 @@ class RigSource:
         except RigError as error:
             if type(error) is not RigError:  # a device that is gone, or a full disk: the capture is in order
                 raise
-            raise UntiedError(str(error)) from error
+            raise UnusableCaptureError(str(error)) from error
         self._check_size(captured.values.shape[1:], taken.folder)
         path = path_of(taken.sweep, (taken.first, taken.stop), self.camera, triggered=taken.triggered)
-        placed = place_lines(captured, path, taken, self.camera, runner.log_of(taken))
-        self._journal.tied(taken, placed.tied, captured.notes)
+        located = locate_lines(captured, path, taken, self.camera, runner.log_of(taken))
+        self._journal.record_positions(taken, located.positions, captured.notes)
         values, sweep = captured.values, path.sweep
         nothing = np.zeros((values.shape[1] // sweep.binning, values.shape[2]), np.uint16)
-        for place in range(line - path.first, len(placed.row)):
-            row, valid = int(placed.row[place]), placed.is_valid(place)
-            x, y = placed.tied.position[row] if valid else path.middle[place]
+        for place in range(line - path.first, len(located.row)):
+            row, valid = int(located.row[place]), located.is_valid(place)
+            x, y = located.positions.position[row] if valid else path.middle[place]
             yield Line(
                 number=path.first + place,
                 data=bin_samples(values[row], sweep.binning) if row >= 0 else nothing,
                 mirror_x=float(x),
                 mirror_y=float(y),
-                time_s=self._time_s(sweep, path.first + place, int(placed.stamp_us[row]) if row >= 0 else -1),
+                time_s=self._time_s(sweep, path.first + place, int(located.stamp_us[row]) if row >= 0 else -1),
                 exposure_ms=exposing(self.camera, sweep).exposure_ms,
                 valid=valid,
             )

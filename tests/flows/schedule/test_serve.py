@@ -100,7 +100,7 @@ def test_sigterm_stops_a_schedule(
     monkeypatch.setattr(serve_command, "_server", terminated)
     ended = command_line("serve", field_file(), "--every", "30m")
     assert (ended.code, ended.errors) == (0, [])
-    assert ended.err.splitlines()[-1] == "stopped: nothing is due any more; the same command serves again"
+    assert ended.err.splitlines()[-1] == "stopped: no run starts from now on; the same command serves again"
 
 
 def test_a_field_is_a_deployment_of_the_survey(field_file: Callable[..., Path], tmp_path: Path) -> None:

@@ -152,7 +152,7 @@ def test_references_are_fetched_once(monkeypatch: pytest.MonkeyPatch):
             assert sharing.record["references"]
         assert (len(log_ins), rig.opened) == (once, opened)
         elsewhere = KeptInMemory()
-        CaptureJournal(elsewhere).refer(CaptureJournal(kept).references[None])
+        CaptureJournal(elsewhere).record_references(CaptureJournal(kept).references[None])
         source.keeping(elsewhere).references(FINE)
         assert (len(log_ins), rig.opened) == (2 * once, opened + 1)
         assert elsewhere.files.keys() == kept.files.keys()
@@ -170,7 +170,7 @@ def counted(call: Callable[..., object], calls: list[object]) -> Callable[..., o
 
 @pytest.mark.parametrize("pulses", ["none", "frame"])
 def test_without_pulses_lines_lie_where_the_log_measured(pulses: str):
-    """A path that runs by its own clock: lines are placed by the log; a pulse a frame steps fine sweeps only."""
+    """A path that runs by its own clock: lines are located by the log; a pulse a frame steps fine sweeps only."""
     with small_rig(pulses=pulses, log_samples=16000) as rig:
         source = rig.source()
         found = list(source.lines(COARSE))
