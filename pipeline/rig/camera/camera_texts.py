@@ -362,9 +362,9 @@ def times_of_lines(index: FrameIndex, first_frame: int, lines: int, lost: int = 
     if index.exposure_ms is not None:
         found.exposure_ms[place[inside]] = index.exposure_ms[inside]
     known, beyond = int(np.count_nonzero(inside)), int(np.count_nonzero(~inside))
-    notes: tuple[str, ...] = () if known == lines else (f"the frame index has the time of {known} of {lines} lines",)
-    notes += (f"the frame index lists {beyond} frames beyond the lines",) if beyond else ()
-    return replace(found, notes=notes)
+    findings: tuple[str, ...] = () if known == lines else (f"the frame index has the time of {known} of {lines} lines",)
+    findings += (f"the frame index lists {beyond} frames beyond the lines",) if beyond else ()
+    return replace(found, notes=findings)
 
 
 def _rows(lines: Iterable[str]) -> _Rows:
