@@ -345,7 +345,7 @@ def times_of_lines(index: FrameIndex, first_frame: int, lines: int, lost: int = 
     """Return frame and time of each of a file's ``lines``.
 
     Lines are frames in order from ``first_frame`` on, the number in the file's name. If the index lists as many frames
-    as the file has lines, with or without the ``lost`` ones at its end, these are its lines whatever their numbers. The
+    as the file has lines, with or without the ``lost`` ones at its end, it lists these lines, whatever the numbers. The
     camera dropped the others then. An index of a later file that begins at 0 counts from that file's start.
     """
     if len(index.frame) in (lines, lines + lost):
