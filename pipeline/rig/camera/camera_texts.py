@@ -344,9 +344,9 @@ def parse_frame_index(lines: Iterable[str], name: str = "the frame index", where
 def times_of_lines(index: FrameIndex, first_frame: int, lines: int, lost: int = 0) -> LineTimes:
     """Return frame and time of each of a file's ``lines``.
 
-    Lines are frames in order from ``first_frame`` on, the number in the file's name. If the index lists as many frames
-    as the file has lines, with or without the ``lost`` ones at its end, it lists these lines, whatever the numbers. The
-    camera dropped the others then. An index of a later file that begins at 0 counts from that file's start.
+    Lines are frames in order from ``first_frame`` on, the number in the file's name. The index may list as many frames
+    as the file has lines, with or without the ``lost`` ones at its end. Then it lists these lines, whatever the
+    numbers: the camera dropped the others. An index of a later file that begins at 0 counts from that file's start.
     """
     if len(index.frame) in (lines, lines + lost):
         exposure = np.full(lines, np.nan) if index.exposure_ms is None else index.exposure_ms[:lines]
