@@ -1,4 +1,4 @@
-"""Serve fields by Prefect: check every field, then have its schedules, limits and runner survey them until stopped."""
+"""Serve fields by Prefect: check every field, then run its schedules and surveys until stopped."""
 
 from __future__ import annotations
 
@@ -60,9 +60,9 @@ else:
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 UNITS_S = {"s": 1, "m": 60, "h": 3600, "d": 86400}
 LEAST, MOST = timedelta(minutes=1), timedelta(days=366)
-STOPPED_AGAIN_S = 15.0  # after which a runner that was asked to stop is asked again
+STOPPED_AGAIN_S = 15.0  # interval of requests to a runner to stop
 PAUSE_TRIES = 5
-AGAIN_S = 2.0  # between two tries to reach a server that has gone
+AGAIN_S = 2.0  # between two tries to reach a server
 
 
 def serve(
@@ -81,17 +81,17 @@ def serve(
     fields
         A settings file for each field.
     cron
-        When all of them are due: minute hour day month weekday, such as '0 6-20 * * *'.
+        Due times of all fields: minute hour day month weekday, such as '0 6-20 * * *'.
     every
-        Or how often: 30m, 2h, 1d; counted from midnight UTC of 1970, not from now.
+        Or an interval: 30m, 2h, 1d; counted from midnight UTC of 1970, not from now.
     timezone
-        Of --cron, such as Europe/Berlin; this machine's by default.
+        Time zone of --cron, such as Europe/Berlin; this machine's by default.
     out
         Archive for all fields, a folder or s3://bucket/prefix; by default that of each field's settings.
     limit
-        Surveys at a time; by default one of each field. Of one rig it is always one.
+        Surveys at a time; by default one per field. A rig has always one.
     port
-        Of Prefect's pages on this machine; a server that PREFECT_API_URL names is used instead.
+        Port of Prefect's pages on this machine; a server that PREFECT_API_URL names is used instead.
     """
     if limit is not None and limit < 1:
         raise SettingsError(
@@ -108,7 +108,7 @@ def serve(
         pages = held.enter_context(_server(home, port))
         held.enter_context(_own_temporary_folder())
         wanted = cron or f"every {every}"
-        _say(f"serving {', '.join(one.name for one in served)}, {wanted}; stop with Ctrl-C, the same command goes on")
+        _say(f"serving {', '.join(one.name for one in served)}, {wanted}; Ctrl-C stops it")
         _say(f"Prefect's pages: {pages}")
         _serve(served, schedule, limit or len(served) + 1)
     return DONE
@@ -116,14 +116,14 @@ def serve(
 
 @dataclass(frozen=True)
 class ServedField:
-    """A field: its name, its settings file and what the file says."""
+    """A field: its name, its settings file and the settings in it."""
 
     name: str
     file: Path
     settings: Settings
 
     def deployment(self, schedule: Any) -> Any:
-        """Return the field's deployment of the flow `survey`; a run that is due while one runs is cancelled."""
+        """Return the field's deployment of the flow `survey`; a run that is due during another is cancelled."""
         return survey_flow.survey.to_deployment(
             self.name,
             schedule=schedule,
@@ -142,9 +142,9 @@ class ServedField:
 
 
 def load_fields(files: Sequence[Path], out: str | None = None) -> list[ServedField]:
-    """Return the fields, each planned to see that it can be surveyed; no device is asked, nothing is captured.
+    """Return the fields after planning each one; no device is used.
 
-    Raises PipelineError: the first that cannot be used, with its file.
+    Raises PipelineError: a field cannot be surveyed; the message names its file.
     """
     if not files:
         raise SettingsError("no fields: give the settings file of one or more, such as serve north.toml --every 30m")
@@ -154,9 +154,7 @@ def load_fields(files: Sequence[Path], out: str | None = None) -> list[ServedFie
         if not is_remote(settings.out):
             settings = replace(settings, out=str(Path(settings.out).absolute()))
         if "scene" not in read_toml(file) and settings.source != "rig":
-            raise SettingsError(
-                f"{file} says neither scene nor source = 'rig': nothing to look at; give the field's scene, or its rig"
-            )
+            raise SettingsError(f"{file} has neither scene nor source = 'rig'; set the field's scene, or its rig")
         name = settings.name or re.sub(r"[^A-Za-z0-9_.-]+", "-", file.stem).strip("-.") or "field"
         if name in fields:
             raise SettingsError(
@@ -167,8 +165,8 @@ def load_fields(files: Sequence[Path], out: str | None = None) -> list[ServedFie
         except NothingToMend as known:
             _say(f"{name}: {known}")
         except NoSceneYet as error:
-            describe_weights(weights_path(settings))  # raises where they cannot be used
-            _say(f"{name}: {error}; it is looked for whenever it is due")
+            describe_weights(weights_path(settings))  # raises where they are invalid
+            _say(f"{name}: {error}; each due run looks for it again")
         except PipelineError as error:
             raise type(error)(f"{file}: {error}") from error
         fields[name] = ServedField(name, file.absolute(), settings)
@@ -176,7 +174,7 @@ def load_fields(files: Sequence[Path], out: str | None = None) -> list[ServedFie
 
 
 def schedule_of(cron: str | None, every: str | None, timezone: str | None = None) -> Any:
-    """Return Prefect's schedule for a cron line in a time zone (or this machine's) or an interval (SettingsError)."""
+    """Return Prefect's schedule for a cron line in a time zone, or for an interval; SettingsError for others."""
     if (cron is None) == (every is None):
         got = "neither" if cron is None else "both"
         raise SettingsError(f"a schedule needs --cron or --every, got {got}; such as --every 30m or --cron '0 6 * * *'")
@@ -202,20 +200,20 @@ def schedule_of(cron: str | None, every: str | None, timezone: str | None = None
 
 @contextmanager
 def _stopped_with_a_sentence() -> Iterator[None]:
-    """Take Ctrl-C, and a service manager's SIGTERM, as the way to stop: it is no error."""
+    """End normally on Ctrl-C, and on a service manager's SIGTERM."""
     try:
         with terminable():
             yield
     except KeyboardInterrupt:
-        _say("stopped: nothing is due any more; the same command serves again")
+        _say("stopped: no run starts from now on; the same command serves again")
 
 
 @contextmanager
 def _alone_on(name: str, root: Path) -> Iterator[None]:
-    """Keep another serve off an archive (ArchiveError) while the block runs."""
+    """Lock an archive against another serve while the block runs (ArchiveError)."""
     release = take_lock(root / ".locks" / "serve.lock", wait=False)
     if release is None:
-        raise ArchiveError(f"another serve works on the archive {name}: give all its fields to that one, or end it")
+        raise ArchiveError(f"another serve uses the archive {name}; give all its fields to that one, or stop it")
     try:
         yield
     finally:
@@ -224,9 +222,9 @@ def _alone_on(name: str, root: Path) -> Iterator[None]:
 
 @contextmanager
 def _server(home: Path, port: int) -> Iterator[str]:
-    """Start a server on this machine, or use the one that PREFECT_API_URL names; yield the address of its pages.
+    """Start a server on this machine, or use that of PREFECT_API_URL; yield the address of its pages.
 
-    Raises SettingsError: the one that is named does not answer, or the port is taken.
+    Raises SettingsError: that server does not answer, or the port is in use.
     """
     try:
         with quiet_environment(home), ExitStack() as held:
@@ -242,10 +240,10 @@ def _server(home: Path, port: int) -> Iterator[str]:
 
 @contextmanager
 def _own_temporary_folder() -> Iterator[None]:
-    """Keep this process's temporary files in a folder that is this user's alone.
+    """Keep this process's temporary files in a private folder.
 
-    Prefect's runner keeps what it starts in /tmp/runner_storage. That folder belongs to the first user who ever ran
-    one: that one could exchange it, and no other can run one.
+    Prefect's runner keeps the code that it starts in /tmp/runner_storage. That folder belongs to the first user who ran
+    one, who could replace the code, and no other user can run one.
     """
     usual = tempfile.tempdir
     with tempfile.TemporaryDirectory(prefix="spectralzoom-runner-", ignore_cleanup_errors=True) as own:
@@ -257,7 +255,7 @@ def _own_temporary_folder() -> Iterator[None]:
 
 
 def _serve(fields: Sequence[ServedField], schedule: Any, limit: int) -> None:
-    """Serve the fields and the reprocessing of their archives until interrupted, also across a server that goes."""
+    """Serve the fields and the reprocessing of their archives until interrupted, also while the server is away."""
     surveys = [one.deployment(schedule) for one in fields]
     outs = dict.fromkeys(str(one.settings.out) for one in fields)
     again = [reprocess_flow.deployment(out, number) for number, out in enumerate(outs, 1)]
@@ -269,12 +267,12 @@ def _serve(fields: Sequence[ServedField], schedule: Any, limit: int) -> None:
                 asyncio.run(_run([*surveys, *again], limit, asked_to_stop))
             except asyncio.CancelledError:
                 break
-            except Exception as error:  # Prefect's runner gives up after three tries, also while it stops
+            except Exception as error:  # the runner gives up after three tries, also while it stops
                 if not asked_to_stop.is_set():
                     _say(
                         f"Prefect's server does not answer ({type(error).__name__}); serving continues when it answers"
                     )
-                    with terminable():  # the loop that ended took its handler of SIGTERM along
+                    with terminable():  # the handler of SIGTERM ended with the event loop
                         _wait_for_server()
         raise KeyboardInterrupt
     finally:
@@ -282,25 +280,25 @@ def _serve(fields: Sequence[ServedField], schedule: Any, limit: int) -> None:
 
 
 async def _run(deployments: Sequence[Any], limit: int, asked_to_stop: threading.Event) -> None:
-    """Have Prefect's runner begin what is due, until it is interrupted."""
+    """Run due flow runs by Prefect's runner until it is interrupted."""
     runner = prefect_runner.Runner(pause_on_shutdown=False, limit=limit)
     for one in deployments:
         await runner.aadd_deployment(one)
     running = asyncio.ensure_future(runner.start())
-    await asyncio.sleep(0)  # here the runner takes SIGTERM for itself
+    await asyncio.sleep(0)  # the runner installs its own handler of SIGTERM here
     loop = asyncio.get_running_loop()
 
     def stop() -> None:
         asked_to_stop.set()
         running.cancel()
-        loop.call_later(STOPPED_AGAIN_S, stop)  # the runner's observer of cancelled runs may swallow the first one
+        loop.call_later(STOPPED_AGAIN_S, stop)  # the runner may lose the first request
 
     loop.add_signal_handler(signal.SIGTERM, stop)  # SIGINT may be ignored here
     await running
 
 
 def _pause(fields: Sequence[str]) -> None:
-    """Pause the schedules of the fields; where the server does not answer, say so after some tries."""
+    """Pause the schedules of the fields; report it where the server does not answer after some tries."""
     for left in reversed(range(PAUSE_TRIES)):
         try:
             with prefect_client.get_client(sync_client=True) as client:
@@ -315,10 +313,9 @@ def _pause(fields: Sequence[str]) -> None:
 
 
 def _prepare(fields: Sequence[str]) -> None:
-    """Set Prefect's limits so that a rig has one survey at a time, and end what an earlier serve left.
+    """Limit a rig to one survey at a time in Prefect, and end the runs that an earlier serve left.
 
-    Surveys that were due while serve was stopped are cancelled, since their time is over; those that ran then have
-    crashed.
+    Runs that were due while serve was stopped are cancelled; those that ran at its end have crashed.
     """
     filters, kind = cast(Any, prefect_filters), prefect_objects.StateType
     named = filters.DeploymentFilter(name=filters.DeploymentFilterName(any_=list(fields)))
@@ -328,7 +325,7 @@ def _prepare(fields: Sequence[str]) -> None:
         ),
         expected_start_time=filters.FlowRunFilterExpectedStartTime(before_=datetime.now(UTC)),
     )
-    missed: Any = prefect_states.Cancelled(message="nothing served the schedule when it was due")
+    missed: Any = prefect_states.Cancelled(message="no serve was running when it was due")
     crashed: Any = prefect_states.Crashed(message="the process that ran it is gone")
     with prefect_client.get_client(sync_client=True) as client:
         client.upsert_global_concurrency_limit_by_name(RIG_LIMIT, 1)

@@ -31,20 +31,20 @@ from storage.readers.scene_files import load_scene_file
 from storage.remote.opening import open_archive
 
 TITLES = {"effects": "effects that matter", "capture": "scan"}
-PATCH, FACTOR = 16, 4  # of the weights that come with the house: scans are those of its surveys
+PATCH, FACTOR = 16, 4  # of the shipped weights, so that scans are those of their surveys
 
 
 def run_simulate(settings: Settings, console: Console, *, coarse: bool = False) -> dict[str, Any]:
     """Scan a scene into an archive, with progress on ``console``; return the record that --json prints.
 
-    Raises BoundError: what would be left out changes the worst part of the scene by more than its bound says;
-    SettingsError, SceneError, ArchiveError: what was asked for cannot be.
+    Raises BoundError: the omitted effects change the worst part of the scene by more than their bound. Raises
+    SettingsError, SceneError or ArchiveError: the scan cannot be made.
     """
     keep_freed_memory()
     with console.status("opening the scene"):
         run, sweeps, notes = open_simulation(settings, coarse=coarse)
-        run = replace(run, planned=tuple(sweeps))  # no other sweep is taken, so none has to be bounded and checked
-        run.archive.reclaim()  # what a killed scan left half made
+        run = replace(run, planned=tuple(sweeps))  # only these sweeps have to be bounded and checked
+        run.archive.reclaim()  # parts that a killed scan left
     for note in notes:
         console.print(f"[dim]note: {escape(note)}[/]")
     with run.archive.in_use(), StageProgress(console, TITLES) as progress:
@@ -68,14 +68,14 @@ def run_simulate(settings: Settings, console: Console, *, coarse: bool = False) 
 
 
 def open_simulation(settings: Settings, *, coarse: bool = False) -> tuple[CaptureRun, list[Sweep], tuple[str, ...]]:
-    """Open scene and archive; give also the sweeps to take, and what was assumed of the scene. Draws nothing."""
+    """Open scene and archive; return the run, its sweeps, and assumptions on the scene. Simulates nothing."""
     if settings.source != "sim":
-        raise SettingsError(f"source = {settings.source!r}: a simulation is of the simulated rig; leave it out")
+        raise SettingsError(f"source = {settings.source!r} cannot be simulated; leave it out")
     refused = farm_refusal(settings)
     if refused is not None:
         raise SettingsError(refused)
     scene, notes = open_scene(settings)
-    if scene.filled_px:  # a survey leaves them out; a simulation would have to invent light
+    if scene.filled_px:  # a survey skips them; a simulation would have to invent radiance
         file = load_scene_file(
             settings.scene, bands=settings.bands, wavelengths=settings.wavelengths, labels_needed=False
         )
@@ -84,8 +84,7 @@ def open_simulation(settings: Settings, *, coarse: bool = False) -> tuple[Captur
         number = band if settings.bands is None else settings.bands[band]
         raise SceneError(
             f"{settings.scene} has no finite value at row {row}, column {column}, band {number} (pixels without:"
-            f" {int(missing.any(axis=2).sum())}), and a simulation invents no light; fill or crop it, or choose other"
-            " --bands"
+            f" {int(missing.any(axis=2).sum())}), which a simulation needs; fill or crop it, or choose other --bands"
         )
     _, coarse_pass, full = PassLayout.of(settings, SceneGrid(*scene.shape, PATCH, FACTOR)).sweeps()
     simulated = make_source(scene, settings)

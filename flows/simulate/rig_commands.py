@@ -1,4 +1,4 @@
-"""The verbs `rig check` and `rig emulate`: a table of what was asked and came; a rig behind a pty and sockets."""
+"""The verbs `rig check`, a table of questions and answers, and `rig emulate`, a rig behind a pty and sockets."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ from flows.terminal.progress import on_stdout, print_json
 from pipeline.errors import SettingsError
 from pipeline.geometry.mirror import STRAIGHT
 from pipeline.rig.device_settings import CameraLimits, SurveyRig
+from pipeline.rig.drivers import open_camera_driver, open_devices, open_mirror_driver
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock, ServedRig
-from pipeline.rig.opening import open_camera_driver, open_devices, open_mirror_driver
 from pipeline.rig.rig_check import TRIGGERS, CheckRow, Device, check_camera, check_mirror, check_triggers, works
 from pipeline.rig.transports import SYSTEM_CLOCK
 from pipeline.simulator.simulated import SimulatedSource
@@ -46,9 +46,9 @@ def run_check(
     move: bool = False,
     as_json: bool = False,
 ) -> int:
-    """Check both devices of the settings, or those that are named, with a table on stdout.
+    """Check both devices of the settings, or the given ones, with a table on stdout.
 
-    Returns 0 where nothing failed, 3 where one of two works, 1 otherwise. Raises SettingsError: they cannot be used.
+    Returns 0 where nothing failed, 3 where one of two works, 1 otherwise. Raises SettingsError: a setting is invalid.
     """
     wanted = load_settings(settings)
     rig = wanted.rig if port is None else replace(wanted.rig, port=port)
@@ -117,15 +117,12 @@ def _at(rig: SurveyRig, camera: str) -> SurveyRig:
 
 EVERY_S = 0.2
 KEPT_CAPTURES = 64
-EMULATED = ("camera", "optics", "mirror", "detector", "air", "sky")  # tables that say what the rig is like
+EMULATED = ("camera", "optics", "mirror", "detector", "air", "sky")  # tables that describe the rig
 USUAL_SIZE = (256, 256)  # of a built-in scene [px]
 
 
 def emulated_settings(path: Path | None, flags: Mapping[str, object]) -> Settings:
-    """Return the settings of the emulated rig. Raises SettingsError: one cannot be used.
-
-    A built-in scene is small by default.
-    """
+    """Return the settings of the emulated rig; a built-in scene is small by default. Raises SettingsError."""
     wanted = load_settings(path, flags, usual={"source": "sim"})
     small = wanted.scene in BUILT_IN_SCENES and wanted.size is None
     return replace(wanted, size=USUAL_SIZE) if small else wanted
@@ -141,12 +138,11 @@ def run_emulate(
     as_json: bool = False,
     ended: threading.Event | None = None,
 ) -> int:
-    """Emulate a rig until Ctrl-C, SIGTERM or ``ended``; how to connect goes to stdout, its state to ``console``.
+    """Emulate a rig until Ctrl-C, SIGTERM or ``ended``; its addresses go to stdout, its state to ``console``.
 
-    ``out`` is a survey's TOML to write. Raises SettingsError, before minutes are spent on the scene: speed, baud or
-    file cannot be.
+    ``out`` is a survey's TOML to write. Raises SettingsError, before the scene is made: speed, baud or file is invalid.
     """
-    FastClock(speed)  # refuses a speed that cannot be
+    FastClock(speed)  # raises for an invalid speed
     if baud < 0:
         raise SettingsError(f"--baud expects bits a second, or 0 for no pace, got {baud}")
     if out is not None and not out.parent.is_dir():
@@ -175,13 +171,13 @@ def run_emulate(
 
 
 def _write_survey(out: Path, settings: Settings, table: dict[str, object]) -> None:
-    """Write the settings of a survey of the emulated rig, whose table [rig] this is."""
+    """Write the settings of a survey of the emulated rig, with its table [rig]."""
     size = None if settings.size is None else f"{settings.size[0]}x{settings.size[1]}"
     names = ("scene", "size", "day", "hour", "bands", "wavelengths", "seed", "effects", "tol", "source")
     wanted = {name: getattr(settings, name) for name in names}
     wanted |= {"size": size, "tol": str(settings.tol), "source": "rig"}
     given = [f"{key} = {_toml_value(value)}" for key, value in wanted.items() if value is not None]
-    changed: dict[str, dict[str, object]] = {}  # what is not usual: a survey has to know the same camera
+    changed: dict[str, dict[str, object]] = {}  # other values than the defaults: the survey needs the same camera
     described, usual = settings.to_dict(), Settings().to_dict()
     for name in EMULATED:
         own, other = (cast("dict[str, object]", one[name]) for one in (described, usual))
@@ -236,7 +232,7 @@ def _ending(event: threading.Event) -> Iterator[threading.Event]:
 
 
 def emulated_source(settings: Settings) -> tuple[SimulatedSource, tuple[str, ...]]:
-    """Return the scene through the simulated rig, and its assumptions; nothing is stored. Raises PipelineError."""
+    """Return the simulated source of the scene, and assumptions on it; nothing is stored. Raises PipelineError."""
     with tempfile.TemporaryDirectory(prefix="spectralzoom-") as folder:
         apart = replace(settings, source="sim", out=str(Path(folder) / "effects"))
         run, _, notes = open_simulation(apart)

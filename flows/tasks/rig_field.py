@@ -12,11 +12,11 @@ from flows.settings.survey_settings import RIG, Settings
 from flows.tasks.scene import FieldSource
 from pipeline.geometry.mirror import STRAIGHT
 from pipeline.geometry.scan import Sweep, exposing, sweep_positions
-from pipeline.rig import opening
+from pipeline.rig import drivers
 from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.capture.capture_runner import RigDevices
 from pipeline.rig.capture.rig_source import RigSource
 from pipeline.rig.device_settings import CameraLimits, check_times
+from pipeline.rig.drivers import RigDevices
 from pipeline.rig.transports import SYSTEM_CLOCK, Clock
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.source import Source
@@ -53,8 +53,8 @@ def rig_field(scene: RasterScene, settings: Settings, planned: Sequence[Sweep]) 
     PoseError: the field exceeds the mirror's range.
     """
     camera, rig = settings.camera, settings.rig
-    opening.factory_of(rig, "mirror_driver")
-    opening.factory_of(rig, "camera_driver")
+    drivers.import_factory(rig, "mirror_driver")
+    drivers.import_factory(rig, "camera_driver")
     for exposed in {exposing(camera, sweep) for sweep in planned} | {camera}:
         check_times(exposed.exposure_ms, exposed.frame_ms, CameraLimits(most_rate_hz=camera.max_rate_hz))
     if rig.mounting != STRAIGHT:
@@ -73,6 +73,6 @@ def rig_field(scene: RasterScene, settings: Settings, planned: Sequence[Sweep]) 
 
 
 def open_devices(settings: Settings, clock: Clock = SYSTEM_CLOCK) -> RigDevices:
-    """Connect to mirror and camera; see `pipeline.rig.opening.open_devices`. Nothing moves."""
+    """Connect to mirror and camera, as `pipeline.rig.drivers.open_devices` does. Nothing moves."""
     limits = CameraLimits(most_rate_hz=settings.camera.max_rate_hz)
-    return opening.open_devices(settings.rig, settings.cost.vector_pairs, limits, clock)
+    return drivers.open_devices(settings.rig, settings.cost.vector_pairs, limits, clock)

@@ -1,4 +1,4 @@
-"""Figures as people read them: seconds, bytes, counts, percent. What is not known is a dash."""
+"""Numbers as text: seconds, bytes, counts, percent. An unknown number is a dash."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import math
 from typing import TypeGuard
 
 DASH = "–"  # noqa: RUF001
-MOST_PERCENT = 1000  # more is told as a factor
+MOST_PERCENT = 1000  # larger values are given as a factor
 LEAST_HECTARES = 0.1  # smaller areas are given in square metres
 
 
 def format_seconds(seconds: float | None) -> str:
-    """Seconds below ten minutes, then minutes and hours."""
+    """Return a time in seconds, from ten minutes on in minutes and hours."""
     if not _known(seconds):
         return DASH
     if seconds < 1:
@@ -23,7 +23,7 @@ def format_seconds(seconds: float | None) -> str:
 
 
 def format_bytes(count: float | None) -> str:
-    """Bytes in decimal units with three figures."""
+    """Return bytes in decimal units with three digits."""
     if not _known(count):
         return DASH
     size, units = float(count), ("B", "kB", "MB", "GB", "TB")
@@ -35,12 +35,12 @@ def format_bytes(count: float | None) -> str:
 
 
 def format_megabytes(count: float | None) -> str:
-    """Bytes in MB, whatever their number, so that a column of them compares."""
+    """Return bytes in MB, for columns of comparable numbers."""
     return f"{three_digits(count / 1e6)} MB" if _known(count) else DASH
 
 
 def format_count(count: float | None) -> str:
-    """Whole numbers with thin spaces by thousands up to ten million, then million, billion, 10^12."""
+    """Return a whole number with thin spaces by thousands, from ten million on in million, billion, 10^12."""
     if not _known(count):
         return DASH
     for size, name in ((1e12, "× 10¹²"), (1e9, "billion"), (1e6, "million")):  # noqa: RUF001
@@ -50,14 +50,14 @@ def format_count(count: float | None) -> str:
 
 
 def three_digits(value: float) -> str:
-    """A figure that is known to about three digits, whatever its size: 0.0823, 12.8, 43 700."""
+    """Return a number with three digits: 0.0823, 12.8, 43 700."""
     if abs(value) < 100:
         return f"{value:.3g}"
     return format_count(round(value, 2 - math.floor(math.log10(abs(value)))))
 
 
 def format_percent(fraction: float | None) -> str:
-    """A fraction as percent without decimals, one decimal below 10 %; from ten times the whole on how many times."""
+    """Return a fraction in percent, with one decimal below 10 %, and from 10 on as a factor."""
     if not _known(fraction):
         return DASH
     if abs(fraction) >= MOST_PERCENT / 100:
@@ -66,12 +66,12 @@ def format_percent(fraction: float | None) -> str:
 
 
 def format_area(hectares: float) -> str:
-    """An area in hectares, small ones in square metres."""
+    """Return an area in hectares, a small one in square metres."""
     return f"{hectares:.3g} ha" if hectares >= LEAST_HECTARES else f"{hectares * 1e4:.3g} m²"
 
 
 def format_metres(length: float) -> str:
-    """A length with three figures, below a metre in cm, below a cm in mm."""
+    """Return a length with three digits in m, cm or mm."""
     for unit, size in (("m", 1.0), ("cm", 0.01)):
         if length >= size:
             return f"{length / size:.3g} {unit}"
@@ -79,17 +79,17 @@ def format_metres(length: float) -> str:
 
 
 def format_points(score: float | None) -> str:
-    """A score of 0..1 as points of 100 with one decimal."""
+    """Return a score of 0..1 in points of 100 with one decimal."""
     return f"{100 * score:.1f}" if _known(score) else DASH
 
 
 def counted(number: int, noun: str) -> str:
-    """A number of things: 1 run, 2 runs, no run counted as 0 runs."""
+    """Return a number with its noun: 1 run, 2 runs, 0 runs."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def known_number(value: object) -> float | None:
-    """A number that a receipt tells; None of anything else, as receipts may claim anything."""
+    """Return a number of a receipt; None for any other value."""
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 

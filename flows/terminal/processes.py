@@ -1,4 +1,4 @@
-"""This process and those it starts: what ends it, what the machine refuses it, caches without a home."""
+"""This process and its children: signals, refusals of the operating system, and caches without a home folder."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from pipeline.errors import ArchiveError, SettingsError
 from storage.archive.staging import disk_advice
 
 DONE, FAILED, PARTLY = 0, 1, 3  # exit codes
-TERMINATED = 128 + signal.SIGTERM  # as a shell tells of a command that SIGTERM ended
+TERMINATED = 128 + signal.SIGTERM  # the exit code that a shell reports after SIGTERM
 
 
 class Terminated(KeyboardInterrupt):
-    """The process was told to end. All that clears up after Ctrl-C clears up after it."""
+    """SIGTERM ends the process; the clean-up is that of Ctrl-C."""
 
 
 @contextmanager
 def terminable(*, last: bool = False) -> Iterator[None]:
-    """Raise `Terminated` in the main thread where SIGTERM comes while the block runs; other threads are left alone.
+    """Raise `Terminated` in the main thread on SIGTERM while the block runs; do nothing in other threads.
 
-    Where the block is the ``last`` that the process does, its exit code stands then: SIGTERM has no effect any more.
+    After the ``last`` block of a process SIGTERM is ignored, so that the exit code stays.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -48,13 +48,13 @@ def _terminate(number: int, frame: FrameType | None) -> None:
     raise Terminated
 
 
-# Texts of exceptions that are no MemoryError: of torch and of threads; and, where memory is limited, of the loader.
+# texts of other exceptions than MemoryError: of torch and threads, and of the loader where memory is limited
 _OF_MEMORY = ("can't allocate memory", "not enough memory", "can't start new thread", "cannot allocate memory")
 _OF_LIMITED_MEMORY = ("failed to map segment", "could not find/load shared object")
 
 
 def format_refusal(error: BaseException) -> str | None:
-    """Return what was refused and what to do; None where the error is something else."""
+    """Return the message for an error of memory or disk, with what to do; None for other errors."""
     text, limit = str(error), resource.getrlimit(resource.RLIMIT_AS)[0]
     limited = limit != resource.RLIM_INFINITY
     known = (*_OF_MEMORY, *(_OF_LIMITED_MEMORY if limited else ()))
@@ -73,17 +73,17 @@ def format_refusal(error: BaseException) -> str | None:
 
 @contextmanager
 def writing(out: Path, flag: str = "--out") -> Iterator[None]:
-    """Turn a place that cannot be written to into an error that says so (ArchiveError)."""
+    """Raise ArchiveError where the block cannot write to ``out``."""
     try:
         yield
-    except ArchiveError:  # which says so already
+    except ArchiveError:
         raise
     except OSError as error:
         raise ArchiveError(f"cannot write to {out}: {error.strerror or error}; choose another {flag}") from error
 
 
-NO_HOME = "/nonexistent"  # as Debian calls the home of users that have none
-OF_LIBRARIES = {  # those that ask for more than XDG's folder
+NO_HOME = "/nonexistent"  # Debian's name for the home of users without one
+OF_LIBRARIES = {  # which need more than XDG_CACHE_HOME
     "NUMBA_CACHE_DIR": "numba",
     "MPLCONFIGDIR": "matplotlib",
     "PREFECT_HOME": "prefect",
@@ -91,12 +91,11 @@ OF_LIBRARIES = {  # those that ask for more than XDG's folder
 
 
 def place_caches(environment: MutableMapping[str, str] | None = None) -> Path | None:
-    """Name a private folder in the environment, for this process and those that it starts, where it is needed.
+    """Set environment variables to a private cache folder where the usual one cannot be written; return it or None.
 
-    It is `spectralzoom-UID` in the temporary folder, so that the next process finds what this one compiled: where it
-    is not ours alone, a new one that goes with this process. Its content is run as code: no other user may write it.
-    ``environment`` is this process's own unless given. None where the usual one (XDG_CACHE_HOME, or ~/.cache) can be
-    written. Raises SettingsError: nothing can be written, the temporary folder included.
+    The usual one is XDG_CACHE_HOME or ~/.cache, the private one `spectralzoom-UID` in the temporary folder. If another
+    user can write that, a new one is made for this process, since its content is run as code. ``environment`` is
+    this process's own by default. Raises SettingsError: the temporary folder cannot be written either.
     """
     environment = os.environ if environment is None else environment
     try:
@@ -104,7 +103,7 @@ def place_caches(environment: MutableMapping[str, str] | None = None) -> Path | 
     except KeyError:
         home = None
     if not home:
-        environment["HOME"] = NO_HOME  # Prefect asks for one before it is set where to keep its files
+        environment["HOME"] = NO_HOME  # Prefect needs one at its import
     usual = _usual_folder(environment)
     with suppress(OSError):
         if usual is not None:
@@ -119,7 +118,7 @@ def place_caches(environment: MutableMapping[str, str] | None = None) -> Path | 
 
 
 def place_pages(environment: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Tell Prefect's server to unpack its pages into the cache folder, where it cannot do so beside its own code."""
+    """Return variables that let Prefect's server unpack its pages in the cache folder, if its own is read-only."""
     found = importlib.util.find_spec("prefect")
     places = [] if found is None else [Path(place) / "server" for place in found.submodule_search_locations or ()]
     folder = _usual_folder(os.environ if environment is None else environment)
@@ -129,7 +128,7 @@ def place_pages(environment: Mapping[str, str] | None = None) -> dict[str, str]:
 
 
 def _usual_folder(environment: Mapping[str, str]) -> Path | None:
-    """Return where caches belong; None where there is no home to hold them."""
+    """Return the usual cache folder; None without a home."""
     named = Path(environment.get("XDG_CACHE_HOME", ""))
     if named.is_absolute():
         return named
@@ -142,13 +141,13 @@ def _private_folder(usual: Path | None) -> Path:
         folder = Path(tempfile.gettempdir()) / f"spectralzoom-{os.geteuid()}"
         with suppress(FileExistsError):
             folder.mkdir(mode=0o700)
-        found = folder.lstat()  # a folder, no link, that this user owns and no other may enter
+        found = folder.lstat()  # must be a folder, no link, that only this user may enter
         if stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o077:
             return folder
         other = Path(tempfile.mkdtemp(prefix="spectralzoom-"))
     except OSError as error:
         raise SettingsError(
-            f"no folder for what libraries keep: neither {usual or 'a home'} nor a temporary folder can be written "
+            f"no folder for the caches of libraries: neither {usual or 'a home'} nor a temporary folder can be written "
             f"({error}); set XDG_CACHE_HOME to a folder that this user can write"
         ) from None
     atexit.register(shutil.rmtree, other, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""The terminal: safe text whatever names are made of, and the progress of long work, as bars or as lines of a log."""
+"""The terminal: text without control characters, and the progress of long work, as bars or as lines of a log."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ from flows.terminal.figures import format_seconds
 from pipeline.errors import visible
 from storage.archive.whole_files import to_json
 
-PIPED_WIDTH = 120  # of tables where no terminal says how wide it is
+PIPED_WIDTH = 120  # of tables without a terminal
 
 
 class Terminal(Console):
-    """A console on which control characters and marks of direction stand as escapes."""
+    """A console that prints control characters and marks of direction as escapes."""
 
     def render_str(self, text: str, **choices: Any) -> Text:
         return super().render_str(visible(text), **choices)
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
-        """Segments of anything that is printed; the console's own controls are its own."""
+        """Yield the segments of a renderable; the console's own control codes stay."""
         for segment in super().render(renderable, options):
             yield segment if segment.control else Segment(visible(segment.text), segment.style)
 
 
 def on_stderr() -> Terminal:
-    """Return where progress and messages go."""
+    """Return the console for progress and messages."""
     return Terminal(stderr=True, highlight=False)
 
 
 def on_stdout() -> Terminal:
-    """Return where results go."""
+    """Return the console for results."""
     return Terminal(file=sys.stdout, highlight=False, width=None if sys.stdout.isatty() else PIPED_WIDTH)
 
 
@@ -53,7 +53,7 @@ def print_json(content: Mapping[str, object]) -> None:
 
 
 def put_out(content: dict[str, Any], show: Callable[[dict[str, Any], Console], None], *, as_json: bool) -> None:
-    """Put an answer on stdout: as one JSON object, or as ``show`` prints it for people."""
+    """Print an answer on stdout: as one JSON object, or by ``show``."""
     if as_json:
         print_json(content)
     else:
@@ -68,7 +68,7 @@ def table(
     title: str | None = None,
     whole: Sequence[str] = (),
 ) -> Table:
-    """Return a table of rows of markup: the first ``left`` columns to the left, those in ``whole`` never folded."""
+    """Return a table of rows of markup; the first ``left`` columns are left-aligned, those in ``whole`` never fold."""
     made = Table(
         title=title,
         title_justify="left",
@@ -86,13 +86,13 @@ def table(
     return made
 
 
-Listener = Callable[[str, float, float], None]  # the stage, how much is done, of how much
+Listener = Callable[[str, float, float], None]  # stage, work done, work in all
 _listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
 
 
 @contextmanager
 def heard_by(listener: Listener | None) -> Iterator[None]:
-    """Report to ``listener``, too, how far each stage is that the block runs; None: to the terminal alone."""
+    """Report the progress of the stages in the block also to ``listener``, unless it is None."""
     before = _listener.set(listener)
     try:
         yield
@@ -107,7 +107,7 @@ TIME = 7
 
 
 class _WordsOrLeft(TimeRemainingColumn):
-    """The time that is left, behind the words where there are some: a narrow line cuts it off."""
+    """The time that is left, after the words of the task; a narrow line cuts it off."""
 
     def render(self, task: Task) -> Text:
         words = task.fields["words"]
@@ -117,7 +117,7 @@ class _WordsOrLeft(TimeRemainingColumn):
 
 
 class StageProgress:
-    """One bar a stage; use as a context manager around the work."""
+    """One bar per stage; a context manager around the work."""
 
     def __init__(self, console: Console, titles: Mapping[str, str] | None = None) -> None:
         self.console, self.titles = console, titles or {}
@@ -148,7 +148,7 @@ class StageProgress:
         self._bars.stop()
 
     def show(self, stage: str, done: float, words: str = "", *, ended: bool = False) -> None:
-        """Say how far a stage is, 0..1, with a word or figure beside it; ``ended`` also where it failed half-way."""
+        """Show the progress of a stage, 0..1, with a word or number; ``ended`` also where it failed."""
         self._now = None if ended else (stage, done)
         if self._listener is not None:
             self._listener(stage, done, 1.0)
@@ -165,21 +165,21 @@ class StageProgress:
             self.console.print(f"{title}: {done:.0%} {escape(words)}".rstrip() + time_left, soft_wrap=True)
 
     def watch(self, stage: str, state: str, done: float) -> None:
-        """Show how far a stage of a survey is that runs, or how it ended: ran, cached, skipped, failed."""
+        """Show the progress of a running stage, or its end: ran, cached, skipped, failed."""
         running = state == "running"
         self.show(stage, done, "" if running else state, ended=not running)
 
     def say(self, words: str) -> None:
-        """Put words beside the stage that runs, as far as it is; nothing where none runs."""
+        """Show words beside the running stage; do nothing where none runs."""
         if self._now is not None:
             self.show(*self._now, words)
 
 
 @contextmanager
 def one_after_the_other(console: Console) -> Iterator[Callable[[str, float, str], None]]:
-    """Bars of parts that follow each other: a part has ended where the next begins, and the last with the block.
+    """Yield a function that shows bars of consecutive parts: title, progress (0..1) and a number as text.
 
-    Gives what identifies a part: its title, how far it is (0..1), and a figure in words.
+    A part ends where the next begins, and the last with the block.
     """
     last = ""
     with StageProgress(console) as progress:

@@ -1,13 +1,12 @@
-"""A recording as a source of lines: sweeps that were taken once serve every later request for lines of that field.
+"""A recording as a source of lines: recorded sweeps serve every later request for lines of that field.
 
-A request for a sweep of the recording itself gives that sweep as it is. A request for any other sweep gives, for each
-planned line, the recorded line that lies nearest; its samples are summed where the recording has finer ones. A line
-keeps the position, time and exposure that were recorded, which the rectification goes by: half a pixel beside the plan
-costs nothing.
+A request for a recorded sweep returns that sweep. A request for any other sweep returns the nearest recorded line for
+each planned line; finer samples are summed. A line keeps its recorded position, time and exposure. The rectification
+uses these, so an offset of half a pixel from the plan costs nothing.
 
 A coarse line of the simulator or the rig holds ``step`` mirror positions during one exposure. A recorded full scan has
-``step`` single lines in its place, and to sum them all would read the whole scan. One of them stands for the coarse
-line: it sees one position instead of ``step``, so detail between the lines is not averaged.
+``step`` single lines there, and summing them would read the whole scan. One of them replaces the coarse line, so detail
+between the lines is not averaged.
 """
 
 from __future__ import annotations
@@ -32,19 +31,19 @@ Numbers = NDArray[np.intp]
 ReadLines = Callable[[Numbers], NDArray[np.uint16]]
 
 BLOCK_LINES = 64  # read at a time
-SWATH_PX = 1.0  # a planned strip may lie so far beside the recorded one
-REACH_STEPS = 0.75  # and a planned line from the nearest recorded one: half their distance, more where that varies,
-PLANNED_REACH = 0.5  # or so much of the planned distance of lines, where that is more
-FINE_ENOUGH = 1.5  # recorded lines may lie so many times farther apart than planned ones
-SAME_PX = 1e-6  # distances that differ by less are equal: of two lines the first counts
+SWATH_PX = 1.0  # largest distance of a planned swath from the recorded one
+REACH_STEPS = 0.75  # largest distance of a planned line from a recorded one, in recorded line spacings,
+PLANNED_REACH = 0.5  # or in planned line spacings, where that is more
+FINE_ENOUGH = 1.5  # largest ratio of recorded to planned line spacing
+SAME_PX = 1e-6  # distances that differ by less are equal; the first line is chosen then
 
 
 @dataclass(frozen=True)
 class RecordedSweep:
-    """One sweep of a recording: lines in the order in which they were taken, and how single lines are read.
+    """One sweep of a recording: its lines in the order of capture, and a function that reads single lines.
 
-    It is a `pipeline.source.SweepLines`. ``sweep`` describes it: the planned one where the recording holds that, else
-    one that `pipeline.capture.straight_scans.fit_sweep` derived from the positions.
+    It is a `pipeline.source.SweepLines`. ``sweep`` is the planned one where the recording holds it, else one that
+    `pipeline.capture.straight_scans.fit_sweep` derived from the positions.
     """
 
     sweep: Sweep
@@ -63,7 +62,7 @@ class RecordedSweep:
 
     @classmethod
     def of(cls, lines: SweepLines, exposure_ms: Floats) -> RecordedSweep:
-        """Record any sweep: its lines with their exposures (line,) [ms]; lines that follow each other are one read."""
+        """Return a recording of any sweep, with exposures (line,) [ms]; consecutive lines are read together."""
 
         def read_lines(numbers: Numbers) -> NDArray[np.uint16]:
             return np.concatenate([lines.read(first, stop) for first, stop in line_runs(numbers)])
@@ -73,12 +72,12 @@ class RecordedSweep:
         )
 
     def read(self, start: int, stop: int) -> NDArray[np.uint16]:
-        """Raw numbers of the lines ``start`` to ``stop``, (line, sample, band)."""
+        """Return raw numbers of the lines ``start`` to ``stop``, (line, sample, band)."""
         return self.read_lines(np.arange(start, min(stop, self.sweep.lines)))
 
     @cached_property
     def tangents(self) -> Floats:
-        """(line, 2) where the line centres lie, along the line and along the scan, as scene tangents, or NaN."""
+        """Return the line centres (line, 2) along the line and the scan, as scene tangents; NaN where unknown."""
         known = np.isfinite(self.position).all(axis=1)
         found = np.full(self.position.shape, np.nan)
         found[known] = direction_to_scene(position_to_direction(self.position[known]))
@@ -86,7 +85,7 @@ class RecordedSweep:
 
     @cached_property
     def line_distance(self) -> float:
-        """Median distance of lines that follow each other along the scan, as a scene tangent."""
+        """Return the median distance of consecutive lines along the scan, as a scene tangent."""
         valid = np.flatnonzero(self.valid_line & np.isfinite(self.tangents[:, 1]))
         if len(valid) < 2:
             return 0.0
@@ -95,14 +94,14 @@ class RecordedSweep:
 
 @dataclass(frozen=True)
 class PickedLines:
-    """The recorded lines that serve a planned sweep, in the order in which they were recorded.
+    """The recorded lines that serve a planned sweep, in the order of the recording.
 
-    Where the recording went the other way this is the plan backwards: times rise, and positions say where lines lie.
+    If the recording went the other way, this reverses the plan; times still rise.
     """
 
     place: Numbers  # (line,) number of the recorded sweep
     line: Numbers  # (line,) number of the line there
-    again: NDArray[np.bool_]  # (line,) the planned line before is served by the same recorded line
+    again: NDArray[np.bool_]  # (line,) the same recorded line serves the planned line before
 
 
 class RecordedSource:
@@ -111,20 +110,20 @@ class RecordedSource:
     Parameters
     ----------
     sweeps
-        What was recorded, in the order in which it was taken.
+        The recorded sweeps, in the order of capture.
     camera
-        The camera that took it, with the samples of a line that is not binned.
+        The camera of the recording, with the samples of a line that is not binned.
     wavelength_nm, field_shape
         (band,) centres [nm] and (y, x) size of the field [px].
     name
-        What the receipt calls it.
+        Name for the receipt.
     notes
-        What was assumed of the recording.
+        Assumptions on the recording.
 
     Raises
     ------
     SceneError
-        There is no sweep, or a sweep's lines have other samples or bands than the camera and the wavelengths say.
+        There is no sweep, or a sweep's lines have other samples or bands than the camera and the wavelengths.
     """
 
     def __init__(
@@ -157,41 +156,41 @@ class RecordedSource:
 
     @property
     def lines_recorded(self) -> int:
-        """Lines that the recording holds."""
+        """Return the number of recorded lines."""
         return sum(one.sweep.lines for one in self.sweeps)
 
     @property
     def record(self) -> Mapping[str, Any]:
-        """Return what the recording consists of and what was assumed of it."""
+        """Return the sweeps of the recording, and the assumptions on it."""
         sweeps = [{"name": one.sweep.name, "lines": one.sweep.lines} for one in self.sweeps]
         return {"recording": {"sweeps": sweeps, "notes": list(self.notes)}}
 
     def lines(self, sweep: Sweep, first: int = 0) -> Iterator[Line]:
-        """Give the lines that serve a sweep one by one, from line ``first`` on, in the order of `PickedLines`.
+        """Yield the lines that serve a sweep, from line ``first`` on, in the order of `PickedLines`.
 
         A recorded line that serves two planned lines is valid once. Raises NotRecordedError: a planned line was never
-        taken; ShapeError: sums of samples do not fit uint16.
+        captured. Raises ShapeError: sums of samples exceed uint16.
         """
         picked = self.pick(sweep)
         for start in range(first, sweep.lines, BLOCK_LINES):
             yield from self._lines_of(sweep, picked, np.arange(start, min(start + BLOCK_LINES, sweep.lines)))
 
     def lines_again(self, sweep: Sweep, numbers: Sequence[int]) -> Iterator[Line]:
-        """Give single lines that were given before: the same, bit for bit; raises as `lines`."""
+        """Yield single lines that were given before, bit for bit; raises as `lines`."""
         picked = self.pick(sweep)
         for number in numbers:
             yield from self._lines_of(sweep, picked, np.array([number]))
 
     def references(self, sweep: Sweep) -> References:
-        """Dark and white frames of the recorded lines that serve a sweep, summed to its binning; raises as `lines`."""
+        """Return dark and white frames of the lines that serve a sweep, summed to its binning; raises as `lines`."""
         served = self.sweeps[int(self.pick(sweep).place[0])] if sweep.lines else self.sweeps[0]
         return sum_references(served.references, sweep.binning // served.sweep.binning)
 
     def cut_to_recorded(self, sweep: Sweep) -> Sweep | None:
-        """Give a sweep without the lines at either end that were never taken; None where none of its lines was.
+        """Return a sweep without the lines at either end that were never captured; None where none was.
 
-        Plans begin and end a few lines beyond the field, where a recording may have none. A line that is missing in
-        between stays, for `lines` to name it.
+        Plans begin and end a few lines beyond the field, where a recording may have none. A missing line in between
+        stays, and `lines` names it.
         """
         if self._own(sweep) is not None:
             return sweep
@@ -203,7 +202,7 @@ class RecordedSource:
         return replace(sweep, start_px=sweep.start_px + first * sweep.step, lines=last + 1 - first)
 
     def serves(self, sweep: Sweep) -> bool:
-        """Return whether every line of a sweep was taken, so that `pick` finds it."""
+        """Return whether every line of a sweep was captured, so that `pick` finds it."""
         return self._own(sweep) is not None or any(
             bool((self._nearest(sweep, group)[0] >= 0).all()) for group in self._groups
         )
@@ -211,10 +210,10 @@ class RecordedSource:
     def pick(self, sweep: Sweep) -> PickedLines:
         """Choose the recorded lines that serve a sweep; nothing is read.
 
-        All of them have the same references. Of sweeps with equal references those win whose lines lie nearest, and of
-        equally near ones those that have the planned binning.
+        All of them have the same references. Among sweeps with equal references the nearest lines are chosen, then
+        those with the planned binning.
 
-        Raises NotRecordedError: a planned line was never taken.
+        Raises NotRecordedError: a planned line was never captured.
         """
         own = self._own(sweep)
         if own is not None:
@@ -239,7 +238,7 @@ class RecordedSource:
         return PickedLines(place, line, again)
 
     def _own(self, sweep: Sweep) -> int | None:
-        """Number of the recorded sweep that is the one asked for, by its lines; its exposure decides among several."""
+        """Return the number of the recorded sweep with the same lines; its exposure decides among several."""
         lines = (sweep.along, sweep.lines, sweep.step, sweep.binning)
         alike = [
             number
@@ -252,7 +251,7 @@ class RecordedSource:
 
     @cached_property
     def _groups(self) -> list[list[int]]:
-        """Numbers of the sweeps that may serve one request together: of one axis, one binning and equal references."""
+        """Return groups of sweeps that may serve one request together: of one axis, binning and references."""
         groups: list[list[int]] = []
         for number, one in enumerate(self.sweeps):
             for group in groups:
@@ -266,9 +265,9 @@ class RecordedSource:
         return groups
 
     def _nearest(self, sweep: Sweep, group: Sequence[int]) -> tuple[Numbers, Numbers, Floats]:
-        """Recorded sweep, line and distance [px] for each planned line; -1 where none of the group is near enough.
+        """Return recorded sweep, line and distance [px] for each planned line; -1 where none is near enough.
 
-        A line that is not valid serves only where no valid one does.
+        An invalid line serves only where no valid one does.
         """
         place, line = np.full((2, sweep.lines), -1)
         best = np.full(sweep.lines, np.inf)
@@ -289,7 +288,7 @@ class RecordedSource:
         return place, line, best
 
     def _can_serve(self, sweep: Sweep, one: RecordedSweep) -> bool:
-        """Return whether a recorded sweep lies on a planned one's strip, with fine enough samples and lines."""
+        """Return whether a recorded sweep lies on a planned one's swath, with fine enough samples and lines."""
         recorded = one.sweep
         return (
             recorded.along == sweep.along
@@ -299,7 +298,7 @@ class RecordedSource:
         )
 
     def _refuse(self, sweep: Sweep, place: Numbers) -> NoReturn:
-        """Raise NotRecordedError for the first planned line that nothing serves; ``place`` is -1 there."""
+        """Raise NotRecordedError for the first planned line without a recorded one; ``place`` is -1 there."""
         alike = [one for one in self.sweeps if one.sweep.along == sweep.along and np.isfinite(one.tangents).any()]
         if not alike:
             axes = ", ".join(sorted({one.sweep.along for one in self.sweeps}))
@@ -315,14 +314,14 @@ class RecordedSource:
         recorded = alike[which].sweep
         swath_px, scan_px = alike[which].tangents[number] / self.camera.ifov_rad
         raise NotRecordedError(
-            f"line {missing} of sweep {sweep.name} was never taken: it lies at {planned[1]:g} px of the scan on the "
-            f"strip at {planned[0]:g} px (binning {sweep.binning}, step {sweep.step}), the nearest recorded line, "
+            f"line {missing} of sweep {sweep.name} was never captured: it lies at {planned[1]:g} px of the scan on the "
+            f"swath at {planned[0]:g} px (binning {sweep.binning}, step {sweep.step}), the nearest recorded line, "
             f"{number} of {recorded.name}, at {scan_px:.6g} px on {swath_px:.6g} px (binning {recorded.binning}, step "
-            f"{recorded.step}). Ask for lines on the recording's own strips, no finer than they were recorded"
+            f"{recorded.step}). Ask for lines on the recording's own swaths, no finer than they were recorded"
         )
 
     def _lines_of(self, sweep: Sweep, picked: PickedLines, numbers: Numbers) -> Iterator[Line]:
-        """Read some of the picked lines, one read for each recorded sweep among them, and give them in order."""
+        """Read some of the picked lines, once for each recorded sweep, and yield them in order."""
         data: dict[int, NDArray[np.uint16]] = {}
         for place in np.unique(picked.place[numbers]):
             here = numbers[picked.place[numbers] == place]
@@ -345,7 +344,7 @@ class RecordedSource:
 
     @cached_property
     def _begins_s(self) -> list[float]:
-        """When each sweep begins, had all been taken one after the other without a break [s]."""
+        """Return the start of each sweep, as if all were captured without a break [s]."""
         begins, after_s = [], 0.0
         for one in self.sweeps:
             begins.append(after_s)
@@ -355,16 +354,16 @@ class RecordedSource:
 
 
 def line_runs(numbers: Numbers) -> list[tuple[int, int]]:
-    """Give (start, stop) of the runs of ascending line numbers that follow each other."""
+    """Return (start, stop) of the runs of consecutive line numbers."""
     edges = np.flatnonzero(np.diff(numbers, prepend=-2, append=-2) != 1)
     return [(int(numbers[first]), int(numbers[stop - 1]) + 1) for first, stop in pairwise(edges)]
 
 
 def nearest_line(scan_px: Floats, wanted_px: Floats) -> tuple[Numbers, Floats]:
-    """Find the line nearest to each wanted place: its number, and how far it lies [px].
+    """Return the number of the line nearest to each wanted place, and its distance [px].
 
-    ``scan_px`` (line,) are the lines in any order, at least one. Of two that lie equally far, up to SAME_PX, the one at
-    the smaller coordinate counts.
+    ``scan_px`` (line,) are the lines in any order, at least one. If two are equally far, up to SAME_PX, the one at the
+    smaller coordinate is chosen.
     """
     order = np.argsort(scan_px, kind="stable")
     places = scan_px[order]
@@ -376,9 +375,9 @@ def nearest_line(scan_px: Floats, wanted_px: Floats) -> tuple[Numbers, Floats]:
 
 
 def sum_references(references: References, samples: int) -> References:
-    """Give references whose frames are summed over ``samples`` neighbours, as the lines are.
+    """Return references whose frames are summed over ``samples`` neighbours.
 
-    A sum is bad where one of its elements is; the relative response is the mean. A remainder is dropped.
+    A sum is bad where one of its elements is. The relative response is the mean. A remainder is dropped.
     """
     if samples == 1:
         return references

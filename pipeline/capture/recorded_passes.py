@@ -1,7 +1,7 @@
-"""Passes over a recording: which recorded lines a survey plans with, and what of a plan a recording can serve.
+"""Passes over a recording: plans cut to the lines that it holds.
 
-A pass is planned as for a rig first, and cut where its first or last lines were never taken. Where the recording lacks
-lines of it, the pass is laid on the strips that were recorded instead. Exposures are those of the recorded lines.
+A pass is planned as for a rig first, and cut where its first or last lines were never captured. If lines are missing in
+between, the recorded swaths replace the planned ones. Exposures are those of the recorded lines.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pipeline.capture.recorded import RecordedSource
 from pipeline.errors import SceneError
 from pipeline.geometry.scan import Axis, Sweep
 
-MOST_CUT_LINES, MOST_CUT_PX = 3, 2.0  # by which a plan may reach beyond a recording: lines that a kernel reads, turns
+MOST_CUT_LINES, MOST_CUT_PX = 3, 2.0  # largest excess of a plan over a recording, for the kernel and turned lines
 
 
 @dataclass(frozen=True)
@@ -26,14 +26,11 @@ class RecordedPasses:
 
     @property
     def axes(self) -> tuple[Axis, ...]:
-        """Axes of the scene that recorded lines lie along."""
+        """Return the axes of the scene along which recorded lines lie."""
         return tuple(dict.fromkeys(one.sweep.along for one in self.source.sweeps))
 
     def uniform_scan(self) -> list[Sweep]:
-        """Give all recorded sweeps, as a uniform scan takes them.
-
-        Raises SceneError: they differ in axis, step or binning, so that they are no one scan.
-        """
+        """Return all recorded sweeps as a uniform scan; SceneError where they differ in axis, step or binning."""
         sweeps = [one.sweep for one in self.source.sweeps]
         if len(self._kinds) > 1:
             words = "; ".join(f"along {along}, step {step}, binning {binning}" for along, step, binning in self._kinds)
@@ -44,7 +41,7 @@ class RecordedPasses:
         return sweeps
 
     def served(self, sweeps: Sequence[Sweep]) -> list[Sweep] | None:
-        """Give planned sweeps without the ends beyond the field that were never taken; None where more is missing."""
+        """Return planned sweeps without uncaptured lines at their ends; None where more is missing."""
         found = []
         for sweep in sweeps:
             cut = self.source.cut_to_recorded(sweep)
@@ -57,14 +54,14 @@ class RecordedPasses:
         return found
 
     def full_scan(self, planned: Sequence[Sweep]) -> list[Sweep]:
-        """Give the scan of every line that savings are stated against: the recording's own, else the planned one."""
+        """Return the full scan that savings are stated against: the recording's own, else the planned one."""
         own = self._full_sweeps() if len(self._kinds) == 1 else []
         return self.served(planned) or own or list(planned)
 
     def first_pass(self, planned: Sequence[Sweep]) -> list[Sweep]:
-        """Give the planned sweeps of a first pass or a uniform scan as the recording serves them.
+        """Return the planned sweeps of a first pass or a uniform scan, cut to the recorded lines.
 
-        Raises NotRecordedError: neither the planned strips nor the recorded ones have the lines.
+        Raises NotRecordedError: neither the planned swaths nor the recorded ones have the lines.
         """
         found = self.served(planned) or self.served(self._on_recorded_swaths(planned)) or []
         if not found:
@@ -73,9 +70,9 @@ class RecordedPasses:
         return found
 
     def fine_pass(self, planned: Sequence[Sweep]) -> list[Sweep]:
-        """Give the planned sweeps of a fine pass without what was never taken at the field's ends.
+        """Return the planned sweeps of a fine pass without uncaptured lines at their ends.
 
-        Raises NotRecordedError: a line between is missing.
+        Raises NotRecordedError: a line in between is missing.
         """
         found = []
         for sweep in planned:
@@ -86,21 +83,21 @@ class RecordedPasses:
         return found
 
     def lines_served(self, sweeps: Sequence[Sweep]) -> int:
-        """Count the recorded lines that serve sweeps, each once."""
+        """Return the number of recorded lines that serve sweeps, each counted once."""
         picked = [self.source.pick(sweep) for sweep in sweeps]
         return len({pair for one in picked for pair in zip(one.place.tolist(), one.line.tolist(), strict=True)})
 
     @property
     def _kinds(self) -> list[tuple[Axis, int, int]]:
-        """Axis, step and binning of the recorded sweeps, each once."""
+        """Return axis, step and binning of the recorded sweeps, each once."""
         return sorted({(one.sweep.along, one.sweep.step, one.sweep.binning) for one in self.source.sweeps})
 
     def _full_sweeps(self) -> list[Sweep]:
-        """Recorded sweeps that have every line at full resolution."""
+        """Return the recorded sweeps with every line at full resolution."""
         return [one.sweep for one in self.source.sweeps if one.sweep.step == one.sweep.binning == 1]
 
     def _on_recorded_swaths(self, planned: Sequence[Sweep]) -> list[Sweep]:
-        """Sweeps of the planned step and binning on every strip of a recorded scan, over the lines taken there."""
+        """Return sweeps of the planned step and binning on every recorded swath, over its lines."""
         if not planned or len(self._kinds) > 1:  # runs of a fine pass are no scan of the field
             return []
         like, found = planned[0], list[Sweep]()
@@ -114,7 +111,7 @@ class RecordedPasses:
         return found
 
     def _exposure_ms(self, sweep: Sweep) -> float | None:
-        """The exposure of the recorded sweep that serves the first line."""
+        """Return the exposure of the recorded sweep that serves the first line."""
         if not sweep.lines:
             return sweep.exposure_ms
         return self.source.sweeps[int(self.source.pick(sweep).place[0])].sweep.exposure_ms

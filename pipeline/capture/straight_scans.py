@@ -1,9 +1,8 @@
 """Positions of recorded lines, the `Sweep` that they describe, the field it covers, and scans without a mirror.
 
-The rectification places lines by their positions alone. Of a `Sweep` it takes ``along`` (which axis of the scene a line
-lies along), ``binning`` (pixels a sample), ``step`` (the distance of lines, for gaps, turns and the pitch of
-registration) and ``name``. ``swath_px``, ``start_px`` and ``lines`` matter to planning, and to the choice of
-recorded lines.
+The rectification places lines by their positions alone. From a `Sweep` it takes ``along`` (the axis of a line),
+``binning`` (pixels per sample), ``step`` (the line spacing) and ``name``. Planning and the choice of recorded lines use
+``swath_px``, ``start_px`` and ``lines``.
 """
 
 from __future__ import annotations
@@ -28,15 +27,15 @@ from pipeline.geometry.mirror import (
 from pipeline.geometry.scan import Axis, Sweep, points_of_scan
 
 Floats = NDArray[np.float64]
-MOST_DEG = 89.0  # an angle beyond which a direction does not look at the scene plane
+MOST_DEG = 89.0  # a direction at a larger angle misses the scene plane
 
 
 def angles_to_positions(angles_deg: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Give the mirror positions (line, 2) of viewing angles (line, 2), and whether the mirror reaches them (line,).
+    """Return the mirror positions (line, 2) of viewing angles (line, 2), and whether the mirror reaches them (line,).
 
-    The angles are those between the undeflected direction and the view, projected on the line's axis and on the scan:
-    the scene tangents are their tangents. Positions that are not reached are NaN. The mirror turns the view by 50 deg
-    along the scan, and by 35.6 deg across it where the scan is at 0.
+    An angle is that between the undeflected direction and the view, projected on the line's axis and on the scan. Its
+    tangent is the scene tangent. Positions beyond the mirror's reach are NaN. The mirror turns the view by 50 deg along
+    the scan, and by 35.6 deg across it where the scan is at 0.
     """
     positions = np.full(angles_deg.shape, np.nan)
     ahead = (np.abs(angles_deg) < MOST_DEG).all(axis=1)
@@ -54,8 +53,8 @@ def angles_to_positions(angles_deg: Floats) -> tuple[Floats, NDArray[np.bool_]]:
 class PlayedVector:
     """A vector of positions that the mirror played by its own clock while the camera took lines by its own.
 
-    The mirror holds cell k from k / ``rate_hz`` to (k + 1) / ``rate_hz`` seconds after its start, and started
-    ``start_s`` before the first line's exposure did (negative: after it).
+    The mirror holds cell k from k / ``rate_hz`` to (k + 1) / ``rate_hz`` seconds after its start. It started
+    ``start_s`` before the first line's exposure (negative: after it).
     """
 
     position: Floats  # (cell, 2) device X and Y
@@ -63,10 +62,10 @@ class PlayedVector:
     start_s: float = 0.0
 
     def at(self, time_s: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Give the position at mid exposure of lines (line, 2), and whether it was played then (line,).
+        """Return the position at mid exposure of lines (line, 2), and whether it was played then (line,).
 
         ``time_s`` (line,) is that of mid exposure since the first line's exposure began. The cell of a line is
-        floor((time_s + start_s) * rate_hz). Before the first and after the last cell stands that cell's position.
+        floor((time_s + start_s) * rate_hz), limited to the first and the last cell.
         """
         cell = np.floor((time_s + self.start_s) * self.rate_hz)
         played = (cell >= 0) & (cell < len(self.position))
@@ -74,10 +73,9 @@ class PlayedVector:
 
 
 def split_vector(values: Floats, where: str) -> Floats:
-    """Give (cell, 2) positions of a vector: two columns X and Y, or one column or row with all X before all Y.
+    """Return (cell, 2) positions of a vector: two columns X and Y, or one column or row with all X before all Y.
 
-    The second is how the mirror's controller keeps both channels in one memory: X in the cells 0 to n - 1 and Y in n to
-    2 n - 1.
+    The mirror's controller uses the second form: X in the cells 0 to n - 1, and Y in n to 2 n - 1.
 
     Raises SceneError: the numbers are no such vector.
     """
@@ -92,19 +90,19 @@ def split_vector(values: Floats, where: str) -> Floats:
     return np.stack(np.split(flat, 2), axis=-1)
 
 
-MOST_BEND = 1 / 16  # of a line's length that line centres may lie off their strip
-MOST_BACK = 8.0  # line distances that a scan may go back before it counts as turned
+MOST_BEND = 1 / 16  # largest distance of line centres from their swath, as a fraction of a line's length
+MOST_BACK = 8.0  # line spacings that a scan may go back before it counts as turned
 STANDING_PX = 1e-3  # a scan that moves less from line to line stands still
 STATED_DIGITS = 6  # of derived coordinates [px], so that a planned sweep comes back as it was
-FLAT_PX = 0.01  # by which lines of a scan without a mirror may be stretched or shifted at their ends
+FLAT_PX = 0.01  # largest stretch or shift at the ends of a line without a mirror
 
 
 @dataclass(frozen=True)
 class StraightScan:
-    """A sweep derived from positions, and what of the scan it does not tell."""
+    """A sweep derived from positions, with the line spacing and direction of the scan."""
 
     sweep: Sweep
-    distance_px: float  # of lines that follow each other; ``sweep.step`` is the nearest whole number from 1
+    distance_px: float  # of consecutive lines; ``sweep.step`` is the nearest whole number from 1
     backward: bool  # lines were taken against the scan axis
 
 
@@ -117,15 +115,15 @@ def fit_sweep(
     along: Axis = "x",
     valid: NDArray[np.bool_] | None = None,
 ) -> StraightScan:
-    """Derive the sweep that positions (line, 2) describe: strip, start and step by medians, which spikes do not move.
+    """Derive the sweep of positions (line, 2): swath, start and step by medians, which outliers do not move.
 
-    The distance of lines is the median over pairs that lie half the scan apart, the start the median of what is left.
-    ``samples`` of a recorded line say the binning, ``camera.samples`` those of one that is not binned. Coordinates are
-    rounded to 1e-6 px. A backward scan gets the sweep that covers the same lines forward.
+    The line spacing is the median over pairs half the scan apart, the start the median of the remainders. The binning
+    is ``camera.samples`` over the ``samples`` of a recorded line. Coordinates are rounded to 1e-6 px. A backward scan
+    gets the sweep of the same lines forward.
 
-    Raises SceneError: fewer than two valid lines, samples that are no whole part of the camera's, a scan that stands
-    still or turns back, or line centres that lie too far off a straight line for a sweep; PoseError: a valid position
-    is beyond the mirror.
+    Raises SceneError: there are fewer than two valid lines, the samples do not divide the camera's, the scan stands
+    still or turns back, or line centres are not on a straight line. Raises PoseError: a valid position is beyond the
+    mirror.
     """
     binning = camera.samples // max(samples, 1)
     if camera.samples // max(binning, 1) != samples:
@@ -156,7 +154,7 @@ def fit_sweep(
     if bend.max() > most:
         worst = int(np.argmax(bend))
         raise SceneError(
-            f"sweep {name} is not straight: line {lines[worst]} lies {bend[worst]:.4g} px beside the strip at "
+            f"sweep {name} is not straight: line {lines[worst]} lies {bend[worst]:.4g} px beside the swath at "
             f"{swath:.4g} px, and at most {most:g} px are allowed; cut the scan into straighter parts by a column "
             "'sweep', or mark single wrong lines with valid = 0"
         )
@@ -189,13 +187,12 @@ class CoveredField:
 
 
 def covered_field(sweeps: Sequence[Sweep], tangents: Sequence[Floats], camera: LineCamera) -> CoveredField:
-    """Give the largest rectangle in whole pixels that the scans together cover, turned lines allowed for.
+    """Return the largest rectangle in whole pixels that the scans cover together, with turned lines.
 
-    ``tangents`` are the line centres of each sweep, (line, 2) along the line and the scan. Strips that lie side by side
-    add up along the line; along the scan counts what all strips have. Strips further apart than a line leave gaps,
-    which are not looked for.
+    ``tangents`` are the line centres of each sweep, (line, 2) along the line and the scan. Along the line adjacent
+    swaths add up; along the scan their intersection counts. Gaps between swaths are not detected.
 
-    Raises SceneError: the strips have no part of the scan in common, or lines lie along both axes.
+    Raises SceneError: the swaths have no part of the scan in common, or lines lie along both axes.
     """
     axes = {sweep.along for sweep in sweeps}
     if len(axes) != 1:
@@ -210,7 +207,7 @@ def covered_field(sweeps: Sequence[Sweep], tangents: Sequence[Floats], camera: L
     begin = max(min(low for low, _ in part) for part in parts.values()) - 0.5
     end = min(max(high for _, high in part) for part in parts.values()) + 0.5
     if end - begin < 1:
-        raise SceneError("the strips of the recording have no part of the scan in common; state the field's size in px")
+        raise SceneError("the swaths of the recording have no part of the scan in common; state the field's size in px")
     low, high = min(parts) + ends[0], max(parts) + ends[1]
     size = (int(end - begin + 1e-6), int(high - low + 1e-6))
     centre = ((begin + end) / 2, (low + high) / 2)
@@ -220,11 +217,11 @@ def covered_field(sweeps: Sequence[Sweep], tangents: Sequence[Floats], camera: L
 
 
 def flat_camera(camera: LineCamera, extent_px: float) -> LineCamera:
-    """Give the camera whose lines stay parallel over ``extent_px`` from the centre: for scans without a mirror.
+    """Return the camera whose lines stay parallel over ``extent_px`` from the centre, for scans without a mirror.
 
-    A stage, a conveyor or a drone moves the camera or the target along a straight line, and all lines are parallel and
-    of one length. That is the limit of a long lens: with the focal length that this chooses, the ends of lines lie
-    within 0.01 px of there. Angles of such a camera are not those of a real one; pixels are.
+    With a stage, a conveyor or a drone all lines are parallel and of one length, as with an infinite focal length. The
+    focal length chosen here keeps the ends of lines within 0.01 px of that. Pixels of such a camera are real, its
+    angles are not.
     """
     half = camera.samples / 2
     tangent = np.sqrt(2 * FLAT_PX / half)  # a line at the tangent e is sqrt(1 + e^2) times as long
@@ -233,7 +230,7 @@ def flat_camera(camera: LineCamera, extent_px: float) -> LineCamera:
 
 
 def flat_positions(scan_px: Floats, camera: LineCamera) -> Floats:
-    """Give the mirror positions (line, 2) that stand for lines of a scan without a mirror, at ``scan_px`` (line,).
+    """Return mirror positions (line, 2) for the lines of a scan without a mirror, at ``scan_px`` (line,).
 
     ``camera`` is that of :func:`flat_camera`.
     """

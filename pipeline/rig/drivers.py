@@ -1,23 +1,35 @@
-"""Protocols of a rig's two devices: all that a survey asks of a mirror and of a camera of any maker.
+"""Protocols of a rig's two devices, for a mirror and a camera of any make, and the functions that open their drivers.
 
-`MirrorController` and `HeadwallCamera` implement them. Times are those of the clock that a driver was opened with.
-Methods raise `RigError` or one of its kinds in :mod:`pipeline.rig.transports`; besides those every method may raise
-`DeviceGone` and `DeadlinePassed`.
+`MirrorController` and `HeadwallCamera` implement them; the table [rig] may name the drivers of another make by their
+import path. Times are those of the clock that a driver was opened with. Every method may raise `DeviceGone` and
+`DeadlinePassed`, besides the errors that it states; all are kinds of `RigError`.
 """
 
 from __future__ import annotations
 
+import inspect
+import logging
+import pkgutil
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Literal, Protocol, cast
 
 from numpy.typing import ArrayLike
 
+from pipeline.errors import RigError, SettingsError
 from pipeline.rig.camera.camera_cubes import CapturedLines, MeanFrame
-from pipeline.rig.camera.camera_files import Kept
+from pipeline.rig.camera.camera_files import Capture, FrameClaim, Kept
 from pipeline.rig.camera.camera_files import Progress as FetchProgress
-from pipeline.rig.mirror.mirror_controller import MotionLog
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
+from pipeline.rig.device_settings import CameraLimits, SurveyRig
+from pipeline.rig.mirror.mirror_controller import MotionLog, open_mirror
 from pipeline.rig.mirror.mirror_controller import Progress as LoadProgress
 from pipeline.rig.mirror.pro_mode import Trigger
+from pipeline.rig.transports import SYSTEM_CLOCK, Clock
+
+__all__ = ["CameraDriver", "Capture", "FrameClaim", "MirrorDriver", "RigDevices", "open_devices"]
+LOG = logging.getLogger(__name__)
 
 
 class MirrorDriver(Protocol):
@@ -94,29 +106,6 @@ class MirrorDriver(Protocol):
         """Close the connection to the device."""
 
 
-@dataclass(frozen=True)
-class Capture:
-    """A capture that the camera acknowledged."""
-
-    folder: str
-    sent_s: float  # when the command was sent, by the clock of the rig's drivers
-    acknowledged_s: float  # when its reply was whole: exposures began between the two, or soon after
-
-
-@dataclass(frozen=True)
-class FrameClaim:
-    """The size that was asked for: frames, in all files of a capture, of so many numbers of 16 bits."""
-
-    frames: int
-    samples: int
-    bands: int
-
-    @property
-    def frame_bytes(self) -> int:
-        """Bytes of a frame."""
-        return 2 * self.samples * self.bands
-
-
 class CameraDriver(Protocol):
     """A line camera that captures a number of frames at a steady rate and keeps them until they are fetched."""
 
@@ -175,3 +164,103 @@ class CameraDriver(Protocol):
 
     def close(self) -> None:
         """Close the connection to the camera; a capture continues."""
+
+
+@dataclass(frozen=True)
+class RigDevices:
+    """Both devices, connected, and the clock of their drivers."""
+
+    steering: MirrorDriver
+    camera: CameraDriver
+    clock: Clock
+
+    def close(self) -> None:
+        """Close both devices, whatever either raises."""
+        for device in (self.steering, self.camera):
+            try:
+                device.close()
+            except RigError as error:
+                LOG.warning("while closing the rig: %s", error)
+
+
+Setting = Literal["mirror_driver", "camera_driver"]
+Factory = Callable[[SurveyRig, Clock], Any]
+_PROTOCOLS: dict[Setting, type] = {"mirror_driver": MirrorDriver, "camera_driver": CameraDriver}
+
+
+def open_devices(rig: SurveyRig, vector_pairs: int, limits: CameraLimits, clock: Clock = SYSTEM_CLOCK) -> RigDevices:
+    """Connect to mirror and camera. Nothing moves.
+
+    Raises
+    ------
+    SettingsError : a driver of another make cannot be imported, or is none.
+    DeviceGone : there is no such port, it is in use, or the camera is not there.
+    DeadlinePassed : nothing answers.
+    RigError : another device answers.
+    """
+    with ExitStack() as opened:
+        mirror = open_mirror_driver(rig, vector_pairs, clock, known=True)
+        opened.callback(mirror.close)
+        camera = open_camera_driver(rig, limits, clock)
+        opened.callback(camera.close)
+        camera.is_capturing()
+        opened.pop_all()
+    return RigDevices(mirror, camera, clock)
+
+
+def open_mirror_driver(
+    rig: SurveyRig, vector_pairs: int, clock: Clock = SYSTEM_CLOCK, *, known: bool = False
+) -> MirrorDriver:
+    """Connect to the mirror, as `open_devices`; ``known`` refuses models that the shipped driver does not know."""
+    factory = import_factory(rig, "mirror_driver")
+    if factory is None:
+        return open_mirror(rig.mirror(vector_pairs), clock, known=known)
+    return cast("MirrorDriver", _checked(rig, "mirror_driver", factory(rig, clock)))
+
+
+def open_camera_driver(rig: SurveyRig, limits: CameraLimits, clock: Clock = SYSTEM_CLOCK) -> CameraDriver:
+    """Return the camera's driver; raises as `open_devices`. The shipped one connects at its first command."""
+    factory = import_factory(rig, "camera_driver")
+    if factory is None:
+        return HeadwallCamera.at(rig.camera, rig.files, limits=limits, clock=clock)
+    return cast("CameraDriver", _checked(rig, "camera_driver", factory(rig, clock)))
+
+
+def import_factory(rig: SurveyRig, setting: Setting) -> Factory | None:
+    """Import the function that opens a driver of another make; None where the settings name the shipped one.
+
+    Raises
+    ------
+    SettingsError : it cannot be imported, or does not take the table [rig] and a clock.
+    """
+    name: str = getattr(rig, setting)
+    if not name:
+        return None
+    try:
+        factory = pkgutil.resolve_name(name)
+    except Exception as error:  # whatever the module of another make does as it is imported
+        raise SettingsError(
+            f"rig.{setting} = {name!r} cannot be imported ({type(error).__name__}: {error}). Expected module:function "
+            "of a package that is installed or of a file in a folder of PYTHONPATH"
+        ) from error
+    try:
+        inspect.signature(factory).bind(rig, SYSTEM_CLOCK)
+    except TypeError as error:
+        raise SettingsError(
+            f"rig.{setting} = {name!r} does not open a driver ({error}). Expected a function of the table [rig] and a "
+            "clock"
+        ) from error
+    return cast("Factory", factory)
+
+
+def _checked(rig: SurveyRig, setting: Setting, device: object) -> object:
+    """Return the device where it has every method of its protocol."""
+    protocol = _PROTOCOLS[setting]
+    methods = [name for name in vars(protocol) if not name.startswith("_")]
+    missing = [name for name in methods if not callable(getattr(device, name, None))]
+    if missing:
+        raise SettingsError(
+            f"rig.{setting} = {getattr(rig, setting)!r} gives a {type(device).__name__} without {', '.join(missing)}. "
+            f"Expected every method of {protocol.__name__} in {protocol.__module__}"
+        )
+    return device

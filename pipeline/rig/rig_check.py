@@ -1,7 +1,7 @@
-"""Questions of `rig check` to both devices. Nothing moves and nothing is set, unless ``move`` is asked for.
+"""The questions of `rig check` to both devices. Nothing moves and nothing is set, unless ``move`` is asked for.
 
-Every driver is asked to connect, and with ``move`` to go round a small square and to play a path that stays at 0; 0.
-The shipped drivers are asked for more: identity, status, temperature, frames with and without a CRC, files.
+Every driver has to connect; with ``move`` the mirror visits the corners of a small square and plays a path that stays
+at 0; 0. The shipped drivers are asked for more: identity, status, frames with and without a CRC, files.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera.camera_files import log_in
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.capture.capture_paths import capture_prefix
-from pipeline.rig.capture.capture_runner import POLL_S, SLACK_S, RigDevices
+from pipeline.rig.capture.capture_runner import POLL_S, SLACK_S
 from pipeline.rig.device_settings import Pulses
-from pipeline.rig.drivers import CameraDriver, MirrorDriver
+from pipeline.rig.drivers import CameraDriver, MirrorDriver, RigDevices
 from pipeline.rig.mirror.mirror_controller import MirrorController, check_model
 from pipeline.rig.mirror.pro_mode import Status, Trigger
 from pipeline.rig.transports import Clock
@@ -33,21 +33,21 @@ Verdict = Literal["ok", "warn", "fail"]
 Device = Literal["mirror", "camera"]
 
 SQUARE = ((0.03, 0.03), (0.03, -0.03), (-0.03, -0.03), (-0.03, 0.03))  # within 0.05 of the middle
-NEAR, FAR = 0.002, 0.02  # of the disk's radius: a position read back is right within NEAR, and lost beyond FAR
+NEAR, FAR = 0.002, 0.02  # of the disk's radius: errors of a position from which on it is odd, and wrong
 SETTLE_S = 2.0
 LOG_HZ, LOGGED = 1000.0, 8
-CELLS, OWN_HZ, OWN_S = 40, 20.0, 0.5  # of a path that stays at 0; 0: its cells, its rate, and how long it is played
-EDGES = Sweep("check", "coarse", "x", 0.0, 0.0, lines=4, step=8, binning=8)  # a capture whose edges are counted
+CELLS, OWN_HZ, OWN_S = 40, 20.0, 0.5  # of a path that stays at 0; 0: cells, rate and duration
+EDGES = Sweep("check", "coarse", "x", 0.0, 0.0, lines=4, step=8, binning=8)  # to count the edges of
 TRIGGERS = "what steps a path"
 MOST_NAMED = 5  # entries of a listing, warnings
 CONNECT = "connect"
-RESTLESS = "look for wind, a loose mount or a drive that hunts; a survey waits for rest in vain"
+RESTLESS = "look for wind, a loose mount or an oscillating drive; a survey would wait in vain"
 CHECK_CABLE = "look at cable, plugs and earth if this comes again"
 
 
 @dataclass(frozen=True)
 class CheckRow:
-    """One thing that was asked, what came, and what to do where that is not right."""
+    """One question, the answer, and what to do where that is not right."""
 
     device: Device
     asked: str
@@ -57,19 +57,19 @@ class CheckRow:
 
 
 def failed(device: Device, asked: str, error: PipelineError) -> CheckRow:
-    """Return the row of an error: what is wrong, and behind its semicolon what to do."""
+    """Return the row of an error: what is wrong, and after its semicolon what to do."""
     came, _, mend = str(error).partition("; ")
     return CheckRow(device, asked, came, "fail", mend)
 
 
 def works(rows: Sequence[CheckRow], device: Device) -> bool:
-    """Return whether a device was asked something and nothing failed."""
+    """Return whether a device was asked and nothing failed."""
     verdicts = [row.verdict for row in rows if row.device == device]
     return bool(verdicts) and "fail" not in verdicts
 
 
 def check_mirror(connect: Callable[[], MirrorDriver], clock: Clock, *, move: bool = False) -> list[CheckRow]:
-    """Ask a mirror for its identity and state; with ``move`` send it round a small square.
+    """Ask a mirror for its identity and state; with ``move`` send it around a small square.
 
     ``connect`` opens the device, which is closed again. Errors become rows.
     """
@@ -124,10 +124,10 @@ def check_camera(connect: Callable[[], CameraDriver]) -> list[CheckRow]:
 def check_triggers(
     connect: Callable[[], RigDevices], clock: Clock, pulses: Pulses, exposed: LineCamera
 ) -> list[CheckRow]:
-    """Play a path by the mirror's own clock, and then by the edges of a capture of four frames: row by row what came.
+    """Play a path by the mirror's own clock, and then by the edges of a capture of four frames.
 
-    All positions of the path are 0; 0, so the mirror stays there. ``pulses`` is the setting that the edges are compared
-    with, ``exposed`` the camera whose times the capture has. Errors become rows.
+    All positions of the path are 0; 0, so the mirror stays there. The edges are compared with the setting ``pulses``;
+    the capture has the times of the camera ``exposed``. Errors become rows.
     """
     rows: list[CheckRow] = []
     with _warnings(rows, "mirror"):
@@ -149,7 +149,7 @@ def check_triggers(
 
 
 def _triggers(devices: RigDevices, clock: Clock, pulses: Pulses, exposed: LineCamera) -> list[CheckRow]:
-    """Return a row of the path by its own clock, and one of the path by edges."""
+    """Return a row for the path by its own clock, and one for the path by edges."""
     mirror, camera = devices.steering, devices.camera
     mirror.goto(0.0, 0.0)
     mirror.settle(SETTLE_S)
@@ -169,13 +169,13 @@ def _triggers(devices: RigDevices, clock: Clock, pulses: Pulses, exposed: LineCa
     edges = mirror.index()
     mirror.halt()
     came = f"{stepped} cells in {OWN_S:g} s at {OWN_HZ:g} Hz"
-    mend = "the path did not step: is it the mirror that the documents are of?"
-    clockwork = CheckRow("mirror", "a path by its own clock", came, *(() if stepped else ("fail", mend)))
-    return [clockwork, _edges_row(edges, capture.folder, pulses)]
+    mend = "the path did not step: is it the mirror of the documents?"
+    by_clock = CheckRow("mirror", "a path by its own clock", came, *(() if stepped else ("fail", mend)))
+    return [by_clock, _edges_row(edges, capture.folder, pulses)]
 
 
 def _edges_row(edges: int, folder: str, pulses: Pulses) -> CheckRow:
-    """Return which pulses the edges of a capture of four frames show, beside the setting."""
+    """Return the pulses that the edges of a capture of four frames show, compared with the setting."""
     more = " or more" if edges >= CELLS - 1 else ""
     came = f"{edges}{more} edges in {EDGES.lines} frames ({folder} on the camera)"
     found: dict[int, Pulses] = {0: "none", EDGES.lines: "frame"}
@@ -195,7 +195,7 @@ def _ask_mirror(mirror: MirrorController, rows: list[CheckRow], heard: list[str]
     found, playing = mirror.identity(), False
     try:
         check_model(found, mirror.wire.port, mirror.settings.expected_id)
-        rows.append(CheckRow("mirror", "identity", found.words))
+        rows.append(CheckRow("mirror", "identity", found.summary))
     except RigError as error:
         rows.append(failed("mirror", "identity", error))
     if mirror.found_in_pro:
@@ -208,17 +208,16 @@ def _ask_mirror(mirror: MirrorController, rows: list[CheckRow], heard: list[str]
             rows.append(CheckRow("mirror", "path", "a path plays", "warn", mend))
         else:
             rows.append(CheckRow("mirror", "path", "no path plays"))
-            rows.append(CheckRow("mirror", "temperature", f"{mirror.temperature():.1f} deg C"))
             before = len(heard)
             _row(rows, "mirror", "frames with and without a CRC", partial(_answered_frames, mirror))
-            del heard[before:]  # refusals of frames that are sent for this are no fault of the line
+            del heard[before:]  # refusals of these frames are no fault of the line
     except RigError as error:
         rows.append(failed("mirror", "status", error))
     return playing
 
 
 def _answered_frames(mirror: MirrorController) -> str:
-    """Return which frames are answered; those of the settings are, or nothing could be asked so far."""
+    """Return which frames are answered; those of the settings are."""
     own = mirror.settings.with_crc
     why = mirror.why_unanswered(with_crc=not own)
     if not why:
@@ -228,23 +227,23 @@ def _answered_frames(mirror: MirrorController) -> str:
 
 
 def _status(mirror: MirrorController, *, playing: bool) -> CheckRow:
-    """Return what a survey would meet: one waits as long for the mirror to come to rest."""
+    """Return the row of the status; a mirror that moves gets as long to come to rest as in a survey."""
     status = mirror.status()
     until = mirror.wire.clock.now() + SETTLE_S
     while Status.NOT_STABLE in status and not playing and mirror.wire.clock.now() < until:
         mirror.wire.clock.sleep(SETTLE_S / 10)
         status = mirror.status()
     if Status.NOT_STABLE in status and not playing:
-        return CheckRow("mirror", "status", status.sentence, "fail", f"it has been so for {SETTLE_S:g} s: {RESTLESS}")
+        return CheckRow("mirror", "status", status.sentence, "fail", f"that lasts for {SETTLE_S:g} s: {RESTLESS}")
     if status.stops_motion:
         return CheckRow("mirror", "status", status.sentence, "fail", "mend that first: motions are refused with it")
     if status:
-        return CheckRow("mirror", "status", status.sentence, "warn", "have a look at the mirror before a survey")
+        return CheckRow("mirror", "status", status.sentence, "warn", "look at the mirror before a survey")
     return CheckRow("mirror", "status", status.sentence)
 
 
 def _move(mirror: MirrorDriver, clock: Clock, rows: list[CheckRow]) -> None:
-    """Send the mirror to the corners of a square and back to the middle; stops at the first error."""
+    """Send the mirror to the corners of a square and back to the middle; stop at the first error."""
     for x, y in (*SQUARE, (0.0, 0.0)):
         asked = f"go to {x:g}; {y:g}"
         try:
@@ -283,16 +282,16 @@ def _row(rows: list[CheckRow], device: Device, asked: str, ask: Callable[[], str
 
 @contextmanager
 def _warnings(rows: list[CheckRow], device: Device) -> Iterator[list[str]]:
-    """Make a row of the drivers' warnings, which are yielded: answers that were late, damaged, or not asked for."""
-    logger, heard = logging.getLogger("pipeline.rig"), logging.Handler(logging.WARNING)
-    words: list[str] = []
-    heard.emit = lambda record: words.append(record.getMessage())  # type: ignore[method-assign]
-    logger.addHandler(heard)
+    """Yield the drivers' warnings, and make a row of them: answers that were late, damaged, or not asked for."""
+    logger, handler = logging.getLogger("pipeline.rig"), logging.Handler(logging.WARNING)
+    warnings: list[str] = []
+    handler.emit = lambda record: warnings.append(record.getMessage())  # type: ignore[method-assign]
+    logger.addHandler(handler)
     try:
-        yield words
+        yield warnings
     finally:
-        logger.removeHandler(heard)
-        if words and rows and rows[0].asked != CONNECT:  # that row says it all
-            more = f"; and {len(words) - MOST_NAMED} more" if len(words) > MOST_NAMED else ""
-            came = "; ".join(one.partition("; ")[0] for one in words[:MOST_NAMED])
+        logger.removeHandler(handler)
+        if warnings and rows and rows[0].asked != CONNECT:
+            more = f"; and {len(warnings) - MOST_NAMED} more" if len(warnings) > MOST_NAMED else ""
+            came = "; ".join(one.partition("; ")[0] for one in warnings[:MOST_NAMED])
             rows.append(CheckRow(device, "bytes on the line", came + more, "warn", CHECK_CABLE))

@@ -1,4 +1,4 @@
-"""Bytes to and from a device with deadlines, by serial port or TCP; transactions over such a line, clocks, errors."""
+"""Lines to a device by serial port or TCP, transactions with deadlines over them, clocks, and errors of a rig."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import socket
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Literal, Protocol, Self, TypeVar
 
@@ -22,10 +23,10 @@ from pipeline.rig.device_settings import Patience
 
 
 class Clock(Protocol):
-    """A clock that never goes back. Deadlines are moments of it."""
+    """A clock that never goes back. Deadlines are its times."""
 
     def now(self) -> float:
-        """Return the moment, counted from anywhere. [s]"""
+        """Return the time since any origin. [s]"""
 
     def sleep(self, seconds: float) -> None:
         """Wait for a time [s]; return at once where it is not above 0."""
@@ -47,7 +48,7 @@ SYSTEM_CLOCK = SystemClock()
 
 
 class Closing(ABC):
-    """A context that ends with :meth:`close`; one that does not say how it closes cannot be made."""
+    """A context that ends with :meth:`close`."""
 
     def __enter__(self) -> Self:
         return self
@@ -57,25 +58,25 @@ class Closing(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Release all that is held."""
+        """Release all resources."""
 
 
-class DeviceGone(RigError):  # noqa: N818 - the name says what is the case
+class DeviceGone(RigError):  # noqa: N818 - the name states the case
     """A device is not there, or went away."""
 
 
-class DeadlinePassed(RigError):  # noqa: N818 - the name says what is the case
-    """A device did not answer in time, and nothing can have moved; ``silent`` says that not a byte came."""
+class DeadlinePassed(RigError):  # noqa: N818 - the name states the case
+    """A device did not answer in time, and nothing can have moved; ``silent``: not a byte came."""
 
     def __init__(self, message: str, *, silent: bool = False) -> None:
         super().__init__(message)
         self.silent = silent
 
 
-class DeviceRefused(RigError):  # noqa: N818 - the name says what is the case
-    """A device answered that it did not do what was asked; ``code`` is the number it gave.
+class DeviceRefused(RigError):  # noqa: N818 - the name states the case
+    """A device refused a request; ``code`` is its error code.
 
-    ``garbled`` says that it did not get the request whole: what only reads may be asked again.
+    ``garbled``: the request arrived damaged, so that one which only reads may be sent again.
     """
 
     def __init__(self, message: str, code: int | None = None, *, garbled: bool = False) -> None:
@@ -84,33 +85,33 @@ class DeviceRefused(RigError):  # noqa: N818 - the name says what is the case
         self.garbled = garbled
 
 
-class StateUnknown(RigError):  # noqa: N818 - the name says what is the case
-    """A device may or may not have moved; motions are frozen until the next connection."""
+class StateUnknown(RigError):  # noqa: N818 - the name states the case
+    """A device may or may not have moved; motions are refused until the next connection."""
 
 
-class NotKept(RigError):  # noqa: N818 - the name says what is the case
-    """The disk refuses to keep what a device sent. The device still has it."""
+class NotKept(RigError):  # noqa: N818 - the name states the case
+    """The disk cannot store what a device sent. The device still has it."""
 
 
 USB_ID = (0x0483, 0xA31E)  # vendor and product of the mirror controller
-_SLICE_S = 0.02  # reads wait in slices: by so much a deadline may be overrun
+_SLICE_S = 0.02  # reads wait in slices, so a deadline may be exceeded by one
 _WRITE_S = 0.25  # a frame takes 10 ms at 115200
-_MOST_DRAINED = 1 << 16  # bytes of a port that never ends; over TCP 16 times as many
+_MOST_DRAINED = 1 << 16  # bytes; over TCP 16 times as many
 LOG = logging.getLogger(__name__)
 BITS_PER_BYTE = 10  # a start bit, eight of data, a stop bit
 
-# a greeting is a read that a device in another mode does not answer, and before which others may have left bytes
+# a greeting is a read that a device in another mode does not answer; another program may have left bytes before it
 Kind = Literal["greeting", "read", "write", "motion"]
 _READS = ("greeting", "read")
 Answer = TypeVar("Answer")
-# Takes bytes as they come and gives the answer once it is whole.
+# takes bytes as they come and returns the answer once it is complete
 Receiver = Callable[[bytes], Answer | None]
 
 
 class Transport(Protocol):
-    """A line to a device. Deadlines are moments of the clock that both ends of a call share.
+    """A line to a device. Deadlines are times of the clock that both ends of a call share.
 
-    Whatever speaks over it raises DeviceGone where the device is not there any more.
+    Every method may raise DeviceGone: the device is not there any more.
     """
 
     @property
@@ -118,10 +119,10 @@ class Transport(Protocol):
         """Its name in messages."""
 
     def write(self, data: bytes, deadline: float) -> None:
-        """Send all bytes; DeadlinePassed where they were not taken in time, and then some may have gone."""
+        """Send all bytes; DeadlinePassed where the device did not take them in time, and some may have gone."""
 
     def read(self, at_most: int, deadline: float) -> bytes:
-        """Wait for bytes and give those that are there; none where the deadline passes first."""
+        """Wait for bytes and return those that are there, ``at_most`` at most; none where the deadline passes first."""
 
     def drain(self) -> bytes:
         """Return the bytes that are there already, without waiting."""
@@ -130,11 +131,16 @@ class Transport(Protocol):
         """Close the port."""
 
 
-class SerialTransport:
-    """A :class:`Transport` over a serial port, held exclusively, or an address that pyserial knows (``socket://host:port``).
+def _check_time(left_s: float, data: bytes, port: str) -> None:
+    if left_s <= 0:
+        raise DeadlinePassed(f"no time was left to send {len(data)} bytes to {port}; give a longer deadline")
 
-    DeviceGone where there is no such port, it is in use, or not permitted; SettingsError for a kind of address, or a
-    speed, that there is not.
+
+class SerialTransport:
+    """A :class:`Transport` over a serial port, held exclusively, or an address of pyserial (``socket://host:port``).
+
+    Raises DeviceGone: there is no such port, it is in use, or not permitted. Raises SettingsError: the kind of address
+    or the speed does not exist.
     """
 
     def __init__(self, port: str, baud: int, clock: Clock = SYSTEM_CLOCK) -> None:
@@ -153,55 +159,52 @@ class SerialTransport:
             ) from error
 
     def write(self, data: bytes, deadline: float) -> None:
-        """Send all bytes within the time that a port takes at most, whatever is left until the deadline.
-
-        DeadlinePassed: no time was left, or the port took too long, and then some may have gone.
-        DeviceGone: the port is not there any more.
-        """
-        if self._clock.now() >= deadline:
-            raise DeadlinePassed(f"no time was left to send {len(data)} bytes to {self.port}; give a longer deadline")
-        try:
-            self._serial.write(data)
-        except SerialTimeoutException:
-            raise DeadlinePassed(
-                f"{self.port} did not take {len(data)} bytes within {_WRITE_S:g} s; is the device on?"
-            ) from None
-        except (SerialException, OSError, TypeError) as error:
-            raise self._gone(error) from error
+        """Send all bytes, in the longest time that a port takes; DeadlinePassed where it takes longer."""
+        _check_time(deadline - self._clock.now(), data, self.port)
+        with self._errors():
+            try:
+                self._serial.write(data)
+            except SerialTimeoutException:
+                raise DeadlinePassed(
+                    f"{self.port} did not take {len(data)} bytes within {_WRITE_S:g} s; is the device on?"
+                ) from None
 
     def read(self, at_most: int, deadline: float) -> bytes:
-        """Wait for a first byte until the deadline, and give what is there, ``at_most`` at most; none where none came.
-
-        DeviceGone: the port is not there any more.
-        """
-        try:
+        """Wait for a first byte until the deadline, and return what is there, ``at_most`` at most."""
+        with self._errors():
             while self._clock.now() < deadline:
                 first: bytes = self._serial.read(1)
                 if first:
                     rest: bytes = self._serial.read(min(at_most - 1, self._serial.in_waiting))
                     return first + rest
-            return b""
-        except (SerialException, OSError, TypeError) as error:
-            raise self._gone(error) from error
+        return b""
 
     def drain(self) -> bytes:
-        """Return what is there already, without waiting, and at most some buffers: a port may never fall silent."""
+        """Return what is there already, at most `_MOST_DRAINED` bytes: a port may never fall silent."""
         drained = b""
-        try:
+        with self._errors():
             while len(drained) < _MOST_DRAINED and (there := self._serial.in_waiting):
                 drained += self._serial.read(there)
-        except (SerialException, OSError, TypeError) as error:
-            raise self._gone(error) from error
         return drained
 
     def close(self) -> None:
         self._serial.close()
 
-    def _gone(self, error: Exception) -> DeviceGone:
-        return DeviceGone(f"{self.port} went away ({error}); look at the cable and the power, then connect again")
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        """Raise the errors of pyserial as DeviceGone."""
+        try:
+            yield
+        except RigError:
+            raise
+        except (SerialException, OSError, TypeError) as error:
+            raise DeviceGone(
+                f"{self.port} went away ({error}); look at the cable and the power, then connect again"
+            ) from error
 
 
 def _why_not(port: str, error: OSError) -> str:
+    """Return why a port cannot be opened, and what to do."""
     if error.errno in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
         ports = list(list_ports.comports())
         mirrors = [one.device for one in ports if (one.vid, one.pid) == USB_ID]
@@ -240,75 +243,67 @@ class SocketTransport:
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def write(self, data: bytes, deadline: float) -> None:
-        """Send all bytes before the deadline.
-
-        DeadlinePassed: no time was left, or the other end did not take them, and then some may have gone.
-        DeviceGone: the connection is lost.
-        """
-        left = deadline - self._clock.now()
-        if left <= 0:
-            raise DeadlinePassed(f"no time was left to send {len(data)} bytes to {self.port}; give a longer deadline")
-        try:
-            self._socket.settimeout(left)
-            self._socket.sendall(data)
-        except TimeoutError:
-            raise DeadlinePassed(f"{self.port} did not take {len(data)} bytes within {left:g} s; is it hung?") from None
-        except OSError as error:
-            raise self._gone(str(error)) from error
+        """Send all bytes before the deadline; DeadlinePassed where the other end did not take them."""
+        left_s = deadline - self._clock.now()
+        _check_time(left_s, data, self.port)
+        with self._errors():
+            self._socket.settimeout(left_s)
+            try:
+                self._socket.sendall(data)
+            except TimeoutError:
+                raise DeadlinePassed(
+                    f"{self.port} did not take {len(data)} bytes within {left_s:g} s; does it hang?"
+                ) from None
 
     def read(self, at_most: int, deadline: float) -> bytes:
-        """Wait for bytes until the deadline, and give what is there, ``at_most`` at most; none where none came.
-
-        DeviceGone: the connection is lost, or the other end closed it.
-        """
-        left = deadline - self._clock.now()
-        if left <= 0:
+        """Wait for bytes until the deadline, and return what is there, ``at_most`` at most."""
+        left_s = deadline - self._clock.now()
+        if left_s <= 0:
             return b""
-        try:
-            self._socket.settimeout(max(left, 1e-3))
-            data = self._socket.recv(at_most)
-        except TimeoutError:
-            self._clock.sleep(deadline - self._clock.now())  # a clock turned by hand has not moved meanwhile
-            return b""
-        except OSError as error:
-            raise self._gone(str(error)) from error
-        if not data:
-            raise self._gone("closed by the other end")
-        return data
+        with self._errors():
+            self._socket.settimeout(max(left_s, 1e-3))
+            try:
+                return self._received(at_most)
+            except TimeoutError:
+                self._clock.sleep(deadline - self._clock.now())  # a manual clock has not moved meanwhile
+        return b""
 
     def drain(self) -> bytes:
-        """Return what is there already, without waiting, and at most some buffers: a sender may never fall silent.
-
-        DeviceGone: the connection is lost, or the other end closed it.
-        """
+        """Return what is there already, a limited number of bytes: a sender may never fall silent."""
         drained = b""
         self._socket.setblocking(False)
-        try:
+        with self._errors(), suppress(BlockingIOError):
             while len(drained) < 16 * _MOST_DRAINED:
-                data = self._socket.recv(65536)
-                if not data:
-                    raise self._gone("closed by the other end")
-                drained += data
-        except (BlockingIOError, InterruptedError):
-            pass
-        except DeviceGone:
-            raise
-        except OSError as error:
-            raise self._gone(str(error)) from error
+                drained += self._received(65536)
         return drained
 
     def close(self) -> None:
         self._socket.close()
 
-    def _gone(self, why: str) -> DeviceGone:
-        return DeviceGone(f"the connection to {self.port} was lost ({why}); look at the cable and the power")
+    def _received(self, at_most: int) -> bytes:
+        data = self._socket.recv(at_most)
+        if not data:
+            raise OSError("closed by the other end")
+        return data
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        """Raise the errors of the socket as DeviceGone."""
+        try:
+            yield
+        except RigError:
+            raise
+        except OSError as error:
+            raise DeviceGone(
+                f"the connection to {self.port} was lost ({error}); look at the cable and the power"
+            ) from error
 
 
 class Wire:
     """One device behind a transport. Only one transaction runs at a time, and each begins with an empty line.
 
-    A read is asked again, within the deadline of the first. A write or a motion never is, and a motion that is not
-    acknowledged freezes all motions. A person has to look where the mirror stands, and connects anew then.
+    A read is sent again within its deadline. A write or a motion never is. After a motion without acknowledgement all
+    motions are refused, until a person has looked at the mirror and connects anew.
     """
 
     def __init__(self, transport: Transport, clock: Clock, patience: Patience) -> None:
@@ -317,7 +312,7 @@ class Wire:
         self.patience = patience
         self.lock = threading.RLock()
         self.unknown = ""  # why the state is unknown; empty where it is known
-        self._owed = 0  # requests whose answer may still come
+        self._unanswered = 0  # requests whose answer may still come
 
     @property
     def port(self) -> str:
@@ -325,11 +320,11 @@ class Wire:
         return self.transport.port
 
     def exchange(self, data: bytes, name: str, kind: Kind, receiver: Callable[[], Receiver[Answer]]) -> Answer:
-        """Send a request, called ``name`` in messages, and wait for its answer.
+        """Send a request, called ``name`` in messages, and return its answer.
 
-        ``receiver`` makes a receiver, one for each time that the request is sent. Raises StateUnknown where a motion
-        was not acknowledged, or motions are frozen since an earlier one was not; DeviceRefused; DeadlinePassed where a
-        read or a write was not answered in time; DeviceGone.
+        ``receiver`` makes a receiver, one for each time that the request is sent. Raises StateUnknown: this motion or
+        an earlier one was not acknowledged. Raises DeadlinePassed: a read or a write was not answered in time. Raises
+        DeviceRefused or DeviceGone.
         """
         with self.lock:
             if kind == "motion":
@@ -363,9 +358,9 @@ class Wire:
                     raise
 
     def _once(self, data: bytes, name: str, receiver: Receiver[Answer], silence_s: float, deadline: float) -> Answer:
-        """Send once, and wait until the device has been silent for a while, at most to the deadline."""
+        """Send once, and wait until the device has been silent for ``silence_s``, at most to the deadline."""
         began = self.clock.now()
-        self._owed += 1
+        self._unanswered += 1
         self.transport.write(data, deadline)
         came = b""
         until = min(began + silence_s, deadline)
@@ -375,29 +370,29 @@ class Wire:
             came += part
             try:
                 answer = receiver(part) if part else None
-            except DeviceRefused:  # an answer all the same; of what is none, the answer may still come
-                self._owed -= 1
+            except DeviceRefused:  # this is an answer; after other errors one may still come
+                self._unanswered -= 1
                 raise
             if answer is not None:
-                self._owed -= 1
+                self._unanswered -= 1
                 return answer
-        said = f"{len(came)} bytes that are none came: {came[:32].hex(' ')}" if came else "nothing came"
+        found = f"{len(came)} other bytes came: {came[:32].hex(' ')}" if came else "nothing came"
         raise DeadlinePassed(
-            f"no answer to {name} from {self.port} within {self.clock.now() - began:.3g} s ({said}); is the "
+            f"no answer to {name} from {self.port} within {self.clock.now() - began:.3g} s ({found}); is the "
             f"controller on, its cable in, and the port's speed right?",
             silent=not came,
         )
 
     def _empty_line(self, when: str, latest: float = math.inf, *, level: int = logging.WARNING) -> None:
-        """Drop what is on the line. If an answer is still owed, wait for silence: it would pass for the next one."""
+        """Drop what is on the line. If an answer may still come, wait for silence: it would pass for the next one."""
         stale = self.transport.drain()
         now = self.clock.now()
         latest = min(latest, now + 5 * self.patience.quiet_s)  # some devices never stop
         until = min(now + self.patience.quiet_s, latest)
-        while self._owed and (part := self.transport.read(4096, until)):
+        while self._unanswered and (part := self.transport.read(4096, until)):
             stale += part
             until = min(self.clock.now() + self.patience.quiet_s, latest)
-        self._owed = 0
+        self._unanswered = 0
         if stale:
             LOG.log(level, "%s: dropped %d stale bytes %s: %s", self.port, len(stale), when, stale[:64].hex(" "))
 
@@ -405,6 +400,6 @@ class Wire:
         """Refuse a motion where an earlier one was not acknowledged (StateUnknown)."""
         if self.unknown:
             raise StateUnknown(
-                f"{name} is refused on {self.port}: {self.unknown}, so where the mirror is is not known. Look at it, "
-                f"then run again, which connects anew"
+                f"{name} is refused on {self.port}: {self.unknown}, so the mirror's position is not known. Look at it, "
+                "then run again, which connects anew"
             )

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from pipeline.errors import ArchiveError, ShapeError
-from pipeline.rig.camera.envi_headers import DATA_TYPES
+from pipeline.rig.camera.camera_texts import DATA_TYPES
 from storage.archive.whole_files import make_folder, write_whole, written_aside
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.cubes import RawCube

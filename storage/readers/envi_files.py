@@ -25,14 +25,15 @@ from pipeline.errors import SceneError
 from pipeline.rig.camera.camera_texts import (
     FRAME_INDEX,
     LONGEST_LINE,
+    EnviHeader,
     FrameIndex,
     LineTimes,
     finite_number,
+    parse_envi_header,
     parse_frame_index,
     place_parts,
     times_of_lines,
 )
-from pipeline.rig.camera.envi_headers import EnviHeader, parse_envi_header
 from storage.readers.cube_sources import MOST_MISSING, Bands, CubeSource, LineFacts
 from storage.readers.image_files import bad_bands, place_of_envi, rescaled
 

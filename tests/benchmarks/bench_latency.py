@@ -28,7 +28,7 @@ from measure import Row
 
 if TYPE_CHECKING:
     from flows.settings.survey_settings import Settings
-    from pipeline.rig.capture.capture_runner import RigDevices
+    from pipeline.rig.drivers import RigDevices
 
 PX, MOST_S = 2560, 5.0
 

@@ -21,7 +21,7 @@ from tests.faults.fault_table import HEADINGS, rows_of, run_table  # noqa: E402
 PLACES = {
     "kills": "stopped_surveys:kill_rows",
     "terminations": "stopped_surveys:termination_rows",
-    "flips": "sealed_flips:archive_rows",
+    "flips": "checksummed_flips:archive_rows",
     "headers": "mutated_files:header_rows",
     "files": "mutated_files:file_rows",
     "disk_full": "disk_full:full_rows",
@@ -31,8 +31,7 @@ PLACES = {
     "lost_lines": "lost_lines:rows",
     "growing_files": "growing_files:rows",
     "spool_rate": "lost_lines:pace_rows",
-    "hostile_rig": "hostile_rig:rows",
-    "checksummed_flips": "sealed_flips:weight_rows",
+    "checksummed_flips": "checksummed_flips:weight_rows",
 }
 FAULTS = {name: rows_of(f"tests.faults.{place}") for name, place in PLACES.items()}
 

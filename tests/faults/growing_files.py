@@ -86,8 +86,8 @@ def flip_journal(flips: int, seed: int = 0) -> Rot:
     for number in range(8):
         times = (float(number), number + 0.5)
         taken = CaptureRecord(SWEEP, 5 * number, 5 * number + 5, f"/captured/a_{number}", True, times, times)
-        journal.began(taken)
-        truth.append(asdict(journal.ended(taken)))
+        journal.record_capture(taken)
+        truth.append(asdict(journal.record_end(taken)))
     content, chance, found = bytes(kept.files[JOURNAL]), random.Random(seed), Rot()
     for _ in range(flips):
         rotten = bytearray(content)

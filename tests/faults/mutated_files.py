@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import PipelineError
-from pipeline.rig.camera.envi_headers import parse_envi_header
+from pipeline.rig.camera.camera_texts import parse_envi_header
 from tests.faults.cube_files import FORMATS, try_reading
 from tests.faults.fault_table import Clock, Row, reported_wrong
 from tests.faults.nursery import ROOT

@@ -72,7 +72,7 @@ class Day:
         dues = [(name, NOON + timedelta(hours=hour)) for hour in range(hours) for name in FIELDS]
         for number, due in enumerate(dues, 1):
             trouble = self.plan.pop(number, None)
-            self.rig.ask("extent", due[0])
+            self.rig.ask("scan_pass", due[0])
             if trouble == "kill" and not self.kill(due):
                 self._later(number, trouble)
             if trouble in DEVICES:

@@ -79,8 +79,7 @@ class PulledRig:
                 link.unlink(missing_ok=True)
                 link.symlink_to(self._port.path)
             if self._server is None:
-                control, files = self._address
-                self._server = CameraServer(self.rig.camera, port=control, file_port=files)
+                self._server = CameraServer(self.rig.camera, self._address)
                 self._address = (self._server.port, self._server.file_port)
             return out
 

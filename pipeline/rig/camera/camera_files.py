@@ -1,18 +1,12 @@
-"""Files of the camera over FTP: fetched in order, continued where an earlier try ended, and every byte read twice.
-
-FTP has no checksums: a file with bytes lost, doubled or inserted can have the right size. Held bytes are therefore read
-again and compared before they count, and dropped whole where two readings differ from them. Bytes that the camera
-itself gives alike twice cannot be doubted here.
-"""
+"""Files of the camera over FTP: fetched in order, and continued where an earlier try ended."""
 
 from __future__ import annotations
 
 import ftplib
 import logging
 import re
-import time
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -20,168 +14,10 @@ from pipeline.errors import PipelineError, RigError
 from pipeline.rig.device_settings import FileServer
 from pipeline.rig.transports import SYSTEM_CLOCK, Clock, DeadlinePassed, DeviceGone, DeviceRefused
 
-MOST_REPLY = 1 << 16  # bytes
-_SYNTAX = (500, 501)  # of FTP: the server did not understand the words, which may have been damaged on the way
-_SIZE = re.compile(r"213 +(\d{1,18})\s*")
-
-
-class DamagedTransfer(RigError):  # noqa: N818 - the name says what is the case
-    """A transfer is no FTP or not the file, as it is where bytes are lost, doubled or put in between: asked again."""
-
-
-class FileSession(ftplib.FTP):
-    """A session that is logged in, see :func:`open_session`."""
-
-    def __init__(self, server: FileServer) -> None:
-        super().__init__(timeout=server.stall_s, encoding="utf-8")
-        self.server = server
-        self._came = b""
-        self._until, self._most = 0.0, MOST_REPLY
-        self._together = False  # whether replies share a deadline
-
-    def log_in(self) -> None:
-        """Connect, greet and log in, all within ``stall_s`` once the server is there."""
-        self._together = True
-        self.connect(self.server.host, self.server.port)
-        self.login(self.server.user, self.server.password)
-        self.voidcmd("TYPE I")
-        self._together = False
-
-    def size_of(self, name: str) -> int | None:
-        """Return the bytes of a file; None where the server does not say.
-
-        Raises DamagedTransfer: its answer is no size.
-        """
-        said = self.sendcmd(f"SIZE {name}")
-        if not said.startswith("213"):
-            return None
-        found = _SIZE.fullmatch(said)
-        if found is None:
-            raise DamagedTransfer(
-                f"{self.server.where} says that {name} has {said[3:].strip()!r:.100} bytes, expected a number; look "
-                "at the file there"
-            )
-        return int(found[1])
-
-    def pieces(self, name: str, start: int, size: int) -> Generator[bytes]:
-        """Return the bytes of a file from ``start`` on, to its end.
-
-        DamagedTransfer where the file continues after ``size`` bytes, or ends before them; DeadlinePassed where less
-        than ``least_kb_s`` came.
-        """
-        reached = start
-        with self.transfercmd(f"RETR {name}", start or None) as connection:
-            least, gained, waited = 1e3 * self.server.least_kb_s * self.server.stall_s, 0, 0.0
-            while True:
-                began = time.monotonic()
-                connection.settimeout(max(self.server.stall_s - waited, 1e-3))
-                try:
-                    data = connection.recv(self.server.block)
-                except TimeoutError as error:
-                    raise DeadlinePassed(self._too_slow(name, gained), silent=not gained) from error
-                waited += time.monotonic() - began  # and not what is done with the bytes in between
-                if not data:
-                    break
-                gained, reached = gained + len(data), reached + len(data)
-                if reached > size:
-                    raise DamagedTransfer(f"{name} goes on after its {size} bytes; is the capture still running?")
-                if gained >= least:
-                    gained, waited = 0, 0.0
-                elif waited >= self.server.stall_s:
-                    raise DeadlinePassed(self._too_slow(name, gained))
-                yield data
-        self.voidresp()
-        if reached < size:
-            raise DamagedTransfer(f"the transfer of {name} ended at byte {reached} of {size}; look at the file there")
-
-    def makepasv(self) -> tuple[str, int]:
-        """Ask where a file can be had."""
-        try:
-            return super().makepasv()
-        except ValueError as error:
-            raise ftplib.error_proto(str(error)) from error
-
-    def getresp(self) -> str:
-        """Read a reply, within ``stall_s``."""
-        if not (self._together and self._until):
-            self._until = time.monotonic() + self.server.stall_s
-        self._most = MOST_REPLY
-        return super().getresp()
-
-    def getline(self) -> str:
-        """Read a line of a reply; what is no UTF-8 in it is shown as such."""
-        assert self.sock is not None
-        while b"\n" not in self._came:
-            left = self._until - time.monotonic()
-            if left <= 0:
-                raise TimeoutError
-            self.sock.settimeout(left)
-            data = self.sock.recv(4096)
-            if not data:
-                raise EOFError
-            self._came += data
-            self._most -= len(data)
-            if self._most < 0:
-                raise ftplib.error_proto(f"{self._came[:80]!r} and on, more than {MOST_REPLY} bytes")
-        self.sock.settimeout(self.server.stall_s)
-        line, _, self._came = self._came.partition(b"\n")
-        return line.rstrip(b"\r").decode("utf-8", errors="replace")
-
-    @property
-    def heard(self) -> str:
-        """Return in words how much came of the reply that was waited for last."""
-        return f"{MOST_REPLY - self._most} bytes of a reply came" if self._most < MOST_REPLY else "nothing came"
-
-    def _too_slow(self, name: str, gained: int) -> str:
-        stall_s = self.server.stall_s
-        if not gained:
-            return f"{self.server.where} was silent for {stall_s:g} s amid {name}; is it on?"
-        return (
-            f"{self.server.where} gave {gained} bytes of {name} in {stall_s:g} s, expected "
-            f"{self.server.least_kb_s:g} kB a second; look at its network, or set rig.least_kb_s lower"
-        )
-
-
-@contextmanager
-def open_session(server: FileServer) -> Iterator[FileSession]:
-    """Yield a session that is logged in; its errors are raised as RigError.
-
-    DeviceRefused where the server says no, DamagedTransfer where it speaks no FTP, DeadlinePassed or DeviceGone where
-    it is not there.
-    """
-    session = FileSession(server)
-    try:
-        session.log_in()
-        yield session
-        session.close()
-    except (PipelineError, GeneratorExit):  # RigErrors are OSErrors too
-        raise
-    except TimeoutError as error:
-        raise DeadlinePassed(
-            f"{server.where} was silent for {server.stall_s:g} s, or said too little ({session.heard}); is it on?"
-        ) from error
-    except ftplib.error_perm as error:
-        code = int(str(error)[:3]) if str(error)[:3].isdigit() else None
-        if code in _SYNTAX:
-            raise DamagedTransfer(f"{server.where} refused: {error!s:.200}; is it an FTP server?") from error
-        raise DeviceRefused(
-            f"{server.where} refused: {error!s:.200}; look at user and password, and whether the file is there", code
-        ) from error
-    except ftplib.error_temp as error:
-        raise DeviceGone(f"{server.where} broke off: {error!s:.200}") from error
-    except ftplib.Error as error:
-        raise DamagedTransfer(
-            f"{server.where} answered {str(error)!r:.200}, which is no FTP; check host and port"
-        ) from error
-    except (OSError, EOFError) as error:
-        why = str(error) or "connection closed"
-        raise DeviceGone(f"{server.where} is not there or went away ({why}); is it on?") from error
-    finally:
-        session.close()
-
-
 LOG = logging.getLogger(__name__)
-NOT_LOGGED_IN = 530  # of FTP: user or password is not taken, whatever file is asked for
+NOT_LOGGED_IN = 530  # of FTP: the user or the password is refused
+OVERLAP = 4096  # last bytes held that are fetched again, to see that it is the same file
+_BLOCK = 1 << 16  # bytes
 _UNFIT = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 Progress = Callable[[str, int, int], None]  # file, bytes held, bytes in all
 
@@ -201,8 +37,31 @@ class RemoteFile:
         return self.name.rsplit("/", 1)[-1]
 
 
+@dataclass(frozen=True)
+class Capture:
+    """A capture that the camera acknowledged."""
+
+    folder: str
+    sent_s: float  # when the command was sent, by the clock of the rig's drivers
+    acknowledged_s: float  # when its reply was complete: exposures began between the two, or soon after
+
+
+@dataclass(frozen=True)
+class FrameClaim:
+    """The size of a capture: frames, in all its files, of ``samples`` x ``bands`` numbers of 16 bits."""
+
+    frames: int
+    samples: int
+    bands: int
+
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes of a frame."""
+        return 2 * self.samples * self.bands
+
+
 def check_remote_name(name: str) -> None:
-    """Refuse a name that cannot stand in a line of text, as files are asked for (RigError)."""
+    """Raise RigError for a name that cannot stand in a line of text, as the protocols need."""
     if _UNFIT.search(name):
         raise RigError(
             f"the camera names a file {name!r:.200}, expected no line ends or control characters in a name; give it "
@@ -245,6 +104,43 @@ class KeptInMemory:
         self.files.pop(name, None)
 
 
+@contextmanager
+def open_session(server: FileServer) -> Iterator[ftplib.FTP]:
+    """Yield a session that is logged in; its errors are raised as RigError.
+
+    Raises DeviceRefused where the server refuses, RigError where it speaks no FTP, DeadlinePassed or DeviceGone where
+    it does not answer.
+    """
+    session = ftplib.FTP(timeout=server.stall_s, encoding="utf-8")
+    try:
+        session.connect(server.host, server.port)
+        session.login(server.user, server.password)
+        session.voidcmd("TYPE I")
+        yield session
+    except PipelineError:  # RigErrors are OSErrors too
+        raise
+    except TimeoutError as error:
+        raise DeadlinePassed(f"{server.where} was silent for {server.stall_s:g} s; is it on?") from error
+    except ftplib.error_perm as error:
+        code = int(str(error)[:3]) if str(error)[:3].isdigit() else None
+        raise DeviceRefused(
+            f"{server.where} refused: {error!s:.200}; look at user and password, and whether the file is there", code
+        ) from error
+    except (ftplib.error_proto, ftplib.error_reply, ValueError) as error:
+        raise RigError(f"{server.where} answered {str(error)!r:.200}, which is no FTP; check host and port") from error
+    except (ftplib.Error, OSError, EOFError) as error:
+        reason = str(error) or "connection closed"
+        raise DeviceGone(f"{server.where} is not there or went away ({reason}); is it on?") from error
+    finally:
+        session.close()
+
+
+def log_in(server: FileServer) -> str:
+    """Log in to the server and return its welcome; DeviceRefused where it refuses the password."""
+    with open_session(server) as session:
+        return session.getwelcome().removeprefix("220").strip() or "logged in"
+
+
 def fetch_files(
     server: FileServer,
     files: Sequence[RemoteFile],
@@ -255,161 +151,75 @@ def fetch_files(
 ) -> None:
     """Fetch files one after the other until ``kept`` holds them whole.
 
-    Bytes held from an earlier call are compared before any are added. A transfer that breaks off is taken up again.
-    Fetched bytes stay in ``kept`` however this ends, unless they are damaged, and a later call continues there.
-
-    Raises RigError where a file is not the one of which a part is held, is larger than it can be, or comes damaged each
-    time; DeviceRefused where the server does not give it, or takes another password; DeadlinePassed or DeviceGone where
-    ``server.tries`` tries in a row brought nothing, or all of them took too long.
+    A transfer that breaks off is continued, in a later call too. The last bytes held from before are compared with the
+    camera's. Raises RigError where they differ or a file is larger than it can be; DeviceRefused where the server
+    refuses it; DeadlinePassed or DeviceGone where ``server.tries`` tries in a row brought no byte.
     """
     for file in files:
         check_remote_name(file.name)
-        _Fetch(server, file, kept, progress, clock).run()
+        _fetch(server, file, kept, progress, clock)
 
 
-def log_in(server: FileServer) -> str:
-    """Log in to the server, look at nothing, and give its welcome; DeviceRefused where it takes another password."""
-    try:
-        with open_session(server) as session:
-            return session.getwelcome().removeprefix("220").strip() or "logged in"
-    except DamagedTransfer as error:
-        raise RigError(str(error)) from error
+def _fetch(server: FileServer, file: RemoteFile, kept: Kept, progress: Progress | None, clock: Clock) -> None:
+    """Fetch one file, again where a session breaks off."""
+    failed = 0
+    while True:
+        before = kept.size(file.name)
+        try:
+            with open_session(server) as session:
+                _transfer(session, file, kept, progress)
+            return
+        except (DeadlinePassed, DeviceGone) as error:
+            held = kept.size(file.name)
+            failed = 1 if held > before else failed + 1
+            if failed >= server.tries:
+                raise type(error)(
+                    f"{error}; {held} bytes of {file.name} are kept, and a later fetch continues there"
+                ) from error
+            LOG.info("%s; continuing at byte %d of %s", error, held, file.name)
+            clock.sleep(server.pause_s)
 
 
-@dataclass
-class _Fetch:
-    """One file on its way. The first ``sure`` bytes of those held came alike twice."""
+def _transfer(session: ftplib.FTP, file: RemoteFile, kept: Kept, progress: Progress | None) -> None:
+    """Read once from shortly before the end of the held bytes: compare with those, and add the rest."""
+    name, size, held = file.name, _whole_size(session, file), kept.size(file.name)
+    another = RigError(f"the {held} bytes of {name} that are held are of another file; remove them and fetch again")
+    if held > size:
+        raise another
+    if size == 0:
+        kept.append(name, b"")
+        return
+    at = max(held - OVERLAP, 0)
+    with session.transfercmd(f"RETR {name}", at or None) as connection:
+        while data := connection.recv(_BLOCK):
+            same = min(len(data), max(held - at, 0))
+            if data[:same] != kept.read(name, at, at + same):
+                raise another
+            at += len(data)
+            if at > size:
+                raise RigError(f"{name} has more than its {size} bytes; fetch it when the capture has ended")
+            if same < len(data):
+                kept.append(name, data[same:])
+                if progress is not None:
+                    progress(name, at, size)
+    session.voidresp()
+    if at < size:
+        raise DeviceGone(f"the transfer of {name} ended at byte {at} of {size}; look at the file there")
 
-    server: FileServer
-    file: RemoteFile
-    kept: Kept
-    progress: Progress | None
-    clock: Clock
-    sure: int = 0
-    doubted: tuple[int, int] = (-1, 0)  # the first byte that came differently, and how often in a row
-    damaged: int = 0
-    refused: int = 0
 
-    def __post_init__(self) -> None:
-        self.earlier = self.held  # by another call, maybe of another file of that name
-        self.began = time.monotonic()
-
-    @property
-    def held(self) -> int:
-        """Bytes that are kept."""
-        return self.kept.size(self.file.name)
-
-    def run(self) -> None:
-        """Read until the file is whole and sure, again where a session breaks off."""
-        failed = 0
-        while True:
-            before = (self.held, self.sure)
-            try:
-                with open_session(self.server) as session:
-                    self._go_on(session)
-                return
-            except (DamagedTransfer, DeadlinePassed, DeviceGone, DeviceRefused) as error:
-                failed = 1 if (self.held, self.sure) > before else failed + 1
-                self._judge(error, failed)
-                LOG.info("%s; going on at byte %d of %s", error, self.held, self.file.name)
-                self.clock.sleep(self.server.pause_s)
-
-    def _judge(self, error: RigError, failed: int) -> None:
-        """Raise what ends the fetching; nothing where the file may be asked for again."""
-        late = time.monotonic() - self.began > self.server.most_s(self.file.size or self.held)
-        if isinstance(error, DeviceRefused):
-            self.refused += 1
-            if self.refused > 1 or late:  # once more: the words may have been damaged on their way there
-                raise error
-        elif isinstance(error, DamagedTransfer):
-            self.damaged += 1
-            if self.damaged >= 2 * self.server.tries - 1 or late:  # it may be dropped and begun anew meanwhile
-                self._drop(error)
-                raise RigError(str(error)) from error
-        elif failed >= self.server.tries or late:
-            raise type(error)(
-                f"{error}; {self.held} bytes of {self.file.name} are kept, and fetching again goes on there"
-            ) from error
-
-    def _go_on(self, session: FileSession) -> None:
-        size = self._whole_size(session)
-        if self.held > size:
-            self._drop(
-                RigError(
-                    f"{self.held} bytes of {self.file.name} are held, the camera's file has {size}: it is another one; "
-                    "take what is held away and fetch again"
-                )
-            )
-        self._tell(size)
-        if size == 0:
-            self.kept.append(self.file.name, b"")
-        while self.sure < size:
-            held = self.held
-            try:
-                self._read(session, held, size)
-            except DamagedTransfer as error:
-                if self.held > held:  # what this reading brought may lie beside its place
-                    self._drop(error)
-                raise
-            self.sure = held if self.server.read_twice else size
-
-    def _read(self, session: FileSession, held: int, size: int) -> None:
-        """Read once from where nothing is sure: compare with what is held, and add what is beyond it."""
-        at = self.sure if self.server.read_twice else max(held - self.server.overlap, 0)
-        with closing(session.pieces(self.file.name, at, size)) as pieces:
-            for data in pieces:
-                same = min(len(data), max(held - at, 0))
-                known = self.kept.read(self.file.name, at, at + same)
-                if data[:same] != known:
-                    self._differ(at + next(i for i in range(same) if data[i] != known[i]), held)
-                if self.server.read_twice:
-                    self.sure = max(self.sure, min(at + same, held))
-                at += len(data)
-                if same < len(data):
-                    self.kept.append(self.file.name, data[same:])
-                    self._tell(size)
-
-    def _tell(self, size: int) -> None:
-        if self.progress is not None:
-            self.progress(self.file.name, self.held, size)
-
-    def _differ(self, at: int, held: int) -> None:
-        """Doubt this reading where it differs from what is held; where the next one does too, what is held goes."""
-        self.doubted = (at, self.doubted[1] + 1 if self.doubted[0] == at else 1)
-        if self.doubted[1] > 1 or not self.server.read_twice:
-            self._drop(
-                RigError(
-                    f"the bytes of {self.file.name} before byte {held} differ from those held: it is another file; "
-                    "take what is held away and fetch again"
-                )
-            )
-        raise DamagedTransfer(
-            f"byte {at} of {self.file.name} came differently each time; look at the network between here and the "
-            "camera, then run again"
+def _whole_size(session: ftplib.FTP, file: RemoteFile) -> int:
+    """Return the size by the server; RigError where the listing differs, or it is more than the file can have."""
+    stated = session.size(file.name)
+    size = file.size if stated is None else stated
+    if size is None:
+        raise RigError(f"neither the listing nor SIZE gives the size of {file.name}; fetch it by hand")
+    if file.size not in (None, size):
+        raise RigError(
+            f"{file.name} has {size} bytes, {file.size} when it was listed; fetch it when the capture has ended"
         )
-
-    def _drop(self, error: RigError) -> None:
-        """Hold nothing of the file any more, unless it is of an earlier call and may be of another file: then raise."""
-        if self.sure < self.earlier:
-            raise RigError(str(error)) from error
-        self.kept.drop(self.file.name)
-        self.sure = self.earlier = 0
-
-    def _whole_size(self, session: FileSession) -> int:
-        """Return the size by the server; where the listing differs, the file still grows."""
-        listed, most = self.file.size, self.file.most
-        told = session.size_of(self.file.name)
-        size = listed if told is None else told
-        if size is None:
-            raise RigError(f"neither the listing nor SIZE tells how long {self.file.name} is; fetch it by hand")
-        if listed is not None and listed != size:
-            raise DamagedTransfer(
-                f"{self.file.name} has {size} bytes, {listed} when it was listed; is the capture still running? "
-                "Fetch when it has ended"
-            )
-        if most is not None and size > most:
-            raise RigError(
-                f"{self.file.name} is said to have {size} bytes, expected {most} at most; nothing of it is fetched: "
-                "look at what the camera wrote"
-            )
-        return size
+    if file.most is not None and size > file.most:
+        raise RigError(
+            f"{file.name} has {size} bytes, expected {file.most} at most, and nothing of it is fetched; look at what "
+            "the camera wrote"
+        )
+    return size

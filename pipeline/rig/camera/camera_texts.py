@@ -1,12 +1,12 @@
-"""Texts that cameras write beside their numbers: ENVI headers taken apart into fields, and frame indices.
+"""Text files beside a camera's cubes: ENVI headers, and frame indices.
 
-A header is ``key = value`` lines after the word ENVI; values in braces may run over lines and be nested. Headwall adds
-lines that begin with ``;``, some of which hold settings of their own. Each reader checks what its header must say:
-files from anywhere (``storage.readers.envi_files``), or a camera's own (``camera_cubes``).
+A header is ``key = value`` lines after the word ENVI; values in braces may be nested and have several lines. Headwall
+adds lines that begin with ``;``, some of which hold settings. Any file (``storage.readers.envi_files``) and a camera's
+own (``camera_cubes``) have further checks in their readers.
 
-``frameIndex_<n>.txt`` lies beside ``raw_<n>``: a heading, then a line a frame with its number and its time in
-microseconds. Versions of the camera's program differ in what stands between the two (a tab or spaces) and in the line
-ends. Frames may be missing or listed twice. Tested on small indices made in these layouts.
+``frameIndex_<n>.txt`` belongs to ``raw_<n>``: a heading, then one line per frame with its number and its time in
+microseconds. Versions of the camera's program differ in the separator (a tab or spaces) and in the line ends. Frames
+may be missing or listed twice. It was tested on small indices made in these layouts.
 """
 
 from __future__ import annotations
@@ -23,28 +23,35 @@ from pipeline.errors import SceneError
 
 FRAME_INDEX = re.compile(r"frameindex_(\d{1,12})\.txt", re.IGNORECASE)  # names of its files
 UNBALANCED = "opens more braces than it closes"
-MOST_UNBALANCED = 16  # values that open more braces than they close: looking for each one's end reads the rest
+MOST_UNBALANCED = 16  # values with an open brace; the search for each end reads the rest of the header
 NANOMETRES = {"nm", "nanometer", "nanometers", "nanometre", "nanometres"}
 MICROMETRES = {"um", "µm", "μm", "micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres"}
 UNSAID = {"", "unknown"}
 LONGEST_LINE = 1000  # characters; a frame's line has about 25
 _LARGEST = 2**62
 _WHOLE = re.compile(r"-?\d{1,19}")
-_BETWEEN_COLUMNS = re.compile(r"[\t,;]+|\s{2,}")  # where a heading has such; a single space may stand in a name
+_BETWEEN_COLUMNS = re.compile(r"[\t,;]+|\s{2,}")  # of a heading; a name may have a single space
 _MS = {"us": 1e-3, "µs": 1e-3, "μs": 1e-3, "microseconds": 1e-3, "s": 1e3, "sec": 1e3, "seconds": 1e3}
+
+INTERLEAVES = ("bil", "bip", "bsq")
+# data type codes of the format's description
+_CODES = (1, 2, 3, 4, 5, 6, 9, 12, 13, 14, 15)
+DATA_TYPES = dict(zip(_CODES, ("u1", "i2", "i4", "f4", "f8", "c8", "c16", "u2", "u4", "i8", "u8"), strict=True))
+# words of a file type that is not plain numbers
+OTHER_FILES = ("tiff", "jpeg", "jp2", "png", "bmp", "hdf", "netcdf", "nitf", "virtual", "meta")
 
 
 def split_header(text: str, where: str, notes: list[str]) -> tuple[dict[str, str], dict[str, str]]:
-    """Return the fields, and settings in comments: as written, keys in lower case, without the outer braces.
+    """Return the fields, and the settings in comments: keys in lower case, values without the outer braces.
 
-    ``notes`` tell how strange forms were read; messages call the header ``where``. SceneError where it does not begin
-    with ENVI (ArcGIS headers do not), or a brace is never closed.
+    ``notes`` describe unusual forms; messages call the header ``where``. Raises SceneError: it does not begin with ENVI
+    (ArcGIS headers do not), or a brace is never closed.
     """
     lines = text.lstrip("\ufeff").splitlines()
     first = next((number for number, line in enumerate(lines) if line.strip()), None)
     if first is None or lines[first].strip().upper() != "ENVI":
         begins = "is empty" if first is None else f"begins with {lines[first].strip()[:40]!r}"
-        raise SceneError(f"{where} {begins}, expected ENVI on its own line; it is no ENVI header, name another")
+        raise SceneError(f"{where} {begins}, expected ENVI on its own line; name an ENVI header")
     settings: dict[str, str] = {}
     plain: list[str] = []
     for line in lines[first + 1 :]:
@@ -80,7 +87,7 @@ def _pairs(lines: list[str], where: str, notes: list[str]) -> Iterator[tuple[str
 
 
 def _braced(value: str, lines: list[str], number: int, where: str, notes: list[str]) -> tuple[str, int]:
-    """Return the inside of a value that begins with a brace, and the number of the line after its end."""
+    """Return the content of a value in braces, and the number of the line after its end."""
     parts = [value]
     depth = _depth(value)
     end = number
@@ -88,7 +95,7 @@ def _braced(value: str, lines: list[str], number: int, where: str, notes: list[s
         parts.append(lines[end])
         depth += _depth(lines[end])
         end += 1
-    if depth > 0:  # one brace too many inside: the first line that ends with one closes it all
+    if depth > 0:  # one brace too many: the first line that ends with one closes the value
         ends = [at for at, part in enumerate(parts) if part.rstrip().endswith("}")]
         if not ends:
             raise SceneError(f"{where} opens a brace that is never closed; is the header cut off?")
@@ -102,13 +109,13 @@ def _braced(value: str, lines: list[str], number: int, where: str, notes: list[s
 
 
 def _depth(text: str) -> int:
-    """Return the number of open braces; escaped ones do not count."""
+    """Return the number of open braces, without escaped ones."""
     bare = re.sub(r"\\[{}]", "", text)
     return bare.count("{") - bare.count("}")
 
 
 def finite_number(text: str) -> float | None:
-    """Return the number that a text is; None where it is none, or not finite."""
+    """Return a text as a finite number; None where it is none."""
     try:
         number = float(text)
     except ValueError:
@@ -119,10 +126,9 @@ def finite_number(text: str) -> float | None:
 def wavelengths_nm(
     fields: Mapping[str, str], channels: int, notes: list[str]
 ) -> tuple[NDArray[np.float64] | None, float]:
-    """Return (band,) centres [nm] and the header's unit in nm.
+    """Return (band,) centres [nm] and the header's unit in nm, with notes on assumptions.
 
-    Without a unit they are read as nm or micrometres by their size; those that do not fit the bands are left out. Notes
-    say so.
+    Without a unit they are read as nm or micrometres by their size. Centres that do not fit the bands are left out.
     """
     values = listed_numbers(fields, "wavelength", channels, notes)
     if values is None:
@@ -145,7 +151,7 @@ def wavelengths_nm(
 
 
 def listed_numbers(fields: Mapping[str, str], key: str, count: int, notes: list[str]) -> NDArray[np.float64] | None:
-    """Return the numbers of a list with any commas and spaces between; None with a note where it is none."""
+    """Return the numbers of a list separated by commas or spaces; None with a note where it is none."""
     if key not in fields:
         return None
     words = [word for word in re.split(r"[,\s]+", fields[key]) if word]
@@ -156,6 +162,102 @@ def listed_numbers(fields: Mapping[str, str], key: str, count: int, notes: list[
         notes.append(f"{key} is left out: {why}")
         return None
     return np.array(numbers, np.float64)
+
+
+@dataclass(frozen=True)
+class EnviHeader:
+    """The content of one header; missing fields are None."""
+
+    samples: int
+    lines: int | None  # None: as many as the data file holds
+    bands: int
+    dtype: np.dtype[np.generic]  # with its byte order
+    interleave: str  # bil, bip or bsq
+    offset: int  # bytes before the numbers
+    kind: str  # file type, such as ENVI Standard or ENVI Spectral Library
+    wavelength_nm: NDArray[np.float64] | None  # (band,)
+    fwhm_nm: NDArray[np.float64] | None  # (band,)
+    nodata: float | None
+    fields: Mapping[str, str]  # all of them, keys in lower case, values without the outer braces
+    settings: Mapping[str, str]  # of the lines that begin with ;
+    notes: tuple[str, ...]
+
+    @property
+    def line_bytes(self) -> int:
+        """Bytes of a line."""
+        return self.samples * self.bands * self.dtype.itemsize
+
+
+def parse_envi_header(text: str, where: str = "the header") -> EnviHeader:
+    """Read a header's text; messages call it ``where``.
+
+    Wavelengths are returned in nm, as :func:`wavelengths_nm` reads them. Raises SceneError: it does not begin with
+    ENVI, a size, type or interleave is missing or impossible, or the file holds more than plain numbers (compressed,
+    bytes between frames).
+    """
+    notes: list[str] = []
+    fields, settings = split_header(text, where, notes)
+    samples, bands = (_whole(fields, key, where, least=1) for key in ("samples", "bands"))
+    kind = fields.get("file type", "ENVI Standard")
+    _refuse_layouts(fields, kind, where)
+    channels = samples if "spectral library" in kind.lower() else bands
+    wavelength, scale = wavelengths_nm(fields, channels, notes)
+    code = _whole(fields, "data type", where, least=1)
+    if code not in DATA_TYPES:
+        raise SceneError(f"{where}: data type = {code} is none of ENVI's {', '.join(map(str, DATA_TYPES))}; correct it")
+    if "byte order" not in fields and np.dtype(DATA_TYPES[code]).itemsize > 1:
+        notes.append("the byte order is missing, little endian is assumed")
+    order = _whole(fields, "byte order", where, least=0, otherwise=0)
+    if order > 1:
+        raise SceneError(f"{where}: byte order = {order}, expected 0 (little endian) or 1 (big endian); correct it")
+    interleave = fields.get("interleave", "").strip().lower()
+    if "interleave" not in fields and bands == 1:
+        notes.append("the interleave is missing, which with one band does not matter")
+        interleave = "bsq"
+    if interleave not in INTERLEAVES:
+        says = f"interleave = {interleave!r}" if interleave else "no interleave"
+        raise SceneError(f"{where}: {says}, expected one of {', '.join(INTERLEAVES)}; correct it")
+    widths = None if wavelength is None else listed_numbers(fields, "fwhm", channels, notes)
+    return EnviHeader(
+        samples=samples,
+        lines=_whole(fields, "lines", where, least=0) if "lines" in fields else None,
+        bands=bands,
+        dtype=np.dtype(("<", ">")[order] + DATA_TYPES[code]),
+        interleave=interleave,
+        offset=_whole(fields, "header offset", where, least=0, otherwise=0),
+        kind=kind,
+        wavelength_nm=wavelength,
+        fwhm_nm=None if widths is None or not (widths > 0).all() else widths * scale,
+        nodata=finite_number(fields.get("data ignore value", "")),
+        fields=fields,
+        settings=settings,
+        notes=tuple(notes),
+    )
+
+
+def _whole(fields: Mapping[str, str], key: str, where: str, *, least: int, otherwise: int | None = None) -> int:
+    if key not in fields and otherwise is not None:
+        return otherwise
+    if key not in fields:
+        raise SceneError(f"{where} does not say {key}; add the line '{key} = ...'")
+    number = finite_number(fields[key])
+    if number is None or number != int(number) or number < least:
+        raise SceneError(f"{where}: {key} = {fields[key]!r}, expected a whole number from {least}; correct it")
+    return int(number)
+
+
+def _refuse_layouts(fields: Mapping[str, str], kind: str, where: str) -> None:
+    """Raise SceneError for files whose numbers are not contiguous: they would be read as other numbers."""
+    if finite_number(fields.get("file compression", "0")) != 0:
+        raise SceneError(f"{where}: file compression = {fields['file compression']!r}, expected 0; unpack the file")
+    for key in ("major frame offsets", "minor frame offsets"):
+        words = [word for word in re.split(r"[,\s]+", fields.get(key, "")) if word]
+        if any(finite_number(word) != 0 for word in words):
+            raise SceneError(
+                f"{where}: {key} = {fields[key]!r} puts bytes between frames, which is not supported; remove them"
+            )
+    if any(word in kind.lower() for word in OTHER_FILES):
+        raise SceneError(f"{where}: file type = {kind!r}, expected plain numbers (ENVI Standard); name the file itself")
 
 
 @dataclass(frozen=True)
@@ -170,7 +272,7 @@ class FrameIndex:
 
 @dataclass(frozen=True)
 class LineTimes:
-    """Times of the lines of one file by its index; -1 or NaN where it says nothing."""
+    """Times of the lines of one file by its index; -1 or NaN where it has none."""
 
     frame: NDArray[np.int64]  # (line,)
     stamp_us: NDArray[np.int64]  # (line,)
@@ -179,17 +281,17 @@ class LineTimes:
 
     @classmethod
     def unknown(cls, lines: int) -> LineTimes:
-        """Return so many lines of which nothing is known."""
+        """Return lines without any time."""
         return cls(np.full(lines, -1), np.full(lines, -1), np.full(lines, np.nan))
 
     def put(self, start: int, own: LineTimes) -> None:
-        """Fill in what is known of the lines of one file, of which the first is line ``start``."""
+        """Fill in the times of one file, whose first line is line ``start``."""
         for name in ("frame", "stamp_us", "exposure_ms"):
             getattr(self, name)[start : start + len(own.frame)] = getattr(own, name)
 
 
 def place_parts(parts: Sequence[tuple[str, int, int]], most: int, notes: list[str]) -> list[int]:
-    """Return the first line of each part of a cube, by the parts' names, first frames and numbers of lines.
+    """Return the first line of each part of a cube, from the parts' names, first frames and numbers of lines.
 
     Raises SceneError: more than ``most`` lines are in no part.
     """
@@ -210,7 +312,7 @@ def place_parts(parts: Sequence[tuple[str, int, int]], most: int, notes: list[st
 
 @dataclass
 class _Rows:
-    """Lines of an index, as they stand in it."""
+    """Lines of an index, in its order."""
 
     frame: array[int] = field(default_factory=lambda: array("q"))
     stamp: array[int] = field(default_factory=lambda: array("q"))
@@ -219,14 +321,14 @@ class _Rows:
 
 
 def parse_frame_index(lines: Iterable[str], name: str = "the frame index", where: str = "") -> FrameIndex:
-    """Read an index's lines; what is no frame is passed over and counted, of a frame listed twice the first counts.
+    """Read an index's lines; other lines than frames are counted, the second of two equal frames is dropped.
 
-    Notes call it ``name``, messages ``where`` if its name alone does not say. SceneError where no line is a frame.
+    Notes call it ``name``, messages ``where`` or ``name``. Raises SceneError: no line is a frame.
     """
     rows = _rows(lines)
     if not rows.frame:
         raise SceneError(
-            f"{where or name} lists no frame, expected lines of number and microseconds; take it away or repair it"
+            f"{where or name} lists no frame, expected lines of number and microseconds; remove or repair it"
         )
     numbers, first = np.unique(np.array(rows.frame, np.int64), return_index=True)
     notes = [f"{name}: {rows.odd} lines are no frames"] if rows.odd else []
@@ -240,12 +342,11 @@ def parse_frame_index(lines: Iterable[str], name: str = "the frame index", where
 
 
 def times_of_lines(index: FrameIndex, first_frame: int, lines: int, lost: int = 0) -> LineTimes:
-    """Return each of a file's ``lines`` its frame and time.
+    """Return frame and time of each of a file's ``lines``.
 
-    Lines are frames in order, the first of them ``first_frame`` (the number in the file's name). If as many frames are
-    listed as there are lines, they are its lines whatever their numbers: the camera dropped those missing. So they are
-    where as many are listed as there were lines before the file lost its last ``lost`` ones. An index whose numbers
-    begin at 0 in a later file counts from that file's start.
+    Lines are frames in order from ``first_frame`` on, the number in the file's name. The index may list as many frames
+    as the file has lines, with or without the ``lost`` ones at its end. Then it lists these lines, whatever the
+    numbers: the camera dropped the others. An index of a later file that begins at 0 counts from that file's start.
     """
     if len(index.frame) in (lines, lines + lost):
         exposure = np.full(lines, np.nan) if index.exposure_ms is None else index.exposure_ms[:lines]
@@ -260,14 +361,14 @@ def times_of_lines(index: FrameIndex, first_frame: int, lines: int, lost: int = 
     found.stamp_us[place[inside]] = index.stamp_us[inside]
     if index.exposure_ms is not None:
         found.exposure_ms[place[inside]] = index.exposure_ms[inside]
-    told, beyond = int(np.count_nonzero(inside)), int(np.count_nonzero(~inside))
-    said: tuple[str, ...] = () if told == lines else (f"the frame index tells the time of {told} of {lines} lines",)
-    said += (f"the frame index lists {beyond} frames beyond the lines",) if beyond else ()
-    return replace(found, notes=said)
+    known, beyond = int(np.count_nonzero(inside)), int(np.count_nonzero(~inside))
+    findings: tuple[str, ...] = () if known == lines else (f"the frame index has the time of {known} of {lines} lines",)
+    findings += (f"the frame index lists {beyond} frames beyond the lines",) if beyond else ()
+    return replace(found, notes=findings)
 
 
 def _rows(lines: Iterable[str]) -> _Rows:
-    """Return the numbers of all lines that are frames, and how many other lines there are."""
+    """Return the numbers of all lines that are frames, and the number of other lines."""
     rows = _Rows()
     column, scale = None, 1.0
     for number, line in enumerate(lines):
@@ -290,7 +391,7 @@ def _rows(lines: Iterable[str]) -> _Rows:
 
 
 def _exposure_column(heading: str) -> tuple[int | None, float]:
-    """Return which column holds exposures, and what one of its units is in ms; they are ms where nothing is said."""
+    """Return the column of exposures, and its unit in ms; without a unit they are ms."""
     titles = [word for word in _BETWEEN_COLUMNS.split(heading) if word]
     if len(titles) < 2:
         titles = heading.split()

@@ -1,37 +1,38 @@
-"""The camera's driver: its control socket, one command at a time, and its files, as a line camera for surveys."""
+"""The camera's driver: commands and replies of its control socket, and its files, as a line camera for surveys.
+
+A command is ``name`` or ``name(JSON)`` and a carriage return. The camera repeats that line (some versions do not), and
+sends ``{"success": ..., "response": ..., "errorMessage": ...}`` and the prompt ``hpi> ``.
+"""
 
 from __future__ import annotations
 
+import json
 import logging
 import re
 import threading
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Self, TypeVar
 
 from pipeline.errors import RigError, SettingsError
 from pipeline.rig.camera.camera_cubes import CapturedLines, MeanFrame, Read, mean_frame, read_capture, read_references
-from pipeline.rig.camera.camera_files import Kept, Progress, RemoteFile, fetch_files
-from pipeline.rig.camera.headwall_replies import (
-    MisfitError,
-    ReplyReader,
-    as_folder,
-    as_listing,
-    as_truth,
-    check_repeated,
-    check_times_set,
-    response_of,
-    to_request,
+from pipeline.rig.camera.camera_files import (
+    Capture,
+    FrameClaim,
+    Kept,
+    Progress,
+    RemoteFile,
+    check_remote_name,
+    fetch_files,
 )
 from pipeline.rig.device_settings import (
     CameraAddress,
     CameraLimits,
     ControlPatience,
     FileServer,
-    check_capture,
+    check_prefix,
     check_times,
 )
-from pipeline.rig.drivers import Capture, FrameClaim
 from pipeline.rig.transports import (
     SYSTEM_CLOCK,
     Clock,
@@ -43,28 +44,139 @@ from pipeline.rig.transports import (
 )
 
 LOG = logging.getLogger(__name__)
-LONGEST_GREETING = 1 << 16  # bytes
-CAPTURE_ROOT = "/captured"  # where new folders appear; assumed, the reply to a capture shows it
-MOST_PASSED_OVER = 32  # replies to other commands, while one is waited for
+COMMANDS = ("configure", "capture", "isCapturing", "stopCapture", "listFiles")
+LONGEST_REPLY = 1 << 24  # bytes: a listing of a hundred thousand files
 Answer = TypeVar("Answer")
+TIMES_ALIKE = 0.01  # of a time: cameras round them
 MOST_TEXT = 1 << 26  # bytes of a header, a frame index or another text: an index of two million frames
 MOST_OFFSET = 1 << 16  # bytes before the first frame of a cube; cameras write none
 MOST_REFERENCE_FRAMES = 2048
-MOST_FILES = 4096
 _RAW = re.compile(r"raw_\d+", re.IGNORECASE)
 _REFERENCE = re.compile(r"(dark|white)[a-z_]*", re.IGNORECASE)
+_PROMPT = re.compile(rb"(?:\A|(?<=[\r\n}]))hpi> ")  # a reply may hold the word, but not there
+_NEGOTIATION = re.compile(rb"\xff[\xfb-\xfe].", re.DOTALL)  # of telnet; UTF-8 never holds the byte FF
+_UNFIT = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
+# words of a refusal -> what to do about it
+_REMEDIES = (
+    (("full", "space", "storage"), "copy the folders on the camera's disk to another and delete them there"),
+    (("busy", "already", "progress", "in use"), "wait until it is done, or stop it with its own program; run again"),
+    (("exposure", "period"), "give an exposure that is not longer than the frame period, both in ms"),
+    (("folder", "directory", "file", "path"), "list the folder above it and take a name from there"),
+)
 
 
-class CaptureUnknown(StateUnknown):
-    """A capture was sent and not acknowledged; what was found on asking stands in the message."""
+@dataclass(frozen=True)
+class CameraReply:
+    """A reply: the command that it repeats, if any, its JSON, if it is such, and the text for messages."""
+
+    command: str
+    content: dict[str, Any] | None
+    text: str
+
+
+def to_request(name: str, argument: Any = None) -> bytes:
+    """Return the bytes of a command."""
+    text = name if argument is None else f"{name}({json.dumps(argument)})"
+    return text.encode("ascii") + b"\r"
+
+
+class ReplyReader:
+    """Takes bytes as they come and gives the replies whose prompt is there."""
+
+    def __init__(self) -> None:
+        self.held = b""  # bytes that no prompt has followed yet
+
+    def feed(self, data: bytes) -> list[CameraReply]:
+        """Take bytes; return the replies that they complete. RigError where more came than any reply has."""
+        *texts, self.held = _PROMPT.split(_NEGOTIATION.sub(b"", self.held + data))
+        if len(self.held) > LONGEST_REPLY:
+            raise RigError(f"{len(self.held)} bytes came without a prompt 'hpi> '; is this the camera's control port?")
+        return [_parse(text) for text in texts]
+
+
+def _parse(data: bytes) -> CameraReply:
+    """Return the reply before a prompt; its command and text are empty where only a line end came."""
+    text = data.decode("utf-8", errors="replace").strip("\0 \t\r\n")
+    echo, body = "", text
+    if not text.startswith("{"):
+        echo, _, body = text.replace("\n", "\r").partition("\r")
+    try:
+        content = json.loads(body)
+    except ValueError:
+        content = None
+    command = echo.split("(")[0].strip()
+    return CameraReply(command if command in COMMANDS else "", content if isinstance(content, dict) else None, text)
+
+
+def response_of(reply: CameraReply, name: str, port: str) -> Any:
+    """Return the response of a reply that reports success.
+
+    Raises DeviceRefused, with the remedy: it reports a failure. Raises RigError: it is no such reply.
+    """
+    success = None if reply.content is None else reply.content.get("success")
+    if reply.content is None or not isinstance(success, bool):
+        raise RigError(
+            f"{port} answered {name} with {reply.text[:200]!r}, expected JSON with success true or false; is this the "
+            "camera's control port?"
+        )
+    if not success:
+        reason = _UNFIT.sub("?", str(reply.content.get("errorMessage") or "no reason given"))[:300]
+        fitting = (what for words, what in _REMEDIES if any(word in reason.lower() for word in words))
+        raise DeviceRefused(
+            f"the camera at {port} refused {name}: {reason}; {next(fitting, 'see the manual of the camera')}"
+        )
+    return reply.content.get("response")
+
+
+def as_folder(response: Any) -> str:
+    """Return the folder of a capture; RigError where the response has none."""
+    folder = response.get("folder") if isinstance(response, dict) else None
+    if not isinstance(folder, str) or not folder:
+        raise RigError(f"expected the folder of the capture from the camera, got {response!r:.100}")
+    check_remote_name(folder)
+    return folder
+
+
+def as_truth(response: Any) -> bool:
+    """Return whether a capture runs; RigError where the response does not say."""
+    value = response.get("capturing") if isinstance(response, dict) else response
+    if not isinstance(value, bool):
+        raise RigError(f"expected true or false from the camera, got {value!r:.100}")
+    return value
+
+
+def as_listing(response: Any) -> list[RemoteFile]:
+    """Return the entries of a folder, by name; RigError where the response is no list of files."""
+    found = []
+    for entry in response if isinstance(response, list) else [response]:
+        name = entry.get("name") if isinstance(entry, dict) else None
+        if not isinstance(name, str):
+            raise RigError(f"expected a list of files from the camera, got {entry!r:.100}")
+        check_remote_name(name)
+        try:
+            size = max(int(entry.get("size")), 0)
+        except (TypeError, ValueError, OverflowError):
+            size = None
+        found.append(RemoteFile(re.sub("/{2,}", "/", name), size, bool(entry.get("isDirectory"))))
+    return sorted(found, key=lambda entry: entry.name)
+
+
+def check_times_set(response: Any, asked_ms: Mapping[str, float]) -> None:
+    """Raise RigError where the response states other times than were asked for. [ms]"""
+    stated = response if isinstance(response, dict) else {}
+    for name, wanted in asked_ms.items():
+        found = stated.get(name, wanted)
+        if not isinstance(found, int | float) or not abs(found - wanted) <= TIMES_ALIKE * wanted:
+            raise RigError(
+                f"the camera set {name} to {found!r:.40} ms, asked was {wanted:g} ms; give a time that it supports"
+            )
 
 
 class HeadwallCamera:
-    """A line camera for surveys: its commands and its files. Nothing is connected before the first command.
+    """A line camera for surveys, a `pipeline.rig.drivers.CameraDriver`. The first command connects.
 
-    After a late or damaged reply the connection is closed and opened again. So a late answer is never taken for the
-    next command's reply. ``connect`` makes a connection. Commands raise DeviceRefused, DeadlinePassed or DeviceGone
-    besides what they say themselves.
+    After a late or damaged reply the connection is closed and opened again, so that a late reply never answers the next
+    command. ``connect`` makes a connection. Commands may also raise DeviceRefused, DeadlinePassed or DeviceGone.
     """
 
     def __init__(
@@ -98,8 +210,8 @@ class HeadwallCamera:
     def configure(self, exposure_ms: float, frame_period_ms: float) -> None:
         """Set exposure and frame period. [ms]
 
-        Raises SettingsError as :func:`check_times` does, RigError where the camera says that it set others, and
-        StateUnknown where a capture may be running, see ``capture``.
+        Raises SettingsError as :func:`check_times`, RigError where the camera reports other times, and StateUnknown
+        where a capture may be running, see ``capture``.
         """
         check_times(exposure_ms, frame_period_ms, self.limits)
         with self._lock:
@@ -107,40 +219,38 @@ class HeadwallCamera:
             times = {"exposure": exposure_ms, "framePeriod": frame_period_ms}
             self._ask("configure", times, lambda response: check_times_set(response, times))
 
-    def capture(self, frames: int, *, cubes: int = 1, prefix: str = "") -> Capture:
-        """Begin a capture of ``cubes`` files (0: until stopped) of ``frames`` lines (0: the camera's own number).
+    def capture(self, frames: int, *, prefix: str = "") -> Capture:
+        """Begin a capture of ``frames`` lines in one file. The command is sent once.
 
-        Sent once. If no reply comes, the camera is asked whether it captures and which folders are new, and the error
-        says so. Captures and settings are refused from then on: a person looks, and connects anew. Raises
-        CaptureUnknown then, and SettingsError where a number or the prefix cannot be used.
+        Raises StateUnknown where no reply comes. Captures and settings are refused from then on, until a person has
+        looked at the camera and connects anew. Raises SettingsError where the prefix cannot be used.
         """
-        check_capture(frames, cubes, prefix)
+        check_prefix(prefix)
         with self._lock:
             self._check_known("capture")
-            before = self._folders()
             self._open()
             sent_s = self.clock.now()
             try:
-                folder = self._once(
-                    "capture", {"prefix": prefix, "maxCubes": cubes, "maxFramesPerCube": frames}, as_folder
-                )
+                folder = self._once("capture", {"prefix": prefix, "maxCubes": 1, "maxFramesPerCube": frames}, as_folder)
             except DeviceRefused:
                 raise
-            except RigError as error:
+            except BaseException as error:
+                self.unknown = "a capture was sent and not acknowledged"
                 self._hang_up()
-                raise self._find_out(error, before, prefix) from error
-            except BaseException:  # interrupted while it waited
-                self.unknown = "a capture was sent and the wait for its reply was interrupted"
-                self._hang_up()
-                raise
+                if not isinstance(error, RigError):  # interrupted while it waited
+                    raise
+                raise StateUnknown(
+                    f"capture (prefix {prefix!r}) was sent and its reply is lost: {error}. It is not sent again. Look "
+                    "at the camera, stop what runs there, then run again, which connects anew"
+                ) from error
             return Capture(folder, sent_s, self.clock.now())
 
     def is_capturing(self) -> bool:
-        """Ask whether a capture runs."""
+        """Return whether a capture runs."""
         return self._ask("isCapturing", None, as_truth)
 
     def stop(self) -> bool:
-        """End a capture; False where none ran. Stopping twice does no harm, so it is asked again without a reply."""
+        """End a capture; return False where none ran. A lost reply is asked for again, since stopping twice is safe."""
         try:
             return self._ask("stopCapture", None, lambda response: response is not False)
         except DeviceRefused:
@@ -157,10 +267,9 @@ class HeadwallCamera:
     def fetch(
         self, folder: str, kept: Kept, progress: Progress | None = None, *, claim: FrameClaim | None = None
     ) -> CapturedLines:
-        """Get a finished capture's files, small ones first, and give its lines; a later call continues.
+        """Fetch a finished capture's files, small ones first, and return its lines; a later call continues.
 
-        RigError where the capture still runs, its files do not belong together, or are larger than ``claim`` lets them
-        be; DeviceRefused, DeadlinePassed, DeviceGone.
+        Raises RigError where the capture still runs, its files do not belong together, or are larger than ``claim``.
         """
         files = self._finished(folder, claim)
         files.sort(key=lambda file: (bool(_RAW.fullmatch(file.base)), file.name))
@@ -168,17 +277,14 @@ class HeadwallCamera:
         return read_capture([file.name for file in files], _reader(kept))
 
     def references(self, folder: str, kept: Kept, *, claim: FrameClaim | None = None) -> dict[str, MeanFrame]:
-        """Return the mean frames of the reference cubes in a capture's folder, by ``dark`` and ``white``.
-
-        Empty without any.
-        """
+        """Return the mean frames of the reference cubes in a capture's folder, by ``dark`` and ``white``."""
         files = [file for file in self._finished(folder, claim) if file.base.lower().startswith(("dark", "white"))]
         fetch_files(self.server, files, kept, clock=self.clock)
         cubes = read_references([file.name for file in files], _reader(kept))
         return {kind: mean_frame(cube.values) for kind, cube in cubes.items()}
 
     def close(self) -> None:
-        """Say exit and hang up. A capture continues; nothing is raised."""
+        """Send exit and close the connection. A capture continues; nothing is raised."""
         with self._lock:
             if self._line is not None:
                 try:
@@ -188,9 +294,10 @@ class HeadwallCamera:
             self._hang_up()
 
     def _ask(self, name: str, argument: Any, check: Callable[[Any], Answer]) -> Answer:
-        """Ask what may be asked twice: again after a lost, late or damaged reply, on a new connection."""
+        """Send a command that may be sent twice: again, on a new connection, after a lost, late or damaged reply."""
         with self._lock:
-            for left in range(self.patience.retries, -1, -1):
+            left = self.patience.retries
+            while True:
                 try:
                     self._open()
                     return self._once(name, argument, check)
@@ -200,12 +307,12 @@ class HeadwallCamera:
                     self._hang_up()
                     if not left:
                         raise
+                    left -= 1
                     LOG.info("%s; asking again", error)
                     self.clock.sleep(self.patience.pause_s)
-            raise AssertionError("unreachable")
 
     def _open(self) -> None:
-        """Open a connection that stands at its prompt, with no earlier input left over."""
+        """Open a connection at its prompt, without earlier input."""
         if self._line is not None:
             try:
                 if stale := self._reader.held + self._line.drain():
@@ -217,56 +324,34 @@ class HeadwallCamera:
                 self._hang_up()
         self._line, self._reader = self._connect(), ReplyReader()
         try:
-            self._greet(self._line)
+            self._wait(self._line, "the greeting", lambda _: True)
         except RigError:
             self._hang_up()
             raise
 
-    def _greet(self, line: Transport) -> None:
-        """Wait for the first prompt, whatever stands before it, not even a line's end."""
-        deadline = self.clock.now() + self.patience.deadline_s
-        came = b""
-        while self.clock.now() < deadline:
-            data = line.read(65536, deadline)
-            came += data
-            if b"hpi> " in came:
-                return
-            if len(came) > LONGEST_GREETING:
-                raise RigError(f"{line.port} greets without end ({_told(came)}); is this the camera's control port?")
-        raise DeadlinePassed(
-            f"{line.port} sent no prompt 'hpi> ' within {self.patience.deadline_s:g} s ({_told(came)}); "
-            "is this the camera's control port (8100)?"
-        )
-
     def _once(self, name: str, argument: Any, check: Callable[[Any], Answer]) -> Answer:
-        """Send one command and wait for its own reply; replies to others are passed over."""
+        """Send one command and wait for its reply; replies to other commands are skipped."""
         line = self._line
         assert line is not None
+        line.write(to_request(name, argument), self.clock.now() + self.patience.deadline_s)
+        reply = self._wait(line, name, lambda reply: bool(reply.text) and reply.command in ("", name))
+        return check(response_of(reply, name, line.port))
+
+    def _wait(self, line: Transport, name: str, fits: Callable[[CameraReply], bool]) -> CameraReply:
+        """Wait for a reply that fits."""
         deadline = self.clock.now() + self.patience.deadline_s
-        request = to_request(name, argument)
-        line.write(request, deadline)
-        passed_over: list[str] = []
+        skipped = ""
         while self.clock.now() < deadline:
-            for said in self._reader.feed(line.read(65536, deadline)):
-                why = f"a reply to {said.command}" if said.command not in ("", name) else ""
-                if not why:
-                    check_repeated(said, request.decode().rstrip("\r"), line.port)
-                    response = response_of(said, name, line.port)
-                    try:
-                        return check(response)
-                    except MisfitError as misfit:
-                        why = str(misfit)
-                LOG.warning("%s, while waiting for %s: %s: %.200s", line.port, name, why, said.text)
-                passed_over.append(said.text[:80])
-                if len(passed_over) > MOST_PASSED_OVER:
-                    raise RigError(
-                        f"{line.port} answers {name} with {len(passed_over)} replies to others; does another program "
-                        "talk to the camera? End that first"
-                    )
-        came = self._reader.held or " | ".join(passed_over).encode()
+            for reply in self._reader.feed(line.read(65536, deadline)):
+                if fits(reply):
+                    return reply
+                LOG.warning("%s, while waiting for %s: skipped %.200s", line.port, name, reply.text)
+                skipped = reply.text
+        came = self._reader.held or skipped.encode()
+        found = f"{len(came)} bytes came: {came[:80]!r}" if came else "nothing came"
         raise DeadlinePassed(
-            f"no reply to {name} from {line.port} within {self.patience.deadline_s:g} s ({_told(came)}); "
-            "is the camera on, and not busy writing? A longer deadline_s waits longer"
+            f"no reply 'hpi> ' to {name} from {line.port} within {self.patience.deadline_s:g} s ({found}); is it the "
+            "camera's control port (8100), is the camera on, and not busy writing?"
         )
 
     def _hang_up(self) -> None:
@@ -281,47 +366,12 @@ class HeadwallCamera:
                 "camera, stop what runs there, then run again, which connects anew"
             )
 
-    def _folders(self) -> set[str] | None:
-        """Return the folders of the capture root; None where the camera does not list it."""
-        try:
-            return {entry.name for entry in self.list_files(CAPTURE_ROOT)}
-        except DeviceRefused as error:
-            LOG.warning("%s: a capture whose reply is lost will not be found by its folder", error)
-            return None
-
-    def _find_out(self, error: RigError, before: set[str] | None, prefix: str) -> CaptureUnknown:
-        """Freeze, ask the camera what it does, and say it."""
-        self.unknown = "a capture was sent and not acknowledged"
-        try:
-            does = "captures" if self.is_capturing() else "does not capture"
-            now = None if before is None else self._folders()
-            new = sorted(now - before) if before is not None and now is not None else []
-            found = f"asked again it {does}, and new are {'the folders ' + ', '.join(new) if new else 'no folders'}"
-        except RigError as other:
-            found = f"asked again it does not answer: {other}"
-        return CaptureUnknown(
-            f"capture (prefix {prefix!r}) was sent and its reply is lost: {error}. It is not sent again; {found}. "
-            "Look at the camera, stop what runs there, then run again, which connects anew"
-        )
-
     def _finished(self, folder: str, claim: FrameClaim | None) -> list[RemoteFile]:
-        """Return the files of a folder once two listings in a row agree.
-
-        A listing that lost an entry on its way looks whole.
-        """
+        """Return the files of a folder; RigError where a capture still runs."""
         if self.is_capturing():
             raise RigError(f"a capture still runs, so files of {folder} may grow; wait for its end, or stop it")
-        listed = self.list_files(folder)
-        for _ in range(self.patience.retries + 1):
-            before, listed = listed, self.list_files(folder)
-            if listed == before:
-                files = [file for file in listed if not file.folder]
-                return files if claim is None else bounded(files, claim)
-        raise RigError(f"{folder} was listed differently each time; look at the camera's network, then run again")
-
-
-def _told(came: bytes) -> str:
-    return f"{len(came)} bytes came: {came[:80]!r}" if came else "nothing came"
+        files = [file for file in self.list_files(folder) if not file.folder]
+        return files if claim is None else bounded(files, claim)
 
 
 def _reader(kept: Kept) -> Read:
@@ -329,31 +379,20 @@ def _reader(kept: Kept) -> Read:
 
 
 def bounded(files: Sequence[RemoteFile], claim: FrameClaim) -> list[RemoteFile]:
-    """Return the files with the most that each can have: cubes what was asked for, references and texts a fixed number.
-
-    RigError where one claims more, or all cubes together do, or there are too many files.
-    """
-    if len(files) > MOST_FILES:
-        raise RigError(f"the camera lists {len(files)} files in one capture, expected {MOST_FILES} at most; look there")
-    found, cubes = [], []
+    """Return the files with the most bytes that each can have; RigError where a file, or all cubes, have more."""
+    found, cubes_bytes = [], 0
     for file in files:
-        most = MOST_TEXT
+        size, most = file.size or 0, MOST_TEXT
         if _RAW.fullmatch(file.base):
             most = claim.frames * claim.frame_bytes + MOST_OFFSET
-            cubes.append(file)
+            cubes_bytes += max(size - MOST_OFFSET, 0)
+            size = max(size, cubes_bytes + MOST_OFFSET)
         elif _REFERENCE.fullmatch(file.base):
             most = MOST_REFERENCE_FRAMES * claim.frame_bytes + MOST_OFFSET
-        _check(file.name, file.size or 0, most)
+        if size > most:
+            raise RigError(
+                f"{file.name}, with the cubes before it, has {size} bytes, expected {most} at most, and nothing of it "
+                "is fetched; look at what the camera wrote, and at camera.samples and the wavelengths in the settings"
+            )
         found.append(replace(file, most=most))
-    if cubes:
-        most = claim.frames * claim.frame_bytes + len(cubes) * MOST_OFFSET
-        _check(f"{cubes[0].name} with the cubes beside it", sum(file.size or 0 for file in cubes), most)
     return found
-
-
-def _check(name: str, size: int, most: int) -> None:
-    if size > most:
-        raise RigError(
-            f"{name} is said to have {size} bytes, expected {most} at most; nothing of it is fetched: look at what the "
-            "camera wrote, and at camera.samples and the wavelengths in the settings"
-        )

@@ -1,3 +1,3 @@
-"""Captures of sweeps on both devices: taken, tied to the mirror's positions and times, and given as a source."""
+"""Captures of sweeps on both devices, with positions and times of their lines, as a source of lines."""
 
-JOURNAL = "captures.jsonl"  # what the rig has acknowledged, beside the files fetched from the camera
+JOURNAL = "captures.jsonl"  # of what the rig has acknowledged, beside the files fetched from the camera

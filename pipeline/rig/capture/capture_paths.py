@@ -1,12 +1,12 @@
-"""Captures of a sweep: what each is called, what the vector memory holds during it, and where its lines lie then.
+"""Captures of a sweep: their names, the vector memory during them, and the positions of their lines.
 
-The records of the positions name the way that was used, and its possible error. Times of lines are the mirror's; the
+A record of positions names the method that gave them, and their possible error. Times of lines are the mirror's; the
 camera stamps its frames in whole microseconds of its own clock.
 
-A capture's prefix says which lines of which sweep it takes, so that a folder tells what it holds.
-``coarse-0_cy-31p5_0p5_96x16x16_0`` is the coarse sweep ``coarse-0``, whose lines lie along y. It is on strip -31.5 px,
-from scan coordinate 0.5 px on, of 96 lines of 16 held positions, binned by 16. The capture begins at its line 0. ``p``
-is the decimal point; a number that takes more room than its bits is ``b`` and those, to base 32.
+A capture's prefix, which begins its folder's name, identifies the lines of the sweep that it takes.
+``coarse-0_cy-31p5_0p5_96x16x16_0`` is the coarse sweep ``coarse-0``, whose lines lie along y. Its swath is at -31.5 px,
+it starts at scan coordinate 0.5 px, and it has 96 lines of 16 held positions, binned by 16. The capture begins at its
+line 0. ``p`` is the decimal point; a number that needs more characters than its bits is ``b`` and those in base 32.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_scene, position_to_direction
 from pipeline.geometry.scan import Axis, Sweep, exposing, line_positions, memory_loads, sweep_positions
 from pipeline.rig.camera.camera_cubes import CapturedLines
-from pipeline.rig.device_settings import Pulses, check_capture
+from pipeline.rig.device_settings import Pulses, check_prefix
 from pipeline.rig.mirror.mirror_controller import wire_positions
 
 Floats = NDArray[Any]  # float64
@@ -34,53 +34,45 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Span = tuple[float, float]  # moments between which a command took effect: sent and acknowledged [s]
 
-_WINDOW = 7  # neighbours that say whether a stamp strayed: up to three strays in a row are seen
-
 
 @dataclass(frozen=True)
 class FrameTimes:
-    """Frame times by the camera; -1 where it says nothing. Lines are in the order in which they were taken."""
+    """Frame times by the camera; -1 where it gives none. Lines are in the order of capture."""
 
     number: Ints  # (line,) frame numbers, the capture's first frame 0
-    stamp_us: Ints  # (line,) by the camera's clock, taken for the exposure's start: its papers do not say which moment
+    stamp_us: Ints  # (line,) by the camera's clock, assumed to be the exposure's start
     exposure_ms: float
     period_ms: float
 
 
 def mend_times(frames: FrameTimes) -> tuple[Ints, Ints, list[str]]:
-    """Return every line a stamp and a number, and say what was done.
+    """Return a stamp and a number for every line, and notes on those that were made up.
 
-    Frames come at a steady rate or later, never sooner. A stamp off its neighbours' by half a period strayed; where all
-    after one are early the clock was set back. Both follow their neighbours then; so do lines without a stamp. A later
-    stamp counts, since a frame may have been dropped.
+    A line without a stamp follows its neighbours at the frame period. A later stamp counts, since a frame may have been
+    dropped. Raises RigError: the stamps go back.
     """
     number, notes = whole_numbers(frames.number)
-    if (number < 0).all():
-        number = np.arange(len(number))
-        notes.append("no line has a frame number: lines are taken for frames in order")
     line = np.arange(len(number))
+    if (number < 0).all():
+        number = line
+        notes.append("no line has a frame number: lines are taken for frames in order")
     number = np.rint(np.interp(line, line[number >= 0], number[number >= 0])).astype(np.int64)
-    period_us = frames.period_ms * 1e3
+    nominal_us = number * frames.period_ms * 1e3
     good = frames.stamp_us >= 0
     if not good.any():
         notes.append("no line has a time stamp: frames are taken to follow their period")
-        return np.rint(number * period_us).astype(np.int64), number, notes
-    origin = int(frames.stamp_us[good][0])
-    late = (frames.stamp_us - origin) - number * period_us  # of frames at the rate that was set
-    good[good] = ~_strayed(late[good], period_us)
+        return np.rint(nominal_us).astype(np.int64), number, notes
     if not good.all():
-        notes.append(f"{np.count_nonzero(~good)} time stamps are missing or stray, and follow their neighbours")
-    back = np.minimum(np.diff(late[good]) + period_us / 2, 0)
-    back = np.where(back < 0, back - period_us / 2, 0)
-    if back.any():
-        notes.append(f"the camera's clock was set back {np.count_nonzero(back)} times, by {-back.sum() / 1e6:.6g} s")
-    mended = late[good] - np.concatenate([[0.0], np.cumsum(back)])
-    whole = np.interp(line, line[good], mended) + number * period_us
-    return origin + np.rint(whole).astype(np.int64), number, notes
+        notes.append(f"{np.count_nonzero(~good)} time stamps are missing, and follow their neighbours")
+    stamps = frames.stamp_us[good]
+    if (np.diff(stamps) < 0).any():
+        raise RigError("the time stamps of its frames go back; was the camera's clock set? Capture again")
+    delay_us = np.interp(line, line[good], (stamps - stamps[0]) - nominal_us[good])
+    return stamps[0] + np.rint(delay_us + nominal_us).astype(np.int64), number, notes
 
 
 def whole_numbers(number: Ints) -> tuple[Ints, list[str]]:
-    """Return the frame numbers and findings; gaps are filled where the lines around them leave no doubt."""
+    """Return the frame numbers and notes; a gap is filled where the numbers around it determine it."""
     filled, notes = number.copy(), []
     known = np.flatnonzero(number >= 0)
     for left, right in pairwise(known.tolist()):
@@ -94,53 +86,42 @@ def whole_numbers(number: Ints) -> tuple[Ints, list[str]]:
     return filled, notes
 
 
-def _strayed(late: Floats, period_us: float) -> Bools:
-    """Return which stamps differ from the median of their neighbours by half a period."""
-    if len(late) < 3:
-        return np.zeros(len(late), np.bool_)
-    window = min(_WINDOW, len(late) - 1 + len(late) % 2)  # odd
-    around = np.lib.stride_tricks.sliding_window_view(np.pad(late, window // 2, mode="edge"), window)
-    strayed: Bools = np.abs(late - np.median(around, axis=1)) > period_us / 2
-    return strayed
-
-
 @dataclass(frozen=True)
 class MirrorScanPath:
-    """Path of the mirror, by its clock: positions that its log measured, or those of a path that it played."""
+    """Path of the mirror by its clock: positions of its log, or of a path that it played."""
 
     time_s: Floats  # (sample,) in order
     position: Floats  # (sample, 2) device X and Y
 
 
 def played_scan_path(position: Floats, rate_hz: float) -> MirrorScanPath:
-    """Return the track of a path: each of the positions (held, 2) held for 1 / ``rate_hz``, one after the other."""
+    """Return the scan path of positions (held, 2) that are each held for 1 / ``rate_hz``, one after the other."""
     ends = np.repeat(np.arange(len(position) + 1), 2)[1:-1] / rate_hz
     return MirrorScanPath(ends, np.repeat(position, 2, axis=0))
 
 
 @dataclass(frozen=True)
 class LinePositions:
-    """Mirror positions of lines, and how they were found. NaN where ``valid`` is False."""
+    """Mirror positions of lines, and the method that gave them. NaN where ``valid`` is False."""
 
     position: Floats  # (line, 2) device X and Y at mid exposure
     valid: Bools  # (line,)
     method: Literal["trigger", "log", "command"]
-    residual_us: float | None  # half of what is not known of the commands' times; None where nothing measures it
+    residual_us: float | None  # half of the uncertainty of the commands' times; None where it is not measured
     residual_px: float | None  # the same on the scene, at the mirror's speed
-    offset_s: float | None = None  # of the first frame on the track
+    offset_s: float | None = None  # of the first frame on the scan path
     notes: tuple[str, ...] = ()
 
 
 def lines_by_trigger(frames: FrameTimes, positions: Floats, *, index_at_end: int | None = None) -> LinePositions:
-    """Take the position that each frame's trigger played: one vector index a frame, whatever the clocks say.
+    """Return the position that each frame's trigger played: one vector index per frame.
 
     ``positions`` (held, 2) are those of the path. ``index_at_end``, the vector index read after the capture, shows
-    whether frames were lost without a trace. RigError where the mirror counted other triggers than the camera frames,
-    or the camera numbers no frame.
+    whether frames are missing. Raises RigError: the counts of triggers and frames differ, or no frame has a number.
     """
     number, notes = whole_numbers(frames.number)
     if not (number >= 0).any():
-        raise RigError("no line has a frame number, so which trigger each belongs to is not known; fetch frameIndex")
+        raise RigError("no line has a frame number, so its trigger is not known; fetch frameIndex")
     if index_at_end is not None and index_at_end != number.max():
         raise RigError(
             f"the mirror counted {index_at_end + 1} triggers, the camera's last frame is number "
@@ -165,11 +146,11 @@ def lines_by_time(
     capture_s: Span,
     method: Literal["log", "command"],
 ) -> LinePositions:
-    """Take the track's position at mid exposure of each line, counted from the commands' times.
+    """Return the scan path's position at mid exposure of each line, by the times of the commands.
 
-    ``began_s`` is when the log or the path began, ``capture_s`` when the capture did, by one clock. The time between a
-    command and the first frame is unknown. A constant offset of the lines stays, for registration of sweeps that go
-    both ways. A stamp that goes back or is missing is made up from its neighbours.
+    ``began_s`` spans the start of the log or path, ``capture_s`` that of the capture, by one clock. The delay between a
+    command and the first frame is unknown, so a constant offset of the lines remains; registration corrects it. Raises
+    RigError: the stamps go back.
     """
     stamp, number, notes = mend_times(frames)
     first_s = float(np.mean(capture_s) - np.mean(began_s)) + float(scan_path.time_s[0])
@@ -177,11 +158,11 @@ def lines_by_time(
     middle_s = exposed_s + frames.exposure_ms * 1e-3 / 2
     valid = (middle_s >= scan_path.time_s[0]) & (middle_s <= scan_path.time_s[-1])
     if not valid.all():
-        notes.append(f"{np.count_nonzero(~valid)} of {len(valid)} lines lie outside of the {method}'s time")
+        notes.append(f"outside of the {method}'s time: {np.count_nonzero(~valid)} of {len(valid)} lines")
     found = np.where(valid[:, None], _at(scan_path, middle_s), np.nan)
     unknown_s = float(np.ptp(began_s) + np.ptp(capture_s)) / 2
     px = _apart_px(scan_path, camera, (middle_s[valid], middle_s[valid] + unknown_s))
-    notes.append(f"software timing: a constant line offset of about {px:.2g} px stays")
+    notes.append(f"software timing: a constant line offset of about {px:.2g} px remains")
     return LinePositions(found, valid, method, unknown_s * 1e6, px, first_s, tuple(notes))
 
 
@@ -198,8 +179,8 @@ def _apart_px(scan_path: MirrorScanPath, camera: LineCamera, times: tuple[Floats
     return float(np.sqrt(np.mean(np.sum((one - other) ** 2, axis=-1))) / camera.ifov_rad)
 
 
-LEAD = 1  # cells before the first line's: a unit that waits for edges takes its first cell at the run command, assumed
-REFERENCES = "references"  # prefix of a capture that is made for the dark and white frames in its folder
+LEAD = 1  # cells before the first line's: a triggered unit plays its first cell at the run command, assumed
+REFERENCES = "references"  # prefix of a capture for the dark and white frames in its folder
 _LONGEST = 14  # b and 64 bits
 _NUMBER = r"(-?\d+(?:p\d+)?|b[0-9a-v]{13})"
 _FORM = re.compile(rf"(.+)_([cf])([xy]){_NUMBER}_{_NUMBER}_(\d+)x(\d+)x(\d+)(?:x(\d+))?_(\d+)", re.DOTALL)
@@ -208,7 +189,7 @@ _KINDS: dict[str, Literal["coarse", "fine"]] = {"c": "coarse", "f": "fine"}
 
 @dataclass(frozen=True)
 class Announced:
-    """A sweep, and its line that a capture's first frame takes."""
+    """A sweep, and the line of it that a capture's first frame takes."""
 
     sweep: Sweep
     first: int
@@ -217,17 +198,17 @@ class Announced:
 def capture_prefix(sweep: Sweep, first: int = 0) -> str:
     """Return the prefix of a capture of a sweep's lines from ``first`` on.
 
-    SettingsError where the sweep's name holds what a folder's name must not, or is too long.
+    Raises SettingsError: the sweep's name is too long, or cannot be part of a folder's name.
     """
     sizes = f"{sweep.lines}x{sweep.step}x{sweep.binning}" + ("" if sweep.held is None else f"x{sweep.held}")
     place = f"{sweep.kind[0]}{sweep.along}{_written(sweep.swath_px)}_{_written(sweep.start_px)}"
     prefix = f"{sweep.name}_{place}_{sizes}_{first}"
-    check_capture(0, 0, prefix)
+    check_prefix(prefix)
     return prefix
 
 
 def announced(prefix: str) -> Announced | None:
-    """Read a capture's prefix; None where it announces no sweep."""
+    """Return the sweep of a capture's prefix; None where it names none."""
     found = _FORM.fullmatch(prefix)
     if found is None:
         return None
@@ -256,10 +237,7 @@ def _number(text: str) -> float:
 
 @dataclass(frozen=True)
 class CapturePath:
-    """Lines ``first`` to ``stop`` of a sweep, and the positions that are held for them.
-
-    Positions are those of the plan, rounded to float32 as they go over the wire.
-    """
+    """Lines ``first`` to ``stop`` of a sweep, and the positions held for them: those of the plan, as float32."""
 
     sweep: Sweep
     first: int
@@ -267,7 +245,7 @@ class CapturePath:
     cells: NDArray[np.float32]  # (lead + held, 2)
     middle: NDArray[np.float32]  # (line, 2) at mid exposure
     rate_hz: float  # of cells, for a path that no edge drives
-    triggered: bool  # by one edge a cell; then the first line's first position is held twice
+    triggered: bool  # one edge per cell; then the first line's first position is held twice
 
     @property
     def lines(self) -> int:
@@ -275,18 +253,15 @@ class CapturePath:
         return self.stop - self.first
 
     def frames_at(self, index: int) -> int | None:
-        """Return how many frames had their edges counted, where the cell ``index`` was played last.
-
-        None within a line.
-        """
+        """Return the number of complete frames where cell ``index`` played last; None within a line."""
         frames, rest = divmod(index + 1 - LEAD, self.sweep.positions)
         return None if rest else frames
 
 
 def next_path(sweep: Sweep, first: int, camera: LineCamera, *, vector_pairs: int, triggered: bool) -> CapturePath:
-    """Return the path of the sweep's lines from ``first`` on, as many as the vector memory takes.
+    """Return the path of as many of the sweep's lines from ``first`` on as the vector memory holds.
 
-    SettingsError where the positions of one line do not fit the memory, PoseError where one is beyond the disk.
+    Raises SettingsError: the positions of one line do not fit the memory. Raises PoseError: one is beyond the disk.
     """
     if vector_pairs <= LEAD:
         raise SettingsError(f"a vector memory of {vector_pairs} pairs holds no line; expected more than {LEAD}")
@@ -296,7 +271,7 @@ def next_path(sweep: Sweep, first: int, camera: LineCamera, *, vector_pairs: int
 
 
 def path_of(sweep: Sweep, lines: tuple[int, int], camera: LineCamera, *, triggered: bool) -> CapturePath:
-    """Return the path of some of the sweep's lines; PoseError where a position is beyond the mirror's disk."""
+    """Return the path of some of the sweep's lines; PoseError where a position is beyond the disk."""
     held: NDArray[Any] = sweep_positions(sweep, camera)[slice(*lines)].reshape(-1, 2)
     lead = held[:LEAD] if triggered else held[:0]
     cells, middle = (
@@ -307,7 +282,7 @@ def path_of(sweep: Sweep, lines: tuple[int, int], camera: LineCamera, *, trigger
 
 
 def can_trigger(pulses: Pulses, sweep: Sweep) -> bool:
-    """Return whether the pulses at the mirror's input step through this sweep: one a position is needed."""
+    """Return whether the pulses at the mirror's input step through this sweep: it needs one per position."""
     return pulses == "position" or (pulses == "frame" and sweep.positions == 1)
 
 
@@ -322,14 +297,14 @@ class CaptureRecord:
     triggered: bool
     run_s: tuple[float, float]  # sent and acknowledged, by the drivers' clock
     capture_s: tuple[float, float]
-    index_at_end: int | None = None  # cell of the path that was played last
+    index_at_end: int | None = None  # cell of the path that played last
     log: LoggedPath | None = None
-    spent: str = ""  # why no line is to be had from it any more
+    spent: str = ""  # why it gives no further line; empty where it may
 
 
 @dataclass(frozen=True)
 class LoggedPath:
-    """A log of measured positions that is kept beside the files: (sample, 2) big-endian float32."""
+    """A log of measured positions beside the fetched files: (sample, 2) big-endian float32."""
 
     name: str
     rate_hz: float
@@ -338,54 +313,54 @@ class LoggedPath:
     crc32: int
 
 
-class UntiedError(RigError):
-    """A capture from which no line, or no further one, is to be had: it is taken again."""
+class UnusableCaptureError(RigError):
+    """A capture gives no line, or no further one, and is taken again."""
 
 
 @dataclass(frozen=True)
-class PlacedLines:
-    """A capture's lines by their order in the sweep."""
+class LocatedLines:
+    """A capture's lines, in the order of the sweep."""
 
     row: NDArray[np.int64]  # (line,) of the captured values; -1 of a line that the camera dropped
-    tied: LinePositions  # by row
-    stamp_us: NDArray[np.int64]  # (row,) by the camera's clock; -1 where it says nothing
+    positions: LinePositions  # by row
+    stamp_us: NDArray[np.int64]  # (row,) by the camera's clock; -1 where it gives none
 
     def is_valid(self, line: int) -> bool:
-        """Return whether a line, counted from the capture's first, is there with its position."""
+        """Return whether a line, counted from the capture's first, was captured and has a position."""
         row = int(self.row[line])
-        return row >= 0 and bool(self.tied.valid[row])
+        return row >= 0 and bool(self.positions.valid[row])
 
 
-def place_lines(
+def locate_lines(
     captured: CapturedLines,
     path: CapturePath,
     taken: CaptureRecord,
     camera: LineCamera,
     scan_path: MirrorScanPath | None,
-) -> PlacedLines:
-    """Return each line of the path its row of the capture, up to the last one that is there whole.
+) -> LocatedLines:
+    """Return the row and position of each line of the path, up to the last complete one.
 
-    UntiedError where nothing, or what contradicts itself, ties frames to the mirror.
+    Raises UnusableCaptureError: frames cannot be assigned to mirror positions without contradiction.
     """
     held = int(np.flatnonzero(captured.valid)[-1]) + 1
-    number = captured.times.frame[:held]  # from the capture's start; rows in order if none is given or can be missing
+    number = captured.times.frame[:held]
     if (number >= 0).any():
         number = np.where(number >= 0, number - captured.first_frame, -1)
-    elif len(captured.values) == path.lines:
+    elif len(captured.values) == path.lines:  # no number, and no line is missing
         number = np.arange(held)
     exposed = exposing(camera, path.sweep)
     frames = FrameTimes(number, captured.times.stamp_us[:held], exposed.exposure_ms, exposed.frame_ms)
     try:
-        tied = _tied(frames, path, taken, camera, scan_path, total=len(captured.values))
+        tied = _positions(frames, path, taken, camera, scan_path, total=len(captured.values))
     except RigError as error:
-        raise UntiedError(f"{taken.folder}: {error}") from error
+        raise UnusableCaptureError(f"{taken.folder}: {error}") from error
     row = np.full(min(int(number.max()) + 1, path.lines), -1, np.int64)
     rows = np.flatnonzero(captured.valid[:held] & (number >= 0) & (number < path.lines))
     row[number[rows]] = rows
-    return PlacedLines(row, tied, frames.stamp_us)
+    return LocatedLines(row, tied, frames.stamp_us)
 
 
-def _tied(
+def _positions(
     frames: FrameTimes,
     path: CapturePath,
     taken: CaptureRecord,
@@ -394,21 +369,19 @@ def _tied(
     *,
     total: int,
 ) -> LinePositions:
-    """Return the positions by the edges that stepped the mirror, else by its log, else by the commands' times."""
+    """Return the positions of lines by trigger edges, else by the mirror's log, else by the commands' times."""
     if taken.triggered:
         counted = None if taken.index_at_end is None else path.frames_at(taken.index_at_end)
         taken_in_all = max(total, int(frames.number.max()) + 1)
         if taken.index_at_end is not None and counted != taken_in_all:
             raise RigError(
                 f"the mirror stands at cell {taken.index_at_end} of its path, after {taken_in_all} frames cell "
-                f"{taken_in_all * path.sweep.positions} was expected: edges were lost, or are not one a position (see "
-                f"pulses in [rig])"
+                f"{taken_in_all * path.sweep.positions} was expected: edges were lost, or are not one per position "
+                "(see pulses in [rig])"
             )
         last = None if counted is None else int(frames.number.max())
         return lines_by_trigger(frames, path.middle.astype(np.float64), index_at_end=last)
-    if (
-        scan_path is not None and taken.log is not None and len(scan_path.position) > 1
-    ):  # then it was begun before the capture
+    if scan_path is not None and taken.log is not None and len(scan_path.position) > 1:
         began_s = (taken.log.started_s - taken.log.start_error_s, taken.log.started_s)
         return lines_by_time(frames, camera, scan_path, began_s, taken.capture_s, "log")
     played = played_scan_path(path.cells.astype(np.float64), path.rate_hz)

@@ -1,10 +1,9 @@
-"""One capture after the other on a rig: path up, mirror to its start, both begun in order, and the end taken down.
+"""Captures on a rig, one after the other, and the journal of what the rig has acknowledged.
 
-The journal says what the rig has acknowledged of a stage's captures, one JSON object a line beside the files fetched
-from the camera. A process that is killed leaves it behind. The next one reads there which folder on the camera holds
-which lines. Lines that the rig acknowledged are not captured twice. Each line has a checksum. A torn line counts as not
-written, and so does one that has changed since. A capture whose end is missing then is not continued: the mirror may
-stand elsewhere now.
+The journal has one JSON object per line, with a checksum, beside the files fetched from the camera. After a killed
+process the next one reads there which folder on the camera holds which lines, and does not capture those again. A torn
+or changed line counts as not written. A capture whose end is missing then is not continued, since the mirror may have
+moved.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import logging
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -32,39 +31,35 @@ from pipeline.rig.capture.capture_paths import (
     LinePositions,
     LoggedPath,
     MirrorScanPath,
-    UntiedError,
+    UnusableCaptureError,
     capture_prefix,
 )
 from pipeline.rig.device_settings import SurveyRig
-from pipeline.rig.drivers import CameraDriver, MirrorDriver
+from pipeline.rig.drivers import RigDevices
 from pipeline.rig.mirror.mirror_controller import MotionLog
 from pipeline.rig.mirror.pro_mode import Trigger
-from pipeline.rig.transports import Clock
 from pipeline.source import AT_REST
 
 LOG = logging.getLogger(__name__)
-_TIE_POINTS = ("method", "residual_us", "residual_px", "offset_s")
+_HOW = ("method", "residual_us", "residual_px", "offset_s")
 SLACK_S = 5.0  # by which a capture may take longer than its frames
 WRITING_S = 120.0  # that a camera may keep writing what it has after a stop
 POLL_S = 0.05
 _CELL = np.dtype(">f4")
 
-Say = Callable[[str], None]  # what the rig is at, in a few words
+Say = Callable[[str], None]  # takes the present step in a few words
 
 
 class CaptureJournal:
-    """Records in ``kept``, read once and added to.
-
-    ``references`` is the folder that holds dark and white frames, ``damage`` which lines of the journal are damaged.
-    """
+    """Records in ``kept``, read once and appended to; ``damage`` names the damaged lines of the journal."""
 
     def __init__(self, kept: Kept) -> None:
         self._kept = kept
         self._taken: dict[str, CaptureRecord] = {}
         self._origins: dict[str, int] = {}  # stamp of line 0 [us], by the sweep's name
-        self._tie_points: dict[str, dict[str, Any]] = {}
+        self._positions: dict[str, dict[str, Any]] = {}
         self._ended: set[str] = set()  # folders
-        self.references: dict[float | None, str] = {}  # folders by the exposure that sweeps have of their own
+        self.references: dict[float | None, str] = {}  # folders of dark and white frames, by a sweep's own exposure
         self.damage: list[str] = []
         self._read()
 
@@ -73,43 +68,43 @@ class CaptureJournal:
         fits = [one for one in self._taken.values() if one.sweep == sweep and one.first <= line < one.stop]
         return next((one for one in reversed(fits) if not one.spent), None)
 
-    def began(self, taken: CaptureRecord) -> None:
-        """Take down a capture that the camera acknowledged."""
+    def record_capture(self, taken: CaptureRecord) -> None:
+        """Record a capture that the camera acknowledged."""
         self._write({"what": "capture", **asdict(taken)})
 
-    def ended(self, taken: CaptureRecord) -> CaptureRecord:
-        """Take down what was read of the mirror after the capture."""
+    def record_end(self, taken: CaptureRecord) -> CaptureRecord:
+        """Record what was read from the mirror after the capture."""
         ended = {"folder": taken.folder, "index_at_end": taken.index_at_end}
         self._write({"what": "end", **ended, "log": None if taken.log is None else asdict(taken.log)})
         return self._taken[taken.folder]
 
-    def spend(self, taken: CaptureRecord, why: str) -> None:
-        """Expect no further line of a capture."""
+    def record_spent(self, taken: CaptureRecord, why: str) -> None:
+        """Record that a capture gives no further line."""
         self._write({"what": "spent", "folder": taken.folder, "why": why})
 
-    def tied(self, taken: CaptureRecord, how: LinePositions, notes: Sequence[str]) -> None:
-        """Take down how a capture's lines were tied to the mirror, once."""
-        if taken.folder not in self._tie_points:
-            said = {name: getattr(how, name) for name in _TIE_POINTS}
-            self._write({"what": "tied", "folder": taken.folder, **said, "notes": [*notes, *how.notes]})
+    def record_positions(self, taken: CaptureRecord, how: LinePositions, notes: Sequence[str]) -> None:
+        """Record once how a capture's lines got their positions."""
+        if taken.folder not in self._positions:
+            values = {name: getattr(how, name) for name in _HOW}
+            self._write({"what": "tied", "folder": taken.folder, **values, "notes": [*notes, *how.notes]})
 
     @property
     def captures(self) -> list[dict[str, Any]]:
-        """Every capture in order: lines of which sweep, where on the camera, how they were tied, why none is left."""
+        """Return every capture in order: sweep, lines, folder on the camera, method of positions, why it is spent."""
         return [
             {"folder": one.folder, "sweep": one.sweep.name, "first": one.first, "stop": one.stop}
-            | self._tie_points.get(one.folder, {})
+            | self._positions.get(one.folder, {})
             | ({"spent": one.spent} if one.spent else {})
             for one in self._taken.values()
         ]
 
-    def refer(self, folder: str, exposure_ms: float | None = None) -> None:
-        """Take down where the dark and white frames of an exposure are; None is the camera's own."""
-        told = {} if exposure_ms is None else {"exposure_ms": exposure_ms}
-        self._write({"what": "references", "folder": folder, **told})
+    def record_references(self, folder: str, exposure_ms: float | None = None) -> None:
+        """Record the folder of the dark and white frames of an exposure; None is the camera's own."""
+        exposure = {} if exposure_ms is None else {"exposure_ms": exposure_ms}
+        self._write({"what": "references", "folder": folder, **exposure})
 
     def origin_us(self, sweep: Sweep, stamp_us: int | None = None) -> int | None:
-        """Stamp of the sweep's line 0, taken down when it is first given."""
+        """Return the stamp of the sweep's line 0; the first one given is recorded."""
         if stamp_us is not None and sweep.name not in self._origins:
             self._write({"what": "origin", "sweep": sweep.name, "stamp_us": stamp_us})
         return self._origins.get(sweep.name)
@@ -118,17 +113,17 @@ class CaptureJournal:
         for line in read_checked(self._kept.read(JOURNAL, 0, self._kept.size(JOURNAL))):
             if line.state == "torn":
                 continue
-            why = "it has changed since it was written" if line.content is None else ""
+            if line.content is None:
+                self.damage.append(f"line {line.number} of {JOURNAL} is ignored: it has changed since it was written")
+                continue
             try:
-                self._follow(line.content or {})
+                self._follow(line.content)
             except (LookupError, TypeError, ValueError):
-                why = why or "what it adds to is not there"
-            if why:
-                self.damage.append(f"line {line.number} of {JOURNAL} counts for nothing: {why}")
+                self.damage.append(f"line {line.number} of {JOURNAL} is ignored: the line that it refers to is missing")
         if self.damage:
             LOG.warning("%s", "; ".join(self.damage))
             for folder in self._taken.keys() - self._ended:
-                self._taken[folder] = replace(self._taken[folder], spent="its end may be what the journal has lost")
+                self._taken[folder] = replace(self._taken[folder], spent="its end may be in a damaged line")
 
     def _write(self, record: dict[str, Any]) -> None:
         text = json.dumps(record).encode()
@@ -140,8 +135,8 @@ class CaptureJournal:
     def _follow(self, record: dict[str, Any]) -> None:
         match record["what"]:
             case "capture":
-                self._taken.pop(record["folder"], None)  # a camera that was emptied gives its folders' names again
-                self._tie_points.pop(record["folder"], None)
+                self._taken.pop(record["folder"], None)  # an emptied camera uses the names of its folders again
+                self._positions.pop(record["folder"], None)
                 self._ended.discard(record["folder"])
                 self._taken[record["folder"]] = CaptureRecord(
                     Sweep(**record["sweep"]),
@@ -160,7 +155,7 @@ class CaptureJournal:
             case "spent":
                 self._taken[record["folder"]] = replace(self._taken[record["folder"]], spent=record["why"])
             case "tied":
-                self._tie_points[record["folder"]] = {name: record[name] for name in (*_TIE_POINTS, "notes")}
+                self._positions[record["folder"]] = {name: record[name] for name in (*_HOW, "notes")}
             case "references":
                 self.references[record.get("exposure_ms")] = record["folder"]
             case "origin":
@@ -171,25 +166,8 @@ def say_nothing(words: str) -> None:
     """Report no progress of the rig."""
 
 
-@dataclass(frozen=True)
-class RigDevices:
-    """Both devices, connected, and the clock that their drivers go by."""
-
-    steering: MirrorDriver
-    camera: CameraDriver
-    clock: Clock
-
-    def close(self) -> None:
-        """Close both devices, whatever either raises."""
-        for device in (self.steering, self.camera):
-            try:
-                device.close()
-            except RigError as error:
-                LOG.warning("while letting go of the rig: %s", error)
-
-
 class CaptureRunner:
-    """Runs captures on devices that are connected, and takes down what they acknowledge."""
+    """Runs captures on connected devices, and records what they acknowledge."""
 
     def __init__(
         self,
@@ -204,13 +182,13 @@ class CaptureRunner:
         self.devices = devices
         self._kept, self._journal = kept, journal
         self._camera, self._rig, self._say = camera, rig, say
-        self._times_ms: tuple[float, float] | None = None  # that the camera was told: exposure and frame period
+        self._times_ms: tuple[float, float] | None = None  # exposure and frame period that the camera has
 
     def take(self, path: CapturePath) -> CaptureRecord:
         """Take the lines of a path, and wait until they are on the camera.
 
-        Motions and the capture are sent once. If anything fails after the mirror or the camera has begun, both are told
-        to stop.
+        Motions and the capture are sent once. If anything fails after the mirror or the camera has begun, both are
+        stopped.
         """
         steering, prefix = self.devices.steering, capture_prefix(path.sweep, path.first)
         exposed = exposing(self._camera, path.sweep)
@@ -224,24 +202,24 @@ class CaptureRunner:
                 capture = self.devices.camera.capture(path.lines, prefix=prefix)
             else:
                 most_hz = (self._rig.log_samples - 1) / (exposed.scan_seconds(path.lines) + SLACK_S)
-                steering.start_log(min(self._rig.log_rate_hz, most_hz))  # so that it holds the whole capture
+                steering.start_log(min(self._rig.log_rate_hz, most_hz))  # it must hold the whole capture
                 capture = self.devices.camera.capture(path.lines, prefix=prefix)
                 run_s = self._run(path)
             at_s = (capture.sent_s, capture.acknowledged_s)
             taken = CaptureRecord(path.sweep, path.first, path.stop, capture.folder, path.triggered, run_s, at_s)
-            self._journal.began(taken)
+            self._journal.record_capture(taken)
             self.wait(taken)
         if taken.triggered:
             taken = replace(taken, index_at_end=steering.index())
         else:
             taken = replace(taken, log=self._keep_log(taken.folder, steering.read_log()))
         steering.halt()
-        return self._journal.ended(taken)
+        return self._journal.record_end(taken)
 
     def wait(self, taken: CaptureRecord) -> None:
-        """Wait until a capture is over; one that takes too long is stopped, and what it has counts.
+        """Wait until a capture is over; one that takes too long is stopped, and its frames count.
 
-        RigError where it does not end, though it was told to.
+        Raises RigError: it does not end after the stop.
         """
         camera, clock = self.devices.camera, self.devices.clock
         began, wanted = clock.now(), exposing(self._camera, taken.sweep).scan_seconds(taken.stop - taken.first)
@@ -251,8 +229,8 @@ class CaptureRunner:
             if clock.now() >= until:
                 if stopped:
                     raise RigError(
-                        f"the camera still captures {taken.folder}, {WRITING_S:g} s after it was told to stop; see "
-                        "what it does, then run again: what it has is fetched then"
+                        f"the camera still captures {taken.folder}, {WRITING_S:g} s after it was stopped; look at the "
+                        "camera, then run again, which fetches what it has"
                     )
                 LOG.warning("the capture %s takes too long and is stopped", taken.folder)
                 camera.stop()
@@ -260,14 +238,14 @@ class CaptureRunner:
             clock.sleep(min(max(began + wanted - clock.now(), POLL_S), 1.0))
 
     def recovered(self, taken: CaptureRecord) -> CaptureRecord:
-        """Take down the end of a capture whose process did not live to see it; nothing has played since."""
+        """Record the end of a capture whose process was killed before it; nothing has played since."""
         self.wait(taken)
         if not taken.triggered or taken.index_at_end is not None:
             return taken
-        return self._journal.ended(replace(taken, index_at_end=self.devices.steering.index()))
+        return self._journal.record_end(replace(taken, index_at_end=self.devices.steering.index()))
 
     def capture_at_rest(self, prefix: str, exposure_ms: float | None = None) -> str:
-        """Take one frame with the mirror at 0; 0 (unless the settings say otherwise), and give its folder.
+        """Take one frame with the mirror at 0; 0 (if ``white_at_rest``), and return its folder.
 
         ``exposure_ms`` is the camera's own where it is None.
         """
@@ -283,19 +261,19 @@ class CaptureRunner:
         return capture.folder
 
     def log_of(self, taken: CaptureRecord) -> MirrorScanPath | None:
-        """Read the mirror's log of a capture; None where there is none, UntiedError where it has changed."""
+        """Return the mirror's log of a capture; None without one, UnusableCaptureError where it has changed."""
         if taken.log is None:
             return None
         log = self._kept.read(taken.log.name, 0, self._kept.size(taken.log.name))
         if zlib.crc32(log) != taken.log.crc32:
-            raise UntiedError(f"the mirror's log that is kept as {taken.log.name} has changed (its CRC-32 differs)")
+            raise UnusableCaptureError(f"the mirror's log {taken.log.name} has changed (its CRC-32 differs)")
         position = np.frombuffer(log, _CELL).reshape(-1, 2).astype(np.float64)
         return MirrorScanPath(np.arange(len(position)) / taken.log.rate_hz, position)
 
     def _configure(self, camera: LineCamera) -> None:
         times_ms = camera.exposure_ms, camera.frame_ms
         if times_ms != self._times_ms:
-            self._times_ms = None  # unknown, should it not answer
+            self._times_ms = None  # unknown if the camera does not answer
             self.devices.camera.configure(*times_ms)
         self._times_ms = times_ms
 
@@ -306,7 +284,7 @@ class CaptureRunner:
         return sent, clock.now()
 
     def _keep_log(self, folder: str, log: MotionLog) -> LoggedPath:
-        """Keep a log by a name of its own: a camera that was emptied gives its folders' names again."""
+        """Keep a log by a new name, since an emptied camera uses the names of its folders again."""
         names = (f"{folder}/mirror_log" + (f"-{number}" if number > 1 else "") for number in itertools.count(1))
         name = next(one for one in names if not self._kept.size(one))
         position = log.position.astype(_CELL).tobytes()

@@ -1,13 +1,11 @@
-"""The rig as a source of lines: a sweep's positions go to the mirror, captures to the camera, and lines come back.
+"""The rig as a source of lines: mirror and camera take a sweep in captures, and its lines come back in order.
 
-A sweep is taken in captures, each of as many lines as the mirror's vector memory holds positions for. Each capture's
-files are fetched, and its lines tied to the mirror, summed over neighbours as the sweep wants, and given in order. A
-line's position is the one sent to the mirror at mid exposure where pulses step it, as the wire has it (float32).
-Without them it is the one that the mirror's log measured. Time is by the camera's own stamps, to a microsecond.
+Each capture has as many lines as the mirror's vector memory holds positions for. Its files are fetched, its lines get
+their positions, and their samples are binned. With pulses a line's position is the one sent to the mirror at mid
+exposure (float32), without them the one that the mirror's log measured. Time is by the camera's stamps, in us.
 
-Over an emulated rig lines are those of its simulated source, bit for bit, in however many captures. Their noise is
-keyed by the sweep's name and the line's number, which name the captures, too. Times differ where a load falls amid a
-sweep: the simulated one continues, a rig has to stop for it.
+An emulated rig gives the lines of its simulated source, bit for bit, in any number of captures. Times differ where the
+vector memory is loaded in the middle of a sweep, since a rig stops for it.
 
 A journal beside the fetched files records all that the rig has acknowledged. A later call with the same ``kept``
 continues a transfer where it broke off, and captures only what the camera does not have.
@@ -34,21 +32,21 @@ from pipeline.rig.camera.camera_files import NOT_LOGGED_IN, Kept
 from pipeline.rig.capture.capture_paths import (
     REFERENCES,
     CaptureRecord,
-    UntiedError,
+    UnusableCaptureError,
     can_trigger,
+    locate_lines,
     next_path,
     path_of,
-    place_lines,
 )
-from pipeline.rig.capture.capture_runner import CaptureJournal, CaptureRunner, RigDevices, Say, say_nothing
+from pipeline.rig.capture.capture_runner import CaptureJournal, CaptureRunner, Say, say_nothing
 from pipeline.rig.device_settings import SurveyRig
-from pipeline.rig.drivers import FrameClaim
+from pipeline.rig.drivers import FrameClaim, RigDevices
 from pipeline.rig.transports import DeviceRefused, StateUnknown
 from pipeline.simulator.simulated import check_binning
 from pipeline.source import Line, References
 
 LOG = logging.getLogger(__name__)
-BARREN = 2  # captures in a row without a line that end a sweep
+BARREN = 2  # captures in a row without a line, after which a sweep fails
 
 
 class RigSource:
@@ -57,17 +55,15 @@ class RigSource:
     Parameters
     ----------
     camera, wavelength_nm, field_shape
-        What is known of a look before it is taken: the camera, as the settings have it, (band,) centres [nm] and (y, x)
-        size of the field [px].
+        The camera of the settings, (band,) centres [nm] and (y, x) size of the field [px].
     open_devices
         Connects both; they are closed when a session, or a call outside of one, ends.
     kept
-        Where the camera's files and the journal go. With that of an earlier process its captures are continued.
+        Store of the camera's files and the journal. The store of an earlier process continues its captures.
     vector_pairs
         Positions that the mirror's memory holds.
     say
-        Called with what the rig is at, in a few words, while no line comes: a path goes up, lines are captured, files
-        are fetched.
+        Called with the present step in a few words while no line comes: upload, capture or transfer.
     """
 
     name = "rig"
@@ -89,22 +85,22 @@ class RigSource:
         self.vector_pairs = vector_pairs
         self._open, self._kept, self._say = open_devices, kept, say
         self._journal = CaptureJournal(kept)
-        self._unknown: list[str] = []  # why the rig's state is unknown; shared by all that are made from this one
+        self._unknown: list[str] = []  # why the rig's state is unknown; shared by all copies of this source
         self._runner: CaptureRunner | None = None
-        self._whole: dict[str, tuple[References, tuple[str, ...]]] = {}  # of all samples, and notes, by folder
+        self._whole: dict[str, tuple[References, tuple[str, ...]]] = {}  # of all samples, with notes, by folder
 
     @property
     def record(self) -> dict[str, Any]:
-        """Return what captures with this ``kept`` were like: how lines were tied to the mirror, by which settings."""
-        told: dict[str, Any] = {
+        """Return settings and captures of this ``kept``, with the method of the lines' positions."""
+        rig: dict[str, Any] = {
             name: getattr(self.rig, name) for name in ("pulses", "ends", "read_back", "strict_crc", "provenance")
         }
         if self.rig.mounting != STRAIGHT:
-            told["mounting"] = asdict(self.rig.mounting)
+            rig["mounting"] = asdict(self.rig.mounting)
         found = [self._whole[folder][1] for folder in self._journal.references.values() if folder in self._whole]
         notes = dict.fromkeys(note for some in found for note in some)
         damage = {"journal": self._journal.damage} if self._journal.damage else {}
-        return {"rig": told, "references": list(notes), "captures": self._journal.captures, **damage}
+        return {"rig": rig, "references": list(notes), "captures": self._journal.captures, **damage}
 
     def keeping(self, kept: Kept) -> RigSource:
         """Return the same source with its files elsewhere."""
@@ -113,23 +109,23 @@ class RigSource:
         return other
 
     def saying(self, say: Say) -> RigSource:
-        """Return the same source with a report of what the rig is at."""
+        """Return the same source with another report of the present step."""
         other = copy(self)
         other._say, other._runner = say, None
         return other
 
     @contextmanager
     def session(self) -> Iterator[CaptureRunner]:
-        """Hold on to the devices over several calls; inner sessions share them.
+        """Keep the devices open over several calls; inner sessions share them.
 
-        Raises DeviceGone, DeadlinePassed or RigError where a device is missing or another one is there. Raises
-        StateUnknown where the last order of an earlier session was not acknowledged; this process repeats no order.
+        Raises DeviceGone, DeadlinePassed or RigError where a device is missing or another one answers. Raises
+        StateUnknown where a motion or capture of an earlier session was not acknowledged.
         """
         if self._runner is not None:
             yield self._runner
             return
         if self._unknown:
-            raise StateUnknown(f"nothing more is sent to the rig: {self._unknown[0]}; look at it, then run again")
+            raise StateUnknown(f"the rig gets no further command: {self._unknown[0]}; look at it, then run again")
         devices = self._open()
         try:
             self._runner = CaptureRunner(devices, self._kept, self._journal, self.camera, self.rig, say=self._say)
@@ -144,10 +140,9 @@ class RigSource:
     def lines(self, sweep: Sweep, first: int = 0) -> Iterator[Line]:
         """Yield the sweep's lines one by one, from line ``first`` on.
 
-        Raises ShapeError where sums of ``sweep.binning`` samples at full scale do not fit uint16; PoseError where a
-        position of the sweep is out of the mirror's reach; StateUnknown where a motion or a capture was sent and not
-        acknowledged; RigError where a device failed, or what it sent does not fit: lines given so far, and captures
-        acknowledged, stay.
+        Raises ShapeError: sums of ``sweep.binning`` samples may exceed uint16. Raises PoseError: a position is beyond
+        the mirror's reach. Raises StateUnknown: a motion or a capture was sent and not acknowledged. Raises RigError: a
+        device failed, or its answer does not fit; earlier lines and acknowledged captures stay.
         """
         check_binning(sweep, self.camera)
         if first >= sweep.lines:
@@ -155,7 +150,7 @@ class RigSource:
         line, barren = first, 0
         with self.session() as runner:
             while line < sweep.lines:
-                before, why = line, "its files end there"
+                before, reason = line, "its files end there"
                 held = self._journal.holding(sweep, line)
                 if held is None:
                     triggered = can_trigger(self.rig.pulses, sweep)
@@ -167,25 +162,25 @@ class RigSource:
                     for found in self._read(runner, taken, line):
                         yield found
                         line += 1
-                except (UntiedError, DeviceRefused) as error:
+                except (UnusableCaptureError, DeviceRefused) as error:
                     if isinstance(error, DeviceRefused) and error.code == NOT_LOGGED_IN:
-                        raise  # the capture is there, and waits for another password
-                    why = str(error)
+                        raise  # the camera still has the capture
+                    reason = str(error)
                 barren = 0 if line > before else barren + 1
                 if line < taken.stop:
-                    self._journal.spend(taken, why)
+                    self._journal.record_spent(taken, reason)
                     if barren >= BARREN:
                         raise RigError(
                             f"sweep {sweep.name}: {BARREN} captures in a row gave no line {line}; the last, "
-                            f"{taken.folder}: {why}. The {line} lines before it are kept; mend that and run again"
+                            f"{taken.folder}: {reason}. The {line} lines before it are kept; mend that and run again"
                         )
-                    LOG.warning("%s: line %d is captured again; %s: %s", sweep.name, line, taken.folder, why)
+                    LOG.warning("%s: line %d is captured again; %s: %s", sweep.name, line, taken.folder, reason)
 
     def lines_again(self, sweep: Sweep, numbers: Sequence[int]) -> Iterator[Line]:
-        """Yield single lines of those given before, in order, from the files of the captures that hold them.
+        """Yield single lines that were given before, in order, from the files of their captures.
 
-        Nothing is captured for them. A line that no capture gives any more comes as one that the camera dropped: there,
-        and not valid. RigError where a device failed, or the password is not taken.
+        Nothing is captured again. A line that no capture gives is yielded as not valid. Raises RigError: a device
+        failed, or the password is refused.
         """
         waiting = list(numbers)
         with self.session() as runner:
@@ -203,7 +198,7 @@ class RigSource:
             for line in self._read(runner, runner.recovered(held), wanted[0]):
                 if line.number in wanted:
                     found[line.number] = line
-        except (UntiedError, DeviceRefused) as error:
+        except (UnusableCaptureError, DeviceRefused) as error:
             if getattr(error, "code", None) == NOT_LOGGED_IN:
                 raise
             LOG.warning("%s, from line %d on: lost; %s: %s", held.sweep.name, wanted[0], held.folder, error)
@@ -217,16 +212,13 @@ class RigSource:
         return Line(number, nothing, float(x), float(y), time_s, exposing(self.camera, sweep).exposure_ms, valid=False)
 
     def references(self, sweep: Sweep) -> References:
-        """Return the dark and white frames with the sweep's binning.
-
-        They are captured and fetched once for all sweeps of an exposure.
-        """
+        """Return the dark and white frames with the sweep's binning; they are captured once for each exposure."""
         exposure_ms, folders = sweep.exposure_ms, self._journal.references
         if folders.get(exposure_ms, "") not in self._whole:
             with self.session() as runner:
                 known = self._known_references(runner, folders[exposure_ms]) if exposure_ms in folders else None
                 if not known:
-                    self._journal.refer(runner.capture_at_rest(REFERENCES, exposure_ms), exposure_ms)
+                    self._journal.record_references(runner.capture_at_rest(REFERENCES, exposure_ms), exposure_ms)
                     known = self._whole_references(runner, folders[exposure_ms])
                 self._whole[folders[exposure_ms]] = known
         whole, _ = self._whole[folders[exposure_ms]]
@@ -235,10 +227,7 @@ class RigSource:
         return References(dark, white, whole.white_reference, bad, by_mirror=self.rig.white_at_rest)
 
     def _known_references(self, runner: CaptureRunner, folder: str) -> tuple[References, tuple[str, ...]] | None:
-        """Return the frames of an earlier session.
-
-        None: the camera no longer has them, because it was emptied or replaced.
-        """
+        """Return the frames of an earlier session; None where the camera does not have them any more."""
         try:
             return self._whole_references(runner, folder)
         except RigError as error:
@@ -248,7 +237,7 @@ class RigSource:
             return None
 
     def _whole_references(self, runner: CaptureRunner, folder: str) -> tuple[References, tuple[str, ...]]:
-        """Return the dark and white frames of all samples, and findings on them."""
+        """Return the dark and white frames of all samples, with notes."""
         frames = runner.devices.camera.references(folder, self._kept, claim=self._claim(1))
         missing = [kind for kind in ("dark", "white") if kind not in frames]
         if missing:
@@ -261,7 +250,7 @@ class RigSource:
         return whole, notes
 
     def _read(self, runner: CaptureRunner, taken: CaptureRecord, line: int) -> Iterator[Line]:
-        """Fetch a capture and yield its lines from ``line`` on; what was dropped, or nothing places, is not valid."""
+        """Fetch a capture and yield its lines from ``line`` on; those without data or position are not valid."""
         try:
             captured = runner.devices.camera.fetch(
                 taken.folder,
@@ -270,30 +259,30 @@ class RigSource:
                 claim=self._claim(taken.stop - taken.first),
             )
         except RigError as error:
-            if type(error) is not RigError:  # a device that is gone, or a disk that is full: nothing is wrong with it
+            if type(error) is not RigError:  # a device that is gone, or a full disk: the capture is in order
                 raise
-            raise UntiedError(str(error)) from error
+            raise UnusableCaptureError(str(error)) from error
         self._check_size(captured.values.shape[1:], taken.folder)
         path = path_of(taken.sweep, (taken.first, taken.stop), self.camera, triggered=taken.triggered)
-        placed = place_lines(captured, path, taken, self.camera, runner.log_of(taken))
-        self._journal.tied(taken, placed.tied, captured.notes)
+        located = locate_lines(captured, path, taken, self.camera, runner.log_of(taken))
+        self._journal.record_positions(taken, located.positions, captured.notes)
         values, sweep = captured.values, path.sweep
         nothing = np.zeros((values.shape[1] // sweep.binning, values.shape[2]), np.uint16)
-        for place in range(line - path.first, len(placed.row)):
-            row, valid = int(placed.row[place]), placed.is_valid(place)
-            x, y = placed.tied.position[row] if valid else path.middle[place]
+        for place in range(line - path.first, len(located.row)):
+            row, valid = int(located.row[place]), located.is_valid(place)
+            x, y = located.positions.position[row] if valid else path.middle[place]
             yield Line(
                 number=path.first + place,
                 data=bin_samples(values[row], sweep.binning) if row >= 0 else nothing,
                 mirror_x=float(x),
                 mirror_y=float(y),
-                time_s=self._time_s(sweep, path.first + place, int(placed.stamp_us[row]) if row >= 0 else -1),
+                time_s=self._time_s(sweep, path.first + place, int(located.stamp_us[row]) if row >= 0 else -1),
                 exposure_ms=exposing(self.camera, sweep).exposure_ms,
                 valid=valid,
             )
 
     def _time_s(self, sweep: Sweep, number: int, stamp_us: int) -> float:
-        """Return the mid exposure since the sweep's first line began, by the camera's stamps, else by its rate."""
+        """Return the time of mid exposure since the sweep's start, by the camera's stamps, else by its frame rate."""
         known, exposed = stamp_us >= 0, exposing(self.camera, sweep)
         origin = self._journal.origin_us(sweep, stamp_us if known and number == 0 else None)
         if known and origin is not None:

@@ -1,9 +1,7 @@
-"""The emulated camera: commands in, replies out, captures of whatever it looks at; its sockets.
+"""The emulated camera: commands in, replies out, captures of what it looks at, and its sockets.
 
-It speaks what :mod:`pipeline.rig.camera.headwall_replies` reads; the texts of refusals are made up, since no document
-tells them.
-
-The files stay in memory; pyftpdlib serves them.
+It speaks the protocol that :mod:`pipeline.rig.camera.headwall_camera` reads; the texts of refusals are made up, since
+no document gives them. The files stay in memory; pyftpdlib serves them.
 """
 
 from __future__ import annotations
@@ -33,11 +31,12 @@ Raw = NDArray[np.uint16]
 Lines = Callable[[Floats, Floats], Raw]  # positions (line, 2), times (line,) of mid exposure -> (line, sample, band)
 Positions = Callable[[Floats], Floats]  # times (line,) -> (line, 2)
 
-_BLOCK = 8  # frames looked at together, while the camera takes no other request
+_BLOCK = 8  # frames that are made together, while the camera takes no other request
+ROOT = "/captured"
 PROMPT = b"\r\nhpi> "
 MOST_LINE = 4096
 STARTED_US = 1_500_000_000_000_000  # by the camera's clock at 0 of the emulator's
-USUAL_FRAMES = 2000  # of a cube, where the command says 0
+USUAL_FRAMES = 2000  # of a cube, where the command gives 0
 DELAY_S = 0.01  # from the command to the first exposure
 
 
@@ -63,7 +62,7 @@ class EmulatedCapture:
         return max(whole if self.most_frames is None else min(whole, self.most_frames), 0)
 
     def begins(self, from_s: float, to_s: float) -> Floats:
-        """Return when exposures begin, (exposure,), of those that begin at ``from_s`` or later and before ``to_s``."""
+        """Return when exposures begin (exposure,), from ``from_s`` on and before ``to_s``."""
         bounds = np.ceil((np.array([from_s, to_s]) - self.began_s) / self.period_s - 1e-9).astype(np.int64)
         first, stop = np.clip(bounds, 0, self.most_frames)
         return np.asarray(self.began_s + np.arange(first, stop) * self.period_s)
@@ -72,18 +71,9 @@ class EmulatedCapture:
         """Return whether frames are still to come."""
         return self.most_frames is None or self.due(now_s) < self.most_frames
 
-    def stop(self, now_s: float) -> None:
-        """Take no frame that is not over."""
-        self.most_frames = self.due(now_s)
-
     def pending(self, now_s: float) -> Ints:
         """Return the numbers of some of the next frames that are exposed and not taken yet."""
         return np.arange(self._taken, max(min(self._taken + _BLOCK, self.due(now_s)), self._taken))
-
-    def middle_s(self, numbers: Ints) -> Floats:
-        """Return the times of mid exposure of frames [s]."""
-        middle: Floats = self.began_s + numbers * self.period_s + self.exposure_s / 2
-        return middle
 
     def put(self, lines: NDArray[Any]) -> None:
         """Take the next frames, (line, sample, band)."""
@@ -100,53 +90,37 @@ class EmulatedCapture:
             return self._whole
         found: dict[str, bytes] = {"imu_gps.txt": b"Roll\tPitch\tYaw\tLat\tLon\tAlt\tTimestamp\n"}
         for name, frames in self.references.items():
-            found |= {name: _bil(frames), f"{name}.hdr": self._header(frames)}
+            found |= self._cube(name, frames)
         self._lines = [np.concatenate(self._lines)] if self._lines else []
         for first in range(0, self._taken, self.frames_per_cube):
-            every = self._lines[0]
-            cube = every[first : first + self.frames_per_cube]
-            found |= {f"raw_{first}": _bil(cube), f"raw_{first}.hdr": self._header(cube)}
-            found[f"frameIndex_{first}.txt"] = self._index(first, len(cube))
+            cube = self._lines[0][first : first + self.frames_per_cube]
+            numbers = np.arange(first, first + len(cube))
+            stamps = STARTED_US + np.rint((self.began_s + numbers * self.period_s) * 1e6).astype(np.int64)
+            rows = [f"{number}\t{stamp}\n" for number, stamp in zip(numbers, stamps, strict=True)]
+            found |= self._cube(f"raw_{first}", cube)
+            found[f"frameIndex_{first}.txt"] = "".join(["Frame#\tTimestamp\n", *rows]).encode()
         if self._taken == self.most_frames:
             self._whole = found
         return found
 
-    def _index(self, first: int, count: int) -> bytes:
-        numbers = np.arange(first, first + count)
-        stamps = STARTED_US + np.rint((self.began_s + numbers * self.period_s) * 1e6).astype(np.int64)
-        rows = [f"{number}\t{stamp}\n" for number, stamp in zip(numbers, stamps, strict=True)]
-        return "".join(["Frame#\tTimestamp\n", *rows]).encode()
-
-    def _header(self, frames: Raw) -> bytes:
+    def _cube(self, name: str, frames: Raw) -> dict[str, bytes]:
+        """Return the files of a cube: its numbers as BIL, and its header."""
         lines, samples, bands = frames.shape
-        text = (
+        header = (
             f"ENVI\ninterleave = bil\ndata type = 12\nlines = {lines}\nsamples = {samples}\nbands = {bands}\n"
             "byte order = 0\nheader offset = 0\n"
         )
         if bands and len(self.wavelength_nm) == bands:
-            text += "wavelength = {\n" + ",\n".join(f"{value:.17g}" for value in self.wavelength_nm) + "\n}\n"
-        return text.encode()
-
-
-def _bil(frames: Raw) -> bytes:
-    return np.ascontiguousarray(frames.transpose(0, 2, 1), "<u2").tobytes()
-
-
-@dataclass(frozen=True)
-class CameraUnit:
-    """Properties of the emulated camera."""
-
-    root: str = "/captured"
-    disk_bytes: int = 480 * 10**9
-    wavelength_nm: tuple[float, ...] = ()
-    references: dict[str, NDArray[np.uint16]] = field(default_factory=dict)  # such as darkReference, in each folder
+            header += "wavelength = {\n" + ",\n".join(f"{value:.17g}" for value in self.wavelength_nm) + "\n}\n"
+        data = np.ascontiguousarray(frames.transpose(0, 2, 1), "<u2").tobytes()
+        return {name: data, f"{name}.hdr": header.encode()}
 
 
 class CameraDevice:
-    """One camera. Frames are made when they are asked for, so ``positions`` must answer for times gone by.
+    """One camera. It makes frames when they are asked for, so ``positions`` must answer for past times.
 
     ``lines`` gives lines (line, sample, band) uint16 of mirror positions (line, 2) and times (line,) by ``clock``;
-    ``positions`` gives mirror positions of times, at rest where none is given.
+    ``positions`` gives mirror positions at times. Without it they are 0.
     """
 
     def __init__(
@@ -155,13 +129,11 @@ class CameraDevice:
         clock: Clock,
         *,
         positions: Positions = lambda times_s: np.zeros((len(times_s), 2)),
-        unit: CameraUnit | None = None,
+        wavelength_nm: Sequence[float] = (),
     ) -> None:
-        self.unit = CameraUnit() if unit is None else unit
-        self.clock = clock
+        self.clock, self.wavelength_nm = clock, wavelength_nm
         self.exposure_ms, self.period_ms = 10.0, 10.0
         self.captures: list[EmulatedCapture] = []
-        self.commands: list[str] = []  # as they came, for tests
         self._lines, self._positions = lines, positions
         self._lock = threading.RLock()
 
@@ -172,14 +144,13 @@ class CameraDevice:
     def command(self, line: str) -> list[Chunk] | None:
         """Do one command and return its reply, or None where the connection ends."""
         with self._lock:
-            self.commands.append(line)
             if line == "exit":
                 return None
             try:
-                said = {"success": True, "response": self._do(line), "errorMessage": ""}
+                reply = {"success": True, "response": self._do(line), "errorMessage": ""}
             except RigError as error:
-                said = {"success": False, "response": None, "errorMessage": str(error)}
-            return [Chunk(0.0, f"{line}\r\n{json.dumps(said)}".encode() + PROMPT)]
+                reply = {"success": False, "response": None, "errorMessage": str(error)}
+            return [Chunk(0.0, f"{line}\r\n{json.dumps(reply)}".encode() + PROMPT)]
 
     def is_capturing(self) -> bool:
         """Return whether a capture runs."""
@@ -191,21 +162,14 @@ class CameraDevice:
             self._poll()
             return {f"{one.folder}/{name}": data for one in self.captures for name, data in one.files().items()}
 
-    def folders(self) -> set[str]:
-        """Return all folders."""
-        every = {"/", self.unit.root, *(capture.folder for capture in self.captures)}
-        return every | {
-            "/" + "/".join(name.split("/")[1:end]) for name in every for end in range(2, name.count("/") + 1)
-        }
-
     def keep_looking(self) -> bool:
-        """Look at some frames that are over; False where there are none. Others may speak to the camera meanwhile."""
+        """Look at some frames that are over; False where there are none. The lock is free while lines are made."""
         with self._lock:
             waiting = ((one, one.pending(self.clock.now())) for one in self.captures[-2:])
             capture, numbers = next(((one, some) for one, some in waiting if len(some)), (None, np.zeros(0, np.int64)))
         if capture is None:
             return False
-        middle_s = capture.middle_s(numbers)
+        middle_s = capture.began_s + numbers * capture.period_s + capture.exposure_s / 2
         lines = self._lines(self._positions(middle_s), middle_s)
         with self._lock:
             capture.put(lines)
@@ -218,12 +182,10 @@ class CameraDevice:
 
     def _do(self, line: str) -> Any:
         name, _, rest = line.partition("(")
-        argument: Any = None
-        if rest:
-            try:
-                argument = json.loads(rest.rstrip().removesuffix(")"))
-            except ValueError:
-                raise RigError(f"argument of {name} is not JSON") from None
+        try:
+            argument = json.loads(rest.rstrip().removesuffix(")")) if rest else None
+        except ValueError:
+            raise RigError(f"argument of {name} is not JSON") from None
         match name.strip():
             case "configure":
                 return self._configure(argument)
@@ -235,34 +197,26 @@ class CameraDevice:
                 return self.is_capturing()
             case "stopCapture":
                 if runs := self.is_capturing():
-                    self.captures[-1].stop(self.clock.now())
+                    self.captures[-1].most_frames = self.captures[-1].due(self.clock.now())
                 return runs
         raise RigError(f"unknown command {name}")
 
     def _configure(self, argument: Any) -> Any:
-        if not isinstance(argument, dict) or not {"exposure", "framePeriod"} >= set(argument):
-            raise RigError("configure takes exposure and framePeriod")
         if self.is_capturing():
             raise RigError("busy capturing")
-        exposure, period = argument.get("exposure", self.exposure_ms), argument.get("framePeriod", self.period_ms)
+        exposure, period = float(argument["exposure"]), float(argument["framePeriod"])
         if not 0 < exposure <= period:
             raise RigError("exposure longer than frame period")
-        self.exposure_ms, self.period_ms = float(exposure), float(period)
-        return {"exposure": self.exposure_ms, "framePeriod": self.period_ms}
+        self.exposure_ms, self.period_ms = exposure, period
+        return {"exposure": exposure, "framePeriod": period}
 
     def _capture(self, argument: Any) -> Any:
-        if not isinstance(argument, dict) or not {"prefix", "maxCubes", "maxFramesPerCube"} >= set(argument):
-            raise RigError("capture takes prefix, maxCubes and maxFramesPerCube")
         if self.is_capturing():
             raise RigError("busy capturing")
-        held = sum(map(len, self.files().values()))
-        if held >= self.unit.disk_bytes:
-            raise RigError("disk full")
-        frames = argument.get("maxFramesPerCube", 0) or USUAL_FRAMES
-        cubes = argument.get("maxCubes", 0)
-        prefix = argument.get("prefix", "")
-        folder = f"{self.unit.root}/{prefix + '_' if prefix else ''}{len(self.captures):06d}"
-        self.captures.append(self._begun(folder, frames, cubes))
+        frames = argument["maxFramesPerCube"] or USUAL_FRAMES
+        prefix = f"{argument['prefix']}_" if argument["prefix"] else ""
+        folder = f"{ROOT}/{prefix}{len(self.captures):06d}"
+        self.captures.append(self._begun(folder, frames, argument["maxCubes"]))
         return {"folder": folder}
 
     def _begun(self, folder: str, frames: int, cubes: int) -> EmulatedCapture:
@@ -273,21 +227,21 @@ class CameraDevice:
             period_s=self.period_ms * 1e-3,
             frames_per_cube=frames,
             most_frames=frames * cubes if cubes else None,
-            wavelength_nm=self.unit.wavelength_nm,
-            references=self.unit.references,
+            wavelength_nm=self.wavelength_nm,
         )
 
     def _list(self, argument: Any) -> list[dict[str, Any]]:
+        """List a folder: the root holds the folder of captures, that one holds a folder for each capture."""
         folder = "/" + str(argument or "").strip("/")
-        if folder not in self.folders():
+        folders = {ROOT, *(capture.folder for capture in self.captures)}
+        if folder not in {"/", *folders}:
             raise RigError(f"no such folder {folder}")
-        under = folder.rstrip("/") + "/"
-        found = [(name, 0, True) for name in self.folders() if name != folder]
+        found = [(name, 0, True) for name in folders]
         found += [(name, len(data), False) for name, data in self.files().items()]
         return [
             {"name": name, "size": size, "mtime": 0, "isDirectory": is_folder}
             for name, size, is_folder in sorted(found)
-            if name.startswith(under) and "/" not in name[len(under) :]
+            if (name.rpartition("/")[0] or "/") == folder
         ]
 
 
@@ -307,14 +261,14 @@ _SLICE_S = 0.05  # how soon threads see that they are to end
 
 
 class CameraConnection:
-    """One connection's own half of the talk: its bytes, cut into commands at carriage returns."""
+    """The camera's end of one connection: cuts bytes into commands at carriage returns."""
 
     def __init__(self, device: CameraDevice) -> None:
         self._device = device
         self._held = b""
 
     def feed(self, data: bytes) -> tuple[list[Chunk], bool]:
-        """Take bytes; give replies, and whether the connection stays open."""
+        """Take bytes; return replies, and whether the connection stays open."""
         self._held += data
         chunks: list[Chunk] = []
         while (end := self._held.find(b"\r")) >= 0:
@@ -331,29 +285,17 @@ class CameraConnection:
 
 
 class CameraServer(Closing):
-    """Both ports of a device, of its control socket and of FTP (0 takes a free one), until ``close``. Also a context.
-
-    RigError where a port is taken.
-    """
+    """Ports of this machine for a device's control socket and FTP (0: a free one), until ``close``. Also a context."""
 
     handler: type[FileHandler] | None = None  # of the file server's sessions
+    host = "127.0.0.1"
 
-    def __init__(self, device: CameraDevice, *, host: str = "127.0.0.1", port: int = 0, file_port: int = 0) -> None:
+    def __init__(self, device: CameraDevice, ports: tuple[int, int] = (0, 0)) -> None:
         self.device = device
-        self.host = host
         self._ended = threading.Event()
         self._threads: list[threading.Thread] = []
-        try:
-            self._listener = socket.create_server((host, port))
-        except OSError as error:
-            raise RigError(
-                f"{host}:{port} cannot be listened on ({error}); take another port, or 0 for a free one"
-            ) from error
-        try:
-            self._files = _file_server(device, (host, file_port), self.handler or FileHandler)
-        except BaseException:
-            self._listener.close()
-            raise
+        self._listener = socket.create_server((self.host, ports[0]))
+        self._files = _file_server(device, (self.host, ports[1]), self.handler or FileHandler)
         self._listener.settimeout(_SLICE_S)
         self.port = int(self._listener.getsockname()[1])
         self.file_port = int(self._files.socket.getsockname()[1])
@@ -361,7 +303,7 @@ class CameraServer(Closing):
             self._start(serve)
 
     def close(self) -> None:
-        """Hang up on everyone, and let go of the ports."""
+        """Close all connections and both ports."""
         self._ended.set()
         for thread in self._threads:
             thread.join(timeout=10)
@@ -382,8 +324,8 @@ class CameraServer(Closing):
         talk = CameraConnection(self.device)
         with connection, suppress(OSError):
             connection.settimeout(_SLICE_S)
-            chunks, goes_on = self.device.greet(), True
-            while goes_on and not self._ended.is_set():
+            chunks, is_open = self.device.greet(), True
+            while is_open and not self._ended.is_set():
                 for chunk in chunks:
                     self._wait(chunk.delay_s)
                     connection.sendall(chunk.data)
@@ -392,7 +334,7 @@ class CameraServer(Closing):
                     data = connection.recv(4096)
                     if not data:
                         return
-                    chunks, goes_on = talk.feed(data)
+                    chunks, is_open = talk.feed(data)
             for chunk in chunks:
                 connection.sendall(chunk.data)
 
@@ -410,21 +352,18 @@ class CameraServer(Closing):
 
 
 def _file_server(device: CameraDevice, address: tuple[str, int], kind: type[FileHandler]) -> FTPServer:
-    chatter = logging.getLogger("pyftpdlib")
-    chatter.setLevel(logging.ERROR)
-    if not chatter.handlers:
-        chatter.addHandler(logging.NullHandler())  # else it turns itself up to everything, on stderr
+    logger = logging.getLogger("pyftpdlib")
+    logger.setLevel(logging.ERROR)
+    if not logger.handlers:
+        logger.addHandler(logging.NullHandler())  # else it logs everything on stderr
     authorizer = DummyAuthorizer()
     authorizer.add_user(FileServer.user, FileServer.password, homedir=".", perm="elr")
     handler = type("CameraFileHandler", (kind,), {"device": device, "authorizer": authorizer})
-    try:
-        return FTPServer(address, handler, ioloop=IOLoop())
-    except OSError as error:
-        raise RigError(f"{address[0]}:{address[1]} cannot be listened on ({error}); take another port") from error
+    return FTPServer(address, handler, ioloop=IOLoop())
 
 
 class _FilesInMemory(AbstractedFS):  # type: ignore[misc]
-    """A device's files by their whole names, to be asked for and fetched: the control socket lists them."""
+    """A device's files by their whole names; the control socket lists them."""
 
     @property
     def device(self) -> CameraDevice:

@@ -1,38 +1,30 @@
-"""A whole emulated rig: mirror and camera on one clock, the exposures at the mirror's trigger, and a simulated scene.
+"""A whole emulated rig: mirror and camera on one clock, pulses at the mirror's trigger input, and a simulated scene.
 
-Noise and drifts of the simulator are keyed by a sweep's name and a line's number, so the camera has to know both. The
-name, with the sweep's geometry, is in the capture's prefix (:func:`pipeline.rig.capture.capture_paths.announced`). The
-number is that of the line whose planned position is nearest to the mirror's at mid exposure. It is the vector index
-where the path is the planned one. It also holds for a path that was loaded in parts, begins with a lead-in, or lost an
-edge.
+The simulator derives noise and drifts from a sweep's name and a line's number. The name, with the sweep's geometry, is
+in the capture's prefix (:func:`pipeline.rig.capture.capture_paths.announced`). The number is that of the line whose
+planned position is nearest to the mirror's at mid exposure. That also holds for a path that was loaded in parts, begins
+with a lead-in cell, or lost an edge.
 
-A line is that of the simulated source, bit for bit, where the mirror holds the planned position to the last bit of the
-wire's float32. Elsewhere it is looked at from where the mirror is. A capture that announces nothing has streams of its
-own, by its folder and frame.
+A line is that of the simulated source, bit for bit, where the mirror holds the planned position to the last bit of
+float32. Elsewhere the scene is imaged from where the mirror is. A capture whose prefix announces no sweep has noise of
+its own, by its folder and frame. A capture with the prefix ``references`` has dark and white cubes.
 
-The cable has one pulse for each held position of the sweep that a capture announces, evenly over the exposure. A pulse
-generator between camera and mirror would give them; cameras have none. Or it has one as each exposure begins, or none.
-
-A planned sweep that is announced (by a capture's prefix, :func:`pipeline.rig.capture.capture_paths.capture_prefix`),
-loaded and played gives the simulated source's lines, bit for bit; see :mod:`pipeline.rig.emulator.emulated_rig`. A path
-that is played by trigger begins with a lead-in cell. The mirror takes the first cell as it is run, and one more at each
-rising edge. Without trigger it is run at (positions of a line) / (frame period). It is the planned one where it begins
-within half a held position of the first exposure. A capture with the prefix ``references`` has dark and white cubes.
-
-The mirror's controller hangs on a pty, which is opened as a real port is.
+The trigger input gets one pulse for each held position of the announced sweep, evenly over the exposure, as a pulse
+generator would give them. It may also get one as each exposure begins, or none. A path that is played by trigger begins
+with a lead-in cell. Without trigger the path runs at (positions of a line) / (frame period). It is the planned one
+where it begins within half a held position of the first exposure.
 """
 
 from __future__ import annotations
 
-import heapq
 import logging
 import os
 import select
 import threading
 import tty
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import count
 from types import MappingProxyType
 
 import numpy as np
@@ -41,17 +33,9 @@ from numpy.typing import NDArray
 from pipeline.errors import RigError, SettingsError
 from pipeline.geometry.mirror import STRAIGHT, Mounting, direction_to_scene, position_to_direction
 from pipeline.geometry.scan import Sweep, sweep_positions
-from pipeline.rig.capture.capture_paths import REFERENCES, Announced, announced
+from pipeline.rig.capture.capture_paths import REFERENCES, announced
 from pipeline.rig.device_settings import Pulses
-from pipeline.rig.emulator.camera_device import (
-    CameraDevice,
-    CameraServer,
-    CameraUnit,
-    EmulatedCapture,
-    Floats,
-    Ints,
-    Raw,
-)
+from pipeline.rig.emulator.camera_device import CameraDevice, CameraServer, EmulatedCapture, Floats, Ints, Raw
 from pipeline.rig.emulator.mirror_device import MirrorDevice
 from pipeline.rig.mirror.mirror_controller import wire_positions
 from pipeline.rig.transports import BITS_PER_BYTE, SYSTEM_CLOCK, Clock, Closing
@@ -67,7 +51,7 @@ REFERENCE_FRAMES = 32
 
 @dataclass(frozen=True)
 class OffPlanAim(Aim):
-    """An aim of the chain: how far lines lie beside their plan, (line, step, 2) from line ``first`` on. [px]"""
+    """An effect that shifts lines from their plan: (line, step, 2) from line ``first`` on. [px]"""
 
     shift_px: Floats
     first: int
@@ -85,21 +69,21 @@ class OffPlanAim(Aim):
 
 @dataclass(frozen=True)
 class SceneView:
-    """A simulated source, looked at from where an emulated mirror is, which is mounted somehow."""
+    """A simulated source, imaged from where an emulated mirror is, with the mounting of that mirror."""
 
     source: SimulatedSource
     mounting: Mounting = STRAIGHT
 
-    def lines(self, told: Announced, held: Floats, times_ms: tuple[float, float], started_s: float) -> Raw:
+    def lines(self, sweep: Sweep, held: Floats, times_ms: tuple[float, float], started_s: float) -> Raw:
         """Return raw lines (line, sample, band) of a sweep, not binned.
 
         ``held`` are (line, step, 2) positions of the device during each exposure, ``times_ms`` exposure and frame
-        period; ``started_s`` is when the sweep began, for what drifts, unless the source's own clock knows.
+        period. Drifts count from ``started_s``, the sweep's start, unless the source's own clock has it.
         """
-        sweep = replace(told.sweep, binning=1)
+        sweep = replace(sweep, binning=1)
         rig = self._rig(times_ms)
-        seen = self.mounting.to_model(held)
-        number = self.numbers(sweep, seen)
+        position = self.mounting.to_model(held)
+        number = self.numbers(sweep, position)
         planned = sweep_positions(sweep, rig.camera)[number]
         wired = wire_positions(planned.reshape(-1, 2), self.mounting).reshape(planned.shape)
         as_planned = (held.astype(np.float32) == wired).all(axis=(1, 2))
@@ -108,7 +92,7 @@ class SceneView:
             lines = range(int(number[run][0]), int(number[run][-1]) + 1)
             choice = self.source.choice
             if not as_planned[run][0]:
-                aim = OffPlanAim(self._place(seen[run]) - self._place(planned[run]), lines.start)
+                aim = OffPlanAim(self._place(position[run]) - self._place(planned[run]), lines.start)
                 choice = Choice(((aim, "exact"), *choice.effects))
             raw.append(self._render(rig, choice, sweep, lines, started_s))
         return np.concatenate(raw)
@@ -119,9 +103,9 @@ class SceneView:
         sweep = Sweep(name, "fine", "x", float(place[0]), float(place[1]), 1)
         return self._render(self._rig(times_ms), self.source.choice, sweep, range(1), started_s)
 
-    def numbers(self, sweep: Sweep, seen: Floats) -> Ints:
+    def numbers(self, sweep: Sweep, position: Floats) -> Ints:
         """Return the line (line,) of the sweep that each exposure (line, step, 2) is nearest to."""
-        scan = self._place(seen)[..., 1].mean(axis=1)
+        scan = self._place(position)[..., 1].mean(axis=1)
         number = np.rint((scan - sweep.start_px - (sweep.positions - 1) / 2) / sweep.step)
         lines: Ints = np.clip(number, 0, sweep.lines - 1).astype(np.int64)
         return lines
@@ -143,14 +127,14 @@ class SceneView:
         return direction_to_scene(position_to_direction(position)) / self.source.camera.ifov_rad
 
     def _rig(self, times_ms: tuple[float, float]) -> Rig:
-        """Return the source's rig, with the times that the camera was set to."""
+        """Return the source's rig with the exposure and frame period of the emulated camera."""
         camera = self.source.camera
         if np.allclose(times_ms, (camera.exposure_ms, camera.frame_ms), rtol=1e-9):
             return self.source.rig
         exposure, period = times_ms
         rate = max(camera.max_rate_hz, 1000 / period)
-        told = replace(camera, exposure_ms=exposure, readout_ms=period - exposure, max_rate_hz=rate)
-        return replace(self.source.rig, camera=told)
+        changed = replace(camera, exposure_ms=exposure, readout_ms=period - exposure, max_rate_hz=rate)
+        return replace(self.source.rig, camera=changed)
 
     def _render(self, rig: Rig, choice: Choice, sweep: Sweep, lines: range, started_s: float) -> Raw:
         source = self.source
@@ -167,42 +151,41 @@ def _runs(number: Ints, alike: NDArray[np.bool_]) -> Iterator[slice]:
 
 
 class SceneCamera(CameraDevice):
-    """A camera that looks at a scene where a mirror sends it.
+    """A camera that images a scene where a mirror was sent.
 
-    The mirror counts as where it was sent: how it gets there is for the simulator's effects, so that it is in the lines
-    once.
+    The mirror's motion to that position is an effect of the simulator, so it is not emulated again.
 
     Parameters
     ----------
     wired
-        What comes at the mirror's trigger input: a pulse for each ``position``, each ``frame``, or ``none``.
+        Pulses at the mirror's trigger input: one for each ``position``, one for each ``frame``, or ``none``.
     kept
-        So many finished captures keep their files, and references always; 0 is all.
+        Number of finished captures that keep their files, besides references; 0 is all.
 
-    ``aside`` leaves frames to calls of :meth:`keep_looking` from a thread; until then it is capturing.
+    With ``aside`` a thread calls :meth:`keep_looking`; the camera counts as capturing until all frames are made.
     """
 
     def __init__(
         self, view: SceneView, mirror: MirrorDevice, clock: Clock, *, wired: Pulses = "position", kept: int = 0
     ) -> None:
-        unit = CameraUnit(wavelength_nm=tuple(view.source.wavelength_nm.tolist()))
-        super().__init__(self._seen, clock, positions=mirror.sent, unit=unit)
+        super().__init__(
+            self._scene_lines, clock, positions=mirror.positions, wavelength_nm=view.source.wavelength_nm.tolist()
+        )
         self.view, self.mirror, self.wired, self.kept = view, mirror, wired, kept
         self.aside = False
 
     def pulses(self, from_s: float, to_s: float) -> Floats:
-        """Return rises and falls (pulse, 2) of the trigger pulses that rise from ``from_s`` on and before ``to_s``."""
-        found = [np.zeros((0, 2))]
+        """Return when trigger pulses rise (pulse,), from ``from_s`` on and before ``to_s``."""
         if self.wired == "none":
-            return found[0]
+            return np.zeros(0)
+        found = []
         for capture in self.captures[-2:]:  # one may just have ended
-            told = announced(_prefix(capture)) if self.wired == "position" else None
-            steps = 1 if told is None else told.sweep.positions
+            known = announced(_prefix(capture)) if self.wired == "position" else None
+            steps = 1 if known is None else known.sweep.positions
             begins = capture.begins(from_s - capture.exposure_s, to_s)[:, None]
             rises = (begins + np.arange(steps) * (capture.exposure_s / steps)).ravel()
-            rises = rises[(rises >= from_s) & (rises < to_s)]
-            found.append(np.stack([rises, rises + capture.exposure_s / (2 * steps)], axis=-1))
-        return np.concatenate(found)
+            found.append(rises[(rises >= from_s) & (rises < to_s)])
+        return np.concatenate([np.zeros(0), *found])
 
     def is_capturing(self) -> bool:
         """Return whether a capture runs, or its frames are still being written."""
@@ -223,23 +206,21 @@ class SceneCamera(CameraDevice):
             capture.references = self.view.references((self.exposure_ms, self.period_ms), REFERENCE_FRAMES)
         return capture
 
-    def _seen(self, positions: Floats, middle_s: Floats) -> Raw:
+    def _scene_lines(self, positions: Floats, middle_s: Floats) -> Raw:
         """Return the raw lines (line, sample, band) of exposures by their mid times."""
-        capture = next((one for one in reversed(self.captures) if one.began_s <= middle_s[0]), None)
-        if capture is None:
-            return self.view.alone("no capture", positions[0], (self.exposure_ms, self.period_ms), 0.0)
+        capture = next(one for one in reversed(self.captures) if one.began_s <= middle_s[0])
         times_ms = capture.exposure_s * 1e3, capture.period_s * 1e3
-        told = announced(_prefix(capture))
-        if told is None:
+        known = announced(_prefix(capture))
+        if known is None:
             number = ((middle_s - capture.began_s) / capture.period_s).astype(int).tolist()
             names = [f"{capture.folder}-{one}" for one in number]
             viewed = zip(names, positions, strict=True)
             return np.concatenate([self.view.alone(name, place, times_ms, capture.began_s) for name, place in viewed])
-        step = told.sweep.positions  # positions during each exposure
+        step = known.sweep.positions  # positions during each exposure
         moments = (np.arange(step) + 0.5) * (capture.exposure_s / step)
-        held = self.mirror.sent(middle_s[:, None] - capture.exposure_s / 2 + moments)
-        whole_began_s = capture.began_s - told.first * capture.period_s  # had the sweep been taken at once
-        return self.view.lines(told, held, times_ms, whole_began_s)
+        held = self.mirror.positions(middle_s[:, None] - capture.exposure_s / 2 + moments)
+        whole_began_s = capture.began_s - known.first * capture.period_s  # as if taken in one capture
+        return self.view.lines(known.sweep, held, times_ms, whole_began_s)
 
 
 def _prefix(capture: EmulatedCapture) -> str:
@@ -249,24 +230,20 @@ def _prefix(capture: EmulatedCapture) -> str:
 
 LOG = logging.getLogger(__name__)
 _MOST_READ = 4096  # bytes
-_RETRY_S = 0.005  # of a user who does not read
+_SLICE_S = 0.05  # how soon the thread sees that it is to end
 _NAP_S = 0.01
 
 
 class EmulatedPort(Closing):
-    """A pty and the thread that serves it, until :meth:`close`; ``path`` is the name that users open. Also a context.
+    """A pty and the thread that serves it, until :meth:`close`; users open ``path``. Also a context.
 
-    The device's clock paces the bytes, too. ``baud`` is the speed in both directions; 0 lets bytes through as they
-    come: USB ports do that whatever their speed says. RigError where this system has no ptys.
+    The device's clock paces the bytes. ``baud`` is the speed in both directions; 0 sets no pace, as with USB ports.
+    RigError where this system has no ptys.
     """
 
     def __init__(self, device: MirrorDevice, *, baud: int = 0) -> None:
         self.device = device
         self._byte_s = BITS_PER_BYTE / baud if baud else 0.0
-        self._order = count()
-        self._in: list[tuple[float, int, bytes]] = []  # when it reached the device
-        self._out: list[tuple[float, int, bytes]] = []
-        self._in_free_s = self._out_free_s = 0.0
         try:
             self._master, self._slave = os.openpty()
             tty.setraw(self._slave)  # else line discipline would echo, and turn CR into LF
@@ -274,20 +251,20 @@ class EmulatedPort(Closing):
             raise RigError(f"no pty for the emulated port: {error}; ptys are there on Linux and macOS") from error
         os.set_blocking(self._master, False)
         self.path = os.ttyname(self._slave)
-        self._stop, self._wake = os.pipe()
+        self._ended = threading.Event()
         self._thread = threading.Thread(target=self._serve, name="emulated mirror port", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread and let go of the pty; users of the port see the device go. Nothing where it is closed."""
-        if self._wake >= 0:
-            os.close(self._wake)
-            self._wake = -1
-            self._thread.join()
+        """End the thread and close the pty; users of the port see the device go."""
+        self._ended.set()
+        self._thread.join()
 
     def _serve(self) -> None:
         try:
-            self._carry()
+            while not self._ended.is_set():
+                if select.select([self._master], [], [], _SLICE_S)[0]:
+                    self._answer(os.read(self._master, _MOST_READ))
         except OSError as error:
             LOG.info("%s: the device went away (%s)", self.path, error)
         except Exception:
@@ -295,56 +272,24 @@ class EmulatedPort(Closing):
         finally:
             for descriptor in (self._master, self._slave):
                 os.close(descriptor)
-            select.select([self._stop], [], [])  # until close() is called
-            os.close(self._stop)
 
-    def _carry(self) -> None:
-        """Carry bytes until the port is closed; OSError where the device goes away."""
+    def _answer(self, data: bytes) -> None:
+        """Hand bytes to the device, and send its replies when they are due; a full pty loses them, as a UART would."""
         clock = self.device.clock
-        while True:
-            ready, _, _ = select.select([self._stop, self._master], [], [], self._patience())
-            if self._stop in ready:
-                return
-            if self._master in ready:
-                data = os.read(self._master, _MOST_READ)
-                self._in_free_s = max(clock.now(), self._in_free_s) + len(data) * self._byte_s
-                heapq.heappush(self._in, (self._in_free_s, next(self._order), data))
-            while self._in and self._in[0][0] <= clock.now():
-                since_s, _, data = heapq.heappop(self._in)
-                for delay_s, reply in self.device.receive(data):
-                    due = since_s + delay_s  # not from now: waking late is not the device's doing
-                    if self._byte_s:
-                        due = self._out_free_s = max(due, self._out_free_s) + len(reply) * self._byte_s
-                    heapq.heappush(self._out, (due, next(self._order), reply))
-            self._deliver()
-
-    def _deliver(self) -> None:
-        """Write what is due; what a user does not take waits."""
-        while self._out and self._out[0][0] <= self.device.clock.now():
-            due, order, data = heapq.heappop(self._out)
-            try:
-                written = os.write(self._master, data)
-            except BlockingIOError:
-                written = 0
-            if written < len(data):
-                heapq.heappush(self._out, (due, order, data[written:]))
-                return
-
-    def _patience(self) -> float | None:
-        """Return the real time until the next event; None without one."""
-        waiting = [queue[0][0] for queue in (self._in, self._out) if queue]
-        if not waiting:
-            return None
-        left = (min(waiting) - self.device.clock.now()) / getattr(self.device.clock, "speed", 1.0)
-        return left if left > 0 else _RETRY_S if self._out and self._out[0][0] <= min(waiting) else 0.0
+        received_s = clock.now() + len(data) * self._byte_s
+        clock.sleep(received_s - clock.now())
+        for delay_s, reply in self.device.receive(data):
+            clock.sleep(received_s + delay_s + len(reply) * self._byte_s - clock.now())
+            with suppress(BlockingIOError):
+                os.write(self._master, reply)
 
 
 class FastClock:
-    """Monotonic time, ``speed`` times as fast as it is, from 0 on. Sleeping takes as much less."""
+    """Monotonic time from 0 on that runs ``speed`` times as fast; sleeping takes 1 / ``speed`` of the time."""
 
     def __init__(self, speed: float = 1.0) -> None:
         if not 0 < speed < float("inf"):
-            raise SettingsError(f"a speed of {speed:g}: expected how many times as fast time goes, above 0 (--speed)")
+            raise SettingsError(f"--speed {speed:g}: expected a factor above 0; 2 runs the clock twice as fast")
         self.speed = speed
         self._began = SYSTEM_CLOCK.now()
 
@@ -356,20 +301,20 @@ class FastClock:
 
 
 class EmulatedRig:
-    """Mirror and camera that look at what ``source`` looks at.
+    """Mirror and camera in front of the scene of ``source``.
 
     Parameters
     ----------
     clock
         Of both devices; a ``FastClock`` for :meth:`serve`.
     wired
-        What pulses the mirror's trigger input gets: one for each held ``position``, each ``frame``, or ``none``.
+        Pulses at the mirror's trigger input: one for each held ``position``, one for each ``frame``, or ``none``.
     kept
-        So many finished captures keep their files; 0 is all.
+        Number of finished captures that keep their files; 0 is all.
     mounting
-        How the mirror is mounted, whatever drivers assume.
+        The mounting of the mirror, whatever drivers assume.
 
-    A subclass may have devices and servers of other kinds, such as ones that fail.
+    A subclass may use other kinds of devices and servers, such as ones that fail.
     """
 
     mirror_kind = MirrorDevice
@@ -393,11 +338,10 @@ class EmulatedRig:
 
     @property
     def state(self) -> str:
-        """Return the state of both devices, in words."""
+        """Return the state of both devices as one line of text."""
         x, y = self.mirror.positions(self.clock.now())
-        last = f", last: {self.mirror.acts[-1].request.words}" if self.mirror.acts else ""
         camera = "capturing" if self.camera.is_capturing() else "idle"
-        mirror = f"mirror {x:+.4f}; {y:+.4f}, {self.mirror.mode.value}{last}"
+        mirror = f"mirror {x:+.4f}; {y:+.4f}, {self.mirror.mode.value}"
         return f"{mirror} | camera {camera}, {len(self.camera.captures)} captures"
 
     def serve(self, *, baud: int = 0) -> ServedRig:
@@ -406,21 +350,16 @@ class EmulatedRig:
 
 
 class ServedRig(Closing):
-    """An emulated rig behind a pty and sockets, from its making to :meth:`close`.
+    """An emulated rig behind a pty and sockets, until :meth:`close`.
 
-    ``port`` is the mirror's, to be opened as a serial port; the camera listens at ``host``, ``camera_port`` and
-    ``file_port``.
+    ``port`` is the mirror's serial port; the camera listens at ``host``, ``camera_port`` and ``file_port``.
     """
 
     def __init__(self, rig: EmulatedRig, baud: int) -> None:
         self.rig = rig
+        self._server = rig.server_kind(rig.camera)
         self._port = EmulatedPort(rig.mirror, baud=baud)
         self.port = self._port.path
-        try:
-            self._server = rig.server_kind(rig.camera)
-        except BaseException:
-            self._port.close()
-            raise
         self.host, self.camera_port, self.file_port = self._server.host, self._server.port, self._server.file_port
         rig.camera.aside = True
         self._ended = threading.Event()

@@ -1,266 +1,319 @@
-"""The emulated mirror controller: bytes in, bytes out, and its registers; time only by the clock that it is given.
+"""The emulated mirror controller: bytes in, bytes out, registers, vector memory, trigger input and log.
 
-It has what drivers ask for in both modes of the documented protocol. Assumed, as the documents leave it open: an empty
-line has no answer; NO answers a line that is not known, ERROR one that is too long. Bytes that come while the
-controller boots are lost. Bytes in pro mode that are no frame are answered by error 0001 at the next boundary. Requests
-are checked by their CRC after GOPROCRC alone, and replies always carry it.
+It answers what the driver asks in both modes of the documented protocol. The mirror is where it was last sent; the
+status bit NOT_STABLE stays on for `SETTLE_S` after each move. Nothing runs by itself: each call plays the vector memory
+up to the clock's present time, so time may run at any speed.
+
+Assumptions where the documents say nothing: an empty line has no answer. NO answers an unknown line, ERROR one that is
+too long. Bytes that arrive while the controller boots are lost. Bytes in pro mode that form no frame are answered by
+error 0001 at the next boundary. Only GOPROCRC makes the controller check the CRC of requests; replies always carry one.
+The run command plays the first cell, with an external trigger too. Each rising edge then plays one more cell. A unit
+that has finished holds its last cell.
 """
 
 from __future__ import annotations
 
 import math
-import operator
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import ShapeError
+from pipeline.geometry.scan import Ends
 from pipeline.rig.emulator import Chunk
-from pipeline.rig.emulator.mirror_state import MirrorState, MirrorUnit, PositionLogger
-from pipeline.rig.mirror import mirror_requests as simple
 from pipeline.rig.mirror import pro_mode as pro
-from pipeline.rig.mirror.mirror_requests import END, MOST_LINE, Reply
+from pipeline.rig.mirror.mirror_requests import END, GO_PRO, GO_PRO_CRC, ID, MOST_LINE, SERIAL, START, VERSION, Reply
+from pipeline.rig.mirror.pro_mode import ErrorCode, Status, VectorRegister
 from pipeline.rig.transports import Clock
 
-LOWEST_HZ, HIGHEST_HZ = 0.0, 10_000.0
-_CURRENT_A = 0.7
-_LOGGED = range(pro.log_slot(0), pro.log_slot(pro.LOG_SLOTS))  # vectors of the logger
+Floats = NDArray[np.float64]
+Pulses = Callable[[float, float], Floats]  # start and end of a time span -> times of the rising edges in it
+
+SETTLE_S = 0.1
+RIM_SLACK = 1e-6  # of float32 cells
+KEPT_MOVES = 20_000  # per axis; an older time gets the oldest position that is kept
+KEPT_REQUESTS = 5_000
+HIGHEST_HZ = 10_000.0
+
+
+@dataclass(frozen=True)
+class MirrorUnit:
+    """Properties of one emulated controller. None of them was read from a real one."""
+
+    model: str = "MR-E-2"
+    version: str = "EMULATOR 1.0"
+    serial_number: str = "EMUL0001"
+    vector_pairs: int = 1500  # of X and Y, in one memory
+    ends: Ends = "exclusive"  # whether ranges include their end; not settled (erratum E14)
+    log_rows: int = 16_000
+    turnaround_s: float = 2e-4  # from a request's last byte to the reply
 
 
 class RefusedError(Exception):
     """The controller answers with an error code."""
 
-    def __init__(self, code: pro.ErrorCode) -> None:
+    def __init__(self, code: ErrorCode) -> None:
         super().__init__(code.name)
         self.code = code
 
 
 @dataclass(frozen=True)
 class Register:
-    """One register: how it is read and written, and the range of what it takes."""
+    """The range of a register's values, its value after power-on, and its type."""
 
-    read: Callable[[], float | int]
-    write: Callable[[Any], object] | None = None
-    least: float = -math.inf
-    most: float = math.inf
-    whole: bool = False
-    signed: bool = False
+    least: float = 0
+    most: float = 0xFFFF
+    start: float = 0
+    whole: bool = True
+    writable: bool = True
 
-    def check(self, cell: bytes) -> float | int:
-        """Read a cell that is to be written; RefusedError where it may not be, or is out of range."""
-        if self.write is None:
-            raise RefusedError(pro.ErrorCode.READ_ONLY)
-        value: float | int = pro.cell_int(cell) if self.whole else pro.cell_float(cell)
-        if self.signed and value >= 2**31:
+    def read(self, cell: bytes) -> float:
+        """Return the value of a cell that is to be written; RefusedError where it is read-only or out of range."""
+        if not self.writable:
+            raise RefusedError(ErrorCode.READ_ONLY)
+        value: float = pro.cell_int(cell) if self.whole else pro.cell_float(cell)
+        if self.whole and self.least < 0 and value >= 2**31:
             value -= 2**32
         if not self.least <= value <= self.most:  # NaN is in no range
-            raise RefusedError(pro.ErrorCode.OUT_OF_RANGE)
+            raise RefusedError(ErrorCode.OUT_OF_RANGE)
         return value
 
 
-class RegisterFile:
-    """All registers of a controller, by id."""
-
-    def __init__(self, state: MirrorState) -> None:
-        self._state = state
-        self.logger = PositionLogger(state)
-        each = [Register(*_item(self.logger.slots, slot), 0, 0xFFFF, whole=True) for slot in range(pro.LOG_SLOTS)]
-        self._registers = {pro.log_slot(slot): register for slot, register in enumerate(each)} | {
-            pro.FEEDBACK_X: Register(lambda: state.axes[0].place(state.moment)),
-            pro.FEEDBACK_Y: Register(lambda: state.axes[1].place(state.moment)),
-            pro.VECTOR_MEMORY: Register(lambda: 0, whole=True),  # whether the head's own copy is valid
-            pro.LOG_RUN: Register(lambda: self.logger.running, lambda on: self.logger.run(bool(on)), 0, 1, whole=True),
-            pro.LOG_RATE: Register(*_attribute(self.logger, "rate_hz", float), 1.0, HIGHEST_HZ),
-            **_channel(state, 0),
-            **_channel(state, 1),
+def _registers(cells: int) -> dict[int, Register]:
+    """Return the registers of a controller with a vector memory of ``cells``, by id."""
+    found = {pro.log_slot(slot): Register() for slot in range(pro.LOG_SLOTS)} | {
+        pro.LOG_RUN: Register(most=1),
+        pro.LOG_RATE: Register(1.0, HIGHEST_HZ, HIGHEST_HZ, whole=False),
+    }
+    for channel in (pro.X, pro.Y):
+        found |= {
+            channel.input: Register(most=0xFF, start=channel.static_system),
+            channel.control: Register(most=0xFF, start=channel.xy_system),
+            **{channel.static_system << 8 | unit: Register(-1.0, 1.0, whole=False) for unit in pro.Unit},
         }
+        unit = {
+            VectorRegister.UNIT: Register(most=2, start=pro.Unit.FEEDBACK),
+            VectorRegister.RUN: Register(most=1),
+            VectorRegister.START: Register(most=cells),
+            VectorRegister.END: Register(most=cells),
+            VectorRegister.FREQUENCY: Register(1e-3, HIGHEST_HZ, HIGHEST_HZ, whole=False),
+            VectorRegister.CYCLES: Register(-1, 2**31 - 1, -1),
+            VectorRegister.TRIGGER: Register(most=2),
+            VectorRegister.INDEX: Register(writable=False),
+        }
+        found |= {channel.vector(name): register for name, register in unit.items()}
+    return found
 
-    def answer(self, frame: pro.Frame) -> pro.Frame:
-        """Carry out a frame of pro mode and give the reply, which may say why not."""
-        command = frame.command & ~pro.ERROR_FLAG
-        try:
-            return self._carry_out(frame.command, frame.payload)
-        except RefusedError as refused:
-            return pro.refuse(command, refused.code)
-        except ShapeError:
-            return pro.refuse(command, pro.ErrorCode.LENGTH_MISMATCH)
 
-    def _carry_out(self, command: int, payload: bytes) -> pro.Frame:
-        match command:
-            case pro.Command.FIRMWARE_ID | pro.Command.STATUS:
-                _expect(payload in (b"", b"\x00\x00"))
-                asked_id = command == pro.Command.FIRMWARE_ID
-                return pro.Frame(
-                    command, pro.int_cell(self._state.unit.firmware_id if asked_id else int(self._state.status()))
-                )
-            case pro.Command.SET_MODE:  # which is the device's own affair
-                _expect(len(payload) == 2)
-                if any(payload):
-                    raise RefusedError(pro.ErrorCode.OUT_OF_RANGE)
-            case pro.Command.GET_VALUE:
-                register, cell = pro.read_register(payload)
-                _expect(not cell)
-                return pro.Frame(command, self.get(register))
-            case pro.Command.SET_VALUE:
-                register, cell = pro.read_register(payload)
-                _expect(bool(cell))
-                self.put({register: cell})
-            case pro.Command.GET_VALUES:
-                asked = pro.read_registers(payload, with_cells=False)
-                _expect(bool(asked))
-                return pro.values_reply([self.get(number) for number, _ in asked])
-            case pro.Command.SET_VALUES:
-                given = pro.read_registers(payload, with_cells=True)
-                _expect(bool(given))
-                self.put(dict(given))
-            case pro.Command.GET_VECTOR:
-                register, offset, length, cells = pro.read_vector(payload)
-                _expect(not cells)
-                return pro.Frame(command, self.get_cells(register, offset, length))
-            case pro.Command.SET_VECTOR:
-                register, offset, length, cells = pro.read_vector(payload)
-                _expect(len(cells) == length)
-                self.put_cells(register, offset, cells)
-            case _:
-                raise RefusedError(pro.ErrorCode.COMMAND_UNKNOWN)
-        return pro.Frame(command)
+class Axis:
+    """The positions that an axis was sent to, with their times."""
+
+    def __init__(self, now_s: float) -> None:
+        self.time_s, self.place = [now_s], [0.0]
+
+    def send(self, times_s: Floats, places: NDArray[np.floating]) -> None:
+        """Send the axis to places (step,) at ascending times; steps that change nothing are left out."""
+        moved = np.diff(places, prepend=self.place[-1]) != 0
+        self.time_s += np.maximum(times_s[moved], self.time_s[-1]).tolist()
+        self.place += places[moved].astype(float).tolist()
+        del self.time_s[: -2 * KEPT_MOVES], self.place[: -2 * KEPT_MOVES]
+
+    def at(self, times_s: ArrayLike) -> Floats:
+        """Return where the axis was sent at times (...)."""
+        last = np.searchsorted(np.asarray(self.time_s), np.asarray(times_s, np.float64), side="right") - 1
+        return np.asarray(self.place)[np.clip(last, 0, None)]
+
+
+@dataclass
+class Playback:
+    """A run of a channel's vector unit: cells ``start`` to ``start + length``, ``total`` steps in all."""
+
+    start: int = 0
+    length: int = 1
+    total: float = 0
+    rate_hz: float = 1.0
+    triggered: bool = False
+    began_s: float = 0.0
+    steps: int = 0  # played so far
+    running: bool = False
+
+    @property
+    def index(self) -> int:
+        """The cell that plays, or played last."""
+        return self.start + max(self.steps - 1, 0) % self.length
+
+    def due(self, now_s: float) -> Floats:
+        """Return the times of the steps up to now that the unit's own clock has not played yet."""
+        last = int(min((now_s - self.began_s) * self.rate_hz + 1e-9, self.total))
+        self.steps = max(self.steps, last - KEPT_MOVES)
+        return self.began_s + np.arange(self.steps, last + 1) / self.rate_hz
+
+    def play(self, steps: int) -> NDArray[np.intp]:
+        """Return the next cells; the run is over where fewer than ``steps`` are left."""
+        taken = int(min(steps, self.total - self.steps))
+        cells = self.start + (self.steps + np.arange(taken)) % self.length
+        self.steps += taken
+        self.running = taken == steps
+        return cells
+
+
+class MirrorState:
+    """Registers, memory and motion of one controller, played up to the clock's time when they are used."""
+
+    def __init__(self, clock: Clock, unit: MirrorUnit) -> None:
+        self.clock, self.unit = clock, unit
+        self.flags = Status(0)  # further status bits
+        self.restart()
+
+    def restart(self) -> None:
+        """Reset to the state after power-on: at rest in the middle, memory and registers empty."""
+        self.memory = np.zeros(2 * self.unit.vector_pairs, np.float32)
+        self.registers = _registers(self.memory.size)
+        self.values = {number: register.start for number, register in self.registers.items()}
+        self.axes = [Axis(-math.inf), Axis(-math.inf)]
+        self.playbacks = [Playback(), Playback()]
+        self._log_s: tuple[float, float] | None = None  # start and stop of the log
+
+    def advance(self) -> float:
+        """Play what is due by the units' own clocks, and return the present time. [s]"""
+        now = self.clock.now()
+        for number, playback in enumerate(self.playbacks):
+            if playback.running and not playback.triggered:
+                self._step(number, playback.due(now))
+        return now
+
+    def trigger(self, rises_s: Floats) -> None:
+        """Step the units that wait for rising edges at the trigger input; all others ignore them."""
+        for number, playback in enumerate(self.playbacks):
+            if playback.running and playback.triggered:
+                self._step(number, rises_s)
+
+    def positions(self, times_s: ArrayLike) -> Floats:
+        """Return the mirror's positions (..., 2) at times (...) up to now; beyond the rim they are trimmed to it."""
+        self.advance()
+        places = np.stack([axis.at(times_s) for axis in self.axes], axis=-1)
+        reach = np.hypot(places[..., :1], places[..., 1:])
+        return np.where(reach > 1 + RIM_SLACK, places / np.maximum(reach, 1), places)
+
+    def status(self) -> Status:
+        """Return the present status bits."""
+        now, flags = self.advance(), self.flags
+        if math.hypot(*(axis.place[-1] for axis in self.axes)) > 1 + RIM_SLACK:
+            flags |= Status.TRIMMED
+        if any(now < axis.time_s[-1] + SETTLE_S for axis in self.axes):
+            flags |= Status.NOT_STABLE
+        return flags
 
     def get(self, number: int) -> bytes:
         """Return a register's cell; RefusedError where there is no such register."""
-        self._state.advance()
-        register = self._find(number)
-        value = register.read()
-        return pro.int_cell(int(value)) if register.whole else pro.float_cell(float(value))
+        now, register = self.advance(), self._register(number)
+        value = self.values[number]
+        for channel, playback in zip((pro.X, pro.Y), self.playbacks, strict=True):
+            if number == channel.vector(VectorRegister.RUN):
+                value = playback.running
+            elif number == channel.vector(VectorRegister.INDEX):
+                value = playback.index
+        if number == pro.LOG_RUN:
+            value = self._log_s is not None and now < self._log_s[1] and self._rows() < self.unit.log_rows
+        return pro.int_cell(int(value)) if register.whole else pro.float_cell(value)
 
     def put(self, cells: Mapping[int, bytes]) -> None:
-        """Write registers at one moment; held positions go out together.
+        """Write registers at one moment; held positions take effect together.
 
-        Raises RefusedError: a register is missing, read only or out of range, and none is written. It is raised, too,
-        where one does not take its value in the present state; those before it are written then.
+        RefusedError where a register is missing, read-only or out of range; none is written then. A range that is not
+        in the memory is refused after the other registers were written.
         """
-        values = {number: self._find(number).check(cell) for number, cell in cells.items()}
-        self._state.advance()
-        for number, value in values.items():
-            write = self._find(number).write
-            assert write is not None
-            write(value)
-        self._state.aim()
+        values = {number: self._register(number).read(cell) for number, cell in cells.items()}
+        for channel in (pro.X, pro.Y):
+            if values.get(channel.input) not in (None, channel.static_system, channel.vector_system):
+                raise RefusedError(ErrorCode.SYSTEM_NOT_SELECTABLE)
+        now = self.advance()
+        self.values |= values
+        for number, channel in enumerate((pro.X, pro.Y)):
+            run = values.get(channel.vector(VectorRegister.RUN))
+            if run == 0:
+                self.playbacks[number].running = False
+            elif run is not None:
+                self.playbacks[number] = self._started(channel, now)
+                self._step(number, np.array([now]))
+            if self.values[channel.input] == channel.static_system:
+                self.axes[number].send(np.array([now]), np.array([self.values[channel.static_xy]]))
+        if values.get(pro.LOG_RUN) == 1:
+            self._log_s = now, math.inf
+        elif pro.LOG_RUN in values and self._log_s is not None:
+            self._log_s = self._log_s[0], min(self._log_s[1], now)
 
     def get_cells(self, number: int, offset: int, length: int) -> bytes:
-        """Return whole cells of the vector memory or of a log's slot; offset and length are in bytes.
-
-        Raises RefusedError: the cells are not whole, or not there.
-        """
+        """Return cells of the vector memory or of a log's slot (offset and length in bytes); else RefusedError."""
         start, stop = _cells(offset, length)
         if number == pro.VECTOR_MEMORY:
-            _within(stop, self._state.memory.size)
-            return self._state.memory[start:stop].astype(">f4").tobytes()
-        if number not in _LOGGED:
-            raise RefusedError(pro.ErrorCode.NO_REGISTER)
-        _within(stop, self.logger.rows)
-        return self.logger.cells(number - pro.log_slot(0), start, stop)
+            _check_within(stop, self.memory.size)
+            return self.memory[start:stop].astype(">f4").tobytes()
+        if not 0 <= number - pro.log_slot(0) < pro.LOG_SLOTS:
+            raise RefusedError(ErrorCode.NO_REGISTER)
+        _check_within(stop, self._rows())
+        channel = int(self.values[number]) - pro.FEEDBACK_X
+        times_s = (self._log_s or (0.0, 0.0))[0] + np.arange(start, stop) / self.values[pro.LOG_RATE]
+        logged = self.positions(times_s)[:, channel] if channel in (0, 1) else np.zeros(stop - start)
+        return logged.astype(">f4").tobytes()
 
     def put_cells(self, number: int, offset: int, data: bytes) -> None:
-        """Write whole cells of the vector memory (else RefusedError)."""
+        """Write cells of the vector memory (else RefusedError)."""
         start, stop = _cells(offset, len(data))
         if number != pro.VECTOR_MEMORY:
-            raise RefusedError(pro.ErrorCode.READ_ONLY if number in _LOGGED else pro.ErrorCode.NO_REGISTER)
-        _within(stop, self._state.memory.size)
-        self._state.advance()
-        self._state.memory[start:stop] = np.frombuffer(data, ">f4")
+            raise RefusedError(ErrorCode.NO_REGISTER)
+        _check_within(stop, self.memory.size)
+        self.advance()
+        self.memory[start:stop] = np.frombuffer(data, ">f4")
 
-    def _find(self, number: int) -> Register:
-        found = self._registers.get(number)
-        if found is None:
-            raise RefusedError(pro.ErrorCode.NO_REGISTER)
-        return found
+    def _step(self, number: int, times_s: Floats) -> None:
+        """Play one cell at each time; the axis follows where its input is the vector unit."""
+        cells = self.playbacks[number].play(len(times_s))
+        channel = (pro.X, pro.Y)[number]
+        if self.values[channel.input] == channel.vector_system:
+            self.axes[number].send(times_s[: len(cells)], self.memory[cells])
 
+    def _started(self, channel: pro.ChannelRegisters, now_s: float) -> Playback:
+        start, end, cycles, trigger = (
+            int(self.values[channel.vector(name)])
+            for name in (VectorRegister.START, VectorRegister.END, VectorRegister.CYCLES, VectorRegister.TRIGGER)
+        )
+        length = end - start + (self.unit.ends == "inclusive")
+        if length < 1 or start + length > self.memory.size:
+            raise RefusedError(ErrorCode.VECTOR_INDEX)
+        total = math.inf if cycles < 0 else cycles * length
+        rate_hz = self.values[channel.vector(VectorRegister.FREQUENCY)]
+        return Playback(start, length, total, rate_hz, trigger != pro.Trigger.OFF, now_s, 0, True)
 
-def _expect(fits: bool) -> None:
-    if not fits:
-        raise ShapeError("a payload whose length does not fit the command")
+    def _rows(self) -> int:
+        """Return the rows of the log; it stops by itself when it is full."""
+        if self._log_s is None:
+            return 0
+        seconds = min(self._log_s[1], self.clock.now()) - self._log_s[0]
+        return min(int(seconds * self.values[pro.LOG_RATE] + 1e-9) + 1, self.unit.log_rows)
+
+    def _register(self, number: int) -> Register:
+        if number not in self.registers:
+            raise RefusedError(ErrorCode.NO_REGISTER)
+        return self.registers[number]
 
 
 def _cells(offset: int, length: int) -> tuple[int, int]:
     if offset % pro.CELL or length % pro.CELL:
-        raise RefusedError(pro.ErrorCode.VECTOR_ALIGNMENT)
+        raise RefusedError(ErrorCode.VECTOR_ALIGNMENT)
     if not 0 < length <= pro.MOST_PAYLOAD:
-        raise RefusedError(pro.ErrorCode.LENGTH_MISMATCH)
+        raise RefusedError(ErrorCode.LENGTH_MISMATCH)
     return offset // pro.CELL, (offset + length) // pro.CELL
 
 
-def _within(stop: int, size: int) -> None:
+def _check_within(stop: int, size: int) -> None:
     if stop > size:
-        raise RefusedError(pro.ErrorCode.VECTOR_INDEX)
-
-
-def _channel(state: MirrorState, channel: int) -> dict[int, Register]:
-    """Return the inputs of a channel, and which of them it follows."""
-    registers = pro.ChannelRegisters(channel)
-    inputs = {registers.static_system, registers.vector_system}
-
-    def choose(system: int) -> None:
-        if system not in inputs:
-            raise RefusedError(pro.ErrorCode.SYSTEM_NOT_SELECTABLE)
-        state.inputs[channel] = system
-
-    table = {
-        registers.input: Register(lambda: state.inputs[channel], choose, 0, 0xFF, whole=True),
-        registers.control: Register(*_item(state.controls, channel), 0, 0xFF, whole=True),
-    }
-    for unit in pro.Unit:
-        most = _CURRENT_A if unit is pro.Unit.CURRENT else 1.0
-        table[registers.static_system << 8 | unit] = Register(*_item(state.static[channel], unit), -most, most)
-    return {**table, **_vector_unit(state, channel)}
-
-
-def _vector_unit(state: MirrorState, channel: int) -> dict[int, Register]:
-    player, most = state.players[channel], state.memory.size
-
-    def run(on: int) -> None:
-        if not on:
-            player.stop()
-        elif player.length < 1 or player.start + player.length > most:
-            raise RefusedError(pro.ErrorCode.VECTOR_INDEX)
-        else:
-            player.run(state.moment)
-
-    rows = {
-        pro.VectorRegister.UNIT: Register(*_attribute(player, "unit", pro.Unit), 0, 2, whole=True),
-        pro.VectorRegister.RUN: Register(lambda: player.running, run, 0, 1, whole=True),
-        pro.VectorRegister.START: Register(*_attribute(player, "start"), 0, most, whole=True),
-        pro.VectorRegister.END: Register(*_attribute(player, "end"), 0, most, whole=True),
-        pro.VectorRegister.FREQUENCY: Register(*_attribute(player, "frequency_hz", float), 1e-3, HIGHEST_HZ),
-        pro.VectorRegister.LOWEST: Register(lambda: LOWEST_HZ),
-        pro.VectorRegister.HIGHEST: Register(lambda: HIGHEST_HZ),
-        pro.VectorRegister.CYCLES: Register(*_attribute(player, "cycles"), -1, 2**31 - 1, whole=True, signed=True),
-        pro.VectorRegister.TRIGGER: Register(*_attribute(player, "external", pro.Trigger), 0, 2, whole=True),
-        pro.VectorRegister.OUTPUT: Register(lambda: state.played[channel]),
-        pro.VectorRegister.INDEX: Register(lambda: player.index, whole=True),
-    }
-    return {pro.ChannelRegisters(channel).vector(name): register for name, register in rows.items()}
-
-
-def _item(holder: Any, key: int) -> tuple[Callable[[], Any], Callable[[Any], object]]:
-    """Return a reader and a writer of an item of a list or of a dictionary."""
-    return partial(operator.getitem, holder, key), partial(operator.setitem, holder, key)
-
-
-def _attribute(holder: object, name: str, kind: type = int) -> tuple[Callable[[], Any], Callable[[Any], object]]:
-    """Return a reader and a writer of an attribute."""
-    return partial(getattr, holder, name), lambda value: setattr(holder, name, kind(value))
-
-
-KEPT_ACTS = 5_000
-Floats = NDArray[np.float64]
-Pulses = Callable[[float, float], Floats]  # (pulse, 2) rises and falls of pulses that rise within a span of time
+        raise RefusedError(ErrorCode.VECTOR_INDEX)
 
 
 class Mode(Enum):
@@ -273,7 +326,7 @@ class Mode(Enum):
 
 @dataclass(frozen=True)
 class Request:
-    """A request as it came: a line of simple mode without its end, a frame, or bytes that are neither."""
+    """A request: a line of simple mode without its end, a frame, or bytes that are neither."""
 
     mode: Mode
     line: str = ""
@@ -282,40 +335,24 @@ class Request:
 
     @property
     def command(self) -> int | None:
-        """Command of the frame."""
+        """The command of the frame."""
         return None if self.frame is None else self.frame.command
-
-    @property
-    def words(self) -> str:
-        """Return the request for people: the line, or the command's name."""
-        if self.frame is None:
-            return self.line or "bytes that are no frame"
-        known = {command.value: command.name for command in pro.Command}
-        return known.get(self.frame.command, f"command {self.frame.command:02X}").lower().replace("_", " ")
-
-
-@dataclass(frozen=True)
-class Act:
-    """A request that was carried out, and when, for tests. [s]"""
-
-    time_s: float
-    request: Request
 
 
 class MirrorDevice:
     """One emulated controller with its mirror.
 
-    ``acts`` are the requests carried out so far, the newest ``KEPT_ACTS``. ``pulses`` is what is wired to the trigger
-    input, which is looked at before anything else is done. Methods may be called from several threads: the port's, and
-    that of an emulated camera, which gives triggers and asks for positions.
+    ``requests`` are the latest `KEPT_REQUESTS` that were carried out. ``pulses`` gives the rising edges at the trigger
+    input. Methods may be called from several threads: that of the port, and that of an emulated camera, which asks for
+    positions.
     """
 
     def __init__(self, clock: Clock, *, unit: MirrorUnit | None = None) -> None:
         self.clock, self.unit = clock, MirrorUnit() if unit is None else unit
-        self.acts: deque[Act] = deque(maxlen=KEPT_ACTS)
+        self.requests: deque[Request] = deque(maxlen=KEPT_REQUESTS)
         self.pulses: Pulses | None = None
         self._pulses_taken_s = clock.now()
-        self._lock, self._wire = threading.RLock(), threading.Lock()
+        self._lock, self._pulses_lock = threading.RLock(), threading.Lock()
         self.state = MirrorState(clock, self.unit)
         self.restart(boot_s=0.0)
 
@@ -324,53 +361,43 @@ class MirrorDevice:
         self.take_pulses()
         with self._lock:
             out: list[Chunk] = []
-            while data and self.clock.now() >= self._boots_until:
+            while data and self.clock.now() >= self._boots_until_s:
                 data = self._take_line(data, out) if self.mode is Mode.SIMPLE else self._take_frame(data, out)
             return out
 
     def take_pulses(self) -> None:
-        """Step through the vector memory as the pulses at the trigger input since the last call say."""
+        """Step through the vector memory by the edges at the trigger input since the last call."""
         if self.pulses is None:
             return
-        with self._wire:
+        with self._pulses_lock:
             now_s = self.clock.now()
-            pulses = self.pulses(self._pulses_taken_s, now_s)
+            rises_s = self.pulses(self._pulses_taken_s, now_s)
             self._pulses_taken_s = max(now_s, self._pulses_taken_s)
-            if len(pulses):
+            if len(rises_s):
                 with self._lock:
-                    self.state.trigger(pulses[:, 0], pulses[:, 1])
+                    self.state.trigger(rises_s)
 
     def positions(self, times_s: ArrayLike) -> Floats:
-        """Return the true mirror positions, (..., 2) device X and Y, at times of the clock up to now (...)."""
+        """Return the mirror's positions (..., 2), device X and Y, at times of the clock up to now (...)."""
         self.take_pulses()
         with self._lock:
             return self.state.positions(times_s)
 
-    def sent(self, times_s: ArrayLike) -> Floats:
-        """Return the commanded mirror positions, (..., 2), at times of the clock up to now (...)."""
-        self.take_pulses()
-        with self._lock:
-            self.state.advance()
-            return np.stack([axis.commands(times_s) for axis in self.state.axes], axis=-1)
-
     def restart(self, *, boot_s: float) -> None:
-        """Lose everything and be in simple mode, deaf for ``boot_s``: a reset, or a loss of power."""
+        """Lose all state and be in simple mode, deaf for ``boot_s``: a reset, or a loss of power."""
         with self._lock:
-            now = self.clock.now()
-            self.state.restart(now)
-            self.registers = RegisterFile(self.state)
-            self.mode = Mode.SIMPLE
-            self._line, self._reader = b"", pro.FrameReader()
-            self._boots_until = now + boot_s if boot_s > 0 else -math.inf
+            self.state.restart()
+            self.set_mode(Mode.SIMPLE)
+            self._boots_until_s = self.clock.now() + boot_s if boot_s > 0 else -math.inf
 
     def set_mode(self, mode: Mode) -> None:
         """Speak another mode from the next byte on."""
         self.mode, self._line, self._reader = mode, b"", pro.FrameReader()
 
     def _take_line(self, data: bytes, out: list[Chunk]) -> bytes:
-        """Take bytes up to the end of a line, and give those behind it: a line may change the mode."""
+        """Take bytes up to the end of a line, and return those behind it: a line may change the mode."""
         taken, end, rest = data.partition(b"\n")
-        self._line = (self._line + taken)[: 2 * MOST_LINE]  # enough to know, at its end, that it is too long
+        self._line = (self._line + taken)[: 2 * MOST_LINE]  # enough to see at its end that it is too long
         if end:
             line, self._line = self._line.rstrip(b"\r"), b""
             if line:
@@ -378,7 +405,7 @@ class MirrorDevice:
         return rest
 
     def _take_frame(self, data: bytes, out: list[Chunk]) -> bytes:
-        """Take bytes up to a boundary, and give those behind it: a frame may change the mode."""
+        """Take bytes up to a boundary, and return those behind it: a frame may change the mode."""
         taken, end, rest = data.partition(bytes((pro.BOUNDARY,)))
         for found in self._reader.feed(taken + end):
             whole, damaged = (found, None) if isinstance(found, pro.Frame) else (None, found)
@@ -391,39 +418,63 @@ class MirrorDevice:
             out.append(Chunk(self.unit.turnaround_s, reply))
 
     def carry_out(self, request: Request) -> bytes:
-        """Do what a request asks for and give the bytes of the reply."""
-        self.acts.append(Act(self.clock.now(), request))
+        """Do what a request asks for and return the bytes of the reply."""
+        self.requests.append(request)
         if request.damaged is not None:  # answered to the command that the bytes seem to hold, if any
             command = request.damaged.data[1] if len(request.damaged.data) > 1 else 0
-            return pro.encode(pro.refuse(command & ~pro.ERROR_FLAG, pro.ErrorCode.FRAME_INVALID))
-        if request.frame is not None:
-            if self.mode is Mode.PRO_CRC and not request.frame.crc_good:
-                return pro.encode(pro.refuse(request.frame.command & ~pro.ERROR_FLAG, pro.ErrorCode.CRC_WRONG))
-            reply = self.registers.answer(request.frame)
-            if reply.command == pro.Command.SET_MODE:
-                self.set_mode(Mode.SIMPLE)
-            return pro.encode(reply)
-        return self._simple(request.line).encode("ascii") + END
+            return _refusal(command, ErrorCode.FRAME_INVALID)
+        if request.frame is None:
+            return self._simple(request.line).encode("ascii") + END
+        frame = request.frame
+        if self.mode is Mode.PRO_CRC and not frame.crc_good:
+            return _refusal(frame.command, ErrorCode.CRC_WRONG)
+        try:
+            return pro.encode(pro.Frame(frame.command, self._pro(frame.command, frame.payload)))
+        except RefusedError as refused:
+            return _refusal(frame.command, refused.code)
+        except ShapeError:
+            return _refusal(frame.command, ErrorCode.LENGTH_MISMATCH)
 
     def _simple(self, line: str) -> str:
-        """Carry out a line, in capitals and without its end, and give the answer without an end."""
+        """Carry out a line, in capitals and without its end, and return the answer without an end."""
         if len(line) + len(END) > MOST_LINE:
             return Reply.ERROR
-        match line:
-            case simple.ID:
-                return self.unit.model
-            case simple.VERSION:
-                return self.unit.version
-            case simple.SERIAL:
-                return self.unit.serial_number
-            case simple.TEMPERATURE:
-                return f"{self.unit.temperature_c:.2f}"
-            case simple.GO_PRO:
-                self.set_mode(Mode.PRO)
-            case simple.GO_PRO_CRC:
-                self.set_mode(Mode.PRO_CRC)
-            case simple.START:
-                pass
+        texts = {ID: self.unit.model, VERSION: self.unit.version, SERIAL: self.unit.serial_number}
+        modes = {START: Mode.SIMPLE, GO_PRO: Mode.PRO, GO_PRO_CRC: Mode.PRO_CRC}
+        if line in modes:
+            self.set_mode(modes[line])
+        return Reply.OK if line in modes else texts.get(line, Reply.NO)
+
+    def _pro(self, command: int, payload: bytes) -> bytes:
+        """Carry out a frame and return the payload of the reply; RefusedError or ShapeError where it is refused."""
+        state = self.state
+        match command:
+            case pro.Command.STATUS:
+                return pro.int_cell(int(state.status()))
+            case pro.Command.SET_MODE:
+                if any(payload):
+                    raise RefusedError(ErrorCode.OUT_OF_RANGE)
+                self.set_mode(Mode.SIMPLE)
+            case pro.Command.GET_VALUE:
+                (number,) = pro.read_registers(b"\x00\x01" + payload, with_cells=False)
+                return state.get(number)
+            case pro.Command.GET_VALUES:
+                numbers = pro.read_registers(payload, with_cells=False)
+                return pro.count_bytes(len(numbers)) + b"".join(map(state.get, numbers))
+            case pro.Command.SET_VALUES:
+                state.put(pro.read_registers(payload, with_cells=True))
+            case pro.Command.GET_VECTOR:
+                register, offset, length, _ = pro.read_vector(payload)
+                return state.get_cells(register, offset, length)
+            case pro.Command.SET_VECTOR:
+                register, offset, length, cells = pro.read_vector(payload)
+                if len(cells) != length:
+                    raise ShapeError(f"{len(cells)} bytes of cells, {length} are stated")
+                state.put_cells(register, offset, cells)
             case _:
-                return Reply.NO
-        return Reply.OK
+                raise RefusedError(ErrorCode.COMMAND_UNKNOWN)
+        return b""
+
+
+def _refusal(command: int, code: ErrorCode) -> bytes:
+    return pro.encode(pro.refuse(command & ~pro.ERROR_FLAG, code))

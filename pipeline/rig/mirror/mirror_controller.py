@@ -1,7 +1,7 @@
-"""The mirror controller's driver: a mirror that can be sent somewhere, or along a path.
+"""The mirror controller's driver: sends a mirror to a position, or along a path.
 
-Written for the documented protocol and tested against an emulator; never run on hardware. Positions are those of a
-mirror mounted straight; on the wire they are the device's own, as the settings say that it is mounted.
+It follows the documented protocol and was tested against an emulator; it never ran on hardware. Positions are those of
+a mirror mounted straight. The wire carries the device's own positions, by the mounting in the settings.
 """
 
 from __future__ import annotations
@@ -23,23 +23,21 @@ from pipeline.rig.mirror.mirror_requests import Identity, Modes, ProLink
 from pipeline.rig.transports import SYSTEM_CLOCK, Clock, Closing, DeviceRefused, SerialTransport, Transport, Wire
 
 LOG = logging.getLogger(__name__)
-SAMPLED_EVERY = 10  # frames: the fraction that "sampled" reads back, besides the ends of both channels
+SAMPLED_EVERY = 10  # frames; "sampled" also reads back the ends of both channels
 Progress = Callable[[int, int], None]  # cells done, cells in all
 
 
 def wire_positions(positions: ArrayLike, mounting: Mounting = STRAIGHT) -> NDArray[np.float32]:
-    """Return positions (position, 2) at the precision of the wire, float32, where rounding carries none beyond the rim.
+    """Return positions (position, 2) as float32 for the wire; rounding moves none of them beyond the rim.
 
-    They are those of the device that is mounted so, for what a straight one gets by the wire.
-
-    Raises ShapeError: they have another shape, or there is none. Raises PoseError: one is not finite or beyond the rim;
-    the message names the first.
+    Positions of a mirror mounted straight become those of the device in its ``mounting``. Raises ShapeError: they have
+    another shape, or there is none. Raises PoseError: one is not finite or lies beyond the rim.
     """
-    given = np.asarray(positions)
-    if given.ndim != 2 or given.shape[1:] != (2,) or not len(given):
-        raise ShapeError(f"a path needs positions as (position, 2), at least one, got shape {given.shape}")
-    exact = check_reach(given).astype(np.float64)
-    exact /= np.maximum(np.hypot(exact[:, :1], exact[:, 1:]), 1)  # what the rim's slack let pass
+    exact = np.array(positions)
+    if exact.ndim != 2 or exact.shape[1:] != (2,) or not len(exact):
+        raise ShapeError(f"a path needs positions as (position, 2), at least one, got shape {exact.shape}")
+    exact = check_reach(exact).astype(np.float64)
+    exact /= np.maximum(np.hypot(exact[:, :1], exact[:, 1:]), 1)  # the slack that check_reach allows
     rounded: NDArray[np.float32] = exact.astype(np.float32)
     beyond = np.hypot(*rounded.astype(np.float64).T) > 1
     rounded[beyond] = np.nextafter(rounded[beyond], np.float32(0))
@@ -49,39 +47,36 @@ def wire_positions(positions: ArrayLike, mounting: Mounting = STRAIGHT) -> NDArr
 def upload(link: ProLink, cells: bytes, read_back: ReadBack, progress: Progress | None = None) -> None:
     """Write cells, X of all positions and then Y of all, to the vector memory, and compare what it holds then.
 
-    ``read_back`` is "none", "sampled" (every tenth frame and the ends of both channels) or "all"; ``progress`` gets
-    cells done and cells in all, those read back included. RigError names a cell that holds something else.
+    ``read_back`` is "none", "sampled" (every tenth frame and the ends of both channels) or "all". ``progress`` gets
+    cells done and cells in all, including those read back. Raises RigError: a cell holds another value.
     """
-    frames = [cells[at : at + pro.VECTOR_CELLS * pro.CELL] for at in range(0, len(cells), pro.VECTOR_CELLS * pro.CELL)]
-    checked = frames_to_check(len(frames), read_back)
-    total = (len(cells) + sum(len(frames[number]) for number in checked)) // pro.CELL
+    size = pro.VECTOR_CELLS * pro.CELL
+    frames = [(at // pro.CELL, cells[at : at + size]) for at in range(0, len(cells), size)]
+    checked = [frames[number] for number in frames_to_check(len(frames), read_back)]
+    total = (len(cells) + sum(len(sent) for _, sent in checked)) // pro.CELL
     done = 0
-
-    def tell(sent: bytes) -> None:
-        nonlocal done
-        done += len(sent) // pro.CELL
+    for number, (start, sent) in enumerate([*frames, *checked]):
+        stop = start + len(sent) // pro.CELL
+        if number < len(frames):
+            link.set(pro.set_vector(pro.VECTOR_MEMORY, start, sent), f"writing cells {start} to {stop}")
+        else:
+            held = read_cells(link, pro.VECTOR_MEMORY, start, stop - start)
+            _compare(link.wire.port, start, sent, held, len(cells) // pro.CELL // 2)
+        done += stop - start
         if progress is not None:
             progress(done, total)
 
-    for number, sent in enumerate(frames):
-        start = number * pro.VECTOR_CELLS
-        link.tell(
-            pro.set_vector(pro.VECTOR_MEMORY, start, sent), f"writing cells {start} to {start + len(sent) // pro.CELL}"
-        )
-        tell(sent)
-    for number in checked:
-        sent, start = frames[number], number * pro.VECTOR_CELLS
-        held = read_cells(link, pro.VECTOR_MEMORY, start, len(sent) // pro.CELL)
-        for cell, (one, other) in enumerate(zip(pro.split_cells(sent), pro.split_cells(held), strict=True), start):
-            if one != other:
-                pairs = len(cells) // pro.CELL // 2
-                axis, position = ("X", cell) if cell < pairs else ("Y", cell - pairs)
-                raise RigError(
-                    f"cell {cell} of the vector memory on {link.wire.port} ({axis} of position {position}) holds "
-                    f"{pro.cell_float(other):.9g}, {pro.cell_float(one):.9g} was sent; nothing was moved: load the "
-                    "path again"
-                )
-        tell(sent)
+
+def _compare(port: str, start: int, sent: bytes, held: bytes, pairs: int) -> None:
+    """Raise RigError for the first cell that holds another value than was sent."""
+    for cell, (one, other) in enumerate(zip(pro.split_cells(sent), pro.split_cells(held), strict=True), start):
+        if one != other:
+            axis, position = ("X", cell) if cell < pairs else ("Y", cell - pairs)
+            raise RigError(
+                f"cell {cell} of the vector memory on {port} ({axis} of position {position}) holds "
+                f"{pro.cell_float(other):.9g}, {pro.cell_float(one):.9g} was sent; nothing was moved: load the path "
+                "again"
+            )
 
 
 def frames_to_check(frames: int, read_back: ReadBack) -> list[int]:
@@ -106,34 +101,23 @@ def read_cells(link: ProLink, register: int, start: int, count: int) -> bytes:
     return link.ask(pro.get_vector(register, start, count), f"reading cells {start} to {start + count}", parse)
 
 
-def check_play(first: int, stop: int, rate_hz: float, cycles: int, loaded: int) -> None:
-    """Refuse a range that is not within the ``loaded`` positions, and a rate or cycles that mean nothing."""
-    if not (0 <= first < stop <= loaded):
-        raise SettingsError(f"{first}:{stop} is no range of the {loaded} positions loaded; load them first")
-    if not (0 < rate_hz < float("inf")) or cycles == 0 or not -1 <= cycles < 2**31:
-        raise SettingsError(
-            f"expected a rate above 0 Hz, and cycles of 1 or more, or -1 for no end, got {rate_hz} Hz and {cycles} "
-            "cycles"
-        )
-
-
 def hold_values(x: float, y: float) -> dict[int, pro.Value]:
-    """Return the registers that send both channels to a position, hold it and end any path.
-
-    They fill one frame.
-    """
+    """Return the registers that send both channels to a position, hold it and end any path; they fill one frame."""
     follow = {**pro.X.followed(pro.X.static_system), **pro.Y.followed(pro.Y.static_system)}
-    halt = {pro.X.vector(pro.VectorRegister.RUN): 0, pro.Y.vector(pro.VectorRegister.RUN): 0}
-    return {pro.X.static_xy: float(x), pro.Y.static_xy: float(y), **follow, **halt}
+    return {pro.X.static_xy: float(x), pro.Y.static_xy: float(y), **follow, **_run_values(0)}
+
+
+def _run_values(run: int) -> dict[int, pro.Value]:
+    """Return the registers that start (1) or halt (0) the vector units of both channels, in one frame."""
+    return {channel.vector(pro.VectorRegister.RUN): run for channel in (pro.X, pro.Y)}
 
 
 @dataclass(frozen=True)
 class MotionLog:
     """Positions that the controller measured at a steady rate.
 
-    ``started_s`` is when the start was acknowledged, by the driver's clock. ``start_error_s`` is how much earlier it
-    may have been: the time of the request itself. Offset and drift against frame times are found where lines get their
-    positions.
+    ``started_s`` is the time of the acknowledgement of the start, by the driver's clock. The log began at most
+    ``start_error_s`` earlier, the duration of the request.
     """
 
     position: NDArray[np.float32]  # (sample, 2) X and Y
@@ -143,15 +127,15 @@ class MotionLog:
 
 
 _POLL_S = 0.01
-KNOWN_MODELS = ("MR-E", "MRE")  # begin the ids of the controllers that the documents are of
+KNOWN_MODELS = ("MR-E", "MRE")  # beginnings of the ids of documented controllers
 
 
 class MirrorController(Closing):
-    """A mirror controller on a port. :meth:`connect` first; use it as a context, or close it.
+    """A mirror controller on a port, a `pipeline.rig.drivers.MirrorDriver`. Call :meth:`connect` first.
 
-    Motions (goto, run) are sent once. One that is not acknowledged raises StateUnknown, and so does every later
-    one of this object; what only reads, and :meth:`halt`, still work. Every method that speaks to the device raises
-    DeviceRefused, DeadlinePassed or DeviceGone besides what it says itself, and RigError before connect.
+    Motions (goto, run) are sent once. One that is not acknowledged raises StateUnknown, and so does every later motion
+    of this object; reads and :meth:`halt` still work. Every method that speaks to the device may also raise
+    DeviceRefused, DeadlinePassed or DeviceGone, and RigError before connect.
     """
 
     def __init__(
@@ -163,13 +147,13 @@ class MirrorController(Closing):
         self._modes = Modes(self._link)
         self._logging: tuple[float, float, float] | None = None  # rate; before the request and after its answer
         self._identity: Identity | None = None
-        self._pairs = 0  # that the vector memory holds
+        self._pairs = 0  # positions in the vector memory
 
     def connect(self, *, known: bool = False) -> Identity:
-        """Find the controller in whichever mode it is, and bring it to pro mode. Nothing moves.
+        """Find the controller in either mode, and change it to pro mode. Nothing moves.
 
-        ``known`` restricts the models to documented ones, or to the one that the settings expect. Raises DeadlinePassed
-        or DeviceGone where nothing answers, RigError where another device does.
+        ``known`` accepts documented models only, or the one that the settings expect. Raises DeadlinePassed or
+        DeviceGone where nothing answers, RigError where another device answers.
         """
         self._pairs, self._identity = 0, None
         found, expected = self._modes.connect(), self.settings.expected_id
@@ -180,21 +164,18 @@ class MirrorController(Closing):
             )
         if known:
             check_model(found, self.wire.port, expected)
-        self._identity = found  # not before: closing parks what is connected, and another device is not moved
+        self._identity = found
         return found
 
     def identity(self) -> Identity:
-        """Return the controller's answers on its identity from when it was connected.
-
-        Raises RigError: it is not connected.
-        """
+        """Return the controller's identity; RigError where it is not connected."""
         self._check_connected()
         assert self._identity is not None
         return self._identity
 
     @property
     def found_in_pro(self) -> bool:
-        """Return whether it was in pro mode when it was connected: an earlier session or another program left it so."""
+        """Return whether it was in pro mode at connect: an earlier session or another program left it so."""
         return self._modes.found_in_pro
 
     def status(self) -> pro.Status:
@@ -202,29 +183,19 @@ class MirrorController(Closing):
         self._check_connected()
         return pro.Status(self._link.ask(pro.ask_status(), "the status", pro.cell_int))
 
-    def temperature(self) -> float:
-        """Return the temperature, read in simple mode.
-
-        Raises RigError: a path plays, and modes are not changed under it.
-        """
-        self._check_idle("ask for its temperature")
-        with self._modes.simple() as lines:
-            return lines.temperature()
-
     def why_unanswered(self, *, with_crc: bool) -> str:
-        """Try frames with a CRC, or without, and come back to those of the settings; return why none is answered.
+        """Try frames with a CRC, or without, and return to those of the settings; return why none is answered, or "".
 
-        Return "" where they are answered. Nothing moves. Raises RigError where a path plays, as `temperature` does.
+        Nothing moves. Raises RigError: a path plays.
         """
         self._check_idle("try other frames")
-        with self._modes.simple():
-            return self._modes.why_unanswered(with_crc=with_crc)
+        return self._modes.try_frames(with_crc=with_crc)
 
     def goto(self, x: float, y: float) -> None:
-        """Send the mirror to a position and hold it there; comes back once that is acknowledged, not at rest.
+        """Send the mirror to a position and hold it there; return once that is acknowledged, not at rest.
 
         Raises PoseError: the position is outside the disk; no byte is sent. Raises RigError: the status forbids motion.
-        Raises StateUnknown: it was not acknowledged, or motions are frozen.
+        Raises StateUnknown: it was not acknowledged, or an earlier motion was not.
         """
         target = wire_positions([(x, y)], self.settings.mounting)[0]
         self._move(hold_values(*target), f"going to {target[0]:.6g}; {target[1]:.6g}")
@@ -244,10 +215,9 @@ class MirrorController(Closing):
     ) -> None:
         """Put positions (position, 2) into the vector memory: X of all, then Y of all, from cell 0 on. Nothing moves.
 
-        ``read_back`` says how much is read back and compared; None takes it from the settings. ``progress`` is called
-        with cells done and cells in all. Raises PoseError or ShapeError where a position is outside the disk,
-        SettingsError where there are too many, before anything is sent; RigError where a path plays, or the memory
-        holds something else than was sent.
+        ``read_back`` selects the cells to read back and compare, by default as in the settings. ``progress`` gets cells
+        done and cells in all. Raises PoseError or ShapeError where a position is outside the disk, and SettingsError
+        where there are too many; nothing is sent then. Raises RigError: a path plays, or a cell holds another value.
         """
         cells = wire_positions(positions, self.settings.mounting)
         if len(cells) > self.settings.vector_pairs:
@@ -264,11 +234,17 @@ class MirrorController(Closing):
     ) -> None:
         """Play the loaded positions ``first`` to ``stop``, half open, at ``rate_hz`` positions a second.
 
-        X plays from cell 0 on, Y from behind the X of all loaded positions, ``cycles`` times (-1: without end);
-        ``trigger`` says which edges step to the next position instead. Raises SettingsError where the range is not
-        within what is loaded, or a number means nothing, and what :meth:`goto` does.
+        X plays from cell 0 on, Y from behind the X of all loaded positions. The path is repeated ``cycles`` times (-1:
+        without end). With a ``trigger`` the edges at its input step to the next position instead. Raises SettingsError:
+        the range is not loaded, or the rate or cycles are out of range. Raises also as :meth:`goto`.
         """
-        check_play(first, stop, rate_hz, cycles, self._pairs)
+        if not (0 <= first < stop <= self._pairs):
+            raise SettingsError(f"{first}:{stop} is no range of the {self._pairs} positions loaded; load them first")
+        if not (0 < rate_hz < float("inf")) or cycles == 0 or not -1 <= cycles < 2**31:
+            raise SettingsError(
+                f"expected a rate above 0 Hz, and cycles of 1 or more, or -1 for no end, got {rate_hz} Hz and {cycles} "
+                "cycles"
+            )
         with self.wire.lock:
             self.wire.check_known("running a path")
             self.halt()
@@ -283,64 +259,50 @@ class MirrorController(Closing):
                     pro.VectorRegister.TRIGGER: int(trigger),
                 }
                 frame = pro.set_values({channel.vector(register): value for register, value in values.items()})
-                self._link.tell(frame, f"setting up the path's {name}")
-            follow: dict[int, pro.Value] = {
-                **pro.X.followed(pro.X.vector_system),
-                **pro.Y.followed(pro.Y.vector_system),
-            }
-            both = {
-                channel.vector(pro.VectorRegister.RUN): 1 for channel in (pro.X, pro.Y)
-            }  # in one frame: they begin together
-            self._move(follow | both, f"running positions {first}:{stop}")
+                self._link.set(frame, f"setting up the path's {name}")
+            follow = {**pro.X.followed(pro.X.vector_system), **pro.Y.followed(pro.Y.vector_system)}
+            self._move(follow | _run_values(1), f"running positions {first}:{stop}")  # one frame: both begin together
 
     def halt(self) -> None:
-        """Stop playing; the mirror stays where it is. Works where motions are frozen, too."""
+        """Stop playing; the mirror stays where it is. Works also where motions are refused."""
         self._check_connected()
-        self._link.tell(
-            pro.set_values({channel.vector(pro.VectorRegister.RUN): 0 for channel in (pro.X, pro.Y)}),
-            "halting the path",
-        )
+        self._link.set(pro.set_values(_run_values(0)), "halting the path")
 
     def is_playing(self) -> bool:
         """Return whether a unit plays a path."""
         self._check_connected()
-        registers = [channel.vector(pro.VectorRegister.RUN) for channel in (pro.X, pro.Y)]
-        return any(
-            map(pro.cell_int, self._link.ask(pro.get_values(registers), "whether a path plays", pro.read_values))
-        )
+        cells = self._link.ask(pro.get_values(list(_run_values(0))), "whether a path plays", pro.read_values)
+        return any(map(pro.cell_int, cells))
 
     def index(self) -> int:
         """Return the position of the loaded path that plays now: the cell of X."""
         self._check_connected()
-        return self._link.ask(
-            pro.get_value(pro.X.vector(pro.VectorRegister.INDEX)), "the place in the path", pro.cell_int
-        )
+        register = pro.X.vector(pro.VectorRegister.INDEX)
+        return self._link.ask(pro.get_value(register), "the place in the path", pro.cell_int)
 
     def start_log(self, rate_hz: float) -> None:
         """Start to log measured positions ``rate_hz`` times a second: X in slot 0, Y in slot 1."""
         self._check_connected()
         self._logging = None
-        self._link.tell(pro.set_values({pro.LOG_RUN: 0}), "stopping the log")
+        self._link.set(pro.set_values({pro.LOG_RUN: 0}), "stopping the log")
         slots = {pro.log_slot(0): pro.FEEDBACK_X, pro.log_slot(1): pro.FEEDBACK_Y}
-        self._link.tell(pro.set_values({**slots, pro.LOG_RATE: float(rate_hz)}), "setting up the log")
+        self._link.set(pro.set_values({**slots, pro.LOG_RATE: float(rate_hz)}), "setting up the log")
         before = self.wire.clock.now()
-        self._link.tell(pro.set_values({pro.LOG_RUN: 1}), "starting the log")
+        self._link.set(pro.set_values({pro.LOG_RUN: 1}), "starting the log")
         self._logging = float(rate_hz), before, self.wire.clock.now()
 
-    def read_log(self, samples: int | None = None) -> MotionLog:
-        """End the log and fetch ``samples`` of it, or as many as the time since the start has.
+    def read_log(self) -> MotionLog:
+        """End the log and fetch the samples since its start, at most as many as the logger holds.
 
-        Never more than the logger holds. A log with fewer values than expected ends where the device says so. RigError
-        where no log was started.
+        A shorter log ends where the device says so. Raises RigError: no log was started.
         """
         if self._logging is None:
             raise RigError(f"no log was started on {self.wire.port}; start one before the path runs")
         rate_hz, before, after = self._logging
-        elapsed = self.wire.clock.now() - after
-        self._link.tell(pro.set_values({pro.LOG_RUN: 0}), "stopping the log")
+        samples = min(int((self.wire.clock.now() - after) * rate_hz), self.settings.log_samples)
+        self._link.set(pro.set_values({pro.LOG_RUN: 0}), "stopping the log")
         self._logging = None
-        wanted = min(int(elapsed * rate_hz) if samples is None else samples, self.settings.log_samples)
-        columns = [self._logged(slot, wanted) for slot in (0, 1)]
+        columns = [self._logged(slot, samples) for slot in (0, 1)]
         held = min(map(len, columns)) // pro.CELL
         measured = np.stack([np.frombuffer(column, ">f4", held) for column in columns], axis=-1).astype(np.float32)
         position = self.settings.mounting.to_model(measured).astype(np.float32, copy=False)
@@ -380,9 +342,9 @@ class MirrorController(Closing):
 
 
 def open_mirror(settings: MirrorSettings, clock: Clock = SYSTEM_CLOCK, *, known: bool = False) -> MirrorController:
-    """Open the port that the settings name and connect to the controller there, see its connect. Nothing moves.
+    """Open the port of the settings and connect to the controller there, as `MirrorController.connect`. Nothing moves.
 
-    Raises DeviceGone where there is no such port, it is in use, or not permitted.
+    Raises DeviceGone: there is no such port, it is in use, or not permitted.
     """
     mirror = MirrorController(SerialTransport(settings.port, settings.baud, clock), settings, clock)
     try:
@@ -394,9 +356,9 @@ def open_mirror(settings: MirrorSettings, clock: Clock = SYSTEM_CLOCK, *, known:
 
 
 def check_model(identity: Identity, port: str, expected: str) -> None:
-    """Refuse a model that the documents are not of, unless the settings expect it by its id (RigError)."""
+    """Raise RigError for an undocumented model, unless the settings expect it by its id."""
     if not expected and not identity.device.upper().startswith(KNOWN_MODELS):
         raise RigError(
-            f"firmware not known on {port}: {identity.words}; expected an id that begins with {KNOWN_MODELS[0]}: is "
+            f"firmware not known on {port}: {identity.summary}; expected an id that begins with {KNOWN_MODELS[0]}: is "
             "another device at this port? If it is the mirror, set rig.expected_id to a part of its id"
         )

@@ -1,14 +1,13 @@
-"""Requests to the mirror controller in either mode: what is sent, what is accepted as the answer, and mode changes.
+"""Requests to the mirror controller in either mode: bytes sent, answers accepted, and mode changes.
 
-Lines of simple mode are ASCII, CR LF behind each, at most 64 bytes, in either case. Frames of pro mode: `pro_mode`.
+Lines of simple mode are ASCII with CR LF, at most 64 bytes, in either case. Frames of pro mode: `pro_mode`.
 """
 
 from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TypeVar
@@ -35,14 +34,14 @@ END = b"\r\n"
 MOST_LINE = 64  # bytes, with the end
 
 START = "START"
-TEMPERATURE, ID, VERSION, SERIAL = "GETTEMP", "GETID", "GETVERSION", "GETSN"
+ID, VERSION, SERIAL = "GETID", "GETVERSION", "GETSN"
 GO_PRO, GO_PRO_CRC = "GOPRO", "GOPROCRC"
 
 Answer = TypeVar("Answer")
 
 
 class Reply(StrEnum):
-    """Replies to requests that ask for nothing but to be done."""
+    """Replies to requests that return no value."""
 
     OK = "OK"
     NO = "NO"
@@ -51,98 +50,51 @@ class Reply(StrEnum):
     ERROR = "ERROR"
 
 
-_WORDS = {
-    Reply.NO: "it does not know the request, or not now",
+_REASONS = {
+    Reply.NO: "it does not know the request, or does not take it now",
     Reply.BELOW: "a value lies below the range and was set to its end",
     Reply.ABOVE: "a value lies above the range and was set to its end",
     Reply.ERROR: "an error on the device",
 }
 
 
-class LineReader:
-    """Finds lines in a stream, however it is cut."""
-
-    def __init__(self) -> None:
-        self._held = b""
-
-    def feed(self, data: bytes) -> list[bytes]:
-        """Take bytes and give the lines that they complete, without their ends; empty lines are left out."""
-        *lines, self._held = (self._held + data).split(b"\n")
-        return [line for line in (line.rstrip(b"\r") for line in lines) if line]
-
-
-def check_done(line: bytes, request: str, port: str) -> None:
-    """Accept the reply OK and nothing else: DeviceRefused at any other that the protocol has, RigError at the rest."""
+def read_done(line: bytes, request: str, port: str) -> bool:
+    """Accept the reply OK; DeviceRefused at another reply of the protocol, RigError at anything else."""
     text = line.decode("ascii", "backslashreplace").strip()
     if text.upper() not in Reply.__members__.values():
         raise RigError(f"expected OK to {request} from {port}, got {text!r}; is this the mirror controller?")
     reply = Reply(text.upper())
     if reply is not Reply.OK:
-        raise DeviceRefused(f"the mirror controller on {port} answered {reply} to {request}: {_WORDS[reply]}")
+        raise DeviceRefused(f"the mirror controller on {port} answered {reply} to {request}: {_REASONS[reply]}")
+    return True
 
 
 def read_text(line: bytes, request: str, port: str) -> str:
-    """Read a reply that is text of the device's own, such as its id.
-
-    It and the reader below raise DeviceRefused where the device said no, and RigError where the reply is none.
-    """
+    """Read a reply that is a text of the device, such as its id; DeviceRefused or RigError where it is none."""
     text = line.decode("ascii", "backslashreplace").strip()
     if not re.fullmatch(r"[ -~]+", text) or "\\x" in text:
         raise RigError(f"expected text to {request} from {port}, got {line!r}; is the port's speed right?")
     if text.upper() in (Reply.NO, Reply.ERROR):
-        check_done(line, request, port)
+        read_done(line, request, port)
     return text
 
 
-def read_temperature(line: bytes, port: str) -> float:
-    """Read a temperature. [deg C]"""
-    text = read_text(line, TEMPERATURE, port)
-    found = re.fullmatch(r"([-+]?\d+(\.\d*)?)( ?C)?", text)
-    if found is None:
-        raise RigError(f"expected a temperature to {TEMPERATURE} from {port}, got {text!r}")
-    return float(found[1])
+def ask_line(wire: Wire, request: str, parse: Callable[[bytes, str, str], Answer], kind: Kind) -> Answer:
+    """Send a line of simple mode and return the parsed line that answers it; raises as `Wire.exchange`."""
 
+    def receiver() -> Receiver[Answer]:
+        """Return a receiver that collects a line."""
+        held = b""
 
-@dataclass(frozen=True)
-class SimpleLink:
-    """Lines of simple mode over a wire.
+        def receive(data: bytes) -> Answer | None:
+            nonlocal held
+            *lines, held = (held + data).split(b"\n")
+            line = next((line for line in (line.rstrip(b"\r") for line in lines) if line), None)
+            return None if line is None else parse(line, request, wire.port)
 
-    Requests raise DeviceRefused, DeadlinePassed or DeviceGone, one that moves the mirror StateUnknown, and RigError
-    where the answer is none.
-    """
+        return receive
 
-    wire: Wire
-
-    def do(self, request: str, kind: Kind) -> None:
-        """Send a request that is answered by OK; going to a range's end is a refusal."""
-
-        def done(line: bytes) -> bool:
-            check_done(line, request, self.wire.port)
-            return True
-
-        self.ask(request, done, kind)
-
-    def text(self, request: str) -> str:
-        """Ask for the controller's id, version or serial number."""
-        return self.ask(request, lambda line: read_text(line, request, self.wire.port))
-
-    def temperature(self) -> float:
-        """Ask for the temperature. [deg C]"""
-        return self.ask(TEMPERATURE, lambda line: read_temperature(line, self.wire.port))
-
-    def ask(self, request: str, parse: Callable[[bytes], Answer], kind: Kind = "read") -> Answer:
-        """Send a request and give what ``parse`` makes of the line that answers it."""
-
-        def receiver() -> Receiver[Answer]:
-            reader = LineReader()
-
-            def receive(data: bytes) -> Answer | None:
-                lines = reader.feed(data)
-                return parse(lines[0]) if lines else None
-
-            return receive
-
-        return self.wire.exchange(request.encode("ascii") + END, request, kind, receiver)
+    return wire.exchange(request.encode("ascii") + END, request, kind, receiver)
 
 
 @dataclass(frozen=True)
@@ -156,19 +108,9 @@ class ProLink:
     with_crc: bool = False
     strict_crc: bool = False
 
-    def ask(self, frame: Frame, name: str, parse: Callable[[bytes], Answer]) -> Answer:
-        """Send a request that only reads, again where no answer comes, and give what ``parse`` makes of the payload."""
-        return self._exchange(frame, name, "read", parse)
+    def ask(self, frame: Frame, name: str, parse: Callable[[bytes], Answer], kind: Kind = "read") -> Answer:
+        """Send a request that only reads and return the parsed payload; it is sent again where no answer comes."""
 
-    def tell(self, frame: Frame, name: str) -> None:
-        """Send a request that sets something and moves nothing, once."""
-        self._exchange(frame, name, "write", bytes)
-
-    def move(self, frame: Frame, name: str) -> None:
-        """Send a request that moves the mirror, once."""
-        self._exchange(frame, name, "motion", bytes)
-
-    def _exchange(self, frame: Frame, name: str, kind: Kind, parse: Callable[[bytes], Answer]) -> Answer:
         def receiver() -> Receiver[Answer]:
             reader = FrameReader()
 
@@ -180,30 +122,36 @@ class ProLink:
 
         return self.wire.exchange(encode(frame, with_crc=self.with_crc), name, kind, receiver)
 
+    def set(self, frame: Frame, name: str) -> None:
+        """Send a request once that writes and moves nothing."""
+        self.ask(frame, name, bytes, "write")
+
+    def move(self, frame: Frame, name: str) -> None:
+        """Send a request once that moves the mirror."""
+        self.ask(frame, name, bytes, "motion")
+
     def _answer(
         self, found: Frame | Damaged, sent: Frame, name: str, parse: Callable[[bytes], Answer]
     ) -> Answer | None:
-        """Return what a frame says to the request; None, and a line in the log, where it is no answer to it."""
+        """Return the answer in a frame; None, and a line in the log, where it does not answer the request."""
         port = self.wire.port
         if isinstance(found, Damaged):
             LOG.warning("%s, while waiting for %s: %s: %s", port, name, found.reason, found.data.hex(" "))
             return None
         if self.with_crc and not found.crc_good:
-            what = "refused" if self.strict_crc else "taken all the same (set strict_crc to refuse it)"
-            LOG.warning("%s: the CRC of an answer to %s does not fit; %s", port, name, what)
+            action = "refused" if self.strict_crc else "accepted (set strict_crc to refuse it)"
+            LOG.warning("%s: the CRC of an answer to %s does not fit; %s", port, name, action)
             if self.strict_crc:
                 return None
         if found.command == sent.command | ERROR_FLAG:
-            try:
-                code = cell_int(found.payload)
-            except ShapeError:
-                size = len(found.payload)
-                raise RigError(f"{name}: {port} answered with an error of {size} bytes, expected 4") from None
-            words = f"the mirror controller on {port} refused {name}: {format_error(code)}"
+            if len(found.payload) != 4:
+                raise RigError(f"{name}: {port} answered with an error of {len(found.payload)} bytes, expected 4")
+            code = cell_int(found.payload)
             garbled = code in (ErrorCode.FRAME_INVALID, ErrorCode.CRC_WRONG)
-            raise DeviceRefused(words, code, garbled=garbled)
+            message = f"the mirror controller on {port} refused {name}: {format_error(code)}"
+            raise DeviceRefused(message, code, garbled=garbled)
         if found.command != sent.command:
-            # lines that were said to a controller in pro mode are complained about when a frame follows
+            # a controller in pro mode complains of lines when the next frame follows
             usual = sent.command == Command.SET_MODE and found.command & ERROR_FLAG
             level = logging.INFO if usual else logging.WARNING
             LOG.log(level, "%s, while waiting for %s: an answer to command %02X", port, name, found.command)
@@ -217,56 +165,55 @@ class ProLink:
 
 @dataclass(frozen=True)
 class Identity:
-    """Identity of a controller, as it states it; a field is empty where it does not know the request."""
+    """Identity of a controller; a field is empty where it does not know the request."""
 
     device: str
     version: str
     serial: str
 
     @property
-    def words(self) -> str:
-        """All of it, for people."""
+    def summary(self) -> str:
+        """All fields in one line."""
         return f"{self.device or 'no id'}, version {self.version or 'unknown'}, serial {self.serial or 'unknown'}"
 
 
-_FRAMES = {False: "frames without a CRC", True: "frames with a CRC"}
-
-
 class Modes:
-    """A controller whose mode is known. Between calls it is in pro mode."""
+    """Changes between the modes of a controller. Between calls it is in pro mode."""
 
     def __init__(self, pro: ProLink) -> None:
         self.pro = pro
-        self.found_in_pro = False  # at the last connect, where an earlier session had left it
-        self._lines = SimpleLink(pro.wire)
+        self.found_in_pro = False  # at the last connect
 
     def connect(self) -> Identity:
-        """Find the controller in either mode, ask what it is, and leave it in pro mode. Nothing moves.
+        """Find the controller in either mode, read its identity, and leave it in pro mode. Nothing moves.
 
-        Raises DeadlinePassed where nothing answers in either mode, RigError where something else does, or DeviceGone.
-        If frames are not answered in the form of the settings, the error says whether they are in the other form.
+        Raises DeadlinePassed where nothing answers in either mode, RigError where something else answers, or
+        DeviceGone. If only frames with the other setting of ``with_crc`` are answered, the error says so.
         """
         with self.pro.wire.lock:
             self.found_in_pro = False
             self.found_in_pro = self._find()
-            said = []
-            for request in (ID, VERSION, SERIAL):
-                try:
-                    said.append(self._lines.text(request))
-                except DeviceRefused as error:  # other firmware may not know it
-                    LOG.warning("%s", error)
-                    said.append("")
+            identity = Identity(*map(self._text, (ID, VERSION, SERIAL)))
             try:
                 self._enter_pro()
             except (DeadlinePassed, DeviceRefused) as error:
                 raise self._with_advice(error) from error
-            return Identity(*said)
+            return identity
 
-    def why_unanswered(self, *, with_crc: bool) -> str:
-        """Try frames with a CRC, or without, from simple mode and back to it: return why none is answered, else "".
+    def try_frames(self, *, with_crc: bool) -> str:
+        """Try frames with a CRC, or without, and return to those of the settings; return why none is answered, or "".
 
-        Nothing moves. Raises DeadlinePassed, DeviceRefused or DeviceGone where simple mode is not reached again.
+        Nothing moves. Raises DeadlinePassed, DeviceRefused or DeviceGone where a mode is not reached again.
         """
+        with self.pro.wire.lock:
+            self._leave_pro()
+            try:
+                return self._why_unanswered(with_crc=with_crc)
+            finally:
+                self._enter_pro()
+
+    def _why_unanswered(self, *, with_crc: bool) -> str:
+        """Try frames from simple mode and return to it; return why none is answered, or ""."""
         tried = Modes(replace(self.pro, with_crc=with_crc))
         try:
             tried._enter_pro()
@@ -276,18 +223,12 @@ class Modes:
         tried._leave_pro()
         return ""
 
-    @contextmanager
-    def simple(self) -> Iterator[SimpleLink]:
-        """Keep simple mode while the block runs; connect again where a mode is not reached.
-
-        Raises DeadlinePassed, DeviceRefused or DeviceGone.
-        """
-        with self.pro.wire.lock:
-            self._leave_pro()
-            try:
-                yield self._lines
-            finally:
-                self._enter_pro()
+    def _text(self, request: str) -> str:
+        try:
+            return ask_line(self.pro.wire, request, read_text, "read")
+        except DeviceRefused as error:  # other firmware may not know it
+            LOG.warning("%s", error)
+            return ""
 
     def _find(self) -> bool:
         """Reach simple mode from either mode, and return whether it was pro mode."""
@@ -302,40 +243,40 @@ class Modes:
     def _leave_pro(self) -> None:
         try:
             self._ask_for_simple(self.pro)
-        except DeviceRefused as error:  # an earlier session may have sent frames the other way
-            LOG.info("%s; asking the other way", error)
+        except DeviceRefused as error:  # an earlier session may have used the other kind of frames
+            LOG.info("%s; asking with the other kind of frames", error)
             self._ask_for_simple(replace(self.pro, with_crc=not self.pro.with_crc))
         self._greet()
 
     def _ask_for_simple(self, link: ProLink) -> None:
         try:
-            link.tell(go_simple(), "changing to simple mode")
-        except DeadlinePassed as error:  # it may have changed all the same; the greeting tells
-            LOG.info("%s; greeting it all the same", error)
+            link.set(go_simple(), "changing to simple mode")
+        except DeadlinePassed as error:  # it may have changed; the greeting shows
+            LOG.info("%s; greeting it in any case", error)
 
     def _greet(self) -> None:
         try:
-            self._lines.do(START, "greeting")
+            ask_line(self.pro.wire, START, read_done, "greeting")
         except DeviceRefused as error:  # the greeting ended a line that was begun before
             LOG.info("%s; greeting it once more", error)
-            self._lines.do(START, "greeting")
+            ask_line(self.pro.wire, START, read_done, "greeting")
 
     def _enter_pro(self) -> None:
-        words = GO_PRO_CRC if self.pro.with_crc else GO_PRO
+        request = GO_PRO_CRC if self.pro.with_crc else GO_PRO
         try:
-            self._lines.do(words, "write")
-        except DeadlinePassed as error:  # it may have changed all the same; the status tells
-            LOG.info("%s; asking for the status all the same", error)
+            ask_line(self.pro.wire, request, read_done, "write")
+        except DeadlinePassed as error:  # it may have changed; the status shows
+            LOG.info("%s; asking for the status in any case", error)
         self.pro.ask(ask_status(), "the status", cell_int)
 
     def _with_advice(self, error: DeadlinePassed | DeviceRefused) -> RigError:
         """Return the error of a pro mode that was not reached, with the setting that reaches it where there is one."""
-        own, other = self.pro.with_crc, not self.pro.with_crc
+        other = not self.pro.with_crc
         try:
             self._find()
-            if self.why_unanswered(with_crc=other):
+            if self._why_unanswered(with_crc=other):
                 return error
         except RigError:
             return error
-        setting = f"with_crc = {str(other).lower()}"
-        return DeviceRefused(f"{_FRAMES[own]}: {error}. It answers {_FRAMES[other]}; set {setting} in [rig]")
+        own, others = ("frames without a CRC", "frames with a CRC")[:: 1 if other else -1]
+        return DeviceRefused(f"{own}: {error}. It answers {others}; set with_crc = {str(other).lower()} in [rig]")

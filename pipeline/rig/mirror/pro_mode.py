@@ -1,14 +1,14 @@
-"""Frames of the mirror controller's pro mode, bytes to frames and back, and what their payloads carry.
+"""Frames of the mirror controller's pro mode: bytes to frames and back, their payloads, and the registers.
 
-A frame is ``7E | address 00 | command | size | payload | CRC, low byte first | 7E``; 7D and 7E between the boundaries
-are sent as 7D and the byte with bit 5 turned. The CRC is CRC-16/ARC over address to payload. It fits the one documented
-frame (``00 11 04 00 00 00 00 | F2 81``) and is not confirmed on hardware. So a reader only says whether it fits. That
-it begins at 0 leaves open whether the address counts; as the address is 0, either way gives the same CRC.
+A frame is ``7E | address 00 | command | size | payload | CRC, low byte first | 7E``. Between the boundaries 7D and 7E
+are sent as 7D and the byte with bit 5 inverted. The CRC is CRC-16/ARC over address to payload. It fits the one
+documented frame (``00 11 04 00 00 00 00 | F2 81``) and is not confirmed on hardware, so a reader only reports whether
+it fits.
 
-Numbers in payloads are big-endian. A register's id takes two bytes, its cell four: a float32, or an integer. Several
+Numbers in payloads are big-endian. A register's id takes two bytes, its cell four: a float32 or an integer. Several
 registers go as their count, all ids, then all cells. A vector's cells are addressed by register, offset in BYTES and
-length in bytes. Requests without an argument carry 00 00. Layouts are those of the controller's public software; what
-an acknowledgement carries is not documented there, it is taken to be nothing.
+length in bytes. Requests without an argument carry 00 00. Layouts are those of the controller's public software, which
+does not document the payload of an acknowledgement; it is assumed to be empty.
 """
 
 from __future__ import annotations
@@ -31,10 +31,8 @@ ERROR_FLAG = 0x80  # command of a reply that says no
 class Command(IntEnum):
     """Commands of frames."""
 
-    FIRMWARE_ID = 0x01
     STATUS = 0x02
     SET_MODE = 0x06
-    SET_VALUE = 0x10
     GET_VALUE = 0x11
     SET_VALUES = 0x12
     GET_VALUES = 0x13
@@ -43,7 +41,7 @@ class Command(IntEnum):
 
 
 class ErrorCode(IntEnum):
-    """Why the device says no, and that in words."""
+    """Reasons of the device for refusing a request, with a text for messages."""
 
     words: str
 
@@ -73,14 +71,14 @@ class ErrorCode(IntEnum):
 
 
 def format_error(code: int) -> str:
-    """Return an error code of the device in words, with its number."""
+    """Return the text of an error code, with its number."""
     known = {error.value: error.words for error in ErrorCode}
-    return f"{known.get(code, 'an error that this driver does not know')} (code {code:04X})"
+    return f"{known.get(code, 'unknown error')} (code {code:04X})"
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame. ``crc_good`` is what a reader found; it does not count when frames are compared."""
+    """One frame. ``crc_good`` is the finding of a reader; comparisons ignore it."""
 
     command: int
     payload: bytes = b""
@@ -90,7 +88,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Damaged:
-    """Bytes between two boundaries that are no frame, as they came, and why."""
+    """Bytes between two boundaries that form no frame, and the reason."""
 
     reason: str
     data: bytes
@@ -104,7 +102,7 @@ def _crc_step(value: int) -> int:
 
 
 def crc_arc(data: bytes) -> int:
-    """Return the CRC-16/ARC of bytes: polynomial 8005 reflected, beginning at 0."""
+    """Return the CRC-16/ARC of bytes: polynomial 8005 reflected, initial value 0."""
     crc = 0
     for byte in data:
         crc = crc >> 8 ^ _crc_step((crc ^ byte) & 0xFF)
@@ -112,9 +110,9 @@ def crc_arc(data: bytes) -> int:
 
 
 def encode(frame: Frame, *, with_crc: bool = True) -> bytes:
-    """Return the bytes of a frame, boundaries and escapes included; 00 00 in the CRC's place without one.
+    """Return the bytes of a frame with boundaries and escapes; without a CRC its two bytes are 00 00.
 
-    Raises ShapeError where the payload is too long.
+    Raises ShapeError: the payload is too long.
     """
     if len(frame.payload) > MOST_PAYLOAD:
         raise ShapeError(f"a frame carries at most {MOST_PAYLOAD} bytes, got {len(frame.payload)}; send several")
@@ -125,17 +123,17 @@ def encode(frame: Frame, *, with_crc: bool = True) -> bytes:
 
 
 class FrameReader:
-    """Finds frames in a stream, however it is cut. Every boundary ends what came before it and begins what follows.
+    """Finds frames in a stream that may be cut anywhere.
 
-    So a damaged frame, or rubbish between frames, never costs the frame behind it.
+    Every boundary ends the bytes before it and begins a frame, so a damaged frame never costs the next one.
     """
 
     def __init__(self) -> None:
         self._held = bytearray()
-        self._begun = False  # a boundary came before what is held
+        self._begun = False  # whether a boundary came before the held bytes
 
     def feed(self, data: bytes) -> list[Frame | Damaged]:
-        """Take bytes and give the frames, and the bytes that are none, that they complete."""
+        """Take bytes; return the frames and the damaged frames that they complete."""
         found: list[Frame | Damaged] = []
         for byte in data:
             if byte == BOUNDARY:
@@ -185,23 +183,18 @@ def float_cell(value: float) -> bytes:
 
 
 def int_cell(value: int) -> bytes:
-    """Return the cell of an integer of 32 bits, with or without a sign."""
+    """Return the cell of a signed or unsigned integer of 32 bits."""
     return (value & 0xFFFFFFFF).to_bytes(CELL, "big")
 
 
-def to_cell(value: Value) -> bytes:
-    """Return the cell of a float or of an integer, by its type."""
-    return int_cell(value) if isinstance(value, int) else float_cell(value)
-
-
 def cell_float(cell: bytes) -> float:
-    """Read a cell as a float32."""
-    return float(struct.unpack(">f", _checked(cell, CELL, "a cell"))[0])
+    """Read a cell as a float32; ShapeError where it is no cell, here and below."""
+    return float(struct.unpack(">f", _checked(cell, CELL))[0])
 
 
 def cell_int(cell: bytes) -> int:
-    """Read a cell as an integer without a sign."""
-    return int.from_bytes(_checked(cell, CELL, "a cell"), "big")
+    """Read a cell as an unsigned integer."""
+    return int.from_bytes(_checked(cell, CELL), "big")
 
 
 def ask_status() -> Frame:
@@ -216,67 +209,58 @@ def go_simple() -> Frame:
 
 def get_value(register: int) -> Frame:
     """Return a request for a register; the reply is its cell."""
-    return Frame(Command.GET_VALUE, _id(register))
+    return Frame(Command.GET_VALUE, count_bytes(register))
 
 
 def get_values(registers: Sequence[int]) -> Frame:
     """Return a request for 1 to 8 registers; the reply is their count and their cells."""
-    return Frame(Command.GET_VALUES, _id(len(registers)) + b"".join(map(_id, registers)))
+    return Frame(Command.GET_VALUES, count_bytes(len(registers)) + b"".join(map(count_bytes, registers)))
 
 
 def set_values(values: Mapping[int, Value]) -> Frame:
-    """Set 1 to 8 registers at once, in the order given."""
-    ids, cells = b"".join(map(_id, values)), b"".join(map(to_cell, values.values()))
-    return Frame(Command.SET_VALUES, _id(len(values)) + ids + cells)
+    """Return a request that sets 1 to 8 registers at once: integers as such, floats as float32."""
+    cells = (int_cell(value) if isinstance(value, int) else float_cell(value) for value in values.values())
+    return Frame(Command.SET_VALUES, count_bytes(len(values)) + b"".join([*map(count_bytes, values), *cells]))
 
 
 def get_vector(register: int, start: int, count: int) -> Frame:
     """Return a request for the cells ``start`` to ``start + count`` of a vector; the reply is the cells."""
-    return Frame(Command.GET_VECTOR, _span(register, start, count))
+    return Frame(Command.GET_VECTOR, struct.pack(">HHB", register, start * CELL, count * CELL))
 
 
 def set_vector(register: int, start: int, cells: bytes) -> Frame:
-    """Set the cells of a vector from ``start`` on."""
-    return Frame(Command.SET_VECTOR, _span(register, start, len(cells) // CELL) + cells)
+    """Return a request that sets the cells of a vector from ``start`` on."""
+    return Frame(Command.SET_VECTOR, struct.pack(">HHB", register, start * CELL, len(cells)) + cells)
 
 
 def refuse(command: int, code: int) -> Frame:
-    """Build the device's reply that it did not."""
+    """Return the device's reply that refuses a command."""
     return Frame(command | ERROR_FLAG, int_cell(code))
 
 
-def values_reply(cells: Sequence[bytes]) -> Frame:
-    """Build the device's reply with several registers' cells."""
-    return Frame(Command.GET_VALUES, _id(len(cells)) + b"".join(cells))
+def count_bytes(number: int) -> bytes:
+    """Return the two bytes of a count or of a register's id."""
+    return number.to_bytes(2, "big")
 
 
-def read_register(payload: bytes) -> tuple[int, bytes]:
-    """Read the register that a request names, and what follows it: nothing, or its cell.
-
-    All readers here raise ShapeError where a length does not fit.
-    """
-    if len(payload) not in (2, 2 + CELL):
-        raise ShapeError(f"expected a register's id and at most its cell, 2 or 6 bytes, got {len(payload)}")
-    return int.from_bytes(payload[:2], "big"), payload[2:]
-
-
-def read_registers(payload: bytes, *, with_cells: bool) -> list[tuple[int, bytes]]:
-    """Read the registers that a request names, each with its cell, or with nothing where only ids came."""
+def read_registers(payload: bytes, *, with_cells: bool) -> dict[int, bytes]:
+    """Read the registers of a request, each with its cell, or with no bytes where only ids came."""
     count = int.from_bytes(payload[:2], "big")
-    _checked(payload, 2 + count * (2 + CELL * with_cells), f"{count} registers")
+    _checked(payload, 2 + count * (2 + CELL * with_cells))
+    if not count:
+        raise ShapeError("expected one register or more, got none")
     ids = [int.from_bytes(payload[at : at + 2], "big") for at in range(2, 2 + 2 * count, 2)]
     cells = split_cells(payload[2 + 2 * count :]) if with_cells else [b""] * count
-    return list(zip(ids, cells, strict=True))
+    return dict(zip(ids, cells, strict=True))
 
 
 def read_values(payload: bytes) -> list[bytes]:
     """Read the cells of a reply with several registers."""
-    count = int.from_bytes(payload[:2], "big")
-    return split_cells(_checked(payload, 2 + CELL * count, f"{count} values")[2:])
+    return split_cells(_checked(payload, 2 + CELL * int.from_bytes(payload[:2], "big"))[2:])
 
 
 def read_vector(payload: bytes) -> tuple[int, int, int, bytes]:
-    """Read a request for cells of a vector: register, offset and length in bytes, and the cells, if they came."""
+    """Read a request for cells of a vector: register, offset and length in bytes, and the cells, if any."""
     if len(payload) < 5:
         raise ShapeError(f"expected a register, an offset and a length, 5 bytes or more, got {len(payload)}")
     register, offset, length = struct.unpack(">HHB", payload[:5])
@@ -285,26 +269,14 @@ def read_vector(payload: bytes) -> tuple[int, int, int, bytes]:
 
 def split_cells(data: bytes) -> list[bytes]:
     """Cut bytes into cells."""
-    if len(data) % CELL:
-        raise ShapeError(f"expected whole cells of {CELL} bytes, got {len(data)} bytes")
-    return [data[at : at + CELL] for at in range(0, len(data), CELL)]
+    return [_checked(data[at : at + CELL], CELL) for at in range(0, len(data), CELL)]
 
 
-def _id(number: int) -> bytes:
-    return number.to_bytes(2, "big")
-
-
-def _span(register: int, start: int, count: int) -> bytes:
-    return struct.pack(">HHB", register, start * CELL, count * CELL)
-
-
-def _checked(data: bytes, size: int, what: str) -> bytes:
+def _checked(data: bytes, size: int) -> bytes:
     if len(data) != size:
-        raise ShapeError(f"expected {size} bytes for {what}, got {len(data)}")
+        raise ShapeError(f"expected {size} bytes, got {len(data)}")
     return data
 
-
-CHANNELS = 2  # 0 is X, 1 is Y
 
 FEEDBACK_X, FEEDBACK_Y = 0x2302, 0x2303
 LOG_SLOTS = 6
@@ -321,17 +293,16 @@ class Unit(IntEnum):
 
 
 class Trigger(IntEnum):
-    """Edges at the trigger input that step through the vector memory."""
+    """Edges at the trigger input that step through the vector memory (1, both edges, is not used)."""
 
     OFF = 0
-    BOTH_EDGES = 1
     RISING_EDGE = 2
 
 
 class Status(IntFlag):
-    """Status bits, and what each says. The ``WAS`` bits stay until they are acknowledged."""
+    """Status bits with their texts. The ``WAS`` bits stay on until they are acknowledged."""
 
-    says: str
+    text: str
 
     DISCONNECTED = 1 << 0, "the mirror head is not connected"
     ELECTRONICS_WARM = 1 << 1, "the mirror head's electronics are too warm"
@@ -341,60 +312,33 @@ class Status(IntFlag):
     OUTPUT_LIMIT = 1 << 5, "the drive is at its limit"
     AVERAGE_LIMIT = 1 << 6, "the drive's average is at its limit"
     TRIMMED = 1 << 7, "a target was beyond the rim, and was trimmed to it"
-    WAS_DISCONNECTED = 1 << 8, "the mirror head was not connected (since acknowledged last)"
-    WAS_ELECTRONICS_WARM = 1 << 9, "the mirror head's electronics were too warm (since acknowledged last)"
-    WAS_MIRROR_WARM = 1 << 10, "the mirror was too warm (since acknowledged last)"
-    WAS_OUTPUT_LIMIT = 1 << 11, "the drive was at its limit (since acknowledged last)"
-    WAS_AVERAGE_LIMIT = 1 << 12, "the drive's average was at its limit (since acknowledged last)"
-    WAS_TRIMMED = 1 << 13, "a target was trimmed to the rim (since acknowledged last)"
+    WAS_DISCONNECTED = 1 << 8, "the mirror head was not connected (since the last acknowledgement)"
+    WAS_ELECTRONICS_WARM = 1 << 9, "the mirror head's electronics were too warm (since the last acknowledgement)"
+    WAS_MIRROR_WARM = 1 << 10, "the mirror was too warm (since the last acknowledgement)"
+    WAS_OUTPUT_LIMIT = 1 << 11, "the drive was at its limit (since the last acknowledgement)"
+    WAS_AVERAGE_LIMIT = 1 << 12, "the drive's average was at its limit (since the last acknowledgement)"
+    WAS_TRIMMED = 1 << 13, "a target was trimmed to the rim (since the last acknowledgement)"
 
-    def __new__(cls, bit: int, says: str = "") -> Status:
+    def __new__(cls, bit: int, text: str = "") -> Status:
         status = int.__new__(cls, bit)
-        status._value_, status.says = bit, says
+        status._value_, status.text = bit, text
         return status
 
     @property
-    def words(self) -> list[str]:
-        """Return the bits that are on, in words; bits without a known meaning by their number."""
-        known = [bit.says for bit in Status if bit in self]
-        rest = int(self) & ~sum(Status)
-        return known + [f"bit {place}, whose meaning is not known" for place in range(32) if rest >> place & 1]
-
-    @property
     def sentence(self) -> str:
-        """The bits and what they say, for messages."""
-        return f"status {int(self):08X}: {'; '.join(self.words) or 'nothing is amiss'}"
+        """The bits and their texts, for messages; unknown bits by their number."""
+        texts = [bit.text for bit in Status if bit in self]
+        rest = int(self) & ~sum(Status)
+        texts += [f"unknown bit {place}" for place in range(32) if rest >> place & 1]
+        return f"status {int(self):08X}: {'; '.join(texts) or 'no error'}"
 
     @property
     def stops_motion(self) -> bool:
-        """Return whether something is on, now, with which the mirror does not go where it is sent."""
+        """Return whether a bit is on with which the mirror does not go where it is sent."""
         return bool(self & _STOPS)
 
 
 _STOPS = Status.DISCONNECTED | Status.ELECTRONICS_WARM | Status.MIRROR_WARM | Status.EEPROM_INVALID
-
-
-@dataclass
-class ChannelRegisters:
-    """The registers of one channel: the inputs it can follow, and which of them it does."""
-
-    channel: int
-
-    def __post_init__(self) -> None:
-        self.static_system = 0x50 + self.channel  # of held positions
-        self.vector_system = 0x68 + self.channel  # plays the vector memory
-        self.xy_system = 0xC0 + self.channel  # controls position
-        self.static_xy = self.static_system << 8 | Unit.XY  # held position, float
-        self.input = 0x4000 + 5 * self.channel  # which system the channel follows
-        self.control = 0x4002 + 5 * self.channel  # which system controls the channel
-
-    def vector(self, register: VectorRegister) -> int:
-        """Return the id of a register of the vector unit."""
-        return self.vector_system << 8 | register
-
-    def followed(self, system: int) -> dict[int, int]:
-        """Return the values that make the channel follow an input, controlled by position."""
-        return {self.control: self.xy_system, self.input: system}
 
 
 class VectorRegister(IntEnum):
@@ -405,17 +349,34 @@ class VectorRegister(IntEnum):
     START = 0x2
     END = 0x3
     FREQUENCY = 0x4  # cells per second, float
-    LOWEST = 0x5  # float, read only
-    HIGHEST = 0x6  # float, read only
     CYCLES = 0x7  # -1 is without end
     TRIGGER = 0x8
-    OUTPUT = 0x9  # float, read only
     INDEX = 0xA  # read only
+
+
+class ChannelRegisters:
+    """Registers of one channel: the inputs it can follow, and which of them it follows."""
+
+    def __init__(self, channel: int) -> None:
+        self.static_system = 0x50 + channel  # of held positions
+        self.vector_system = 0x68 + channel  # plays the vector memory
+        self.xy_system = 0xC0 + channel  # controls position
+        self.static_xy = self.static_system << 8 | Unit.XY  # held position, float
+        self.input = 0x4000 + 5 * channel  # which system the channel follows
+        self.control = 0x4002 + 5 * channel  # which system controls the channel
+
+    def vector(self, register: VectorRegister) -> int:
+        """Return the id of a register of the vector unit."""
+        return self.vector_system << 8 | register
+
+    def followed(self, system: int) -> dict[int, Value]:
+        """Return the values that make the channel follow an input, controlled by position."""
+        return {self.control: self.xy_system, self.input: system}
 
 
 X, Y = ChannelRegisters(0), ChannelRegisters(1)
 
 
 def log_slot(slot: int) -> int:
-    """Return the id of the register that assigns a slot of the logger, which is also that of the vector it records."""
+    """Return the id of the register that assigns a slot of the logger; the recorded vector has the same id."""
     return 0x2400 | slot

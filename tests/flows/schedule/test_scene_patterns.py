@@ -83,6 +83,6 @@ def test_a_schedule_begins_before_there_is_a_scene(
     pattern = {"scene": str(tmp_path / "scenes" / "{new}.png"), "source": None, "budget": None}
     (field,) = load_fields([field_file("north", **pattern)])
     assert field.settings.scene == pattern["scene"]
-    assert "it is looked for whenever it is due" in capsys.readouterr().err
+    assert "each due run looks for it again" in capsys.readouterr().err
     with pytest.raises(WeightsError):
         load_fields([field_file("south", **pattern, weights=str(tmp_path / "none.safetensors"))])

@@ -29,7 +29,7 @@ BAD = {
     "no zone": (("north",), "--cron 0_6_*_*_* --timezone Mars/Base", 2, "--timezone 'Mars/Base' is no time zone"),
     "no such file": (("nowhere",), "--every 30m", 2, "no settings file .*nowhere.toml"),
     "unknown key": (("typo",), "--every 30m", 2, "unknown setting 'sceene' in .*typo.toml; did you mean 'scene'"),
-    "neither scene nor rig": (("blind",), "--every 30m", 2, "blind.toml says neither scene nor source = 'rig'"),
+    "neither scene nor rig": (("blind",), "--every 30m", 2, "blind.toml has neither scene nor source = 'rig'"),
     "scene missing": (("gone",), "--every 30m", 1, "gone.toml: there is no file .*gone.png"),
     "twice": (("north", "north"), "--every 30m", 2, "are both called north"),
     "limit": (("north",), "--every 30m --limit 0", 2, "--limit 0: expected 1 or more"),
@@ -60,7 +60,7 @@ def test_two_serves_on_one_archive(field_file: Callable[..., Path], tmp_path: Pa
     release = take_lock(Archive.open(tmp_path / "archive").root / ".locks" / "serve.lock", wait=False)
     assert release is not None
     try:
-        command_line("serve", file, "--every", "30m").refused(1, "another serve works on the archive")
+        command_line("serve", file, "--every", "30m").refused(1, "another serve uses the archive")
     finally:
         release()
 
@@ -100,7 +100,7 @@ def test_sigterm_stops_a_schedule(
     monkeypatch.setattr(serve_command, "_server", terminated)
     ended = command_line("serve", field_file(), "--every", "30m")
     assert (ended.code, ended.errors) == (0, [])
-    assert ended.err.splitlines()[-1] == "stopped: nothing is due any more; the same command serves again"
+    assert ended.err.splitlines()[-1] == "stopped: no run starts from now on; the same command serves again"
 
 
 def test_a_field_is_a_deployment_of_the_survey(field_file: Callable[..., Path], tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from tests.pipeline.rig.camera_faults import FaultyRig
 from tests.pipeline.rig.mirror_faults import make_fault
 from tests.pipeline.rig.small_rig import small_source
 
-SETS = {Command.SET_VALUE, Command.SET_VALUES, Command.SET_VECTOR}
+SETS = {Command.SET_VALUES, Command.SET_VECTOR}
 NOWHERE = "127.0.0.1:1:1"
 
 
@@ -47,7 +47,7 @@ def camera_of(rig: ServedRig) -> str:
 
 def still(rig: ServedRig) -> bool:
     """Whether the mirror was told nothing but its mode."""
-    return not any(act.request.command in SETS for act in rig.rig.mirror.acts)
+    return not any(request.command in SETS for request in rig.rig.mirror.requests)
 
 
 def test_settings_file_says_where_both_are(command_line: CommandLine, tmp_path: Path) -> None:
@@ -152,11 +152,12 @@ def test_what_is_not_tried_is_said(command_line: CommandLine) -> None:
         for more, why in (((), "without a camera"), (("--camera", NOWHERE), "as not all of the above is in order")):
             ended = command_line("rig", "check", "--port", rig.port, *more, "--move", "--json")
             assert json.loads(ended.out)["rows"][-1]["came"].startswith(f"not tried {why}; pulses")
-        for player in rig.rig.mirror.state.players:
-            player.start, player.end, player.running, player.frequency_hz = 0, 10, True, 0.001
+        playbacks = rig.rig.mirror.state.playbacks
+        for playback in playbacks:
+            playback.running, playback.total = True, float("inf")
         ended = command_line("rig", "check", "--port", rig.port, "--camera", camera_of(rig), "--move", "--json")
         assert json.loads(ended.out)["rows"][-1]["came"].startswith(f"not tried {why}; pulses")
-        assert all(player.running for player in rig.rig.mirror.state.players)
+        assert all(playback.running for playback in playbacks)
         assert not rig.rig.camera.captures
 
 

@@ -32,8 +32,8 @@ from pipeline.geometry.mirror import STRAIGHT, Mounting
 from pipeline.geometry.scan import Sweep, exposing
 from pipeline.rig.camera.camera_cubes import mean_frame
 from pipeline.rig.capture.capture_paths import REFERENCES
-from pipeline.rig.capture.capture_runner import RigDevices
 from pipeline.rig.device_settings import SurveyRig
+from pipeline.rig.drivers import RigDevices
 from pipeline.rig.emulator.emulated_rig import REFERENCE_FRAMES, EmulatedRig, FastClock, SceneView
 from pipeline.rig.emulator.mirror_device import Mode
 from pipeline.rig.mirror.pro_mode import Command
@@ -388,9 +388,9 @@ def test_another_device_is_not_moved(command_line: CommandLine, tmp_path: Path, 
     with rig.serve() as served:
         told = {"port": served.port, "host": served.host, "control_port": served.camera_port}
         assert words in told_on_the_command_line(command_line, tmp_path, **told)
-    asked = {act.request.command for act in rig.mirror.acts}
-    assert not asked & {Command.SET_VALUE, Command.SET_VALUES, Command.SET_VECTOR}
-    assert not any("=" in act.request.line for act in rig.mirror.acts)
+    asked = {request.command for request in rig.mirror.requests}
+    assert not asked & {Command.SET_VALUES, Command.SET_VECTOR}
+    assert not any("=" in request.line for request in rig.mirror.requests)
 
 
 def test_port_in_use_and_camera_unreachable(command_line: CommandLine, tmp_path: Path):
@@ -404,5 +404,5 @@ def test_port_in_use_and_camera_unreachable(command_line: CommandLine, tmp_path:
         other.close()
         error = told_on_the_command_line(command_line, tmp_path, **told)
         assert f"127.0.0.1:{told['control_port']}" in error
-        assert not rig.mirror.state.players[0].running
+        assert not rig.mirror.state.playbacks[0].running
         assert rig.mirror.state.positions(rig.clock.now()).tolist() == [0.0, 0.0]

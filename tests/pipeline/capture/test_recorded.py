@@ -153,10 +153,10 @@ def _lines_apart(distance_px: float) -> RecordedSweep:
     [
         (
             Sweep("fine-0", "fine", "x", 0.0, 35.5, 8),
-            r"line 5 of sweep fine-0 was never taken: it lies at 40.5 px of the scan on the strip at 0 px \(binning 1, "
-            r"step 1\), the nearest recorded line, 79 of scan-0, at 39.5 px on 0 px",
+            r"line 5 of sweep fine-0 was never captured: it lies at 40.5 px of the scan on the swath at 0 px "
+            r"\(binning 1, step 1\), the nearest recorded line, 79 of scan-0, at 39.5 px on 0 px",
         ),
-        (Sweep("fine-0", "fine", "x", 20.0, -9.5, 4), r"line 0 of sweep fine-0 was never taken: .* strip at 20 px"),
+        (Sweep("fine-0", "fine", "x", 20.0, -9.5, 4), r"line 0 of sweep fine-0 was never captured: .* swath at 20 px"),
         (
             Sweep("fine-0", "fine", "y", 0.0, -9.5, 4),
             "lie along y, those of the recording along x; plan sweeps along x",
@@ -182,7 +182,7 @@ def test_a_plan_is_cut_to_what_was_recorded() -> None:
     inside = replace(lower, name="fine", lines=10)
     assert recorded.cut_to_recorded(inside) == inside
     assert recorded.cut_to_recorded(replace(inside, swath_px=64.0)) is None
-    with pytest.raises(NotRecordedError, match="line 8 of sweep coarse-0 was never taken: it lies at -8 px"):
+    with pytest.raises(NotRecordedError, match="line 8 of sweep coarse-0 was never captured: it lies at -8 px"):
         next(recorded.lines(replace(beyond, start_px=-41.5, lines=21)))
 
 

@@ -60,7 +60,7 @@ def _moved(along_px: np.ndarray, scan_px: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(
     ("along", "scan", "message"),
     [
-        (np.linspace(0, 200, 50), np.arange(50.0), r"line 0 lies 100 px beside the strip at 100 px, and at most 40 px"),
+        (np.linspace(0, 200, 50), np.arange(50.0), r"line 0 lies 100 px beside the swath at 100 px, and at most 40 px"),
         (np.zeros(50), np.full(50, 3.0), "stands still"),
         (np.zeros(50), np.concatenate([np.arange(35.0), np.arange(34.0, 19, -1)]), "turns back at line 4[23]"),
     ],

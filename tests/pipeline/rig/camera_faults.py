@@ -66,7 +66,8 @@ class FaultyCamera(CameraDevice):
 
     def __init__(self, *given: Any, faults: CameraFaults | None = None, **named: Any) -> None:
         self.faults = CameraFaults() if faults is None else faults
-        self._missing: dict[str, int] = {}  # bytes at the end of the last cube, by folder
+        self.commands: list[str] = []  # as they came
+        self._cut: set[str] = set()  # folders whose last cube is cut off
         super().__init__(*given, **named)
 
     def greet(self) -> list[Chunk]:
@@ -76,6 +77,7 @@ class FaultyCamera(CameraDevice):
     def command(self, line: str) -> list[Chunk] | None:
         """Do a command, and answer it or not."""
         with self._lock:
+            self.commands.append(line)
             said = super().command(line)
             if said is None or self.faults.strikes(CameraFault.HANGS_UP):
                 return None
@@ -99,11 +101,12 @@ class FaultyCamera(CameraDevice):
     def files(self) -> dict[str, bytes]:
         """Give the files, with cubes that are cut off."""
         found = super().files()
-        for folder, missing in self._missing.items():
+        for folder in self._cut:
             cubes = [name for name in found if name.startswith(folder + "/") and _CUBE.fullmatch(name.split("/")[-1])]
             if cubes:
                 last = max(cubes, key=lambda name: int(name.rpartition("_")[2]))
-                found[last] = found[last][:-missing]
+                lines = int(found[f"{last}.hdr"].partition(b"lines = ")[2].split()[0])
+                found[last] = found[last][: -3 * len(found[last]) // (2 * lines)]  # a line and a half
         return found
 
     def _in_pieces(self, data: bytes) -> list[Chunk]:
@@ -120,11 +123,9 @@ class FaultyCamera(CameraDevice):
         return super()._capture(argument)
 
     def _begun(self, folder: str, frames: int, cubes: int) -> EmulatedCapture:
+        self._cut.discard(folder)
         if self.faults.strikes(CameraFault.CUT_CUBE):
-            now_s = np.array([self.clock.now()])
-            self._missing[folder] = self._lines(self._positions(now_s), now_s)[0].size * 3  # a line and a half
-        else:
-            self._missing.pop(folder, None)
+            self._cut.add(folder)
         return super()._begun(folder, frames, cubes)
 
 

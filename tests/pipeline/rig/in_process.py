@@ -9,8 +9,8 @@ from itertools import count
 
 from pipeline.errors import SettingsError
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.capture.capture_runner import RigDevices
 from pipeline.rig.device_settings import FileServer, MirrorSettings
+from pipeline.rig.drivers import RigDevices
 from pipeline.rig.emulator import Chunk
 from pipeline.rig.emulator.camera_device import CameraConnection, CameraDevice
 from pipeline.rig.emulator.emulated_rig import EmulatedRig

@@ -24,7 +24,6 @@ from pipeline.rig.mirror.pro_mode import (
     FrameReader,
     Status,
     encode,
-    int_cell,
     read_vector,
     refuse,
 )
@@ -35,7 +34,6 @@ TICK_S = 0.005  # at which replies that wait for each other leave
 # the end of a reply with a text, one of a status, and a whole frame: what another program left behind
 _LEFT_BEHIND = (b"R-E-2\r\n", b"00000010\r\n", bytes.fromhex("7e 00 11 04 00 00 00 00 f2 81 7e"))
 _OTHER_TEXTS = {ID: "LENS-DRIVER-4", VERSION: "0.0.1"}
-_OTHER_FIRMWARE = 0xDEAD0001
 
 Change = Callable[[bytes, int, Random], bytes]  # some bytes, and the place of the one that is changed
 Spoil = Callable[[MirrorDevice, list[Chunk], Random], list[Chunk]]
@@ -391,9 +389,6 @@ class OtherFirmware(Fault):
         if request.line in _OTHER_TEXTS:
             self.chance.struck += 1
             return _OTHER_TEXTS[request.line].encode("ascii") + END
-        if request.command == Command.FIRMWARE_ID:
-            self.chance.struck += 1
-            return encode(Frame(Command.FIRMWARE_ID, int_cell(_OTHER_FIRMWARE)))
         return None
 
 
@@ -472,8 +467,8 @@ class Modem(Fault):
         return [Chunk(device.unit.turnaround_s, data + b"".join(answers))]
 
 
-_VALUES = frozenset({Command.GET_VALUE, Command.SET_VALUE, Command.GET_VALUES, Command.SET_VALUES})
-_SETTING = frozenset({Command.SET_VALUE, Command.SET_VALUES})
+_VALUES = frozenset({Command.GET_VALUE, Command.GET_VALUES, Command.SET_VALUES})
+_SETTING = frozenset({Command.SET_VALUES})
 _VECTORS = frozenset({Command.SET_VECTOR, Command.GET_VECTOR})
 _UPLOAD = frozenset({Command.SET_VECTOR})
 _BYTES = 1024  # within so many bytes to the controller

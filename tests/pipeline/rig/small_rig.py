@@ -15,9 +15,9 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import STRAIGHT, Mounting
 from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera.camera_files import Kept, KeptInMemory
-from pipeline.rig.capture.capture_runner import RigDevices
 from pipeline.rig.capture.rig_source import RigSource
 from pipeline.rig.device_settings import SurveyRig
+from pipeline.rig.drivers import RigDevices
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import socket
 import sys
@@ -12,7 +11,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-import serial
 
 from pipeline.errors import SettingsError
 from pipeline.rig.device_settings import MirrorSettings, SurveyRig
@@ -121,21 +119,6 @@ def test_no_port_says_which_there_are(monkeypatch: pytest.MonkeyPatch):
         monkeypatch.setattr("serial.tools.list_ports.comports", lambda ports=ports: ports)
         with pytest.raises(DeviceGone, match=f"no port /dev/no-such-port; {words}"):
             SerialTransport("/dev/no-such-port", 115200)
-
-
-@pytest.mark.parametrize(
-    ("number", "words"),
-    [(errno.EACCES, "no permission for x; add this user"), (errno.EBUSY, "in use"), (errno.EIO, "cannot be opened")],
-)
-def test_other_refusals_to_open_say_what_to_do(monkeypatch: pytest.MonkeyPatch, number: int, words: str):
-    """What the system says, in words that help."""
-
-    def refuse(*_: object, **__: object) -> None:
-        raise serial.SerialException(number, "could not open port x")
-
-    monkeypatch.setattr("serial.serial_for_url", refuse)
-    with pytest.raises(DeviceGone, match=words):
-        SerialTransport("x", 115200)
 
 
 def test_a_socket_is_a_port_too():

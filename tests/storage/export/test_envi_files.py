@@ -14,7 +14,7 @@ import rasterio
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError, ShapeError
-from pipeline.rig.camera.envi_headers import DATA_TYPES, INTERLEAVES
+from pipeline.rig.camera.camera_texts import DATA_TYPES, INTERLEAVES
 from storage.export.image_files import EnviFile, write_envi
 from storage.readers.envi_files import EnviCube, open_envi_cube
 

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.rig.camera.envi_headers import parse_envi_header
+from pipeline.rig.camera.camera_texts import parse_envi_header
 from storage.readers.envi_files import load_envi_header, open_envi_cube
 from storage.readers.open_cubes import open_cube
 
@@ -179,7 +179,7 @@ def test_what_is_no_text(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match="is empty, expected ENVI"):
         load_envi_header(path)
     path.write_bytes(b"\0\1\xff")
-    with pytest.raises(SceneError, match="expected ENVI on its own line; it is no ENVI header, name another"):
+    with pytest.raises(SceneError, match="expected ENVI on its own line; name an ENVI header"):
         load_envi_header(path)
     path.write_bytes(PLAIN.encode() + "sensor = Kamera f\xfcr \xb5m".encode("latin-1"))
     assert load_envi_header(path).fields["sensor"] == "Kamera f\xfcr \xb5m"

@@ -170,7 +170,7 @@ def test_no_frame_at_all(tmp_path: Path, text: str) -> None:
             (2000, 5),
             0,
             [2000, 2001, -1, 2003, -1],
-            ("the frame index tells the time of 3 of 5 lines", "the frame index lists 1 frames beyond the lines"),
+            ("the frame index has the time of 3 of 5 lines", "the frame index lists 1 frames beyond the lines"),
         ),
         (
             # as many frames as lines are the lines, whatever their numbers

@@ -7,8 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from pipeline.rig.emulator.camera_device import CameraConnection, CameraDevice, CameraUnit
-from pipeline.rig.transports import DeviceRefused
+from pipeline.rig.emulator.camera_device import CameraConnection, CameraDevice
 from tests.pipeline.rig.camera.camera_line import LinesOf, control_of
 from tests.pipeline.rig.camera_faults import CameraFault, CameraFaults, FaultyCamera
 from tests.pipeline.rig.in_process import ManualClock
@@ -17,10 +16,10 @@ CAPTURE = b'capture({"prefix": "", "maxCubes": 1, "maxFramesPerCube": 5})'
 PROMPT = b"\r\nhpi> "
 
 
-def device_with(fault: CameraFault | None = None, times: int = 1, seed: int = 0, **unit: object) -> CameraDevice:
+def device_with(fault: CameraFault | None = None, times: int = 1, seed: int = 0) -> FaultyCamera:
     """A camera with one fault."""
     faults = CameraFaults({} if fault is None else {fault: times}, seed)
-    return FaultyCamera(LinesOf(), ManualClock(), unit=CameraUnit(**unit), faults=faults)  # type: ignore[arg-type]
+    return FaultyCamera(LinesOf(), ManualClock(), faults=faults)
 
 
 @pytest.mark.parametrize(
@@ -81,7 +80,8 @@ def test_frames_pass_with_time() -> None:
     device = device_with()
     clock = device.clock
     control = control_of(device, clock)  # type: ignore[arg-type]
-    folder = control.capture(30, cubes=2).folder
+    device.command('capture({"prefix": "", "maxCubes": 2, "maxFramesPerCube": 30})')
+    folder = device.captures[0].folder
     clock.sleep(0.3)
     assert control.is_capturing()
     assert len(device.files()[f"{folder}/raw_0"]) == 29 * 48
@@ -120,18 +120,3 @@ def test_what_it_sees_is_asked_once() -> None:
     (capture,) = device.captures
     begins = np.concatenate([capture.begins(*span) for span in pairwise(np.linspace(0, 2, 38))])
     np.testing.assert_allclose(begins, 0.01 + np.arange(100) * 0.01, atol=1e-12)
-
-
-@pytest.mark.parametrize(("fault", "words"), [(CameraFault.FULL, "disk full"), (CameraFault.BUSY, "busy capturing")])
-def test_captures_that_are_refused(fault: CameraFault, words: str) -> None:
-    """A camera that is full or busy says so; the next capture begins, unless its disk has filled up by then."""
-    device = device_with(fault, disk_bytes=1000)
-    clock = device.clock
-    control = control_of(device, clock)  # type: ignore[arg-type]
-    with pytest.raises(DeviceRefused, match=words):
-        control.capture(5)
-    assert device.captures == []
-    assert control.capture(30).folder == "/captured/000000"
-    clock.sleep(1)
-    with pytest.raises(DeviceRefused, match=r"disk full; copy the folders on the camera's disk"):
-        control.capture(30)

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from pipeline.errors import RigError
-from pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_files
+from pipeline.rig.camera import camera_files
+from pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_files, log_in
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.device_settings import CameraAddress, ControlPatience, FileServer
-from pipeline.rig.emulator.camera_device import MOST_LINE, CameraConnection, CameraDevice, CameraServer, CameraUnit
-from pipeline.rig.transports import SYSTEM_CLOCK, DeviceGone, DeviceRefused, SocketTransport
+from pipeline.rig.emulator.camera_device import MOST_LINE, CameraConnection, CameraDevice, CameraServer
+from pipeline.rig.transports import SYSTEM_CLOCK, DeadlinePassed, DeviceGone, DeviceRefused, SocketTransport
 from tests.pipeline.rig.camera.camera_line import LinesOf, wait_for
 from tests.pipeline.rig.camera_faults import CameraFault, CameraFaults, FaultyCamera, FaultyServer
 from tests.pipeline.rig.in_process import ManualClock
@@ -29,11 +30,11 @@ def remote_files(device: CameraDevice, folder: str) -> list[RemoteFile]:
 
 @contextmanager
 def camera(
-    faults: dict[CameraFault, int] | None = None, unit: CameraUnit | None = None, **server: object
+    faults: dict[CameraFault, int] | None = None, **server: object
 ) -> Iterator[tuple[HeadwallCamera, CameraDevice, LinesOf]]:
     """A served camera, its driver by the same clock, and what it sees."""
     clock, lines = ManualClock(100.0), LinesOf()
-    device = FaultyCamera(lines, clock, unit=unit, faults=CameraFaults(dict(faults or {})))
+    device = FaultyCamera(lines, clock, faults=CameraFaults(dict(faults or {})))
     with FaultyServer(device) as served:
         files = FileServer(served.host, served.file_port, stall_s=2.0, pause_s=0.01, **server)  # type: ignore[arg-type]
         driver = HeadwallCamera.at(CameraAddress(served.host, served.port), files, clock=clock)
@@ -51,30 +52,31 @@ def test_whoever_never_ends_a_command_is_hung_up_on() -> None:
 def test_whole_loop() -> None:
     """Configure, capture, poll, fetch, lines and references: what the camera saw, with its own frames' times."""
     dark = np.random.default_rng(1).integers(60, 70, (20, 6, 4)).astype(np.uint16)
-    unit = CameraUnit(references={"darkReference": dark})
-    with camera(unit=unit) as (driver, device, lines):
+    with camera() as (driver, device, lines):
         driver.configure(8.0, 10.0)
-        capture = driver.capture(60, cubes=3, prefix="field")
-        assert capture.folder == "/captured/field_000000"
+        device.command('capture({"prefix": "field", "maxCubes": 3, "maxFramesPerCube": 60})')
+        folder = "/captured/field_000000"
+        device.captures[0].references["darkReference"] = dark
         wait_for(driver, 5.0)
         seen: list[tuple[str, int, int]] = []
-        found = driver.fetch(capture.folder, KeptInMemory(), lambda *step: seen.append(step))
+        found = driver.fetch(folder, KeptInMemory(), lambda *step: seen.append(step))
         np.testing.assert_array_equal(found.values, np.concatenate(lines.given))
         assert found.values.shape == (180, 6, 4)
         assert found.valid.all()
         assert found.notes == ()
         assert np.diff(found.times.stamp_us).tolist() == [10000] * 179
-        assert seen[-1] == (f"{capture.folder}/raw_60", 60 * 48, 60 * 48)
+        assert seen[-1] == (f"{folder}/raw_60", 60 * 48, 60 * 48)
         assert device.commands.count("isCapturing") > 2
-        (kind,) = (means := driver.references(capture.folder, KeptInMemory()))
+        (kind,) = (means := driver.references(folder, KeptInMemory()))
         assert kind == "dark"
         np.testing.assert_array_equal(means["dark"].mean, dark.mean(axis=0).astype(np.float32))
 
 
-def test_transfer_that_breaks_off_goes_on() -> None:
+def test_transfer_that_breaks_off_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
     """Broken off again and again it is taken up where it ended: no byte lost, none twice."""
+    monkeypatch.setattr(camera_files, "OVERLAP", 16)
     faults = {CameraFault.BREAKS_OFF: 4, CameraFault.REFUSES_FILES: 2}
-    with camera(faults, tries=3, overlap=16) as (driver, device, lines):
+    with camera(faults, tries=3) as (driver, device, lines):
         folder = driver.capture(100).folder
         wait_for(driver, 5.0)
         kept = KeptInMemory()
@@ -90,7 +92,7 @@ def test_what_has_come_is_kept() -> None:
         wait_for(driver, 5.0)
         (raw,) = [file for file in remote_files(device, "/captured/000000") if file.name.endswith("raw_0")]
         kept = KeptInMemory()
-        with pytest.raises(DeviceGone, match=rf"{raw.size // 2} bytes of {raw.name} are kept, and fetching again"):
+        with pytest.raises(DeviceGone, match=rf"{raw.size // 2} bytes of {raw.name} are kept, and a later fetch"):
             fetch_files(driver.server, [raw], kept)
         assert kept.size(raw.name) == raw.size // 2
         fetch_files(driver.server, [raw], kept)
@@ -103,26 +105,27 @@ def test_another_file_of_the_same_name() -> None:
         driver.capture(10)
         wait_for(driver, 5.0)
         (raw,) = [file for file in remote_files(device, "/captured/000000") if file.name.endswith("raw_0")]
-        for held, words in ((b"\xff" * 20, "it is another file"), (b"x" * 10_000, "it is another one")):
+        for held, words in ((b"\xff" * 20, "are of another file"), (b"x" * 10_000, "are of another file")):
             kept = KeptInMemory({raw.name: bytearray(held)})
             with pytest.raises(RigError, match=words):
                 fetch_files(driver.server, [raw], kept)
             assert bytes(kept.files[raw.name]) == held
-        with pytest.raises(RigError, match=r"481 when it was listed; is the capture still running"):
+        with pytest.raises(RigError, match=r"481 when it was listed; fetch it when the capture has ended"):
             fetch_files(driver.server, [RemoteFile(raw.name, 481, False)], KeptInMemory())
 
 
-@pytest.mark.parametrize("read_twice", [True, False])
 @pytest.mark.parametrize(
-    ("more", "words"),
+    ("more", "kind", "words"),
     [
-        (-100, r"goes on after its 380 bytes; is the capture still running"),
-        (100, r"ended at byte 480 of 580; look at the file there"),
+        (-100, RigError, r"more than its 380 bytes; fetch it when the capture has ended"),
+        (100, DeviceGone, r"ended at byte 480 of 580; look at the file there"),
     ],
 )
-def test_transfer_of_another_length(more: int, words: str, read_twice: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A file that is longer, or shorter, than the server said is not taken for whole, and nothing of it is kept."""
-    with camera(tries=2, read_twice=read_twice) as (driver, device, _):
+def test_transfer_of_another_length(
+    more: int, kind: type[RigError], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file that is longer, or shorter, than the server said is not taken for whole."""
+    with camera(tries=2) as (driver, device, _):
         driver.capture(10)
         wait_for(driver, 5.0)
         name = "/captured/000000/raw_0"
@@ -130,8 +133,34 @@ def test_transfer_of_another_length(more: int, words: str, read_twice: bool, mon
         monkeypatch.setattr("pipeline.rig.emulator.camera_device._FilesInMemory.getsize", lambda *_: len(whole) + more)
         with pytest.raises(RigError, match=words) as caught:
             fetch_files(driver.server, [RemoteFile(name, None, False)], kept)
-        assert type(caught.value) is RigError
-        assert kept.size(name) == 0
+        assert type(caught.value) is kind
+
+
+@pytest.mark.parametrize(
+    ("listed", "most", "words"),
+    [(480, 400, "has 480 bytes, expected 400 at most, and nothing of it is fetched"), (481, None, "481 when it was")],
+)
+def test_a_size_that_cannot_be(listed: int, most: int | None, words: str) -> None:
+    """A file that is larger than it can be, or grew since it was listed, is not fetched."""
+    with camera() as (driver, _, _):
+        driver.capture(10)
+        wait_for(driver, 5.0)
+        kept = KeptInMemory()
+        with pytest.raises(RigError, match=words):
+            fetch_files(driver.server, [RemoteFile("/captured/000000/raw_0", listed, False, most)], kept)
+        assert not kept.files
+
+
+def test_a_server_that_falls_silent() -> None:
+    """It costs the timeout; what is no FTP is named as such."""
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        server = FileServer("127.0.0.1", silent.getsockname()[1], stall_s=0.1, tries=1)
+        with pytest.raises(DeadlinePassed, match=r"was silent for 0.1 s; is it on\?"):
+            log_in(server)
+    with CameraServer(CameraDevice(LinesOf(), ManualClock())) as served:
+        server = FileServer(served.host, served.port, stall_s=2.0)
+        with pytest.raises(RigError, match="which is no FTP; check host and port"):
+            log_in(server)
 
 
 def test_files_that_are_refused() -> None:
@@ -165,19 +194,12 @@ def test_fetch_while_it_captures() -> None:
 
 
 def test_server_closes_cleanly() -> None:
-    """Threads end and ports are free again; a taken port is refused."""
+    """Threads end."""
     before = threading.active_count()
-    device = CameraDevice(LinesOf(), ManualClock())
-    with CameraServer(device) as served:
+    with CameraServer(CameraDevice(LinesOf(), ManualClock())) as served:
         line = SocketTransport(served.host, served.port)
-        with pytest.raises(RigError, match="cannot be listened on"):
-            CameraServer(device, port=served.port)
-        with pytest.raises(RigError, match="cannot be listened on"):
-            CameraServer(device, file_port=served.file_port)
     line.close()
     assert threading.active_count() == before
-    with CameraServer(device, port=served.port, file_port=served.file_port):
-        pass
 
 
 def test_silence_on_a_real_socket() -> None:

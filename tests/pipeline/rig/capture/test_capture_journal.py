@@ -27,10 +27,10 @@ def test_latest_capture_of_a_line_counts() -> None:
     """Of two that have a line the later one is read, and the earlier one once that is spent; so by another process."""
     kept = KeptInMemory()
     journal = CaptureJournal(kept)
-    journal.began(ONE)
-    journal.began(OTHER)
+    journal.record_capture(ONE)
+    journal.record_capture(OTHER)
     assert folders(journal) == folders(CaptureJournal(kept)) == [*"aaabbbbbb", ""]
-    journal.spend(OTHER, "cut off")
+    journal.record_spent(OTHER, "cut off")
     assert folders(journal) == folders(CaptureJournal(kept)) == [*"aaaaa", "", "", "", "", ""]
     assert journal.holding(COARSE, 0) is None
 
@@ -40,12 +40,12 @@ def test_folder_whose_name_comes_again_is_the_latest() -> None:
     kept = KeptInMemory()
     journal = CaptureJournal(kept)
     again = replace(ONE, run_s=(7.0, 7.1))
-    journal.began(ONE)
-    journal.tied(ONE, tied(1.0), ())
-    journal.spend(ONE, "gone")
-    journal.began(replace(OTHER, first=0))
-    journal.began(again)
-    journal.tied(again, tied(2.0), ())
+    journal.record_capture(ONE)
+    journal.record_positions(ONE, tied(1.0), ())
+    journal.record_spent(ONE, "gone")
+    journal.record_capture(replace(OTHER, first=0))
+    journal.record_capture(again)
+    journal.record_positions(again, tied(2.0), ())
     for told in (journal, CaptureJournal(kept)):
         assert told.holding(FINE, 0) == again
         assert [one["folder"] for one in told.captures] == ["/captured/b", "/captured/a"]
@@ -68,9 +68,9 @@ def test_flipped_bit_of_the_journal_changes_no_capture():
 def test_a_torn_journal_is_read():
     """Behind a torn record the next is whole; line 0 keeps its stamp."""
     kept = KeptInMemory()
-    CaptureJournal(kept).began(ONE)
+    CaptureJournal(kept).record_capture(ONE)
     kept.append(JOURNAL, b'{"what": "spent", "fol')
-    CaptureJournal(kept).began(OTHER)
+    CaptureJournal(kept).record_capture(OTHER)
     journal = CaptureJournal(kept)
     assert folders(journal) == [*"aaabbbbbb", ""]
     assert journal.damage == []

