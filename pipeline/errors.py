@@ -125,10 +125,6 @@ class IncompleteStoreError(PipelineError, LookupError):
     """A store has no valid manifest, or its content does not match it."""
 
 
-class OldStoreError(IncompleteStoreError):
-    """A store is whole, but of an earlier version that this one does not read."""
-
-
 class WorkerError(PipelineError, RuntimeError):
     """Processes that work for this one died, or their scheduler went away."""
 

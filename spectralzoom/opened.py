@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import ArchiveError, IncompleteStoreError, OldStoreError
+from pipeline.errors import ArchiveError, IncompleteStoreError
 from pipeline.lazy import deferred
 from storage.archive.archive import Archive
 from storage.archive.records import Run, read_run
 from storage.arrays.layout import damage_named
-from storage.arrays.signal_cubes import REPROCESS
 from storage.readers.recordings import LINE_PRODUCTS
 
 if TYPE_CHECKING:
@@ -168,8 +167,6 @@ class OpenedRun:
         and exposure of each line are coordinates.
         """
         names = [name for name in LINE_PRODUCTS.values() if name in self.receipt["products"]]
-        if not names and any(name in self.receipt["products"] for name in LINE_PRODUCTS):
-            raise OldStoreError(f"the run {self.name} of {self.archive_name} has no condensed lines; {REPROCESS}")
         stores = [path for name in names for path in sorted(self._place(name).glob("*.zarr"))]
         return {path.stem: spectra.open_lazy_lines(path) for path in stores}
 

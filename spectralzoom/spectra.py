@@ -19,7 +19,7 @@ from xarray.core.indexing import IndexSelResult
 from storage.arrays.georeference import GRID_MAPPING
 from storage.arrays.layout import open_group
 from storage.arrays.mosaics import Mosaic, open_mosaic
-from storage.arrays.signal_cubes import SignalCube, check_condensed, open_signal_cube, read_coordinates, score_layout
+from storage.arrays.signal_cubes import SignalCube, open_signal_cube, read_coordinates, score_layout
 
 Restore = Callable[[slice, slice, Sequence[int]], NDArray[np.float32]]  # rows, columns, bands: (row, column, band)
 OF_WAVELENGTHS = ("band", "wavelength")
@@ -87,7 +87,7 @@ class _LineSpectra:
 def open_lazy_mosaic(path: Path) -> xarray.DataArray:
     """Open a mosaic as (y, x, band) scene values, with a coordinate on every axis.
 
-    Raises IncompleteStoreError: it is missing, damaged or of an earlier version.
+    Raises IncompleteStoreError: it is missing or damaged.
     """
     return _open(path, ("y", "x", "band"), OF_PLACES, _MosaicSpectra(path))
 
@@ -100,7 +100,6 @@ def open_lazy_lines(path: Path) -> xarray.DataArray:
 def _open(path: Path, dims: tuple[str, str, str], places: Sequence[str], restore: Restore) -> xarray.DataArray:
     """Return spectra with the coordinates of their store, in dask's blocks of whole shards of scores."""
     group = open_group(path)
-    check_condensed(group, path)
     size, block = score_layout(group)
     coords = {name: xarray.Variable(*one) for name, one in read_coordinates(group, (*places, *OF_BANDS)).items()}
     shape = (*size, coords["wavelength"].sizes["band"])

@@ -151,7 +151,7 @@ def run_verify(archive: str | Path, console: Console, *, remake: bool = False, a
         "complete": done.complete,
     }
     put_out(content, show_repair, as_json=as_json)
-    stray = any(finding.kind in ("stray", "growing") for finding in bad)
+    stray = any(finding.kind == "stray" for finding in bad)
     return DONE if done.complete and not stray else PARTLY if done.remade or done.dropped else FAILED
 
 

@@ -72,11 +72,16 @@ def by_setting(flags: Any) -> dict[str, object]:
 
 
 NO_FLAGS = SurveyFlags()
+Verbose = Annotated[
+    bool, Parameter(name=("--verbose", "-v"), negative="", help="Print all savings, stages, effects and versions.")
+]
 NO_SIMULATION_FLAGS = SimulationFlags()
 NO_RENDERING_FLAGS = RenderingFlags()
 
 
-def survey(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = False) -> int:
+def survey(
+    settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = False, verbose: Verbose = False
+) -> int:
     """Survey a field: by the scan that promises most for the seconds, or coarsely, then finely where that changes it.
 
     Parameters
@@ -86,7 +91,7 @@ def survey(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_js
     """
     asked = load_settings(settings, by_setting(flags))
     try:
-        published = survey_command.run_survey(asked, stderr)
+        published = survey_command.run_survey(asked, stderr, verbose=verbose)
     except NothingToMend as said:
         if as_json:
             print_json({"captured": False, "run": said.run, "why": str(said)})

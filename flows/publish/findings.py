@@ -59,14 +59,12 @@ def field_figures(run: SurveyRun, fine: FinePlan | None) -> dict[str, Any]:
         if footprint is None
         else dict(zip(("nearest", "median", "farthest"), footprint.range_m, strict=True)),
         "footprint_m": None if footprint is None else {"width": footprint.width_m, "depth": footprint.depth_m},
-        "footprint_east_north_m": None if footprint is None else footprint.outline_m.tolist(),
         "hectares": kept.hectares,
         "kept_fraction": None if run.zones.kept is None else float(run.zones.kept.kept.mean()),
         "camera_s": camera_s if captured else None,
         "fine_planned": fine is not None or run.plan.plain,
         "lines": lines if captured else None,
         "hectares_per_hour": kept.hectares_per_hour(seconds) if captured else None,
-        "full_scan_hectares_per_hour": kept.hectares_per_hour(run.plan.full_s) if captured else None,
     }
 
 

@@ -1,4 +1,4 @@
-"""Parts of pictures of a map: palettes, outlines of patches, scale bars; and the map on the ground."""
+"""Draw parts of pictures: palettes, outlines of patches, the map on the ground, spectra of the classes."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from flows.terminal.figures import format_area
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.class_maps import ClassMap
 from storage.arrays.ground_maps import GroundMap
+from storage.arrays.mosaics import Mosaic
 from storage.arrays.quicklooks import stretch
 
 GROUND_IN, GROUND_DPI, GROUND_MOST_PX = 9.0, 130, 1200
@@ -154,3 +155,70 @@ def draw_ground(found: GroundMap) -> bytes:
     buffer = io.BytesIO()
     save_png(figure, buffer)
     return buffer.getvalue()
+
+
+LEAST_BANDS = 5  # of a curve
+GAP = 1.9  # times the median distance of bands, from which on bands were removed between two
+CONTIGUOUS_NM = 20.0  # median distance of bands up to which they cover a spectrum; a satellite's few lie apart anyway
+DOTS: Any = {"marker": ".", "markersize": 2.4, "markeredgewidth": 0}  # they show a band between two gaps
+
+
+def draw_spectra(mosaic: Mosaic, found: ClassMap) -> bytes | None:
+    """Draw the mean spectrum of each mapped class as WebP; None with fewer than `LEAST_BANDS` bands or no value."""
+    spectra = class_spectra(mosaic, found.classes, len(found.names))
+    if len(mosaic.wavelength_nm) < LEAST_BANDS or not np.isfinite(spectra).any():
+        return None
+    names = [name.replace("_", " ") for name in found.names]
+    palette = class_palette(found.colours)
+    with mpl.rc_context({**STYLE, "font.size": 9}):
+        figure = Figure(figsize=(9, 3.6), dpi=110, layout="constrained", facecolor=PAPER)
+        axes = figure.subplots()
+        axes.set_facecolor(PAPER)
+        for name, spectrum, colour in zip(names, spectra, palette, strict=False):
+            if (known := np.isfinite(spectrum)).any():
+                nm, curve = curve_with_gaps(mosaic.wavelength_nm[known], spectrum[known])
+                axes.plot(nm, curve, color=colour, linewidth=1.2, label=name, **DOTS)
+        axes.set(xlabel="wavelength [nm]", ylabel="value of the scene")
+        axes.legend(loc="best", ncols=2, fontsize=7, frameon=False)
+        drawn = io.BytesIO()
+        save_png(figure, drawn)
+    with Image.open(drawn) as opened:
+        flat = opened.convert("RGB").quantize(256, dither=Image.Dither.NONE)
+    return webp(flat.convert("RGB"), lossless=True)
+
+
+def class_spectra(mosaic: Mosaic, classes: NDArray[np.integer], count: int) -> NDArray[np.float32]:
+    """Return the mean spectra (class, band) of ``count`` classes; NaN for one that no pixel of the mosaic shows.
+
+    ``classes`` (y, x) are of the fine grid; under a pixel of the mosaic counts the one at its centre.
+    """
+    half, step = mosaic.factor // 2, mosaic.factor
+    sums, pixels, top = np.zeros((count, len(mosaic.components))), np.zeros(count), 0
+    for scores in mosaic.row_blocks():
+        rows = np.minimum(np.arange(top, top + len(scores)) * step + half, classes.shape[0] - 1)
+        columns = np.minimum(np.arange(scores.shape[1]) * step + half, classes.shape[1] - 1)
+        under, seen = classes[np.ix_(rows, columns)], np.isfinite(scores).all(axis=2)
+        for number in range(count):
+            here = scores[seen & (under == number)]
+            sums[number] += here.sum(axis=0, dtype=np.float64)
+            pixels[number] += len(here)
+        top += len(scores)
+    means = np.where(pixels[:, None] > 0, sums / np.maximum(pixels, 1)[:, None], np.nan)
+    spectra = mosaic.spectra(means.astype(np.float32))
+    spectra[pixels == 0] = np.nan
+    return spectra
+
+
+def curve_with_gaps(
+    wavelength_nm: NDArray[np.floating], values: NDArray[np.floating]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return a curve (band,) in the order of wavelengths, with a NaN wherever bands were removed.
+
+    Bands that do not cover the spectrum (`CONTIGUOUS_NM`) have no gaps.
+    """
+    order = np.argsort(wavelength_nm, kind="stable")
+    nm, curve = np.asarray(wavelength_nm, np.float64)[order], np.asarray(values, np.float64)[order]
+    apart = np.diff(nm)
+    usual = float(np.median(apart)) if len(apart) else np.inf
+    breaks = np.flatnonzero(apart > GAP * usual) + 1 if usual <= CONTIGUOUS_NM else []
+    return np.insert(nm, breaks, np.nan), np.insert(curve, breaks, np.nan)

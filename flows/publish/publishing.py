@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 from flows.publish.byte_account import recount_bytes
 from flows.publish.receipt import is_pending
-from flows.publish.receipt_table import byte_rows, cost_rows, finding_rows, headline
-from flows.publish.report import render_markdown, replace_bytes
+from flows.publish.receipt_table import finding_rows, headline, saving_rows
+from flows.publish.report import render_markdown, replace_savings
 from flows.publish.retention import is_outlived
 from flows.publish.run_folder import Published, asked_settings, extend_with_accuracy, publish_run
 from flows.settings.survey_settings import OF_THE_MACHINE
@@ -39,8 +39,7 @@ else:
 
 PASSES = (capture_fine.name, capture_coarse.name)  # in the order in which they are condensed
 NOT_ASKED = ("notes", "out", "engine", *OF_THE_MACHINE)  # of a receipt's settings: no byte depends on them
-MOST_BYTES = 100 * 1024  # of the picture, as it stands in the text
-WIDTHS_PX = (1200, 1000, 800, 600, 400, 200)
+WIDTH_PX = 800  # of the picture in the text
 
 
 def publish(plan: OpenSurvey) -> RunRef:
@@ -109,7 +108,7 @@ def _kept_by_others(plan: OpenSurvey, stage: str, raw: StageRef) -> str | None:
 
 def recount(plan: OpenSurvey, run: RunRef) -> RunRef:
     """Publish a run again with its bytes as they are now, once stores were cleared away."""
-    receipt = recount_bytes(plan.run.archive, run.name, replace_bytes)
+    receipt = recount_bytes(plan.run.archive, run.name, replace_savings)
     _show_artifacts(plan, Published(receipt, run.folder, run.captured_again))
     return run
 
@@ -160,15 +159,14 @@ def _show_artifacts(plan: OpenSurvey, published: Published) -> None:
     report = (published.folder / "report.html").absolute().as_uri()
     receipt = published.receipt
     with suppress(Exception):  # a server that is gone: the archive has it all
-        costs = [*cost_rows(receipt["savings"]), *byte_rows(receipt)]
         rows = [
             {
                 "cost": row["label"],
                 "this survey": row["done"],
-                "everything": row["full"],
+                "reference": row["full"],
                 "fraction": format_percent(row["ratio"]),
             }
-            for row in costs
+            for row in saving_rows(receipt)
         ]
         text = render_markdown(
             "survey.md",
@@ -186,15 +184,12 @@ def _show_artifacts(plan: OpenSurvey, published: Published) -> None:
 
 
 def small_jpeg(png: bytes) -> bytes:
-    """Return a picture as a JPEG that takes at most 100 KiB in base64, as large as that lets it be."""
+    """Return a picture as a JPEG of at most 800 px width, which stays below 100 KiB in base64."""
     from PIL import Image
 
+    file = io.BytesIO()
     with Image.open(io.BytesIO(png)) as opened:
         picture = opened.convert("RGB")
-    for width in WIDTHS_PX:
-        smaller, file = picture.copy(), io.BytesIO()
-        smaller.thumbnail((width, 10 * width))
-        smaller.save(file, "JPEG", quality=80, optimize=True)
-        if len(file.getvalue()) * 4 / 3 <= MOST_BYTES - 4:
-            break
+    picture.thumbnail((WIDTH_PX, 10 * WIDTH_PX))
+    picture.save(file, "JPEG", quality=60, optimize=True)
     return file.getvalue()

@@ -11,7 +11,6 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -20,26 +19,14 @@ from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 from numpy.typing import NDArray
 from PIL import Image
 
-from flows.publish.panels import (
-    INK,
-    MUTED,
-    PAPER,
-    STYLE,
-    UNLABELLED_COLOUR,
-    class_palette,
-    class_rgb,
-    grey_of,
-    outline,
-    save_png,
-)
+from flows.publish.panels import MUTED, STYLE, UNLABELLED_COLOUR, class_palette, class_rgb, grey_of, outline, save_png
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.geometry.scan import Axis
 from storage.arrays.quicklooks import choose_bands, develop, stretch
 
 Box = tuple[int, int, int, int]
-COLOURS, RAMP = 256, 32  # of the picture, and of them for a key
+COLOURS = 256
 HEAT_ALPHA = 0.72  # of scores over the field
-FIXED = (PAPER, INK, MUTED, UNLABELLED_COLOUR, "white", "black")
 
 
 @dataclass(frozen=True)
@@ -73,35 +60,12 @@ class QuicklookData:
 
 
 def draw_quicklook(path: str | Path, panels: QuicklookData) -> None:
-    """Draw the four panels as a PNG of about 1800 x 1400 px (flatter or taller for fields that are); OSError.
-
-    It has 256 colours, those of classes, paper, words and keys among them: a third of the bytes.
-    """
+    """Draw the four panels as a PNG of about 1800 x 1400 px with 256 colours; raises OSError."""
     drawn = io.BytesIO()
     with mpl.rc_context(_STYLE):
         save_png(_compose(panels), drawn)
-    name, alpha = ("viridis", 1.0) if panels.policy is None else ("inferno", HEAT_ALPHA)
-    key = alpha * mpl.colormaps[name](np.linspace(0, 1, RAMP))[:, :3] + 1 - alpha  # over white
-    fixed = np.array([to_rgb(colour) for colour in FIXED])
-    kept = np.rint(255 * np.vstack([class_palette(panels.class_colours)[: COLOURS // 4], fixed, key])).astype(np.uint8)
     with Image.open(drawn) as opened:
-        picture = opened.convert("RGB")
-    _in_colours(picture, kept).save(path, "PNG", optimize=True)
-
-
-def _in_colours(picture: Image.Image, kept: NDArray[np.uint8]) -> Image.Image:
-    """A picture in 256 colours: those (colour, 3) that are ``kept`` as they are, and what stands best for others."""
-    others = picture.quantize(COLOURS - len(kept), dither=Image.Dither.NONE).getpalette() or []
-    table = Image.new("P", (1, 1))
-    table.putpalette(kept.tobytes() + bytes(others))
-    numbers = np.array(picture.quantize(palette=table, dither=Image.Dither.NONE))  # looked up coarsely
-    place = np.array([1 << 16, 1 << 8, 1], np.uint32)
-    own = np.asarray(picture) @ place
-    for number, colour in enumerate(kept @ place):
-        numbers[own == colour] = number
-    found = Image.fromarray(numbers)
-    found.putpalette(table.getpalette() or [])
-    return found
+        opened.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(path, "PNG", optimize=True)
 
 
 _STYLE: Any = {**STYLE, "axes.titlesize": 14, "axes.titleweight": "bold", "axes.titlelocation": "left"}

@@ -27,12 +27,12 @@ from flows.publish.panels import data_address
 from flows.publish.receipt import Receipt
 from flows.publish.receipt_table import (
     area_rows,
-    byte_rows,
-    cost_rows,
     finding_rows,
+    format_reference,
     format_reused,
     headline,
     plot_rows,
+    saving_rows,
 )
 from flows.tasks.scores import error_matrix, format_false_classes
 from flows.terminal.figures import format_bytes, format_percent, format_points, format_seconds
@@ -47,7 +47,7 @@ SHA256 = {
     f"{LEAFLET}/LICENSE": "53e8dc25862014e4324741ca18fbe3611e11d42ef69f59f86ea8c5389647d4cb",
 }
 MAP_SCRIPTS = (f"{LEAFLET}/leaflet.js", "scripts/field_map.js")
-BYTES_SECTION = '<section id="bytes">'  # of a report, which ends with it
+SAVINGS_SECTION = '<section id="savings">'  # of a report
 _MARKDOWN = "\\`*_{}[]<>#|"
 
 
@@ -149,8 +149,6 @@ def render_report(
     """
     shown = [Picture(quicklook, "The survey at a glance."), *pictures]
     scene = split_variable(receipt["settings"]["scene"])[0].name
-    split: Mapping[str, Any] = receipt["savings"]["multiply_adds"]
-    parts = [name for name in ("overview", "score", "detail") if split["done"] and split[name] is not None]
     total, accuracy = receipt.get("effects_total"), receipt.get("accuracy")
     return render_page(
         "report.html",
@@ -166,10 +164,7 @@ def render_report(
         leaflet=LEAFLET,
         error_colours=ERROR_COLOURS,
         pictures=[{"address": data_address(one.content), "caption": one.caption} for one in shown],
-        costs=cost_rows(receipt["savings"]),
-        byte_rows=byte_rows(receipt),
-        reused=format_reused(receipt),
-        fractions={name: split[name] / split["done"] for name in parts},
+        **_savings(receipt),
         areas=area_rows(receipt),
         findings=finding_rows({name: one for name, one in receipt.items() if name != "areas"}),
         plots=plot_rows(receipt.get("plots", [])),
@@ -205,10 +200,20 @@ def _run_folder(receipt: Receipt) -> str:
     return next(posixpath.dirname(one) for one in products.values() if one.startswith("runs/"))
 
 
-def replace_bytes(page: str, receipt: Receipt) -> str:
-    """Return a report with the bytes of a receipt in the place of those that it tells."""
-    begin, end = BYTES_SECTION, "</section>"
-    head, there, rest = page.partition(begin)
-    template = _environment(markdown=False).get_template("bytes.html")
-    rows = visible(template.render(byte_rows=byte_rows(receipt), reused=format_reused(receipt)))
-    return f"{head}{rows.rstrip()}{rest.partition(end)[2]}" if there else page
+def replace_savings(page: str, receipt: Receipt) -> str:
+    """Return a report with the savings of a receipt, such as after its bytes were counted again."""
+    head, there, rest = page.partition(SAVINGS_SECTION)
+    template = _environment(markdown=False).get_template("savings.html")
+    section = visible(template.render(_savings(receipt))).rstrip()
+    return f"{head}{section}{rest.partition('</section>')[2]}" if there else page
+
+
+def _savings(receipt: Receipt) -> dict[str, Any]:
+    split: Mapping[str, Any] = receipt["savings"]["multiply_adds"]
+    parts = [name for name in ("overview", "score", "detail") if split["done"] and split[name] is not None]
+    return {
+        "savings": saving_rows(receipt),
+        "reference": format_reference(receipt),
+        "reused": format_reused(receipt),
+        "fractions": {name: split[name] / split["done"] for name in parts},
+    }

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
 from flows.publish.byte_account import recount_bytes
-from flows.publish.report import replace_bytes
+from flows.publish.report import replace_savings
 from flows.settings.values import parse_keep, raw_days
 from flows.tasks.stages.condense import SIGNAL, SIGNAL_FINE, camera_of, raw_differs
 from storage.archive.archive import Archive
@@ -119,4 +119,4 @@ def _recount(archive: Archive) -> None:
         account = run.receipt.get("data_bytes")
         named = any(run.products.get(name) in cleared for name in LINE_PRODUCTS)
         if named and isinstance(account, dict) and account.get("kept") != archive.kept_bytes(run, catalogue):
-            recount_bytes(archive, run.folder.name, replace_bytes)
+            recount_bytes(archive, run.folder.name, replace_savings)

@@ -19,11 +19,10 @@ from PIL import Image
 from flows.publish.byte_account import open_account, publish_counted
 from flows.publish.field_map import block_of, field_map, prior_map
 from flows.publish.findings import PLOTS_FILE, field_figures, find_areas, find_ground, find_map, find_zones, plots_csv
-from flows.publish.panels import draw_ground, webp
+from flows.publish.panels import draw_ground, draw_spectra, webp
 from flows.publish.quicklook import QuicklookData, draw_quicklook
 from flows.publish.receipt import AccuracyIs, Receipt, build_receipt, check_receipt, with_accuracy
 from flows.publish.report import Picture, render_report
-from flows.publish.spectra import draw_spectra
 from flows.settings.load import anchor_paths
 from flows.settings.values import EXTENT_WHOLE
 from flows.tasks.open_survey import STAGES, OpenSurvey, Products
@@ -286,9 +285,6 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
         "reason": plan.reason,
         "lines": plan.lines,
         "seconds": plan.seconds,
-        "score_fraction": plan.expected_gain / plan.wanted_gain if plan.wanted_gain else None,
-        "score_per_second": plan.gain_per_second,
-        "full_seconds": plan.full_seconds,
         "out_of_reach": plan.out_of_reach,
     }
     found: dict[str, Any] = {"field": field_figures(run, plan), "plan": figures}
@@ -336,14 +332,12 @@ def _partly_seen(run: SurveyRun, mosaic: StageRef, plan: FinePlan) -> int:
 def _recording(run: SurveyRun, recorded: RecordedPasses, plan: FinePlan) -> dict[str, Any]:
     """Return what was read of a recording, and what its passes would have taken of a camera beside every line."""
     done, full, cost = [*run.plan.coarse, *plan.sweeps], run.plan.full, run.settings.cost
-    whole = recorded.served(full) is not None
     return {
         "sweeps": str(run.settings.sweeps),
         "lines_read": recorded.lines_served(done),
         "lines_recorded": recorded.source.lines_recorded,
         "passes_s": run.plan.coarse_s + plan.seconds,
         "full_scan_s": cost.seconds(full, run.camera),
-        "full_scan_is": "recorded" if whole else "planned",
     }
 
 

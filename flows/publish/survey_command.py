@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.markup import escape
 
-from flows.publish.receipt_table import headline, print_table
+from flows.publish.receipt_table import print_details, print_summary
 from flows.publish.run_folder import Published, load_receipt
 from flows.settings.parameters import SurveySettings
 from flows.settings.survey_settings import Settings
@@ -39,8 +39,8 @@ else:
     survey_flow = deferred("flows.survey")
 
 
-def run_survey(settings: Settings, console: Console) -> Published:
-    """Survey, publish the run and print its receipt on ``console``.
+def run_survey(settings: Settings, console: Console, *, verbose: bool = False) -> Published:
+    """Survey, publish the run and print its summary on ``console``; with ``verbose`` also its stages and effects.
 
     Raises PipelineError: from the flow, as it is; NothingToMend: an earlier map is sure enough.
     """
@@ -54,7 +54,7 @@ def run_survey(settings: Settings, console: Console) -> Published:
         with observed_by(Observer(progress.watch, note, progress.say)), opened_first(settings):
             run = _survey(settings, console)
     published = Published(load_receipt(run.folder), run.folder, run.captured_again)
-    show_published(published, settings.out, console)
+    show_published(published, settings.out, console, verbose=verbose)
     return published
 
 
@@ -100,11 +100,11 @@ def _prefect_server(out: str) -> Iterator[None]:
             release()
 
 
-def show_published(published: Published, out: str, console: Console) -> None:
-    """Print the headline, what was spent, and where the files lie that say the rest."""
-    console.print(escape(headline(published.receipt, published.captured_again)))
-    print_table(published.receipt, console)
+def show_published(published: Published, out: str, console: Console, *, verbose: bool = False) -> None:
+    """Print the score, the savings and the place of the report; with ``verbose`` stages, effects and versions."""
+    print_summary(published.receipt, console)
+    if verbose:
+        print_details(published.receipt, console)
     if is_remote(out):
-        console.print(f"  {escape(out)}/runs/{published.folder.name}, and on this machine", soft_wrap=True)
-    beside = ", with quicklook.png and receipt.json beside it"
-    console.print(f"  {escape(str(published.folder / 'report.html'))}{beside}", soft_wrap=True)
+        console.print(f"Run: {escape(out)}/runs/{published.folder.name}", soft_wrap=True)
+    console.print(f"Report: {escape(str(published.folder / 'report.html'))}", soft_wrap=True)

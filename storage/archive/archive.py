@@ -45,7 +45,7 @@ from storage.archive.manifests import (
     write_manifest,
 )
 from storage.archive.records import Run
-from storage.archive.run_folders import RunDraft, date_of_store, finish_extensions, take_its_place
+from storage.archive.run_folders import RunDraft, finish_extensions, take_its_place
 from storage.archive.staging import (
     PART_SUFFIX,
     bytes_below,
@@ -172,7 +172,6 @@ class Archive:
             try:
                 yield StagedStore(part, ref, done)
                 if not done:
-                    facts |= {"created": date_of_store(self.root, ref.uri)}
                     consolidate_stores(part)
                     write_manifest(part, facts)
                     self._put_in_place(part, final)
@@ -255,7 +254,7 @@ class Archive:
                 try:
                     remove_tree(part)
                     part.mkdir()
-                    write_manifest(part, cleared_facts(before, manifest_sha256(final)))
+                    write_manifest(part, cleared_facts(before))
                     take_its_place(part, final)
                 finally:
                     remove_tree(part)
@@ -333,10 +332,6 @@ class Archive:
 
     def drop_leftover(self, uri: str) -> None:
         """Remove one of `leftovers`."""
-
-    def restore(self, uri: str) -> bool:
-        """Return whether a broken store or run of a bucket could be written again as it is on this machine."""
-        return False
 
     def drop_run(self, uri: str) -> None:
         """Take a damaged run away."""

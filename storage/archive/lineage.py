@@ -103,15 +103,6 @@ class Catalogue:
         return found
 
     @cached_property
-    def recorded_by(self) -> dict[str, list[tuple[Run, str]]]:
-        """Return for each store the runs that recorded the SHA-256 of its manifest, oldest first, with that."""
-        found: dict[str, list[tuple[Run, str]]] = {}
-        for run in self.runs:
-            for uri, sha256 in run.recorded.items():
-                found.setdefault(uri, []).append((run, sha256))
-        return found
-
-    @cached_property
     def named_and_below(self) -> dict[str, set[str]]:
         """For each run the stores that it names, and what these rest on."""
         return {run.uri: set(run.names) | self.ancestors(run.names) for run in self.runs}

@@ -124,15 +124,11 @@ def made_bytes(manifest: Mapping[str, Any]) -> int:
     return size if isinstance(size, int) else listed_bytes(manifest)
 
 
-def cleared_facts(before: Mapping[str, Any], sha256: str) -> dict[str, Any]:
-    """Return the facts for the manifest of a store whose files are cleared away: earlier ones, and what was removed.
-
-    ``before`` and ``sha256`` are the manifest that it has until then, and the SHA-256 of its file.
-    """
+def cleared_facts(before: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the facts for the manifest of a store whose files are cleared away: those of ``before``, and the size."""
     kept = {name: value for name, value in before.items() if name not in ("files", "format", "seal")}
     at = datetime.now(UTC).isoformat(timespec="milliseconds")
-    entry = {"at": at, "bytes_before": listed_bytes(before), "manifests": [sha256]}
-    return kept | {CLEARED: entry}
+    return kept | {CLEARED: {"at": at, "bytes_before": listed_bytes(before)}}
 
 
 def is_cleared(manifest: Mapping[str, Any]) -> bool:
@@ -140,9 +136,9 @@ def is_cleared(manifest: Mapping[str, Any]) -> bool:
     return CLEARED in manifest
 
 
-def manifests_before(manifest: Mapping[str, Any], change: str) -> list[str]:
-    """Return SHA-256 of a folder's manifests before a ``change``, CLEARED or EXTENDED, oldest first."""
-    found = _table(manifest.get(change)).get("manifests")
+def manifests_before(manifest: Mapping[str, Any]) -> list[str]:
+    """Return the SHA-256 of a run's manifests before it was extended, oldest first."""
+    found = _table(manifest.get(EXTENDED)).get("manifests")
     return [one for one in found if isinstance(one, str)] if isinstance(found, list) else []
 
 
@@ -157,7 +153,7 @@ def extended_facts(before: Mapping[str, Any], sha256: str) -> dict[str, Any]:
     """
     at = datetime.now(UTC).isoformat(timespec="milliseconds")
     created = {} if "created" not in before else {"created": before["created"]}
-    return created | {EXTENDED: {"at": at, "manifests": [*manifests_before(before, EXTENDED), sha256]}}
+    return created | {EXTENDED: {"at": at, "manifests": [*manifests_before(before), sha256]}}
 
 
 def check_files(folder: Path, *, hashes: bool) -> None:

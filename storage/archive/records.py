@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from storage.archive.keys import StageRef, in_text
-from storage.archive.manifests import EXTENDED, is_cleared, listed_bytes, try_manifest
+from storage.archive.manifests import is_cleared, listed_bytes, try_manifest
 from storage.archive.staging import MANIFEST_NAME, file_hash, read_plain
 
 RECEIPT = "receipt.json"
@@ -127,11 +127,6 @@ class Run:
     def created(self) -> str:
         """When it was published, ISO 8601 in UTC."""
         return _text(self.facts.get("created")) or _text(self.receipt.get("finished"))
-
-    @property
-    def checksummed(self) -> str:
-        """When its manifest was written: at its publication, or when something was last added to it; ISO 8601."""
-        return _text(_table(self.facts.get(EXTENDED)).get("at")) or self.created
 
     @property
     def simulated(self) -> bool:

@@ -11,14 +11,12 @@ import errno
 import os
 import secrets
 from collections.abc import Callable, Iterator, Mapping
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from storage.archive.keys import plain, published_runs
+from storage.archive.keys import plain
 from storage.archive.manifests import (
-    EXTENDED,
     extended_facts,
     manifest_sha256,
     manifests_before,
@@ -26,9 +24,7 @@ from storage.archive.manifests import (
     try_manifest,
     write_manifest,
 )
-from storage.archive.records import read_run
 from storage.archive.staging import (
-    MANIFEST_NAME,
     PART_SUFFIX,
     bytes_below,
     check_name,
@@ -39,27 +35,9 @@ from storage.archive.staging import (
     take_lock,
 )
 
-TICK_S = 0.02  # dates have milliseconds, and those of files are some of them late
 _AT_FDCWD = -100  # names are absolute, or of the working folder
 _RENAME_EXCHANGE = 2
 _UNSUPPORTED = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP)
-
-
-def date_of_store(root: Path, uri: str) -> str:
-    """Return the date of a new store: now, or after the last run that knows its address where the clock was set back.
-
-    `verify` uses the date to tell a store that was made anew from one whose manifest was written later.
-    """
-    now = datetime.now(UTC)
-    folders = published_runs(root)
-    if any((folder / MANIFEST_NAME).lstat().st_mtime >= now.timestamp() - TICK_S for folder in folders):
-        runs = (read_run(folder, {}) for folder in folders)
-        for known in (run.checksummed for run in runs if uri in run.recorded):
-            try:
-                now = max(now, datetime.fromisoformat(known) + timedelta(milliseconds=1))
-            except (ValueError, TypeError, OverflowError):
-                continue  # it does not say when it was published
-    return now.isoformat(timespec="milliseconds")
 
 
 class RunDraft:
@@ -193,7 +171,7 @@ def unfinished_extensions(root: Path) -> Iterator[Path]:
     for part in sorted((root / "runs").glob(f"*{PART_SUFFIX}")):
         facts, problem = try_manifest(part)
         named = part.name.removesuffix(PART_SUFFIX)
-        whole = problem is None and bool(manifests_before(facts, EXTENDED)) and facts.get("run") == named
+        whole = problem is None and bool(manifests_before(facts)) and facts.get("run") == named
         if whole and not (root / "runs" / named).exists():
             yield part
 

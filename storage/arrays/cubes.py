@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.scan import Sweep
+from pipeline.signal.subspace import SignalStatistics
 from pipeline.source import Line, References
 from storage.arrays.layout import (
     RAW_PACKING,
@@ -247,3 +248,17 @@ def open_raw_cube(path: Path) -> RawCube:
 def open_raw_cubes(folder: Path) -> list[RawCube]:
     """Open the sweeps of a capture, in the order of their names; raises as `open_raw_cube`."""
     return [open_raw_cube(path) for path in sorted(folder.glob("*.zarr"))]
+
+
+STATISTICS = "statistics.npz"
+
+
+def write_statistics(folder: Path, found: SignalStatistics) -> None:
+    """Store the statistics of a capture in its folder."""
+    np.savez(folder / STATISTICS, allow_pickle=False, **found.arrays())
+
+
+def read_statistics(folder: Path) -> SignalStatistics:
+    """Read the statistics of a capture (IncompleteStoreError: they are missing or damaged)."""
+    with damage_named(str(folder / STATISTICS)), np.load(folder / STATISTICS) as stored:
+        return SignalStatistics.of_arrays(stored)

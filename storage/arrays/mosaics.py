@@ -34,7 +34,6 @@ from storage.arrays.layout import (
 )
 from storage.arrays.signal_cubes import (
     LARGEST_SHORT,
-    check_condensed,
     read_components,
     score_spec,
     step_of,
@@ -300,9 +299,8 @@ class Mosaic:
 
 
 def open_mosaic(path: Path) -> Mosaic:
-    """Open a mosaic. Raises IncompleteStoreError where it is missing, damaged or of an earlier version."""
+    """Open a mosaic. Raises IncompleteStoreError where it is missing or damaged."""
     group = open_group(path)
-    check_condensed(group, path)
     wavelength, fwhm = read_bands(group)
     return Mosaic(group, read_components(group), step_of(group), wavelength, fwhm, grid_of(dict(group.attrs)))
 

@@ -21,7 +21,6 @@ import zarr
 from numpy.typing import NDArray
 from zarr.storage import MemoryStore
 
-from pipeline.errors import OldStoreError
 from pipeline.geometry.mirror import mirror_throughput
 from pipeline.signal.calibrate import judge_elements
 from pipeline.signal.components import Components
@@ -57,7 +56,6 @@ from storage.arrays.quicklooks import Quicklook, write_quicklook
 CHUNK = 64  # lines and samples of a chunk of scores, all components of them: what lies together packs together
 SHARD_SAMPLES = 640
 FRAMES_OF = "frames_of"  # attribute: the sweep beside it that holds the dark and white frames of both
-REPROCESS = "`spectralzoom reprocess ARCHIVE` makes its run anew"
 MOST_DN = np.iinfo(np.uint16).max
 SIGNAL_ARRAYS = ("scores", "quality", "axes", "mean", "noise", "rare_line", "rare_sample", "rare_residual")
 LARGEST_SHORT = 32_000  # of scores and residuals in steps; larger ones are stored in 32 bits
@@ -253,12 +251,6 @@ class SignalCube(StoredSweep):
         return values
 
 
-def check_condensed(group: zarr.Group, path: StorePlace) -> None:
-    """Refuse a store of spectra that an earlier version wrote band by band (OldStoreError)."""
-    if "scores" not in group and "values" in group:
-        raise OldStoreError(f"{path} holds spectra band by band, as earlier versions stored them; {REPROCESS}")
-
-
 def step_of(group: zarr.Group, said: str = "scale_factor") -> float:
     """Return a step of the scores of a store, or another number that they say (IncompleteStoreError: damaged)."""
     scores = array_of(group, "scores")
@@ -287,12 +279,8 @@ def read_coordinates(
 
 
 def open_signal_cube(path: StorePlace) -> SignalCube:
-    """Open a condensed sweep.
-
-    Raises IncompleteStoreError: there is none, it was not closed, it is damaged, or of an earlier version.
-    """
+    """Open a condensed sweep. Raises IncompleteStoreError: there is none, it was not closed, or it is damaged."""
     group = open_group(path)
-    check_condensed(group, path)
     return SignalCube(
         **read_line_facts(group, path),
         components=read_components(group),

@@ -1,7 +1,6 @@
 """Making an archive whole again: what is broken is named, taken away, and made anew by the surveys that name it.
 
-Raw lines of a rig cannot be made anew, nor can stores of a former version of a stage: they stay as they are. Stores in
-a bucket that this machine's working copy has whole are uploaded again.
+Raw lines of a rig cannot be made anew, nor can stores of a former version of a stage: they stay as they are.
 """
 
 from __future__ import annotations
@@ -76,10 +75,8 @@ def repair(
     with archive.in_use(alone=True) as alone:
         if not alone:
             raise ArchiveError(f"{archive.name} is in use; run verify --repair again when the survey there has ended")
-        bad = list(findings)
-        restored = [uri for uri in dict.fromkeys(one.uri for one in bad) if archive.restore(uri)]
-        plan = plan_repair(archive, [one for one in bad if one.uri not in restored], versions=versions)
-        done = Repaired(plan, remade=restored)
+        plan = plan_repair(archive, findings, versions=versions)
+        done = Repaired(plan)
         for uri in plan.remade:
             archive.discard(archive.ref(*uri.split("/")[1:]))
     succeeded: set[str] = set()

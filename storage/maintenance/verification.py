@@ -14,26 +14,13 @@ from typing import Any, Literal
 
 import zarr
 
-from pipeline.json_lines import read_checked
-from pipeline.rig.capture import JOURNAL
 from storage.archive.keys import without_manifest
 from storage.archive.lineage import Catalogue
-from storage.archive.manifests import (
-    CLEARED,
-    EXTENDED,
-    broken_files,
-    listed_bytes,
-    manifest_sha256,
-    manifests_before,
-    try_manifest,
-)
+from storage.archive.manifests import broken_files, listed_bytes, manifests_before, try_manifest
 from storage.archive.run_folders import unfinished_extensions
-from storage.archive.staging import MANIFEST_NAME, NotPlainError, kind_of, read_plain
-from storage.arrays.fetched_files import SUMS, first_unlike
-from storage.arrays.spool import ENDING, spool_problems
+from storage.archive.staging import MANIFEST_NAME, kind_of
 
 WORDS = {"y": "rows", "x": "columns", "line": "lines", "sample": "samples", "band": "bands", "patch": "patches"}
-SPOOLS = "spool"
 _NO_ARRAY = (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError)
 
 
@@ -63,7 +50,7 @@ def name_damage(store: Path, name: str) -> str:
     return f" ({folder.relative_to(store).as_posix()}: {', '.join(ranges) or 'all of it'})"
 
 
-Kind = Literal["whole", "broken", "missing", "stray", "growing"]
+Kind = Literal["whole", "broken", "missing", "stray"]
 Progress = Callable[[str, float], None]  # address of what is being read, how far of all bytes, 0..1
 
 
@@ -72,7 +59,6 @@ class Finding:
     """Finding of ``verify`` on one store or run; ``problem`` is None where every byte is as published.
 
     ``missing``: something names or rests on a store that is not there. ``stray``: what is no part of the archive.
-    ``growing``: something of a spool that is damaged; the rest of it is used.
     """
 
     uri: str
@@ -109,44 +95,7 @@ def verify_everything(
     found += [*_misplaced(catalogue, root), *_missing(catalogue)]
     words = "what was added to it lacks its last step, a name; any command that writes into the archive gives it"
     found += [Finding(f"runs/{part.stem}", words, "stray") for part in unfinished_extensions(root)]
-    return [*found, *verify_growing(root)]
-
-
-def verify_growing(root: Path) -> Iterator[Finding]:
-    """Yield the findings about spools and what lies beside them; none where all is as it was written."""
-    for folder in _inside(root / SPOOLS):
-        for problem in _spool_problems(folder):
-            yield Finding(f"{SPOOLS}/{folder.name}", problem, "growing")
-    if kind_of(root / SPOOLS) not in (None, "a folder"):
-        yield Finding(SPOOLS, f"is {kind_of(root / SPOOLS)}, expected a folder; take it out of the archive", "stray")
-    for place, folders, files in os.walk(root / SPOOLS):
-        for path in (Path(place, one) for one in (*folders, *files)):
-            if (kind := kind_of(path)) not in (None, "a file", "a folder"):
-                uri = path.relative_to(root).as_posix()
-                yield Finding(uri, f"is {kind}, expected a file; take it out of the archive", "stray")
-
-
-def _spool_problems(folder: Path) -> Iterator[str]:
-    """Yield what has changed in the folder of a capture under way: lines, and the rig's files beside them."""
-    for path in (one for one in (*_inside(folder), *(file for inner in _inside(folder) for file in _inside(inner)))):
-        name = path.relative_to(folder).as_posix()
-        try:
-            if path.suffix == ENDING:
-                yield from spool_problems(path)
-            elif path.name == JOURNAL:
-                changed = [line.number for line in read_checked(read_plain(path)) if line.state == "changed"]
-                yield from (f"{name}: line {number} has changed since it was written" for number in changed)
-            elif name.endswith(SUMS) and (at := first_unlike(path.with_name(path.name.removesuffix(SUMS)))) is not None:
-                where = f"{name.removesuffix(SUMS)} is not as it was fetched from byte {at} on"
-                yield f"{where}; it is asked for again when the capture goes on"
-        except (FileNotFoundError, NotPlainError):
-            continue  # its lines are published; or it is a link and the like, which is reported for all of them
-        except OSError as error:
-            yield f"{name} cannot be read: {error.strerror}"
-
-
-def _inside(folder: Path) -> list[Path]:
-    return sorted(folder.iterdir()) if kind_of(folder) == "a folder" else []
+    return found
 
 
 def _changed_since(catalogue: Catalogue, uri: str) -> bool:
@@ -154,7 +103,7 @@ def _changed_since(catalogue: Catalogue, uri: str) -> bool:
     run = None if uri in catalogue.stores else next((run for run in catalogue.runs if run.uri == uri), None)
     if run is None:
         return False
-    return manifests_before(try_manifest(run.folder)[0], EXTENDED) != manifests_before(run.facts, EXTENDED)
+    return manifests_before(try_manifest(run.folder)[0]) != manifests_before(run.facts)
 
 
 def _problems(folder: Path) -> Iterator[str]:
@@ -168,18 +117,13 @@ def _problems(folder: Path) -> Iterator[str]:
 
 
 def _identity_problems(catalogue: Catalogue, uri: str) -> Iterator[str]:
-    """Yield whether a store is the one that its place and the runs say."""
+    """Yield whether the manifest of a store is that of another address."""
     store = catalogue.stores.get(uri)
     if store is None or store.problem is not None or kind_of(store.ref.path / MANIFEST_NAME) != "a file":
         return  # which is reported already
     stated = f"stages/{store.facts.get('stage')}/{store.facts.get('key')}"
     if stated != uri:
         yield f"its {MANIFEST_NAME} is that of {stated}; move it back, or take it out of the archive"
-    knowing = catalogue.recorded_by.get(uri, [])
-    own = {manifest_sha256(store.ref.path), *manifests_before(store.facts, CLEARED)} if knowing else set()
-    anew = all(store.created > run.checksummed for run, _ in knowing)
-    if not anew and not any(sha256 in own for _, sha256 in knowing):
-        yield f"its {MANIFEST_NAME} has changed since {knowing[-1][0].uri} was published (its SHA-256 differs)"
 
 
 def _misplaced(catalogue: Catalogue, root: Path) -> Iterator[Finding]:

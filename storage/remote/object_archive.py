@@ -28,7 +28,6 @@ from pipeline.errors import ArchiveError, IncompleteStoreError
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, in_text, open_folder, store_at
 from storage.archive.manifests import (
-    EXTENDED,
     check_files,
     file_problem,
     is_cleared,
@@ -145,24 +144,6 @@ class ObjectArchive(Archive):
             self._upload(ref.uri, first=False)
         return cleared
 
-    def restore(self, uri: str) -> bool:
-        """Write a broken store or run of the bucket again, if the working copy has it as it was published."""
-        folder = self.root / uri
-        standing = self.objects.read(f"{uri}/{MANIFEST_NAME}")
-        manifest, problem = try_manifest(folder)
-        if problem is not None or is_cleared(manifest):
-            return False
-        if standing not in (None, (folder / MANIFEST_NAME).read_bytes()) and parse_manifest(standing)[1] is None:
-            return False  # another machine has made it anew since
-        try:
-            self._fetch_files(uri)
-            check_files(folder, hashes=True)
-        except IncompleteStoreError:
-            return False
-        self.objects.remove(self.objects.listing(uri))
-        self._upload(uri, first=True)
-        return True
-
     def drop_run(self, uri: str) -> None:
         """Take a damaged run away, here and in the bucket."""
         super().drop_run(uri)
@@ -199,7 +180,7 @@ class ObjectArchive(Archive):
                 self._upload(uri, first=True)
             elif not self._is_dated(uri, there[uri]):
                 standing = hashlib.sha256(self.objects.read(f"{uri}/{MANIFEST_NAME}") or b"").hexdigest()
-                if standing in manifests_before(read_manifest(self.root / uri), EXTENDED):  # something was added to it
+                if standing in manifests_before(read_manifest(self.root / uri)):  # something was added to it
                     self._upload(uri, first=False)
 
     # --- the whole of it ----------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from storage.archive.archive import Archive
-from storage.maintenance.verification import Finding, Progress, verify_everything, verify_growing
+from storage.maintenance.verification import Finding, Progress, verify_everything
 from storage.remote.object_archive import MARK, ObjectArchive, open_object_archive
 from storage.remote.object_stores import Objects, is_remote, parse_place
 
@@ -34,9 +34,8 @@ def is_archive(address: str | Path) -> bool:
 def verify_archive(archive: Archive, progress: Progress | None = None) -> list[Finding]:
     """Check every store and every run; each file and shard that is broken has a finding of its own.
 
-    Every object of an archive in a bucket is read again, and all that grows in the working copy. Findings are named as
-    in a folder.
+    Every object of an archive in a bucket is read again. Findings are named as in a folder.
     """
     if isinstance(archive, ObjectArchive):
-        return [*archive.verify_everything(progress), *verify_growing(archive.root)]
+        return archive.verify_everything(progress)
     return verify_everything(archive.root, progress)

@@ -20,7 +20,7 @@ from storage.archive.staging import MANIFEST_NAME
 from storage.maintenance.garbage import clear_up
 from tests.faults.fault_table import Clock, Row, reported_wrong
 from tests.faults.nursery import Nursery
-from tests.faults.small_survey import Subject, prepare, problems, words, wrong_after_fault, wrong_after_rerun
+from tests.faults.small_survey import Subject, prepare, words, wrong_after_fault, wrong_after_rerun
 
 DAY_S = 86400.0
 FAR = 400 * DAY_S
@@ -55,26 +55,6 @@ def same_moment(subject: Subject, out: Path, clock: dict[str, Any]) -> list[str]
     return [*wrong, *wrong_after_rerun(subject, out, subject.nursery.run(words(out)), runs=4), *_order(out)]
 
 
-def made_anew(subject: Subject, out: Path, clock: dict[str, Any]) -> list[str]:
-    """Stores that a run names go and are made again by a clock that is behind: verify does not doubt them."""
-    ahead = clock["shift_s"] > 0  # then it is set right in between
-    given, wrong = {"fault": "wrong_clock", **clock}, list[str]()
-    if ahead:
-        wrong += wrong_after_rerun(subject, out, subject.nursery.run(words(out), **given), runs=1)
-    else:
-        subject.surveyed(out)
-    _date_files(out)
-    archive = Archive.open(out)
-    first = archive.runs()
-    for stage in ("rectify", "segment"):
-        for ref in archive.refs(stage):
-            archive.discard(ref)
-    wrong += wrong_after_rerun(subject, out, subject.nursery.run(words(out), **({} if ahead else given)), runs=2)
-    for folder in set(archive.runs()) - set(first):
-        shutil.rmtree(folder)  # killed before it was published
-    return [*wrong, *problems(out)]
-
-
 def cleared_up(subject: Subject, out: Path, clock: dict[str, Any]) -> list[str]:
     """gc after a survey that began by the right clock, went on by a wrong one and was killed before its end."""
     subject.surveyed(out)
@@ -102,7 +82,6 @@ CASES: dict[str, tuple[Case, tuple[str, ...], str]] = {
         "keys and bytes as ever, nothing made twice, runs in the order of their dates, archive verifies",
     ),
     "clock stands": (same_moment, ("standing still",), "three surveys at once: a run listed for each"),
-    "clock wrong in a repair": (made_anew, tuple(WRONG), "verify does not doubt what was made again"),
     "clock set back, then gc": (cleared_up, ("an hour back", "400 days back"), "nothing fresh, in use or named goes"),
 }
 

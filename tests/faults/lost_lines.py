@@ -163,13 +163,12 @@ def try_power(cuts: int, folder: Path, seed: int = 0) -> Losses:
 
 def _go_on(place: Path, appended: int, found: Losses) -> Iterator[str]:
     with Spool.open(place, SAMPLES, BANDS, header=HEADER) as spool:
-        lost = max(appended - spool.count, 0) + len(spool.lost)
+        lost = max(appended - spool.count, 0)
         found.lost[lost] += 1
         if lost > SYNC_LINES:
             yield f"{lost} lines lost"
-        spool.mend(line(number) for number in spool.lost)
         kept = [one for block in spool.blocks() for one in block]
-        yield from (f"line {one.number} is another" for one in kept if not _same(one, line(one.number)))
+        yield from (f"line {one.number} is another" for one in kept if not same(one, line(one.number)))
         fill(spool, LINES)
 
 
@@ -192,11 +191,11 @@ def try_kills(kills: int, folder: Path, seed: int = 0) -> Losses:
             kept = [one for block in spool.blocks() for one in block]
             if appended > spool.count:
                 found.wrong.append(f"{appended - spool.count} of {appended} lines lost")
-            found.wrong += [f"line {one.number} is another" for one in kept if not _same(one, line(one.number))]
+            found.wrong += [f"line {one.number} is another" for one in kept if not same(one, line(one.number))]
     return found
 
 
-def _same(one: Line, other: Line) -> bool:
+def same(one: Line, other: Line) -> bool:
     return np.array_equal(one.data, other.data) and _facts(one) == _facts(other)
 
 

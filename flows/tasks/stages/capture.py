@@ -28,9 +28,8 @@ from pipeline.source import Line, Source
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, stage_key
 from storage.archive.manifests import write_table
-from storage.arrays.cubes import RawCubeWriter, SweepHeader
+from storage.arrays.cubes import RawCubeWriter, SweepHeader, write_statistics
 from storage.arrays.spool import Spool
-from storage.arrays.statistics import write_statistics
 from storage.parallel.pool import WorkerPool
 
 RAW = Product("capture", version=12)
@@ -103,11 +102,7 @@ class SweepRecorder:
         found: SignalStatistics,
         taken: Callable[[int], None],
     ) -> None:
-        """Take lines into the spool and then the cube, one by one, from where a broken capture stopped.
-
-        Lines that were lost since are asked for again; a rig captures nothing for them, and what it cannot give is
-        invalid.
-        """
+        """Take lines into the spool and then the cube, one by one, from where an interrupted capture stopped."""
         references = source.references(sweep)
         header = SweepHeader(sweep, references, self.wavelength_nm, self.fwhm_nm, source.name, simulation=effects)
         samples, bands = references.dark.shape
@@ -124,7 +119,6 @@ class SweepRecorder:
                 statistics.add(line)
                 taken(spool.count)
 
-            spool.mend(source.lines_again(sweep, spool.lost))
             for block in spool.blocks():
                 cube.write(block)
                 for line in block:

@@ -26,11 +26,10 @@ from pipeline.signal.subspace import FEW_BANDS, SignalStatistics, bands_alone, c
 from pipeline.signal.sweep_signal import CondensedSweep, Condenser, calibrated_blocks, differing_lines
 from storage.archive.keys import StageRef
 from storage.archive.manifests import check_files, read_table, write_table
-from storage.arrays.cubes import RawCube, SweepHeader, open_raw_cubes
+from storage.arrays.cubes import RawCube, SweepHeader, open_raw_cubes, read_statistics
 from storage.arrays.layout import numbers_in_memory
 from storage.arrays.signal_cubes import LineRows, SignalCubeWriter, open_signal_cubes
 from storage.arrays.spool import line_values
-from storage.arrays.statistics import read_statistics
 
 SIGNAL = Product("condense", version=1)
 SIGNAL_FINE = Product("condense_fine", version=2)

@@ -91,7 +91,7 @@ def test_broken_off_it_leaves_the_store_whole(
 
 
 def test_a_manifest_that_says_so_falsely_is_found(archive: Archive) -> None:
-    """A store is cleared by its checksummed manifest, which names the one that runs know."""
+    """The manifest of another store is named."""
     small = small_survey(archive)
     other = small_survey(archive, kernel="nearest")
     cleared(archive)
