@@ -48,20 +48,20 @@ def save_png(figure: Figure, file: str | Path | IO[bytes], **choices: Any) -> No
 
 
 def webp(picture: Image.Image, **choices: Any) -> bytes:
-    """Pack a picture as Pillow's ``choices`` say: a tenth to a third shorter than PNG and JPEG that look the same."""
+    """Return a picture as WebP; ``choices`` are those of Pillow."""
     file = io.BytesIO()
     picture.save(file, "WEBP", **choices)
     return file.getvalue()
 
 
 def data_address(content: bytes) -> str:
-    """Return a PNG or WebP as an address of data, for a page."""
+    """Return a PNG or WebP as a data address for a page."""
     kind = "webp" if content.startswith(b"RIFF") else "png"
     return f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
 def grey_of(image: NDArray[np.floating]) -> NDArray[np.float32]:
-    """(y, x) brightness 0..1 of a field, the mean of its bands stretched."""
+    """Return the brightness (y, x) of a field, 0..1: the mean of its bands, stretched."""
     known = np.isfinite(image)
     total = np.where(known, image, 0).sum(axis=-1, dtype=np.float32)
     count = known.sum(axis=-1)
@@ -75,7 +75,7 @@ def class_palette(colours: NDArray[np.integer]) -> NDArray[np.float32]:
 
 
 def class_rgb(classes: NDArray[np.integer], palette: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(y, x, 3) picture of a class map; numbers without a colour (255 among them) are light grey."""
+    """Return a class map as a picture (y, x, 3); numbers without a colour, such as 255, are light grey."""
     table = np.tile(np.asarray(UNLABELLED_COLOUR, np.float32), (256, 1))
     table[: len(palette)] = palette
     picture: NDArray[np.float32] = table[np.clip(classes, 0, UNLABELLED)]
@@ -83,7 +83,7 @@ def class_rgb(classes: NDArray[np.integer], palette: NDArray[np.float32]) -> NDA
 
 
 def outline(chosen: NDArray[np.bool_], patch_px: int, shape: tuple[int, int]) -> list[list[tuple[float, float]]]:
-    """Border of a set of patches as line segments ((x, y), (x, y)) in scene px, clipped to the scene's (y, x) size."""
+    """Return the border of some patches as segments ((x, y), (x, y)) in scene px, clipped to the (y, x) ``shape``."""
     padded = np.pad(chosen, 1)
     limit = np.array([shape[1], shape[0]], np.float64)
     segments = []
@@ -122,7 +122,7 @@ def draw_difference(path: Path, maps: Sequence[ClassMap], titles: Sequence[str])
 
 
 def draw_ground(found: GroundMap) -> bytes:
-    """Picture and class map side by side, PNG: north up, metres from the lower left corner, hectares in the legend."""
+    """Draw picture and class map side by side as PNG: north up, axes in metres, hectares in the legend."""
     box = found.geobox.boundingbox
     extent = (0.0, box.right - box.left, 0.0, box.top - box.bottom)
     tall = extent[3] / extent[1]
@@ -190,7 +190,7 @@ def draw_spectra(mosaic: Mosaic, found: ClassMap) -> bytes | None:
 def class_spectra(mosaic: Mosaic, classes: NDArray[np.integer], count: int) -> NDArray[np.float32]:
     """Return the mean spectra (class, band) of ``count`` classes; NaN for one that no pixel of the mosaic shows.
 
-    ``classes`` (y, x) are of the fine grid; under a pixel of the mosaic counts the one at its centre.
+    ``classes`` (y, x) are of the fine grid; a pixel of the mosaic has the class at its centre.
     """
     half, step = mosaic.factor // 2, mosaic.factor
     sums, pixels, top = np.zeros((count, len(mosaic.components))), np.zeros(count), 0
@@ -220,5 +220,5 @@ def curve_with_gaps(
     nm, curve = np.asarray(wavelength_nm, np.float64)[order], np.asarray(values, np.float64)[order]
     apart = np.diff(nm)
     usual = float(np.median(apart)) if len(apart) else np.inf
-    breaks = np.flatnonzero(apart > GAP * usual) + 1 if usual <= CONTIGUOUS_NM else []
+    breaks = np.flatnonzero((apart > GAP * usual) & (usual <= CONTIGUOUS_NM)) + 1
     return np.insert(nm, breaks, np.nan), np.insert(curve, breaks, np.nan)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -49,7 +50,7 @@ MOST_NAMED = 4  # changes of class in a row
 LEADING_CLASSES = 3  # of a plot
 FOREIGN = 0.2  # fraction of unknown pixels above which the weights do not fit the field
 FOREIGN_WORDS = (
-    "these weights do not know this field: train some on labelled scenes of it (spectralzoom train DATASET), or leave "
+    "These weights do not know this field: train some on labelled scenes of it (spectralzoom train DATASET), or leave "
     "the class out with --unknown off"
 )
 
@@ -108,7 +109,7 @@ def format_score(receipt: Mapping[str, Any]) -> str:
         alone = receipt.get("plan", {}).get("kind") in ("scan", "raster") and "kept" not in receipt
         return f"{score} {format_worst_class(accuracy, alone=alone)}".rstrip()
     if is_foreign(receipt):
-        return f"{format_percent(receipt['unknown']['fraction'])} of the map is unknown: {FOREIGN_WORDS}."
+        return f"Unknown: {format_percent(receipt['unknown']['fraction'])} of the map. {FOREIGN_WORDS}."
     later = " The accuracy against the labels is added later." if is_pending(receipt) else ""
     expected = receipt.get("expected") or {}
     if predicted := format_prediction(expected.get("miou"), expected.get("error")):
@@ -276,15 +277,15 @@ def _scan(scan: Mapping[str, Any]) -> str:
 
 
 def _shift(shift_px: Sequence[float]) -> str:
-    return f"shifted by {np.hypot(*shift_px):.0f} px" if any(shift_px) else ""
+    return f"shifted by {math.hypot(*shift_px):.0f} px" if any(shift_px) else ""
 
 
 def _offsets(sweeps: Mapping[str, Sequence[float]]) -> str:
-    return f"corrected by up to {max(float(np.hypot(down, across)) for down, across in sweeps.values()):.1f} px"
+    return f"corrected by up to {max(math.hypot(*offset) for offset in sweeps.values()):.1f} px"
 
 
 def _multiply_adds(cost: Mapping[str, float]) -> str:
-    return f"{format_percent(cost['done'] / cost['everything'])} of the multiply-adds at full resolution"
+    return f"multiply-adds {format_percent(cost['done'] / cost['everything'])} of full resolution"
 
 
 # parts of a receipt: their label, and the figures that are shown, in order

@@ -1,4 +1,4 @@
-"""The verb `survey`: the flow with a bar for each stage, then the receipt."""
+"""Run the verb `survey`: the flow with progress bars, then a summary of the receipt."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ else:
 def run_survey(settings: Settings, console: Console, *, verbose: bool = False) -> Published:
     """Survey, publish the run and print its summary on ``console``; with ``verbose`` also its stages and effects.
 
-    Raises PipelineError: from the flow, as it is; NothingToMend: an earlier map is sure enough.
+    Raises PipelineError: of the flow; NothingToMend: the expected error of an earlier map is small enough.
     """
     use_one_thread()
     keep_freed_memory()
@@ -59,9 +59,9 @@ def run_survey(settings: Settings, console: Console, *, verbose: bool = False) -
 
 
 def _survey(settings: Settings, console: Console) -> RunRef:
-    """Run the flow on a server of this process, or on the one that PREFECT_API_URL names; plainly where there is none.
+    """Run the flow on a server of this process or at PREFECT_API_URL; without Prefect where that fails.
 
-    Inside a flow of the user's own its tasks become tasks of that flow.
+    Inside another flow its tasks become tasks of that flow.
     """
     asked = SurveySettings.of(settings)
     if settings.engine != "plain" and not inside_flow():
@@ -72,16 +72,16 @@ def _survey(settings: Settings, console: Console) -> RunRef:
                 found: RunRef = state.result()
                 return found
         except ServerUnavailable as error:
-            console.print(f"[yellow]{escape(str(error))}; going on with --engine plain[/]")
+            console.print(f"[yellow]{escape(str(error))}; the survey runs with --engine plain[/]")
     plain: RunRef = survey_flow.survey.fn(asked)
     return plain
 
 
 @contextmanager
 def _prefect_server(out: str) -> Iterator[None]:
-    """Have a server for one survey, its files in the archive; one that PREFECT_API_URL names is used as it is.
+    """Start a server for one survey, with its files in the archive, or use the one at PREFECT_API_URL.
 
-    A second survey of the archive has a folder of its own, which goes with it. Raises ServerUnavailable.
+    A second survey of the archive has a temporary folder of its own. Raises ServerUnavailable.
     """
     if "PREFECT_API_URL" in os.environ:
         check_answers(os.environ["PREFECT_API_URL"])

@@ -1,8 +1,8 @@
 """Keep files of the camera in a folder while they are fetched, so that the next transfer continues there.
 
 A file of the camera is named by its whole path there, notes about the files by a name alone. Bytes are only appended;
-a file that came damaged is dropped as a whole. Notes are on the disk when ``append`` returns. Of a file so is all but
-the last ``SYNC_BYTES``, since the camera still has them.
+a file that came damaged is dropped as a whole. Notes are on the disk when ``append`` returns. The last ``SYNC_BYTES``
+of a file may not be, since the camera still has them.
 
 ::
 

@@ -1,8 +1,8 @@
 """Store the lines of a capture while it runs, so that a crash loses at most the lines since the last sync.
 
-``<name>.lines`` begins with one line of JSON that describes the sweep. Records of one size follow, one for each line:
-number, mirror X and Y, time, exposure, valid, a CRC-32, and the raw numbers (sample, band) uint16. The CRC continues
-that of the header, so that a record belongs to one sweep alone.
+``<name>.lines`` begins with one line of JSON that describes the sweep. Records of one size follow, one for each line.
+A record has number, mirror X and Y, time, exposure, valid, a CRC-32, and the raw numbers (sample, band) uint16. The CRC
+continues that of the header, so that a record belongs to one sweep alone.
 
 A torn tail is cut off, and the capture continues there. A line that was damaged after it was synced is lost alone: it
 is named in the log, and comes back as an invalid line.

@@ -1,7 +1,7 @@
-"""Reading a whole archive again: every byte against its manifest, every manifest against its seal and its runs.
+"""Verify an archive: compare every byte with its manifest, and every manifest with its seal and its address.
 
-A link or a pipe in the place of a file is reported and never opened. A finding on a broken file of an array names the
-part that it holds.
+A link or a pipe instead of a file is reported and never opened. The finding on a damaged file of an array names its
+rows and columns.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ _NO_ARRAY = (OSError, ValueError, KeyError, TypeError, IndexError, RecursionErro
 
 
 def name_damage(store: Path, name: str) -> str:
-    """Return the known part of a store in a broken file, to follow its name; empty where it belongs to no array.
+    """Return the part of an array in a damaged file, as text behind its name; empty where it belongs to no array.
 
-    For example ``(values: rows 0 to 63, columns 0 to 639)``; a dimension of which it has everything is left out.
+    For example ``(values: rows 0 to 63, columns 0 to 639)``; dimensions that the file covers are left out.
     """
     file = store / name
     inner = [path for path in file.parents if path.is_relative_to(store)]
@@ -51,14 +51,14 @@ def name_damage(store: Path, name: str) -> str:
 
 
 Kind = Literal["whole", "broken", "missing", "stray"]
-Progress = Callable[[str, float], None]  # address of what is being read, how far of all bytes, 0..1
+Progress = Callable[[str, float], None]  # address being read, fraction of all bytes
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Finding of ``verify`` on one store or run; ``problem`` is None where every byte is as published.
+    """Finding on one store or run; ``problem`` is None where every byte is as published.
 
-    ``missing``: something names or rests on a store that is not there. ``stray``: what is no part of the archive.
+    ``missing``: a run or store names a store that is not there. ``stray``: something that is no part of an archive.
     """
 
     uri: str
@@ -69,9 +69,9 @@ class Finding:
 def verify_everything(
     root: Path, progress: Progress | None = None, problems_of: Callable[[Path], Iterator[str]] | None = None
 ) -> list[Finding]:
-    """Check every store and run of an archive; a finding for each that is whole, and for each thing that is not.
+    """Return a finding for each store and run without damage, and for each problem.
 
-    ``problems_of`` reads one published folder again where its files lie elsewhere.
+    ``problems_of`` reads one published folder whose files lie elsewhere, as in a bucket.
     """
     read_again = problems_of or _problems
     catalogue = Catalogue.read(root)
@@ -93,7 +93,7 @@ def verify_everything(
         if not problems:
             found.append(Finding(uri, None))
     found += [*_misplaced(catalogue, root), *_missing(catalogue)]
-    words = "what was added to it lacks its last step, a name; any command that writes into the archive gives it"
+    words = "its extension is not finished; any command that writes into the archive finishes it"
     found += [Finding(f"runs/{part.stem}", words, "stray") for part in unfinished_extensions(root)]
     return found
 
@@ -107,7 +107,7 @@ def _changed_since(catalogue: Catalogue, uri: str) -> bool:
 
 
 def _problems(folder: Path) -> Iterator[str]:
-    """Yield what is wrong with one published folder, file by file."""
+    """Yield the problems of one published folder, file by file."""
     manifest, problem = try_manifest(folder)
     if problem is not None:
         yield f"{MANIFEST_NAME} is damaged: {problem}"
@@ -127,7 +127,7 @@ def _identity_problems(catalogue: Catalogue, uri: str) -> Iterator[str]:
 
 
 def _misplaced(catalogue: Catalogue, root: Path) -> Iterator[Finding]:
-    """Yield findings on runs that name another run (copies, or renamed), and on leftovers without a manifest."""
+    """Yield findings on runs with another run's name (copies, or renamed), and on folders without a manifest."""
     there = {run.folder.name for run in catalogue.runs}
     for run in catalogue.runs:
         stated = run.facts.get("run", run.folder.name)
@@ -143,7 +143,7 @@ def _misplaced(catalogue: Catalogue, root: Path) -> Iterator[Finding]:
 
 
 def _missing(catalogue: Catalogue) -> Iterator[Finding]:
-    """Yield what runs name and stores rest on, and is not there."""
+    """Yield the stores that a run or another store names and that are missing."""
     there, told = set(catalogue.stores), set[str]()
     for run in catalogue.runs:
         for uri in sorted(run.names - there - told):

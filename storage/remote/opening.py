@@ -1,4 +1,4 @@
-"""Archives of either kind, a folder of this machine or a prefix of a bucket: what differs is chosen here."""
+"""Open and verify archives in a folder of this machine or below a prefix of a bucket."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from storage.remote.object_stores import Objects, is_remote, parse_place
 
 
 def open_archive(address: str | Path, *, create: bool = True, write: bool = True) -> Archive:
-    """Open the archive at a folder or ``s3://bucket/prefix``, or make it where ``create``.
+    """Open the archive at a folder or ``s3://bucket/prefix``, or create it with ``create``.
 
-    Raises ArchiveError: the path is a file, is not there, or cannot be written to (``write``). So does a missing
-    obstore, which an archive on S3 needs. SettingsError: an address on S3 that is none.
+    Raises ArchiveError: the path is a file, is missing, or cannot be written to (``write``), or obstore is not
+    installed; SettingsError: the address on S3 is not valid.
     """
     if is_remote(address):
         return open_object_archive(address, create=create, write=write)
@@ -22,9 +22,9 @@ def open_archive(address: str | Path, *, create: bool = True, write: bool = True
 
 
 def is_archive(address: str | Path) -> bool:
-    """Return whether there is something to open: an archive, or a file that will be refused.
+    """Return whether there is an archive to open, or a file that will be refused.
 
-    Raises UnreachableError: that cannot be told of an address on S3.
+    Raises UnreachableError: a bucket does not answer.
     """
     if is_remote(address):
         return Objects(parse_place(address)).read(MARK) is not None

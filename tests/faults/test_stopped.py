@@ -152,7 +152,7 @@ def test_the_run_is_there_before_its_map_is_judged(mapped: Path, whole: Any) -> 
     assert [row["name"] for row in receipt["stages"]] == [row["name"] for row in whole["stages"]][:-1]
     assert whole["savings"] == receipt["savings"]
     (run,) = Archive.open(mapped).runs()
-    assert "The map is not judged yet" in (run / "report.html").read_text()
+    assert "The accuracy against the labels is added later" in (run / "report.html").read_text()
 
 
 @pytest.mark.parametrize("place", PLACES)

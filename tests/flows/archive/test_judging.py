@@ -195,7 +195,7 @@ def test_ls_and_the_receipt_say_that_a_map_is_not_judged_yet(
     listed = json.loads(command_line("ls", out, "--json").out)["runs"]
     assert [(row["accuracy_is"], row["miou"]) for row in listed] == [("pending", None), ("left out", None)]
     pages = [(run / "report.html").read_text() for run in Archive.open(out).runs()]
-    assert ["The map is not judged yet" in page for page in pages] == [True, False]
+    assert ["The accuracy against the labels is added later" in page for page in pages] == [True, False]
 
 
 def test_what_was_left_out_is_added_later(

@@ -233,7 +233,7 @@ def test_the_details_have_stages_effects_and_versions():
         ({}, "The score is not known: there are no labels."),
         ({"expected": {"miou": 0.94, "error": 0.02}}, "Expected mIoU 94.0 ± 2.0 of 100, estimated from the map's own"),
         ({"expected": {"miou": 0.94, "error": 0.4}, "accuracy_is": "pending"}, "is added later."),
-        ({"unknown": {"fraction": 0.5}, "expected": {"miou": 0.9, "error": 0.0}}, "50 % of the map is unknown: these"),
+        ({"unknown": {"fraction": 0.5}, "expected": {"miou": 0.9, "error": 0.0}}, "Unknown: 50 % of the map. These"),
     ],
 )
 def test_a_map_without_labels_has_its_own_estimate(found: dict, words: str):

@@ -191,7 +191,7 @@ def test_killed_between_two_renames_verify_and_gc_know(archive: Archive) -> None
     name = run_id(archive)
     extend(archive, name)
     (archive.root / "runs" / name).rename(archive.root / "runs" / (name + PART_SUFFIX))
-    assert any(one.startswith(f"runs/{name} what was added to it lacks its last step") for one in problems(archive))
+    assert any(one.startswith(f"runs/{name} its extension is not finished") for one in problems(archive))
     assert "unfinished" not in {removal.what for removal in clear_up(archive, keep_days=9, dry_run=True).removals}
     opened = Archive.open(archive.root, create=False)
     assert (figure_of(opened), problems(opened)) == (0.75, [])

@@ -93,7 +93,7 @@ def test_a_store_that_goes_while_the_archive_is_open_is_told_of(machine: Machine
     found = other.find("rectify", ref.key)
     assert found is not None
     archive.discard(ref)
-    with pytest.raises(IncompleteStoreError, match="was removed meanwhile; run again, and it is made again"):
+    with pytest.raises(IncompleteStoreError, match=r"was removed meanwhile\. Run again: it is built again"):
         _ = found.path
     assert make(other)[1]
 
