@@ -1,8 +1,8 @@
 """Write and read the georeference of stored images: a GeoBox, or the camera's angles.
 
 A GeoBox is written as CF's grid mapping with coordinates of pixel centres, and as GeoZarr's attributes ``proj:`` and
-``spatial:``. Plain xarray, rioxarray and odc-geo read both. The coordinates of a rotated grid count pixels, as in odc-geo;
-its grid mapping has the GeoTransform.
+``spatial:``. Plain xarray, rioxarray and odc-geo read both. The coordinates of a rotated grid count pixels, as in
+odc-geo; its grid mapping has the GeoTransform.
 """
 
 from __future__ import annotations

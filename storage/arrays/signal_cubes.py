@@ -4,8 +4,8 @@
 
 Any Zarr v3 reader opens the arrays ``scores`` (``scale_factor`` is the step), ``axes``, ``mean`` and ``noise``.
 ``quality`` of a spectrum is 0 where all bands were seen and 1 where some were restored from the others. It is 2 where
-less than half were seen. ``rare_*`` are the residuals of spectra that the components do not represent. The dark and white
-frames of the sweep are stored for a later calibration.
+less than half were seen. ``rare_*`` are the residuals of spectra that the components do not represent. The dark and
+white frames of the sweep are stored for a later calibration.
 """
 
 from __future__ import annotations

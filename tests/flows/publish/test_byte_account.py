@@ -12,7 +12,6 @@ import pytest
 from rich.console import Console
 
 from flows.archive.commands import contents
-from flows.archive.compare_command import compare
 from flows.archive.history import read_history
 from flows.publish import publishing
 from flows.publish.byte_account import publish_counted, recount_bytes
@@ -188,13 +187,6 @@ def test_a_run_in_a_bucket_counts_its_objects(
     assert again["written"] < again["moved_bucket"] < again["written"] + 1.2 * stores
 
 
-def test_what_goes_to_worker_processes_is_not_counted(survey_png: Survey, tmp_path: Path) -> None:
-    """The receipt has no number of it, and the table says so."""
-    receipt = survey_png(tmp_path / "archive", accuracy=False, scheduler="processes", workers="2").receipt
-    assert receipt["data_bytes"]["moved_workers"] is None
-    assert "not counted" in _printed(receipt)
-
-
 @pytest.mark.parametrize("stores", [899, 99_000, 999_400, 9_999_999_000])
 def test_the_figure_of_a_folder_that_holds_the_figure(
     stores: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -243,15 +235,3 @@ def test_a_tiny_field_has_no_absurd_percentage() -> None:
     for text in (_printed(receipt), render_report(receipt, PNG).replace("\u202f", " ")):
         assert "1 710 times" in text
         assert "170717" not in text
-
-
-def test_compare_has_the_bytes_of_both(published: Published, survey_png: Survey, capsys: Any, tmp_path: Path) -> None:
-    """Each figure of both runs beside the other's."""
-    other = survey_png(tmp_path / "archive", accuracy=False, budget="0.7")
-    capsys.readouterr()
-    names = (published.folder.name, other.folder.name)
-    compare(tmp_path / "archive", *names, out=tmp_path, as_json=True)
-    found = json.loads(capsys.readouterr().out)["data_bytes"]
-    accounts = [told(one.folder) for one in (published, other)]
-    assert found["kept"] == [account["kept"] for account in accounts]
-    assert found["captured"] == [account["captured"] for account in accounts]
