@@ -10,7 +10,6 @@ import base64
 import io
 import json
 from contextlib import suppress
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from flows.publish.byte_account import recount_bytes
@@ -104,7 +103,7 @@ def _kept_by_others(plan: OpenSurvey, stage: str, raw: StageRef) -> str | None:
         return None
     archive = plan.run.archive
     runs = Catalogue.read(archive.root).named_by(raw.uri)
-    return next((f"{one.uri} keeps them" for one in runs if not is_outlived(one, datetime.now(UTC))), None)
+    return next((f"{one.uri} keeps them" for one in runs if not is_outlived(one, archive.now())), None)
 
 
 def recount(plan: OpenSurvey, run: RunRef) -> RunRef:

@@ -50,7 +50,7 @@ def clear_raw_lines(
     Every line is compared first; lines that differ or cannot be read stay. With ``dry_run`` nothing is compared or
     removed. Raises ArchiveError: the disk refuses.
     """
-    found = list(outlived_lines(Catalogue.read(archive.root), datetime.now(UTC)))
+    found = list(outlived_lines(Catalogue.read(archive.root), archive.now()))
     if dry_run:
         return RawClearance([_removal(one) for one in found])
     done = RawClearance()

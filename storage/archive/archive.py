@@ -281,6 +281,10 @@ class Archive:
                     release()
         return removed
 
+    def now(self) -> datetime:
+        """Return the time from which the age of stores is counted."""
+        return datetime.now(UTC)
+
     def size_of(self, uri: str) -> int:
         """Return the present bytes of all files of a store or run, manifest included."""
         return bytes_below(self.root / uri)

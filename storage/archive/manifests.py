@@ -46,8 +46,8 @@ def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
         files[path.relative_to(folder).as_posix()] = {"sha256": file_hash(path), "size": path.stat().st_size}
     known = {"created": datetime.now(UTC).isoformat(timespec="milliseconds"), "libraries": library_versions()}
     content = {**known, **facts, "files": files, "format": FORMAT}
-    manifest = folder / MANIFEST_NAME
-    manifest.write_text(_text(content | {"seal": _seal(content)}), encoding="utf-8")
+    manifest, checksummed = folder / MANIFEST_NAME, content | {"seal": _seal(content)}
+    manifest.write_text(_text(checksummed), encoding="utf-8")
     sync_path(manifest)
     for inner in sorted(path for path in folder.rglob("*") if path.is_dir()):
         sync_path(inner)

@@ -103,7 +103,7 @@ def plan_clearance(archive: Archive, *, keep_days: float = 1.0, raw_too: bool = 
         raise SettingsError(f"--keep-days {keep_days}: expected a number of days, 0 or more")
     catalogue = Catalogue.read(archive.root)
     named = set[str]().union(*(catalogue.named_and_below[run.uri] for run in catalogue.runs))
-    moment = datetime.now(UTC)
+    moment = archive.now()
     spared = _spared(catalogue, named, keep_days, raw_too, moment)
     below = catalogue.ancestors(spared) & set(catalogue.stores) - named
     kept = dict.fromkeys(below, "an input of a store that stays") | spared

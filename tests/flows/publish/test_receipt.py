@@ -222,7 +222,7 @@ def test_the_details_have_stages_effects_and_versions():
     receipt = make_receipt()
     receipt["stages"][1]["state"] = "skipped"
     text = _printed(receipt, details=True)
-    for words in ("samples on the field", "capture", "torch 2.13.0", "1 of 1 effects"):
+    for words in ("samples on the field", "capture", "torch 2.13.0", "Effects computed: 1 of 1"):
         assert words in text, words
     assert "rectify" not in text
 

@@ -81,16 +81,15 @@ def test_a_torn_tail_is_cut_off(tmp_path: Path, cut: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("damaged", "lost", "count"),
-    [([0], [0], 150), ([3, 63, 64], [3, 63, 64], 150), ([127], [127], 150), ([128], [], 128), ([5, 149], [5], 149)],
+    ("damaged", "lost", "count"), [([0], [0], 128), ([3, 63], [3, 63], 128), ([64], [], 64), ([5, 127], [5], 127)]
 )
 def test_a_damaged_line_is_lost_alone(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, damaged: list[int], lost: list[int], count: int
 ) -> None:
     """Before the last sync it is named and not valid, all others stay; behind it the capture continues there."""
-    _fill(tmp_path, 150)
+    _fill(tmp_path, 128)  # the second sync may not have ended
     for number in damaged:
-        flip(tmp_path / "lines.lines", (number - 150) * RECORD + 7 * number % RECORD)
+        flip(tmp_path / "lines.lines", (number - 128) * RECORD + 7 * number % RECORD)
     with _open(tmp_path) as spool:
         assert spool.count == count
         found = _lines(spool)
