@@ -139,7 +139,7 @@ def test_a_plain_scan_shows_how_sure_its_map_is(monkeypatch: pytest.MonkeyPatch,
     draw_quicklook(tmp_path / "q.png", replace(data, policy=None, blocks=(), raw_lines=2098, confidence=confidence))
     told = dict(words)
     assert told["1  Raw lines"] == "2 sweeps, 2098 lines"
-    assert told["2  Confidence"] == ("of the model in its own map" if confident else "the map has none")
+    assert told["2  Confidence"] == ("of the model" if confident else "the map has none")
     assert "2  Captured again" not in told
 
 
